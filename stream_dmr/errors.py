@@ -1,0 +1,32 @@
+"""What can go wrong on the user's side, each with the one line that mends it."""
+
+
+class UserError(Exception):
+    """The user's input is wrong: the command prints this one line and exits with 2.
+
+    The message says what was expected, what came instead, and how to mend it.
+    """
+
+
+class TemplateError(UserError):
+    """A template mesh or its TOML breaks the template contract."""
+
+
+class CalibrationError(UserError):
+    """A calibration file, board picture or set of pictures can't be used."""
+
+
+class SourceError(UserError):
+    """A video, folder or camera can't be read."""
+
+
+class AnnotationError(UserError):
+    """A boxes file or a masks folder can't be read or doesn't match the source."""
+
+
+class ConfigError(UserError):
+    """`config.toml` holds an unknown key, a wrong type or a value out of range."""
+
+
+class OutputError(UserError):
+    """The output folder can't be written to."""

@@ -1,0 +1,188 @@
+"""The messages that flow from stage to stage: one immutable type per stage, numpy inside.
+
+Frame -> FishCrop -> FittedMesh -> LocalizedFish -> LengthEstimate
+
+`slots` and `eq=False`: a generated `==` fails on arrays. Arrays are made read-only on the way in.
+A fish that a stage can't handle is not dropped: its message carries the reason, and the stages
+after it pass that reason on.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from stream_dmr.camera import Camera
+
+
+def _freeze(message: object) -> None:
+    """Make the arrays and mappings of a frozen dataclass read-only."""
+    for field in fields(message):  # type: ignore[arg-type]
+        value = getattr(message, field.name)
+        if isinstance(value, np.ndarray) and value.flags.writeable:
+            value = value.view()
+            value.flags.writeable = False
+        elif isinstance(value, dict):
+            value = MappingProxyType(dict(value))
+        else:
+            continue
+        object.__setattr__(message, field.name, value)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Frame:
+    """One picture of the source."""
+
+    frame_index: int
+    timestamp_ns: int
+    image: UInt8[np.ndarray, "H W 3"]  # BGR
+    source: str  # file name or address, for people
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class CropQuality:
+    """Facts about a crop that later stages gate by."""
+
+    touches_border: bool  # the mask reaches the edge of the frame: part of the fish is outside
+    visible_fraction: float  # of the fish, 0 to 1, as the annotations or the tracker say
+    sharpness: float  # variance of the Laplacian inside the mask, grey levels squared
+    mask_area_px: float  # of the mask, in frame pixels
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FishCrop:
+    """One fish cut out of one frame, through an ideal pinhole camera of its own."""
+
+    frame_index: int
+    timestamp_ns: int
+    track_id: int
+    bbox_xyxy_px: Float[np.ndarray, "4"]  # half-open, frame pixels
+    image: UInt8[np.ndarray, "S S 3"]  # BGR, lens distortion removed
+    mask: Bool[np.ndarray, "S S"]  # all False where nothing was segmented
+    crop_camera: Camera  # of `image` and `mask`; the orientation is the frame camera's
+    frame_camera: Camera  # with crop_camera it gives the exact crop-to-frame pixel map
+    quality: CropQuality
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class LossTerms:
+    """The terms of eq. (3), each before its lambda."""
+
+    iou: float
+    boundary: float
+    scale: float
+    translation: float
+    normal: float
+    laplacian: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SolverReport:
+    """How a fit went. `elapsed_ns` is the one field of all messages that no replay can repeat."""
+
+    solver: str  # "adam", ...
+    deformation: str  # "spine" | "linear-blend"
+    iterations: int
+    converged: bool
+    stop_reason: str
+    cold_start: bool
+    elapsed_ns: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FittedShape:
+    """The deformed template in the orientation of the camera, at a relative scale.
+
+    The camera stands in the origin, so the coordinates project through the crop's K as they are;
+    their common scale is arbitrary.
+    """
+
+    parameters: Float[np.ndarray, "P"]  # layout: stream_dmr.skinning.Parameters
+    vertices: Float[np.ndarray, "V 3"]
+    keypoints: Float[np.ndarray, "3 3"]  # head, center, tail
+    keypoints_px: Float[np.ndarray, "3 2"]  # the same in frame pixels
+    midline: Float[np.ndarray, "M 3"]  # head keypoint to tail keypoint
+    iou: float  # of the hard silhouette with the mask
+    losses: LossTerms
+    covariance: Float[np.ndarray, "P P"]  # of `parameters`
+    length_std_ratio: float  # std of the arc length, as a fraction of it, by `covariance`
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FittedMesh:
+    """The fit of one crop, or why there is none."""
+
+    frame_index: int
+    timestamp_ns: int
+    track_id: int
+    shape: FittedShape | None  # None where `refusal` says why
+    report: SolverReport | None  # None where no solver ran
+    quality: CropQuality
+    refusal: str  # "" when fitted
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class LocalizedFish:
+    """One fish of one frame in millimetres, accepted or refused with its reason.
+
+    Without a calibration the millimetres are None and the pixels and the bending ratio remain.
+    """
+
+    frame_index: int
+    timestamp_ns: int
+    track_id: int
+    keypoints_px: Float[np.ndarray, "3 2"] | None  # head, center, tail
+    keypoints_mm: Float[np.ndarray, "3 3"] | None  # the same in the camera frame
+    midline_mm: Float[np.ndarray, "M 3"] | None
+    bending_ratio: float | None  # arc over chord, eq. (13)
+    length_mm: float | None
+    length_std_mm: float | None
+    iou: float | None
+    accepted: bool  # may this frame count towards the fish's length?
+    reason: str  # "" when accepted, else why not
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class LengthEstimate:
+    """What is known of one fish's length so far; `is_final` once its track has ended."""
+
+    frame_index: int  # of the LocalizedFish that this estimate follows
+    timestamp_ns: int
+    track_id: int
+    is_frame_used: bool  # did that frame pass every gate, the filter's own included?
+    frame_reason: str  # "" when used, else why not
+    length_mm: float | None  # None until there are enough good frames
+    length_std_mm: float | None
+    ci95_mm: Float[np.ndarray, "2"] | None  # low, high
+    frames_seen: int
+    frames_used: int
+    refused: Mapping[str, int]  # reason -> number of frames
+    first_frame: int
+    last_frame: int
+    first_timestamp_ns: int
+    last_timestamp_ns: int
+    status: str  # "measured" | "measuring" | why there is no length
+    is_final: bool
+    smoothed_frames: Int[np.ndarray, "N"]  # frame indices of the RTS series, empty until final
+    smoothed_mm: Float[np.ndarray, "N"]
+    smoothed_std_mm: Float[np.ndarray, "N"]
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+
+Message = Frame | FishCrop | FittedMesh | LocalizedFish | LengthEstimate

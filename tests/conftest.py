@@ -1,0 +1,29 @@
+"""Shape annotations execute under pytest; scenes outside the repository skip with a reason."""
+
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+install_import_hook(["stream_dmr", "nodes"], "beartype.beartype")
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+def _folder(name: str) -> Path:
+    folder = SHARED / name
+    if not folder.is_dir():
+        pytest.skip(f"needs the material in {folder}, which is not part of the repository")
+    return folder
+
+
+@pytest.fixture
+def scenes() -> Path:
+    """Scenes with known lengths, made by another generator than ours."""
+    return _folder("scenes")
+
+
+@pytest.fixture
+def real() -> Path:
+    """Real photographs and clips."""
+    return _folder("real")
