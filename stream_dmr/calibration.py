@@ -1,0 +1,195 @@
+"""The calibration file: a camera and its reference plane as OpenCV FileStorage YAML.
+
+Keys: `image_width, image_height, camera_matrix, distortion_coefficients, rvec, tvec`; rvec and
+tvec take world points (the reference plane is world Z = 0) to camera points in mm.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.camera import Calibration, Camera, ReferencePlane
+from stream_dmr.errors import CalibrationError, OutputError
+
+_KEYS = (
+    "image_width",
+    "image_height",
+    "camera_matrix",
+    "distortion_coefficients",
+    "rvec",
+    "tvec",
+)
+_DISTORTION_SHAPES = [(4,), (5,), (8,), (12,), (14,)]  # what OpenCV's lens models have
+_REMEDY = "make the file anew with `stream-dmr calibrate`"
+_MIN_SLOPE = np.sin(np.radians(3.0))  # a plane seen flatter than this has no usable depth
+_MIN_DEPTH_MM = 10.0  # closer than that, tvec is in metres
+
+
+def load_calibration(path: Path | str) -> Calibration:
+    """Read and check a calibration file.
+
+    Raises CalibrationError where the file is missing, is no OpenCV YAML, lacks a key, holds a
+    value of the wrong shape or a value that no camera has, or has its plane behind the camera.
+    """
+    path = Path(path)
+    values = _read_values(path)
+    camera = Camera(
+        width=_positive_int(values, "image_width", path=path),
+        height=_positive_int(values, "image_height", path=path),
+        K=_array(values, "camera_matrix", shapes=[(3, 3)], path=path),
+        distortion=_array(values, "distortion_coefficients", shapes=_DISTORTION_SHAPES, path=path),
+    )
+    rotation, _ = cv2.Rodrigues(_array(values, "rvec", shapes=[(3,)], path=path))
+    plane = ReferencePlane(
+        rotation=rotation, translation_mm=_array(values, "tvec", shapes=[(3,)], path=path)
+    )
+    _check_intrinsics(camera.K, path=path)
+    _check_plane(camera, plane, path=path)
+    return Calibration(camera=camera, plane=plane)
+
+
+def save_calibration(path: Path | str, calibration: Calibration) -> None:
+    """Write a calibration file that `load_calibration` and OpenCV read.
+
+    The numbers come back equal to the last bit, but for the plane's rotation, which is stored as
+    a rotation vector (error below 1e-12). Raises OutputError where the file can't be written.
+    """
+    path = Path(path)
+    camera, plane = calibration.camera, calibration.plane
+    rvec, _ = cv2.Rodrigues(plane.rotation)
+    storage = cv2.FileStorage(
+        ".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
+    )
+    storage.write("image_width", camera.width)
+    storage.write("image_height", camera.height)
+    storage.write("camera_matrix", camera.K)
+    storage.write("distortion_coefficients", camera.distortion.reshape(1, -1))
+    storage.write("rvec", rvec.reshape(3, 1))
+    storage.write("tvec", plane.translation_mm.reshape(3, 1))
+    try:
+        path.write_text(storage.releaseAndGetString(), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(
+            f"{path}: expected a place to write the calibration to, got: {error.strerror}"
+        ) from error
+
+
+def require_size(calibration: Calibration, *, width: int, height: int) -> None:
+    """Raise CalibrationError unless the calibration was made for pictures of this size."""
+    camera = calibration.camera
+    if (camera.width, camera.height) != (width, height):
+        raise CalibrationError(
+            f"expected pictures of {camera.width}x{camera.height} px, the calibration's size, "
+            f"got {width}x{height}; calibrate with pictures of {width}x{height} px from this camera"
+        )
+
+
+def _read_values(path: Path) -> dict[str, float | np.ndarray]:
+    """Every key's number or matrix, as OpenCV parses them."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise CalibrationError(f"{path}: expected a calibration file, got none there") from error
+    except OSError as error:
+        raise CalibrationError(
+            f"{path}: expected a readable calibration file, got: {error.strerror}"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise _not_yaml(path, "bytes that are no text") from error
+    if not text.startswith("%YAML"):
+        raise _not_yaml(path, f"a file that begins with {text[:20]!r}" if text else "an empty file")
+    try:
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        nodes = {key: storage.getNode(key) for key in _KEYS}
+    except (cv2.error, SystemError) as error:
+        raise _not_yaml(path, "one that OpenCV can't parse") from error
+    if missing := [key for key in _KEYS if nodes[key].empty()]:
+        raise CalibrationError(
+            f"{path}: expected the keys {', '.join(_KEYS)}; missing: {', '.join(missing)}; "
+            f"add them, or {_REMEDY}"
+        )
+    return {key: _value(node, key, path=path) for key, node in nodes.items()}
+
+
+def _value(node: cv2.FileNode, key: str, *, path: Path) -> float | np.ndarray:
+    if node.isInt() or node.isReal():
+        return node.real()
+    try:
+        matrix = node.mat()
+    except (cv2.error, SystemError):
+        matrix = None
+    if matrix is None:
+        raise CalibrationError(
+            f"{path}: {key}: expected a number or an !!opencv-matrix whose data match its rows and "
+            f"cols, got something else; {_REMEDY}"
+        )
+    return np.asarray(matrix)
+
+
+def _positive_int(values: dict[str, float | np.ndarray], key: str, *, path: Path) -> int:
+    value = values[key]
+    if isinstance(value, np.ndarray) or not (value > 0 and float(value).is_integer()):
+        got = "a matrix" if isinstance(value, np.ndarray) else f"{value:g}"
+        raise CalibrationError(
+            f"{path}: {key}: expected a positive whole number of pixels, got {got}; {_REMEDY}"
+        )
+    return int(value)
+
+
+def _array(
+    values: dict[str, float | np.ndarray], key: str, *, shapes: list[tuple[int, ...]], path: Path
+) -> Float[np.ndarray, "..."]:
+    """Return a finite float64 array of one of `shapes`; rows and columns both pass as vectors."""
+    value = np.squeeze(values[key]).astype(np.float64)
+    if value.shape not in shapes:
+        expected = " or ".join("x".join(map(str, shape)) for shape in shapes)
+        got = "x".join(map(str, value.shape)) or "one number"
+        raise CalibrationError(f"{path}: {key}: expected {expected} numbers, got {got}; {_REMEDY}")
+    if not np.isfinite(value).all():
+        raise CalibrationError(
+            f"{path}: {key}: expected finite numbers, got {value.tolist()}; {_REMEDY}"
+        )
+    return value
+
+
+def _check_intrinsics(K: Float[np.ndarray, "3 3"], *, path: Path) -> None:
+    fx, fy = K[0, 0], K[1, 1]
+    if fx <= 0 or fy <= 0:
+        raise CalibrationError(
+            f"{path}: camera_matrix: expected positive focal lengths, got {fx:g} and {fy:g}; "
+            f"{_REMEDY}"
+        )
+    pinhole = np.array([[fx, 0.0, K[0, 2]], [0.0, fy, K[1, 2]], [0.0, 0.0, 1.0]])
+    if not np.array_equal(K, pinhole):
+        raise CalibrationError(
+            f"{path}: camera_matrix: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], "
+            f"got {K.tolist()}; {_REMEDY}"
+        )
+
+
+def _check_plane(camera: Camera, plane: ReferencePlane, *, path: Path) -> None:
+    """Refuse a plane that is edge-on, behind the picture's middle, or given in metres."""
+    middle = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
+    ray = camera.back_project(middle)[0]
+    normal = plane.rotation[:, 2]
+    slope = abs(normal @ ray) / np.linalg.norm(ray)
+    if slope < _MIN_SLOPE or abs(normal @ plane.translation_mm) < _MIN_DEPTH_MM * slope:
+        raise CalibrationError(
+            f"{path}: rvec, tvec: expected a reference plane some distance in front of the camera, "
+            f"in mm, got one seen edge-on, or closer than {_MIN_DEPTH_MM:g} mm; check that tvec is "
+            f"in mm, or {_REMEDY}"
+        )
+    depth = plane.depth_mm(ray[None])[0]
+    if depth < 0:
+        raise CalibrationError(
+            f"{path}: rvec, tvec: expected a reference plane in front of the camera, got one "
+            f"{-depth:.0f} mm behind it; they must take world points to camera points, not back"
+        )
+
+
+def _not_yaml(path: Path, got: str) -> CalibrationError:
+    return CalibrationError(
+        f"{path}: expected OpenCV FileStorage YAML, which begins with %YAML, got {got}; {_REMEDY}"
+    )
