@@ -30,3 +30,7 @@ class ConfigError(UserError):
 
 class OutputError(UserError):
     """The output folder can't be written to."""
+
+
+class RecordingError(UserError):
+    """A recording can't be read: damaged, torn, of a newer version, or none at all."""

@@ -1,0 +1,140 @@
+"""Message <-> bytes: one typed, versioned encoding per message type, exact to the last bit.
+
+The schema is `messages.proto`; a dataclass and its protobuf message have the same field names.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, fields, is_dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from google.protobuf.descriptor import FieldDescriptor
+from google.protobuf.message import DecodeError
+from google.protobuf.message import Message as Proto
+
+from stream_dmr import messages
+from stream_dmr.camera import Calibration, Camera, ReferencePlane
+from stream_dmr.errors import RecordingError
+from stream_dmr.recording.pictures import Picture, compress, compress_mask, decompress
+from stream_dmr.recording.schema import proto_class
+
+CODEC_VERSION = 1
+"""Raised when a file written from now on would be read wrongly by an older reader."""
+
+T = TypeVar("T")
+
+_DATACLASSES: dict[str, type] = {
+    kind.__name__: kind
+    for kind in (
+        *(messages.Frame, messages.FishCrop, messages.FittedMesh),
+        *(messages.LocalizedFish, messages.LengthEstimate),
+        *(messages.CropQuality, messages.LossTerms, messages.SolverReport, messages.FittedShape),
+        *(Camera, ReferencePlane, Calibration),
+    )
+}
+_SCALARS = {
+    FieldDescriptor.TYPE_BOOL: bool,
+    FieldDescriptor.TYPE_DOUBLE: float,
+    FieldDescriptor.TYPE_INT64: int,
+    # A file name of undecodable bytes must not stop a run.
+    FieldDescriptor.TYPE_STRING: lambda text: text.encode("utf-8", "backslashreplace").decode(),
+}
+
+
+def encode(message: object, *, picture: Picture | None = None) -> bytes:
+    """The bytes of a message (or of any other dataclass in `messages.proto`).
+
+    `picture` replaces the message's `image`; without it the image is written as PNG, exact.
+    """
+    proto = proto_class(type(message).__name__)()
+    _fill(proto, message, picture)
+    return proto.SerializeToString(deterministic=True)
+
+
+def decode(kind: type[T], data: bytes) -> T:
+    """The message of type `kind` that `encode` wrote; RecordingError where the bytes are not one.
+
+    The image of a Frame recorded by reference has the shape (0, 0, 3).
+    """
+    proto = proto_class(kind.__name__)()
+    try:
+        proto.ParseFromString(data)
+    except DecodeError as error:
+        raise RecordingError(
+            f"expected a {kind.__name__} in the recording, found other bytes: it is damaged"
+        ) from error
+    return _build(kind, proto)
+
+
+def check_version(version: int) -> None:
+    """Raise RecordingError for a recording written by a newer codec than this one."""
+    if version > CODEC_VERSION:
+        raise RecordingError(
+            f"the recording has codec version {version}, newer than {CODEC_VERSION}, the newest "
+            "that this stream-dmr reads: upgrade stream-dmr"
+        )
+
+
+def _fill(proto: Proto, value: object, picture: Picture | None = None) -> None:
+    for field in fields(value):  # type: ignore[arg-type]
+        item = getattr(value, field.name)
+        if field.name == "image":
+            item = picture or compress(item, format="png")
+        if item is not None:
+            _set(proto, proto.DESCRIPTOR.fields_by_name[field.name], item)
+
+
+def _set(proto: Proto, field: FieldDescriptor, item: Any) -> None:
+    if field.message_type is None:
+        setattr(proto, field.name, _SCALARS[field.type](item))
+        return
+    inner = getattr(proto, field.name)
+    if isinstance(item, Mapping):
+        for name, count in item.items():
+            inner.add(name=_SCALARS[FieldDescriptor.TYPE_STRING](name), count=count)
+        return
+    inner.SetInParent()
+    if field.message_type.name == "Picture":
+        item = item if isinstance(item, Picture) else compress_mask(item)
+        inner.MergeFrom(proto_class("Picture")(**asdict(item)))
+    elif is_dataclass(item):
+        _fill(inner, item)
+    else:
+        little = item.astype(item.dtype.newbyteorder("<"), copy=False)
+        inner.dtype, inner.data = little.dtype.str, little.tobytes()
+        inner.shape.extend(item.shape)
+
+
+def _build(kind: type[T], proto: Proto) -> T:
+    by_name = proto.DESCRIPTOR.fields_by_name
+    return kind(**{f.name: _get(proto, by_name[f.name]) for f in fields(kind)})  # type: ignore[arg-type]
+
+
+def _get(proto: Proto, field: FieldDescriptor) -> Any:
+    inner = getattr(proto, field.name)
+    if field.is_repeated:
+        return {count.name: count.count for count in inner}
+    if field.has_presence and not proto.HasField(field.name):
+        if field.containing_oneof is None:  # so the schema doesn't say `optional`
+            raise RecordingError(
+                f"{proto.DESCRIPTOR.name} lacks its {field.name}: the recording is damaged"
+            )
+        return None
+    if field.message_type is None:
+        return inner
+    name = field.message_type.name
+    if name == "Array":
+        return _array(inner)
+    if name == "Picture":
+        values = {f.name: getattr(inner, f.name) for f in fields(Picture)}
+        return decompress(Picture(**values))
+    return _build(_DATACLASSES[name], inner)
+
+
+def _array(proto: Any) -> np.ndarray:
+    try:
+        dtype = np.dtype(proto.dtype)
+        array = np.frombuffer(proto.data, dtype).reshape(tuple(proto.shape))
+    except (TypeError, ValueError) as error:
+        raise RecordingError(f"the recording holds a damaged array: {error}") from error
+    return array.astype(dtype.newbyteorder("="), copy=False)
