@@ -1,11 +1,26 @@
-"""Chains the nodes: threads, bounded queues, shutdown, counters."""
+"""Chains the nodes: one thread each, bounded queues between them, shutdown, counters.
 
-from collections.abc import Sequence
-from typing import Protocol
+A frame travels as one batch: what a stage makes of it goes on to the next stage together, and the
+stage's `tick` follows it. So the order within a stage is the order of the source, whatever the
+threads do, and a shutdown cuts between frames.
+"""
 
-from stream_dmr.messages import Message
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+from stream_dmr.messages import Frame, Message
+
+_QUEUE_FRAMES = 2  # between two stages: enough to keep both busy, few enough to stop soon
+_POLL_S = 0.1  # how soon a waiting stage notices that the chain stops
+_SOURCE_GRACE_S = 1.0  # a camera that hangs in a read is left behind after this
 
 
+@runtime_checkable
 class Node(Protocol):
     """A stage of the chain: holds its per-track state, does no I/O, never reads a wall clock."""
 
@@ -14,9 +29,205 @@ class Node(Protocol):
         ...
 
     def tick(self, timestamp_ns: int, /) -> Sequence[Message]:
-        """A frame has passed completely, fish in it or not: time-outs are decided here."""
+        """Take note that a frame has passed, fish in it or not: time-outs are decided here."""
         ...
 
     def close(self) -> Sequence[Message]:
-        """The stream has ended: return what is still owed."""
+        """Take note that the stream has ended: return what is still owed."""
         ...
+
+
+@dataclass(kw_only=True)
+class StageCounters:
+    """What one stage did."""
+
+    stage: str
+    messages_in: int = 0
+    messages_out: int = 0
+    busy_s: float = 0.0
+
+
+@dataclass(kw_only=True)
+class _Batch:
+    """What one stage made of one frame; without `timestamp_ns`: of the end of the stream."""
+
+    timestamp_ns: int | None
+    messages: list[Message] = field(default_factory=list)
+
+
+_Inbox = queue.Queue[_Batch]
+
+
+def run_chain(
+    source: Iterable[Frame],
+    nodes: Sequence[Node],
+    *,
+    on_message: Callable[[Message], None],
+    stop: threading.Event,
+    on_frame: Callable[[], None] = lambda: None,
+) -> list[StageCounters]:
+    """Run every frame of `source` through `nodes`; return the counters of source and nodes.
+
+    `on_message` sees every message of every stage before the next stage does; it is called from
+    the stages' threads, in the stage's order. `on_frame` is called when a frame has left the last
+    stage. Setting `stop` ends the chain soon: the busiest stage and those before it drop what they
+    have not begun, those after it finish what they were given, and every node is closed. An
+    exception ends the chain in the same way, at the stage where it happened, and is raised here.
+    """
+    return _Chain(source, nodes, on_message=on_message, on_frame=on_frame, stop=stop).run()
+
+
+class _Chain:
+    """One run: stage 0 is the source, stage k the k-th node."""
+
+    def __init__(
+        self,
+        source: Iterable[Frame],
+        nodes: Sequence[Node],
+        *,
+        on_message: Callable[[Message], None],
+        on_frame: Callable[[], None],
+        stop: threading.Event,
+    ) -> None:
+        self._source = source
+        self._nodes = nodes
+        self._on_message = on_message
+        self._on_frame = on_frame
+        self._stop = stop
+        self._inboxes = [_Inbox(_QUEUE_FRAMES) for _ in nodes]  # of stages 1, 2, ...
+        self._counters = [StageCounters(stage=type(stage).__name__) for stage in (source, *nodes)]
+        self._busy_since: list[float | None] = [None] * len(self._counters)
+        self._is_stopped = False  # has `stop` been seen?
+        self._cut = -1  # the last stage that drops what it has not begun
+        self._failure: BaseException | None = None
+        self._lock = threading.Lock()
+
+    def run(self) -> list[StageCounters]:
+        threads = [threading.Thread(target=self._run_source, name="source", daemon=True)]
+        threads += [
+            threading.Thread(target=self._run_node, args=(stage,), name=f"stage-{stage}")
+            for stage in range(1, len(self._nodes) + 1)
+        ]
+        for thread in threads:
+            thread.start()
+        try:
+            for thread in threads[1:]:
+                thread.join()
+        except BaseException:
+            self._stop.set()
+            for thread in threads[1:]:
+                thread.join()
+            raise
+        finally:
+            self._cut = len(self._nodes)
+            threads[0].join(_SOURCE_GRACE_S)
+        if self._failure is not None:
+            raise self._failure
+        return self._counters
+
+    def _run_source(self) -> None:
+        try:
+            frames = iter(self._source)
+            while (batch := self._read(frames)) is not None:
+                self._pass_on(0, batch)
+        except BaseException as error:
+            self._fail(0, error)
+        self._pass_on(0, _Batch(timestamp_ns=None))
+
+    def _read(self, frames: Iterator[Frame]) -> _Batch | None:
+        """Wait for the next frame; None at the end of the source or of the chain."""
+        with self._busy(0):
+            frame = next(frames, None)
+            if frame is None or self._is_cut(0):
+                return None
+            batch = _Batch(timestamp_ns=frame.timestamp_ns)
+            self._emit(0, [frame], batch)
+            return batch
+
+    def _run_node(self, stage: int) -> None:
+        node = self._nodes[stage - 1]
+        while (batch := self._take(stage)) is not None and batch.timestamp_ns is not None:
+            self._pass_on(stage, self._process(stage, node, batch))
+        # Messages that the stage before owed at its end, then our own end.
+        ending = batch or _Batch(timestamp_ns=None)
+        self._pass_on(stage, self._process(stage, node, ending, close=True))
+
+    def _process(self, stage: int, node: Node, batch: _Batch, *, close: bool = False) -> _Batch:
+        """Step through a batch, then tick or close. What came before an exception still goes on."""
+        made = _Batch(timestamp_ns=batch.timestamp_ns)
+        with self._busy(stage):
+            try:
+                for message in batch.messages:
+                    if self._is_cut(stage):
+                        break
+                    self._counters[stage].messages_in += 1
+                    self._emit(stage, node.step(message), made)
+                if batch.timestamp_ns is not None and not self._is_cut(stage):
+                    self._emit(stage, node.tick(batch.timestamp_ns), made)
+                    if stage == len(self._nodes):
+                        self._on_frame()
+            except BaseException as error:
+                self._fail(stage, error)
+            try:
+                if close:
+                    self._emit(stage, node.close(), made)
+            except BaseException as error:
+                self._fail(stage, error)
+        return made
+
+    def _emit(self, stage: int, messages: Sequence[Message], made: _Batch) -> None:
+        for message in messages:
+            self._on_message(message)
+            made.messages.append(message)
+            self._counters[stage].messages_out += 1
+
+    def _take(self, stage: int) -> _Batch | None:
+        """Wait for the next batch of a stage; None once it has to drop what waits."""
+        while not self._is_cut(stage):
+            try:
+                return self._inboxes[stage - 1].get(timeout=_POLL_S)
+            except queue.Empty:
+                continue
+        return None
+
+    def _pass_on(self, stage: int, batch: _Batch) -> None:
+        """Hand a batch to the next stage, unless that one no longer takes any."""
+        while stage < len(self._nodes) and not self._is_cut(stage + 1):
+            try:
+                return self._inboxes[stage].put(batch, timeout=_POLL_S)
+            except queue.Full:
+                continue
+
+    def _fail(self, stage: int, error: BaseException) -> None:
+        """Keep the first exception, and end this stage and those before it."""
+        with self._lock:
+            self._failure = self._failure or error
+            self._cut = max(self._cut, stage)
+
+    def _is_cut(self, stage: int) -> bool:
+        """Say whether the chain is ending and this stage drops what it has not begun."""
+        if self._stop.is_set() and not self._is_stopped:
+            with self._lock:
+                self._is_stopped = True
+                # The first node always: a source that hangs would never send it its end.
+                self._cut = max(self._cut, self._busiest_stage(), 1)
+        return stage <= self._cut
+
+    def _busiest_stage(self) -> int:
+        """Find the stage with the most work so far, what it has in hand included."""
+        now = time.perf_counter()
+        busy = [
+            counters.busy_s + (0.0 if since is None else now - since)
+            for counters, since in zip(self._counters, self._busy_since, strict=True)
+        ]
+        return busy.index(max(busy))
+
+    @contextmanager
+    def _busy(self, stage: int) -> Iterator[None]:
+        """Count the time spent inside as work of a stage."""
+        self._busy_since[stage] = began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._busy_since[stage] = None
+            self._counters[stage].busy_s += time.perf_counter() - began
