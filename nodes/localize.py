@@ -1,0 +1,30 @@
+"""Localize: from a fit at a relative scale to a fish in millimetres, accepted or refused.
+
+Fourth of the chain: FittedMesh -> LocalizedFish.
+"""
+
+from collections.abc import Sequence
+
+from stream_dmr.camera import Calibration
+from stream_dmr.localization import LocalizeSettings, localize
+from stream_dmr.messages import FittedMesh, LocalizedFish
+
+
+class Localize:
+    """Holds the calibration; frames don't depend on each other. Without one: no millimetres."""
+
+    def __init__(self, settings: LocalizeSettings, *, calibration: Calibration | None) -> None:
+        self._settings = settings
+        self._calibration = calibration
+
+    def step(self, message: FittedMesh, /) -> Sequence[LocalizedFish]:
+        """One LocalizedFish for every fit, refused ones included."""
+        return [localize(message, settings=self._settings, calibration=self._calibration)]
+
+    def tick(self, timestamp_ns: int, /) -> Sequence[LocalizedFish]:
+        """Nothing is owed: every fit was answered at once."""
+        return []
+
+    def close(self) -> Sequence[LocalizedFish]:
+        """Nothing is owed: every fit was answered at once."""
+        return []

@@ -1,0 +1,223 @@
+"""Absolute 3D localization of a fitted fish by the paper's closed form (Sec. 2.3, eq. 6-13).
+
+The fit knows the fish's shape in the orientation of the camera, but not its scale. The scale comes
+from the reference plane: the center lies on it (eq. 9-11), head and tail lie on the rays through
+their pixels (eq. 6-8) and, seen from the center, in the directions of the fitted shape (eq. 12).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+
+from stream_dmr.camera import Calibration, ReferencePlane
+from stream_dmr.geometry import bending_ratio
+from stream_dmr.messages import CropQuality, FittedMesh, FittedShape, LocalizedFish
+from stream_dmr.settings import Settings
+
+NO_CALIBRATION = "no calibration"
+TOUCHES_BORDER = "touches border"
+MOSTLY_HIDDEN = "mostly hidden"
+POOR_FIT = "poor fit"
+UNCERTAIN = "uncertain"
+PLANE_BEHIND = "plane behind camera"  # or parallel to the center's ray
+KEYPOINTS_COINCIDE = "keypoints coincide"
+END_ON = "seen end-on"  # head or tail points straight at the camera or away from it
+KEYPOINTS_DISAGREE = "keypoints disagree"  # the lines of eq. (8) and (12) meet on the wrong side
+
+_MIN_ANGLE_RAD = 1e-3  # between two lines, for their intersection to mean anything
+
+
+class LocalizeSettings(Settings):
+    """`[localize]`: from the fitted shape to millimetres, and which frames count."""
+
+    bending: bool = Field(
+        default=True,
+        description="length along the bent body; false: chord only, the paper's ablation",
+    )
+    min_iou: float = Field(
+        default=0.85, ge=0, le=1, description="poorest fit that counts, silhouette IoU with mask"
+    )
+    min_visible_fraction: float = Field(
+        default=0.7, ge=0, le=1, description="least visible part of a fish that counts, 0 to 1"
+    )
+    max_length_std_ratio: float = Field(
+        default=0.2, gt=0, description="least certain fit that counts, std of length over length"
+    )
+    refuse_border: bool = Field(
+        default=True, description="refuse frames whose mask touches the edge of the picture"
+    )
+    plane_std_mm: float = Field(
+        default=25.0, gt=0, description="std of the centers' distance from the plane, mm"
+    )
+
+
+class Unlocatable(Exception):
+    """This shape has no place in millimetres; the message is the short reason why."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Location:
+    """A fish in the camera frame, in millimetres."""
+
+    keypoints_mm: Float[np.ndarray, "3 3"]  # H', C', T'
+    midline_mm: Float[np.ndarray, "M 3"]
+    length_mm: float
+    length_std_mm: float | None  # None where the fit can't tell
+
+
+def center_on_plane(ray: Float[np.ndarray, "3"], plane: ReferencePlane) -> Float[np.ndarray, "3"]:
+    """C' of eq. (9)-(11): where the center's ray (X_c, Y_c, 1) meets the reference plane, in mm.
+
+    Raises Unlocatable where it meets the plane behind the camera, or never.
+    """
+    with np.errstate(divide="ignore"):
+        depth_mm = float(plane.depth_mm(ray[None])[0])
+    if not (np.isfinite(depth_mm) and depth_mm > 0):
+        raise Unlocatable(PLANE_BEHIND)
+    return depth_mm * ray
+
+
+def intersect(
+    ray: Float[np.ndarray, "3"],
+    center_mm: Float[np.ndarray, "3"],
+    direction: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "3"]:
+    """H' (or T'): the line m * ray of eq. (7) meets the line C' + a * direction of eq. (12).
+
+    With noise the lines pass each other; the point nearest to both is taken, the middle of
+    their common perpendicular. `direction` is h' - C' = h - c, at any scale.
+    Raises Unlocatable where the lines are nearly parallel, or meet behind the camera or on the
+    far side of the center.
+    """
+    size = np.linalg.norm(direction)
+    if size == 0:
+        raise Unlocatable(KEYPOINTS_COINCIDE)
+    along_ray, along_body = ray / np.linalg.norm(ray), direction / size
+    if np.linalg.norm(np.cross(along_ray, along_body)) < np.sin(_MIN_ANGLE_RAD):
+        raise Unlocatable(END_ON)
+    # m * along_ray - a * along_body = C', three equations for two unknowns
+    m, a = np.linalg.lstsq(np.column_stack([along_ray, -along_body]), center_mm, rcond=None)[0]
+    if m <= 0 or a <= 0:
+        raise Unlocatable(KEYPOINTS_DISAGREE)
+    return (m * along_ray + center_mm + a * along_body) / 2
+
+
+def locate_keypoints(
+    keypoints: Float[np.ndarray, "3 3"],
+    keypoints_px: Float[np.ndarray, "3 2"],
+    calibration: Calibration,
+) -> Float[np.ndarray, "3 3"]:
+    """H', C', T' in mm (eq. 6-12) of the fitted head, center, tail at a relative scale.
+
+    Only differences of `keypoints` are used. Raises Unlocatable.
+    """
+    head, center, tail = keypoints
+    rays = calibration.camera.back_project(keypoints_px)
+    center_mm = center_on_plane(rays[1], calibration.plane)
+    head_mm = intersect(rays[0], center_mm, head - center)
+    tail_mm = intersect(rays[2], center_mm, tail - center)
+    return np.stack([head_mm, center_mm, tail_mm])
+
+
+def place_midline(
+    midline: Float[np.ndarray, "M 3"],
+    center: Float[np.ndarray, "3"],
+    keypoints_mm: Float[np.ndarray, "3 3"],
+) -> Float[np.ndarray, "M 3"]:
+    """Midline in mm: moved so that `center` is C', scaled so that its chord is |H'T'|.
+
+    Its arc length is therefore the length of eq. (13).
+    """
+    head_mm, center_mm, tail_mm = keypoints_mm
+    scale = np.linalg.norm(head_mm - tail_mm) / np.linalg.norm(midline[0] - midline[-1])
+    return center_mm + scale * (midline - center)
+
+
+def locate(shape: FittedShape, calibration: Calibration, settings: LocalizeSettings) -> Location:
+    """Where the fish is and how long, by eq. (13): |H'T'| times the bending ratio of the fit.
+
+    Without `settings.bending` the length is |H'T'| alone. Raises Unlocatable.
+    """
+    numbers = (shape.keypoints, shape.keypoints_px, shape.midline)
+    if not all(np.isfinite(array).all() for array in numbers):
+        raise Unlocatable(POOR_FIT)
+    ratio = bend(shape)
+    if ratio is None:
+        raise Unlocatable(KEYPOINTS_COINCIDE)
+    keypoints_mm = locate_keypoints(shape.keypoints, shape.keypoints_px, calibration)
+    chord_mm = float(np.linalg.norm(keypoints_mm[0] - keypoints_mm[2]))
+    length_mm = chord_mm * ratio if settings.bending else chord_mm
+    std_mm = length_mm * length_std_ratio(shape, calibration.plane, settings.plane_std_mm)
+    return Location(
+        keypoints_mm=keypoints_mm,
+        midline_mm=place_midline(shape.midline, shape.keypoints[1], keypoints_mm),
+        length_mm=length_mm,
+        length_std_mm=std_mm if np.isfinite(std_mm) else None,
+    )
+
+
+def bend(shape: FittedShape) -> float | None:
+    """Bending ratio of the fitted midline, None where its ends coincide or it isn't finite."""
+    if not np.isfinite(shape.midline).all() or np.array_equal(shape.midline[0], shape.midline[-1]):
+        return None
+    return bending_ratio(shape.midline)
+
+
+def length_std_ratio(shape: FittedShape, plane: ReferencePlane, plane_std_mm: float) -> float:
+    """Std of one frame's length as a fraction of it: the fit's own and the plane's, independent.
+
+    A center off the plane by d scales the whole fish by d over the camera's distance from the
+    plane, along its normal: |R_3 . T|, which is the depth where the camera looks at it squarely.
+    """
+    distance_mm = abs(float(plane.rotation[:, 2] @ plane.translation_mm))
+    return float(np.hypot(shape.length_std_ratio, plane_std_mm / distance_mm))
+
+
+def quality_refusal(shape: FittedShape, quality: CropQuality, settings: LocalizeSettings) -> str:
+    """Name the first gate that a frame fails, a short fixed reason; "" where it passes all."""
+    # "not >=" rather than "<", so that NaN fails
+    checks = {
+        TOUCHES_BORDER: settings.refuse_border and quality.touches_border,
+        MOSTLY_HIDDEN: not quality.visible_fraction >= settings.min_visible_fraction,
+        POOR_FIT: not shape.iou >= settings.min_iou,
+        UNCERTAIN: not 0 <= shape.length_std_ratio <= settings.max_length_std_ratio,
+    }
+    return next((reason for reason, failed in checks.items() if failed), "")
+
+
+def localize(
+    mesh: FittedMesh, *, settings: LocalizeSettings, calibration: Calibration | None
+) -> LocalizedFish:
+    """Place one fit in millimetres and decide whether it may count towards the fish's length.
+
+    A frame that fails a gate keeps its millimetres, where it has any, for whoever looks at it.
+    """
+    if mesh.shape is None:
+        return _message(mesh, mesh.refusal)
+    if calibration is None:
+        return _message(mesh, NO_CALIBRATION)
+    reason = quality_refusal(mesh.shape, mesh.quality, settings)
+    try:
+        return _message(mesh, reason, locate(mesh.shape, calibration, settings))
+    except Unlocatable as problem:
+        return _message(mesh, reason or str(problem))
+
+
+def _message(mesh: FittedMesh, reason: str, location: Location | None = None) -> LocalizedFish:
+    shape = mesh.shape
+    return LocalizedFish(
+        frame_index=mesh.frame_index,
+        timestamp_ns=mesh.timestamp_ns,
+        track_id=mesh.track_id,
+        keypoints_px=None if shape is None else shape.keypoints_px,
+        keypoints_mm=None if location is None else location.keypoints_mm,
+        midline_mm=None if location is None else location.midline_mm,
+        bending_ratio=None if shape is None else bend(shape),
+        length_mm=None if location is None else location.length_mm,
+        length_std_mm=None if location is None else location.length_std_mm,
+        iou=None if shape is None else shape.iou,
+        accepted=reason == "",
+        reason=reason,
+    )
