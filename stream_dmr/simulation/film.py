@@ -1,0 +1,165 @@
+"""Filming a scene: pictures, label masks and boxes, frame by frame. The truth is not made here."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8, UInt16
+
+from stream_dmr.simulation.backdrop import Backdrop, draw_gaff, draw_hook, draw_line
+from stream_dmr.simulation.fish import PosedFish
+from stream_dmr.simulation.render import Patch, draw_fish_patch, frame_window, paste
+from stream_dmr.simulation.scene import Scene, Visit
+
+_BACKDROP, _FRAME = 8, 9  # streams of random numbers; the scene and the skin have the others
+_GAFF_FROM, _GAFF_UNTIL = 0.36, 0.66  # of a fish's visit
+_MIN_BOX_PIXELS = 30  # fewer are too few to be called seen
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Box:
+    """What can be seen of one fish in one frame; the box is tight around its visible mask."""
+
+    frame_index: int
+    track_id: int
+    xywh_px: tuple[int, int, int, int]
+    visible_fraction: float  # of its silhouette: neither hidden nor outside the picture
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Shot:
+    """One frame of the film with its annotations."""
+
+    frame_index: int
+    image: UInt8[np.ndarray, "H W 3"]
+    labels: UInt16[np.ndarray, "H W"]  # track id, 0 is background
+    boxes: list[Box]
+
+
+def film(scene: Scene) -> Iterator[Shot]:
+    """Film a scene, frame by frame from 1; the same scene gives the same frames."""
+    camera = scene.calibration.camera
+    backdrop = Backdrop(
+        np.random.default_rng((scene.seed, _BACKDROP)), width=camera.width, height=camera.height
+    )
+    for frame_index in range(1, scene.num_frames + 1):
+        yield _shoot(scene, backdrop, frame_index)
+
+
+def _shoot(scene: Scene, backdrop: Backdrop, frame_index: int) -> Shot:
+    rng = np.random.default_rng((scene.seed, _FRAME, frame_index))
+    image = backdrop.draw(frame_index)
+    labels = np.zeros(image.shape[:2], np.uint16)
+    pixels_in_all: dict[int, int] = {}
+    visits = scene.visits_at(frame_index)
+    posed = {visit.fish.track_id: scene.pose(visit, frame_index) for visit in visits}
+    # Far ones first, so that near ones cover them.
+    for visit in sorted(visits, key=lambda v: -posed[v.fish.track_id].keypoints[1, 2]):
+        track_id = visit.fish.track_id
+        patch = _draw_fish(scene, visit, posed[track_id], image, backdrop, frame_index)
+        mask = ragged(patch.mask, rng, amplitude_px=scene.preset.ragged_px)
+        rows, columns, inside = frame_window(patch, image.shape[1], image.shape[0])
+        labels[rows, columns][mask[inside]] = track_id
+        pixels_in_all[track_id] = int(mask.sum())
+    for visit in visits:
+        labels[_draw_gaff(scene, visit, posed[visit.fish.track_id], image, frame_index)] = 0
+    return Shot(
+        frame_index=frame_index,
+        image=_expose(image, rng, noise_levels=scene.preset.noise_levels),
+        labels=labels,
+        boxes=_boxes(labels, pixels_in_all, frame_index),
+    )
+
+
+def ragged(
+    mask: Bool[np.ndarray, "H W"], rng: np.random.Generator, *, amplitude_px: float
+) -> Bool[np.ndarray, "H W"]:
+    """Shift the outline in and out by smooth noise of this standard deviation, as segmenters do."""
+    if amplitude_px == 0.0:
+        return mask
+    inside = mask.astype(np.uint8)
+    distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)
+    distance -= cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
+    shift = cv2.GaussianBlur(rng.standard_normal(mask.shape, np.float32), (0, 0), 4.0)
+    # Signed distances are +-1 at the pixels on both sides of an outline, so 0 leaves it as it is.
+    return distance + amplitude_px * shift / shift.std() > 0.0
+
+
+def _draw_fish(
+    scene: Scene,
+    visit: Visit,
+    posed: PosedFish,
+    image: UInt8[np.ndarray, "H W 3"],
+    backdrop: Backdrop,
+    frame_index: int,
+) -> Patch:
+    """Line, fish and hook into the picture."""
+    camera, preset = scene.calibration.camera, scene.preset
+    mouth_px, center_px = camera.project(posed.keypoints)[:2]
+    patch = draw_fish_patch(posed, camera=camera, seed=scene.seed)
+    draw_line(image, mouth_px=mouth_px, roller_px=backdrop.roller_px)
+    motion = (center_px - _center_before(scene, visit, frame_index)) * preset.exposure_frames
+    paste(image, patch, defocus_px=preset.defocus_px, motion_px=motion)
+    draw_hook(image, mouth_px=mouth_px)
+    return patch
+
+
+def _center_before(scene: Scene, visit: Visit, frame_index: int) -> Float[np.ndarray, "2"]:
+    """Where the center was a frame ago; in the first frame, where it is."""
+    earlier = scene.pose(visit, max(frame_index - 1, visit.first_frame))
+    return scene.calibration.camera.project(earlier.keypoints)[1]
+
+
+def _draw_gaff(
+    scene: Scene,
+    visit: Visit,
+    posed: PosedFish,
+    image: UInt8[np.ndarray, "H W 3"],
+    frame_index: int,
+) -> Bool[np.ndarray, "H W"]:
+    """The gaff reaches across the fish for about a third of its visit; the pixels it covers."""
+    progress = visit.progress(frame_index)
+    if not visit.is_gaffed or progress is None or not _GAFF_FROM <= progress <= _GAFF_UNTIL:
+        return np.zeros(image.shape[:2], bool)
+    stroke = (progress - _GAFF_FROM) / (_GAFF_UNTIL - _GAFF_FROM)
+    keypoints_px = scene.calibration.camera.project(posed.keypoints)
+    target = keypoints_px[0] + (0.25 + 0.5 * stroke) * (keypoints_px[2] - keypoints_px[0])
+    side = 1.0 if target[0] < image.shape[1] / 2 else -1.0  # from the vessel, over the free water
+    hand = np.array([target[0] + side * 560.0, -30.0])
+    reach = (target - hand) / np.linalg.norm(target - hand)
+    return draw_gaff(image, hand_px=hand, tip_px=target + 70.0 * reach)
+
+
+def _boxes(
+    labels: UInt16[np.ndarray, "H W"], pixels_in_all: dict[int, int], frame_index: int
+) -> list[Box]:
+    """Tight boxes of what is visible; a pixel spans one unit, from its index to the next."""
+    boxes = []
+    for track_id, pixels in sorted(pixels_in_all.items()):
+        visible = (labels == track_id).astype(np.uint8)
+        seen = int(cv2.countNonZero(visible))
+        if seen >= _MIN_BOX_PIXELS:
+            x, y, width, height = cv2.boundingRect(visible)
+            boxes.append(
+                Box(
+                    frame_index=frame_index,
+                    track_id=track_id,
+                    xywh_px=(x, y, width, height),
+                    visible_fraction=seen / pixels,
+                )
+            )
+    return boxes
+
+
+def _expose(
+    image: UInt8[np.ndarray, "H W 3"], rng: np.random.Generator, *, noise_levels: float
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Sensor noise. One tile of it is drawn and shifted about, since fresh noise takes too long."""
+    height, width = image.shape[:2]
+    tile = np.empty((256, 256, 3), np.int16)
+    cv2.setRNGSeed(int(rng.integers(1 << 30)))
+    cv2.randn(tile, 0, noise_levels)
+    tile = np.tile(tile, (height // 256 + 2, width // 256 + 2, 1))
+    y, x = rng.integers(256, size=2)
+    return cv2.add(image, tile[y : y + height, x : x + width], dtype=cv2.CV_8U)

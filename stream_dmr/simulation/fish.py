@@ -1,0 +1,99 @@
+"""One simulated fish: who it is, how it hangs in one frame, and the body that follows from both."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from stream_dmr.camera import Calibration, ReferencePlane
+from stream_dmr.geometry import arc_length, bending_ratio
+from stream_dmr.simulation.body import Body, BodyMesh, body_mesh, draw_body, keypoints
+from stream_dmr.simulation.spine import Spine, bend_spine
+
+# World: X right, Y down, Z away from the camera. A straight fish hangs head up along Y with its
+# broad side across X; +z of the body, the side with the eyes, looks at the camera.
+_WORLD_FROM_HANGING = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fish:
+    """An individual, the same in every frame."""
+
+    track_id: int
+    length_mm: float
+    body: Body
+    mesh: BodyMesh
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pose:
+    """How a fish hangs in one frame."""
+
+    bends: Float[np.ndarray, "3 K"]  # see `spine.curvature`
+    yaw_rad: float  # about the vertical; 0 shows the side with the eyes, pi the blind side
+    sway_rad: float  # about the line of sight, as a pendulum
+    tilt_rad: float  # towards and away from the camera
+    center_world_mm: Float[np.ndarray, "3"]  # of the center keypoint; [2] is its way off the plane
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PosedFish:
+    """A fish in one frame, in the camera frame in mm: the truth, before anything is drawn."""
+
+    fish: Fish
+    vertices: Float[np.ndarray, "V 3"]
+    midline: Float[np.ndarray, "M 3"]
+    keypoints: Float[np.ndarray, "3 3"]  # head, center, tail
+
+    @property
+    def faces(self) -> Int[np.ndarray, "F 3"]:
+        """Faces of `vertices`, counter-clockwise outside."""
+        return self.fish.mesh.faces
+
+    @property
+    def arc_mm(self) -> float:
+        """Length along the midline: the fish's length, measured on this frame's curve."""
+        return arc_length(self.midline)
+
+    @property
+    def bending_ratio(self) -> float:
+        """Arc over chord of the midline."""
+        return bending_ratio(self.midline)
+
+
+def draw_fish(rng: np.random.Generator, *, track_id: int) -> Fish:
+    """A random halibut of 500 to 1000 mm; most are nearer to the lower end, as in a catch."""
+    body = draw_body(rng)
+    length_mm = 500.0 + 500.0 * float(rng.beta(1.8, 3.0))
+    return Fish(track_id=track_id, length_mm=length_mm, body=body, mesh=body_mesh(body))
+
+
+def pose_fish(fish: Fish, pose: Pose, *, calibration: Calibration) -> PosedFish:
+    """Bend the fish, hang it up and bring it into the camera frame."""
+    spine = _in_camera(_hang(fish, pose), calibration.plane)
+    return PosedFish(
+        fish=fish,
+        vertices=spine.place(fish.mesh.points),
+        midline=spine.points,
+        keypoints=spine.place(keypoints()),
+    )
+
+
+def _hang(fish: Fish, pose: Pose) -> Spine:
+    """The centre line in the world frame: its centroid under the hook, then yaw, tilt and sway."""
+    spine = bend_spine(pose.bends, length_mm=fish.length_mm)
+    middle = spine.frames[len(spine.frames) // 2]
+    spine = spine.moved(middle.T, np.zeros(3))
+    # Gravity pulls the centroid under the head, where the hook is.
+    down = spine.points.mean(axis=0) - spine.points[0]
+    align, _ = Rotation.align_vectors([[1.0, 0.0, 0.0]], [down])
+    swing = Rotation.from_euler("ZXY", [pose.sway_rad, pose.tilt_rad, pose.yaw_rad])
+    rotation = swing.as_matrix() @ _WORLD_FROM_HANGING @ align.as_matrix()
+    turned = spine.moved(rotation, np.zeros(3))
+    center = turned.place(keypoints())[1]
+    return turned.moved(np.eye(3), pose.center_world_mm - center)
+
+
+def _in_camera(spine_world: Spine, plane: ReferencePlane) -> Spine:
+    return spine_world.moved(plane.rotation, plane.translation_mm)

@@ -1,0 +1,153 @@
+"""A scene at the rail: one camera, one reference plane, and fish that come and go."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.camera import Calibration, Camera, ReferencePlane
+from stream_dmr.simulation.fish import Fish, Pose, PosedFish, draw_fish, pose_fish
+from stream_dmr.simulation.motion import draw_poses, draw_still_pose
+from stream_dmr.simulation.presets import Preset, find_preset
+
+WIDTH, HEIGHT = 1280, 960
+_GROUP = 3  # fish that follow each other closely; then nothing hangs on the line for a while
+_GROUP_SLOTS = 5.0
+_VISIT_SLOTS = 2.4
+_MARGIN_SLOTS = 0.4
+
+# Streams of random numbers: what one part draws must not change what another one sees.
+_CALIBRATION, _FISH, _VIEW = range(3)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Visit:
+    """One fish and its poses, from `first_frame` on, one a frame."""
+
+    fish: Fish
+    first_frame: int
+    poses: list[Pose]
+    is_gaffed: bool
+
+    def progress(self, frame_index: int) -> float | None:
+        """From 0 (it comes) to 1 (it leaves); None while it isn't there."""
+        passed = frame_index - self.first_frame
+        if not 0 <= passed < len(self.poses):
+            return None
+        return passed / max(len(self.poses) - 1, 1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scene:
+    """Everything that is true of a simulated clip, before anything is drawn."""
+
+    seed: int
+    preset: Preset
+    calibration: Calibration
+    num_frames: int
+    visits: list[Visit]
+
+    def visits_at(self, frame_index: int) -> list[Visit]:
+        """The fish on the line in a frame, by track id."""
+        return [visit for visit in self.visits if visit.progress(frame_index) is not None]
+
+    def pose(self, visit: Visit, frame_index: int) -> PosedFish:
+        """The body of a visiting fish in a frame."""
+        pose = visit.poses[frame_index - visit.first_frame]
+        return pose_fish(visit.fish, pose, calibration=self.calibration)
+
+
+def make_scene(*, num_fish: int, num_frames: int, preset: str, seed: int) -> Scene:
+    """Draw a scene; equal arguments give equal scenes. Track ids count from 1.
+
+    Up to three fish are in sight together; the first and the last frames, and those between
+    groups of three, show none.
+    """
+    chosen = find_preset(preset)
+    return Scene(
+        seed=seed,
+        preset=chosen,
+        calibration=draw_calibration(np.random.default_rng((seed, _CALIBRATION))),
+        num_frames=num_frames,
+        visits=[
+            _draw_visit(index, num_fish=num_fish, num_frames=num_frames, preset=chosen, seed=seed)
+            for index in range(num_fish)
+        ],
+    )
+
+
+def draw_calibration(rng: np.random.Generator) -> Calibration:
+    """A camera of some 1300 px focal length and a tilted plane about 5 m away."""
+    focal = rng.uniform(1250.0, 1350.0)
+    K = np.array(
+        [
+            [focal, 0.0, (WIDTH - 1) / 2 + rng.uniform(-20.0, 20.0)],
+            [0.0, focal * rng.uniform(0.997, 1.003), (HEIGHT - 1) / 2 + rng.uniform(-20.0, 20.0)],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    lens = [rng.uniform(-0.08, -0.03), rng.uniform(0.0, 0.02), *rng.uniform(-3e-4, 3e-4, 2), 0.0]
+    tilt = rng.uniform(-0.3, 0.3, 3) * [1.0, 1.0, 0.2]
+    rotation, _ = cv2.Rodrigues(tilt)
+    middle = np.array([*rng.uniform(-150.0, 150.0, 2), rng.uniform(4700.0, 5300.0)])
+    return Calibration(
+        camera=Camera(width=WIDTH, height=HEIGHT, K=K, distortion=np.array(lens)),
+        plane=ReferencePlane(rotation=rotation.astype(np.float64), translation_mm=middle),
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class View:
+    """One random bent fish before a random camera: for tests and benchmarks without a video."""
+
+    calibration: Calibration
+    posed: PosedFish
+
+    @property
+    def length_mm(self) -> float:
+        """The true length."""
+        return self.posed.fish.length_mm
+
+    @property
+    def vertices_px(self) -> Float[np.ndarray, "V 2"]:
+        """The body's vertices in the picture, lens distortion included."""
+        return self.calibration.camera.project(self.posed.vertices)
+
+
+def draw_view(*, preset: str, seed: int) -> View:
+    """A random fish, wholly inside the picture; `render.draw_mask` gives its exact mask."""
+    rng = np.random.default_rng((seed, _VIEW))
+    calibration = draw_calibration(rng)
+    place = np.array([rng.uniform(-900.0, 900.0), rng.uniform(-500.0, 500.0), 0.0])
+    pose = draw_still_pose(rng, find_preset(preset), center_world_mm=place)
+    fish = draw_fish(rng, track_id=1)
+    return View(calibration=calibration, posed=pose_fish(fish, pose, calibration=calibration))
+
+
+def _draw_visit(
+    index: int, *, num_fish: int, num_frames: int, preset: Preset, seed: int
+) -> Visit:
+    """The fish number `index` and when it comes; time runs in slots, one for every fish."""
+    rng = np.random.default_rng((seed, _FISH, index))
+    last_start = _start_slot(num_fish - 1)
+    frames_per_slot = num_frames / (last_start + _VISIT_SLOTS + 2 * _MARGIN_SLOTS)
+    start = (_MARGIN_SLOTS + _start_slot(index)) * frames_per_slot
+    first_frame = min(1 + int(start + rng.uniform(0.0, 0.3) * frames_per_slot), num_frames)
+    visit_frames = max(1, round(_VISIT_SLOTS * frames_per_slot))
+    lane = (index % _GROUP - 1) * preset.lane_mm * (1 if index // _GROUP % 2 else -1)
+    return Visit(
+        fish=draw_fish(rng, track_id=index + 1),
+        first_frame=first_frame,
+        poses=draw_poses(
+            rng,
+            preset,
+            lane_mm=lane + rng.uniform(-80.0, 80.0),
+            num_frames=min(visit_frames, num_frames + 1 - first_frame),
+        ),
+        is_gaffed=preset.gaff_every > 0 and index % preset.gaff_every == 0,
+    )
+
+
+def _start_slot(index: int) -> float:
+    return _GROUP_SLOTS * (index // _GROUP) + index % _GROUP
