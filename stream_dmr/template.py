@@ -1,0 +1,194 @@
+"""The species' template: a closed mesh with joints, keypoints and a midline, in canonical form."""
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+
+from stream_dmr.errors import TemplateError
+from stream_dmr.geometry import arc_lengths
+
+BUNDLED = Path(__file__).parent / "templates"
+NUM_MIDLINE_POINTS = 33
+# A keypoint or joint may stick out of the mesh by this much, in body lengths.
+_MAX_OUTSIDE = 0.02
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Template:
+    """A species' mean body at rest, in body lengths.
+
+    x runs from head to tail, y across the broad side, z through the thickness; the center
+    keypoint is the origin, and the midline from head to tail keypoint is 1 long.
+    """
+
+    name: str
+    rest_vertices: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]  # counter-clockwise seen from outside
+    keypoints: Float[np.ndarray, "3 3"]  # head, center, tail
+    joints: Float[np.ndarray, "J 3"]  # from head to tail, J >= 2
+    midline: Float[np.ndarray, "M 3"]  # through head, joints and tail, evenly spaced
+
+
+def load_template(path: str | Path) -> Template:
+    """Read a template: a bundled one by name, or any mesh that trimesh reads with a TOML beside it.
+
+    The TOML has the mesh's name and holds `joints` (two or more points, in any order) and
+    `[keypoints] head, center, tail`, all in the mesh's own coordinates. Raises TemplateError
+    where the mesh or the TOML breaks that contract.
+    """
+    mesh_path = BUNDLED / f"{path}.ply" if str(path) in bundled_names() else Path(path)
+    if not mesh_path.is_file():
+        raise TemplateError(
+            f"template {path}: expected a mesh file or one of {', '.join(bundled_names())}; "
+            "found neither; check the path"
+        )
+    return make_template(
+        _load_mesh(mesh_path), _load_points(mesh_path.with_suffix(".toml")), name=mesh_path.stem
+    )
+
+
+def bundled_names() -> list[str]:
+    """Names of the templates that come with the package."""
+    return sorted(file.stem for file in BUNDLED.glob("*.ply"))
+
+
+def make_template(
+    mesh: trimesh.Trimesh, points: dict[str, Float[np.ndarray, "N 3"]], *, name: str
+) -> Template:
+    """Bring a closed mesh and its `keypoints` and `joints` to canonical form.
+
+    Raises TemplateError where a point lies off the mesh or head and tail coincide.
+    """
+    keypoints, joints = points["keypoints"], points["joints"]
+    head, _, tail = keypoints
+    axis = tail - head
+    if np.linalg.norm(axis) < 1e-6 * mesh.scale:
+        raise TemplateError(f"template {name}: head and tail coincide; give two distinct points")
+    joints = joints[np.argsort(joints @ axis)]
+    spine = np.vstack([head, joints, tail])
+    body_length = arc_lengths(spine)[-1]
+    _require_on_mesh(mesh, keypoints, joints, body_length, name)
+    canonical = _canonical_axes(mesh.vertices, axis)
+
+    def to_canonical(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+        return (points - keypoints[1]) @ canonical.T / body_length
+
+    return Template(
+        name=name,
+        rest_vertices=to_canonical(np.asarray(mesh.vertices, np.float64)),
+        faces=np.asarray(mesh.faces, np.int64),
+        keypoints=to_canonical(keypoints),
+        joints=to_canonical(joints),
+        midline=_resample(to_canonical(spine), NUM_MIDLINE_POINTS),
+    )
+
+
+def _load_mesh(path: Path) -> trimesh.Trimesh:
+    try:
+        mesh = trimesh.load_mesh(path)
+    except Exception as error:  # trimesh raises whatever its many readers raise
+        raise TemplateError(
+            f"template {path}: expected a mesh that trimesh reads, got: {error}"
+        ) from error
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise TemplateError(
+            f"template {path}: expected one mesh with faces, got an empty one; export the surface"
+        )
+    mesh.merge_vertices()
+    if not np.isfinite(mesh.vertices).all():
+        raise TemplateError(f"template {path}: expected finite vertices, got NaN or infinity")
+    if not (mesh.is_watertight and mesh.is_winding_consistent):
+        raise TemplateError(
+            f"template {path}: expected a closed mesh, got one with holes or flipped faces; "
+            "close it in a mesh editor"
+        )
+    if mesh.volume < 0:
+        mesh.invert()
+    return mesh
+
+
+def _load_points(path: Path) -> dict[str, Float[np.ndarray, "N 3"]]:
+    if not path.is_file():
+        raise TemplateError(
+            f"template: expected {path} beside the mesh, with joints and [keypoints]; it is missing"
+        )
+    try:
+        table = tomllib.loads(path.read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise TemplateError(f"template {path}: expected TOML, got: {error}") from error
+    keypoints = table.get("keypoints", {})
+    missing = [key for key in ("head", "center", "tail") if key not in keypoints]
+    if missing:
+        raise TemplateError(f"template {path}: [keypoints] lacks {', '.join(missing)}; add it")
+    joints = _points(table.get("joints", []), path, "joints")
+    if len(joints) < 2:
+        raise TemplateError(
+            f"template {path}: expected two or more joints, got {len(joints)}; add bend points"
+        )
+    ends = [keypoints[key] for key in ("head", "center", "tail")]
+    return {"keypoints": _points(ends, path, "keypoints"), "joints": joints}
+
+
+def _points(values: Any, path: Path, name: str) -> Float[np.ndarray, "N 3"]:
+    try:
+        points = np.array(values, dtype=np.float64).reshape(-1, 3)
+    except (ValueError, TypeError) as error:
+        raise TemplateError(f"template {path}: expected {name} as [x, y, z], got {values}") from error
+    if not np.isfinite(points).all():
+        raise TemplateError(f"template {path}: expected finite {name}, got {values}")
+    return points
+
+
+def _require_on_mesh(
+    mesh: trimesh.Trimesh,
+    keypoints: Float[np.ndarray, "3 3"],
+    joints: Float[np.ndarray, "J 3"],
+    body_length: float,
+    name: str,
+) -> None:
+    labels = ["head", "center", "tail", *(f"joint {j + 1}" for j in range(len(joints)))]
+    points = np.vstack([keypoints, joints])
+    _, distance, _ = trimesh.proximity.closest_point_naive(mesh, points)
+    outside = np.where(_is_inside(mesh, points), 0.0, distance) / body_length
+    for label, gap in zip(labels, outside, strict=True):
+        if gap > _MAX_OUTSIDE:
+            raise TemplateError(
+                f"template {name}: expected {label} on or in the mesh, got it {gap:.2f} body "
+                "lengths off; give points in the mesh's own coordinates"
+            )
+
+
+def _is_inside(mesh: trimesh.Trimesh, points: Float[np.ndarray, "N 3"]) -> np.ndarray:
+    """Winding number by solid angles (Van Oosterom and Strackee 1983): works without a ray engine."""
+    a, b, c = np.moveaxis(mesh.triangles[None] - points[:, None, None], 2, 0)
+    la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
+    numerator = np.einsum("nfi,nfi->nf", a, np.cross(b, c))
+    dots = [np.einsum("nfi,nfi->nf", u, v) for u, v in ((a, b), (b, c), (c, a))]
+    denominator = la * lb * lc + dots[0] * lc + dots[1] * la + dots[2] * lb
+    return np.arctan2(numerator, denominator).sum(axis=1) / (2 * np.pi) > 0.5
+
+
+def _canonical_axes(
+    vertices: Float[np.ndarray, "V 3"], axis: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3 3"]:
+    """Rows x (head to tail), y (the body's widest direction across x), z, right-handed."""
+    x = axis / np.linalg.norm(axis)
+    across = vertices - vertices.mean(axis=0)
+    across = across - np.outer(across @ x, x)
+    y = np.linalg.svd(across, full_matrices=False)[2][0]
+    y -= (y @ x) * x
+    # The sign of a singular vector is arbitrary: fix it, so that templates are reproducible.
+    y *= np.sign(y[np.argmax(np.abs(y))]) / np.linalg.norm(y)
+    return np.stack([x, y, np.cross(x, y)])
+
+
+def _resample(points: Float[np.ndarray, "N 3"], count: int) -> Float[np.ndarray, "M 3"]:
+    """Points evenly spaced along a polyline, its ends included."""
+    at = arc_lengths(points)
+    even = np.linspace(0.0, at[-1], count)
+    return np.stack([np.interp(even, at, points[:, k]) for k in range(3)], axis=1)
