@@ -1,0 +1,111 @@
+"""Chessboard views with known camera and pose, by exact inverse mapping.
+
+Every sub-pixel's ray goes back through the lens to the board's plane and takes the colour it
+meets there, so the only error of a view is the sampling's.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from stream_dmr.camera import Camera, ReferencePlane
+
+LENS = Camera(
+    width=800,
+    height=600,
+    K=np.array([[842.0, 0.0, 411.3], [0.0, 845.5, 288.6], [0.0, 0.0, 1.0]]),
+    distortion=np.array([-0.21, 0.09, 0.0011, -0.0007, 0.0]),
+)
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """Light and faults of one picture."""
+
+    shade: float = 0.0  # the picture's far corner gets 1 - shade of the light
+    blur_px: float = 0.6
+    noise: float = 2.0  # grey levels
+    seed: int = 0
+
+
+class BoardRenderer:
+    """Renders one board through one camera; the camera's rays are computed once."""
+
+    def __init__(self, camera: Camera, *, board=(9, 6), square_mm=25.0, samples=4):
+        self.camera, self.board, self.square_mm, self.samples = camera, board, square_mm, samples
+        offsets = (np.arange(samples) + 0.5) / samples - 0.5
+        x = (np.arange(camera.width)[:, None] + offsets).ravel()
+        y = (np.arange(camera.height)[:, None] + offsets).ravel()
+        pixels = np.stack(np.meshgrid(x, y), axis=-1)
+        self._rays = camera.back_project(pixels.reshape(-1, 2)).reshape(*pixels.shape[:2], 3)
+
+    def corners_px(self, pose: ReferencePlane) -> np.ndarray:
+        """True pixels of the inner corners, row by row, those of world x fastest."""
+        points = board_points(self.board, self.square_mm)
+        return self.camera.project(points @ pose.rotation.T + pose.translation_mm)
+
+    def render(self, pose: ReferencePlane, view: BoardView | None = None) -> np.ndarray:
+        """Grey picture, uint8 (H, W), of the board lying in the pose's plane."""
+        view = view or BoardView()
+        fine = self._colours(pose)
+        small = fine.reshape(self.camera.height, self.samples, self.camera.width, self.samples)
+        return _take_picture(small.mean(axis=(1, 3)), view)
+
+    def _colours(self, pose: ReferencePlane) -> np.ndarray:
+        inverse = np.linalg.inv(pose.homography(np.eye(3)))
+        on_plane = self._rays @ inverse.T
+        x, y = (on_plane[..., i] / on_plane[..., 2] / self.square_mm + 1 for i in (0, 1))
+        columns, rows = self.board[0] + 1, self.board[1] + 1
+        is_square = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+        is_paper = (x >= -0.7) & (x < columns + 0.7) & (y >= -0.7) & (y < rows + 0.7)
+        is_black = (np.floor(x) + np.floor(y)) % 2 == 0
+        table = 120 + 25 * np.sin(x * 2.3) * np.sin(y * 1.7 + 1)
+        return np.where(is_square & is_black, 35.0, np.where(is_paper, 215.0, table))
+
+
+def board_points(board=(9, 6), square_mm=25.0) -> np.ndarray:
+    """Inner corners (N, 3) in the board's frame, in mm, world x fastest."""
+    columns, rows = np.meshgrid(np.arange(board[0]), np.arange(board[1]))
+    flat = np.stack([columns.ravel(), rows.ravel(), np.zeros(columns.size)], axis=1)
+    return flat * square_mm
+
+
+def pose(
+    *,
+    tilt_deg=(0.0, 0.0, 0.0),
+    distance_mm=420.0,
+    shift_mm=(0.0, 0.0),
+    board=(9, 6),
+    square_mm=25.0,
+) -> ReferencePlane:
+    """The board turned by a rotation vector about its middle, which stands before the camera."""
+    rotation, _ = cv2.Rodrigues(np.radians(np.asarray(tilt_deg, np.float64)))
+    middle = board_points(board, square_mm).mean(axis=0)
+    place = np.array([*shift_mm, distance_mm])
+    return ReferencePlane(rotation=rotation, translation_mm=place - rotation @ middle)
+
+
+def varied_poses(num: int, *, seed: int = 0, distance_mm: float = 420.0) -> list[ReferencePlane]:
+    """Boards as a careful person would hold them: tilted to all sides, all over the picture."""
+    rng = np.random.default_rng(seed)
+    poses = []
+    for index in range(num):
+        around = 2 * np.pi * index / num
+        tilt = rng.uniform(20, 38)
+        poses.append(
+            pose(
+                tilt_deg=(tilt * np.cos(around), tilt * np.sin(around), rng.uniform(-25, 25)),
+                distance_mm=distance_mm * rng.uniform(0.95, 1.3),
+                shift_mm=tuple(rng.uniform(-35, 35, 2)),
+            )
+        )
+    return poses
+
+
+def _take_picture(light: np.ndarray, view: BoardView) -> np.ndarray:
+    height, width = light.shape
+    ramp = (np.arange(width) / width)[None] * 0.6 + (np.arange(height) / height)[:, None] * 0.4
+    picture = cv2.GaussianBlur(light * (1 - view.shade * ramp), (0, 0), view.blur_px)
+    picture += np.random.default_rng(view.seed).normal(0, view.noise, picture.shape)
+    return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
