@@ -133,7 +133,7 @@ class TrackLength:
         if self._filter is None or num_used < self._settings.min_frames:
             return None, None, None
         length_mm = self._filter.length_mm
-        std_mm = float(self._std_mm(np.array(length_mm), np.array(self._filter.variance)))
+        std_mm = float(self._std_mm(np.array([length_mm]), np.array([self._filter.variance]))[0])
         return length_mm, std_mm, length_mm + _STD_PER_CI95 * std_mm * np.array([-1.0, 1.0])
 
     def _smoothed(self) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
@@ -144,8 +144,8 @@ class TrackLength:
         return smoothed_mm, self._std_mm(smoothed_mm, variance)
 
     def _std_mm(
-        self, length_mm: Float[np.ndarray, "*N"], variance: Float[np.ndarray, "*N"]
-    ) -> Float[np.ndarray, "*N"]:
+        self, length_mm: Float[np.ndarray, "N"], variance: Float[np.ndarray, "N"]
+    ) -> Float[np.ndarray, "N"]:
         """Std from the filter's variance and the error that all frames share, independent."""
         return np.sqrt(variance + (self._settings.common_std_ratio * length_mm) ** 2)
 

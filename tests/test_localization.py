@@ -140,7 +140,7 @@ def test_without_bending_the_length_is_the_chord(scene):
 def test_intersection_is_the_point_nearest_to_both_lines(seed):
     """Slow twin: minimise the sum of squared distances to both lines by the normal equations."""
     rng = np.random.default_rng(seed)
-    center, ray = rng.normal(0, 1, 3) + [0, 0, 5], rng.normal(0, 0.2, 3) + [0, 0, 1]
+    center, ray = rng.normal([0, 0, 5], 1), rng.normal([0, 0, 1], 0.2)
     direction = rng.uniform(0.5, 4) * ray - center + rng.normal(0, 0.05, 3)  # nearly meets the ray
     assume(angle(ray, direction) > 0.05)
     assume(angle(ray, direction) < np.pi - 0.05)
@@ -162,7 +162,7 @@ def test_head_along_the_cameras_ray_is_refused(sign):
     """The center is off the axis, the head straight before or behind it: any scale would do."""
     calibration = make_calibration()
     center = 2500.0 * np.array([0.1, -0.05, 1.0])
-    midline = np.stack([center * (1 + 0.1 * sign), center + 30.0, center + [200.0, 0, 0]])
+    midline = np.stack([center * (1 + 0.1 * sign), center + 30.0, center + np.array([200.0, 0, 0])])
     mesh = make_mesh(make_shape(midline, center, calibration.camera))
     fish = localized(mesh, calibration)
     assert (fish.accepted, fish.reason, fish.length_mm) == (False, END_ON, None)
@@ -172,7 +172,9 @@ def test_head_along_the_cameras_ray_is_refused(sign):
 def test_keypoint_at_the_center_is_refused():
     calibration = make_calibration()
     center = np.array([0.0, 0.0, 2500.0])
-    midline = np.stack([center, center + [100.0, 10, 0], center + [200.0, 0, 0]])
+    midline = np.stack(
+        [center, center + np.array([100.0, 10, 0]), center + np.array([200.0, 0, 0])]
+    )
     fish = localized(make_mesh(make_shape(midline, center, calibration.camera)), calibration)
     assert (fish.reason, fish.length_mm) == (KEYPOINTS_COINCIDE, None)
 
