@@ -131,9 +131,7 @@ def _cut(start: Tensor, end: Tensor, batch: Tensor, size: int) -> _Pieces:
     return _Pieces(edge, cell, t0, t1)
 
 
-def _accumulate(
-    start: Tensor, end: Tensor, pieces: _Pieces, num_batches: int, size: int
-) -> Tensor:
+def _accumulate(start: Tensor, end: Tensor, pieces: _Pieces, num_batches: int, size: int) -> Tensor:
     """Signed area to the right of each piece: partly in its own cell, fully in those after it."""
     width = size + 3
     step = (end - start)[pieces.edge]

@@ -138,7 +138,9 @@ def _points(values: Any, path: Path, name: str) -> Float[np.ndarray, "N 3"]:
     try:
         points = np.array(values, dtype=np.float64).reshape(-1, 3)
     except (ValueError, TypeError) as error:
-        raise TemplateError(f"template {path}: expected {name} as [x, y, z], got {values}") from error
+        raise TemplateError(
+            f"template {path}: expected {name} as [x, y, z], got {values}"
+        ) from error
     if not np.isfinite(points).all():
         raise TemplateError(f"template {path}: expected finite {name}, got {values}")
     return points

@@ -100,9 +100,7 @@ class Fitter:
             iterations=rough.iterations + fine.iterations,
         )
 
-    def _shape(
-        self, objective: Objective, flat: Float[Tensor, "P"], crop: FishCrop
-    ) -> FittedShape:
+    def _shape(self, objective: Objective, flat: Float[Tensor, "P"], crop: FishCrop) -> FittedShape:
         with torch.no_grad():
             deformed = objective.deform(flat[None])
             terms = objective.terms(flat[None])

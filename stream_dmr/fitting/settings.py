@@ -11,7 +11,8 @@ class FitMeshSettings(Settings):
     """How the template is fitted to a mask."""
 
     deformation: Literal["spine", "linear-blend"] = Field(
-        "spine", description='"spine" keeps the length while bending; "linear-blend" is the paper\'s'
+        "spine",
+        description='"spine" keeps the length while bending; "linear-blend" is the paper\'s',
     )
     solver: Literal["adam"] = Field("adam", description="the paper's gradient descent")
     device: Literal["cpu", "cuda"] = Field("cpu", description="where the fit runs")
