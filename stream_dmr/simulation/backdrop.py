@@ -33,7 +33,10 @@ class Backdrop:
         self._swell = _grey(0.8 * noise(rng, *big, grain_px=(90, 34)) + _ripples(rng, big, 11.0))
         self._chop = _grey(_ripples(rng, big, 5.0) + 0.5 * _ripples(rng, big, 2.2))
         self._colours = np.stack(
-            [np.interp(np.arange(256), _SEA_STOPS, channel) for channel in zip(*_SEA_BGR, strict=True)],
+            [
+                np.interp(np.arange(256), _SEA_STOPS, channel)
+                for channel in zip(*_SEA_BGR, strict=True)
+            ],
             axis=-1,
         ).astype(np.uint8)[:, None]
         self._rail, self._rail_mask = _draw_rail(rng, width)
@@ -74,7 +77,7 @@ def draw_line(
 
 def draw_hook(image: UInt8[np.ndarray, "H W 3"], *, mouth_px: Float[np.ndarray, "2"]) -> None:
     """The shank and bend of a circle hook in the fish's mouth, drawn over the fish."""
-    center = _fixed(mouth_px + [-2.5, -1.0])
+    center = _fixed(mouth_px - np.array([2.5, 1.0]))
     axes = (4 << _SUBPIXEL, 5 << _SUBPIXEL)
     cv2.ellipse(image, center, axes, 0, -40, 200, (150, 156, 158), 2, cv2.LINE_AA, _SUBPIXEL)
 

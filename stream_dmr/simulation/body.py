@@ -55,7 +55,9 @@ class Body:
         """
         across = np.cos(angle)
         through = np.sign(np.sin(angle)) * np.abs(np.sin(angle)) ** 1.5
-        bow = self.fork_depth * across**2 * _smooth_step((s - self.tail_from) / (1 - self.tail_from))
+        bow = (
+            self.fork_depth * across**2 * _smooth_step((s - self.tail_from) / (1 - self.tail_from))
+        )
         return np.stack(
             [s + bow, self.half_width_at(s) * across, self.half_thickness_at(s) * through], axis=-1
         )

@@ -125,7 +125,7 @@ def _draw_gaff(
     stroke = (progress - _GAFF_FROM) / (_GAFF_UNTIL - _GAFF_FROM)
     keypoints_px = scene.calibration.camera.project(posed.keypoints)
     target = keypoints_px[0] + (0.25 + 0.5 * stroke) * (keypoints_px[2] - keypoints_px[0])
-    side = 1.0 if target[0] < image.shape[1] / 2 else -1.0  # from the vessel, over the free water
+    side = 1.0 if visit.fish.track_id % 2 else -1.0
     hand = np.array([target[0] + side * 560.0, -30.0])
     reach = (target - hand) / np.linalg.norm(target - hand)
     return draw_gaff(image, hand_px=hand, tip_px=target + 70.0 * reach)
@@ -155,11 +155,9 @@ def _boxes(
 def _expose(
     image: UInt8[np.ndarray, "H W 3"], rng: np.random.Generator, *, noise_levels: float
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Sensor noise. One tile of it is drawn and shifted about, since fresh noise takes too long."""
+    """Sensor noise: one tile of it, repeated, since noise for the whole frame takes too long."""
     height, width = image.shape[:2]
-    tile = np.empty((256, 256, 3), np.int16)
-    cv2.setRNGSeed(int(rng.integers(1 << 30)))
-    cv2.randn(tile, 0, noise_levels)
+    tile = np.round(noise_levels * rng.standard_normal((256, 256, 3), np.float32)).astype(np.int16)
     tile = np.tile(tile, (height // 256 + 2, width // 256 + 2, 1))
     y, x = rng.integers(256, size=2)
     return cv2.add(image, tile[y : y + height, x : x + width], dtype=cv2.CV_8U)

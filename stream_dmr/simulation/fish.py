@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from stream_dmr.camera import Calibration, ReferencePlane
 from stream_dmr.geometry import arc_length, bending_ratio
 from stream_dmr.simulation.body import Body, BodyMesh, body_mesh, draw_body, keypoints
-from stream_dmr.simulation.spine import Spine, bend_spine
+from stream_dmr.simulation.spine import Spine, bend_spine, total_bend_rad
 
 # World: X right, Y down, Z away from the camera. A straight fish hangs head up along Y with its
 # broad side across X; +z of the body, the side with the eyes, looks at the camera.
@@ -35,6 +35,11 @@ class Pose:
     sway_rad: float  # about the line of sight, as a pendulum
     tilt_rad: float  # towards and away from the camera
     center_world_mm: Float[np.ndarray, "3"]  # of the center keypoint; [2] is its way off the plane
+
+    @property
+    def total_bend_rad(self) -> float:
+        """How far the body's tangent turns from head to tail."""
+        return total_bend_rad(self.bends)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -87,7 +92,7 @@ def _hang(fish: Fish, pose: Pose) -> Spine:
     spine = spine.moved(middle.T, np.zeros(3))
     # Gravity pulls the centroid under the head, where the hook is.
     down = spine.points.mean(axis=0) - spine.points[0]
-    align, _ = Rotation.align_vectors([[1.0, 0.0, 0.0]], [down])
+    align = Rotation.align_vectors([[1.0, 0.0, 0.0]], [down])[0]
     swing = Rotation.from_euler("ZXY", [pose.sway_rad, pose.tilt_rad, pose.yaw_rad])
     rotation = swing.as_matrix() @ _WORLD_FROM_HANGING @ align.as_matrix()
     turned = spine.moved(rotation, np.zeros(3))

@@ -35,7 +35,7 @@ def draw_poses(
 def draw_still_pose(
     rng: np.random.Generator, preset: Preset, *, center_world_mm: Float[np.ndarray, "3"]
 ) -> Pose:
-    """One pose out of the middle of a passage, with its center here (and off the plane a little)."""
+    """One pose out of the middle of a passage, its center moved here but as far off the plane."""
     pose = draw_poses(rng, preset, lane_mm=0.0, num_frames=15)[7]
     center = center_world_mm + np.array([0.0, 0.0, pose.center_world_mm[2]])
     return Pose(
@@ -66,9 +66,7 @@ def _draw_path(
 ) -> Float[np.ndarray, "T 3"]:
     """Up through the picture, slower in its middle, drifting sideways, close to the plane."""
     progress = np.linspace(-1.0, 1.0, len(seconds))
-    drift = rng.uniform(-120.0, 120.0) * progress + 40.0 * _wander(
-        rng, seconds, (), fastest_hz=0.7
-    )
+    drift = rng.uniform(-120.0, 120.0) * progress + 40.0 * _wander(rng, seconds, (), fastest_hz=0.7)
     climb = -_TRAVEL_MM * (0.45 * progress + 0.55 * progress**3)
     off = _OFF_PLANE_MM * (rng.standard_normal() + 0.5 * _wander(rng, seconds, (), fastest_hz=0.7))
     off = off.clip(-_MAX_OFF_PLANE_MM, _MAX_OFF_PLANE_MM)

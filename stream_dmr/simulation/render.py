@@ -85,9 +85,7 @@ def paste(
     image[rows, columns] = np.clip(under * (1 - layers[..., 3:]) + layers[..., :3], 0, 255)
 
 
-def frame_window(
-    patch: Patch, width: int, height: int
-) -> tuple[slice, slice, tuple[slice, slice]]:
+def frame_window(patch: Patch, width: int, height: int) -> tuple[slice, slice, tuple[slice, slice]]:
     """Rows and columns of the frame that a patch covers, and the part of the patch inside it."""
     patch_height, patch_width = patch.mask.shape
     top, bottom = np.clip([patch.top, patch.top + patch_height], 0, height).tolist()

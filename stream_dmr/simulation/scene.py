@@ -30,6 +30,10 @@ class Visit:
     poses: list[Pose]
     is_gaffed: bool
 
+    def pose_at(self, frame_index: int) -> Pose:
+        """How the fish hangs in a frame of its visit."""
+        return self.poses[frame_index - self.first_frame]
+
     def progress(self, frame_index: int) -> float | None:
         """From 0 (it comes) to 1 (it leaves); None while it isn't there."""
         passed = frame_index - self.first_frame
@@ -54,7 +58,7 @@ class Scene:
 
     def pose(self, visit: Visit, frame_index: int) -> PosedFish:
         """The body of a visiting fish in a frame."""
-        pose = visit.poses[frame_index - visit.first_frame]
+        pose = visit.pose_at(frame_index)
         return pose_fish(visit.fish, pose, calibration=self.calibration)
 
 
@@ -125,9 +129,7 @@ def draw_view(*, preset: str, seed: int) -> View:
     return View(calibration=calibration, posed=pose_fish(fish, pose, calibration=calibration))
 
 
-def _draw_visit(
-    index: int, *, num_fish: int, num_frames: int, preset: Preset, seed: int
-) -> Visit:
+def _draw_visit(index: int, *, num_fish: int, num_frames: int, preset: Preset, seed: int) -> Visit:
     """The fish number `index` and when it comes; time runs in slots, one for every fish."""
     rng = np.random.default_rng((seed, _FISH, index))
     last_start = _start_slot(num_fish - 1)

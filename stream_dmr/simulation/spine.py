@@ -65,7 +65,7 @@ def curvature(
 
 
 def total_bend_rad(bends: Float[np.ndarray, "3 K"]) -> float:
-    """How far the tangent turns from head to tail: the integral of |curvature|, without the twist."""
+    """How far the tangent turns from head to tail: the integral of |curvature|, twist left out."""
     turning = curvature(_middles(), bends)[:, 1:]
     return float(np.linalg.norm(turning, axis=1).sum() / NUM_STEPS)
 

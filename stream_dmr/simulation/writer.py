@@ -1,0 +1,144 @@
+"""Writes a simulated scene: the clip, its annotations, its calibration, the truth, a template."""
+
+import csv
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+from jaxtyping import UInt16
+
+from stream_dmr.calibration import save_calibration
+from stream_dmr.errors import OutputError, UserError
+from stream_dmr.simulation.body import HALIBUT, JOINT_ARCS, body_mesh, keypoints
+from stream_dmr.simulation.film import Box, film
+from stream_dmr.simulation.motion import FPS
+from stream_dmr.simulation.scene import Scene, make_scene
+
+_MAX_FISH = 65535  # what a 16-bit mask can tell apart
+
+TRUTH_FRAMES_COLUMNS = (
+    "frame_index",
+    "track_id",
+    *(f"{point}_{axis}_mm" for point in ("head", "center", "tail") for axis in "xyz"),
+    *(f"{point}_{axis}" for point in ("head", "center", "tail") for axis in "uv"),
+    "arc_mm",
+    "bending_ratio",
+    "total_bend_deg",
+)
+
+
+def simulate(out: Path, *, num_fish: int, num_frames: int, preset: str, seed: int) -> None:
+    """Write a clip of hooked fish with known lengths into the folder `out`.
+
+    `video.mp4`, `boxes.txt`, `masks/`, `calibration.yaml`, `truth.csv` (length per fish),
+    `truth_frames.csv` (per fish and frame: keypoints in the camera frame in mm and in frame
+    pixels with lens distortion, arc, bending), and `species.ply` with `species.toml`, the mean
+    body as a template. Equal arguments write equal masks and truth to the last bit.
+
+    Raises UserError for counts, a preset or a seed that can't be, OutputError where `out` can't
+    be written to.
+    """
+    _check(num_fish=num_fish, num_frames=num_frames, seed=seed)
+    scene = make_scene(num_fish=num_fish, num_frames=num_frames, preset=preset, seed=seed)
+    try:
+        _empty_masks(out / "masks")
+        write_species(out)
+        _write_truth(out, scene)
+        save_calibration(out / "calibration.yaml", scene.calibration)
+        _write_film(out, scene)
+    except OSError as error:
+        raise OutputError(
+            f"{out}: expected a folder to write the simulated scene to, got: {error}; "
+            "choose another --out or free some space"
+        ) from error
+
+
+def write_species(out: Path) -> None:
+    """Write the mean body as a template for the fit: `species.ply` with `species.toml`."""
+    mesh = body_mesh(HALIBUT)
+    trimesh.Trimesh(mesh.points, mesh.faces, process=False).export(out / "species.ply")
+    head, center, tail = keypoints().tolist()
+    (out / "species.toml").write_text(
+        f'name = "simulated halibut"\njoints = {keypoints(JOINT_ARCS).tolist()}\n\n'
+        f"[keypoints]\nhead = {head}\ncenter = {center}\ntail = {tail}\n",
+        encoding="utf-8",
+    )
+
+
+def _check(*, num_fish: int, num_frames: int, seed: int) -> None:
+    if not 0 <= num_fish <= _MAX_FISH:
+        raise UserError(f"--fish: expected a number from 0 to {_MAX_FISH}, got {num_fish}")
+    if num_frames < 1:
+        raise UserError(f"--frames: expected at least 1, got {num_frames}")
+    if seed < 0:
+        raise UserError(f"--seed: expected a number from 0 on, got {seed}")
+
+
+def _empty_masks(folder: Path) -> None:
+    """Make the folder; masks of an earlier, longer clip would label frames that aren't there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in folder.iterdir():
+        if re.fullmatch(r"\d{6}\.png", path.name):
+            path.unlink()
+
+
+def _write_truth(out: Path, scene: Scene) -> None:
+    fish = [visit.fish for visit in scene.visits]
+    lengths = [(one.track_id, f"{one.length_mm:.6f}") for one in fish]
+    _write_csv(out / "truth.csv", ("track_id", "length_mm"), lengths)
+    _write_csv(out / "truth_frames.csv", TRUTH_FRAMES_COLUMNS, _truth_rows(scene))
+
+
+def _truth_rows(scene: Scene) -> Iterable[tuple[int | str, ...]]:
+    for frame_index in range(1, scene.num_frames + 1):
+        for visit in scene.visits_at(frame_index):
+            posed = scene.pose(visit, frame_index)
+            pixels = scene.calibration.camera.project(posed.keypoints)
+            bend_deg = float(np.degrees(visit.pose_at(frame_index).total_bend_rad))
+            yield (
+                frame_index,
+                visit.fish.track_id,
+                *(f"{value:.6f}" for value in posed.keypoints.ravel()),
+                *(f"{value:.4f}" for value in pixels.ravel()),
+                f"{posed.arc_mm:.6f}",
+                f"{posed.bending_ratio:.6f}",
+                f"{bend_deg:.3f}",
+            )
+
+
+def _write_csv(path: Path, columns: Iterable[str], rows: Iterable[Iterable[int | str]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def _write_film(out: Path, scene: Scene) -> None:
+    camera = scene.calibration.camera
+    codec = cv2.VideoWriter.fourcc(*"mp4v")
+    video = cv2.VideoWriter(str(out / "video.mp4"), codec, FPS, (camera.width, camera.height))
+    if not video.isOpened():
+        raise OutputError(f"{out / 'video.mp4'}: expected to open it for writing, could not")
+    try:
+        with (out / "boxes.txt").open("w", encoding="utf-8") as boxes:
+            for shot in film(scene):
+                video.write(shot.image)
+                _write_mask(out / "masks" / f"{shot.frame_index:06d}.png", shot.labels, scene)
+                boxes.writelines(map(_mot_line, shot.boxes))
+    finally:
+        video.release()
+
+
+def _write_mask(path: Path, labels: UInt16[np.ndarray, "H W"], scene: Scene) -> None:
+    pixels = labels if len(scene.visits) > 255 else labels.astype(np.uint8)
+    _, encoded = cv2.imencode(".png", pixels)
+    path.write_bytes(encoded.tobytes())  # unlike imwrite, it says what went wrong
+
+
+def _mot_line(box: Box) -> str:
+    """MOT Challenge text: frame, id, x, y, w, h, conf, class, visibility."""
+    numbers = (box.frame_index, box.track_id, *box.xywh_px, 1, 1, f"{box.visible_fraction:.3f}")
+    return ",".join(map(str, numbers)) + "\n"
