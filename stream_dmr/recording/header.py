@@ -1,0 +1,81 @@
+"""What a recording needs beside its messages to be recomputed from."""
+
+import platform
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+
+from stream_dmr import __version__
+from stream_dmr.camera import Calibration
+from stream_dmr.messages import Message
+from stream_dmr.recording.codec import CODEC_VERSION, decode, encode
+from stream_dmr.recording.pictures import Picture
+from stream_dmr.recording.topics import TOPICS, Topic
+from stream_dmr.template import Template
+
+_LIBRARIES = ("numpy", "opencv-python-headless", "torch", "scipy", "mcap", "rerun-sdk")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunHeader:
+    """The inputs of a run that are not messages."""
+
+    source: str  # file name or address
+    command: str  # as typed
+    config_toml: str
+    template: Template
+    calibration: Calibration | None = None
+    calibration_file: bytes = b""  # the user's file as it was; empty where there is none
+
+    def metadata(self) -> dict[str, str]:
+        """The record `run`: who wrote this, from what, and with which versions."""
+        return {
+            "source": self.source,
+            "command": self.command,
+            "codec_version": str(CODEC_VERSION),
+            "stream_dmr": __version__,
+            "python": platform.python_version(),
+            "platform": platform.platform(),
+            **{name: _version(name) for name in _LIBRARIES},
+        }
+
+    def attachments(self) -> dict[str, bytes]:
+        """Name -> content. The .pb ones are exact and for replay, the others are for people too."""
+        files = {"config.toml": self.config_toml.encode(), "template.pb": encode(self.template)}
+        if self.calibration is not None:
+            files["calibration.pb"] = encode(self.calibration)
+            files["calibration.yaml"] = self.calibration_file
+        return files
+
+    @classmethod
+    def from_parts(cls, metadata: dict[str, str], attachments: dict[str, bytes]) -> "RunHeader":
+        """The inverse of `metadata` and `attachments`, exact. KeyError where a part is missing."""
+        calibration = attachments.get("calibration.pb")
+        return cls(
+            source=metadata["source"],
+            command=metadata["command"],
+            config_toml=attachments["config.toml"].decode(),
+            template=decode(Template, attachments["template.pb"]),
+            calibration=None if calibration is None else decode(Calibration, calibration),
+            calibration_file=attachments.get("calibration.yaml", b""),
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Record:
+    """A message with its encodings, made once for all sinks."""
+
+    message: Message
+    payload: bytes  # as `codec.encode` gives it
+    picture: Picture | None  # a Frame's JPEG, for viewing
+
+    @property
+    def topic(self) -> Topic:
+        """Where it belongs."""
+        return TOPICS[type(self.message)]
+
+
+def _version(library: str) -> str:
+    try:
+        return version(library)
+    except PackageNotFoundError:
+        return "not installed"

@@ -1,0 +1,140 @@
+"""recording.mcap: the record of truth, whole up to the last second after a crash.
+
+Written as `recording.mcap.part` and renamed once it is closed. Whatever is needed to read the
+messages comes first, and every chunk of messages is complete in itself.
+"""
+
+import time
+from collections import Counter
+from pathlib import Path
+from typing import IO, cast
+
+from mcap.data_stream import RecordBuilder
+from mcap.records import DataEnd, Footer
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+
+from stream_dmr import __version__
+from stream_dmr.errors import OutputError
+from stream_dmr.recording.header import Record, RunHeader
+from stream_dmr.recording.schema import schema_bytes
+from stream_dmr.recording.topics import TOPICS
+from stream_dmr.recording.whole_file import WholeFile, rename_durably
+
+NAME = "recording.mcap"
+_CHUNK_BYTES = 256 * 1024
+_MEDIA_TYPES = {".toml": "application/toml", ".yaml": "application/yaml"}
+
+
+class McapSink:
+    """Writes every record, with the capture time as its log time.
+
+    A flush comes with the first record that is `flush_s` of wall clock after the last flush. A
+    full disk ends the recording: the file keeps its whole chunks and is closed without an index,
+    which readers do without; where not even that has room, it stays behind as `.part`.
+    """
+
+    def __init__(self, out_dir: Path, header: RunHeader, *, flush_s: float) -> None:
+        self.path = out_dir / NAME
+        self._part = out_dir / f"{NAME}.part"
+        self._flush_ns = int(flush_s * 1e9)
+        self._channels: dict[type, int] = {}
+        self._sequences: Counter[int] = Counter()
+        self._closed = False
+        try:
+            _set_aside(self._part)
+            self._file = WholeFile(self._part)
+            self._writer = _start(self._file, header)
+            self._register_topics()
+            self._flush()
+        except OSError as error:
+            raise self._refusal(error) from error
+
+    def write(self, record: Record) -> None:
+        """Append one record; OutputError where the disk refuses it, and the recording is over."""
+        if self._closed:
+            raise ValueError(f"{self.path} is closed")
+        channel = self._channels[type(record.message)]
+        self._sequences[channel] += 1
+        timestamp_ns = record.message.timestamp_ns
+        try:
+            self._writer.add_message(
+                channel, timestamp_ns, record.payload, timestamp_ns, self._sequences[channel]
+            )
+            if time.monotonic_ns() >= self._flush_at_ns:
+                self._flush()
+        except OSError as error:
+            self._end_without_index(self._file.tell())
+            raise self._refusal(error) from error
+
+    def close(self) -> None:
+        """Write the index, make it durable and give the file its name. Idempotent."""
+        if self._closed:
+            return
+        whole = self._file.tell()
+        try:
+            self._flush()
+            whole = self._file.tell()
+            self._writer.finish()
+            self._end()
+        except OSError as error:
+            self._end_without_index(whole)
+            raise self._refusal(error) from error
+
+    def _register_topics(self) -> None:
+        for kind, row in TOPICS.items():
+            schema = self._writer.register_schema(row.schema, "protobuf", schema_bytes())
+            self._channels[kind] = self._writer.register_channel(row.topic, "protobuf", schema)
+
+    def _flush(self) -> None:
+        self._writer.flush()
+        self._file.sync()
+        self._flush_at_ns = time.monotonic_ns() + self._flush_ns
+
+    def _end(self) -> None:
+        self._file.sync()
+        self._closed = True
+        self._file.close()
+        rename_durably(self._part, self.path)
+
+    def _end_without_index(self, whole: int) -> None:
+        """Keep the first `whole` bytes, which end with a record, and close after them."""
+        builder = RecordBuilder()
+        DataEnd(0).write(builder)
+        Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
+        try:
+            self._file.truncate(whole)
+            self._file.write(builder.end() + MCAP0_MAGIC)
+            self._end()
+        except OSError:  # the caller reports the first failure
+            if not self._closed:
+                self._closed = True
+                self._file.close()
+
+    def _refusal(self, error: OSError) -> OutputError:
+        kept = f"; what came before is kept in {self.path.parent}" if self._channels else ""
+        return OutputError(
+            f"{self.path}: expected a folder with room to write to, got: {error.strerror}{kept}; "
+            "make room or choose another --out"
+        )
+
+
+def _start(file: WholeFile, header: RunHeader) -> Writer:
+    writer = Writer(
+        cast(IO[bytes], file), chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD
+    )
+    writer.start(profile="stream-dmr", library=f"stream-dmr {__version__}")
+    writer.add_metadata("run", header.metadata())
+    for name, data in header.attachments().items():
+        media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/protobuf")
+        writer.add_attachment(0, 0, name, media_type, data)
+    return writer
+
+
+def _set_aside(part: Path) -> None:
+    """Rename what a crashed run left, so that it is not overwritten."""
+    number = 1
+    while part.exists():
+        aside = part.with_name(f"recording.crashed-{number}.mcap.part")
+        if not aside.exists():
+            part.rename(aside)
+        number += 1

@@ -1,0 +1,117 @@
+"""How a recording opens in Rerun: the layout of its views, the colours, and what never moves."""
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from jaxtyping import Float
+
+from stream_dmr.camera import Calibration, Camera
+from stream_dmr.recording.topics import CAMERA, LOG, PLANE
+
+# Okabe and Ito's palette, told apart by the colour-blind too; black and grey left out.
+_PALETTE = (
+    (230, 159, 0),
+    (86, 180, 233),
+    (0, 158, 115),
+    (240, 228, 66),
+    (204, 121, 167),
+    (213, 94, 0),
+    (0, 114, 178),
+)
+_GRID_MM = 100.0
+_GREY = (150, 160, 170, 90)
+RUN = "run"
+
+
+def color(track_id: int) -> tuple[int, int, int]:
+    """The colour of a track, the same in every view."""
+    return _PALETTE[track_id % len(_PALETTE)]
+
+
+def blueprint(calibration: Calibration | None) -> rrb.Blueprint:
+    """The frame and the 3D scene above, length, IoU and the log of events below."""
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(
+                rrb.Spatial2DView(origin=CAMERA, name="Frame: outlines, boxes, keypoints"),
+                _scene_view(calibration),
+            ),
+            rrb.Horizontal(
+                rrb.TimeSeriesView(origin="length", name="Length and its 95 % band, mm"),
+                rrb.TimeSeriesView(
+                    origin="iou", name="Silhouette IoU", axis_y=rrb.ScalarAxis(range=(0.5, 1.0))
+                ),
+                rrb.Tabs(
+                    rrb.TextLogView(origin=LOG, name="Refusals and lengths"),
+                    rrb.TextDocumentView(origin=RUN, name="Run"),
+                ),
+            ),
+            row_shares=[3, 2],
+        ),
+        rrb.TimePanel(timeline="frame", state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
+
+
+def _scene_view(calibration: Calibration | None) -> rrb.Spatial3DView:
+    depth = 1.0 if calibration is None else _middle(calibration)[2]
+    return rrb.Spatial3DView(
+        origin="scene",
+        contents=["scene/**", "- scene/camera/fish/**"],
+        name="Scene, camera frame, " + ("relative" if calibration is None else "mm"),
+        line_grid=rrb.LineGrid3D(visible=False),
+        # From above the camera's right shoulder, towards the fish.
+        eye_controls=rrb.EyeControls3D(
+            position=(0.75 * depth, -0.45 * depth, -0.1 * depth),
+            look_target=(0.0, 0.0, depth),
+            eye_up=(0.0, -1.0, 0.0),
+        ),
+    )
+
+
+def log_camera(rec: rr.RecordingStream, camera: Camera, *, depth: float) -> None:
+    """The camera, for all time; its picture stands `depth` in front of it, behind the fish."""
+    # Rerun counts pixels from the corner of the top-left one, we from its centre.
+    shift = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    pinhole = rr.Pinhole(
+        image_from_camera=shift @ camera.K,
+        resolution=(camera.width, camera.height),
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=depth,
+    )
+    rec.log(CAMERA, pinhole, static=True)
+
+
+def log_calibration(rec: rr.RecordingStream, calibration: Calibration) -> None:
+    """The camera and the reference plane as a grid of 100 mm, for all time."""
+    middle, camera, plane = _middle(calibration), calibration.camera, calibration.plane
+    log_camera(rec, camera, depth=0.35 * middle[2])
+    half = 0.6 * middle[2] * max(camera.width / camera.K[0, 0], camera.height / camera.K[1, 1])
+    lines = _grid(plane.rotation.T @ (middle - plane.translation_mm), half)
+    strips = lines @ plane.rotation.T + plane.translation_mm
+    rec.log(
+        PLANE, rr.LineStrips3D(strips, colors=[_GREY], radii=rr.Radius.ui_points(0.7)), static=True
+    )
+
+
+def _middle(calibration: Calibration) -> Float[np.ndarray, "3"]:
+    """Where the camera's axis meets the plane, or the plane's origin where it doesn't."""
+    ray = np.array([[0.0, 0.0, 1.0]])
+    depth = calibration.plane.depth_mm(ray)[0]
+    if np.isfinite(depth) and depth > 0:
+        return ray[0] * depth
+    return calibration.plane.translation_mm
+
+
+def _grid(middle: Float[np.ndarray, "3"], half: float) -> Float[np.ndarray, "L 2 3"]:
+    """Lines of a square grid in world Z = 0, on multiples of its spacing."""
+    spacing = _GRID_MM * max(1.0, np.ceil(half / _GRID_MM / 20))  # 40 lines each way at most
+    count = int(np.ceil(half / spacing))
+    center = np.round(middle[:2] / spacing) * spacing
+    offsets = np.arange(-count, count + 1) * spacing
+    ends = np.array([-count, count]) * spacing
+    along, across = np.meshgrid(offsets, ends, indexing="ij")
+    vertical = np.stack([along, across, np.zeros_like(along)], axis=-1)
+    lines = np.concatenate([vertical, vertical[..., [1, 0, 2]]])
+    return lines + np.array([*center, 0.0])

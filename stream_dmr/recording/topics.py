@@ -1,0 +1,67 @@
+"""The one table of what a message is called in each kind of recording."""
+
+from dataclasses import dataclass
+
+from stream_dmr.messages import (
+    FishCrop,
+    FittedMesh,
+    Frame,
+    LengthEstimate,
+    LocalizedFish,
+    Message,
+)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Topic:
+    """Where the messages of one type lie."""
+
+    message: type[Message]
+    topic: str  # in the .mcap
+    entities: tuple[str, ...]  # in the .rrd; {id} is the track's
+
+    @property
+    def schema(self) -> str:
+        """Name of the protobuf message, in `messages.proto`."""
+        return f"stream_dmr.{self.message.__name__}"
+
+    @property
+    def payload(self) -> str:
+        """Entity path of the encoded messages in the .rrd."""
+        return f"messages{self.topic}"
+
+
+FRAME = "scene/camera/frame"
+BOX, OUTLINE = "scene/camera/fish/{id}/box", "scene/camera/fish/{id}/outline"
+MESH = "scene/fish/{id}/mesh"
+KEYPOINTS_2D = "scene/camera/fish/{id}/keypoints"
+KEYPOINTS_3D, MIDLINE = "scene/fish/{id}/keypoints", "scene/fish/{id}/midline"
+FRAME_LENGTH, LENGTH = "length/{id}/frame", "length/{id}/estimate"
+IOU = "iou/{id}"
+LOG = "log"
+CAMERA, PLANE = "scene/camera", "scene/plane"  # static, from the header
+FISH_ROOTS = ("scene/camera/fish", "scene/fish")  # what a new frame clears
+
+TOPICS: dict[type[Message], Topic] = {
+    row.message: row
+    for row in (
+        Topic(message=Frame, topic="/frame", entities=(FRAME,)),
+        Topic(message=FishCrop, topic="/crop", entities=(BOX, OUTLINE)),
+        Topic(message=FittedMesh, topic="/fit", entities=(MESH, IOU)),
+        Topic(
+            message=LocalizedFish,
+            topic="/localized",
+            entities=(KEYPOINTS_2D, KEYPOINTS_3D, MIDLINE, FRAME_LENGTH),
+        ),
+        Topic(message=LengthEstimate, topic="/length", entities=(LENGTH, LOG)),
+    )
+}
+
+
+def topics_table() -> str:
+    """The table as Markdown, for `docs/recording.md`."""
+    lines = ["| message | topic (.mcap) | schema | entities (.rrd) |", "|---|---|---|---|"]
+    for row in TOPICS.values():
+        entities = ", ".join(f"`{path}`" for path in row.entities)
+        lines.append(f"| `{row.message.__name__}` | `{row.topic}` | `{row.schema}` | {entities} |")
+    return "\n".join(lines)

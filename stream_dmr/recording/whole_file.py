@@ -1,0 +1,57 @@
+"""A file in which every write happens completely or not at all."""
+
+import os
+from pathlib import Path
+
+
+class WholeFile:
+    """An unbuffered file for writing that takes a failed write back.
+
+    So a full disk leaves the file at the end of the last whole record, ready to be ended properly.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+        self._size = 0
+
+    def write(self, data: bytes) -> int:
+        """Append `data`; where that fails, OSError, with the file as it was."""
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[os.write(self._fd, rest) :]
+        except OSError:
+            self.truncate(self._size)
+            raise
+        self._size += len(data)
+        return len(data)
+
+    def truncate(self, size: int) -> None:
+        """Cut back to `size` bytes; the next write continues there."""
+        os.ftruncate(self._fd, size)
+        self._size = os.lseek(self._fd, size, os.SEEK_SET)
+
+    def tell(self) -> int:
+        """Bytes written so far."""
+        return self._size
+
+    def flush(self) -> None:
+        """Nothing is buffered here."""
+
+    def sync(self) -> None:
+        """Wait until the disk has what was written."""
+        os.fdatasync(self._fd)
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._fd)
+
+
+def rename_durably(path: Path, target: Path) -> None:
+    """Rename within a folder, replacing `target`, so that the name survives a power loss."""
+    path.replace(target)
+    folder = os.open(target.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
