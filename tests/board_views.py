@@ -12,9 +12,9 @@ import numpy as np
 from stream_dmr.camera import Camera, ReferencePlane
 
 LENS = Camera(
-    width=800,
-    height=600,
-    K=np.array([[842.0, 0.0, 411.3], [0.0, 845.5, 288.6], [0.0, 0.0, 1.0]]),
+    width=640,
+    height=480,
+    K=np.array([[672.0, 0.0, 329.3], [0.0, 675.5, 231.6], [0.0, 0.0, 1.0]]),
     distortion=np.array([-0.21, 0.09, 0.0011, -0.0007, 0.0]),
 )
 
@@ -33,12 +33,14 @@ class BoardRenderer:
     """Renders one board through one camera; the camera's rays are computed once."""
 
     def __init__(self, camera: Camera, *, board=(9, 6), square_mm=25.0, samples=4):
-        self.camera, self.board, self.square_mm, self.samples = camera, board, square_mm, samples
+        self.camera, self.board, self.square_mm = camera, board, square_mm
         offsets = (np.arange(samples) + 0.5) / samples - 0.5
-        x = (np.arange(camera.width)[:, None] + offsets).ravel()
-        y = (np.arange(camera.height)[:, None] + offsets).ravel()
-        pixels = np.stack(np.meshgrid(x, y), axis=-1)
-        self._rays = camera.back_project(pixels.reshape(-1, 2)).reshape(*pixels.shape[:2], 3)
+        x = np.arange(camera.width)[:, None] + offsets
+        y = np.arange(camera.height)[:, None] + offsets
+        pixels = np.empty((camera.height, samples, camera.width, samples, 2))
+        pixels[..., 0], pixels[..., 1] = x, y[:, :, None, None]
+        rays = camera.back_project(pixels.reshape(-1, 2))
+        self._rays = rays.reshape(*pixels.shape[:-1], 3).astype(np.float32)
 
     def corners_px(self, pose: ReferencePlane) -> np.ndarray:
         """True pixels of the inner corners, row by row, those of world x fastest."""
@@ -47,20 +49,17 @@ class BoardRenderer:
 
     def render(self, pose: ReferencePlane, view: BoardView | None = None) -> np.ndarray:
         """Grey picture, uint8 (H, W), of the board lying in the pose's plane."""
-        view = view or BoardView()
-        fine = self._colours(pose)
-        small = fine.reshape(self.camera.height, self.samples, self.camera.width, self.samples)
-        return _take_picture(small.mean(axis=(1, 3)), view)
+        light = self._colours(self._rays, pose).mean(axis=(1, 3))
+        return _take_picture(light, view or BoardView())
 
-    def _colours(self, pose: ReferencePlane) -> np.ndarray:
-        inverse = np.linalg.inv(pose.homography(np.eye(3)))
-        on_plane = self._rays @ inverse.T
+    def _colours(self, rays: np.ndarray, pose: ReferencePlane) -> np.ndarray:
+        on_plane = rays @ np.linalg.inv(pose.homography(np.eye(3))).T.astype(np.float32)
         x, y = (on_plane[..., i] / on_plane[..., 2] / self.square_mm + 1 for i in (0, 1))
         columns, rows = self.board[0] + 1, self.board[1] + 1
         is_square = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
         is_paper = (x >= -0.7) & (x < columns + 0.7) & (y >= -0.7) & (y < rows + 0.7)
         is_black = (np.floor(x) + np.floor(y)) % 2 == 0
-        table = 120 + 25 * np.sin(x * 2.3) * np.sin(y * 1.7 + 1)
+        table = 120 + 25 * np.sin(x * 2.3)
         return np.where(is_square & is_black, 35.0, np.where(is_paper, 215.0, table))
 
 
