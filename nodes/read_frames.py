@@ -1,0 +1,22 @@
+"""ReadFrames: the head of the chain, frames in order from a file, folder, camera or stream."""
+
+from collections.abc import Iterator
+
+from stream_dmr.messages import Frame
+from stream_dmr.video import ReadFramesSettings, open_source
+
+
+class ReadFrames:
+    """Iterates the frames of a source, once; `source` tells its size, rate and warnings."""
+
+    def __init__(self, source: str, settings: ReadFramesSettings) -> None:
+        """Raises SourceError where nothing can be read from `source`."""
+        self.source = open_source(source, settings)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Raises SourceError where a frame doesn't fit those before it."""
+        return iter(self.source)
+
+    def close(self) -> None:
+        """Let go of the file or device; iteration ends."""
+        self.source.close()

@@ -1,0 +1,130 @@
+"""A folder of pictures as a source of frames."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8, UInt16
+
+from stream_dmr.errors import SourceError
+from stream_dmr.messages import Frame
+
+_PICTURES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
+_VIDEOS = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv"}
+_SECOND_NS = 1_000_000_000
+
+
+class PictureFolder:
+    """A folder of pictures in natural order (`2.png` before `10.png`), all of one size.
+
+    Grey and 16-bit pictures become 8-bit BGR. One that can't be decoded is left out with a warning
+    but keeps its frame index, so that boxes and masks stay with their pictures.
+    """
+
+    def __init__(self, folder: Path, *, fps: float) -> None:
+        self._paths = _pictures_in(folder)
+        self._is_closed = False
+        self.name = folder.resolve().name
+        self.num_frames: int | None = len(self._paths)
+        self.fps = fps
+        self.warnings: list[str] = []
+        first = next((p for p in map(_read_picture, self._paths) if p is not None), None)
+        if first is None:
+            raise SourceError(
+                f"{folder}: expected pictures, but none of its {len(self._paths)} can be decoded"
+            )
+        self.height, self.width = first.shape[:2]
+        self._full_scale = _full_scale_of(self._paths) if first.dtype == np.uint16 else 2**16 - 1
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frame_index, path in enumerate(self._paths, start=1):
+            if self._is_closed:
+                return
+            picture = _read_picture(path)
+            if picture is None:
+                self.warnings.append(f"{path.name}: can't be decoded, so was left out")
+                continue
+            check_size(picture, width=self.width, height=self.height, where=str(path))
+            yield Frame(
+                frame_index=frame_index,
+                timestamp_ns=nominal_ns(frame_index, self.fps),
+                image=_to_8_bit(picture, self._full_scale),
+                source=path.name,
+            )
+
+    def close(self) -> None:
+        """End the iteration; no file is held."""
+        self._is_closed = True
+
+
+def nominal_ns(frame_index: int, fps: float) -> int:
+    """The time of a frame where only a constant rate is known, ns since the first frame."""
+    return round((frame_index - 1) * _SECOND_NS / fps)
+
+
+def check_size(
+    image: UInt8[np.ndarray, "H W 3"] | UInt16[np.ndarray, "H W 3"],
+    *,
+    width: int,
+    height: int,
+    where: str,
+) -> None:
+    """Raises SourceError, naming both sizes, where a picture isn't `width` x `height` px."""
+    if image.shape[:2] != (height, width):
+        raise SourceError(
+            f"{where}: expected {width}x{height} px, as the first frame has, got "
+            f"{image.shape[1]}x{image.shape[0]} px; pictures of one source must have one size"
+        )
+
+
+def _pictures_in(folder: Path) -> list[Path]:
+    try:
+        files = [p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")]
+    except OSError as error:
+        raise SourceError(
+            f"{folder}: expected a folder of pictures, but it can't be read: {error.strerror}"
+        ) from None
+    pictures = [p for p in files if p.suffix.lower() in _PICTURES]
+    if pictures:
+        return sorted(pictures, key=_natural_order)
+    if any(p.suffix.lower() in _VIDEOS for p in files):
+        raise SourceError(
+            f"{folder}: expected a folder of pictures, found videos; give one of them, "
+            "or run `stream-dmr batch` over a list of them"
+        )
+    raise SourceError(
+        f"{folder}: expected a folder of pictures ({', '.join(sorted(_PICTURES))}), found none"
+    )
+
+
+def _natural_order(path: Path) -> tuple[list[str | int], str]:
+    parts = re.split(r"([0-9]+)", path.name)
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
+
+
+def _read_picture(path: Path) -> np.ndarray | None:
+    """A picture as BGR of its own depth, turned upright if it says so; None if it can't be read."""
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    return picture if picture is not None and picture.dtype in (np.uint8, np.uint16) else None
+
+
+def _full_scale_of(paths: list[Path]) -> int:
+    """The number that stands for white in a folder of 16-bit pictures.
+
+    Sensors of 12 bits often write their numbers unscaled into 16, where they come out all but
+    black: so a folder whose pictures all would is taken for 12 bits. Some five of them are asked.
+    """
+    sample = map(_read_picture, paths[:: max(1, len(paths) // 4)])
+    brightest = max((int(p.max()) for p in sample if p is not None), default=2**16 - 1)
+    return 2**12 - 1 if brightest < 2**12 else 2**16 - 1
+
+
+def _to_8_bit(
+    picture: UInt8[np.ndarray, "H W 3"] | UInt16[np.ndarray, "H W 3"], full_scale: int
+) -> UInt8[np.ndarray, "H W 3"]:
+    """One factor for the whole folder, so that nothing flickers; what is above white is white."""
+    if picture.dtype == np.uint8:
+        return picture
+    return cv2.convertScaleAbs(picture, alpha=255 / full_scale)
