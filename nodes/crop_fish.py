@@ -1,0 +1,37 @@
+"""CropFish: every fish of a frame, cut out through an ideal camera of its own."""
+
+from collections.abc import Sequence
+
+from stream_dmr.camera import Camera
+from stream_dmr.messages import FishCrop, Frame
+from stream_dmr.segmentation.crop import CropFishSettings, crop_fish
+from stream_dmr.segmentation.detections import Annotations
+
+
+class CropFish:
+    """Frame -> FishCrop, one per fish. Without a calibrated camera a nominal one stands in."""
+
+    def __init__(
+        self, settings: CropFishSettings, *, camera: Camera | None, detections: Annotations
+    ) -> None:
+        self.detections = detections
+        self._settings = settings
+        self._camera = camera
+
+    def step(self, frame: Frame, /) -> list[FishCrop]:
+        """The fish of one frame, by id. Raises AnnotationError where its mask can't be used."""
+        if self._camera is None:
+            height, width = frame.image.shape[:2]
+            self._camera = Camera.nominal(width=width, height=height)
+        return [
+            crop_fish(frame, detection, frame_camera=self._camera, settings=self._settings)
+            for detection in self.detections.detect(frame)
+        ]
+
+    def tick(self, timestamp_ns: int, /) -> Sequence[FishCrop]:
+        """Nothing waits for time to pass here."""
+        return ()
+
+    def close(self) -> Sequence[FishCrop]:
+        """Nothing is owed at the end."""
+        return ()

@@ -1,0 +1,161 @@
+"""Boxes and masks that somebody else made, read from files and refused where they can't be right.
+
+Boxes: MOT Challenge text (Milan et al., "MOT16", arXiv:1603.00831, Table 3).
+Masks: one label picture per frame, as in DAVIS 2017 (Pont-Tuset et al., arXiv:1704.00675).
+"""
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Integer
+from PIL import Image
+
+from stream_dmr.errors import AnnotationError
+
+_COLUMNS = "frame,id,x,y,w,h,conf,class,visibility"
+_MASK_NAME = re.compile(r"\d{6,}\.png")
+_LABEL_MODES = {"1", "L", "P", "I", "I;16", "I;16B"}  # one channel; "P": palette indices
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Box:
+    """One fish of one frame, as a boxes file has it."""
+
+    track_id: int
+    bbox_xyxy_px: Float[np.ndarray, "4"]  # half-open, frame pixels; may reach out of the frame
+    visibility: float  # of the fish, 0 to 1; 1 where the file doesn't say
+
+
+def load_boxes(path: Path) -> dict[int, list[Box]]:
+    """Boxes by frame (from 1), within a frame by id; an empty file means that there are no fish.
+
+    Columns: frame, id, x, y, w, h, conf and optionally class and visibility; with ten columns the
+    last three are MOT15's world coordinates. conf and class are not used; a visibility of -1
+    means "not given", as everywhere in MOT.
+
+    Raises AnnotationError with the line's number and what was expected there.
+    """
+    frames: dict[int, dict[int, Box]] = {}
+    for number, line in enumerate(_read_text(path).splitlines(), start=1):
+        if not line.strip():
+            continue
+        where = f"{path}, line {number}"
+        frame_index, box = _parse_box(line, where)
+        boxes = frames.setdefault(frame_index, {})
+        if box.track_id in boxes:
+            raise AnnotationError(
+                f"{where}: expected one box per fish and frame, "
+                f"got a second one of id {box.track_id} in frame {frame_index}; remove one"
+            )
+        boxes[box.track_id] = box
+    return {index: [frames[index][i] for i in sorted(frames[index])] for index in sorted(frames)}
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise AnnotationError(
+            f"{path}: expected a text file of boxes ({_COLUMNS}), got binary data"
+        ) from None
+    except OSError as error:
+        raise AnnotationError(
+            f"{path}: expected a file of boxes, but it can't be read: {error.strerror}"
+        ) from None
+
+
+def _parse_box(line: str, where: str) -> tuple[int, Box]:
+    values = _parse_numbers(line, where)
+    frame, track_id, x, y, width, height = values[:6]
+    if frame < 1 or frame != int(frame):
+        raise AnnotationError(f"{where}: expected a frame number, counted from 1, got {frame:g}")
+    if track_id < 1 or track_id != int(track_id):
+        raise AnnotationError(
+            f"{where}: expected an id of 1 or more that follows one fish, got {track_id:g}; "
+            "detections without ids must be tracked first"
+        )
+    if width <= 0 or height <= 0:
+        raise AnnotationError(
+            f"{where}: expected a width and height above 0, got {width:g} x {height:g}"
+        )
+    visibility = values[8] if len(values) == 9 else -1.0
+    if visibility != -1 and not 0 <= visibility <= 1:
+        raise AnnotationError(f"{where}: expected a visibility from 0 to 1, got {visibility:g}")
+    corners = np.array([x, y, x + width, y + height])
+    box = Box(
+        track_id=int(track_id),
+        bbox_xyxy_px=corners,
+        visibility=1.0 if visibility == -1 else visibility,
+    )
+    return int(frame), box
+
+
+def _parse_numbers(line: str, where: str) -> list[float]:
+    try:
+        values = [float(column) for column in line.split(",")]
+    except ValueError:
+        values = []
+    if not 7 <= len(values) <= 10 or not all(map(math.isfinite, values)):
+        raise AnnotationError(
+            f"{where}: expected numbers {_COLUMNS}, separated by commas, got {line.strip()[:60]!r}"
+        )
+    return values
+
+
+class Masks:
+    """A folder of label pictures `000001.png` ...: a pixel's value is its fish's id, 0 is none.
+
+    Pictures are read when asked for. Palette pictures give their indices, not their colours.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Raises AnnotationError where the folder is missing or holds no such pictures."""
+        if not folder.is_dir():
+            raise AnnotationError(f"{folder}: expected a folder of masks, found none there")
+        names = sorted(entry.name for entry in folder.iterdir() if entry.suffix == ".png")
+        if not any(_MASK_NAME.fullmatch(name) for name in names):
+            found = f"{names[0]} and the like" if names else "no PNG"
+            raise AnnotationError(
+                f"{folder}: expected masks named 000001.png, 000002.png ..., found {found}"
+            )
+        if "000000.png" in names:
+            raise AnnotationError(
+                f"{folder}: expected masks counted from 000001.png, found 000000.png; "
+                "rename them by one"
+            )
+        self.folder = folder
+
+    def labels(
+        self, frame_index: int, *, width: int, height: int
+    ) -> Integer[np.ndarray, "H W"] | None:
+        """The label picture of a frame of that size in px; None where the folder has none.
+
+        Raises AnnotationError for a picture in colour, of another size, or unreadable.
+        """
+        path = self.folder / f"{frame_index:06d}.png"
+        try:
+            with Image.open(path) as picture:
+                _check_labels(picture, path, size=(width, height))
+                # A 1-bit picture comes as bool; every other mode as its own unsigned integers.
+                labels = np.asarray(picture)
+        except FileNotFoundError:
+            return None
+        except (OSError, SyntaxError):  # Pillow's two ways to call a PNG broken
+            raise AnnotationError(f"{path}: expected a PNG mask, but it can't be decoded") from None
+        return labels.astype(np.uint8) if labels.dtype == bool else labels
+
+
+def _check_labels(picture: Image.Image, path: Path, *, size: tuple[int, int]) -> None:
+    if picture.mode not in _LABEL_MODES:
+        raise AnnotationError(
+            f"{path}: expected one channel whose pixels are fish ids, got a picture in colour "
+            f"({picture.mode}); write the ids as grey values or palette indices"
+        )
+    if picture.size != size:
+        raise AnnotationError(
+            f"{path}: expected a mask of the frame's size, {size[0]}x{size[1]} px, "
+            f"got {picture.size[0]}x{picture.size[1]} px"
+        )

@@ -1,0 +1,188 @@
+"""Cuts a fish out of a frame: image and mask as an ideal pinhole camera would have seen them."""
+
+import math
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+from pydantic import Field
+
+from stream_dmr.camera import Camera
+from stream_dmr.messages import CropQuality, FishCrop, Frame
+from stream_dmr.segmentation.detections import Detection
+from stream_dmr.settings import Settings
+
+_SMALLEST_PART = 0.05  # of the largest part's area: the tail behind a gaff stays, specks go
+_LARGEST_HOLE = 0.01  # of the mask's area: pinholes are noise, larger ones something in front
+_BORDER_PX = 1  # a mask this near to the frame's edge touches it
+_MOST_SAMPLES = 4  # per crop pixel and axis; more cost time and change nothing that we measured
+
+
+class CropFishSettings(Settings):
+    """`[crop_fish]`: how fish are cut out of the frame."""
+
+    crop_size_px: int = Field(192, ge=32, le=1024, description="width and height of a crop, px")
+    margin: float = Field(
+        0.15, ge=0, le=2, description="room on each side, as a fraction of the fish's longer side"
+    )
+    min_mask_area_px: int = Field(
+        64, ge=1, description="a smaller mask counts as none, in frame px"
+    )
+
+
+def crop_fish(
+    frame: Frame, detection: Detection, *, frame_camera: Camera, settings: CropFishSettings
+) -> FishCrop:
+    """One fish, seen through a crop camera around the union of its box and its mask."""
+    mask = clean_mask(detection.mask, min_area_px=settings.min_mask_area_px)
+    crop_camera = _camera_around(
+        _union(detection.bbox_xyxy_px, mask), frame_camera=frame_camera, settings=settings
+    )
+    image, crop_mask = _resample(
+        frame.image, mask, crop_camera=crop_camera, frame_camera=frame_camera
+    )
+    return FishCrop(
+        frame_index=frame.frame_index,
+        timestamp_ns=frame.timestamp_ns,
+        track_id=detection.track_id,
+        bbox_xyxy_px=detection.bbox_xyxy_px,
+        image=image,
+        mask=crop_mask,
+        crop_camera=crop_camera,
+        frame_camera=frame_camera,
+        quality=CropQuality(
+            touches_border=_touches_border(mask),
+            visible_fraction=detection.visible_fraction,
+            sharpness=_sharpness(image, crop_mask),
+            mask_area_px=float(np.count_nonzero(mask)),
+        ),
+    )
+
+
+def clean_mask(mask: Bool[np.ndarray, "H W"], *, min_area_px: int) -> Bool[np.ndarray, "H W"]:
+    """The mask without specks and pinholes; empty if it is smaller than `min_area_px`.
+
+    Parts below 5 % of the largest part's area go, so that a fish cut in two by a line or a gaff
+    keeps both halves; holes below 1 % of the fish's area are filled, larger ones stay.
+    """
+    x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
+    cleaned = np.zeros_like(mask)
+    if width == 0:
+        return cleaned
+    region = mask[y : y + height, x : x + width]
+    parts, areas = _parts(region, connectivity=8)
+    region = (areas >= _SMALLEST_PART * areas.max())[parts] & region
+    # With a rim of sea around it, everything but part 1, the outside, is a hole.
+    gaps, areas = _parts(~np.pad(region, 1), connectivity=4)
+    is_hole = areas < _LARGEST_HOLE * np.count_nonzero(region)
+    is_hole[[0, gaps[0, 0]]] = False
+    region = region | is_hole[gaps][1:-1, 1:-1]
+    if np.count_nonzero(region) >= min_area_px:
+        cleaned[y : y + height, x : x + width] = region
+    return cleaned
+
+
+def _parts(mask: Bool[np.ndarray, "H W"], *, connectivity: int) -> tuple[np.ndarray, np.ndarray]:
+    """Connected parts of a mask: a label per pixel, 0 outside, and an area per label (0: zero)."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(
+        mask.astype(np.uint8), connectivity=connectivity
+    )
+    areas = stats[:, cv2.CC_STAT_AREA].copy()
+    areas[0] = 0
+    return labels, areas
+
+
+def _union(
+    bbox_xyxy_px: Float[np.ndarray, "4"], mask: Bool[np.ndarray, "H W"]
+) -> Float[np.ndarray, "4"]:
+    """The smallest box around the mask and what the frame shows of the box, half-open."""
+    height, width = mask.shape
+    box = np.clip(bbox_xyxy_px, 0, [width, height, width, height])
+    x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
+    if w == 0:
+        return box
+    return np.concatenate([np.minimum(box[:2], [x, y]), np.maximum(box[2:], [x + w, y + h])])
+
+
+def _camera_around(
+    bbox_xyxy_px: Float[np.ndarray, "4"], *, frame_camera: Camera, settings: CropFishSettings
+) -> Camera:
+    """The crop camera that has a box with its margins in view.
+
+    The box is measured after undistortion, by rays through its outline: near the corners of a wide
+    lens a fish is much larger there than in the frame.
+    """
+    x0, y0, x1, y1 = bbox_xyxy_px - 0.5  # half-open counts from pixel edges, cameras from centres
+    along = np.linspace(0, 1, 9)
+    x, y = x0 + along * (x1 - x0), y0 + along * (y1 - y0)
+    outline = np.concatenate(
+        [np.column_stack([x, np.full(9, edge)]) for edge in (y0, y1)]
+        + [np.column_stack([np.full(9, edge), y]) for edge in (x0, x1)]
+    )
+    rays = frame_camera.back_project(outline)
+    low, high = rays.min(axis=0), rays.max(axis=0)
+    side_px = ((high - low)[:2] * frame_camera.K[[0, 1], [0, 1]]).max()
+    return frame_camera.crop(
+        center_px=frame_camera.project((low + high)[None] / 2)[0],
+        side_px=float(side_px) * (1 + 2 * settings.margin),
+        size=settings.crop_size_px,
+    )
+
+
+def _resample(
+    image: UInt8[np.ndarray, "H W 3"],
+    mask: Bool[np.ndarray, "H W"],
+    *,
+    crop_camera: Camera,
+    frame_camera: Camera,
+) -> tuple[UInt8[np.ndarray, "S S 3"], Bool[np.ndarray, "S S"]]:
+    """Image and mask in the crop: black and empty where the frame ends.
+
+    A crop pixel is the mean of n x n samples, about one per frame pixel, since single samples of a
+    shrunken mask jump along its outline; it belongs to the mask by majority. Known shapes through
+    a strong lens come out with an area right to 0.3 % and an outline as good as pixels allow.
+    """
+    size = crop_camera.width
+    scale = float((frame_camera.K[[0, 1], [0, 1]] / crop_camera.K[[0, 1], [0, 1]]).max())
+    samples = min(max(math.ceil(scale), 1), _MOST_SAMPLES)
+    x, y = frame_from_crop_map(crop_camera, frame_camera=frame_camera, samples=samples)
+
+    def mean(picture: np.ndarray) -> np.ndarray:
+        fine = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        return cv2.resize(fine, (size, size), interpolation=cv2.INTER_AREA)
+
+    return mean(image), mean(mask * np.uint8(255)) > 127
+
+
+def frame_from_crop_map(
+    crop_camera: Camera, *, frame_camera: Camera, samples: int = 1
+) -> tuple[Float32[np.ndarray, "N N"], Float32[np.ndarray, "N N"]]:
+    """Frame x and y of `samples` x `samples` points in each crop pixel: `frame_from_crop` as a map.
+
+    OpenCV's map for undistortion is this very one, in 0.1 ms instead of 13 ms for 192 x 192; it
+    differs by its float32 only: at most 2e-4 px in frames up to 4096 px wide.
+    """
+    K = crop_camera.K.copy()
+    K[:2, :2] *= samples
+    K[:2, 2] = (K[:2, 2] + 0.5) * samples - 0.5  # pixel centres are integers, edges at halves
+    size = (crop_camera.width * samples, crop_camera.height * samples)
+    x, y = cv2.initUndistortRectifyMap(
+        frame_camera.K, frame_camera.distortion, np.eye(3), K, size, cv2.CV_32FC1
+    )
+    return x, y
+
+
+def _touches_border(mask: Bool[np.ndarray, "H W"]) -> bool:
+    height, width = mask.shape
+    x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
+    if w == 0:
+        return False
+    return min(x, y, width - (x + w), height - (y + h)) <= _BORDER_PX
+
+
+def _sharpness(image: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]) -> float:
+    """Variance of the Laplacian inside the mask (Pech-Pacheco et al., ICPR 2000)."""
+    if not mask.any():
+        return 0.0
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return float(cv2.Laplacian(grey, cv2.CV_64F)[mask].var())
