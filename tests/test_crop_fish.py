@@ -190,6 +190,13 @@ def test_a_mask_larger_than_its_box_widens_the_crop():
     assert crop.crop_camera.K[0, 0] / camera.K[0, 0] == pytest.approx(192 / (60 * 1.3))
 
 
+def test_a_box_of_no_size_to_speak_of_is_cropped_all_the_same():
+    camera = Camera.nominal(width=400, height=300)
+    crop = crop_of(np.zeros((300, 400), bool), camera, box=[210, 110, 210 + 1e-9, 110 + 1e-9])
+    assert not crop.mask.any()
+    assert (crop.image == 128).all()
+
+
 def test_outside_of_the_frame_there_is_nothing():
     camera = Camera.nominal(width=100, height=80)
     mask = np.zeros((80, 100), bool)

@@ -121,10 +121,11 @@ def _camera_around(
     )
     rays = frame_camera.back_project(outline)
     low, high = rays.min(axis=0), rays.max(axis=0)
-    side_px = ((high - low)[:2] * frame_camera.K[[0, 1], [0, 1]]).max()
+    extent_px = (high - low)[:2] * frame_camera.K[[0, 1], [0, 1]]
+    side_px = max(1.0, *extent_px)  # annotators do click by mistake
     return frame_camera.crop(
         center_px=frame_camera.project((low + high)[None] / 2)[0],
-        side_px=float(side_px) * (1 + 2 * settings.margin),
+        side_px=float(side_px * (1 + 2 * settings.margin)),
         size=settings.crop_size_px,
     )
 
