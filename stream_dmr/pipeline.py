@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from stream_dmr.messages import Frame, Message
 
@@ -24,8 +24,11 @@ _SOURCE_GRACE_S = 1.0  # a camera that hangs in a read is left behind after this
 class Node(Protocol):
     """A stage of the chain: holds its per-track state, does no I/O, never reads a wall clock."""
 
-    def step(self, message: Message, /) -> Sequence[Message]:
-        """Take one message of the stage before; return what follows from it, in order."""
+    def step(self, message: Any, /) -> Sequence[Message]:
+        """Take one message of the stage before; return what follows from it, in order.
+
+        Each node names its own type; `tests/test_architecture.py` checks that they fit together.
+        """
         ...
 
     def tick(self, timestamp_ns: int, /) -> Sequence[Message]:
@@ -62,17 +65,18 @@ def run_chain(
     source: Iterable[Frame],
     nodes: Sequence[Node],
     *,
-    on_message: Callable[[Message], None],
+    on_message: Callable[[Message], Message],
     stop: threading.Event,
     on_frame: Callable[[], None] = lambda: None,
 ) -> list[StageCounters]:
     """Run every frame of `source` through `nodes`; return the counters of source and nodes.
 
-    `on_message` sees every message of every stage before the next stage does; it is called from
-    the stages' threads, in the stage's order. `on_frame` is called when a frame has left the last
-    stage. Setting `stop` ends the chain soon: the busiest stage and those before it drop what they
-    have not begun, those after it finish what they were given, and every node is closed. An
-    exception ends the chain in the same way, at the stage where it happened, and is raised here.
+    `on_message` takes every message of every stage, in the stage's order and in its thread, and
+    returns what the next stage gets: a recorder returns what a replay will read. `on_frame` is
+    called when a frame has left the last stage. Setting `stop` ends the chain soon: the busiest
+    stage and those before it drop what they have not begun, those after it finish what they were
+    given, and every node is closed. An exception ends the chain in the same way, at the stage
+    where it happened, and is raised here.
     """
     return _Chain(source, nodes, on_message=on_message, on_frame=on_frame, stop=stop).run()
 
@@ -85,7 +89,7 @@ class _Chain:
         source: Iterable[Frame],
         nodes: Sequence[Node],
         *,
-        on_message: Callable[[Message], None],
+        on_message: Callable[[Message], Message],
         on_frame: Callable[[], None],
         stop: threading.Event,
     ) -> None:
@@ -177,8 +181,7 @@ class _Chain:
 
     def _emit(self, stage: int, messages: Sequence[Message], made: _Batch) -> None:
         for message in messages:
-            self._on_message(message)
-            made.messages.append(message)
+            made.messages.append(self._on_message(message))
             self._counters[stage].messages_out += 1
 
     def _take(self, stage: int) -> _Batch | None:

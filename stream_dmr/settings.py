@@ -9,4 +9,4 @@ class Settings(BaseModel):
     Unknown keys and wrong types are refused; `config.py` turns the refusal into one clear line.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)

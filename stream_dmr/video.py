@@ -31,7 +31,7 @@ class ReadFramesSettings(Settings):
     """`[read_frames]`: how a source is read."""
 
     images_fps: float = Field(
-        30.0,
+        default=30.0,
         gt=0,
         allow_inf_nan=False,
         description="frames/s of folders of pictures and of videos without timestamps",

@@ -48,9 +48,10 @@ class Recorded:
     def __init__(self) -> None:
         self.messages: list[tuple[str, int]] = []
 
-    def __call__(self, message: Message) -> None:
+    def __call__(self, message: Message) -> Message:
         assert isinstance(message, Frame)
         self.messages.append((message.source, message.frame_index))
+        return message
 
     def of(self, stage: str) -> list[int]:
         return [index for source, index in self.messages if source == stage]
@@ -95,12 +96,27 @@ def test_each_stage_sends_what_it_would_without_threads_in_the_same_order(count,
     assert [c.messages_in for c in counters[2:]] == [c.messages_out for c in counters[1:-1]]
 
 
+def test_the_next_stage_gets_what_the_recorder_returns():
+    def lossy(message: Message) -> Message:
+        return frame(message.frame_index + 100) if message.frame_index < 100 else message
+
+    seen = []
+
+    class Last(Repeat):
+        def step(self, message: Message) -> Sequence[Message]:
+            seen.append(message.frame_index)
+            return []
+
+    run_chain(frames(3), [Last("last")], on_message=lossy, stop=threading.Event())
+    assert seen == [101, 102, 103]
+
+
 def test_every_frame_is_reported_when_it_has_left_the_chain():
     done = []
     run_chain(
         frames(5),
         [Repeat("a"), Repeat("b", copies=0)],
-        on_message=lambda message: None,
+        on_message=lambda message: message,
         on_frame=lambda: done.append(1),
         stop=threading.Event(),
     )
@@ -126,7 +142,7 @@ def test_the_source_waits_for_a_slow_stage():
             finished += 1
 
     nodes = [Repeat("quick"), Repeat("slow", delay_s=0.002), Repeat("last")]
-    run_chain(source(), nodes, on_message=lambda m: None, on_frame=done, stop=threading.Event())
+    run_chain(source(), nodes, on_message=lambda m: m, on_frame=done, stop=threading.Event())
     assert max(ahead) < 15
 
 
@@ -213,10 +229,11 @@ def test_an_exception_in_the_source_loses_nothing_that_was_read():
 
 @pytest.mark.parametrize("stage", ["test", "a", "b", "b.close"])
 def test_an_exception_in_the_recorder_ends_the_chain(stage):
-    def full(message: Message) -> None:
+    def full(message: Message) -> Message:
         assert isinstance(message, Frame)
         if message.source == stage and message.frame_index in (0, 3):
             raise BrokenError("disk full")
+        return message
 
     nodes = [Repeat("a"), Repeat("b", owes=True)]
     with pytest.raises(BrokenError, match="disk full"):

@@ -21,12 +21,17 @@ _MOST_SAMPLES = 4  # per crop pixel and axis; more cost time and change nothing 
 class CropFishSettings(Settings):
     """`[crop_fish]`: how fish are cut out of the frame."""
 
-    crop_size_px: int = Field(192, ge=32, le=1024, description="width and height of a crop, px")
+    crop_size_px: int = Field(
+        default=192, ge=32, le=1024, description="width and height of a crop, px"
+    )
     margin: float = Field(
-        0.15, ge=0, le=2, description="room on each side, as a fraction of the fish's longer side"
+        default=0.15,
+        ge=0,
+        le=2,
+        description="room on each side, as a fraction of the fish's longer side",
     )
     min_mask_area_px: int = Field(
-        64, ge=1, description="a smaller mask counts as none, in frame px"
+        default=64, ge=1, description="a smaller mask counts as none, in frame px"
     )
 
 

@@ -1,0 +1,206 @@
+"""The command `stream-dmr`. What is heavy is imported inside the commands: --help must be quick."""
+
+import re
+import shlex
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Annotated
+
+import typer
+
+from stream_dmr import __version__
+from stream_dmr.cli_calibrate import calibrate
+from stream_dmr.errors import UserError
+
+app = typer.Typer(
+    name="stream-dmr",
+    help="Lengths of hooked, bent fish from one calibrated camera, with every stage recorded.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+app.command()(calibrate)
+
+
+def main() -> None:
+    """Run the command; a user's mistake is one line and exit code 2, our own a traceback and 1."""
+    try:
+        app(prog_name="stream-dmr")
+    except UserError as error:
+        print(f"error: {one_line(error)}", file=sys.stderr)
+        sys.exit(2)
+    except Exception as error:
+        traceback.print_exc()
+        print(
+            f"error: stream-dmr broke down ({type(error).__name__}); this is not your fault, "
+            "please report it with the lines above",
+            file=sys.stderr,
+        )
+        sys.exit(1)
+
+
+def one_line(error: UserError) -> str:
+    """The message of an error and its notes on one line."""
+    parts = [str(error), *getattr(error, "__notes__", [])]
+    return "; ".join(" ".join(part.splitlines()) for part in parts)
+
+
+def _print_version(is_asked: bool) -> None:
+    if is_asked:
+        print(f"stream-dmr {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version."),
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command("run")
+def run_command(
+    source: Annotated[
+        str,
+        typer.Option(help="A video, a folder of pictures, rtsp://... or a camera's index."),
+    ],
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="Calibration file. Without one: relative shapes, no millimetres."),
+    ] = None,
+    boxes: Annotated[
+        Path | None, typer.Option(help="Boxes as MOT Challenge text, frames from 1.")
+    ] = None,
+    masks: Annotated[
+        Path | None,
+        typer.Option(help="Folder of %06d.png from 1; a pixel's value is the fish's id."),
+    ] = None,
+    template: Annotated[
+        str, typer.Option(help="The species: halibut, cod, or a mesh with its TOML beside it.")
+    ] = "halibut",
+    config: Annotated[
+        Path | None, typer.Option(help="A config.toml; left-out settings keep their defaults.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for the results; one with results of an earlier run is refused.",
+            show_default="runs/<name of the source>",
+        ),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the results of an earlier run in --out.")
+    ] = False,
+) -> None:
+    """Measure the fish of a clip.
+
+    Writes lengths.csv, frames.csv, recording.mcap and recording.rrd into --out. Ctrl-C ends the
+    run early and keeps what was done.
+    """
+    with _stop_on_signals() as stop:
+        from stream_dmr.display import RunDisplay, print_fish
+        from stream_dmr.run import RunRequest, run
+
+        request = RunRequest(
+            source=source,
+            out=out or default_out(source),
+            calibration=calibration,
+            boxes=boxes,
+            masks=masks,
+            template=template,
+            config=config,
+            overwrite=overwrite,
+            command=_command_line(),
+        )
+        with RunDisplay() as display:
+            summary = run(request, stop=stop, observer=display)
+        print_fish(summary.fish)
+        rate = summary.num_frames / summary.elapsed_s
+        print(f"{summary.num_frames} frames in {summary.elapsed_s:.1f} s, {rate:.1f} frames/s")
+        print(f"results in {request.out}: {', '.join(path.name for path in summary.files)}")
+    if stop.signal_number:
+        print(f"stopped by {signal.Signals(stop.signal_number).name}", file=sys.stderr)
+        raise typer.Exit(128 + stop.signal_number)
+
+
+def default_out(source: str) -> Path:
+    """runs/ and the name of the source, made fit for a folder's name."""
+    if source.isdecimal() and not Path(source).exists():
+        return Path("runs") / f"camera-{source}"
+    if "://" in source:
+        address = _without_password(source).split("://", 1)[1]
+        return Path("runs") / re.sub(r"[^A-Za-z0-9._-]+", "-", address).strip("-")
+    return Path("runs") / Path(source).resolve().stem
+
+
+def _without_password(text: str) -> str:
+    return re.sub(r"(?<=://)[^/\s]*@", "", text)
+
+
+def _command_line() -> str:
+    return _without_password(shlex.join(["stream-dmr", *sys.argv[1:]]))
+
+
+class _Stop(threading.Event):
+    """Set by a signal, which it remembers."""
+
+    signal_number = 0
+
+
+@contextmanager
+def _stop_on_signals() -> Iterator[_Stop]:
+    """Ctrl-C and SIGTERM set the event instead of breaking in; repeated ones change nothing."""
+    stop = _Stop()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        if not stop.is_set():
+            stop.signal_number = number
+            stop.set()
+
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, on_signal) for number in signals]
+    try:
+        yield stop
+    finally:
+        for number, handler in zip(signals, before, strict=True):
+            signal.signal(number, handler)
+
+
+@app.command("simulate")
+def simulate_command(
+    out: Annotated[Path, typer.Option(help="Folder for the scene.")],
+    fish: Annotated[int, typer.Option(help="Number of fish.")] = 3,
+    frames: Annotated[int, typer.Option(help="Number of frames.")] = 60,
+    preset: Annotated[str, typer.Option(help="clean, realistic or severe.")] = "realistic",
+    seed: Annotated[int, typer.Option(help="Equal seeds give equal scenes.")] = 0,
+) -> None:
+    """Make a scene of hooked fish with known lengths: video, boxes, masks, calibration, truth."""
+    from stream_dmr.simulation import simulate
+
+    simulate(out, num_fish=fish, num_frames=frames, preset=preset, seed=seed)
+    print(f"scene in {out}: video.mp4, boxes.txt, masks, calibration.yaml, truth.csv, species.ply")
+
+
+@app.command("evaluate")
+def evaluate_command(
+    lengths: Annotated[Path, typer.Option(help="lengths.csv of a run.")],
+    truth: Annotated[Path, typer.Option(help="truth.csv with track_id,length_mm.")],
+) -> None:
+    """Compare measured lengths with known ones."""
+    from stream_dmr.display import print_evaluation
+    from stream_dmr.evaluation import evaluate
+
+    print_evaluation(evaluate(lengths, truth))
+
+
+if __name__ == "__main__":
+    main()
