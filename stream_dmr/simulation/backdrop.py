@@ -30,7 +30,9 @@ class Backdrop:
     def __init__(self, rng: np.random.Generator, *, width: int, height: int) -> None:
         self._width, self._height = width, height
         big = (height + _SEA_MARGIN_PX, width + _SEA_MARGIN_PX)
-        self._swell = _grey(0.8 * noise(rng, *big, grain_px=(90, 34)) + _ripples(rng, big, 11.0))
+        self._swell = _grey(
+            0.8 * noise(rng, *big, grain_px=(90.0, 34.0)) + _ripples(rng, big, 11.0)
+        )
         self._chop = _grey(_ripples(rng, big, 5.0) + 0.5 * _ripples(rng, big, 2.2))
         self._colours = np.stack(
             [
@@ -49,7 +51,7 @@ class Backdrop:
         swell = self._cut(self._swell, speed=0.021, frame_index=frame_index, phase=self._drift[0])
         chop = self._cut(self._chop, speed=-0.033, frame_index=frame_index, phase=self._drift[1])
         waves = cv2.addWeighted(swell, 0.62, chop, 0.38, 0.0)
-        image = cv2.LUT(cv2.merge([waves] * 3), self._colours)
+        image = cv2.applyColorMap(waves, self._colours)
         top = image[: len(self._rail)]
         top[self._rail_mask] = self._rail[self._rail_mask]
         return image
@@ -131,10 +133,10 @@ def _draw_rail(
     slope = rng.uniform(-14.0, 14.0)
     edge = _RAIL_PX + slope * np.linspace(-1.0, 1.0, width)
     y = np.arange(height)[:, None]
-    paint = 128 + 5 * noise(rng, height, width, grain_px=(30, 8))
-    paint += 3 * noise(rng, height, width, grain_px=(1, 1))
+    paint = 128 + 5 * noise(rng, height, width, grain_px=(30.0, 8.0))
+    paint += 3 * noise(rng, height, width, grain_px=(1.0, 1.0))
     steel = paint[..., None] * np.array([0.92, 0.98, 0.96], np.float32)
-    rust = np.clip(noise(rng, height, width, grain_px=(3, 26)) - 1.1, 0.0, 1.0)[..., None]
+    rust = np.clip(noise(rng, height, width, grain_px=(3.0, 26.0)) - 1.1, 0.0, 1.0)[..., None]
     steel = steel * (1 - rust) + rust * np.array([38, 66, 112], np.float32)
     lip = np.exp(-(((y - edge + 6) / 4.0) ** 2))[..., None]
     steel = steel * (1 - 0.55 * lip) + 0.55 * lip * 190

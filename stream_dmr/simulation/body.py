@@ -33,7 +33,7 @@ class Body:
 
     def half_width_at(self, s: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
         """Half the breadth of the outline at s, fins included; `half_width` at `widest_at`."""
-        flesh = self.half_width * _bump(s, peak=self.widest_at, end=0.93, power=0.8)
+        flesh = self.half_width * _bump(s, peak=self.widest_at, end=0.92, power=0.8)
         flare = np.clip((s - self.tail_from) / (1.0 - self.tail_from), 0.0, 1.0) ** 1.2
         peduncle = self.peduncle_half_width * _smooth_step((s - 0.6) / 0.2)
         tail = peduncle + (self.tail_half_width - self.peduncle_half_width) * flare

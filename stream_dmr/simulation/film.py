@@ -5,15 +5,20 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8, UInt16
+from jaxtyping import Bool, Float, Int16, UInt8, UInt16
 
 from stream_dmr.simulation.backdrop import Backdrop, draw_gaff, draw_hook, draw_line
 from stream_dmr.simulation.fish import PosedFish
 from stream_dmr.simulation.render import Patch, draw_fish_patch, frame_window, paste
 from stream_dmr.simulation.scene import Scene, Visit
 
-_BACKDROP, _FRAME = 8, 9  # streams of random numbers; the scene and the skin have the others
+_BACKDROP, _FRAME, _SENSOR = (
+    8,
+    9,
+    10,
+)  # streams of random numbers; the scene and the skin have the others
 _GAFF_FROM, _GAFF_UNTIL = 0.36, 0.66  # of a fish's visit
+_NOISE_MARGIN_PX = 256
 _MIN_BOX_PIXELS = 30  # fewer are too few to be called seen
 
 
@@ -43,11 +48,14 @@ def film(scene: Scene) -> Iterator[Shot]:
     backdrop = Backdrop(
         np.random.default_rng((scene.seed, _BACKDROP)), width=camera.width, height=camera.height
     )
+    noise = _draw_sensor_noise(scene)
     for frame_index in range(1, scene.num_frames + 1):
-        yield _shoot(scene, backdrop, frame_index)
+        yield _shoot(scene, backdrop, noise, frame_index)
 
 
-def _shoot(scene: Scene, backdrop: Backdrop, frame_index: int) -> Shot:
+def _shoot(
+    scene: Scene, backdrop: Backdrop, noise: Int16[np.ndarray, "A B 3"], frame_index: int
+) -> Shot:
     rng = np.random.default_rng((scene.seed, _FRAME, frame_index))
     image = backdrop.draw(frame_index)
     labels = np.zeros(image.shape[:2], np.uint16)
@@ -66,7 +74,7 @@ def _shoot(scene: Scene, backdrop: Backdrop, frame_index: int) -> Shot:
         labels[_draw_gaff(scene, visit, posed[visit.fish.track_id], image, frame_index)] = 0
     return Shot(
         frame_index=frame_index,
-        image=_expose(image, rng, noise_levels=scene.preset.noise_levels),
+        image=_expose(image, rng, noise),
         labels=labels,
         boxes=_boxes(labels, pixels_in_all, frame_index),
     )
@@ -79,10 +87,10 @@ def ragged(
     if amplitude_px == 0.0:
         return mask
     inside = mask.astype(np.uint8)
-    distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)
-    distance -= cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
+    # To the outline, which runs half a pixel beside the outermost pixel centres.
+    depth = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - 0.5
+    distance = np.where(mask, depth, 0.5 - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5))
     shift = cv2.GaussianBlur(rng.standard_normal(mask.shape, np.float32), (0, 0), 4.0)
-    # Signed distances are +-1 at the pixels on both sides of an outline, so 0 leaves it as it is.
     return distance + amplitude_px * shift / shift.std() > 0.0
 
 
@@ -152,12 +160,22 @@ def _boxes(
     return boxes
 
 
+def _draw_sensor_noise(scene: Scene) -> Int16[np.ndarray, "A B 3"]:
+    """One picture of noise, larger than the frames, which each frame is to cut at random.
+
+    Noise of its own for every frame would take longer than all the rest.
+    """
+    rng = np.random.default_rng((scene.seed, _SENSOR))
+    camera = scene.calibration.camera
+    size = (camera.height + _NOISE_MARGIN_PX, camera.width + _NOISE_MARGIN_PX, 3)
+    noise = scene.preset.noise_levels * rng.standard_normal(size, np.float32)
+    return np.round(noise).astype(np.int16)
+
+
 def _expose(
-    image: UInt8[np.ndarray, "H W 3"], rng: np.random.Generator, *, noise_levels: float
+    image: UInt8[np.ndarray, "H W 3"], rng: np.random.Generator, noise: Int16[np.ndarray, "A B 3"]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Sensor noise: one tile of it, repeated, since noise for the whole frame takes too long."""
+    """The picture with the sensor's noise in it."""
     height, width = image.shape[:2]
-    tile = np.round(noise_levels * rng.standard_normal((256, 256, 3), np.float32)).astype(np.int16)
-    tile = np.tile(tile, (height // 256 + 2, width // 256 + 2, 1))
-    y, x = rng.integers(256, size=2)
-    return cv2.add(image, tile[y : y + height, x : x + width], dtype=cv2.CV_8U)
+    y, x = rng.integers(_NOISE_MARGIN_PX, size=2)
+    return cv2.add(image, noise[y : y + height, x : x + width], dtype=cv2.CV_8U)

@@ -50,12 +50,12 @@ def draw_still_pose(
 def _draw_bends(
     rng: np.random.Generator, preset: Preset, seconds: Float[np.ndarray, "T"]
 ) -> Float[np.ndarray, "T 3 K"]:
-    """Curvature coefficients over time; the most bent frame turns by half to all of the preset."""
+    """Curvature coefficients over time; the most bent frame turns by 70 to 100 % of the preset."""
     sizes = _ROW_SIZES[:, None] * _ORDER_SIZES
     posture = rng.standard_normal(sizes.shape)  # kept throughout, beside what moves
     bends = sizes * (posture + _wander(rng, seconds, sizes.shape, fastest_hz=1.2))
     peak = max(total_bend_rad(frame) for frame in bends)
-    bends *= np.radians(preset.max_bend_deg) * rng.uniform(0.5, 1.0) / peak
+    bends *= np.radians(preset.max_bend_deg) * rng.uniform(0.7, 1.0) / peak
     twist = np.radians(preset.max_twist_deg) * np.tanh(_wander(rng, seconds, (), fastest_hz=0.8))
     bends[:, 0, 0] = twist * np.pi / 2  # sin(pi s) integrates to 2 / pi
     return bends

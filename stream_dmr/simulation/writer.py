@@ -68,6 +68,13 @@ def write_species(out: Path) -> None:
     )
 
 
+def encode_mask(labels: UInt16[np.ndarray, "H W"], *, num_fish: int) -> bytes:
+    """Track ids as a PNG: 8-bit where they fit, else 16-bit."""
+    pixels = labels.astype(np.uint8) if num_fish <= 255 else labels
+    _, encoded = cv2.imencode(".png", pixels)
+    return encoded.tobytes()
+
+
 def _check(*, num_fish: int, num_frames: int, seed: int) -> None:
     if not 0 <= num_fish <= _MAX_FISH:
         raise UserError(f"--fish: expected a number from 0 to {_MAX_FISH}, got {num_fish}")
@@ -126,16 +133,12 @@ def _write_film(out: Path, scene: Scene) -> None:
         with (out / "boxes.txt").open("w", encoding="utf-8") as boxes:
             for shot in film(scene):
                 video.write(shot.image)
-                _write_mask(out / "masks" / f"{shot.frame_index:06d}.png", shot.labels, scene)
+                # Unlike imwrite, write_bytes says what went wrong.
+                png = encode_mask(shot.labels, num_fish=len(scene.visits))
+                (out / "masks" / f"{shot.frame_index:06d}.png").write_bytes(png)
                 boxes.writelines(map(_mot_line, shot.boxes))
     finally:
         video.release()
-
-
-def _write_mask(path: Path, labels: UInt16[np.ndarray, "H W"], scene: Scene) -> None:
-    pixels = labels if len(scene.visits) > 255 else labels.astype(np.uint8)
-    _, encoded = cv2.imencode(".png", pixels)
-    path.write_bytes(encoded.tobytes())  # unlike imwrite, it says what went wrong
 
 
 def _mot_line(box: Box) -> str:
