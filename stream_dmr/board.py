@@ -115,7 +115,7 @@ def draw_views(result: BoardResult, folder: Path) -> None:
 def _look(
     image_paths: Iterable[Path | str], plane_image: Path, board: Board
 ) -> tuple[dict[Path, np.ndarray], tuple[int, int], list[LeftOut]]:
-    """Corners of each usable picture, the plane's first; its (width, height); the left out."""
+    """Return corners by picture, the plane's first; its (width, height); and who is left out."""
     try:
         picture = read_grey(plane_image)
         plane_corners = _corners_or_refuse(picture, board)

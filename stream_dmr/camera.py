@@ -38,9 +38,7 @@ class Camera:
         ).reshape(-1, 2)
         return np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1)
 
-    def crop(
-        self, *, center_px: Float[np.ndarray, "2"], side_px: float, size: int
-    ) -> "Camera":
+    def crop(self, *, center_px: Float[np.ndarray, "2"], side_px: float, size: int) -> "Camera":
         """The ideal pinhole camera of a square crop, in the orientation of this camera.
 
         The crop is centered on the frame pixel `center_px`; it spans about `side_px` frame pixels
@@ -61,7 +59,7 @@ class Camera:
 
     @classmethod
     def nominal(cls, *, width: int, height: int) -> "Camera":
-        """A stand-in where nothing is calibrated: a field of view of some 45 degrees, no distortion.
+        """A stand-in where nothing is calibrated: some 45 degrees wide, no distortion.
 
         Good enough for relative shapes; never for millimetres.
         """
@@ -103,7 +101,7 @@ class ReferencePlane:
         return np.linalg.inv(self.homography(np.eye(3)))
 
     def depth_mm(self, rays: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
-        """Depth Z at which rays (X, Y, 1) meet the plane, by eq. (10); negative behind the camera."""
+        """Depth Z at which rays (X, Y, 1) meet the plane (eq. 10); negative behind the camera."""
         return 1.0 / (rays @ self._plane_from_ray.T)[:, 2]
 
 

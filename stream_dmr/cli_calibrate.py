@@ -46,14 +46,15 @@ def calibrate(
         square_mm=square_mm,
     )
     save_calibration(out, result.calibration)
-    folder = corners or out.with_name(f"{out.stem}-corners")
-    draw_views(result, folder)
     console.print(_views_table(result))
     for left in result.left_out:
-        console.print(f"left out: {left.path.name}: {left.reason}", markup=False)
+        console.print(f"left out: {left.path.name}: {left.reason}", markup=False, soft_wrap=True)
     for line in _summary(result):
-        console.print(line, markup=False)
-    console.print(f"calibration: {out}\ncorners drawn: {folder}", markup=False)
+        console.print(line, markup=False, soft_wrap=True)
+    console.print(f"calibration: {out}", markup=False, soft_wrap=True)
+    folder = corners or out.with_name(f"{out.stem}-corners")
+    draw_views(result, folder)
+    console.print(f"corners drawn: {folder}", markup=False, soft_wrap=True)
 
 
 def _views_table(result: "BoardResult") -> "Table":

@@ -279,9 +279,21 @@ def test_corners_begin_at_the_top_left_whichever_way_the_board_is_held(renderer,
     assert corner_error(found, true) < 0.1
 
 
-def test_sixteen_bit_colour_and_turned_pictures_are_read(tmp_path):
+def test_sixteen_bit_colour_pictures_are_read(tmp_path):
     deep = np.random.default_rng(0).integers(0, 65535, (20, 30, 3)).astype(np.uint16)
     assert read_grey(save(tmp_path / "deep.png", deep)).shape == (20, 30)
+
+
+def test_pictures_are_not_turned_by_exif(tmp_path):
+    """The lens does not turn with the way up that a picture is shown."""
+    _, encoded = cv2.imencode(".jpg", np.zeros((20, 30), np.uint8))
+    tiff = b"MM\0*\0\0\0\x08" + b"\0\x01" + b"\x01\x12\0\x03\0\0\0\x01\0\x06\0\0" + bytes(4)
+    exif = b"Exif\0\0" + tiff
+    segment = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
+    content = encoded.tobytes()
+    (tmp_path / "turned.jpg").write_bytes(content[:2] + segment + content[2:])
+    assert cv2.imread(str(tmp_path / "turned.jpg")).shape[:2] == (30, 20)
+    assert read_grey(tmp_path / "turned.jpg").shape == (20, 30)
 
 
 def test_drawing_refuses_an_unwritable_folder(result, tmp_path):
