@@ -90,7 +90,7 @@ def make_template(
 
 def _load_mesh(path: Path) -> trimesh.Trimesh:
     try:
-        mesh = trimesh.load_mesh(path)
+        mesh = trimesh.load_mesh(path, process=False)
     except Exception as error:  # trimesh raises whatever its many readers raise
         raise TemplateError(
             f"template {path}: expected a mesh that trimesh reads, got: {error}"
@@ -99,9 +99,11 @@ def _load_mesh(path: Path) -> trimesh.Trimesh:
         raise TemplateError(
             f"template {path}: expected one mesh with faces, got an empty one; export the surface"
         )
-    mesh.merge_vertices()
+    # Before merging, which would drop such vertices without a word.
     if not np.isfinite(mesh.vertices).all():
         raise TemplateError(f"template {path}: expected finite vertices, got NaN or infinity")
+    # Some formats repeat a vertex for each face, or along the seams of a texture.
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
     if not (mesh.is_watertight and mesh.is_winding_consistent):
         raise TemplateError(
             f"template {path}: expected a closed mesh, got one with holes or flipped faces; "
@@ -121,7 +123,8 @@ def _load_points(path: Path) -> dict[str, Float[np.ndarray, "N 3"]]:
         table = tomllib.loads(path.read_text())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise TemplateError(f"template {path}: expected TOML, got: {error}") from error
-    keypoints = table.get("keypoints", {})
+    keypoints = table.get("keypoints")
+    keypoints = keypoints if isinstance(keypoints, dict) else {}
     missing = [key for key in ("head", "center", "tail") if key not in keypoints]
     if missing:
         raise TemplateError(f"template {path}: [keypoints] lacks {', '.join(missing)}; add it")
@@ -136,11 +139,11 @@ def _load_points(path: Path) -> dict[str, Float[np.ndarray, "N 3"]]:
 
 def _points(values: Any, path: Path, name: str) -> Float[np.ndarray, "N 3"]:
     try:
-        points = np.array(values, dtype=np.float64).reshape(-1, 3)
-    except (ValueError, TypeError) as error:
-        raise TemplateError(
-            f"template {path}: expected {name} as [x, y, z], got {values}"
-        ) from error
+        points = np.array(values, dtype=np.float64) if len(values) else np.empty((0, 3))
+    except (ValueError, TypeError):
+        points = np.empty((0, 0))
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise TemplateError(f"template {path}: expected {name} as [x, y, z], got {values}")
     if not np.isfinite(points).all():
         raise TemplateError(f"template {path}: expected finite {name}, got {values}")
     return points
@@ -166,7 +169,7 @@ def _require_on_mesh(
 
 
 def _is_inside(mesh: trimesh.Trimesh, points: Float[np.ndarray, "N 3"]) -> np.ndarray:
-    """Winding number by solid angles (Van Oosterom and Strackee 1983): works without a ray engine."""
+    """Winding number by solid angles (Van Oosterom and Strackee 1983): needs no ray engine."""
     a, b, c = np.moveaxis(mesh.triangles[None] - points[:, None, None], 2, 0)
     la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
     numerator = np.einsum("nfi,nfi->nf", a, np.cross(b, c))
