@@ -5,7 +5,6 @@ Values are rounded to six decimals, far below what is measured; blank means ther
 
 import csv
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -13,23 +12,19 @@ from jaxtyping import Float
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate, LocalizedFish, Message
 
-LENGTHS_COLUMNS = (
-    "track_id,length_mm,length_std_mm,ci95_low_mm,ci95_high_mm,frames_seen,frames_used,"
-    "first_frame,last_frame,first_time,last_time,status"
-).split(",")
-FRAMES_COLUMNS = (
-    "frame_index,timestamp_ns,track_id,head_u,head_v,center_u,center_v,tail_u,tail_v,"
-    "head_x_mm,head_y_mm,head_z_mm,center_x_mm,center_y_mm,center_z_mm,"
-    "tail_x_mm,tail_y_mm,tail_z_mm,"
-    "bending_ratio,length_mm,length_std_mm,iou,accepted,reason"
-).split(",")
-
-
-class HasMessage(Protocol):
-    """A record of the recorder, of which the tables use the message."""
-
-    @property
-    def message(self) -> Message: ...
+LENGTHS_COLUMNS = [
+    *("track_id", "length_mm", "length_std_mm", "ci95_low_mm", "ci95_high_mm"),
+    *("frames_seen", "frames_used", "first_frame", "last_frame", "first_time", "last_time"),
+    "status",
+]
+FRAMES_COLUMNS = [
+    *("frame_index", "timestamp_ns", "track_id"),
+    *("head_u", "head_v", "center_u", "center_v", "tail_u", "tail_v"),
+    *("head_x_mm", "head_y_mm", "head_z_mm"),
+    *("center_x_mm", "center_y_mm", "center_z_mm"),
+    *("tail_x_mm", "tail_y_mm", "tail_z_mm"),
+    *("bending_ratio", "length_mm", "length_std_mm", "iou", "accepted", "reason"),
+]
 
 
 class Tables:
@@ -44,9 +39,8 @@ class Tables:
         self._frames = _Table(out_dir / "frames.csv", FRAMES_COLUMNS)
         self._waiting: dict[tuple[int, int], LocalizedFish] = {}
 
-    def write(self, record: HasMessage) -> None:
-        """Take any record; OutputError where the disk refuses a row."""
-        message = record.message
+    def write(self, message: Message) -> None:
+        """Take any message; OutputError where the disk refuses a row."""
         if isinstance(message, LocalizedFish):
             self._waiting[message.track_id, message.frame_index] = message
         elif isinstance(message, LengthEstimate):

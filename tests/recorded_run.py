@@ -1,6 +1,8 @@
 """A made-up run for the recording's tests and benchmark: bent fish that swim across the picture."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -35,6 +37,7 @@ def calibration() -> Calibration:
     return Calibration(camera=camera, plane=plane)
 
 
+@cache
 def template(rings: int = 32, around: int = 20) -> Template:
     """A spindle of about 640 vertices."""
     x = np.linspace(-0.5, 0.5, rings)
@@ -94,6 +97,26 @@ def run(num_frames: int, *, num_fish: int = 2, calibrated: bool = True) -> Itera
     for i in range(1, num_fish + 1):
         last = num_frames if i != 2 else 2 * num_frames // 3
         yield _estimate(i, last, calibrated, is_final=True)
+
+
+def assert_same(one: object, other: object, where: str = "") -> None:
+    """Equal to the last bit, types, dtypes and shapes included; NaN equals NaN."""
+    if is_dataclass(one):
+        assert type(one) is type(other), where
+        for field in fields(one):
+            path = f"{where}.{field.name}"
+            assert_same(getattr(one, field.name), getattr(other, field.name), path)
+    elif isinstance(one, np.ndarray):
+        assert isinstance(other, np.ndarray), where
+        assert (one.dtype, one.shape) == (other.dtype, other.shape), where
+        assert one.tobytes() == other.tobytes(), where
+    elif isinstance(one, Mapping):
+        assert isinstance(other, Mapping), where
+        assert list(one.items()) == list(other.items()), where
+    elif isinstance(one, float):
+        assert np.float64(one).tobytes() == np.float64(other).tobytes(), where
+    else:
+        assert one == other, where
 
 
 def _body(i: int, index: int) -> dict[str, np.ndarray]:

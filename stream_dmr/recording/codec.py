@@ -84,7 +84,7 @@ def _fill(proto: Proto, value: object, picture: Picture | None = None) -> None:
             _set(proto, proto.DESCRIPTOR.fields_by_name[field.name], item)
 
 
-def _set(proto: Proto, field: FieldDescriptor, item: Any) -> None:
+def _set(proto: Proto, field: Any, item: Any) -> None:
     if field.message_type is None:
         setattr(proto, field.name, _SCALARS[field.type](item))
         return
@@ -110,7 +110,7 @@ def _build(kind: type[T], proto: Proto) -> T:
     return kind(**{f.name: _get(proto, by_name[f.name]) for f in fields(kind)})  # type: ignore[arg-type]
 
 
-def _get(proto: Proto, field: FieldDescriptor) -> Any:
+def _get(proto: Proto, field: Any) -> Any:
     inner = getattr(proto, field.name)
     if field.is_repeated:
         return {count.name: count.count for count in inner}

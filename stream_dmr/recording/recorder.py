@@ -1,6 +1,5 @@
 """Records a run: every message of every stage, to every sink."""
 
-from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from stream_dmr.tables import Tables
 
 
 class Sink(Protocol):
-    """One kind of output."""
+    """One kind of recording."""
 
     def write(self, record: Record, /) -> None:
         """Take one record; OutputError where the disk refuses it."""
@@ -42,6 +41,7 @@ class Recorder:
         self._settings = settings
         self._lock = Lock()
         self._sinks: list[Sink] = []
+        self._refused: list[Sink] = []
         try:
             out_dir.mkdir(parents=True, exist_ok=True)
             for make in _sink_makers(out_dir, header, settings):
@@ -63,16 +63,29 @@ class Recorder:
         those that the recording holds, and only then does a replay repeat the run exactly.
         """
         record = self._encode(message)
-        with self._lock:
+        with self._lock, ExitStack() as stack:
             for sink in self._sinks:
-                sink.write(record)
+                stack.callback(self._write_to, sink, record)
         return record.message
+
+    def _write_to(self, sink: Sink, record: Record) -> None:
+        """Write to one sink; once the disk has refused it, never again.
+
+        The others go on: where the pictures no longer have room, the lengths still may.
+        """
+        if sink in self._refused:
+            return
+        try:
+            sink.write(record)
+        except OutputError:
+            self._refused.append(sink)
+            raise
 
     def close(self) -> None:
         """Close every sink, also where another one fails; then raise the failure. Idempotent."""
         with self._lock, ExitStack() as stack:
-            while self._sinks:
-                stack.callback(self._sinks.pop(0).close)
+            for sink in (*self._sinks, self._tables):
+                stack.callback(sink.close)
 
     def __enter__(self) -> Self:
         return self
@@ -110,12 +123,10 @@ class Recorder:
         return compress(message.image, format="jpeg", jpeg_quality=quality)
 
 
-def _sink_makers(
-    out_dir: Path, header: RunHeader, settings: RecordingSettings
-) -> Sequence[Callable[[], Sink]]:
-    makers: list[Callable[[], Sink]] = [lambda: Tables(out_dir)]
-    if settings.mcap:
-        makers.append(lambda: McapSink(out_dir, header, flush_s=settings.flush_s))
-    if settings.rrd:
-        makers.append(lambda: RerunSink(out_dir, header, settings))
-    return makers
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"{folder}: expected a folder to write to, got: {error.strerror}; choose another --out"
+        ) from error

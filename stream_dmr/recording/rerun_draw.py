@@ -17,10 +17,13 @@ from stream_dmr.messages import (
 )
 from stream_dmr.recording import topics
 from stream_dmr.recording.header import Record, RunHeader
-from stream_dmr.recording.rerun_view import color, log_calibration, log_camera
+from stream_dmr.recording.rerun_view import NOMINAL_DEPTH, color, log_calibration, log_camera
 
 _HALF_PIXEL = 0.5  # Rerun counts pixels from the corner of the top-left one, we from its centre
-_THIN, _THICK = rr.Radius.ui_points(1.2), rr.Radius.ui_points(4.0)
+_THIN = rr.Radius.ui_points(1.2)
+_DOTS = rr.Radius.ui_points([5.5, 3.5, 3.5])  # head, center, tail: the large one is the head
+_WHITE = (255, 255, 255)
+_SEE_THROUGH = 150  # opacity of a mesh, of 255: the midline shows
 
 
 class Drawing:
@@ -63,7 +66,7 @@ class Drawing:
         self._introduce(crop.track_id)
         if not self._has_camera:
             self._has_camera = True
-            log_camera(self._rec, crop.frame_camera, depth=1.0)
+            log_camera(self._rec, crop.frame_camera, depth=NOMINAL_DEPTH)
         box = rr.Boxes2D(
             array=crop.bbox_xyxy_px,
             array_format=rr.Box2DFormat.XYXY,
@@ -84,7 +87,7 @@ class Drawing:
         track_id, tint = fish.track_id, [color(fish.track_id)]
         shape = self._shapes.pop(track_id, None)
         if fish.keypoints_px is not None:
-            points = rr.Points2D(fish.keypoints_px + _HALF_PIXEL, colors=tint, radii=_THICK)
+            points = rr.Points2D(fish.keypoints_px + _HALF_PIXEL, colors=tint, radii=_DOTS)
             self._log(topics.KEYPOINTS_2D, track_id, points)
         if shape is not None:
             vertices, keypoints, midline = place(shape, fish)
@@ -92,9 +95,9 @@ class Drawing:
                 vertex_positions=vertices, vertex_normals=_normals(vertices, self._faces)
             )
             self._log(topics.MESH, track_id, mesh)
-            dots = rr.Points3D(keypoints, colors=[(255, 255, 255)], radii=_THICK)
+            dots = rr.Points3D(keypoints, colors=[_WHITE], radii=_DOTS)
             self._log(topics.KEYPOINTS_3D, track_id, dots)
-            line = rr.LineStrips3D([midline], colors=[(255, 255, 255)], radii=_THIN)
+            line = rr.LineStrips3D([midline], colors=[_WHITE], radii=_THIN)
             self._log(topics.MIDLINE, track_id, line)
         if fish.accepted and fish.length_mm is not None:
             self._log(topics.FRAME_LENGTH, track_id, rr.Scalars(fish.length_mm))
@@ -102,9 +105,10 @@ class Drawing:
     def _length(self, estimate: LengthEstimate) -> None:
         track_id, reason = estimate.track_id, estimate.frame_reason
         if estimate.is_final:
-            self._event(track_id, _verdict(estimate), rr.TextLogLevel.INFO)
+            self._event(topics.RESULTS, track_id, _verdict(estimate), rr.TextLogLevel.INFO)
         elif reason and reason != self._reasons.get(track_id):
-            self._event(track_id, f"not used from here on: {reason}", rr.TextLogLevel.WARN)
+            text = f"not used from here on: {reason}"
+            self._event(topics.REFUSALS, track_id, text, rr.TextLogLevel.WARN)
         self._reasons[track_id] = reason
         if estimate.length_mm is not None and estimate.ci95_mm is not None:
             values = [estimate.length_mm, *estimate.ci95_mm]
@@ -116,7 +120,9 @@ class Drawing:
             return
         self._tracks.add(track_id)
         tint, name = color(track_id), f"fish {track_id}"
-        mesh = rr.Mesh3D.from_fields(triangle_indices=self._faces, albedo_factor=tint)
+        mesh = rr.Mesh3D.from_fields(
+            triangle_indices=self._faces, albedo_factor=(*tint, _SEE_THROUGH)
+        )
         self._log(topics.MESH, track_id, mesh, static=True)
         lines = rr.SeriesLines(
             names=[name, f"{name} low", f"{name} high"],
@@ -128,9 +134,9 @@ class Drawing:
         self._log(topics.FRAME_LENGTH, track_id, dots, static=True)
         self._log(topics.IOU, track_id, rr.SeriesLines(names=name, colors=tint), static=True)
 
-    def _event(self, track_id: int, text: str, level: str) -> None:
-        line = rr.TextLog(f"fish {track_id}: {text}", level=level, color=color(track_id))
-        self._rec.log(topics.LOG, line)
+    def _event(self, path: str, track_id: int, text: str, level: rr.TextLogLevel) -> None:
+        line = f"fish {track_id}: {text}"
+        self._rec.log(path, rr.TextLog(line, level=str(level), color=color(track_id)))
 
     def _log(
         self, path: str, track_id: int, what: rr.AsComponents, *, static: bool = False

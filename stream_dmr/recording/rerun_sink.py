@@ -50,9 +50,10 @@ class RerunSink:
         """Draw one record; OutputError where the disk refuses it."""
         message = record.message
         self._rec.set_time("frame", sequence=message.frame_index)
-        since = "timestamp" if message.timestamp_ns > _EPOCH_NS else "duration"
-        kind = np.datetime64 if since == "timestamp" else np.timedelta64
-        self._rec.set_time("time", **{since: kind(message.timestamp_ns, "ns")})
+        if message.timestamp_ns > _EPOCH_NS:
+            self._rec.set_time("time", timestamp=np.datetime64(message.timestamp_ns, "ns"))
+        else:
+            self._rec.set_time("time", duration=np.timedelta64(message.timestamp_ns, "ns"))
         self._drawing.draw(record)
         if self._with_messages:
             self._log_message(record)

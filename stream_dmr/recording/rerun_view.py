@@ -20,6 +20,8 @@ _PALETTE = (
 )
 _GRID_MM = 100.0
 _GREY = (150, 160, 170, 90)
+_PICTURE_DEPTH = 0.35  # of the camera's picture in the scene, of the distance to the fish
+NOMINAL_DEPTH = 2.5  # of a fish without calibration, in body lengths: it fills half the picture
 RUN = "run"
 
 
@@ -37,7 +39,11 @@ def blueprint(calibration: Calibration | None) -> rrb.Blueprint:
                 _scene_view(calibration),
             ),
             rrb.Horizontal(
-                rrb.TimeSeriesView(origin="length", name="Length and its 95 % band, mm"),
+                rrb.TimeSeriesView(
+                    origin="length",
+                    name="Length, its 95 % band, and single frames, mm",
+                    plot_legend=rrb.PlotLegend(visible=False),  # it hides the lines; hover names
+                ),
                 rrb.TimeSeriesView(
                     origin="iou", name="Silhouette IoU", axis_y=rrb.ScalarAxis(range=(0.5, 1.0))
                 ),
@@ -55,7 +61,7 @@ def blueprint(calibration: Calibration | None) -> rrb.Blueprint:
 
 
 def _scene_view(calibration: Calibration | None) -> rrb.Spatial3DView:
-    depth = 1.0 if calibration is None else _middle(calibration)[2]
+    depth = NOMINAL_DEPTH if calibration is None else _middle(calibration)[2]
     return rrb.Spatial3DView(
         origin="scene",
         contents=["scene/**", "- scene/camera/fish/**"],
@@ -63,22 +69,22 @@ def _scene_view(calibration: Calibration | None) -> rrb.Spatial3DView:
         line_grid=rrb.LineGrid3D(visible=False),
         # From above the camera's right shoulder, towards the fish.
         eye_controls=rrb.EyeControls3D(
-            position=(0.75 * depth, -0.45 * depth, -0.1 * depth),
-            look_target=(0.0, 0.0, depth),
+            position=(0.85 * depth, -0.5 * depth, -0.35 * depth),
+            look_target=(0.0, 0.0, 0.75 * depth),
             eye_up=(0.0, -1.0, 0.0),
         ),
     )
 
 
 def log_camera(rec: rr.RecordingStream, camera: Camera, *, depth: float) -> None:
-    """The camera, for all time; its picture stands `depth` in front of it, behind the fish."""
+    """The camera, for all time, for fish that hang some `depth` away."""
     # Rerun counts pixels from the corner of the top-left one, we from its centre.
     shift = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
     pinhole = rr.Pinhole(
         image_from_camera=shift @ camera.K,
         resolution=(camera.width, camera.height),
         camera_xyz=rr.ViewCoordinates.RDF,
-        image_plane_distance=depth,
+        image_plane_distance=_PICTURE_DEPTH * depth,
     )
     rec.log(CAMERA, pinhole, static=True)
 
@@ -86,7 +92,7 @@ def log_camera(rec: rr.RecordingStream, camera: Camera, *, depth: float) -> None
 def log_calibration(rec: rr.RecordingStream, calibration: Calibration) -> None:
     """The camera and the reference plane as a grid of 100 mm, for all time."""
     middle, camera, plane = _middle(calibration), calibration.camera, calibration.plane
-    log_camera(rec, camera, depth=0.35 * middle[2])
+    log_camera(rec, camera, depth=middle[2])
     half = 0.6 * middle[2] * max(camera.width / camera.K[0, 0], camera.height / camera.K[1, 1])
     lines = _grid(plane.rotation.T @ (middle - plane.translation_mm), half)
     strips = lines @ plane.rotation.T + plane.translation_mm

@@ -32,7 +32,7 @@ _FIELD = re.compile(r"(optional |repeated |)(\w+) (\w+) = (\d+);")
 
 def proto_class(name: str) -> type[Proto]:
     """The protobuf class of a message of `messages.proto`, by its name there."""
-    return message_factory.GetMessageClass(_pool().FindMessageTypeByName(f"{PACKAGE}.{name}"))
+    return _classes()[name]
 
 
 def schema_bytes() -> bytes:
@@ -79,7 +79,8 @@ def _file_descriptor() -> FileDescriptorProto:
 
 
 @cache
-def _pool() -> descriptor_pool.DescriptorPool:
+def _classes() -> dict[str, type[Proto]]:
     pool = descriptor_pool.DescriptorPool()
-    pool.Add(_file_descriptor())
-    return pool
+    file = pool.AddSerializedFile(_file_descriptor().SerializeToString())
+    messages = file.message_types_by_name.items()
+    return {name: message_factory.GetMessageClass(message) for name, message in messages}

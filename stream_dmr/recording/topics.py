@@ -38,7 +38,7 @@ KEYPOINTS_2D = "scene/camera/fish/{id}/keypoints"
 KEYPOINTS_3D, MIDLINE = "scene/fish/{id}/keypoints", "scene/fish/{id}/midline"
 FRAME_LENGTH, LENGTH = "length/{id}/frame", "length/{id}/estimate"
 IOU = "iou/{id}"
-LOG = "log"
+LOG, REFUSALS, RESULTS = "log", "log/refusals", "log/lengths"
 CAMERA, PLANE = "scene/camera", "scene/plane"  # static, from the header
 FISH_ROOTS = ("scene/camera/fish", "scene/fish")  # what a new frame clears
 
@@ -53,7 +53,7 @@ TOPICS: dict[type[Message], Topic] = {
             topic="/localized",
             entities=(KEYPOINTS_2D, KEYPOINTS_3D, MIDLINE, FRAME_LENGTH),
         ),
-        Topic(message=LengthEstimate, topic="/length", entities=(LENGTH, LOG)),
+        Topic(message=LengthEstimate, topic="/length", entities=(LENGTH, REFUSALS, RESULTS)),
     )
 }
 
