@@ -73,7 +73,7 @@ def rim_edges(vertices_px: Float[Tensor, "B V 2"], rig: Rig) -> Rim:
 
 
 class _Pieces(NamedTuple):
-    """Rim edges cut at the borders of pixels: each piece lies within one cell of the padded grid."""
+    """Rim edges cut at the borders of pixels: each piece lies in one cell of the padded grid."""
 
     edge: Int[Tensor, "K"]
     cell: Int[Tensor, "K"]  # flat index into the padded grid (batch, size + 2, size + 3)

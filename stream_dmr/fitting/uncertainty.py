@@ -51,7 +51,7 @@ def log_length(shape: Deformed) -> Float[Tensor, "B"]:
 def _visible_rim(
     objective: Objective, flat: Float[Tensor, "P"]
 ) -> tuple[Tensor, Float[Tensor, "N 2"], Float[Tensor, "N"]]:
-    """Vertices of the rim that bound the silhouette, the outline's normals there and its lengths."""
+    """Vertices of the rim that bound the silhouette, with the outline's normals and lengths."""
     pixels = objective.project(objective.deform(flat[None]).vertices)
     rim = rim_edges(pixels, objective.rig)
     start, end = pixels[0, rim.start], pixels[0, rim.end]

@@ -177,7 +177,7 @@ def main() -> None:
     """Write every species' mesh and TOML beside this file."""
     for species in (HALIBUT, COD):
         base = Path(__file__).parent / species.name
-        base.with_suffix(".ply").write_bytes(body_mesh(species).export(file_type="ply"))
+        body_mesh(species).export(base.with_suffix(".ply"))
         base.with_suffix(".toml").write_text(_toml(species))
 
 
