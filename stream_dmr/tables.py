@@ -4,13 +4,16 @@ Values are rounded to six decimals, far below what is measured; blank means ther
 """
 
 import csv
+import io
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.errors import OutputError
-from stream_dmr.messages import LengthEstimate, LocalizedFish, Message
+from stream_dmr.messages import LengthEstimate, LocalizedFish
+from stream_dmr.recording.header import Record
+from stream_dmr.recording.whole_file import WholeFile
 
 LENGTHS_COLUMNS = [
     *("track_id", "length_mm", "length_std_mm", "ci95_low_mm", "ci95_high_mm"),
@@ -39,8 +42,9 @@ class Tables:
         self._frames = _Table(out_dir / "frames.csv", FRAMES_COLUMNS)
         self._waiting: dict[tuple[int, int], LocalizedFish] = {}
 
-    def write(self, message: Message) -> None:
-        """Take any message; OutputError where the disk refuses a row."""
+    def write(self, record: Record) -> None:
+        """Take any record; OutputError where the disk refuses a row."""
+        message = record.message
         if isinstance(message, LocalizedFish):
             self._waiting[message.track_id, message.frame_index] = message
         elif isinstance(message, LengthEstimate):
@@ -111,29 +115,26 @@ def _numbers(values: Float[np.ndarray, "..."] | None, count: int) -> list[str]:
 
 
 class _Table:
-    """A CSV file with its header from the start, flushed row by row."""
+    """A CSV file with its header from the start, in which every row is whole."""
 
     def __init__(self, path: Path, columns: list[str]) -> None:
         self._path = path
         try:
-            self._file = path.open("w", newline="", encoding="utf-8")
+            self._file = WholeFile(path)
         except OSError as error:
             raise self._refusal(error) from error
-        self._writer = csv.writer(self._file, lineterminator="\n")
         self.add(columns)
 
     def add(self, row: list[str]) -> None:
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerow(row)
         try:
-            self._writer.writerow(row)
-            self._file.flush()
+            self._file.write(text.getvalue().encode("utf-8", "backslashreplace"))
         except OSError as error:
             raise self._refusal(error) from error
 
     def close(self) -> None:
-        try:
-            self._file.close()
-        except OSError as error:  # what could not be flushed before still can't be
-            raise self._refusal(error) from error
+        self._file.close()
 
     def _refusal(self, error: OSError) -> OutputError:
         return OutputError(

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from threading import Lock
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol, runtime_checkable
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import FishCrop, Frame, Message
@@ -18,8 +18,9 @@ from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.tables import Tables
 
 
+@runtime_checkable
 class Sink(Protocol):
-    """One kind of recording."""
+    """One kind of output."""
 
     def write(self, record: Record, /) -> None:
         """Take one record; OutputError where the disk refuses it."""
@@ -42,19 +43,15 @@ class Recorder:
         self._lock = Lock()
         self._sinks: list[Sink] = []
         self._refused: list[Sink] = []
-        try:
-            out_dir.mkdir(parents=True, exist_ok=True)
-            for make in _sink_makers(out_dir, header, settings):
-                self._sinks.append(make())
-        except OSError as error:
-            self.close()
-            raise OutputError(
-                f"{out_dir}: expected a folder to write to, got: {error.strerror}; "
-                "choose another --out"
-            ) from error
-        except OutputError:
-            self.close()
-            raise
+        _make_folder(out_dir)
+        with ExitStack() as undo:
+            undo.callback(self.close)
+            self._sinks.append(Tables(out_dir))
+            if settings.mcap:
+                self._sinks.append(McapSink(out_dir, header, flush_s=settings.flush_s))
+            if settings.rrd:
+                self._sinks.append(RerunSink(out_dir, header, settings))
+            undo.pop_all()
 
     def write(self, message: Message) -> Message:
         """Record a message; returns it as a replay will read it back.
@@ -84,10 +81,10 @@ class Recorder:
     def close(self) -> None:
         """Close every sink, also where another one fails; then raise the failure. Idempotent."""
         with self._lock, ExitStack() as stack:
-            for sink in (*self._sinks, self._tables):
+            for sink in self._sinks:
                 stack.callback(sink.close)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Recorder":
         return self
 
     def __exit__(

@@ -18,7 +18,7 @@ from stream_dmr.recording.rerun_view import RUN, blueprint
 from stream_dmr.recording.settings import RecordingSettings
 
 NAME = "recording.rrd"
-_HEADER = "messages/header"
+_HEADER = ["messages", "header"]
 _FLUSH_TIMEOUT_S = 30.0
 _EPOCH_NS = 10**17  # timestamps above are since 1970 (this is 1973), below since the start
 
@@ -78,7 +78,7 @@ class RerunSink:
         if self._with_messages:
             parts = {"run.json": json.dumps(metadata).encode(), **header.attachments()}
             for name, data in parts.items():
-                self._rec.log([_HEADER, name], _blob(data), static=True)
+                self._rec.log([*_HEADER, name], _blob(data), static=True)
 
     def _log_message(self, record: Record) -> None:
         """The message as in the .mcap, but a frame by reference: its JPEG is drawn already."""
