@@ -51,10 +51,11 @@ def one_line(error: UserError) -> str:
     return "; ".join(" ".join(part.splitlines()) for part in parts)
 
 
-def _print_version(is_asked: bool) -> None:
+def _print_version(is_asked: bool) -> bool:
     if is_asked:
         print(f"stream-dmr {__version__}")
         raise typer.Exit
+    return is_asked
 
 
 @app.callback()

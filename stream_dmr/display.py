@@ -4,7 +4,6 @@ import sys
 import time
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -38,7 +37,7 @@ class RunDisplay(Observer):
         self._warned: set[str] = set()
         self._began = self._last_line = time.monotonic()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "RunDisplay":
         return self
 
     def __exit__(

@@ -172,7 +172,8 @@ def _run_chain(
             reader, nodes, on_message=tally.record, on_frame=tally.frame_done, stop=stop
         )
     except UserError as error:
-        error.add_note(f"what was computed before is kept in {out}")
+        if not isinstance(error, OutputError):  # which says so itself
+            error.add_note(f"what was computed before is kept in {out}")
         raise
     return RunSummary(
         fish=sorted(tally.final, key=lambda estimate: estimate.track_id),
