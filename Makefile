@@ -1,21 +1,21 @@
 # `make demo` and `make test` are all a fresh clone needs; both are idempotent.
-PYTHON ?= python3
+PYTHON ?= $(shell command -v python3.11 || echo python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-slow check format clean
+.PHONY: demo test test-slow check format config clean
 
-demo: $(STAMP)
+demo: $(STAMP)  ## the main job on the embedded scene, lengths beside the truth
 	$(BIN)/python -m stream_dmr.demo
 
-test: $(STAMP)
+test: $(STAMP)  ## the tests of a few minutes
 	$(BIN)/pytest -n 2
 
-test-slow: $(STAMP)
+test-slow: $(STAMP)  ## the long ones, and those on material outside the repository
 	$(BIN)/pytest -m "slow or scenes"
 
-check: $(STAMP)
+check: $(STAMP)  ## style and types
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/pyright
@@ -24,8 +24,13 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
+config: $(STAMP)  ## config.toml anew from the settings classes
+	$(BIN)/python -m stream_dmr.config > config.toml.new
+	mv config.toml.new config.toml
+
+# The stamp comes last, so that an interrupted installation is taken up again.
 $(STAMP): pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
+	$(PYTHON) -m venv $(VENV) || { echo "needs the module venv: apt install python3-venv"; exit 1; }
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 

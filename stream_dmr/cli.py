@@ -29,9 +29,16 @@ app.command()(calibrate)
 
 
 def main() -> None:
-    """Run the command; a user's mistake is one line and exit code 2, our own a traceback and 1."""
-    try:
+    """The entry point of `stream-dmr`."""
+    with exit_codes():
         app(prog_name="stream-dmr")
+
+
+@contextmanager
+def exit_codes() -> Iterator[None]:
+    """A user's mistake becomes one line and exit code 2, our own a traceback and exit code 1."""
+    try:
+        yield
     except UserError as error:
         print(f"error: {one_line(error)}", file=sys.stderr)
         sys.exit(2)
