@@ -84,7 +84,7 @@ def print_fish(fish: Sequence[LengthEstimate]) -> None:
             length_text(estimate),
             interval_text(estimate),
             f"{estimate.frames_used}/{estimate.frames_seen}",
-            estimate.status,
+            status_text(estimate),
         )
     _stdout().print(table if fish else "no fish")
 
@@ -126,3 +126,12 @@ def interval_text(estimate: LengthEstimate) -> str:
         return "-"
     low, high = estimate.ci95_mm
     return f"{low:.1f} to {high:.1f}"
+
+
+def status_text(estimate: LengthEstimate) -> str:
+    """The status; where there is no length, with the reasons why frames were refused."""
+    reasons = sorted(estimate.refused.items(), key=lambda item: -item[1])
+    shown = [f"{count} {reason}" for reason, count in reasons if reason != estimate.status]
+    if estimate.length_mm is not None or not shown:
+        return estimate.status
+    return f"{estimate.status}: {', '.join(shown)}"

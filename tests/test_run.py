@@ -88,8 +88,11 @@ def test_a_clip_without_fish_gives_empty_tables(tmp_path: Path):
 
 
 def test_too_few_good_frames_give_no_length_and_say_so(tmp_path: Path):
-    options = write_clip(tmp_path / "clip", num_frames=2)
-    assert invoke("run", options).code == 0
+    options = write_clip(tmp_path / "clip", num_frames=3)
+    (tmp_path / "clip" / "masks" / "000002.png").unlink()
+    outcome = invoke("run", options)
+    assert outcome.code == 0, outcome.err
+    assert "1 no mask" in outcome.out
     (row,) = rows(Path(options["--out"]) / "lengths.csv")
     assert row["length_mm"] == ""
     assert row["status"] not in ("", "measured")
@@ -119,6 +122,7 @@ def test_frames_without_a_mask_are_refused_and_warned_of(tmp_path: Path):
     outcome = invoke("run", options)
     assert outcome.code == 0, outcome.err
     assert outcome.err.count("warning: masks:") == 1
+    assert "no mask" not in outcome.out
     frames = rows(Path(options["--out"]) / "frames.csv")
     assert [row["frame_index"] for row in frames if row["accepted"] == "false"] == ["2"]
     assert rows(Path(options["--out"]) / "lengths.csv")[0]["frames_used"] == "4"
