@@ -277,12 +277,13 @@ class TestWeights:
     def test_rows_are_shares(self, seed, num_joints, size):
         rng = np.random.default_rng(seed)
         joints = torch.as_tensor(rng.normal(size=(num_joints, 3)))
-        precisions = torch.as_tensor(rng.normal(size=(2, num_joints, 6)) * size)
+        precisions = torch.as_tensor(rng.uniform(-size, size, (2, num_joints, 6)))
         weights = skinning_weights(RIG.points, joints, precisions)
         assert (weights >= 0).all()
         torch.testing.assert_close(weights.sum(dim=-1), torch.ones(2, len(RIG.points)).double())
         if size <= 1:
-            assert (weights > 0).all(), "no joint ever loses a point for good"
+            # Wilder ones are positive too, but too small for a float.
+            assert (weights > 0).all()
 
     @forty
     @given(entries=st.lists(st.floats(-3, 3), min_size=6, max_size=6))
