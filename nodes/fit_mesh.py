@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from stream_dmr.camera import Calibration
 from stream_dmr.fitting.fit import Fitter
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.messages import FishCrop, FittedMesh
@@ -13,19 +14,25 @@ from stream_dmr.template import Template
 class FitMesh:
     """Holds the last good parameters of every track."""
 
-    def __init__(self, settings: FitMeshSettings, *, template: Template) -> None:
+    def __init__(
+        self,
+        settings: FitMeshSettings,
+        *,
+        template: Template,
+        calibration: Calibration | None,
+    ) -> None:
         self._settings = settings
-        self._fitter = Fitter(template, settings)
+        normal = None if calibration is None else calibration.plane.rotation[:, 2]
+        self._fitter = Fitter(template, settings, plane_normal=normal)
         self._warm: dict[int, np.ndarray] = {}
 
     def step(self, crop: FishCrop, /) -> list[FittedMesh]:
-        """Fit one crop; a poor fit is passed on but never warms the next one."""
-        fitted = self._fitter.fit(crop, self._warm.get(crop.track_id))
-        if fitted.shape is not None:
-            if fitted.shape.iou >= self._settings.cold_below_iou:
-                self._warm[crop.track_id] = fitted.shape.parameters
-            else:
-                self._warm.pop(crop.track_id, None)
+        """Fit one crop; a poor fit, or one of half a fish, is passed on but warms no other."""
+        fitted = self._fitter.fit(crop, self._warm.pop(crop.track_id, None))
+        shape = fitted.shape
+        if shape is not None and not crop.quality.touches_border:
+            if shape.iou >= self._settings.cold_below_iou:
+                self._warm[crop.track_id] = shape.parameters
         return [fitted]
 
     def tick(self, timestamp_ns: int, /) -> Sequence[FittedMesh]:

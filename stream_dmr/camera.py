@@ -57,6 +57,10 @@ class Camera:
         )
         return Camera(width=size, height=size, K=K, distortion=np.zeros(5))
 
+    def middle_ray(self) -> Float[np.ndarray, "3"]:
+        """The ray (X, Y, 1) through the middle of the picture."""
+        return self.back_project(np.array([[(self.width - 1) / 2, (self.height - 1) / 2]]))[0]
+
     @classmethod
     def nominal(cls, *, width: int, height: int) -> "Camera":
         """A stand-in where nothing is calibrated: some 45 degrees wide, no distortion.

@@ -3,10 +3,8 @@
 Every term is batched: it takes B fits at once and returns B numbers, before its lambda.
 """
 
-import cv2
-import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from stream_dmr.skinning import Rig
@@ -31,15 +29,6 @@ def boundary_loss(
     """
     percent = signed_distance * (100.0 / signed_distance.shape[0])
     return (silhouettes * percent).mean(dim=(1, 2))
-
-
-def signed_distance(mask: Bool[np.ndarray, "S S"]) -> Float[np.ndarray, "S S"]:
-    """Distance in pixels to the mask's edge, negative inside: the map behind `boundary_loss`."""
-    inside = mask.astype(np.uint8)
-    out = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    into = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    # Both count to the nearest pixel's centre on the other side; the edge lies half way.
-    return np.where(mask, 0.5 - into, out - 0.5).astype(np.float64)
 
 
 def scale_loss(joint_log_scales: Float[Tensor, "B J"]) -> Float[Tensor, "B"]:

@@ -132,7 +132,7 @@ def _later_nodes(
 ) -> list[Node]:
     """The nodes that a crop passes, from the fit to the length."""
     return [
-        FitMesh(config.fit_mesh, template=template),
+        FitMesh(config.fit_mesh, template=template, calibration=calibration),
         Localize(config.localize, calibration=calibration),
         SmoothLength(config.smooth_length),
     ]

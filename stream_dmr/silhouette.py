@@ -13,21 +13,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stream_dmr.camera import Camera
 from stream_dmr.skinning import Rig
 
 
 def project(points: Float[Tensor, "B N 3"], K: Float[Tensor, "3 3"]) -> Float[Tensor, "B N 2"]:
     """Pixels of points in front of an ideal pinhole camera, x right and y down."""
     return points[..., :2] / points[..., 2:] * K[[0, 1], [0, 1]] + K[:2, 2]
-
-
-def anchor(camera: Camera) -> Float[Tensor, "3"]:
-    """Where a fit's root rests: at depth 1 on the ray through the middle of the crop."""
-    middle = torch.tensor([(camera.width - 1) / 2, (camera.height - 1) / 2], dtype=torch.float64)
-    K = torch.as_tensor(camera.K)
-    ray = (middle - K[:2, 2]) / K[[0, 1], [0, 1]]
-    return torch.cat([ray, torch.ones(1, dtype=torch.float64)])
 
 
 def silhouette(

@@ -16,10 +16,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from stream_dmr.body import JOINT, ROOT, Body, rest_vector
 from stream_dmr.template import Template
-
-# Radius of a joint's Gaussian before it is learnt, in body lengths.
-REST_WEIGHT_RADIUS = 0.25
 
 
 class Parameters(NamedTuple):
@@ -35,9 +33,8 @@ class Parameters(NamedTuple):
 
     @classmethod
     def from_flat(cls, flat: Float[Tensor, "B P"]) -> "Parameters":
-        """Split P = 6 + 13 J columns."""
-        batch, num_joints = flat.shape[0], (flat.shape[1] - 6) // 13
-        root, joints = flat[:, :6], flat[:, 6:].reshape(batch, num_joints, 13)
+        """Split P = ROOT + JOINT * J columns."""
+        root, joints = flat[:, :ROOT], flat[:, ROOT:].unflatten(1, (-1, JOINT))
         return cls(
             root_rotation=root[:, :3],
             root_translation=root[:, 3:5],
@@ -66,24 +63,18 @@ class Parameters(NamedTuple):
 
 
 def rest_parameters(num_joints: int, *, batch: int = 1) -> Float[Tensor, "B P"]:
-    """Parameters of the template at rest, one body length at depth 1."""
-    joint = torch.zeros(13, dtype=torch.float64)
-    joint[7:10] = -np.log(REST_WEIGHT_RADIUS)
-    root = torch.zeros(6, dtype=torch.float64)
-    return torch.cat([root, joint.repeat(num_joints)]).repeat(batch, 1)
+    """A batch of parameters of the template at rest, one body length at depth 1."""
+    return torch.as_tensor(rest_vector(num_joints)).repeat(batch, 1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Rig:
-    """A template as tensors, its points bound to the midline: what a deformation works on.
-
-    Points are the V vertices, the 3 keypoints and the M midline points, in this order.
-    """
+    """A `Body` as tensors, float64 throughout."""
 
     points: Float[Tensor, "N 3"]
     faces: Int[Tensor, "F 3"]
-    edges: Int[Tensor, "E 2"]  # each once, in the direction in which its first face runs
-    edge_faces: Int[Tensor, "E 2"]  # the faces that run along and against the edge
+    edges: Int[Tensor, "E 2"]
+    edge_faces: Int[Tensor, "E 2"]
     num_neighbors: Float[Tensor, "V"]  # of each vertex along the edges
     joints: Float[Tensor, "J 3"]
     midline: Float[Tensor, "M 3"]
@@ -94,27 +85,22 @@ class Rig:
 
     @classmethod
     def from_template(cls, template: Template, *, device: str = "cpu") -> "Rig":
-        """Bind the template's points to its midline; float64 throughout."""
-        points = np.concatenate([template.rest_vertices, template.keypoints, template.midline])
-        segments, fractions, feet = bind_to_midline(points, template.midline)
-        edges, edge_faces = _edges(template.faces)
-
-        def tensor(array: np.ndarray) -> Tensor:
-            return torch.as_tensor(array, device=device)
-
-        return cls(
-            points=tensor(points),
-            faces=tensor(template.faces),
-            edges=tensor(edges),
-            edge_faces=tensor(edge_faces),
-            num_neighbors=tensor(np.bincount(edges.ravel()).astype(np.float64)),
-            joints=tensor(template.joints),
-            midline=tensor(template.midline),
-            feet=tensor(feet),
-            foot_segments=tensor(segments),
-            foot_fractions=tensor(fractions),
-            num_vertices=len(template.rest_vertices),
-        )
+        """Bind a template's points to its midline and move it to a device."""
+        body = Body.from_template(template)
+        arrays = {
+            "points": body.points,
+            "faces": body.faces,
+            "edges": body.edges,
+            "edge_faces": body.edge_faces,
+            "num_neighbors": np.bincount(body.edges.ravel()).astype(np.float64),
+            "joints": body.joints,
+            "midline": body.midline,
+            "feet": body.places[body.place_of],
+            "foot_segments": body.segments[body.place_of],
+            "foot_fractions": body.fractions[body.place_of],
+        }
+        tensors = {name: torch.as_tensor(array, device=device) for name, array in arrays.items()}
+        return cls(**tensors, num_vertices=body.num_vertices)
 
 
 class Deformed(NamedTuple):
@@ -205,22 +191,6 @@ def rotation_matrices(rotvec: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batc
     return identity + torch.sinc(angle / torch.pi) * cross + 0.5 * half.square() * (cross @ cross)
 
 
-def bind_to_midline(
-    points: Float[np.ndarray, "N 3"], midline: Float[np.ndarray, "M 3"]
-) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
-    """Nearest place of each point on a polyline: its segment, the fraction in it, and the foot.
-
-    Points past an end get that end as their foot.
-    """
-    start, step = midline[:-1], np.diff(midline, axis=0)
-    along = np.einsum("nmk,mk->nm", points[:, None] - start, step) / (step**2).sum(axis=1)
-    along = along.clip(0.0, 1.0)
-    feet = start + along[..., None] * step
-    segment = np.argmin(((points[:, None] - feet) ** 2).sum(axis=-1), axis=1)
-    row = np.arange(len(points))
-    return segment, along[row, segment], feet[row, segment]
-
-
 def _frames(
     rig: Rig, parameters: Parameters, places: Float[Tensor, "N 3"]
 ) -> tuple[Float[Tensor, "B N 3 3"], Float[Tensor, "B N"], Float[Tensor, "B N 3"]]:
@@ -241,12 +211,3 @@ def _cholesky_factors(precisions: Float[Tensor, "B J 6"]) -> Float[Tensor, "B J 
     d, e, f = precisions[..., 3:].unbind(-1)
     zero = torch.zeros_like(a)
     return torch.stack([a, zero, zero, d, b, zero, e, f, c], dim=-1).unflatten(-1, (3, 3))
-
-
-def _edges(faces: Int[np.ndarray, "F 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Each edge of a closed mesh once, with the faces that run along and against it."""
-    directed = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    face_of = {(a, b): i // 3 for i, (a, b) in enumerate(directed.tolist())}
-    edges = [(a, b) for a, b in face_of if a < b]
-    edge_faces = [(face_of[a, b], face_of[b, a]) for a, b in edges]
-    return np.array(edges, np.int64), np.array(edge_faces, np.int64)

@@ -288,7 +288,7 @@ class TestRepeats:
             ]
             for track_id in (7, 8)
         }
-        together = FitMesh(settings, template=TEMPLATE)
+        together = FitMesh(settings, template=TEMPLATE, calibration=None)
         interleaved = [
             message
             for frame in zip(*tracks.values(), strict=True)
@@ -296,14 +296,14 @@ class TestRepeats:
             for message in together.step(crop)
         ]
         for track_id, crops in tracks.items():
-            node = FitMesh(settings, template=TEMPLATE)
+            node = FitMesh(settings, template=TEMPLATE, calibration=None)
             alone = [message for crop in crops for message in node.step(crop)]
             mixed = [m for m in interleaved if m.track_id == track_id]
             assert [bits(m) for m in mixed] == [bits(m) for m in alone]
             assert [m.report.cold_start for m in alone] == [True, False, False]
 
     def test_a_lost_fish_is_found_again_from_cold(self):
-        node = FitMesh(FitMeshSettings(), template=TEMPLATE)
+        node = FitMesh(FitMeshSettings(), template=TEMPLATE, calibration=None)
         crops = [crop_of(true_pose(1), RIG, size=64, frame_index=k) for k in (1, 2, 3)]
         crops[1] = crop_from_mask(blank(64), camera=crop_camera(size=64), frame_index=2)
         fitted = [message for crop in crops for message in node.step(crop)]

@@ -3,34 +3,45 @@
 import time
 
 import numpy as np
-import torch
 from jaxtyping import Float
-from torch import Tensor
 
+from stream_dmr.body import Body
 from stream_dmr.camera import frame_from_crop
-from stream_dmr.fitting import adam
 from stream_dmr.fitting.cold_start import cold_starts
-from stream_dmr.fitting.objective import Objective, Target
+from stream_dmr.fitting.contour.deformation import KINDS, deform
+from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
+from stream_dmr.fitting.contour.outline import project
+from stream_dmr.fitting.contour.solver import ContourSolver
 from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.solver import Solution, Solver
+from stream_dmr.fitting.target import Target
 from stream_dmr.fitting.uncertainty import covariance
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms, SolverReport
-from stream_dmr.skinning import Parameters, Rig
 from stream_dmr.template import Template
 
-# Of all cold starts, this many are followed to the end.
-_NUM_POLISHED = 3
-# A warm start begins near the end: smaller first steps.
-_WARM_STEP = 0.3
-_POLISH_STEP = 0.3
+
+# Without a calibration, fish are taken to hang square to the camera.
+_TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
 
 
 class Fitter:
     """Fits one template to crops; holds nothing of any track."""
 
-    def __init__(self, template: Template, settings: FitMeshSettings) -> None:
-        self.template = template
-        self.settings = settings
-        self.rig = Rig.from_template(template, device=settings.device)
+    def __init__(
+        self,
+        template: Template,
+        settings: FitMeshSettings,
+        *,
+        plane_normal: Float[np.ndarray, "3"] | None = None,
+    ) -> None:
+        """`plane_normal`, in the camera frame, is of the plane that fish hang in, if known."""
+        normal = _TOWARD_CAMERA if plane_normal is None else plane_normal
+        self._plane_normal = np.ascontiguousarray(normal)
+        self._template = template
+        self._settings = settings
+        self._body = Body.from_template(template)
+        self._kind = KINDS[settings.deformation]
+        self._solver = _make_solver(template, self._body, settings)
 
     def fit(self, crop: FishCrop, warm: Float[np.ndarray, "P"] | None) -> FittedMesh:
         """Fit the template to a crop's mask, starting from the parameters of the frame before.
@@ -41,15 +52,14 @@ class Fitter:
         if refusal:
             return _message(crop, None, None, refusal)
         began = time.perf_counter_ns()
-        target = Target.from_crop(crop, device=self.settings.device)
-        objective = Objective(rig=self.rig, target=target, settings=self.settings)
-        solution, is_cold = self._solve(objective, crop, warm)
-        if not bool(torch.isfinite(solution.loss[0])):
+        target = Target.from_crop(crop, plane_normal=self._plane_normal)
+        solution, is_cold = self._solve(target, warm)
+        if not np.isfinite(solution.flat).all() or not np.isfinite(solution.loss):
             return _message(crop, None, None, "fit diverged")
-        shape = self._shape(objective, solution.flat[0], crop)
+        shape = self._shape(target, solution, crop)
         report = SolverReport(
-            solver=self.settings.solver,
-            deformation=self.settings.deformation,
+            solver=self._settings.solver,
+            deformation=self._settings.deformation,
             iterations=solution.iterations,
             converged=solution.converged,
             stop_reason=solution.stop_reason,
@@ -62,87 +72,72 @@ class Fitter:
         area = int(crop.mask.sum())
         if area == 0:
             return "no mask"
-        return "mask too small" if area < self.settings.min_mask_px else ""
+        if crop.mask.all():
+            return "mask fills the crop"  # it has no edge to fit to
+        return "mask too small" if area < self._settings.min_mask_px else ""
 
-    def _solve(
-        self, objective: Objective, crop: FishCrop, warm: Float[np.ndarray, "P"] | None
-    ) -> tuple[adam.Solution, bool]:
+    def _solve(self, target: Target, warm: Float[np.ndarray, "P"] | None) -> tuple[Solution, bool]:
         """The warm fit if it is good, else the better one of warm and cold."""
         solution = None
         if warm is not None:
-            start = _recentered(objective, torch.as_tensor(warm.copy())[None])
-            iterations = self.settings.warm_iterations
-            solution = adam.solve(objective, start, iterations=iterations, step=_WARM_STEP)
-            if float(solution.iou[0]) >= self.settings.cold_below_iou:
+            start = _recentered(self._body, self._kind, target, warm)
+            solution = self._solver.refine(target, start)
+            if solution.iou >= self._settings.cold_below_iou:
                 return solution, False
-        cold = self._solve_cold(objective, crop)
-        if solution is not None and bool(solution.loss[0] <= cold.loss[0]):
+        cold = self._solver.search(target, cold_starts(target, self._template))
+        if solution is not None and solution.loss <= cold.loss:
             return solution, False
         return cold, True
 
-    def _solve_cold(self, objective: Objective, crop: FishCrop) -> adam.Solution:
-        """A few iterations from every start, the best ones to the end, the best of these."""
-        starts = cold_starts(crop.mask, crop.crop_camera, self.template)
-        starts = starts.to(self.settings.device)
-        rough = adam.solve(objective, starts, iterations=self.settings.cold_iterations)
-        best = rough.loss.argsort()[:_NUM_POLISHED]
-        fine = adam.solve(
-            objective,
-            rough.flat[best],
-            iterations=self.settings.polish_iterations,
-            step=_POLISH_STEP,
+    def _shape(self, target: Target, solution: Solution, crop: FishCrop) -> FittedShape:
+        flat, v = solution.flat, self._body.num_vertices
+        terms, iou, points, pixels, rim, covered = evaluate(self._body, self._kind, target, flat)
+        spread, length_std = covariance(
+            self._body,
+            target,
+            self._settings,
+            flat,
+            points=points,
+            pixels=pixels,
+            rim=rim,
+            covered=covered,
         )
-        winner = fine.loss.argmin()[None]
-        return fine._replace(
-            flat=fine.flat[winner],
-            loss=fine.loss[winner],
-            iou=fine.iou[winner],
-            iterations=rough.iterations + fine.iterations,
-        )
-
-    def _shape(self, objective: Objective, flat: Float[Tensor, "P"], crop: FishCrop) -> FittedShape:
-        with torch.no_grad():
-            deformed = objective.deform(flat[None])
-            terms = objective.terms(flat[None])
-            spread, length_std = covariance(objective, flat)
-            keypoints_px = objective.project(deformed.keypoints)[0]
-        anchor = objective.target.anchor
-
-        def camera_points(points: Float[Tensor, "1 N 3"]) -> Float[np.ndarray, "N 3"]:
-            return (points[0] + anchor).cpu().numpy()
-
+        placed = points + target.anchor
+        keypoints_px = project(points[v : v + 3], target.anchor, target.K)
         return FittedShape(
-            parameters=flat.cpu().numpy(),
-            vertices=camera_points(deformed.vertices),
-            keypoints=camera_points(deformed.keypoints),
+            parameters=flat,
+            vertices=placed[:v],
+            keypoints=placed[v : v + 3],
             keypoints_px=frame_from_crop(
-                keypoints_px.cpu().numpy(),
-                crop_camera=crop.crop_camera,
-                frame_camera=crop.frame_camera,
+                keypoints_px, crop_camera=crop.crop_camera, frame_camera=crop.frame_camera
             ),
-            midline=camera_points(deformed.midline),
-            iou=float(terms.hard_iou[0]),
-            losses=LossTerms(**{key: float(getattr(terms, key)[0]) for key in _LOSS_NAMES}),
-            covariance=spread.cpu().numpy(),
+            midline=placed[v + 3 :],
+            iou=iou,
+            losses=LossTerms(**dict(zip(LossTerms.__slots__, terms.tolist(), strict=True))),
+            covariance=spread,
             length_std_ratio=length_std,
         )
 
 
-_LOSS_NAMES = ("iou", "boundary", "scale", "translation", "normal", "laplacian")
+def _make_solver(template: Template, body: Body, settings: FitMeshSettings) -> Solver:
+    if settings.solver == "contour":
+        return ContourSolver(body, settings)
+    from stream_dmr.fitting.adam import AdamSolver  # torch takes a second to import
+
+    return AdamSolver(template, settings)
 
 
-def _recentered(objective: Objective, flat: Float[Tensor, "1 P"]) -> Float[Tensor, "1 P"]:
+def _recentered(
+    body: Body, kind: int, target: Target, flat: Float[np.ndarray, "P"]
+) -> Float[np.ndarray, "P"]:
     """Parameters moved sideways so that the silhouette's middle falls on the mask's."""
-    flat = flat.to(objective.target.mask.device)
-    rows, columns = torch.nonzero(objective.target.mask > 0.5, as_tuple=True)
-    middle = torch.stack([columns, rows], dim=1).to(flat.dtype)
-    middle = (middle.amin(dim=0) + middle.amax(dim=0)) / 2
-    pixels = objective.project(objective.deform(flat).vertices)[0]
-    gap = middle - (pixels.amin(dim=0) + pixels.amax(dim=0)) / 2
-    parameters = Parameters.from_flat(flat)
-    scale = parameters.root_log_scale.exp() * objective.target.K[[0, 1], [0, 1]]
-    moved = parameters.root_translation + gap / scale
-    return parameters._replace(root_translation=moved).flat()
+    rows, columns = np.nonzero(target.mask > 0.5)
+    middle = np.array([columns.min() + columns.max(), rows.min() + rows.max()]) / 2
+    pixels = project(deform(body, kind, flat)[: body.num_vertices], target.anchor, target.K)
+    gap = middle - (pixels.min(axis=0) + pixels.max(axis=0)) / 2
+    moved = flat.copy()
+    moved[3:5] += gap / (np.exp(flat[5]) * target.K[[0, 1], [0, 1]])
+    return moved
 
 
 def _message(

@@ -2,6 +2,8 @@
 
 from typing import Literal
 
+import numpy as np
+from jaxtyping import Float
 from pydantic import Field
 
 from stream_dmr.settings import Settings
@@ -14,23 +16,31 @@ class FitMeshSettings(Settings):
         default="spine",
         description='"spine" keeps the length while bending; "linear-blend" is the paper\'s',
     )
-    solver: Literal["adam"] = Field(default="adam", description="the paper's gradient descent")
-    device: Literal["cpu", "cuda"] = Field(default="cpu", description="where the fit runs")
+    solver: Literal["contour", "adam"] = Field(
+        default="contour", description='"contour" is second order and fast; "adam" is the paper\'s'
+    )
+    device: Literal["cpu", "cuda"] = Field(default="cpu", description="where adam runs")
     lambda_scale: float = Field(default=1.0, ge=0, description="weight of L_s, eq. (3)")
     lambda_translation: float = Field(default=10.0, ge=0, description="weight of L_t, eq. (3)")
     lambda_normal: float = Field(default=0.003, ge=0, description="weight of L_normal, eq. (3)")
     lambda_laplacian: float = Field(default=0.003, ge=0, description="weight of L_lap, eq. (3)")
-    warm_iterations: int = Field(
-        default=60, ge=1, description="most iterations from the frame before"
+    tilt_std_rad: float = Field(
+        default=0.25, gt=0, description="how far a fish hangs out of the reference plane, rad"
     )
-    cold_iterations: int = Field(
-        default=40, ge=1, description="iterations of every start of a cold fit"
+    bend_std_rad: float = Field(default=1.0, gt=0, description="how far a joint bends, rad")
+    twist_std_rad: float = Field(default=0.3, gt=0, description="how far a joint twists, rad")
+    weight_std: float = Field(
+        default=0.5, gt=0, description="spread of the logs that shape the skinning weights"
     )
-    polish_iterations: int = Field(
-        default=120, ge=1, description="most iterations of its best starts"
+    prior_weight: float = Field(
+        default=0.003, ge=0, description="of these spreads in L_rec; 0 is the paper's loss"
     )
+    contour_iterations: int = Field(
+        default=30, ge=1, description="most iterations of a contour fit"
+    )
+    adam_iterations: int = Field(default=150, ge=1, description="most iterations of an adam fit")
     tolerance: float = Field(
-        default=1e-4, gt=0, description="stop when L_rec falls by less than this in ten iterations"
+        default=1e-4, gt=0, description="a fit has settled when L_rec falls by less than this"
     )
     cold_below_iou: float = Field(
         default=0.9, ge=0, le=1, description="IoU under which a warm fit is tried again from cold"
@@ -46,3 +56,25 @@ class FitMeshSettings(Settings):
     edge_correlation_px: float = Field(
         default=8.0, gt=0, description="how far along the edge such an error reaches, crop pixels"
     )
+
+    def lambdas(self) -> Float[np.ndarray, "6"]:
+        """Weights of the terms of eq. (3): iou, boundary, scale, translation, normal, laplacian."""
+        return np.array(
+            [
+                1.0,
+                1.0,
+                self.lambda_scale,
+                self.lambda_translation,
+                self.lambda_normal,
+                self.lambda_laplacian,
+            ]
+        )
+
+    def priors(self) -> Float[np.ndarray, "14"]:
+        """Weights of the squares of the tilt, then of each joint's 13 parameters (stream_dmr.body).
+
+        The joints' translations and scales have L_t and L_s.
+        """
+        turns = [self.twist_std_rad, self.bend_std_rad, self.bend_std_rad]
+        spread = [self.tilt_std_rad, *turns, *[np.inf] * 4, *[self.weight_std] * 6]
+        return self.prior_weight / np.square(spread)

@@ -7,59 +7,58 @@ inverse of the covariance. A bend toward the camera moves the outline little and
 variance; so does the length of a fish that may be turned away.
 """
 
-import torch
+import numpy as np
 from jaxtyping import Float
-from torch import Tensor
 
-from stream_dmr.fitting.objective import Objective
-from stream_dmr.silhouette import rim_edges, silhouette
-from stream_dmr.skinning import Deformed
+from stream_dmr.body import JOINT, ROOT, Body
+from stream_dmr.fitting.contour.deformation import KINDS, jacobian
+from stream_dmr.fitting.contour.normal_equations import rim_slopes, visible_rim, weighted_squares
+from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.target import Target
 
 # What is known of the parameters before any picture, as standard deviations: rotations of the root
 # and the joints (rad), their translations (body lengths), log scales, log precisions.
 _ROOT_PRIOR = [2.0] * 3 + [1.0] * 2 + [1.0]
 _JOINT_PRIOR = [1.0] * 3 + [0.03] * 3 + [0.1] + [1.0] * 6
-_STEP = 1e-4
 
 
 def covariance(
-    objective: Objective, flat: Float[Tensor, "P"]
-) -> tuple[Float[Tensor, "P P"], float]:
-    """Covariance of the parameters of a fit, and the std of its length as a fraction of it."""
-    settings = objective.settings
-    rim, normals, lengths = _visible_rim(objective, flat)
-    steps = _STEP * torch.eye(len(flat), dtype=flat.dtype, device=flat.device)
-    shapes = objective.deform(torch.cat([flat + steps, flat - steps]))
-    pixels = objective.project(shapes.vertices)[:, rim]
-    forward, backward = pixels.chunk(2)
-    slopes = (((forward - backward) / (2 * _STEP)) * normals).sum(dim=-1)  # (P, N), px
+    body: Body,
+    target: Target,
+    settings: FitMeshSettings,
+    flat: Float[np.ndarray, "P"],
+    *,
+    points: Float[np.ndarray, "N 3"],
+    pixels: Float[np.ndarray, "V 2"],
+    rim: np.ndarray,
+    covered: Float[np.ndarray, "S S"],
+) -> tuple[Float[np.ndarray, "P P"], float]:
+    """Covariance of the parameters of a fit, and the std of its length as a fraction of it.
+
+    `points` to `covered` are what `levenberg_marquardt.evaluate` returns for `flat`.
+    """
+    kind = KINDS[settings.deformation]
+    visible, normals, lengths = visible_rim(pixels, rim, covered)
+    index, slopes = rim_slopes(body, kind, target, flat, points, visible)
+    ends = slopes[index[visible]].mean(axis=1)  # (R, 2, P): of the middle of each edge
+    rows = np.einsum("rk,rkp->rp", normals, ends)
     weight = lengths / (settings.edge_correlation_px * settings.edge_std_px**2)
-    joints = (len(flat) - 6) // 13
-    prior = torch.tensor(_ROOT_PRIOR + _JOINT_PRIOR * joints, dtype=flat.dtype, device=flat.device)
-    information = (slopes * weight) @ slopes.T + torch.diag(prior**-2)
-    spread = torch.linalg.inv(information)
-    forward, backward = log_length(shapes).chunk(2)
-    slope = (forward - backward) / (2 * _STEP)
-    return spread, float((slope @ spread @ slope).sqrt())
+    information, _ = weighted_squares(rows, np.zeros(len(rows)), weight)
+    num_joints = (len(flat) - ROOT) // JOINT
+    prior = np.array(_ROOT_PRIOR + _JOINT_PRIOR * num_joints)
+    spread = np.linalg.inv(information + np.diag(prior**-2.0))
+    spread = (spread + spread.T) / 2
+    slope = _log_length_slope(body, kind, flat, points)
+    return spread, float(np.sqrt(slope @ spread @ slope))
 
 
-def log_length(shape: Deformed) -> Float[Tensor, "B"]:
-    """Log of the arc length along the midline, at the fixed depth of the root."""
-    return (shape.midline[:, 1:] - shape.midline[:, :-1]).norm(dim=-1).sum(dim=1).log()
-
-
-def _visible_rim(
-    objective: Objective, flat: Float[Tensor, "P"]
-) -> tuple[Tensor, Float[Tensor, "N 2"], Float[Tensor, "N"]]:
-    """Vertices of the rim that bound the silhouette, with the outline's normals and lengths."""
-    pixels = objective.project(objective.deform(flat[None]).vertices)
-    rim = rim_edges(pixels, objective.rig)
-    start, end = pixels[0, rim.start], pixels[0, rim.end]
-    step = end - start
-    length = step.norm(dim=1)
-    normal = torch.stack([step[:, 1], -step[:, 0]], dim=1) / length.clamp(min=1e-12)[:, None]
-    size = objective.target.mask.shape[0]
-    covered = silhouette(pixels, objective.rig, size=size)[0]
-    outside = ((start + end) / 2 + normal).round().long().clamp(0, size - 1)
-    is_visible = covered[outside[:, 1], outside[:, 0]] < 0.5
-    return rim.start[is_visible], normal[is_visible], length[is_visible]
+def _log_length_slope(
+    body: Body, kind: int, flat: Float[np.ndarray, "P"], points: Float[np.ndarray, "N 3"]
+) -> Float[np.ndarray, "P"]:
+    """d log(arc length of the midline) / d parameters, at the fixed depth of the root."""
+    first = body.num_vertices + 3
+    midline = points[first:]
+    slopes = np.diff(jacobian(body, kind, flat, np.arange(first, len(points))), axis=0)
+    steps = np.diff(midline, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    return np.einsum("mk,mkp->p", steps / lengths[:, None], slopes) / lengths.sum()

@@ -1,0 +1,94 @@
+"""Damped Gauss-Newton on the contour, with the paper's L_rec deciding which iterate is best."""
+
+import numpy as np
+
+from stream_dmr.body import JOINT, ROOT
+from stream_dmr.fitting.contour.compiled import compiled
+from stream_dmr.fitting.contour.deformation import deform
+from stream_dmr.fitting.contour.normal_equations import normal_equations, prior_loss
+from stream_dmr.fitting.contour.outline import coverage, overlap, project, rim_edges, smoothness
+
+SETTLED, STUCK, EXHAUSTED = 0, 1, 2
+STOP_REASONS = ("L_rec settled", "no step lowers L_rec", "iterations used up")
+
+_GROWTH, _SHRINK = 5.0, 0.3
+_MOST_DAMPING = 1e4
+
+
+@compiled
+def evaluate(body, kind, target, flat):
+    """The six terms of eq. (3) and the hard IoU, with what the normal equations need again."""
+    points = deform(body, kind, flat)
+    pixels = project(points[: body.num_vertices], target.anchor, target.K)
+    rim = rim_edges(pixels, body.faces, body.edges, body.edge_faces)
+    covered = coverage(pixels, rim, len(target.mask))
+    iou, boundary, hard = overlap(covered, target.mask, target.distance, target.mask_area)
+    normal, laplacian = smoothness(
+        points, flat, body.faces, body.edges, body.edge_faces, body.num_vertices
+    )
+    scale, translation = 0.0, 0.0
+    for j in range(len(body.joints)):
+        base = ROOT + JOINT * j
+        scale += (np.exp(flat[base + 6]) - 1.0) ** 2
+        for i in range(3, 6):
+            translation += flat[base + i] ** 2
+    terms = np.array([iou, boundary, scale, translation, normal, laplacian])
+    return terms, hard, points, pixels, rim, covered
+
+
+@compiled
+def minimise(body, kind, target, lambdas, priors, start, rest, iterations, tolerance, damping):
+    """Best parameters, their L_rec and hard IoU, the iterations used and why it stopped."""
+    flat = start.copy()
+    terms, hard, points, pixels, rim, covered = evaluate(body, kind, target, flat)
+    loss = np.sum(terms * lambdas) + prior_loss(target, flat, rest, priors)
+    H, g = normal_equations(
+        body, kind, target, lambdas, priors, flat, rest, points, pixels, rim, covered
+    )
+    calm = 0
+    for iteration in range(1, iterations + 1):
+        trial = flat - _solve(H, g, damping)
+        found = evaluate(body, kind, target, trial)
+        gain = loss - np.sum(found[0] * lambdas) - prior_loss(target, trial, rest, priors)
+        if gain > 0:
+            flat = trial
+            loss -= gain
+            terms, hard, points, pixels, rim, covered = found
+            damping *= _SHRINK
+            calm = calm + 1 if gain < tolerance else 0
+            if calm == 2:
+                return flat, loss, hard, iteration, SETTLED
+            if iteration < iterations:
+                H, g = normal_equations(
+                    body, kind, target, lambdas, priors, flat, rest, points, pixels, rim, covered
+                )
+        else:
+            damping *= _GROWTH
+            if damping > _MOST_DAMPING:
+                return flat, loss, hard, iteration, STUCK
+    return flat, loss, hard, iterations, EXHAUSTED
+
+
+@compiled
+def _solve(H, g, damping):
+    """(H + damping diag H)^-1 g by Cholesky: H is a sum of squares, so the factor exists."""
+    count = len(g)
+    L = H.copy()
+    x = g.copy()
+    for p in range(count):
+        L[p, p] += damping * H[p, p] + 1e-12
+    for p in range(count):
+        for q in range(p + 1):
+            total = L[p, q]
+            for k in range(q):
+                total -= L[p, k] * L[q, k]
+            L[p, q] = np.sqrt(max(total, 1e-30)) if p == q else total / L[q, q]
+    for p in range(count):
+        for k in range(p):
+            x[p] -= L[p, k] * x[k]
+        x[p] /= L[p, p]
+    for p in range(count - 1, -1, -1):
+        for k in range(p + 1, count):
+            x[p] -= L[k, p] * x[k]
+        x[p] /= L[p, p]
+    return x

@@ -1,0 +1,249 @@
+"""The least-squares problem of one iterate: contour residuals, both ways, and the regularisers.
+
+L_iou grows by |d| / A and L_boundary by c d^2 / 2 per pixel of rim that stands a distance d off the
+target, with A the mask's area and c the scale of `losses.boundary_loss`. Reweighted least squares
+turn both into w d^2 / 2 with w = 1 / (A max(|d|, eps)) + c. The distance is measured both ways,
+each with half the weight: from the model's rim by the target's distance map, and from the target's
+contour to the nearest rim edge that faces the same way; so that neither a tail left out nor a fin
+too many goes unseen.
+"""
+
+import numpy as np
+
+from stream_dmr.body import JOINT, ROOT
+from stream_dmr.fitting.contour.compiled import compiled
+from stream_dmr.fitting.contour.deformation import jacobian, rotation, turn_slope
+
+# Residuals under this are all the same to the reweighting, px: the pixels' own staircase.
+_FLAT_PX = 0.5
+# Normals of a contour point and its rim edge agree when their cosine is above this.
+_SAME_WAY = 0.3
+# The joints' common rotation is the root's own: this weight of its square holds that gauge.
+_GAUGE = 1e-1
+
+
+@compiled
+def normal_equations(body, kind, target, lambdas, priors, flat, rest, points, pixels, rim, covered):
+    """H and g of the quadratic model E(flat + x) = E + g x + x H x / 2."""
+    visible, normals, lengths = visible_rim(pixels, rim, covered)
+    index, slopes = rim_slopes(body, kind, target, flat, points, visible)
+    rows = np.empty((len(visible) + len(target.contour), len(flat)))
+    residuals = np.empty(len(rows))
+    weights = np.zeros(len(rows))
+    _rim_rows(target, pixels, visible, lengths, index, slopes, rows, residuals, weights)
+    _contour_rows(
+        target, pixels, visible, normals, index, slopes, rows, residuals, weights, len(visible)
+    )
+    H, g = weighted_squares(rows, residuals, weights)
+    _regularise(target, flat, rest, lambdas, priors, H, g)
+    return H, g
+
+
+@compiled
+def weighted_squares(rows, residuals, weights):
+    """sum w r r^T and sum w r residual, summed in one fixed order: the same bits every time."""
+    count = rows.shape[1]
+    H, g = np.zeros((count, count)), np.zeros(count)
+    for n in range(len(rows)):
+        row = rows[n]
+        for p in range(count):
+            a = weights[n] * row[p]
+            g[p] += a * residuals[n]
+            for q in range(p + 1):
+                H[p, q] += a * row[q]
+    for p in range(count):
+        for q in range(p):
+            H[q, p] = H[p, q]
+    return H, g
+
+
+@compiled
+def rim_slopes(body, kind, target, flat, points, visible):
+    """d pixels / d parameters (C, 2, P) of the rim's vertices, and where each vertex's rows are."""
+    index = np.full(body.num_vertices, -1, np.int64)
+    chosen = np.empty(2 * len(visible), np.int64)
+    count = 0
+    for r in range(len(visible)):
+        for k in range(2):
+            v = visible[r, k]
+            if index[v] < 0:
+                index[v] = count
+                chosen[count] = v
+                count += 1
+    chosen = chosen[:count]
+    return index, _pixel_slopes(points, chosen, jacobian(body, kind, flat, chosen), target)
+
+
+@compiled
+def visible_rim(pixels, rim, covered):
+    """Rim edges with nothing of the body outside them, their outward normals and lengths."""
+    size = len(covered)
+    keep = np.empty((len(rim), 2), np.int64)
+    normals = np.empty((len(rim), 2))
+    lengths = np.empty(len(rim))
+    count = 0
+    for r in range(len(rim)):
+        a, b = pixels[rim[r, 0]], pixels[rim[r, 1]]
+        dx, dy = b[0] - a[0], b[1] - a[1]
+        length = np.sqrt(dx * dx + dy * dy)
+        if length < 1e-9:
+            continue
+        nx, ny = dy / length, -dx / length
+        column = int(np.round((a[0] + b[0]) / 2 + nx))
+        row = int(np.round((a[1] + b[1]) / 2 + ny))
+        if 0 <= row < size and 0 <= column < size and covered[row, column] >= 0.5:
+            continue
+        keep[count] = rim[r]
+        normals[count, 0], normals[count, 1] = nx, ny
+        lengths[count] = length
+        count += 1
+    return keep[:count], normals[:count], lengths[:count]
+
+
+@compiled
+def _pixel_slopes(points, chosen, slopes, target):
+    """d pixels / d parameters, (C, 2, P), of the chosen vertices."""
+    out = np.empty((len(chosen), 2, slopes.shape[2]))
+    for c in range(len(chosen)):
+        x, y, z = points[chosen[c]] + target.anchor
+        for p in range(slopes.shape[2]):
+            dz = slopes[c, 2, p] / z
+            out[c, 0, p] = target.K[0, 0] * (slopes[c, 0, p] - x * dz) / z
+            out[c, 1, p] = target.K[1, 1] * (slopes[c, 1, p] - y * dz) / z
+    return out
+
+
+@compiled
+def _weight(length, residual, target):
+    return (
+        0.5
+        * length
+        * (1.0 / (target.mask_area * max(abs(residual), _FLAT_PX)) + 100.0 / len(target.mask) ** 3)
+    )
+
+
+@compiled
+def _rim_rows(target, pixels, visible, lengths, index, slopes, rows, residuals, weights):
+    """The model's rim in the target's signed distance field."""
+    for r in range(len(visible)):
+        a, b = visible[r]
+        x, y = (pixels[a, 0] + pixels[b, 0]) / 2, (pixels[a, 1] + pixels[b, 1]) / 2
+        value, gx, gy = _look_up(target.distance, x, y)
+        residuals[r] = value
+        weights[r] = _weight(lengths[r], value, target)
+        i, j = index[a], index[b]
+        for p in range(rows.shape[1]):
+            rows[r, p] = 0.5 * (
+                gx * (slopes[i, 0, p] + slopes[j, 0, p]) + gy * (slopes[i, 1, p] + slopes[j, 1, p])
+            )
+
+
+@compiled
+def _look_up(field, x, y):
+    """Value and unit gradient of a distance field between pixels; it goes on outside."""
+    size = len(field)
+    cx, cy = min(max(x, 0.0), size - 1.001), min(max(y, 0.0), size - 1.001)
+    k, i = int(cx), int(cy)
+    fx, fy = cx - k, cy - i
+    f00, f01, f10, f11 = field[i, k], field[i, k + 1], field[i + 1, k], field[i + 1, k + 1]
+    value = (f00 * (1 - fx) + f01 * fx) * (1 - fy) + (f10 * (1 - fx) + f11 * fx) * fy
+    gx = (f01 - f00) * (1 - fy) + (f11 - f10) * fy
+    gy = (f10 - f00) * (1 - fx) + (f11 - f01) * fx
+    out_x, out_y = x - cx, y - cy
+    gx, gy = gx + out_x, gy + out_y
+    length = np.sqrt(gx * gx + gy * gy)
+    if length < 1e-9:
+        return value, 0.0, 0.0
+    return value + np.sqrt(out_x * out_x + out_y * out_y), gx / length, gy / length
+
+
+@compiled
+def _contour_rows(target, pixels, visible, normals, index, slopes, rows, residuals, weights, first):
+    """The target's contour to the nearest rim edge that faces the same way."""
+    for c in range(len(target.contour)):
+        row = first + c
+        qx, qy = target.contour[c]
+        nx, ny = target.contour_normals[c]
+        best, edge, place = np.inf, -1, 0.0
+        for r in range(len(visible)):
+            if normals[r, 0] * nx + normals[r, 1] * ny < _SAME_WAY:
+                continue
+            a, b = visible[r]
+            ax, ay = pixels[a]
+            dx, dy = pixels[b, 0] - ax, pixels[b, 1] - ay
+            t = ((qx - ax) * dx + (qy - ay) * dy) / (dx * dx + dy * dy)
+            t = min(max(t, 0.0), 1.0)
+            ex, ey = ax + t * dx - qx, ay + t * dy - qy
+            if ex * ex + ey * ey < best:
+                best, edge, place = ex * ex + ey * ey, r, t
+        if edge < 0:
+            rows[row] = 0.0
+            residuals[row] = 0.0
+            continue
+        a, b = visible[edge]
+        ex = (1 - place) * pixels[a, 0] + place * pixels[b, 0] - qx
+        ey = (1 - place) * pixels[a, 1] + place * pixels[b, 1] - qy
+        gap = np.sqrt(best)
+        is_out = ex * normals[edge, 0] + ey * normals[edge, 1] >= 0
+        if gap > 0.25:
+            ux, uy = ex / gap, ey / gap
+        else:
+            ux, uy = normals[edge]
+            gap = ex * ux + ey * uy
+            is_out = True
+        if not is_out:
+            ux, uy, gap = -ux, -uy, -gap
+        residuals[row] = gap
+        weights[row] = _weight(target.contour_lengths[c], gap, target)
+        i, j = index[a], index[b]
+        for p in range(rows.shape[1]):
+            rows[row, p] = (1 - place) * (ux * slopes[i, 0, p] + uy * slopes[i, 1, p]) + place * (
+                ux * slopes[j, 0, p] + uy * slopes[j, 1, p]
+            )
+
+
+@compiled
+def _regularise(target, flat, rest, lambdas, priors, H, g):
+    """L_s and L_t of eq. (4), the priors, and the gauge."""
+    num_joints = (len(flat) - ROOT) // JOINT
+    for i in range(3):
+        total = 0.0
+        for j in range(num_joints):
+            total += flat[ROOT + JOINT * j + i]
+        for j in range(num_joints):
+            g[ROOT + JOINT * j + i] += _GAUGE * total
+            for k in range(num_joints):
+                H[ROOT + JOINT * j + i, ROOT + JOINT * k + i] += _GAUGE
+    for j in range(num_joints):
+        base = ROOT + JOINT * j
+        for i in range(13):
+            _add_square(base + i, flat[base + i] - rest[base + i], 1.0, priors[1 + i], H, g)
+        for i in range(3, 6):
+            _add_square(base + i, flat[base + i], 1.0, 2 * lambdas[3], H, g)
+        scale = np.exp(flat[base + 6])
+        _add_square(base + 6, scale - 1.0, scale, 2 * lambdas[2], H, g)
+    R, J = rotation(flat[:3])
+    A = np.empty((3, 3))
+    turn_slope(R, J, np.array([1.0, 0.0, 0.0]), A)
+    tilt = target.plane_normal @ R[:, 0]
+    slope = target.plane_normal @ A
+    for i in range(3):
+        g[i] += priors[0] * tilt * slope[i]
+        for k in range(3):
+            H[i, k] += priors[0] * slope[i] * slope[k]
+
+
+@compiled
+def prior_loss(target, flat, rest, priors):
+    """What the priors add to L_rec: half the weighted squares of tilt, bends and weights."""
+    R, _ = rotation(flat[:3])
+    loss = 0.5 * priors[0] * (target.plane_normal @ R[:, 0]) ** 2
+    for p in range(ROOT, len(flat)):
+        loss += 0.5 * priors[1 + (p - ROOT) % JOINT] * (flat[p] - rest[p]) ** 2
+    return loss
+
+
+@compiled
+def _add_square(p, residual, slope, weight, H, g):
+    g[p] += weight * slope * residual
+    H[p, p] += weight * slope * slope

@@ -1,0 +1,162 @@
+"""The model's outline in the picture, and how well it covers the mask: compiled loops.
+
+The same formulas as `silhouette.py` and `losses.py`, which are the reference that the tests hold
+them against.
+"""
+
+import numpy as np
+
+from stream_dmr.fitting.contour.compiled import compiled
+
+
+@compiled
+def project(points, anchor, K):
+    """Pixels (N, 2) of points that are centered on the root."""
+    out = np.empty((len(points), 2))
+    for n in range(len(points)):
+        depth = points[n, 2] + anchor[2]
+        out[n, 0] = (points[n, 0] + anchor[0]) / depth * K[0, 0] + K[0, 2]
+        out[n, 1] = (points[n, 1] + anchor[1]) / depth * K[1, 1] + K[1, 2]
+    return out
+
+
+@compiled
+def rim_edges(pixels, faces, edges, edge_faces):
+    """Edges (R, 2) between faces that look at the camera and faces that look away."""
+    is_front = np.empty(len(faces), np.bool_)
+    for f in range(len(faces)):
+        a, b, c = faces[f]
+        abx, aby = pixels[b, 0] - pixels[a, 0], pixels[b, 1] - pixels[a, 1]
+        acx, acy = pixels[c, 0] - pixels[a, 0], pixels[c, 1] - pixels[a, 1]
+        is_front[f] = abx * acy - aby * acx < 0
+    rim = np.empty((len(edges), 2), np.int64)
+    count = 0
+    for e in range(len(edges)):
+        along = is_front[edge_faces[e, 0]]
+        if along != is_front[edge_faces[e, 1]]:
+            rim[count, 0] = edges[e, 1] if along else edges[e, 0]
+            rim[count, 1] = edges[e, 0] if along else edges[e, 1]
+            count += 1
+    return rim[:count]
+
+
+@compiled
+def coverage(pixels, rim, size):
+    """Covered share of each pixel, (S, S): signed areas of the rim edges, summed along rows."""
+    grid = np.zeros((size, size + 1))
+    for r in range(len(rim)):
+        x0, y0 = pixels[rim[r, 0], 0] + 0.5, pixels[rim[r, 0], 1] + 0.5
+        x1, y1 = pixels[rim[r, 1], 0] + 0.5, pixels[rim[r, 1], 1] + 0.5
+        if y0 == y1:
+            continue
+        sign = 1.0 if y0 > y1 else -1.0
+        if y0 > y1:
+            x0, y0, x1, y1 = x1, y1, x0, y0
+        slope = (x1 - x0) / (y1 - y0)
+        top, bottom = max(y0, 0.0), min(y1, float(size))
+        row = int(np.floor(top))
+        while top < bottom:
+            low = min(bottom, row + 1.0)
+            _add_row(grid[row], x0 + (top - y0) * slope, x0 + (low - y0) * slope, low - top, sign)
+            top = low
+            row += 1
+    for i in range(size):
+        total = 0.0
+        for k in range(size):
+            total += grid[i, k]
+            grid[i, k] = min(max(total, 0.0), 1.0)
+    return grid[:, :size]
+
+
+@compiled
+def _add_row(row, xa, xb, height, sign):
+    """Signed area right of one piece of an edge within one row of pixels."""
+    size = len(row) - 1
+    if xa > xb:
+        xa, xb = xb, xa
+    if xa >= size:
+        return
+    if xb <= 0.0:
+        row[0] += sign * height
+        return
+    per_x = height / (xb - xa) if xb > xa else 0.0
+    left = xa
+    if xa < 0.0:
+        row[0] += sign * per_x * -xa
+        left = 0.0
+    right = min(xb, float(size))
+    column = int(np.floor(left))
+    while column < size:
+        end = min(right, column + 1.0)
+        share = per_x * (end - left) if xb > xa else height
+        own = share * (column + 1.0 - (left + end) / 2)
+        row[column] += sign * own
+        row[column + 1] += sign * (share - own)
+        if end >= right:
+            break
+        left = end
+        column += 1
+
+
+@compiled
+def overlap(covered, mask, distance, mask_area):
+    """L_iou and L_boundary of eq. (3), and the hard IoU."""
+    size = len(mask)
+    both = total = boundary = 0.0
+    hard_both = hard_total = 0
+    for i in range(size):
+        for k in range(size):
+            c = covered[i, k]
+            if c > 0.0:
+                total += c
+                boundary += c * distance[i, k]
+                both += c * mask[i, k]
+                if c >= 0.5:
+                    hard_total += 1
+                    if mask[i, k] > 0.5:
+                        hard_both += 1
+    iou = both / (total + mask_area - both)
+    hard = hard_both / (hard_total + mask_area - hard_both)
+    return 1.0 - iou, boundary * 100.0 / size**3, hard
+
+
+@compiled
+def smoothness(points, flat, faces, edges, edge_faces, num_vertices):
+    """L_normal and L_lap of eq. (5), in body lengths."""
+    normals = np.empty((len(faces), 3))
+    for f in range(len(faces)):
+        a, b, c = faces[f]
+        u0, u1, u2 = (
+            points[b, 0] - points[a, 0],
+            points[b, 1] - points[a, 1],
+            points[b, 2] - points[a, 2],
+        )
+        v0, v1, v2 = (
+            points[c, 0] - points[a, 0],
+            points[c, 1] - points[a, 1],
+            points[c, 2] - points[a, 2],
+        )
+        n0, n1, n2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+        length = max(np.sqrt(n0 * n0 + n1 * n1 + n2 * n2), 1e-300)
+        normals[f, 0], normals[f, 1], normals[f, 2] = n0 / length, n1 / length, n2 / length
+    normal = 0.0
+    sums = np.zeros((num_vertices, 3))
+    count = np.zeros(num_vertices)
+    for e in range(len(edges)):
+        p, q = edge_faces[e]
+        normal += 1.0 - (
+            normals[p, 0] * normals[q, 0]
+            + normals[p, 1] * normals[q, 1]
+            + normals[p, 2] * normals[q, 2]
+        )
+        a, b = edges[e]
+        count[a] += 1
+        count[b] += 1
+        for i in range(3):
+            sums[a, i] += points[b, i]
+            sums[b, i] += points[a, i]
+    laplacian = 0.0
+    for v in range(num_vertices):
+        for i in range(3):
+            laplacian += (points[v, i] - sums[v, i] / count[v]) ** 2
+    return normal, laplacian * np.exp(-2 * flat[5])

@@ -1,0 +1,80 @@
+"""The fast solver: a second-order search on the contour instead of gradient descent on pixels."""
+
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.body import JOINT, ROOT, Body, rest_vector
+from stream_dmr.fitting.contour.deformation import KINDS
+from stream_dmr.fitting.contour.levenberg_marquardt import SETTLED, STOP_REASONS, STUCK, minimise
+from stream_dmr.fitting.contour.normal_equations import prior_loss
+from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.solver import Solution
+from stream_dmr.fitting.target import Target
+
+_SEARCH_ITERATIONS = 6
+_NUM_FINISHED = 4
+# Damping at the start: near the answer the model is trusted, far from it less.
+_NEAR, _FAR = 1e-2, 1e-1
+
+
+class ContourSolver:
+    """Levenberg-Marquardt on contour residuals, judged by the paper's L_rec."""
+
+    def __init__(self, body: Body, settings: FitMeshSettings) -> None:
+        self._body = body
+        self._settings = settings
+        self._kind = KINDS[settings.deformation]
+        self._rest = rest_vector(len(body.joints))
+
+    def refine(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
+        """From one start near the answer, and from its mirror image where that is more likely."""
+        found = self._finish(target, start)
+        mirrored = mirror(found.flat)
+        gain = self._prior_loss(target, found.flat) - self._prior_loss(target, mirrored)
+        if gain < self._settings.tolerance:
+            return found
+        return min(found, self._finish(target, mirrored), key=lambda solution: solution.loss)
+
+    def _finish(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
+        return self._minimise(target, start, self._settings.contour_iterations, _NEAR)
+
+    def _prior_loss(self, target: Target, flat: Float[np.ndarray, "P"]) -> float:
+        return prior_loss(target, flat, self._rest, self._settings.priors())
+
+    def search(self, target: Target, starts: Float[np.ndarray, "B P"]) -> Solution:
+        """A few iterations from every start, the best ones to the end, the best of these."""
+        rough = [self._minimise(target, start, _SEARCH_ITERATIONS, _FAR) for start in starts]
+        rough.sort(key=lambda solution: solution.loss)
+        fine = [self.refine(target, solution.flat) for solution in rough[:_NUM_FINISHED]]
+        return min(fine, key=lambda solution: solution.loss)
+
+    def _minimise(
+        self, target: Target, start: Float[np.ndarray, "P"], iterations: int, damping: float
+    ) -> Solution:
+        flat, loss, iou, used, stop = minimise(
+            self._body,
+            self._kind,
+            target,
+            self._settings.lambdas(),
+            self._settings.priors(),
+            start,
+            self._rest,
+            iterations,
+            self._settings.tolerance,
+            damping,
+        )
+        return Solution(flat, loss, iou, used, stop in (SETTLED, STUCK), STOP_REASONS[stop])
+
+
+def mirror(flat: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
+    """The same body mirrored in depth, which from afar has the same silhouette.
+
+    A body that is alike on both flat sides can't show which of its ends is nearer; only priors and
+    perspective can. Rotation vectors (x, y, z) become (-x, -y, z), and what couples the thickness
+    to the rest changes its sign.
+    """
+    mirrored = flat.copy()
+    mirrored[:2] *= -1
+    joints = mirrored[ROOT:].reshape(-1, JOINT)
+    joints[:, [0, 1, 5, 11, 12]] *= -1
+    return mirrored

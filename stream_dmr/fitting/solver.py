@@ -1,0 +1,32 @@
+"""What every solver offers, and what it answers."""
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.fitting.target import Target
+
+
+class Solution(NamedTuple):
+    """The best iterate by L_rec, and why the search ended."""
+
+    flat: Float[np.ndarray, "P"]  # layout: stream_dmr.body
+    loss: float  # L_rec of eq. (3)
+    iou: float  # of the hard silhouette
+    iterations: int
+    converged: bool
+    stop_reason: str
+
+
+@runtime_checkable
+class Solver(Protocol):
+    """Minimises L_rec of eq. (3) for one template."""
+
+    def refine(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
+        """From one start near the answer."""
+        ...
+
+    def search(self, target: Target, starts: Float[np.ndarray, "B P"]) -> Solution:
+        """From many starts, of which at least one leads to the answer."""
+        ...
