@@ -10,8 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from command import Outcome, invoke, rows
-from tiny_clip import QUICK, calibration, draw_mask, draw_picture, write_clip
+from tiny_clip import QUICK, calibration, draw_mask, draw_picture, options, write_clip
 
 from stream_dmr.calibration import save_calibration
 from stream_dmr.errors import RecordingError
@@ -28,8 +29,6 @@ def clip(tmp_path: Path) -> Path:
 
 
 def options_of(clip: Path) -> Options:
-    from tiny_clip import options
-
     return options(clip)
 
 
@@ -151,6 +150,12 @@ def test_bad_input_is_refused_before_the_first_frame(
 def test_a_folder_that_can_not_be_made_is_refused(clip: Path, out: str):
     outcome = invoke("run", options_of(clip) | {"--out": str(clip / out)})
     assert_refused(outcome, "expected a folder")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_a_device_that_is_not_there_is_refused(clip: Path):
+    (clip / "quick.toml").write_text("[fit_mesh]\nsolver = 'adam'\ndevice = 'cuda'\n")
+    assert_refused(invoke("run", options_of(clip)), r"\[fit_mesh\]: expected a CUDA device")
 
 
 def test_nothing_to_find_the_fish_by_is_refused(clip: Path):

@@ -6,6 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stream_dmr.body import JOINT, ROOT
+from stream_dmr.errors import ConfigError
 from stream_dmr.fitting.objective import Objective
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution
@@ -28,6 +29,12 @@ class AdamSolver:
     """Gradient descent on the differentiable silhouette (Kingma and Ba, "Adam", ICLR 2015)."""
 
     def __init__(self, template: Template, settings: FitMeshSettings) -> None:
+        """Raises ConfigError where the settings name a device that is not there."""
+        if settings.device == "cuda" and not torch.cuda.is_available():
+            raise ConfigError(
+                "[fit_mesh]: expected a CUDA device and a CUDA build of torch for "
+                'device = "cuda", found none; set device = "cpu"'
+            )
         self._rig = Rig.from_template(template, device=settings.device)
         self._settings = settings
 
