@@ -30,9 +30,9 @@ class FitMesh:
         """Fit one crop; a poor fit, or one of half a fish, is passed on but warms no other."""
         fitted = self._fitter.fit(crop, self._warm.pop(crop.track_id, None))
         shape = fitted.shape
-        if shape is not None and not crop.quality.touches_border:
-            if shape.iou >= self._settings.cold_below_iou:
-                self._warm[crop.track_id] = shape.parameters
+        is_whole = not crop.quality.touches_border
+        if is_whole and shape is not None and shape.iou >= self._settings.cold_below_iou:
+            self._warm[crop.track_id] = shape.parameters
         return [fitted]
 
     def tick(self, timestamp_ns: int, /) -> Sequence[FittedMesh]:

@@ -1,4 +1,4 @@
-"""A template prepared for deformation: its points bound to the midline, its edges paired with faces.
+"""A template prepared for deformation: points bound to the midline, edges paired with faces.
 
 Plain arrays, so that torch, numpy and compiled loops all work on one and the same binding; and the
 layout of the parameters that deform it.

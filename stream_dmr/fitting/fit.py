@@ -19,7 +19,6 @@ from stream_dmr.fitting.uncertainty import covariance
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms, SolverReport
 from stream_dmr.template import Template
 
-
 # Without a calibration, fish are taken to hang square to the camera.
 _TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
 

@@ -55,7 +55,7 @@ def covariance(
 def _log_length_slope(
     body: Body, kind: int, flat: Float[np.ndarray, "P"], points: Float[np.ndarray, "N 3"]
 ) -> Float[np.ndarray, "P"]:
-    """d log(arc length of the midline) / d parameters, at the fixed depth of the root."""
+    """Slope of the log of the midline's arc length, at the fixed depth of the root."""
     first = body.num_vertices + 3
     midline = points[first:]
     slopes = np.diff(jacobian(body, kind, flat, np.arange(first, len(points))), axis=0)

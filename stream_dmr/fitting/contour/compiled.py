@@ -2,13 +2,11 @@
 
 import inspect
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any
 
 import numba
 
-F = TypeVar("F", bound=Callable[..., object])
 
-
-def compiled(function: F) -> F:
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile for float64 numpy arrays. Unwrapped first: run-time type checks can't be compiled."""
     return numba.njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function))

@@ -80,7 +80,7 @@ def weights(place, joints, L, W, dE):
 
 @compiled
 def turn_slope(R, J, v, out):
-    """d(R v)/d omega = -R [v]x J_r, a 3x3 matrix."""
+    """Slope d(R v)/d omega = -R [v]x J_r, a 3x3 matrix."""
     for k in range(3):
         c0 = J[1, k] * v[2] - J[2, k] * v[1]
         c1 = J[2, k] * v[0] - J[0, k] * v[2]
@@ -144,10 +144,7 @@ def joint_scales(flat, num_joints):
 @compiled
 def deform(body, kind, flat):
     """Deformed points (N, 3), centered on the root, in units of the root's depth."""
-    if kind == SPINE:
-        out = _spine_points(body, flat)
-    else:
-        out = _blend_points(body, flat)
+    out = _spine_points(body, flat) if kind == SPINE else _blend_points(body, flat)
     root, _ = rotation(flat[:3])
     size = np.exp(flat[5])
     for n in range(len(out)):
@@ -237,7 +234,7 @@ def _at_place(body, nodes, u):
 
 @compiled
 def jacobian(body, kind, flat, chosen):
-    """d points / d parameters, (C, 3, P), of the chosen points."""
+    """Slopes of the chosen points to the parameters, (C, 3, P)."""
     num_joints = len(body.joints)
     L = factors(flat, num_joints)
     out = np.zeros((len(chosen), 3, len(flat)))

@@ -41,7 +41,7 @@ def normal_equations(body, kind, target, lambdas, priors, flat, rest, points, pi
 
 @compiled
 def weighted_squares(rows, residuals, weights):
-    """sum w r r^T and sum w r residual, summed in one fixed order: the same bits every time."""
+    """H = sum w r r^T and g = sum w r residual, summed in one fixed order: the same bits every time."""
     count = rows.shape[1]
     H, g = np.zeros((count, count)), np.zeros(count)
     for n in range(len(rows)):
@@ -59,7 +59,7 @@ def weighted_squares(rows, residuals, weights):
 
 @compiled
 def rim_slopes(body, kind, target, flat, points, visible):
-    """d pixels / d parameters (C, 2, P) of the rim's vertices, and where each vertex's rows are."""
+    """Where each vertex's rows are, and slopes of the rim's pixels to the parameters (C, 2, P)."""
     index = np.full(body.num_vertices, -1, np.int64)
     chosen = np.empty(2 * len(visible), np.int64)
     count = 0
@@ -102,7 +102,7 @@ def visible_rim(pixels, rim, covered):
 
 @compiled
 def _pixel_slopes(points, chosen, slopes, target):
-    """d pixels / d parameters, (C, 2, P), of the chosen vertices."""
+    """Slopes of the chosen vertices' pixels to the parameters, (C, 2, P)."""
     out = np.empty((len(chosen), 2, slopes.shape[2]))
     for c in range(len(chosen)):
         x, y, z = points[chosen[c]] + target.anchor
@@ -225,8 +225,9 @@ def _regularise(target, flat, rest, lambdas, priors, H, g):
     R, J = rotation(flat[:3])
     A = np.empty((3, 3))
     turn_slope(R, J, np.array([1.0, 0.0, 0.0]), A)
-    tilt = target.plane_normal @ R[:, 0]
-    slope = target.plane_normal @ A
+    n = target.plane_normal
+    tilt = n[0] * R[0, 0] + n[1] * R[1, 0] + n[2] * R[2, 0]
+    slope = n @ A
     for i in range(3):
         g[i] += priors[0] * tilt * slope[i]
         for k in range(3):
@@ -237,7 +238,8 @@ def _regularise(target, flat, rest, lambdas, priors, H, g):
 def prior_loss(target, flat, rest, priors):
     """What the priors add to L_rec: half the weighted squares of tilt, bends and weights."""
     R, _ = rotation(flat[:3])
-    loss = 0.5 * priors[0] * (target.plane_normal @ R[:, 0]) ** 2
+    n = target.plane_normal
+    loss = 0.5 * priors[0] * (n[0] * R[0, 0] + n[1] * R[1, 0] + n[2] * R[2, 0]) ** 2
     for p in range(ROOT, len(flat)):
         loss += 0.5 * priors[1 + (p - ROOT) % JOINT] * (flat[p] - rest[p]) ** 2
     return loss
