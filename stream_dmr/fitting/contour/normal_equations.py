@@ -41,7 +41,7 @@ def normal_equations(body, kind, target, lambdas, priors, flat, rest, points, pi
 
 @compiled
 def weighted_squares(rows, residuals, weights):
-    """H = sum w r r^T and g = sum w r residual, summed in one fixed order: the same bits every time."""
+    """H = sum w r r^T and g = sum w r residual, in one fixed order: the same bits every time."""
     count = rows.shape[1]
     H, g = np.zeros((count, count)), np.zeros(count)
     for n in range(len(rows)):
