@@ -3,6 +3,8 @@
 Exits with 1 where a fish of the scene was not measured.
 """
 
+import os
+import sys
 from pathlib import Path
 
 import typer
@@ -34,7 +36,8 @@ def measure_scene(scene: Path, *, out: Path, config: Path | None = None) -> bool
     evaluation = evaluate(out / "lengths.csv", scene / "truth.csv")
     print("\nbeside the truth:\n")
     print_evaluation(evaluation)
-    print(f"\nlook at it: rerun {out / 'recording.rrd'}")
+    viewer = os.path.relpath(Path(sys.executable).with_name("rerun"))  # no activated venv needed
+    print(f"\nlook at it: {viewer} {out / 'recording.rrd'}")
     return evaluation.fraction_measured == 1.0
 
 
