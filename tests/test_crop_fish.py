@@ -141,11 +141,11 @@ def test_the_whole_box_is_in_the_crop_with_its_margin(camera, x, y, w, h):
     x0, y0, x1, y1 = np.array(box) - 0.5
     corners = np.array([[x0, y0], [x1, y0], [x0, y1], [x1, y1]])
     seen = crop_from_frame(corners, crop_camera=crop.crop_camera, frame_camera=camera)
-    margin = 192 * 0.15 / 1.3
+    margin = 128 * 0.15 / 1.3
     assert seen.min() > margin - 1.0
     assert seen.max() < 191 - margin + 1.0
     extent = seen.max(axis=0) - seen.min(axis=0)
-    assert extent.max() > 192 - 2 * margin - 24  # the longer side fills the rest (bulges aside)
+    assert extent.max() > 128 - 2 * margin - 24  # the longer side fills the rest (bulges aside)
 
 
 def test_without_distortion_a_crop_is_a_cut_of_the_frame():
@@ -175,7 +175,7 @@ def test_the_crop_covers_box_and_mask_and_keeps_the_box():
     mask[100:120, 200:260] = True
     crop = crop_of(mask, camera, box=[180, 90, 240, 130])
     assert list(crop.bbox_xyxy_px) == [180, 90, 240, 130]
-    assert crop.crop_camera.K[0, 0] / camera.K[0, 0] == pytest.approx(192 / (80 * 1.3))
+    assert crop.crop_camera.K[0, 0] / camera.K[0, 0] == pytest.approx(128 / (80 * 1.3))
     middle = frame_from_crop(
         np.array([[95.5, 95.5]]), crop_camera=crop.crop_camera, frame_camera=camera
     )
@@ -187,7 +187,7 @@ def test_a_mask_larger_than_its_box_widens_the_crop():
     mask = np.zeros((300, 400), bool)
     mask[100:130, 200:260] = True
     crop = crop_of(mask, camera, box=[210.5, 110.5, 220.5, 120.5])
-    assert crop.crop_camera.K[0, 0] / camera.K[0, 0] == pytest.approx(192 / (60 * 1.3))
+    assert crop.crop_camera.K[0, 0] / camera.K[0, 0] == pytest.approx(128 / (60 * 1.3))
 
 
 def test_a_box_of_no_size_to_speak_of_is_cropped_all_the_same():
@@ -292,7 +292,7 @@ def test_the_node_crops_every_fish_and_stands_in_for_a_missing_camera():
     assert second.quality.visible_fraction == 0.4
     assert (first.frame_camera.width, first.frame_camera.height) == (120, 90)
     assert first.frame_camera is second.frame_camera
-    assert first.image.shape == (192, 192, 3)
+    assert first.image.shape == (128, 128, 3)
     assert node.step(Frame(frame_index=2, timestamp_ns=1, image=frame.image, source="")) == []
     assert (*node.tick(1), *node.close()) == ()
 

@@ -22,7 +22,7 @@ class CropFishSettings(Settings):
     """`[crop_fish]`: how fish are cut out of the frame."""
 
     crop_size_px: int = Field(
-        default=192, ge=32, le=1024, description="width and height of a crop, px"
+        default=128, ge=32, le=1024, description="width and height of a crop, px"
     )
     margin: float = Field(
         default=0.15,
