@@ -40,10 +40,10 @@ class FitMeshSettings(Settings):
     )
     adam_iterations: int = Field(default=150, ge=1, description="most iterations of an adam fit")
     tolerance: float = Field(
-        default=1e-4, gt=0, description="a fit has settled when L_rec falls by less than this"
+        default=5e-4, gt=0, description="a fit has settled when L_rec falls by less than this"
     )
     cold_below_iou: float = Field(
-        default=0.9, ge=0, le=1, description="IoU under which a warm fit is tried again from cold"
+        default=0.85, ge=0, le=1, description="IoU under which a warm fit is tried again from cold"
     )
     min_mask_px: int = Field(
         default=100, ge=1, description="smallest mask that is fitted, crop pixels"

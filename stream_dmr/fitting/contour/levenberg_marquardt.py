@@ -11,8 +11,8 @@ from stream_dmr.fitting.contour.outline import coverage, overlap, project, rim_e
 SETTLED, STUCK, EXHAUSTED = 0, 1, 2
 STOP_REASONS = ("L_rec settled", "no step lowers L_rec", "iterations used up")
 
-_GROWTH, _SHRINK = 5.0, 0.3
-_MOST_DAMPING = 1e4
+_GROWTH, _SHRINK = 10.0, 0.3
+_MOST_REFUSED = 3  # steps in a row, each ten times shorter: what is left to gain is pixel noise
 
 
 @compiled
@@ -45,7 +45,7 @@ def minimise(body, kind, target, lambdas, priors, start, rest, iterations, toler
     H, g = normal_equations(
         body, kind, target, lambdas, priors, flat, rest, points, pixels, rim, covered
     )
-    calm = 0
+    calm, refused = 0, 0
     for iteration in range(1, iterations + 1):
         trial = flat - _solve(H, g, damping)
         found = evaluate(body, kind, target, trial)
@@ -55,6 +55,7 @@ def minimise(body, kind, target, lambdas, priors, start, rest, iterations, toler
             loss -= gain
             terms, hard, points, pixels, rim, covered = found
             damping *= _SHRINK
+            refused = 0
             calm = calm + 1 if gain < tolerance else 0
             if calm == 2:
                 return flat, loss, hard, iteration, SETTLED
@@ -64,7 +65,8 @@ def minimise(body, kind, target, lambdas, priors, start, rest, iterations, toler
                 )
         else:
             damping *= _GROWTH
-            if damping > _MOST_DAMPING:
+            refused += 1
+            if refused == _MOST_REFUSED:
                 return flat, loss, hard, iteration, STUCK
     return flat, loss, hard, iterations, EXHAUSTED
 
