@@ -201,6 +201,15 @@ def test_masks_alone_give_the_boxes(tmp_path):
     assert annotations.warnings == ["masks: no picture for 2 frames, the first of them 2"]
 
 
+def test_a_frame_without_boxes_needs_no_mask(tmp_path):
+    cv2.imwrite(str(tmp_path / "000001.png"), labels_of(id1=(0, 0, 2, 2)))
+    boxes = boxes_file(tmp_path, "1,1,0,0,3,3,1\n4,1,0,0,3,3,1\n")
+    annotations = open_annotations(boxes=boxes, masks=tmp_path)
+    for index in (1, 2, 3, 4):
+        annotations.detect(frame_at(index))
+    assert annotations.warnings == ["masks: no picture for 1 frames, the first of them 4"]
+
+
 def test_boxes_choose_among_the_masks_and_mismatches_are_told(tmp_path):
     cv2.imwrite(str(tmp_path / "000001.png"), labels_of(id3=(4, 1, 7, 5), id1=(0, 0, 2, 2)))
     boxes = boxes_file(

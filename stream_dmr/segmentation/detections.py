@@ -53,9 +53,11 @@ class Annotations:
 
     def detect(self, frame: Frame) -> list[Detection]:
         """The fish of one frame, by id. Raises AnnotationError where its mask can't be used."""
-        labels = self._labels(frame)
         if self._boxes is None:
+            labels = self._labels(frame, is_expected=True)
             return [] if labels is None else _detections_of(labels)
+        boxes = self._boxes_inside(frame, self._boxes.get(frame.frame_index, ()))
+        labels = self._labels(frame, is_expected=bool(boxes))
         return [
             Detection(
                 track_id=box.track_id,
@@ -63,7 +65,7 @@ class Annotations:
                 mask=self._mask(frame, box, labels),
                 visible_fraction=box.visibility,
             )
-            for box in self._boxes_inside(frame, self._boxes.get(frame.frame_index, ()))
+            for box in boxes
         ]
 
     @property
@@ -86,15 +88,15 @@ class Annotations:
                 lines.append(f"masks: ids {_join(unboxed)} have no box, so were left out")
         return lines
 
-    def _labels(self, frame: Frame) -> Integer[np.ndarray, "H W"] | None:
+    def _labels(self, frame: Frame, *, is_expected: bool) -> Integer[np.ndarray, "H W"] | None:
         if self._masks is None:
             return None
         height, width = frame.image.shape[:2]
         labels = self._masks.labels(frame.frame_index, width=width, height=height)
-        if labels is None:
-            self._frames_without_mask.append(frame.frame_index)
-        else:
+        if labels is not None:
             self._masked_ids.update(_ids(labels))
+        elif is_expected:  # where no fish is boxed, none is missed
+            self._frames_without_mask.append(frame.frame_index)
         return labels
 
     def _boxes_inside(self, frame: Frame, boxes: Sequence[Box]) -> list[Box]:
