@@ -1,0 +1,239 @@
+"""The contour solver by itself: warm fits, cold fits, fits per second, final loss, parts, start-up."""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from clock import Took, took, typical
+from jaxtyping import Float
+from targets import Known, Pair
+
+from stream_dmr.body import Body, rest_vector
+from stream_dmr.fitting.adam import AdamSolver
+from stream_dmr.fitting.contour import deformation, levenberg_marquardt, normal_equations, outline
+from stream_dmr.fitting.contour.deformation import KINDS, deform
+from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
+from stream_dmr.fitting.contour.outline import project
+from stream_dmr.fitting.contour.solver import ContourSolver
+from stream_dmr.fitting.fit import Fitter, _recentered
+from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.target import Target, mask_contour, signed_distance
+from stream_dmr.fitting.uncertainty import covariance
+from stream_dmr.template import Template
+
+SPINE = KINDS["spine"]
+ADAM_ITERATIONS = 300  # its steps have shrunk ten thousandfold by then
+
+
+class Warm(NamedTuple):
+    """One warm fit: the whole `Fitter.fit`, and its solver alone."""
+
+    whole: Took
+    solver: Took
+    iterations: int
+    iou: float
+
+
+class Cold(NamedTuple):
+    """One cold fit of a body that the template can match exactly."""
+
+    whole: Took
+    iou: float
+    is_flipped: bool
+    bend_rad: float
+
+
+class Losses(NamedTuple):
+    """L_rec of eq. (3), priors left out, where each solver ended from one and the same start."""
+
+    contour: float
+    contour_without_priors: float
+    adam: float
+
+
+class Setup:
+    """A template with all that the measurements need of it."""
+
+    def __init__(self, template: Template) -> None:
+        self.template = template
+        self.body = Body.from_template(template)
+        self.settings = FitMeshSettings()
+
+    def fitter(self, pair: Pair) -> Fitter:
+        return Fitter(self.template, self.settings, plane_normal=pair.plane_normal)
+
+    def before(self, pair: Pair) -> Float[np.ndarray, "P"]:
+        """Parameters of the frame before, fitted from cold."""
+        shape = self.fitter(pair).fit(pair.before, None).shape
+        assert shape is not None
+        return shape.parameters
+
+    def start(self, pair: Pair) -> tuple[Target, Float[np.ndarray, "P"]]:
+        """What the solver of a warm fit is given."""
+        target = Target.from_crop(pair.now, plane_normal=pair.plane_normal)
+        return target, _recentered(self.body, SPINE, target, self.before(pair))
+
+
+def warm(setup: Setup, pair: Pair) -> Warm:
+    """A fit that starts from the frame before."""
+    fitter, before = setup.fitter(pair), setup.before(pair)
+    solver = ContourSolver(setup.body, setup.settings)
+    target, start = setup.start(pair)
+    found = solver.refine(target, start)
+    return Warm(
+        typical(lambda: fitter.fit(pair.now, before), repeats=7),
+        typical(lambda: solver.refine(target, start), repeats=7),
+        found.iterations,
+        found.iou,
+    )
+
+
+def cold(setup: Setup, known: Known) -> Cold:
+    """A fit that starts from nothing."""
+    fitter = Fitter(setup.template, setup.settings)
+    shape = fitter.fit(known.crop, None).shape
+    assert shape is not None
+    v, K = setup.body.num_vertices, known.crop.crop_camera.K
+    points = deform(setup.body, SPINE, known.flat)[v : v + 3]
+    truth = project(points, np.array([0.0, 0.0, 1.0]), K)
+    head = shape.keypoints_px[0]
+    is_flipped = np.linalg.norm(head - truth[2]) < np.linalg.norm(head - truth[0])
+    lap = took(lambda: fitter.fit(known.crop, None))
+    return Cold(lap, shape.iou, bool(is_flipped), known.bend_rad)
+
+
+def fits_per_second(setup: Setup, pairs: list[Pair], *, threads: int, seconds: float) -> float:
+    """Warm fits of all the pairs over and over, shared out to threads: numba releases the GIL."""
+    jobs = [(setup.fitter(pair), pair.now, setup.before(pair)) for pair in pairs]
+    until = time.perf_counter() + seconds
+
+    def work(first: int) -> int:
+        count = 0
+        while time.perf_counter() < until:
+            fitter, crop, before = jobs[(first + count) % len(jobs)]
+            fitter.fit(crop, before)
+            count += 1
+        return count
+
+    began = time.perf_counter()
+    with ThreadPoolExecutor(threads) as pool:
+        total = sum(pool.map(work, range(threads)))
+    return total / (time.perf_counter() - began)
+
+
+def losses(setup: Setup, pair: Pair) -> Losses:
+    """Where the solvers end; adam with so many iterations that its steps have died away."""
+    target, start = setup.start(pair)
+    bare = FitMeshSettings(prior_weight=0.0)
+    patient = FitMeshSettings(solver="adam", adam_iterations=ADAM_ITERATIONS, tolerance=1e-12)
+    ends = (
+        ContourSolver(setup.body, setup.settings).refine(target, start),
+        ContourSolver(setup.body, bare).refine(target, start),
+        AdamSolver(setup.template, patient).refine(target, start),
+    )
+    lambdas = setup.settings.lambdas()
+    values = [evaluate(setup.body, SPINE, target, end.flat)[0] @ lambdas for end in ends]
+    return Losses(*map(float, values))
+
+
+def fit_parts(setup: Setup, pair: Pair) -> dict[str, Callable[[], object]]:
+    """What a warm `Fitter.fit` does, each part to be timed by itself."""
+    body, settings, before = setup.body, setup.settings, setup.before(pair)
+    target, start = setup.start(pair)
+    solver = ContourSolver(body, settings)
+    flat = solver.refine(target, start).flat
+    _, _, points, pixels, rim, covered = evaluate(body, SPINE, target, flat)
+    mask, fitter = pair.now.mask, setup.fitter(pair)
+    outline_of = {"points": points, "pixels": pixels, "rim": rim, "covered": covered}
+    return {
+        "signed distance map": lambda: signed_distance(mask),
+        "contour of the mask": lambda: mask_contour(mask),
+        "start moved onto the mask": lambda: _recentered(body, SPINE, target, before),
+        "solver": lambda: solver.refine(target, start),
+        "terms of the result": lambda: evaluate(body, SPINE, target, flat),
+        "covariance": lambda: covariance(body, target, settings, flat, **outline_of),
+        "all of `Fitter.fit`": lambda: fitter.fit(pair.now, before),
+    }
+
+
+def iteration_parts(setup: Setup, pair: Pair) -> dict[str, Callable[[], object]]:
+    """What one iteration of the solver does."""
+    body, lm, out = setup.body, levenberg_marquardt, outline
+    lambdas, priors = setup.settings.lambdas(), setup.settings.priors()
+    rest = rest_vector(len(body.joints))
+    target, flat = setup.start(pair)
+    _, _, points, pixels, rim, covered = evaluate(body, SPINE, target, flat)
+    visible, _, _ = normal_equations.visible_rim(pixels, rim, covered)
+    chosen, vertices = np.unique(visible), points[: body.num_vertices]
+    rows = np.random.default_rng(0).normal(size=(len(visible) + len(target.contour), len(flat)))
+    weights = np.ones(len(rows))
+    problem = (body, SPINE, target, lambdas, priors, flat, rest, points, pixels, rim, covered)
+    H, g = normal_equations.normal_equations(*problem)
+    mesh = (body.faces, body.edges, body.edge_faces)
+    return {
+        "evaluate": lambda: evaluate(body, SPINE, target, flat),
+        "- deform": lambda: deform(body, SPINE, flat),
+        "- project": lambda: project(vertices, target.anchor, target.K),
+        "- rim": lambda: out.rim_edges(pixels, *mesh),
+        "- coverage": lambda: out.coverage(pixels, rim, len(target.mask)),
+        "- overlap": lambda: out.overlap(covered, target.mask, target.distance, target.mask_area),
+        "- smoothness": lambda: out.smoothness(points, flat, *mesh, body.num_vertices),
+        "normal equations": lambda: normal_equations.normal_equations(*problem),
+        "- visible rim": lambda: normal_equations.visible_rim(pixels, rim, covered),
+        "- jacobian": lambda: deformation.jacobian(body, SPINE, flat, chosen),
+        "- sums of squares": lambda: normal_equations.weighted_squares(rows, weights, weights),
+        "solve": lambda: lm._solve(H, g, 1e-2),
+    }
+
+
+def parts_ms(parts: dict[str, Callable[[], object]], *, repeats: int = 60) -> dict[str, float]:
+    """Median CPU milliseconds of each."""
+    return {name: typical(call, repeats=repeats).cpu_s * 1e3 for name, call in parts.items()}
+
+
+_FIRST_CALLS = """
+import time
+began = time.perf_counter()
+import sys
+sys.path.insert(0, "benchmarks")
+import cv2, numpy as np
+from targets import crop_of_mask, species_template
+from stream_dmr.camera import Camera
+from stream_dmr.fitting.fit import Fitter
+from stream_dmr.fitting.settings import FitMeshSettings
+mask = cv2.ellipse(np.zeros((128, 128), np.uint8), (64, 64), (45, 16), 20, 0, 360, 1, -1) > 0
+crop = crop_of_mask(mask, Camera.nominal(width=128, height=128))
+fitter = Fitter(species_template(), FitMeshSettings())
+ready = time.perf_counter()
+flat = fitter.fit(crop, None).shape.parameters
+fitter.fit(crop, flat)
+first = time.perf_counter()
+fitter.fit(crop, None)
+fitter.fit(crop, flat)
+print(ready - began, first - ready, time.perf_counter() - first)
+"""
+
+
+def first_calls() -> tuple[list[float], list[float]]:
+    """Seconds of importing, a process's first two fits and the next two: empty and full cache."""
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {"NUMBA_CACHE_DIR": cache}
+        empty, full = (
+            subprocess.run(
+                [sys.executable, "-c", _FIRST_CALLS],
+                cwd=Path(__file__).parents[1],
+                env=environment,
+                check=True,
+                capture_output=True,
+                text=True,
+            ).stdout.split()
+            for _ in range(2)
+        )
+    return [float(value) for value in empty], [float(value) for value in full]
