@@ -283,6 +283,16 @@ def test_the_rrd_holds_the_exact_messages_too(tmp_path: Path, messages: list[Mes
     assert_same(header(), again)
 
 
+def test_every_entity_of_the_table_is_drawn_over_time(tmp_path: Path, messages: list[Message]):
+    record(tmp_path, messages, RecordingSettings())
+    chunks = RrdReader(tmp_path / "recording.rrd").stream()
+    drawn = {str(chunk.entity_path) for chunk in chunks if not chunk.is_static}
+    ids = {message.track_id for message in messages if isinstance(message, FishCrop)}
+    paths = [path for topic in TOPICS.values() for path in topic.entities if "{id}" in path]
+    for path in paths:
+        assert any("/" + path.format(id=track_id) in drawn for track_id in ids), path
+
+
 def test_a_placed_mesh_lies_on_its_fish():
     """A fit is the fish at another scale about the camera; placing it must undo that."""
     fish = next(m for m in run(1) if isinstance(m, LocalizedFish))

@@ -99,6 +99,8 @@ class Drawing:
             self._log(topics.KEYPOINTS_3D, track_id, dots)
             line = rr.LineStrips3D([midline], colors=[_WHITE], radii=_THIN)
             self._log(topics.MIDLINE, track_id, line)
+        if fish.bending_ratio is not None:
+            self._log(topics.BENDING, track_id, rr.Scalars(fish.bending_ratio))
         if fish.accepted and fish.length_mm is not None:
             self._log(topics.FRAME_LENGTH, track_id, rr.Scalars(fish.length_mm))
 
@@ -132,7 +134,8 @@ class Drawing:
         self._log(topics.LENGTH, track_id, lines, static=True)
         dots = rr.SeriesPoints(names=f"{name}, frame", colors=tint, marker_sizes=2.0)
         self._log(topics.FRAME_LENGTH, track_id, dots, static=True)
-        self._log(topics.IOU, track_id, rr.SeriesLines(names=name, colors=tint), static=True)
+        for path in (topics.IOU, topics.BENDING):
+            self._log(path, track_id, rr.SeriesLines(names=name, colors=tint), static=True)
 
     def _event(self, path: str, track_id: int, text: str, level: rr.TextLogLevel) -> None:
         line = f"fish {track_id}: {text}"

@@ -20,7 +20,7 @@ _PALETTE = (
 )
 _GRID_MM = 100.0
 _GREY = (150, 160, 170, 90)
-_PICTURE_DEPTH = 0.35  # of the camera's picture in the scene, of the distance to the fish
+_PICTURE_DEPTH = 0.25  # of the camera's picture in the scene, of the distance to the fish
 NOMINAL_DEPTH = 2.5  # of a fish without calibration, in body lengths: it fills half the picture
 RUN = "run"
 
@@ -31,7 +31,10 @@ def color(track_id: int) -> tuple[int, int, int]:
 
 
 def blueprint(calibration: Calibration | None) -> rrb.Blueprint:
-    """The frame and the 3D scene above, length, IoU and the log of events below."""
+    """The frame and the 3D scene above; length, IoU and the log of events below.
+
+    Without a calibration there are no lengths, so the bending ratio takes their place.
+    """
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
@@ -39,14 +42,10 @@ def blueprint(calibration: Calibration | None) -> rrb.Blueprint:
                 _scene_view(calibration),
             ),
             rrb.Horizontal(
-                rrb.TimeSeriesView(
-                    origin="length",
-                    name="Length, its 95 % band, and single frames, mm",
-                    plot_legend=rrb.PlotLegend(visible=False),  # it hides the lines; hover names
-                ),
-                rrb.TimeSeriesView(
-                    origin="iou", name="Silhouette IoU", axis_y=rrb.ScalarAxis(range=(0.5, 1.0))
-                ),
+                _series("bending", "Bending ratio")
+                if calibration is None
+                else _series("length", "Length, its 95 % band, and single frames, mm"),
+                _series("iou", "Silhouette IoU", axis_y=rrb.ScalarAxis(range=(0.5, 1.0))),
                 rrb.Tabs(
                     rrb.TextLogView(origin=LOG, name="Refusals and lengths"),
                     rrb.TextDocumentView(origin=RUN, name="Run"),
@@ -60,6 +59,11 @@ def blueprint(calibration: Calibration | None) -> rrb.Blueprint:
     )
 
 
+def _series(origin: str, name: str, *, axis_y: rrb.ScalarAxis | None = None) -> rrb.TimeSeriesView:
+    legend = rrb.PlotLegend(visible=False)  # it hides the lines; hovering names them
+    return rrb.TimeSeriesView(origin=origin, name=name, axis_y=axis_y, plot_legend=legend)
+
+
 def _scene_view(calibration: Calibration | None) -> rrb.Spatial3DView:
     depth = NOMINAL_DEPTH if calibration is None else _middle(calibration)[2]
     return rrb.Spatial3DView(
@@ -67,10 +71,10 @@ def _scene_view(calibration: Calibration | None) -> rrb.Spatial3DView:
         contents=["scene/**", "- scene/camera/fish/**"],
         name="Scene, camera frame, " + ("relative" if calibration is None else "mm"),
         line_grid=rrb.LineGrid3D(visible=False),
-        # From above the camera's right shoulder, towards the fish.
+        # From above the camera's right shoulder, close enough to see how a fish is bent.
         eye_controls=rrb.EyeControls3D(
-            position=(0.85 * depth, -0.5 * depth, -0.35 * depth),
-            look_target=(0.0, 0.0, 0.75 * depth),
+            position=(0.7 * depth, -0.4 * depth, -0.05 * depth),
+            look_target=(0.0, -0.02 * depth, 0.85 * depth),
             eye_up=(0.0, -1.0, 0.0),
         ),
     )

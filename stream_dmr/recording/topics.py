@@ -37,7 +37,7 @@ MESH = "scene/fish/{id}/mesh"
 KEYPOINTS_2D = "scene/camera/fish/{id}/keypoints"
 KEYPOINTS_3D, MIDLINE = "scene/fish/{id}/keypoints", "scene/fish/{id}/midline"
 FRAME_LENGTH, LENGTH = "length/{id}/frame", "length/{id}/estimate"
-IOU = "iou/{id}"
+IOU, BENDING = "iou/{id}", "bending/{id}"
 LOG, REFUSALS, RESULTS = "log", "log/refusals", "log/lengths"
 CAMERA, PLANE = "scene/camera", "scene/plane"  # static, from the header
 FISH_ROOTS = ("scene/camera/fish", "scene/fish")  # what a new frame clears
@@ -51,7 +51,7 @@ TOPICS: dict[type[Message], Topic] = {
         Topic(
             message=LocalizedFish,
             topic="/localized",
-            entities=(KEYPOINTS_2D, KEYPOINTS_3D, MIDLINE, FRAME_LENGTH),
+            entities=(KEYPOINTS_2D, KEYPOINTS_3D, MIDLINE, FRAME_LENGTH, BENDING),
         ),
         Topic(message=LengthEstimate, topic="/length", entities=(LENGTH, REFUSALS, RESULTS)),
     )
