@@ -1,0 +1,81 @@
+"""Frames per second of the whole chain, 1280 x 960, three fish in view in every frame."""
+
+import tempfile
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+
+from stream_dmr.calibration import save_calibration
+from stream_dmr.config import Config, to_toml
+from stream_dmr.run import RunRequest, run
+from stream_dmr.simulation.film import Shot, film
+from stream_dmr.simulation.scene import HEIGHT, WIDTH, make_scene
+from stream_dmr.simulation.writer import encode_mask, write_species
+
+NUM_FISH = 3
+_MOSTLY = 0.9  # of each fish is in view, as in the middle of a passage
+RECORDINGS = {
+    "both recordings (default)": {},
+    ".mcap alone": {"rrd": False},
+    "no recording": {"mcap": False, "rrd": False},
+}
+
+
+class Rate(NamedTuple):
+    """How one run went."""
+
+    frames_per_second: float
+    num_frames: int
+    cpu_ms: float  # of all threads, per frame: what other users of the machine don't change
+    busy_ms: dict[str, float]  # of each stage, per frame
+
+
+def write_clip(out: Path, *, num_frames: int, seed: int = 1) -> None:
+    """A simulated clip in which every frame shows three fish, with exact masks and calibration."""
+    slots = make_scene(num_fish=NUM_FISH, num_frames=4 * num_frames, preset="realistic", seed=seed)
+    together = [replace(visit, first_frame=1, is_gaffed=False) for visit in slots.visits]
+    scene = replace(slots, visits=together)
+    shots = (shot for shot in film(scene) if _shows_all(shot))
+    write_species(out)
+    save_calibration(out / "calibration.yaml", scene.calibration)
+    (out / "masks").mkdir()
+    codec = cv2.VideoWriter.fourcc(*"mp4v")
+    video = cv2.VideoWriter(str(out / "video.mp4"), codec, 15, (WIDTH, HEIGHT))
+    for index, shot in zip(range(1, num_frames + 1), shots, strict=False):
+        video.write(shot.image)
+        _write_mask(out / "masks" / f"{index:06d}.png", shot)
+    video.release()
+
+
+def measure(clip: Path, recording: dict[str, bool]) -> Rate:
+    """Run the chain over a clip once."""
+    with tempfile.TemporaryDirectory() as folder:
+        config = Path(folder) / "config.toml"
+        config.write_text(to_toml(Config.model_validate({"recording": recording})))
+        request = RunRequest(
+            source=str(clip / "video.mp4"),
+            calibration=clip / "calibration.yaml",
+            masks=clip / "masks",
+            template=str(clip / "species.ply"),
+            config=config,
+            out=Path(folder) / "out",
+        )
+        began = time.process_time()
+        summary = run(request, stop=threading.Event())
+        cpu_s = time.process_time() - began
+    count = summary.num_frames
+    busy = {counter.stage: counter.busy_s * 1e3 / count for counter in summary.counters}
+    return Rate(count / summary.elapsed_s, count, cpu_s * 1e3 / count, busy)
+
+
+def _shows_all(shot: Shot) -> bool:
+    visible = [box for box in shot.boxes if box.visible_fraction >= _MOSTLY]
+    return len(visible) == NUM_FISH
+
+
+def _write_mask(path: Path, shot: Shot) -> None:
+    path.write_bytes(encode_mask(shot.labels, num_fish=NUM_FISH))
