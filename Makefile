@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-slow check format config clean
+.PHONY: demo test test-slow bench check format config clean
 
 demo: $(STAMP)  ## the main job on the embedded scene, lengths beside the truth
 	$(BIN)/python -m stream_dmr.demo
@@ -14,6 +14,11 @@ test: $(STAMP)  ## the tests of a few minutes
 
 test-slow: $(STAMP)  ## the long ones, and those on material outside the repository
 	$(BIN)/pytest -m "slow or scenes"
+
+bench: $(STAMP)  ## the fit beside other renderers, and the chain: docs/performance.md, six minutes
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[bench]' \
+		|| echo "the extra bench could not be installed: what needs it is left out"
+	$(BIN)/python benchmarks/solvers.py
 
 check: $(STAMP)  ## style and types
 	$(BIN)/ruff format --check .

@@ -1,9 +1,10 @@
 """Time to a hard IoU of 0.97: the contour solver, our `adam`, and DEODR with Adam.
 
 One thread. What is compared is the thread's CPU time: on a shared machine the wall clock doubles
-long runs and spares short ones, which would flatter the fast solver. Each clock runs from the crop's mask, so distance map and contour are included. The
-contour solver doesn't report while it runs, so it is asked for ever more iterations until it gets
-there, and that run is timed; the others are stopped by an exception as soon as an iterate is there.
+long runs and spares short ones, which would flatter the fast solver. Each clock runs from the
+crop's mask, so distance map and contour are included. The contour solver doesn't report while it
+runs, so it is asked for ever more iterations until it gets there, and that run is timed; the others
+are stopped by an exception as soon as an iterate is there.
 """
 
 from collections.abc import Callable, Iterator
@@ -50,8 +51,10 @@ class _Reached(Exception):
 class _Watched(ContourSolver):
     """Stops as soon as a minimisation ends at the goal."""
 
-    def _minimise(self, *arguments: Any) -> Solution:
-        solution = super()._minimise(*arguments)
+    def _minimise(
+        self, target: Target, start: Float[np.ndarray, "P"], iterations: int, damping: float
+    ) -> Solution:
+        solution = super()._minimise(target, start, iterations, damping)
         if solution.iou >= GOAL:
             raise _Reached
         return solution

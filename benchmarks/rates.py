@@ -1,4 +1,4 @@
-"""The contour solver by itself: warm fits, cold fits, fits per second, final loss, parts, start-up."""
+"""The contour solver by itself: warm and cold fits, their rate, final loss, parts, start-up."""
 
 import os
 import subprocess
@@ -67,6 +67,7 @@ class Setup:
         self.settings = FitMeshSettings()
 
     def fitter(self, pair: Pair) -> Fitter:
+        """As the chain makes it, for the pair's reference plane."""
         return Fitter(self.template, self.settings, plane_normal=pair.plane_normal)
 
     def before(self, pair: Pair) -> Float[np.ndarray, "P"]:
@@ -97,15 +98,14 @@ def warm(setup: Setup, pair: Pair) -> Warm:
 
 def cold(setup: Setup, known: Known) -> Cold:
     """A fit that starts from nothing."""
-    fitter = Fitter(setup.template, setup.settings)
-    shape = fitter.fit(known.crop, None).shape
-    assert shape is not None
+    fitter, fitted = Fitter(setup.template, setup.settings), []
+    lap = took(lambda: fitted.append(fitter.fit(known.crop, None)))
+    shape = fitted[0].shape
     v, K = setup.body.num_vertices, known.crop.crop_camera.K
     points = deform(setup.body, SPINE, known.flat)[v : v + 3]
     truth = project(points, np.array([0.0, 0.0, 1.0]), K)
     head = shape.keypoints_px[0]
     is_flipped = np.linalg.norm(head - truth[2]) < np.linalg.norm(head - truth[0])
-    lap = took(lambda: fitter.fit(known.crop, None))
     return Cold(lap, shape.iou, bool(is_flipped), known.bend_rad)
 
 

@@ -74,7 +74,9 @@ def plot(laps: list[Lap], path: Path) -> None:
                 axis.plot([place] * len(times), times, ".", color=f"C{s}", alpha=0.35, ms=4)
                 if times:
                     label = solver if x == 0 else None
-                    axis.plot(place, np.median(times), "_", color=f"C{s}", ms=16, mew=3, label=label)
+                    axis.plot(
+                        place, np.median(times), "_", color=f"C{s}", ms=16, mew=3, label=label
+                    )
         axis.set(yscale="log", title=f"{size} px", xticks=range(len(STARTS)), xticklabels=STARTS)
         axis.grid(axis="y", alpha=0.3)
     axes[0][0].set_ylabel("CPU ms to IoU 0.97")
@@ -202,9 +204,7 @@ def _losses(losses: list[Losses]) -> str:
     ):
         gaps = [a - b.adam for a, b in zip(values, losses, strict=True)]
         close = sum(gap <= 1e-3 for gap in gaps)
-        rows.append(
-            f"| {name} | {_range(gaps, '+.4f')} | {max(gaps):+.4f} | {close}/{len(gaps)} |"
-        )
+        rows.append(f"| {name} | {_range(gaps, '+.4f')} | {max(gaps):+.4f} | {close}/{len(gaps)} |")
     return "\n".join(rows)
 
 

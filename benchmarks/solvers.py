@@ -1,4 +1,4 @@
-"""How fast the contour solver is, beside `adam` and DEODR: tables and a plot in docs/performance.md.
+"""How fast the fit is, beside `adam` and DEODR: tables and a plot in docs/performance.md.
 
     python benchmarks/solvers.py [--targets N] [--dry]
 

@@ -1,4 +1,4 @@
-"""Masks to fit: simulated fish, frame after frame, and bodies that the template can match exactly."""
+"""Masks to fit: simulated fish, frame after frame, and bodies that the template matches exactly."""
 
 from typing import NamedTuple
 
@@ -85,24 +85,29 @@ def _joint_bend(
     return low
 
 
-def _known_crop(
-    body: Body, flat: Float[np.ndarray, "P"], *, size: int, bend_rad: float
-) -> Known:
+def _known_crop(body: Body, flat: Float[np.ndarray, "P"], *, size: int, bend_rad: float) -> Known:
     """The body in the middle of a crop, filling all but 15 % on each side."""
     flat = flat.copy()
     flat[5] = np.log(0.12)
     for _ in range(3):  # depth differs along the body, so centering takes a few rounds
-        points = deform(body, KINDS["spine"], flat)[: body.num_vertices] + [0.0, 0.0, 1.0]
-        rays = points[:, :2] / points[:, 2:]
-        low, high = rays.min(axis=0), rays.max(axis=0)
+        points, low, high = _placed(body, flat)
         flat[3:5] -= (low + high) / 2 / np.exp(flat[5])
+    points, low, high = _placed(body, flat)
     focal = 0.77 * size / float((high - low).max())
     middle = (size - 1) / 2
     K = np.array([[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]])
     camera = Camera(width=size, height=size, K=K, distortion=np.zeros(5))
-    points = deform(body, KINDS["spine"], flat)[: body.num_vertices] + [0.0, 0.0, 1.0]
     mask = draw_mask(points, body.faces, camera=camera)
     return Known(crop_of_mask(mask, camera), flat, bend_rad)
+
+
+def _placed(
+    body: Body, flat: Float[np.ndarray, "P"]
+) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """Vertices before the camera, and the corners of the box around their rays."""
+    points = deform(body, KINDS["spine"], flat)[: body.num_vertices] + np.array([0.0, 0.0, 1.0])
+    rays = points[:, :2] / points[:, 2:]
+    return points, rays.min(axis=0), rays.max(axis=0)
 
 
 def _crop(scene: Scene, visit: Visit, frame_index: int, *, size: int) -> FishCrop:
@@ -122,6 +127,7 @@ def _box(mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "4"]:
 
 
 def crop_of_mask(mask: Bool[np.ndarray, "S S"], camera: Camera) -> FishCrop:
+    """A crop without a picture."""
     return FishCrop(
         frame_index=1,
         timestamp_ns=0,
