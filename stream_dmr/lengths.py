@@ -146,8 +146,16 @@ class TrackLength:
     def _std_mm(
         self, length_mm: Float[np.ndarray, "N"], variance: Float[np.ndarray, "N"]
     ) -> Float[np.ndarray, "N"]:
-        """Std from the filter's variance and the error that all frames share, independent."""
-        return np.sqrt(variance + (self._settings.common_std_ratio * length_mm) ** 2)
+        """Std from the filter's variance and from what frames of one fish have in common.
+
+        Twenty frames of one pose are not twenty measurements: with a correlation rho between the
+        errors of n frames, the variance of their mean is P (1 - rho + rho n), where P is what the
+        filter takes for n independent ones.
+        """
+        assert self._filter is not None
+        rho, n = self._settings.frame_correlation, len(self._filter.frames)
+        shared = (self._settings.common_std_ratio * length_mm) ** 2
+        return np.sqrt(variance * (1.0 - rho + rho * n) + shared)
 
     def _status(self, num_used: int, *, is_final: bool) -> str:
         if NO_CALIBRATION in self._refused:

@@ -151,16 +151,17 @@ def test_outlier_is_named_in_its_own_frame_and_the_next_one_is_used():
     assert (estimates[7].frames_seen, estimates[7].frames_used) == (8, 7)
 
 
-@pytest.mark.parametrize("common", [0.0, 0.02])
-def test_interval_covers_the_truth_as_often_as_it_says(common):
-    """150 fish of 15 independent frames, with and without an error that all frames share."""
+@pytest.mark.parametrize(("common", "rho"), [(0.0, 0.0), (0.02, 0.0), (0.01, 0.2)])
+def test_interval_covers_the_truth_as_often_as_it_says(common, rho):
+    """150 fish of 15 frames, with and without errors that frames share."""
     rng = np.random.default_rng(1)
     hits, nees = [], []
     for truth in rng.uniform(400, 1200, 150):
         std = truth * rng.uniform(0.02, 0.06, 15)
-        seen = truth * (1 + common * rng.normal()) + std * rng.normal(size=15)
+        errors = np.sqrt(rho) * rng.normal() + np.sqrt(1 - rho) * rng.normal(size=15)
+        seen = truth * (1 + common * rng.normal()) + std * errors
         frames = [frame(i + 1, seen[i], std_mm=std[i]) for i in range(15)]
-        final = run(frames, common_std_ratio=common)[-1]
+        final = run(frames, common_std_ratio=common, frame_correlation=rho)[-1]
         low, high = final.ci95_mm
         hits.append(low <= truth <= high)
         nees.append(((final.length_mm - truth) / final.length_std_mm) ** 2)
@@ -183,7 +184,8 @@ def test_overconfident_fits_are_widened_by_their_own_scatter():
 
 
 def test_common_error_does_not_average_out():
-    final = run([frame(i, 700.0) for i in range(1, 400)], common_std_ratio=0.02)[-1]
+    frames = [frame(i, 700.0) for i in range(1, 400)]
+    final = run(frames, common_std_ratio=0.02, frame_correlation=0.0)[-1]
     assert final.length_std_mm == pytest.approx(14.0, rel=0.01)
     np.testing.assert_allclose(final.ci95_mm, [700 - 27.5, 700 + 27.5], atol=0.3)
 

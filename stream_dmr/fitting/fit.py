@@ -23,6 +23,11 @@ from stream_dmr.template import Template
 _TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
 
 
+# In L_rec: by so much must a cold fit be better to give up the pose of the frame before, and with it
+# which end is the head.
+_CLEAR_GAIN = 0.01
+
+
 class Fitter:
     """Fits one template to crops; holds nothing of any track."""
 
@@ -76,7 +81,7 @@ class Fitter:
         return "mask too small" if area < self._settings.min_mask_px else ""
 
     def _solve(self, target: Target, warm: Float[np.ndarray, "P"] | None) -> tuple[Solution, bool]:
-        """The warm fit if it is good, else the better one of warm and cold."""
+        """The warm fit if it is good, else a cold one where that is clearly better."""
         solution = None
         if warm is not None:
             start = _recentered(self._body, self._kind, target, warm)
@@ -84,7 +89,7 @@ class Fitter:
             if solution.iou >= self._settings.cold_below_iou:
                 return solution, False
         cold = self._solver.search(target, cold_starts(target, self._template))
-        if solution is not None and solution.loss <= cold.loss:
+        if solution is not None and solution.loss < cold.loss + _CLEAR_GAIN:
             return solution, False
         return cold, True
 
