@@ -11,8 +11,9 @@ from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution
 from stream_dmr.fitting.target import Target
 
-_SEARCH_ITERATIONS = 6
-_NUM_FINISHED = 4
+# Of a search: iterations of a round, and how many of the starts go through to it.
+_ROUNDS = ((2, 1.0), (4, 0.5))
+_NUM_FINISHED = 3
 # Damping at the start: near the answer the model is trusted, far from it less.
 _NEAR, _FAR = 1e-2, 1e-1
 
@@ -42,10 +43,14 @@ class ContourSolver:
         return prior_loss(target, flat, self._rest, self._settings.priors())
 
     def search(self, target: Target, starts: Float[np.ndarray, "B P"]) -> Solution:
-        """A few iterations from every start, the best ones to the end, the best of these."""
-        rough = [self._minimise(target, start, _SEARCH_ITERATIONS, _FAR) for start in starts]
-        rough.sort(key=lambda solution: solution.loss)
-        fine = [self.refine(target, solution.flat) for solution in rough[:_NUM_FINISHED]]
+        """Rounds of a few iterations, after each the better ones; the best of those finished."""
+        flats = list(starts)
+        for iterations, share in _ROUNDS:
+            flats = flats[: max(_NUM_FINISHED, int(share * len(starts)))]
+            rough = [self._minimise(target, flat, iterations, _FAR) for flat in flats]
+            rough.sort(key=lambda solution: solution.loss)
+            flats = [solution.flat for solution in rough]
+        fine = [self.refine(target, flat) for flat in flats[:_NUM_FINISHED]]
         return min(fine, key=lambda solution: solution.loss)
 
     def _minimise(
