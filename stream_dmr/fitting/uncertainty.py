@@ -19,7 +19,7 @@ from stream_dmr.fitting.target import Target
 # What is known of the parameters before any picture, as standard deviations: rotations of the root
 # and the joints (rad), their translations (body lengths), log scales, log precisions.
 _ROOT_PRIOR = [2.0] * 3 + [1.0] * 2 + [1.0]
-_JOINT_PRIOR = [1.0] * 3 + [0.03] * 3 + [0.1] + [1.0] * 6
+_JOINT_PRIOR = [1.0] * 3 + [0.013] * 3 + [0.1] + [1.0] * 6
 
 
 def covariance(
