@@ -35,6 +35,8 @@ class AdamSolver:
                 "[fit_mesh]: expected a CUDA device and a CUDA build of torch for "
                 'device = "cuda", found none; set device = "cpu"'
             )
+        # Tensors this small gain nothing from threads, and wait for them where cores are busy.
+        torch.set_num_threads(1)
         self._rig = Rig.from_template(template, device=settings.device)
         self._settings = settings
 
