@@ -23,8 +23,8 @@ from stream_dmr.template import Template
 _TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
 
 
-# In L_rec: by so much must a cold fit be better to give up the pose of the frame before, and with it
-# which end is the head.
+# In L_rec: by so much must a cold fit be better to give up the pose of the frame before, and which
+# end is the head.
 _CLEAR_GAIN = 0.01
 
 
