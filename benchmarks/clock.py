@@ -15,7 +15,7 @@ class Took(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """Median and quartiles of a sample; None where less than half of it arrived."""
+    """Median and quartiles of a sample."""
 
     median: float
     low: float
