@@ -184,7 +184,7 @@ def iteration_parts(setup: Setup, pair: Pair) -> dict[str, Callable[[], object]]
         "- rim": lambda: out.rim_edges(pixels, *mesh),
         "- coverage": lambda: out.coverage(pixels, rim, len(target.mask)),
         "- overlap": lambda: out.overlap(covered, target.mask, target.distance, target.mask_area),
-        "- smoothness": lambda: out.smoothness(points, flat, *mesh, body.num_vertices),
+        "- smoothness": lambda: out.smoothness(body, points, np.exp(flat[5])),
         "normal equations": lambda: normal_equations.normal_equations(*problem),
         "- visible rim": lambda: normal_equations.visible_rim(pixels, rim, covered),
         "- jacobian": lambda: deformation.jacobian(body, SPINE, flat, chosen),

@@ -38,6 +38,7 @@ class Body(NamedTuple):
     faces: Int[np.ndarray, "F 3"]
     edges: Int[np.ndarray, "E 2"]  # each once, in the direction in which its first face runs
     edge_faces: Int[np.ndarray, "E 2"]  # the faces that run along and against the edge
+    num_neighbors: Int[np.ndarray, "V"]  # of each vertex along the edges
     num_vertices: int
 
     @classmethod
@@ -45,8 +46,8 @@ class Body(NamedTuple):
         """Bind a template's points to its midline."""
         points = np.concatenate([template.rest_vertices, template.keypoints, template.midline])
         segments, fractions = bind_to_midline(points, template.midline)
-        # Rounded, since points of one ring differ in their last bits.
-        where = np.round(segments + fractions, 9)
+        # Rounded, since points of one ring differ in the last bits of the file that they come from.
+        where = np.round(segments + fractions, 3)
         _, first, place_of = np.unique(where, return_index=True, return_inverse=True)
         segments, fractions = segments[first], fractions[first]
         start, step = template.midline[:-1], np.diff(template.midline, axis=0)
@@ -62,6 +63,7 @@ class Body(NamedTuple):
             faces=template.faces,
             edges=edges,
             edge_faces=edge_faces,
+            num_neighbors=np.bincount(edges.ravel()),
             num_vertices=len(template.rest_vertices),
         )
 

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -92,7 +91,7 @@ class Rig:
             "faces": body.faces,
             "edges": body.edges,
             "edge_faces": body.edge_faces,
-            "num_neighbors": np.bincount(body.edges.ravel()).astype(np.float64),
+            "num_neighbors": body.num_neighbors.astype(float),
             "joints": body.joints,
             "midline": body.midline,
             "feet": body.places[body.place_of],

@@ -40,7 +40,7 @@ class FitMeshSettings(Settings):
     )
     adam_iterations: int = Field(default=150, ge=1, description="most iterations of an adam fit")
     tolerance: float = Field(
-        default=5e-4, gt=0, description="a fit has settled when L_rec falls by less than this"
+        default=2e-4, gt=0, description="a fit has settled when L_rec falls by less than this"
     )
     cold_below_iou: float = Field(
         default=0.85, ge=0, le=1, description="IoU under which a warm fit is tried again from cold"

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from stream_dmr.fitting.compiled import compiled
 from stream_dmr.messages import FishCrop
 
 _SMOOTHING_PX = 1.5  # of the staircase that pixels make of an edge; short beside any fin
@@ -41,19 +42,27 @@ class Target(NamedTuple):
 
 def signed_distance(mask: Bool[np.ndarray, "S S"]) -> Float[np.ndarray, "S S"]:
     """Distance in pixels to the mask's edge, negative inside: the map behind `boundary_loss`."""
-    # Both count to the nearest pixel's centre on the other side; the edge lies half way.
-    return np.where(mask, 0.5 - _distance_to(~mask), _distance_to(mask) - 0.5)
+    inside = mask.astype(np.uint8)
+    out = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    into = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return _signed(out, into)
 
 
-def _distance_to(pixels: Bool[np.ndarray, "S S"]) -> Float[np.ndarray, "S S"]:
-    """Distance to the nearest of some pixels, to the last bit.
+@compiled
+def _signed(out, into):
+    """Half a pixel less on either side: both count to centres, and the edge lies half way.
 
     OpenCV's square roots differ in their last bits with where in memory an array lies; but what it
     takes the roots of are whole numbers, so they can be had back.
     """
-    elsewhere = (~pixels).astype(np.uint8)
-    rough = cv2.distanceTransform(elsewhere, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.sqrt(np.rint(np.square(rough.astype(np.float64))))
+    signed = np.empty(out.shape)
+    for i in range(out.shape[0]):
+        for k in range(out.shape[1]):
+            if out[i, k] > 0.0:
+                signed[i, k] = np.sqrt(np.rint(np.float64(out[i, k]) ** 2)) - 0.5
+            else:
+                signed[i, k] = 0.5 - np.sqrt(np.rint(np.float64(into[i, k]) ** 2))
+    return signed
 
 
 def mask_contour(

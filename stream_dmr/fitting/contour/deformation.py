@@ -9,7 +9,7 @@ softmax of e_j, so that a blend X = sum_j W_j X_j has dX/de_j = W_j (X_j - X).
 import numpy as np
 
 from stream_dmr.body import JOINT, ROOT
-from stream_dmr.fitting.contour.compiled import compiled
+from stream_dmr.fitting.compiled import compiled
 
 SPINE, LINEAR_BLEND = 0, 1
 KINDS = {"spine": SPINE, "linear-blend": LINEAR_BLEND}
@@ -18,25 +18,57 @@ KINDS = {"spine": SPINE, "linear-blend": LINEAR_BLEND}
 @compiled
 def rotation(w):
     """Rotation matrix of a rotation vector, and its right Jacobian."""
-    x, y, z = w
-    angle2 = x * x + y * y + z * z
-    if angle2 < 1e-8:
-        a, b, c = 1 - angle2 / 6, 0.5 - angle2 / 24, 1 / 6 - angle2 / 120
-    else:
-        angle = np.sqrt(angle2)
-        a = np.sin(angle) / angle
-        b = (1 - np.cos(angle)) / angle2
-        c = (1 - a) / angle2
-    R = np.empty((3, 3))
-    J = np.empty((3, 3))
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    for i in range(3):
-        for k in range(3):
-            square = w[i] * w[k] - (angle2 if i == k else 0.0)
-            one = 1.0 if i == k else 0.0
-            R[i, k] = one + a * cross[i, k] + b * square
-            J[i, k] = one - b * cross[i, k] + c * square
+    R, J = np.empty((3, 3)), np.empty((3, 3))
+    a, b, c = _sines(w)
+    _fill(w, a, b, R)
+    _fill(w, -b, c, J)
     return R, J
+
+
+@compiled
+def turn(w, R):
+    """The rotation matrix alone, into R."""
+    a, b, _ = _sines(w)
+    _fill(w, a, b, R)
+
+
+@compiled
+def _sines(w):
+    """Sin(t) / t, (1 - cos t) / t^2 and (t - sin t) / t^3 of the angle t."""
+    angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    if angle2 < 1e-8:
+        return 1 - angle2 / 6, 0.5 - angle2 / 24, 1 / 6 - angle2 / 120
+    angle = np.sqrt(angle2)
+    a = np.sin(angle) / angle
+    return a, (1 - np.cos(angle)) / angle2, (1 - a) / angle2
+
+
+@compiled
+def _fill(w, a, b, out):
+    """I + a [w]x + b [w]x^2."""
+    x, y, z = w[0], w[1], w[2]
+    out[0, 0] = 1 - b * (y * y + z * z)
+    out[1, 1] = 1 - b * (x * x + z * z)
+    out[2, 2] = 1 - b * (x * x + y * y)
+    out[0, 1], out[1, 0] = b * x * y - a * z, b * x * y + a * z
+    out[0, 2], out[2, 0] = b * x * z + a * y, b * x * z - a * y
+    out[1, 2], out[2, 1] = b * y * z - a * x, b * y * z + a * x
+
+
+@compiled
+def apply(R, v, out):
+    """R v into out: for three numbers faster than a call of BLAS."""
+    for i in range(3):
+        out[i] = R[i, 0] * v[0] + R[i, 1] * v[1] + R[i, 2] * v[2]
+
+
+@compiled
+def dot(a, b):
+    """Scalar product of two short vectors."""
+    total = 0.0
+    for k in range(len(a)):
+        total += a[k] * b[k]
+    return total
 
 
 @compiled
@@ -106,17 +138,23 @@ def spine_nodes(body, flat, L, with_slope):
     place = np.zeros((count, 3))
     slope = np.zeros((count if with_slope else 0, 3, JOINT * num_joints))
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
-    omega, A = np.empty(3), np.empty((3, 3))
+    omega, step, Rd, middle = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    A, R = np.empty((3, 3)), np.empty((3, 3))
     for k in range(count - 1):
-        weights((body.midline[k] + body.midline[k + 1]) / 2, body.joints, L, W, dE)
+        for i in range(3):
+            middle[i] = (body.midline[k, i] + body.midline[k + 1, i]) / 2
+        weights(middle, body.joints, L, W, dE)
         blend(W, flat, 0, 3, omega)
-        R, J = rotation(omega)
-        step = body.midline[k + 1] - body.midline[k]
-        Rd = R @ step
-        scale = W @ S
-        place[k + 1] = place[k] + scale * Rd
+        for i in range(3):
+            step[i] = body.midline[k + 1, i] - body.midline[k, i]
+        turn(omega, R)
+        apply(R, step, Rd)
+        scale = dot(W, S)
+        for i in range(3):
+            place[k + 1, i] = place[k, i] + scale * Rd[i]
         if not with_slope:
             continue
+        R, J = rotation(omega)
         turn_slope(R, J, step, A)
         slope[k + 1] = slope[k]
         for j in range(num_joints):
@@ -176,10 +214,13 @@ def _spine_points(body, flat):
     for u in range(len(body.places)):
         weights(body.places[u], body.joints, L, W, dE)
         blend(W, flat, 0, 3, omega)
-        turns[u] = rotation(omega)[0]
+        turn(omega, turns[u])
         blend(W, flat, 3, 3, omega)
-        bases[u] = _at_place(body, nodes, u) - center + turns[u] @ omega
-        scales[u] = W @ S
+        apply(turns[u], omega, bases[u])
+        k, t = body.segments[u], body.fractions[u]
+        for i in range(3):
+            bases[u, i] += (1.0 - t) * nodes[k, i] + t * nodes[k + 1, i] - center[i]
+        scales[u] = dot(W, S)
     out = np.empty_like(body.points)
     for n in range(len(out)):
         u = body.place_of[n]
@@ -199,7 +240,7 @@ def _blend_points(body, flat):
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
     turns = np.empty((num_joints, 3, 3))
     for j in range(num_joints):
-        turns[j] = rotation(flat[ROOT + JOINT * j : ROOT + JOINT * j + 3])[0]
+        turn(flat[ROOT + JOINT * j : ROOT + JOINT * j + 3], turns[j])
     out = np.zeros_like(body.points)
     for n in range(len(out)):
         weights(body.points[n], body.joints, L, W, dE)
@@ -219,7 +260,7 @@ def _move_and_scale(body, flat, size, out):
     for n in range(len(out)):
         weights(body.points[n], body.joints, L, W, dE)
         blend(W, flat, 3, 3, shift)
-        scale = size * (W @ S)
+        scale = size * dot(W, S)
         out[n, 0] = scale * (out[n, 0] + shift[0] + flat[3])
         out[n, 1] = scale * (out[n, 1] + shift[1] + flat[4])
         out[n, 2] = scale * (out[n, 2] + shift[2])
@@ -256,6 +297,7 @@ def _spine_jacobian(body, flat, L, chosen, out):
     size = np.exp(flat[5])
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
     omega, shift, off, o = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    v, Roff = np.empty(3), np.empty(3)
     A, along, none = np.empty((3, 3)), np.empty(3), np.zeros(3)
     local = np.empty((3, JOINT * num_joints))
     for c in range(len(chosen)):
@@ -264,13 +306,13 @@ def _spine_jacobian(body, flat, L, chosen, out):
         weights(body.places[u], body.joints, L, W, dE)
         blend(W, flat, 0, 3, omega)
         blend(W, flat, 3, 3, shift)
-        scale = W @ S
+        scale = dot(W, S)
         R, J = rotation(omega)
         for i in range(3):
             off[i] = body.points[n, i] - body.places[u, i]
             o[i] = scale * off[i] + shift[i]
         turn_slope(R, J, o, A)
-        Roff = R @ off
+        apply(R, off, Roff)
         k, t = body.segments[u], body.fractions[u]
         for i in range(3):
             for p in range(JOINT * num_joints):
@@ -289,7 +331,9 @@ def _spine_jacobian(body, flat, L, chosen, out):
                 local[i, b + 6] += W[j] * S[j] * Roff[i]
                 for q in range(6):
                     local[i, b + 7 + q] += W[j] * along[i] * dE[j, q]
-        v = (1.0 - t) * nodes[k] + t * nodes[k + 1] - center + R @ o
+        apply(R, o, v)
+        for i in range(3):
+            v[i] += (1.0 - t) * nodes[k, i] + t * nodes[k + 1, i] - center[i]
         _root_slope(root, root_J, size, flat, v, none, 1.0, out[c], A)
         for i in range(3):
             for p in range(JOINT * num_joints):
@@ -327,7 +371,7 @@ def _blend_jacobian(body, flat, L, chosen, out):
         point = body.points[chosen[c]]
         weights(point, body.joints, L, W, dE)
         blend(W, flat, 3, 3, shift)
-        scale = W @ S
+        scale = dot(W, S)
         v = np.zeros(3)
         for j in range(num_joints):
             v += W[j] * (turns[j] @ point)

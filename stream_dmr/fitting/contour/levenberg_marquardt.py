@@ -3,8 +3,8 @@
 import numpy as np
 
 from stream_dmr.body import JOINT, ROOT
-from stream_dmr.fitting.contour.compiled import compiled
-from stream_dmr.fitting.contour.deformation import deform
+from stream_dmr.fitting.compiled import compiled
+from stream_dmr.fitting.contour.deformation import deform, dot
 from stream_dmr.fitting.contour.normal_equations import normal_equations, prior_loss
 from stream_dmr.fitting.contour.outline import coverage, overlap, project, rim_edges, smoothness
 
@@ -23,9 +23,7 @@ def evaluate(body, kind, target, flat):
     rim = rim_edges(pixels, body.faces, body.edges, body.edge_faces)
     covered = coverage(pixels, rim, len(target.mask))
     iou, boundary, hard = overlap(covered, target.mask, target.distance, target.mask_area)
-    normal, laplacian = smoothness(
-        points, flat, body.faces, body.edges, body.edge_faces, body.num_vertices
-    )
+    normal, laplacian = smoothness(body, points, np.exp(flat[5]))
     scale, translation = 0.0, 0.0
     for j in range(len(body.joints)):
         base = ROOT + JOINT * j
@@ -47,7 +45,10 @@ def minimise(body, kind, target, lambdas, priors, start, rest, iterations, toler
     )
     calm, refused = 0, 0
     for iteration in range(1, iterations + 1):
-        trial = flat - _solve(H, g, damping)
+        step = _solve(H, g, damping)
+        if 0.5 * dot(g, step) < tolerance:
+            return flat, loss, hard, iteration - 1, SETTLED
+        trial = flat - step
         found = evaluate(body, kind, target, trial)
         gain = loss - np.sum(found[0] * lambdas) - prior_loss(target, trial, rest, priors)
         if gain > 0:

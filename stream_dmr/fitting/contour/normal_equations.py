@@ -11,7 +11,7 @@ too many goes unseen.
 import numpy as np
 
 from stream_dmr.body import JOINT, ROOT
-from stream_dmr.fitting.contour.compiled import compiled
+from stream_dmr.fitting.compiled import compiled
 from stream_dmr.fitting.contour.deformation import jacobian, rotation, turn_slope
 
 # Residuals under this are all the same to the reweighting, px: the pixels' own staircase.

@@ -6,7 +6,7 @@ them against.
 
 import numpy as np
 
-from stream_dmr.fitting.contour.compiled import compiled
+from stream_dmr.fitting.compiled import compiled
 
 
 @compiled
@@ -121,42 +121,36 @@ def overlap(covered, mask, distance, mask_area):
 
 
 @compiled
-def smoothness(points, flat, faces, edges, edge_faces, num_vertices):
-    """L_normal and L_lap of eq. (5), in body lengths."""
+def smoothness(body, points, size):
+    """L_normal and L_lap of eq. (5) of a body of this size, so that they are in body lengths."""
+    normals = _face_normals(points, body.faces)
+    normal = 0.0
+    mean = np.zeros((body.num_vertices, 3))
+    for e in range(len(body.edges)):
+        p, q = body.edge_faces[e]
+        cosine = normals[p, 0] * normals[q, 0] + normals[p, 1] * normals[q, 1]
+        normal += 1.0 - cosine - normals[p, 2] * normals[q, 2]
+        a, b = body.edges[e]
+        for i in range(3):
+            mean[a, i] += points[b, i]
+            mean[b, i] += points[a, i]
+    laplacian = 0.0
+    for v in range(body.num_vertices):
+        share = 1.0 / body.num_neighbors[v]
+        for i in range(3):
+            laplacian += (points[v, i] - share * mean[v, i]) ** 2
+    return normal, laplacian / size**2
+
+
+@compiled
+def _face_normals(points, faces):
     normals = np.empty((len(faces), 3))
     for f in range(len(faces)):
         a, b, c = faces[f]
-        u0, u1, u2 = (
-            points[b, 0] - points[a, 0],
-            points[b, 1] - points[a, 1],
-            points[b, 2] - points[a, 2],
-        )
-        v0, v1, v2 = (
-            points[c, 0] - points[a, 0],
-            points[c, 1] - points[a, 1],
-            points[c, 2] - points[a, 2],
-        )
+        u0, v0 = points[b, 0] - points[a, 0], points[c, 0] - points[a, 0]
+        u1, v1 = points[b, 1] - points[a, 1], points[c, 1] - points[a, 1]
+        u2, v2 = points[b, 2] - points[a, 2], points[c, 2] - points[a, 2]
         n0, n1, n2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
-        length = max(np.sqrt(n0 * n0 + n1 * n1 + n2 * n2), 1e-300)
-        normals[f, 0], normals[f, 1], normals[f, 2] = n0 / length, n1 / length, n2 / length
-    normal = 0.0
-    sums = np.zeros((num_vertices, 3))
-    count = np.zeros(num_vertices)
-    for e in range(len(edges)):
-        p, q = edge_faces[e]
-        normal += 1.0 - (
-            normals[p, 0] * normals[q, 0]
-            + normals[p, 1] * normals[q, 1]
-            + normals[p, 2] * normals[q, 2]
-        )
-        a, b = edges[e]
-        count[a] += 1
-        count[b] += 1
-        for i in range(3):
-            sums[a, i] += points[b, i]
-            sums[b, i] += points[a, i]
-    laplacian = 0.0
-    for v in range(num_vertices):
-        for i in range(3):
-            laplacian += (points[v, i] - sums[v, i] / count[v]) ** 2
-    return normal, laplacian * np.exp(-2 * flat[5])
+        scale = 1.0 / max(np.sqrt(n0 * n0 + n1 * n1 + n2 * n2), 1e-300)
+        normals[f, 0], normals[f, 1], normals[f, 2] = n0 * scale, n1 * scale, n2 * scale
+    return normals
