@@ -3,7 +3,8 @@
     python benchmarks/accuracy.py SCENE... [--template MESH]
 
 A scene is a folder as `stream-dmr simulate` writes it: video.mp4, boxes.txt, masks,
-calibration.yaml and truth.csv. Prints one Markdown table a scene; every row is a run of the whole chain.
+calibration.yaml and truth.csv. Prints one Markdown table a scene; every row is a run of the whole
+chain.
 """
 
 import argparse
