@@ -4,9 +4,10 @@ import numpy as np
 
 from stream_dmr.body import JOINT, ROOT
 from stream_dmr.fitting.compiled import compiled
-from stream_dmr.fitting.contour.deformation import deform, dot
+from stream_dmr.fitting.contour.deformation import deform
 from stream_dmr.fitting.contour.normal_equations import normal_equations, prior_loss
 from stream_dmr.fitting.contour.outline import coverage, overlap, project, rim_edges, smoothness
+from stream_dmr.fitting.contour.rotation import dot
 
 SETTLED, STUCK, EXHAUSTED = 0, 1, 2
 STOP_REASONS = ("L_rec settled", "no step lowers L_rec", "iterations used up")

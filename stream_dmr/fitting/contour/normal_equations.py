@@ -12,7 +12,8 @@ import numpy as np
 
 from stream_dmr.body import JOINT, ROOT
 from stream_dmr.fitting.compiled import compiled
-from stream_dmr.fitting.contour.deformation import jacobian, rotation, turn_slope
+from stream_dmr.fitting.contour.deformation import jacobian
+from stream_dmr.fitting.contour.rotation import rotation, turn_slope
 
 # Residuals under this are all the same to the reweighting, px: the pixels' own staircase.
 _FLAT_PX = 0.5
