@@ -21,10 +21,11 @@ from stream_dmr.fitting import adam
 from stream_dmr.fitting.adam import AdamSolver
 from stream_dmr.fitting.cold_start import cold_starts
 from stream_dmr.fitting.contour.solver import ContourSolver
-from stream_dmr.fitting.fit import Fitter, _recentered
+from stream_dmr.fitting.fit import Fitter
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution
 from stream_dmr.fitting.target import Target
+from stream_dmr.fitting.warm_start import recentered
 from stream_dmr.template import Template
 
 GOAL = 0.97
@@ -102,7 +103,7 @@ class Race:
     def _warm(
         self, pair: Pair, before: Float[np.ndarray, "P"]
     ) -> dict[str, Callable[[], Took | None]]:
-        return self._from(pair, lambda t: _recentered(self._body, 0, t, before), near=True)
+        return self._from(pair, lambda t: recentered(self._body, 0, t, before), near=True)
 
     def _from(
         self, pair: Pair, start: Callable[[Target], Float[np.ndarray, "P"]], *, near: bool

@@ -22,10 +22,12 @@ from stream_dmr.fitting.contour.deformation import KINDS, deform
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.outline import project
 from stream_dmr.fitting.contour.solver import ContourSolver
-from stream_dmr.fitting.fit import Fitter, _recentered
+from stream_dmr.fitting.distance_map import signed_distance
+from stream_dmr.fitting.fit import Fitter
 from stream_dmr.fitting.settings import FitMeshSettings
-from stream_dmr.fitting.target import Target, mask_contour, signed_distance
+from stream_dmr.fitting.target import Target, mask_contour
 from stream_dmr.fitting.uncertainty import covariance
+from stream_dmr.fitting.warm_start import recentered
 from stream_dmr.template import Template
 
 SPINE = KINDS["spine"]
@@ -79,7 +81,7 @@ class Setup:
     def start(self, pair: Pair) -> tuple[Target, Float[np.ndarray, "P"]]:
         """What the solver of a warm fit is given."""
         target = Target.from_crop(pair.now, plane_normal=pair.plane_normal)
-        return target, _recentered(self.body, SPINE, target, self.before(pair))
+        return target, recentered(self.body, SPINE, target, self.before(pair))
 
 
 def warm(setup: Setup, pair: Pair) -> Warm:
@@ -155,7 +157,7 @@ def fit_parts(setup: Setup, pair: Pair) -> dict[str, Callable[[], object]]:
     return {
         "signed distance map": lambda: signed_distance(mask),
         "contour of the mask": lambda: mask_contour(mask),
-        "start moved onto the mask": lambda: _recentered(body, SPINE, target, before),
+        "start moved onto the mask": lambda: recentered(body, SPINE, target, before),
         "solver": lambda: solver.refine(target, start),
         "terms of the result": lambda: evaluate(body, SPINE, target, flat),
         "covariance": lambda: covariance(body, target, settings, flat, **outline_of),
@@ -206,6 +208,7 @@ sys.path.insert(0, "benchmarks")
 import cv2, numpy as np
 from targets import crop_of_mask, species_template
 from stream_dmr.camera import Camera
+from stream_dmr.fitting.distance_map import signed_distance
 from stream_dmr.fitting.fit import Fitter
 from stream_dmr.fitting.settings import FitMeshSettings
 mask = cv2.ellipse(np.zeros((128, 128), np.uint8), (64, 64), (45, 16), 20, 0, 360, 1, -1) > 0

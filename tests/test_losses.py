@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapes import fish_rig, random_flat, seeds
 
-from stream_dmr.fitting.target import signed_distance
+from stream_dmr.fitting.distance_map import signed_distance
 from stream_dmr.losses import (
     boundary_loss,
     iou_loss,
@@ -86,7 +86,6 @@ class TestBoundary:
             others = outside if mask[pixel] else inside
             distance = min(np.hypot(*(pixel - other)) for other in others) - 0.5
             expected[pixel] = -distance if mask[pixel] else distance
-        # To the last bits, which OpenCV's own square roots change from run to run.
         np.testing.assert_allclose(signed_distance(mask), expected, rtol=0, atol=1e-14)
 
     @settings(max_examples=10, deadline=None)

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import ndimage
 from shapes import crop_from_mask, seeds
 
-from stream_dmr.fitting.target import Target, mask_contour, signed_distance
+from stream_dmr.fitting.distance_map import signed_distance
+from stream_dmr.fitting.target import Target, mask_contour
 
 SIZE = 96
 offsets = st.floats(-0.5, 0.5)
@@ -48,6 +50,17 @@ class TestSignedDistance:
         distance = signed_distance(mask)
         np.testing.assert_array_equal(distance < 0, mask)
         np.testing.assert_array_equal(signed_distance(~mask), -distance)
+
+    @forty
+    @given(seed=seeds, share=st.sampled_from([0.001, 0.02, 0.3, 0.98, 0.999]))
+    def test_equals_scipy_s_on_specks_and_holes(self, seed, share):
+        mask = np.random.default_rng(seed).random((33, 70)) < share
+        if mask.all() or not mask.any():
+            expected = np.full(mask.shape, -np.inf if mask.all() else np.inf)
+        else:
+            edt = ndimage.distance_transform_edt
+            expected = np.where(mask, 0.5 - edt(mask), edt(~mask) - 0.5)
+        np.testing.assert_array_equal(signed_distance(mask), expected)
 
 
 class TestContour:

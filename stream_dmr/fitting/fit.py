@@ -8,7 +8,7 @@ from jaxtyping import Float
 from stream_dmr.body import Body
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.fitting.cold_start import cold_starts
-from stream_dmr.fitting.contour.deformation import KINDS, deform
+from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.outline import project
 from stream_dmr.fitting.contour.solver import ContourSolver
@@ -16,6 +16,7 @@ from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution, Solver
 from stream_dmr.fitting.target import Target
 from stream_dmr.fitting.uncertainty import covariance
+from stream_dmr.fitting.warm_start import recentered
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms, SolverReport
 from stream_dmr.template import Template
 
@@ -84,7 +85,7 @@ class Fitter:
         """The warm fit if it is good, else a cold one where that is clearly better."""
         solution = None
         if warm is not None:
-            start = _recentered(self._body, self._kind, target, warm)
+            start = recentered(self._body, self._kind, target, warm)
             solution = self._solver.refine(target, start)
             if solution.iou >= self._settings.cold_below_iou:
                 return solution, False
@@ -129,19 +130,6 @@ def _make_solver(template: Template, body: Body, settings: FitMeshSettings) -> S
     from stream_dmr.fitting.adam import AdamSolver  # torch takes a second to import
 
     return AdamSolver(template, settings)
-
-
-def _recentered(
-    body: Body, kind: int, target: Target, flat: Float[np.ndarray, "P"]
-) -> Float[np.ndarray, "P"]:
-    """Parameters moved sideways so that the silhouette's middle falls on the mask's."""
-    rows, columns = np.nonzero(target.mask > 0.5)
-    middle = np.array([columns.min() + columns.max(), rows.min() + rows.max()]) / 2
-    pixels = project(deform(body, kind, flat)[: body.num_vertices], target.anchor, target.K)
-    gap = middle - (pixels.min(axis=0) + pixels.max(axis=0)) / 2
-    moved = flat.copy()
-    moved[3:5] += gap / (np.exp(flat[5]) * target.K[[0, 1], [0, 1]])
-    return moved
 
 
 def _message(

@@ -7,10 +7,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from stream_dmr.fitting.compiled import compiled
+from stream_dmr.fitting.distance_map import signed_distance
 from stream_dmr.messages import FishCrop
 
 _SMOOTHING_PX = 1.5  # of the staircase that pixels make of an edge; short beside any fin
+_REACH = 4  # of the smoothing's kernel, px
 _SPACING_PX = 2.0
+_FEWEST = 8  # pixels of an edge: less is a speck
+_BORDER_PX = 0.6  # nearer to the picture's border there is no edge of the fish, only of the picture
 
 
 class Target(NamedTuple):
@@ -40,31 +44,6 @@ class Target(NamedTuple):
         )
 
 
-def signed_distance(mask: Bool[np.ndarray, "S S"]) -> Float[np.ndarray, "S S"]:
-    """Distance in pixels to the mask's edge, negative inside: the map behind `boundary_loss`."""
-    inside = mask.astype(np.uint8)
-    out = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    into = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return _signed(out, into)
-
-
-@compiled
-def _signed(out, into):
-    """Half a pixel less on either side: both count to centres, and the edge lies half way.
-
-    OpenCV's square roots differ in their last bits with where in memory an array lies; but what it
-    takes the roots of are whole numbers, so they can be had back.
-    """
-    signed = np.empty(out.shape)
-    for i in range(out.shape[0]):
-        for k in range(out.shape[1]):
-            if out[i, k] > 0.0:
-                signed[i, k] = np.sqrt(np.rint(np.float64(out[i, k]) ** 2)) - 0.5
-            else:
-                signed[i, k] = 0.5 - np.sqrt(np.rint(np.float64(into[i, k]) ** 2))
-    return signed
-
-
 def mask_contour(
     mask: Bool[np.ndarray, "S S"],
 ) -> tuple[Float[np.ndarray, "C 2"], Float[np.ndarray, "C 2"], Float[np.ndarray, "C"]]:
@@ -75,36 +54,50 @@ def mask_contour(
     fish goes on beyond them.
     """
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    parts = [_edge(c[:, 0].astype(np.float64)) for c in contours if len(c) >= 8]
+    parts = [_edge(traced[:, 0], *mask.shape) for traced in contours if len(traced) >= _FEWEST]
     if not parts:
         return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
     points, normals, lengths = (np.concatenate(values) for values in zip(*parts, strict=True))
-    last = np.array(mask.shape[::-1]) - 1
-    inside = ((points > 0.6) & (points < last - 0.6)).all(axis=1)
-    return points[inside], normals[inside], lengths[inside]
+    return points, normals, lengths
 
 
-def _edge(
-    traced: Float[np.ndarray, "N 2"],
-) -> tuple[Float[np.ndarray, "C 2"], Float[np.ndarray, "C 2"], Float[np.ndarray, "C"]]:
-    points = _smooth(traced)
-    tangent = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
-    # OpenCV traces outer contours with the outside to the right of the way as seen with y down.
-    normals = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    steps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
-    perimeter = float(steps.sum())
-    count = max(int(perimeter / _SPACING_PX), 8)
-    at = np.concatenate([[0.0], np.cumsum(steps)[:-1]])
-    chosen = np.searchsorted(at, np.arange(count) * perimeter / count).clip(0, len(points) - 1)
-    edge = points[chosen] + 0.5 * normals[chosen]
-    return edge, normals[chosen], np.full(count, perimeter / count)
+@compiled
+def _edge(traced, height, width):
+    """One closed curve of traced pixels (N, 2), smoothed, resampled and moved outward."""
+    smooth = _smooth(traced)
+    steps = np.empty(len(smooth))
+    for n in range(len(smooth)):
+        after = smooth[(n + 1) % len(smooth)]
+        steps[n] = np.hypot(after[0] - smooth[n, 0], after[1] - smooth[n, 1])
+    perimeter = np.sum(steps)
+    count = max(int(perimeter / _SPACING_PX), _FEWEST)
+    points, normals = np.empty((count, 2)), np.empty((count, 2))
+    kept, n, way = 0, 0, 0.0
+    for c in range(count):
+        while way < c * perimeter / count and n < len(smooth) - 1:
+            way += steps[n]
+            n += 1
+        before, after = smooth[n - 1], smooth[(n + 1) % len(smooth)]
+        dx, dy = after[0] - before[0], after[1] - before[1]
+        scale = 1.0 / max(np.hypot(dx, dy), 1e-9)
+        # OpenCV traces outer contours with the outside to the right of the way, y being down.
+        normals[kept, 0], normals[kept, 1] = -dy * scale, dx * scale
+        x, y = smooth[n, 0] + 0.5 * normals[kept, 0], smooth[n, 1] + 0.5 * normals[kept, 1]
+        points[kept, 0], points[kept, 1] = x, y
+        if _BORDER_PX < x < width - 1 - _BORDER_PX and _BORDER_PX < y < height - 1 - _BORDER_PX:
+            kept += 1
+    return points[:kept], normals[:kept], np.full(kept, perimeter / count)
 
 
-def _smooth(points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
+@compiled
+def _smooth(traced):
     """Gaussian smoothing around a closed curve."""
-    reach = np.arange(-4, 5)
-    kernel = np.exp(-0.5 * (reach / _SMOOTHING_PX) ** 2)
-    around = np.concatenate([points[-4:], points, points[:4]])
+    kernel = np.exp(-0.5 * (np.arange(-_REACH, _REACH + 1) / _SMOOTHING_PX) ** 2)
     kernel /= kernel.sum()
-    return np.stack([np.convolve(around[:, k], kernel, mode="valid") for k in (0, 1)], axis=1)
+    smooth = np.zeros((len(traced), 2))
+    for n in range(len(traced)):
+        for k in range(len(kernel)):
+            m = (n + k - _REACH) % len(traced)
+            smooth[n, 0] += kernel[k] * traced[m, 0]
+            smooth[n, 1] += kernel[k] * traced[m, 1]
+    return smooth

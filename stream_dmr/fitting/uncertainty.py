@@ -11,8 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.body import JOINT, ROOT, Body
+from stream_dmr.fitting.compiled import compiled
 from stream_dmr.fitting.contour.deformation import KINDS, jacobian
 from stream_dmr.fitting.contour.normal_equations import rim_slopes, visible_rim, weighted_squares
+from stream_dmr.fitting.contour.rotation import dot
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
 
@@ -39,11 +41,8 @@ def covariance(
     """
     kind = KINDS[settings.deformation]
     visible, normals, lengths = visible_rim(pixels, rim, covered)
-    index, slopes = rim_slopes(body, kind, target, flat, points, visible)
-    ends = slopes[index[visible]].mean(axis=1)  # (R, 2, P): of the middle of each edge
-    rows = np.einsum("rk,rkp->rp", normals, ends)
-    weight = lengths / (settings.edge_correlation_px * settings.edge_std_px**2)
-    information, _ = weighted_squares(rows, np.zeros(len(rows)), weight)
+    weight = 1.0 / (settings.edge_correlation_px * settings.edge_std_px**2)
+    information = _information(body, kind, target, flat, points, visible, normals, weight * lengths)
     num_joints = (len(flat) - ROOT) // JOINT
     prior = np.array(_ROOT_PRIOR + _JOINT_PRIOR * num_joints)
     spread = np.linalg.inv(information + np.diag(prior**-2.0))
@@ -52,13 +51,32 @@ def covariance(
     return spread, float(np.sqrt(slope @ spread @ slope))
 
 
-def _log_length_slope(
-    body: Body, kind: int, flat: Float[np.ndarray, "P"], points: Float[np.ndarray, "N 3"]
-) -> Float[np.ndarray, "P"]:
-    """Slope of the log of the midline's arc length, at the fixed depth of the root."""
-    first = body.num_vertices + 3
-    midline = points[first:]
-    slopes = np.diff(jacobian(body, kind, flat, np.arange(first, len(points))), axis=0)
-    steps = np.diff(midline, axis=0)
-    lengths = np.linalg.norm(steps, axis=1)
-    return np.einsum("mk,mkp->p", steps / lengths[:, None], slopes) / lengths.sum()
+@compiled
+def _information(body, kind, target, flat, points, visible, normals, weights):
+    """Sum over the rim of w r r^T, with r the slope (P,) of each edge's middle across itself."""
+    index, slopes = rim_slopes(body, kind, target, flat, points, visible)
+    rows = np.empty((len(visible), len(flat)))
+    for r in range(len(visible)):
+        i, j = index[visible[r, 0]], index[visible[r, 1]]
+        nx, ny = normals[r] / 2
+        for p in range(rows.shape[1]):
+            x, y = slopes[i, 0, p] + slopes[j, 0, p], slopes[i, 1, p] + slopes[j, 1, p]
+            rows[r, p] = nx * x + ny * y
+    information, _ = weighted_squares(rows, np.zeros(len(rows)), weights)
+    return information
+
+
+@compiled
+def _log_length_slope(body, kind, flat, points):
+    """Slope (P,) of the log of the midline's arc length, at the fixed depth of the root."""
+    chosen = np.arange(body.num_vertices + 3, len(points))
+    slopes = jacobian(body, kind, flat, chosen)
+    slope, total = np.zeros(len(flat)), 0.0
+    for m in range(len(chosen) - 1):
+        step = points[chosen[m + 1]] - points[chosen[m]]
+        length = np.sqrt(dot(step, step))
+        total += length
+        for i in range(3):
+            for p in range(len(flat)):
+                slope[p] += step[i] / length * (slopes[m + 1, i, p] - slopes[m, i, p])
+    return slope / total
