@@ -130,3 +130,19 @@ def test_a_target_holds_what_the_crop_shows():
     np.testing.assert_allclose(
         crop.crop_camera.project(target.anchor[None]), [[(SIZE - 1) / 2] * 2], atol=1e-9
     )
+
+
+@pytest.mark.parametrize("size", [96, 97])
+def test_half_the_resolution_shows_nearly_the_same(size):
+    whole = Target.from_crop(
+        crop_from_mask(disc(30.0, dx=3.0, size=size)), plane_normal=np.array([0.0, 0.0, 1.0])
+    )
+    half = whole.coarse()
+    assert half.mask.shape == half.distance.shape == (48, 48)
+    assert half.mask.sum() == pytest.approx(half.mask_area)
+    fresh = signed_distance(half.mask > 0.5)
+    assert np.abs(half.distance - fresh).max() < 0.75  # its staircase is twice as coarse
+    assert half.contour_lengths.sum() == pytest.approx(whole.contour_lengths.sum() / 2, rel=0.03)
+    # A ray is seen at the same place of the picture.
+    ray = np.array([0.01, -0.02, 1.0])
+    np.testing.assert_allclose((half.K @ ray)[:2] + 0.5, ((whole.K @ ray)[:2] + 0.5) / 2)

@@ -21,14 +21,25 @@ def cold_starts(target: Target, template: Template) -> Float[np.ndarray, "B P"]:
     """One start for each head end, roll and bend, placed and scaled by the mask's moments."""
     center_px, angle, extent_px = _moments(target.mask)
     focal = target.K[[0, 1], [0, 1]]
+    num_joints = len(template.joints)
+    flips, rolls, bends = np.array(list(product(_FLIPS_RAD, _ROLLS_RAD, _BENDS_RAD))).T
+    # A bent body is longer than it looks: the arc over the chord of a circle, 1 for a straight one.
+    length = extent_px / float(focal.mean()) / np.sinc(bends / (2 * np.pi))
+    # The broad side (z toward or away from the camera) faces the camera when roll is 0.
+    root = Rotation.from_euler("zx", np.stack([angle + flips, rolls], axis=1))
+    # The bend's axis is the camera's, seen from the body. Joints turn a little further than their
+    # share, since their weights never get to 0 and 1.
+    axis = 1.25 * bends[:, None] * root.inv().apply([0.0, 0.0, 1.0])
+    # The middle of head and tail, not the center keypoint, falls on the centroid.
+    middle = root.apply(template.keypoints[[0, 2]].mean(axis=0))[:, :2]
     offset = (center_px - target.K[:2, 2]) / focal - target.anchor[:2]
-    scale = extent_px / float(focal.mean())
-    return np.stack(
-        [
-            _start(template, offset, angle + flip, scale, roll=roll, bend=bend)
-            for flip, roll, bend in product(_FLIPS_RAD, _ROLLS_RAD, _BENDS_RAD)
-        ]
-    )
+    starts = np.tile(rest_vector(num_joints), (len(bends), 1))
+    starts[:, :3] = root.as_rotvec()
+    starts[:, 3:5] = offset / length[:, None] - middle
+    starts[:, 5] = np.log(length)
+    joints = starts[:, ROOT:].reshape(len(bends), num_joints, JOINT)
+    joints[:, :, :3] = np.linspace(-0.5, 0.5, num_joints)[:, None] * axis[:, None]
+    return starts
 
 
 def _moments(mask: Float[np.ndarray, "S S"]) -> tuple[Float[np.ndarray, "2"], float, float]:
@@ -39,32 +50,3 @@ def _moments(mask: Float[np.ndarray, "S S"]) -> tuple[Float[np.ndarray, "2"], fl
     _, axes = np.linalg.eigh(np.cov((points - center).T))
     along = (points - center) @ axes[:, 1]
     return center, float(np.arctan2(axes[1, 1], axes[0, 1])), float(np.ptp(along)) + 1.0
-
-
-def _start(
-    template: Template,
-    offset: Float[np.ndarray, "2"],
-    angle: float,
-    scale: float,
-    *,
-    roll: float,
-    bend: float,
-) -> Float[np.ndarray, "P"]:
-    """A template turned to `angle` in the picture, rolled about its own axis and bent."""
-    num_joints = len(template.joints)
-    # A bent body is longer than it looks: the arc over the chord of a circle.
-    length = scale * (1.0 if bend == 0.0 else abs(bend) / 2 / np.sin(abs(bend) / 2))
-    # The broad side (z toward or away from the camera) faces the camera when roll is 0.
-    root = Rotation.from_euler("zx", [angle, roll])
-    # The bend's axis is the camera's, seen from the body. Joints turn a little further than their
-    # share, since their weights never get to 0 and 1.
-    turns = 1.25 * bend * np.linspace(-0.5, 0.5, num_joints)[:, None]
-    turns = turns * root.inv().apply([0.0, 0.0, 1.0])
-    # The middle of head and tail, not the center keypoint, falls on the centroid.
-    middle = root.apply(template.keypoints[[0, 2]].mean(axis=0))[:2]
-    flat = rest_vector(num_joints)
-    flat[:3] = root.as_rotvec()
-    flat[3:5] = offset / length - middle
-    flat[5] = np.log(length)
-    flat[ROOT:].reshape(num_joints, JOINT)[:, :3] = turns
-    return flat

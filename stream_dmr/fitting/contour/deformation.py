@@ -19,7 +19,7 @@ def deform(body, kind, flat):
     root, _ = rotation(flat[:3])
     size = np.exp(flat[5])
     for n in range(len(out)):
-        x, y, z = out[n]
+        x, y, z = out[n, 0], out[n, 1], out[n, 2]
         for i in range(3):
             out[n, i] = root[i, 0] * x + root[i, 1] * y + root[i, 2] * z
     if kind == SPINE:

@@ -20,7 +20,7 @@ def blend_points(body, flat):
     out = np.zeros_like(body.points)
     for n in range(len(out)):
         weights(body.points[n], body.joints, L, W, dE)
-        x, y, z = body.points[n]
+        x, y, z = body.points[n, 0], body.points[n, 1], body.points[n, 2]
         for j in range(num_joints):
             for i in range(3):
                 out[n, i] += W[j] * (turns[j, i, 0] * x + turns[j, i, 1] * y + turns[j, i, 2] * z)

@@ -45,13 +45,22 @@ def weighted_squares(rows, residuals, weights):
     """H = sum w r r^T and g = sum w r residual, in one fixed order: the same bits every time."""
     count = rows.shape[1]
     H, g = np.zeros((count, count)), np.zeros(count)
-    for n in range(len(rows)):
-        row = rows[n]
+    whole = len(rows) // 4 * 4
+    for n in range(0, whole, 4):  # four at a time: each entry of H is loaded and stored less often
+        r0, r1, r2, r3 = rows[n], rows[n + 1], rows[n + 2], rows[n + 3]
         for p in range(count):
-            a = weights[n] * row[p]
+            a0, a1 = weights[n] * r0[p], weights[n + 1] * r1[p]
+            a2, a3 = weights[n + 2] * r2[p], weights[n + 3] * r3[p]
+            g[p] += a0 * residuals[n] + a1 * residuals[n + 1]
+            g[p] += a2 * residuals[n + 2] + a3 * residuals[n + 3]
+            for q in range(p + 1):
+                H[p, q] += a0 * r0[q] + a1 * r1[q] + a2 * r2[q] + a3 * r3[q]
+    for n in range(whole, len(rows)):
+        for p in range(count):
+            a = weights[n] * rows[n, p]
             g[p] += a * residuals[n]
             for q in range(p + 1):
-                H[p, q] += a * row[q]
+                H[p, q] += a * rows[n, q]
     for p in range(count):
         for q in range(p):
             H[q, p] = H[p, q]
@@ -84,17 +93,17 @@ def visible_rim(pixels, rim, covered):
     lengths = np.empty(len(rim))
     count = 0
     for r in range(len(rim)):
-        a, b = pixels[rim[r, 0]], pixels[rim[r, 1]]
-        dx, dy = b[0] - a[0], b[1] - a[1]
+        a, b = rim[r, 0], rim[r, 1]
+        dx, dy = pixels[b, 0] - pixels[a, 0], pixels[b, 1] - pixels[a, 1]
         length = np.sqrt(dx * dx + dy * dy)
         if length < 1e-9:
             continue
         nx, ny = dy / length, -dx / length
-        column = int(np.round((a[0] + b[0]) / 2 + nx))
-        row = int(np.round((a[1] + b[1]) / 2 + ny))
+        column = int(np.round((pixels[a, 0] + pixels[b, 0]) / 2 + nx))
+        row = int(np.round((pixels[a, 1] + pixels[b, 1]) / 2 + ny))
         if 0 <= row < size and 0 <= column < size and covered[row, column] >= 0.5:
             continue
-        keep[count] = rim[r]
+        keep[count, 0], keep[count, 1] = a, b
         normals[count, 0], normals[count, 1] = nx, ny
         lengths[count] = length
         count += 1
@@ -106,7 +115,9 @@ def _pixel_slopes(points, chosen, slopes, target):
     """Slopes of the chosen vertices' pixels to the parameters, (C, 2, P)."""
     out = np.empty((len(chosen), 2, slopes.shape[2]))
     for c in range(len(chosen)):
-        x, y, z = points[chosen[c]] + target.anchor
+        n = chosen[c]
+        x, y = points[n, 0] + target.anchor[0], points[n, 1] + target.anchor[1]
+        z = points[n, 2] + target.anchor[2]
         for p in range(slopes.shape[2]):
             dz = slopes[c, 2, p] / z
             out[c, 0, p] = target.K[0, 0] * (slopes[c, 0, p] - x * dz) / z
@@ -127,7 +138,7 @@ def _weight(length, residual, target):
 def _rim_rows(target, pixels, visible, lengths, index, slopes, rows, residuals, weights):
     """The model's rim in the target's signed distance field."""
     for r in range(len(visible)):
-        a, b = visible[r]
+        a, b = visible[r, 0], visible[r, 1]
         x, y = (pixels[a, 0] + pixels[b, 0]) / 2, (pixels[a, 1] + pixels[b, 1]) / 2
         value, gx, gy = _look_up(target.distance, x, y)
         residuals[r] = value
@@ -161,46 +172,57 @@ def _look_up(field, x, y):
 @compiled
 def _contour_rows(target, pixels, visible, normals, index, slopes, rows, residuals, weights, first):
     """The target's contour to the nearest rim edge that faces the same way."""
+    starts, ways, scales = _segments(pixels, visible)
     for c in range(len(target.contour)):
         row = first + c
-        qx, qy = target.contour[c]
-        nx, ny = target.contour_normals[c]
+        qx, qy = target.contour[c, 0], target.contour[c, 1]
+        nx, ny = target.contour_normals[c, 0], target.contour_normals[c, 1]
         best, edge, place = np.inf, -1, 0.0
         for r in range(len(visible)):
             if normals[r, 0] * nx + normals[r, 1] * ny < _SAME_WAY:
                 continue
-            a, b = visible[r]
-            ax, ay = pixels[a]
-            dx, dy = pixels[b, 0] - ax, pixels[b, 1] - ay
-            t = ((qx - ax) * dx + (qy - ay) * dy) / (dx * dx + dy * dy)
+            dx, dy = ways[r, 0], ways[r, 1]
+            t = ((qx - starts[r, 0]) * dx + (qy - starts[r, 1]) * dy) * scales[r]
             t = min(max(t, 0.0), 1.0)
-            ex, ey = ax + t * dx - qx, ay + t * dy - qy
+            ex, ey = starts[r, 0] + t * dx - qx, starts[r, 1] + t * dy - qy
             if ex * ex + ey * ey < best:
                 best, edge, place = ex * ex + ey * ey, r, t
         if edge < 0:
             rows[row] = 0.0
             residuals[row] = 0.0
             continue
-        a, b = visible[edge]
-        ex = (1 - place) * pixels[a, 0] + place * pixels[b, 0] - qx
-        ey = (1 - place) * pixels[a, 1] + place * pixels[b, 1] - qy
+        ex = starts[edge, 0] + place * ways[edge, 0] - qx
+        ey = starts[edge, 1] + place * ways[edge, 1] - qy
         gap = np.sqrt(best)
         is_out = ex * normals[edge, 0] + ey * normals[edge, 1] >= 0
         if gap > 0.25:
             ux, uy = ex / gap, ey / gap
         else:
-            ux, uy = normals[edge]
+            ux, uy = normals[edge, 0], normals[edge, 1]
             gap = ex * ux + ey * uy
             is_out = True
         if not is_out:
             ux, uy, gap = -ux, -uy, -gap
         residuals[row] = gap
         weights[row] = _weight(target.contour_lengths[c], gap, target)
-        i, j = index[a], index[b]
+        i, j = index[visible[edge, 0]], index[visible[edge, 1]]
         for p in range(rows.shape[1]):
             rows[row, p] = (1 - place) * (ux * slopes[i, 0, p] + uy * slopes[i, 1, p]) + place * (
                 ux * slopes[j, 0, p] + uy * slopes[j, 1, p]
             )
+
+
+@compiled
+def _segments(pixels, visible):
+    """Where each rim edge begins, where it leads, and one over its squared length."""
+    starts, ways = np.empty((len(visible), 2)), np.empty((len(visible), 2))
+    scales = np.empty(len(visible))
+    for r in range(len(visible)):
+        a, b = visible[r, 0], visible[r, 1]
+        starts[r, 0], starts[r, 1] = pixels[a, 0], pixels[a, 1]
+        ways[r, 0], ways[r, 1] = pixels[b, 0] - pixels[a, 0], pixels[b, 1] - pixels[a, 1]
+        scales[r] = 1.0 / (ways[r, 0] ** 2 + ways[r, 1] ** 2)
+    return starts, ways, scales
 
 
 @compiled

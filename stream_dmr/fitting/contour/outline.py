@@ -25,7 +25,7 @@ def rim_edges(pixels, faces, edges, edge_faces):
     """Edges (R, 2) between faces that look at the camera and faces that look away."""
     is_front = np.empty(len(faces), np.bool_)
     for f in range(len(faces)):
-        a, b, c = faces[f]
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         abx, aby = pixels[b, 0] - pixels[a, 0], pixels[b, 1] - pixels[a, 1]
         acx, acy = pixels[c, 0] - pixels[a, 0], pixels[c, 1] - pixels[a, 1]
         is_front[f] = abx * acy - aby * acx < 0
@@ -123,14 +123,15 @@ def overlap(covered, mask, distance, mask_area):
 @compiled
 def smoothness(body, points, size):
     """L_normal and L_lap of eq. (5) of a body of this size, so that they are in body lengths."""
+    edges, edge_faces = body.edges, body.edge_faces
     normals = _face_normals(points, body.faces)
     normal = 0.0
     mean = np.zeros((body.num_vertices, 3))
-    for e in range(len(body.edges)):
-        p, q = body.edge_faces[e]
+    for e in range(len(edges)):
+        p, q = edge_faces[e, 0], edge_faces[e, 1]
         cosine = normals[p, 0] * normals[q, 0] + normals[p, 1] * normals[q, 1]
         normal += 1.0 - cosine - normals[p, 2] * normals[q, 2]
-        a, b = body.edges[e]
+        a, b = edges[e, 0], edges[e, 1]
         for i in range(3):
             mean[a, i] += points[b, i]
             mean[b, i] += points[a, i]
@@ -146,7 +147,7 @@ def smoothness(body, points, size):
 def _face_normals(points, faces):
     normals = np.empty((len(faces), 3))
     for f in range(len(faces)):
-        a, b, c = faces[f]
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         u0, v0 = points[b, 0] - points[a, 0], points[c, 0] - points[a, 0]
         u1, v1 = points[b, 1] - points[a, 1], points[c, 1] - points[a, 1]
         u2, v2 = points[b, 2] - points[a, 2], points[c, 2] - points[a, 2]

@@ -13,10 +13,16 @@ from stream_dmr.fitting.compiled import compiled
 def rotation(w):
     """Rotation matrix of a rotation vector, and its right Jacobian."""
     R, J = np.empty((3, 3)), np.empty((3, 3))
+    turn_and_slope(w, R, J)
+    return R, J
+
+
+@compiled
+def turn_and_slope(w, R, J):
+    """The same into R and J: loops must not allocate."""
     a, b, c = _sines(w)
     _fill(w, a, b, R)
     _fill(w, -b, c, J)
-    return R, J
 
 
 @compiled

@@ -5,14 +5,20 @@ from jaxtyping import Float
 
 from stream_dmr.body import JOINT, ROOT, Body, rest_vector
 from stream_dmr.fitting.contour.deformation import KINDS
-from stream_dmr.fitting.contour.levenberg_marquardt import SETTLED, STOP_REASONS, STUCK, minimise
+from stream_dmr.fitting.contour.levenberg_marquardt import (
+    SETTLED,
+    STOP_REASONS,
+    STUCK,
+    evaluate,
+    minimise,
+)
 from stream_dmr.fitting.contour.normal_equations import prior_loss
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution
 from stream_dmr.fitting.target import Target
 
-# Of a search: iterations of a round, and how many of the starts go through to it.
-_ROUNDS = ((2, 1.0), (4, 0.5))
+# Of a search: iterations of a round, and how many starts go into it at the most.
+_ROUNDS = ((2, 24), (4, 12))
 _NUM_FINISHED = 3
 # Damping at the start: near the answer the model is trusted, far from it less.
 _NEAR, _FAR = 1e-2, 1e-1
@@ -43,15 +49,23 @@ class ContourSolver:
         return prior_loss(target, flat, self._rest, self._settings.priors())
 
     def search(self, target: Target, starts: Float[np.ndarray, "B P"]) -> Solution:
-        """Rounds of a few iterations, after each the better ones; the best of those finished."""
-        flats = list(starts)
-        for iterations, share in _ROUNDS:
-            flats = flats[: max(_NUM_FINISHED, int(share * len(starts)))]
-            rough = [self._minimise(target, flat, iterations, _FAR) for flat in flats]
+        """The likeliest start to its end; of the others the best after rounds on a coarse picture.
+
+        The likeliest leads to the answer by itself most of the time, but not always.
+        """
+        coarse = target.coarse()
+        flats = sorted(starts, key=lambda flat: self._loss(coarse, flat))
+        found = [self.refine(target, flats.pop(0))]
+        for iterations, most in _ROUNDS:
+            rough = [self._minimise(coarse, flat, iterations, _FAR) for flat in flats[:most]]
             rough.sort(key=lambda solution: solution.loss)
             flats = [solution.flat for solution in rough]
-        fine = [self.refine(target, flat) for flat in flats[:_NUM_FINISHED]]
-        return min(fine, key=lambda solution: solution.loss)
+        found += [self.refine(target, flat) for flat in flats[:_NUM_FINISHED]]
+        return min(found, key=lambda solution: solution.loss)
+
+    def _loss(self, target: Target, flat: Float[np.ndarray, "P"]) -> float:
+        terms, *_ = evaluate(self._body, self._kind, target, flat)
+        return float(terms @ self._settings.lambdas()) + self._prior_loss(target, flat)
 
     def _minimise(
         self, target: Target, start: Float[np.ndarray, "P"], iterations: int, damping: float

@@ -5,7 +5,14 @@ import numpy as np
 from stream_dmr.body import JOINT, ROOT
 from stream_dmr.fitting.compiled import compiled
 from stream_dmr.fitting.contour.joints import blend, factors, joint_scales, root_slope, weights
-from stream_dmr.fitting.contour.rotation import apply, dot, rotation, turn, turn_slope
+from stream_dmr.fitting.contour.rotation import (
+    apply,
+    dot,
+    rotation,
+    turn,
+    turn_and_slope,
+    turn_slope,
+)
 
 
 @compiled
@@ -55,6 +62,7 @@ def spine_jacobian(body, flat, L, chosen, out):
     omega, shift, off, o = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     v, Roff = np.empty(3), np.empty(3)
     A, along, none = np.empty((3, 3)), np.empty(3), np.zeros(3)
+    R, J = np.empty((3, 3)), np.empty((3, 3))
     local = np.empty((3, JOINT * num_joints))
     for c in range(len(chosen)):
         n = chosen[c]
@@ -63,7 +71,7 @@ def spine_jacobian(body, flat, L, chosen, out):
         blend(W, flat, 0, 3, omega)
         blend(W, flat, 3, 3, shift)
         scale = dot(W, S)
-        R, J = rotation(omega)
+        turn_and_slope(omega, R, J)
         for i in range(3):
             off[i] = body.points[n, i] - body.places[u, i]
             o[i] = scale * off[i] + shift[i]
@@ -107,7 +115,7 @@ def spine_nodes(body, flat, L, with_slope):
     slope = np.zeros((count if with_slope else 0, 3, JOINT * num_joints))
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
     omega, step, Rd, middle = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    A, R = np.empty((3, 3)), np.empty((3, 3))
+    A, R, J = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for k in range(count - 1):
         for i in range(3):
             middle[i] = (body.midline[k, i] + body.midline[k + 1, i]) / 2
@@ -122,7 +130,7 @@ def spine_nodes(body, flat, L, with_slope):
             place[k + 1, i] = place[k, i] + scale * Rd[i]
         if not with_slope:
             continue
-        R, J = rotation(omega)
+        turn_and_slope(omega, R, J)
         turn_slope(R, J, step, A)
         slope[k + 1] = slope[k]
         for j in range(num_joints):
