@@ -40,8 +40,11 @@ def crop_fish(
 ) -> FishCrop:
     """One fish, seen through a crop camera around the union of its box and its mask."""
     mask = clean_mask(detection.mask, min_area_px=settings.min_mask_area_px)
+    extent = _extent(mask)
     crop_camera = _camera_around(
-        _union(detection.bbox_xyxy_px, mask), frame_camera=frame_camera, settings=settings
+        _union(detection.bbox_xyxy_px, extent, shape=mask.shape),
+        frame_camera=frame_camera,
+        settings=settings,
     )
     image, crop_mask = _resample(
         frame.image, mask, crop_camera=crop_camera, frame_camera=frame_camera
@@ -56,7 +59,7 @@ def crop_fish(
         crop_camera=crop_camera,
         frame_camera=frame_camera,
         quality=CropQuality(
-            touches_border=_touches_border(mask),
+            touches_border=_touches_border(extent, shape=mask.shape),
             visible_fraction=detection.visible_fraction,
             sharpness=_sharpness(image, crop_mask),
             mask_area_px=float(np.count_nonzero(mask)),
@@ -97,16 +100,24 @@ def _parts(mask: Bool[np.ndarray, "H W"], *, connectivity: int) -> tuple[np.ndar
     return labels, areas
 
 
+def _extent(mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "4"] | None:
+    """The box around a mask, half-open; None for an empty one."""
+    x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
+    return np.array([x, y, x + width, y + height], np.float64) if width else None
+
+
 def _union(
-    bbox_xyxy_px: Float[np.ndarray, "4"], mask: Bool[np.ndarray, "H W"]
+    bbox_xyxy_px: Float[np.ndarray, "4"],
+    extent: Float[np.ndarray, "4"] | None,
+    *,
+    shape: tuple[int, ...],
 ) -> Float[np.ndarray, "4"]:
-    """The smallest box around the mask and what the frame shows of the box, half-open."""
-    height, width = mask.shape
+    """The smallest box around the mask's extent and what the frame shows of the box."""
+    height, width = shape
     box = np.clip(bbox_xyxy_px, 0, [width, height, width, height])
-    x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
-    if w == 0:
+    if extent is None:
         return box
-    return np.concatenate([np.minimum(box[:2], [x, y]), np.maximum(box[2:], [x + w, y + h])])
+    return np.concatenate([np.minimum(box[:2], extent[:2]), np.maximum(box[2:], extent[2:])])
 
 
 def _camera_around(
@@ -178,12 +189,12 @@ def frame_from_crop_map(
     return x, y
 
 
-def _touches_border(mask: Bool[np.ndarray, "H W"]) -> bool:
-    height, width = mask.shape
-    x, y, w, h = cv2.boundingRect(mask.view(np.uint8))
-    if w == 0:
+def _touches_border(extent: Float[np.ndarray, "4"] | None, *, shape: tuple[int, ...]) -> bool:
+    if extent is None:
         return False
-    return min(x, y, width - (x + w), height - (y + h)) <= _BORDER_PX
+    height, width = shape
+    x0, y0, x1, y1 = extent
+    return bool(min(x0, y0, width - x1, height - y1) <= _BORDER_PX)
 
 
 def _sharpness(image: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]) -> float:
