@@ -108,6 +108,9 @@ def run_command(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the results of an earlier run in --out.")
     ] = False,
+    timings: Annotated[
+        bool, typer.Option("--timings", help="At the end, show the time that each stage took.")
+    ] = False,
 ) -> None:
     """Measure the fish of a clip.
 
@@ -115,7 +118,7 @@ def run_command(
     run early and keeps what was done.
     """
     with _stop_on_signals() as stop:
-        from stream_dmr.display import RunDisplay, print_fish
+        from stream_dmr.display import RunDisplay, print_fish, print_timings
         from stream_dmr.run import RunRequest, run
 
         request = RunRequest(
@@ -132,6 +135,8 @@ def run_command(
         with RunDisplay() as display:
             summary = run(request, stop=stop, observer=display)
         print_fish(summary.fish)
+        if timings:
+            print_timings(summary)
         rate = summary.num_frames / summary.elapsed_s
         print(f"{summary.num_frames} frames in {summary.elapsed_s:.1f} s, {rate:.1f} frames/s")
         print(f"results in {request.out}: {', '.join(path.name for path in summary.files)}")

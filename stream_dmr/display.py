@@ -11,7 +11,7 @@ from rich.table import Table
 
 from stream_dmr.evaluation import Evaluation, summary_rows
 from stream_dmr.messages import LengthEstimate
-from stream_dmr.run import Observer
+from stream_dmr.run import Observer, RunSummary
 
 _LINE_EVERY_S = 10.0  # where there is no terminal to draw a bar on
 _PLAIN_WIDTH = 120
@@ -87,6 +87,21 @@ def print_fish(fish: Sequence[LengthEstimate]) -> None:
             status_text(estimate),
         )
     _stdout().print(table if fish else "no fish")
+
+
+def print_timings(summary: RunSummary) -> None:
+    """Print what each stage of the chain took, its part of the recording included, to stdout."""
+    table = _table("stage", "messages in", "out", "busy ms/frame", "CPU ms/frame", "busy %")
+    for counter in summary.counters:
+        table.add_row(
+            counter.stage,
+            str(counter.messages_in),
+            str(counter.messages_out),
+            f"{1e3 * counter.busy_s / max(summary.num_frames, 1):.2f}",
+            f"{1e3 * counter.cpu_s / max(summary.num_frames, 1):.2f}",
+            f"{100 * counter.busy_s / summary.elapsed_s:.0f}",
+        )
+    _stdout().print(table)
 
 
 def print_evaluation(evaluation: Evaluation) -> None:

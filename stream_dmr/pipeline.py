@@ -47,7 +47,8 @@ class StageCounters:
     stage: str
     messages_in: int = 0
     messages_out: int = 0
-    busy_s: float = 0.0
+    busy_s: float = 0.0  # from taking a frame to passing it on; waiting for a core included
+    cpu_s: float = 0.0  # of the stage's own thread; what libraries do in threads of theirs is not
 
 
 @dataclass(kw_only=True)
@@ -229,8 +230,10 @@ class _Chain:
     def _busy(self, stage: int) -> Iterator[None]:
         """Count the time spent inside as work of a stage."""
         self._busy_since[stage] = began = time.perf_counter()
+        cpu_began = time.thread_time()
         try:
             yield
         finally:
             self._busy_since[stage] = None
             self._counters[stage].busy_s += time.perf_counter() - began
+            self._counters[stage].cpu_s += time.thread_time() - cpu_began

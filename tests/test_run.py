@@ -69,6 +69,22 @@ def test_several_fish_come_and_go_and_every_stage_is_recorded(tmp_path: Path):
     assert header.template.name == "tiny"
 
 
+def test_timings_name_every_stage_and_what_went_through_it(tmp_path: Path):
+    options = write_clip(tmp_path / "clip", fish=[[1, 2]] * 3)
+    outcome = invoke("run", options | {"--timings": None})
+    assert outcome.code == 0, outcome.err
+    names = ("ReadFrames", "CropFish", "FitMesh", "Localize", "SmoothLength")
+    stages = [line.split() for line in outcome.out.splitlines() if line.startswith(names)]
+    assert [row[:3] for row in stages] == [
+        ["ReadFrames", "0", "3"],
+        ["CropFish", "3", "6"],
+        ["FitMesh", "6", "6"],
+        ["Localize", "6", "6"],
+        ["SmoothLength", "6", "8"],
+    ]
+    assert all(float(ms) > 0 for row in stages for ms in row[3:5])
+
+
 def test_the_same_run_gives_the_same_tables(tmp_path: Path):
     options = write_clip(tmp_path / "clip", fish=[[1, 2]] * 3)
     first, second = str(tmp_path / "first"), str(tmp_path / "second")
