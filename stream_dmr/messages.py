@@ -62,7 +62,7 @@ class FishCrop:
     timestamp_ns: int
     track_id: int
     bbox_xyxy_px: Float[np.ndarray, "4"]  # half-open, frame pixels
-    image: UInt8[np.ndarray, "S S 3"]  # BGR, lens distortion removed
+    image: UInt8[np.ndarray, "S S 3"] | None  # BGR, lens distortion removed; None: not recorded
     mask: Bool[np.ndarray, "S S"]  # all False where nothing was segmented
     crop_camera: Camera  # of `image` and `mask`; the orientation is the frame camera's
     frame_camera: Camera  # with crop_camera it gives the exact crop-to-frame pixel map
@@ -106,13 +106,13 @@ class FittedShape:
     """
 
     parameters: Float[np.ndarray, "P"]  # layout: stream_dmr.skinning.Parameters
-    vertices: Float[np.ndarray, "V 3"]
+    vertices: Float[np.ndarray, "V 3"] | None  # None: not recorded, `parameters` give them
     keypoints: Float[np.ndarray, "3 3"]  # head, center, tail
     keypoints_px: Float[np.ndarray, "3 2"]  # the same in frame pixels
     midline: Float[np.ndarray, "M 3"]  # head keypoint to tail keypoint
     iou: float  # of the hard silhouette with the mask
     losses: LossTerms
-    covariance: Float[np.ndarray, "P P"]  # of `parameters`
+    covariance: Float[np.ndarray, "P P"] | None  # of `parameters`; None: not recorded
     length_std_ratio: float  # std of the arc length, as a fraction of it, by `covariance`
 
     def __post_init__(self) -> None:

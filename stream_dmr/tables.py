@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate, LocalizedFish
-from stream_dmr.recording.header import Record
+from stream_dmr.recording.record import Record
 from stream_dmr.recording.whole_file import WholeFile
 
 LENGTHS_COLUMNS = [

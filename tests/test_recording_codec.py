@@ -66,7 +66,7 @@ crops = sizes.flatmap(
         FishCrop,
         **keys,
         bbox_xyxy_px=numbers(4),
-        image=arrays(np.uint8, (size, size, 3)),
+        image=optional(arrays(np.uint8, (size, size, 3))),
         mask=arrays(np.bool_, (size, size)),
         crop_camera=cameras,
         frame_camera=cameras,
@@ -77,12 +77,12 @@ shapes = st.tuples(sizes, sizes, sizes).flatmap(
     lambda s: st.builds(
         FittedShape,
         parameters=numbers(s[0]),
-        vertices=numbers(s[1], 3) | numbers(s[1], 3, dtype=np.float32),
+        vertices=optional(numbers(s[1], 3) | numbers(s[1], 3, dtype=np.float32)),
         keypoints=numbers(3, 3),
         keypoints_px=numbers(3, 2),
         midline=numbers(s[2], 3),
         losses=st.builds(LossTerms, **{field.name: floats for field in fields(LossTerms)}),
-        covariance=numbers(s[0], s[0]),
+        covariance=optional(numbers(s[0], s[0])),
         iou=floats,
         length_std_ratio=floats,
     )

@@ -221,7 +221,7 @@ def test_a_disk_that_fills_up_ends_the_run_and_keeps_what_came_before(tmp_path, 
     noise = np.random.default_rng(0)
     clip = tmp_path / "clip"
     options = write_clip(clip, num_frames=1)
-    (clip / "quick.toml").write_text(QUICK + "\n[recording]\nrrd = false\n")
+    (clip / "quick.toml").write_text(QUICK + "\n[recording]\nrrd = false\nframes = 'jpeg'\n")
     (clip / "pictures").mkdir()
     for frame_index in range(1, 31):
         picture = noise.integers(0, 255, (120, 160, 3), np.uint8)

@@ -11,7 +11,7 @@ from recorded_run import run
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate, LocalizedFish, Message
-from stream_dmr.recording.header import Record
+from stream_dmr.recording.record import Record
 from stream_dmr.tables import Tables, seconds
 
 LENGTHS_HEADER = (
@@ -27,7 +27,7 @@ FRAMES_HEADER = (
 
 def write_all(tables: Tables, messages: list[Message]) -> None:
     for message in messages:
-        tables.write(Record(message=message, payload=b"", picture=None))
+        tables.write(Record(message=message, whole=message, picture=None))
 
 
 def write(out: Path, messages: list[Message]) -> tuple[list[dict], list[dict]]:

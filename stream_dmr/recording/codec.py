@@ -4,7 +4,7 @@ The schema is `messages.proto`; a dataclass and its protobuf message have the sa
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,8 +18,11 @@ from stream_dmr.errors import RecordingError
 from stream_dmr.recording.pictures import Picture, compress, compress_mask, decompress
 from stream_dmr.recording.schema import proto_class
 
-CODEC_VERSION = 1
-"""Raised when a file written from now on would be read wrongly by an older reader."""
+CODEC_VERSION = 2
+"""Raised when a file written from now on would be read wrongly by an older reader.
+
+2: a crop may lack its picture, a fit its vertices and covariance.
+"""
 
 T = TypeVar("T")
 
@@ -66,6 +69,13 @@ def decode(kind: type[T], data: bytes) -> T:
     return _build(kind, proto)
 
 
+def reference(frame: bytes) -> Picture:
+    """How the picture of an encoded Frame was recorded, for finding it again in the source."""
+    proto: Any = proto_class("Frame")()
+    proto.ParseFromString(frame)
+    return _picture(proto.image)
+
+
 def check_version(version: int) -> None:
     """Raise RecordingError for a recording written by a newer codec than this one."""
     if version > CODEC_VERSION:
@@ -78,7 +88,7 @@ def check_version(version: int) -> None:
 def _fill(proto: Proto, value: object, picture: Picture | None = None) -> None:
     for field in fields(value):  # type: ignore[arg-type]
         item = getattr(value, field.name)
-        if field.name == "image":
+        if field.name == "image" and item is not None:
             item = picture or compress(item, format="png")
         if item is not None:
             _set(proto, proto.DESCRIPTOR.fields_by_name[field.name], item)
@@ -96,7 +106,8 @@ def _set(proto: Proto, field: Any, item: Any) -> None:
     inner.SetInParent()
     if field.message_type.name == "Picture":
         item = item if isinstance(item, Picture) else compress_mask(item)
-        inner.MergeFrom(proto_class("Picture")(**asdict(item)))
+        for part in fields(Picture):
+            setattr(inner, part.name, getattr(item, part.name))
     elif is_dataclass(item):
         _fill(inner, item)
     else:
@@ -126,9 +137,12 @@ def _get(proto: Proto, field: Any) -> Any:
     if name == "Array":
         return _array(inner)
     if name == "Picture":
-        values = {f.name: getattr(inner, f.name) for f in fields(Picture)}
-        return decompress(Picture(**values))
+        return decompress(_picture(inner))
     return _build(_DATACLASSES[name], inner)
+
+
+def _picture(proto: Any) -> Picture:
+    return Picture(**{part.name: getattr(proto, part.name) for part in fields(Picture)})
 
 
 def _array(proto: Any) -> np.ndarray:

@@ -6,10 +6,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 from stream_dmr import __version__
 from stream_dmr.camera import Calibration
-from stream_dmr.messages import Message
 from stream_dmr.recording.codec import CODEC_VERSION, decode, encode
-from stream_dmr.recording.pictures import Picture
-from stream_dmr.recording.topics import TOPICS, Topic
 from stream_dmr.template import Template
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "torch", "scipy", "mcap", "rerun-sdk")
@@ -58,20 +55,6 @@ class RunHeader:
             calibration=None if calibration is None else decode(Calibration, calibration),
             calibration_file=attachments.get("calibration.yaml", b""),
         )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Record:
-    """A message with its encodings, made once for all sinks."""
-
-    message: Message
-    payload: bytes  # as `codec.encode` gives it
-    picture: Picture | None  # a Frame's JPEG, for viewing
-
-    @property
-    def topic(self) -> Topic:
-        """Where it belongs."""
-        return TOPICS[type(self.message)]
 
 
 def _version(library: str) -> str:

@@ -15,7 +15,8 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from stream_dmr import __version__
 from stream_dmr.errors import OutputError
-from stream_dmr.recording.header import Record, RunHeader
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.record import Record
 from stream_dmr.recording.schema import schema_bytes
 from stream_dmr.recording.topics import TOPICS
 from stream_dmr.recording.whole_file import WholeFile, rename_durably

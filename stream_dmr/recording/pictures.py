@@ -1,5 +1,6 @@
 """Pictures as compressed bytes and back."""
 
+import zlib
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,14 +21,15 @@ class Picture:
     height: int
     width: int
     data: bytes  # empty for a reference
+    crc32: int = 0  # of the pixels that a reference stands for, see `checksum`
 
 
 def compress(
     image: UInt8[np.ndarray, "H W 3"], *, format: Format, jpeg_quality: int = 95
 ) -> Picture:
-    """A BGR picture as "png" (exact), "jpeg" or "reference" (its size only)."""
+    """A BGR picture as "png" (exact), "jpeg" or "reference" (its size and checksum)."""
     if format == "reference":
-        return _picture(format, image, b"")
+        return _picture(format, image, b"", crc32=checksum(image))
     if format == "jpeg":
         parameters = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
     else:
@@ -61,6 +63,11 @@ def decompress(picture: Picture) -> UInt8[np.ndarray, "H W 3"] | Bool[np.ndarray
     return image > 127 if picture.format == "png1" else image
 
 
-def _picture(format: Format, image: np.ndarray, data: bytes) -> Picture:
+def checksum(image: UInt8[np.ndarray, "H W 3"]) -> int:
+    """CRC-32 of the BGR bytes, row by row: to tell whether a picture is the recorded one."""
+    return zlib.crc32(np.ascontiguousarray(image).data)
+
+
+def _picture(format: Format, image: np.ndarray, data: bytes, *, crc32: int = 0) -> Picture:
     height, width = image.shape[:2]
-    return Picture(format=format, height=height, width=width, data=data)
+    return Picture(format=format, height=height, width=width, data=data, crc32=crc32)

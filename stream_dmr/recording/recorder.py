@@ -1,21 +1,23 @@
 """Records a run: every message of every stage, to every sink."""
 
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
-from threading import Lock
+from queue import Queue
+from threading import Lock, Thread
 from types import TracebackType
 from typing import Protocol, runtime_checkable
 
 from stream_dmr.errors import OutputError
-from stream_dmr.messages import FishCrop, Frame, Message
-from stream_dmr.recording.codec import encode
-from stream_dmr.recording.header import Record, RunHeader
+from stream_dmr.messages import Message
+from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.mcap_sink import McapSink
-from stream_dmr.recording.pictures import Picture, compress, decompress
+from stream_dmr.recording.record import Record, make_record
+from stream_dmr.recording.rerun_sink import NAME as RRD_NAME
 from stream_dmr.recording.rerun_sink import RerunSink
 from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.tables import Tables
+
+_QUEUE_MESSAGES = 64  # some 6 frames; where the disk can't keep up, the run waits: nothing is lost
 
 
 @runtime_checkable
@@ -34,55 +36,52 @@ class Sink(Protocol):
 class Recorder:
     """Writes recording.mcap, recording.rrd, lengths.csv and frames.csv into one folder.
 
-    Thread-safe; the messages of one stage must come in their order. Raises OutputError where the
-    folder can't be written to.
+    A thread of its own encodes and writes, so that measuring waits for no disk. Thread-safe; the
+    messages of one stage must come in their order. Raises OutputError where the folder can't be
+    written to: here, at the next `write`, or at `close`.
     """
 
     def __init__(self, out_dir: Path, header: RunHeader, settings: RecordingSettings) -> None:
         self._settings = settings
-        self._lock = Lock()
         self._sinks: list[Sink] = []
         self._refused: list[Sink] = []
+        self._failure: BaseException | None = None
+        self._lock = Lock()
+        self._queue: Queue[Record | None] = Queue(_QUEUE_MESSAGES)
+        self._thread = Thread(target=self._write_all, name="recorder", daemon=True)
         _make_folder(out_dir)
         with ExitStack() as undo:
-            undo.callback(self.close)
+            undo.callback(self._close_sinks)
             self._sinks.append(Tables(out_dir))
             if settings.mcap:
                 self._sinks.append(McapSink(out_dir, header, flush_s=settings.flush_s))
             if settings.rrd:
-                self._sinks.append(RerunSink(out_dir, header, settings))
+                self._sinks.append(RerunSink(out_dir / RRD_NAME, header, settings))
             undo.pop_all()
+        self._thread.start()
 
     def write(self, message: Message) -> Message:
         """Record a message; returns it as a replay will read it back.
 
-        Hand the returned message on to the next stage: with a lossy picture setting its pixels are
-        those that the recording holds, and only then does a replay repeat the run exactly.
+        Hand the returned message on to the next stage: only then does a replay repeat the run
+        exactly. With a lossy picture setting its pixels are those that the recording holds, and
+        what is not recorded it lacks; only a frame by reference keeps its pixels.
         """
-        record = self._encode(message)
-        with self._lock, ExitStack() as stack:
-            for sink in self._sinks:
-                stack.callback(self._write_to, sink, record)
+        record = make_record(message, self._settings)
+        self._queue.put(record)
+        self._raise_failure()
         return record.message
 
-    def _write_to(self, sink: Sink, record: Record) -> None:
-        """Write to one sink; once the disk has refused it, never again.
-
-        The others go on: where the pictures no longer have room, the lengths still may.
-        """
-        if sink in self._refused:
-            return
-        try:
-            sink.write(record)
-        except OutputError:
-            self._refused.append(sink)
-            raise
-
     def close(self) -> None:
-        """Close every sink, also where another one fails; then raise the failure. Idempotent."""
-        with self._lock, ExitStack() as stack:
-            for sink in self._sinks:
-                stack.callback(sink.close)
+        """Write what is waiting and close every sink, also where another one fails. Idempotent.
+
+        A failure that was not yet raised is raised then.
+        """
+        if self._thread.is_alive():
+            self._queue.put(None)
+            self._thread.join()
+            self._close_sinks()
+        self._raise_failure()
 
     def __enter__(self) -> "Recorder":
         return self
@@ -95,29 +94,39 @@ class Recorder:
     ) -> None:
         self.close()
 
-    def _encode(self, message: Message) -> Record:
-        if isinstance(message, Frame):
-            return self._encode_frame(message)
-        if isinstance(message, FishCrop) and self._settings.crops == "jpeg":
-            picture = self._jpeg(message)
-            payload = encode(message, picture=picture)
-            message = replace(message, image=decompress(picture))
-            return Record(message=message, payload=payload, picture=None)
-        return Record(message=message, payload=encode(message), picture=None)
+    def _write_all(self) -> None:
+        while (record := self._queue.get()) is not None:
+            for sink in self._sinks:
+                self._write_to(sink, record)
+            self._queue.task_done()
 
-    def _encode_frame(self, frame: Frame) -> Record:
-        if self._settings.frames == "jpeg":
-            picture = self._jpeg(frame)
-            payload = encode(frame, picture=picture)
-            frame = replace(frame, image=decompress(picture))
-        else:
-            picture = self._jpeg(frame) if self._settings.rrd else None
-            payload = encode(frame, picture=compress(frame.image, format="reference"))
-        return Record(message=frame, payload=payload, picture=picture)
+    def _write_to(self, sink: Sink, record: Record) -> None:
+        """Write to one sink; once it has failed, never again.
 
-    def _jpeg(self, message: Frame | FishCrop) -> Picture:
-        quality = self._settings.jpeg_quality
-        return compress(message.image, format="jpeg", jpeg_quality=quality)
+        The others go on: where the pictures no longer have room, the lengths still may.
+        """
+        if sink in self._refused:
+            return
+        try:
+            sink.write(record)
+        except Exception as error:  # whatever it is, the run must hear of it
+            self._refused.append(sink)
+            self._fail(error)
+
+    def _fail(self, error: BaseException) -> None:
+        with self._lock:
+            self._failure = self._failure or error
+
+    def _raise_failure(self) -> None:
+        with self._lock:
+            failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
+
+    def _close_sinks(self) -> None:
+        with ExitStack() as stack:
+            for sink in self._sinks:
+                stack.callback(sink.close)
 
 
 def _make_folder(folder: Path) -> None:

@@ -1,18 +1,15 @@
-"""recording.rrd: the view of a run, and, with `rrd_messages`, its exact messages as well."""
+"""recording.rrd: the view of a run, and, with `rrd_messages`, its messages as well."""
 
 import json
 import time
-import zlib
 from pathlib import Path
 
-import numpy as np
 import rerun as rr
 
 from stream_dmr.errors import OutputError
-from stream_dmr.messages import Frame
-from stream_dmr.recording.codec import encode
-from stream_dmr.recording.header import Record, RunHeader
-from stream_dmr.recording.pictures import compress
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.record import Record
+from stream_dmr.recording.rerun_columns import blob
 from stream_dmr.recording.rerun_draw import Drawing
 from stream_dmr.recording.rerun_view import RUN, blueprint
 from stream_dmr.recording.settings import RecordingSettings
@@ -20,7 +17,6 @@ from stream_dmr.recording.settings import RecordingSettings
 NAME = "recording.rrd"
 _HEADER = ["messages", "header"]
 _FLUSH_TIMEOUT_S = 30.0
-_EPOCH_NS = 10**17  # timestamps above are since 1970 (this is 1973), below since the start
 
 
 class RerunSink:
@@ -29,34 +25,28 @@ class RerunSink:
     Rerun says nothing of a full disk until it is flushed, so that comes every `flush_s`.
     """
 
-    def __init__(self, out_dir: Path, header: RunHeader, settings: RecordingSettings) -> None:
-        self.path = out_dir / NAME
+    def __init__(self, path: Path, header: RunHeader, settings: RecordingSettings) -> None:
+        self.path = path
         self._flush_ns = int(settings.flush_s * 1e9)
         self._with_messages = settings.rrd_messages
         self._closed = False
-        self._rec = rr.RecordingStream("stream-dmr")
-        self._rec.set_log_time_enabled(False)
-        self._rec.set_log_tick_enabled(False)
-        layout = blueprint(header.calibration)
+        self._rec = new_stream()
         try:
-            self._rec.set_sinks(rr.FileSink(str(self.path)), default_blueprint=layout)
+            sink = rr.FileSink(str(path))
+            self._rec.set_sinks(sink, default_blueprint=blueprint(header.calibration))
         except RuntimeError as error:
             raise self._refusal(error) from error
-        self._drawing = Drawing(self._rec, header)
-        self._log_header(header)
+        self._drawing = Drawing(self._rec, header, settings)
+        log_run(self._rec, header)
+        if self._with_messages:
+            self._log_header(header)
         self._flush()
 
     def write(self, record: Record) -> None:
         """Draw one record; OutputError where the disk refuses it."""
-        message = record.message
-        self._rec.set_time("frame", sequence=message.frame_index)
-        if message.timestamp_ns > _EPOCH_NS:
-            self._rec.set_time("time", timestamp=np.datetime64(message.timestamp_ns, "ns"))
-        else:
-            self._rec.set_time("time", duration=np.timedelta64(message.timestamp_ns, "ns"))
         self._drawing.draw(record)
         if self._with_messages:
-            self._log_message(record)
+            self._drawing.keep(record)
         if time.monotonic_ns() >= self._flush_at_ns:
             self._flush()
 
@@ -71,23 +61,12 @@ class RerunSink:
             self._rec.disconnect()
 
     def _log_header(self, header: RunHeader) -> None:
-        metadata = header.metadata()
-        rows = "\n".join(f"| {name} | `{value}` |" for name, value in metadata.items())
-        text = f"| | |\n|---|---|\n{rows}\n\n```toml\n{header.config_toml}\n```"
-        self._rec.log(RUN, rr.TextDocument(text, media_type="text/markdown"), static=True)
-        if self._with_messages:
-            parts = {"run.json": json.dumps(metadata).encode(), **header.attachments()}
-            for name, data in parts.items():
-                self._rec.log([*_HEADER, name], _blob(data), static=True)
-
-    def _log_message(self, record: Record) -> None:
-        """The message as in the .mcap, but a frame by reference: its JPEG is drawn already."""
-        message, payload = record.message, record.payload
-        if isinstance(message, Frame):
-            payload = encode(message, picture=compress(message.image, format="reference"))
-        self._rec.log(record.topic.payload, _blob(payload))
+        parts = {"run.json": json.dumps(header.metadata()).encode(), **header.attachments()}
+        for name, data in parts.items():
+            self._rec.log([*_HEADER, name], rr.AnyValues(drop_untyped_nones=True, **blob(data)), static=True)
 
     def _flush(self) -> None:
+        self._drawing.send()
         try:
             self._rec.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except RuntimeError as error:
@@ -102,8 +81,16 @@ class RerunSink:
         )
 
 
-def _blob(data: bytes) -> rr.AnyValues:
-    """Bytes with their CRC-32, since an .rrd has no checksum of its own."""
-    return rr.AnyValues(
-        payload=np.frombuffer(data, np.uint8), crc32=np.array([zlib.crc32(data)], np.uint32)
-    )
+def new_stream() -> rr.RecordingStream:
+    """A stream in which nothing is known but what we say."""
+    rec = rr.RecordingStream("stream-dmr")
+    rec.set_log_time_enabled(False)
+    rec.set_log_tick_enabled(False)
+    return rec
+
+
+def log_run(rec: rr.RecordingStream, header: RunHeader) -> None:
+    """Who recorded this, from what, and with which settings, for people."""
+    rows = "\n".join(f"| {name} | `{value}` |" for name, value in header.metadata().items())
+    text = f"| | |\n|---|---|\n{rows}\n\n```toml\n{header.config_toml}\n```"
+    rec.log(RUN, rr.TextDocument(text, media_type="text/markdown"), static=True)

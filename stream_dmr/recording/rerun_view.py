@@ -3,9 +3,10 @@
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from stream_dmr.camera import Calibration, Camera
+from stream_dmr.recording import topics
 from stream_dmr.recording.topics import CAMERA, LOG, PLANE
 
 # Okabe and Ito's palette, told apart by the colour-blind too; black and grey left out.
@@ -23,11 +24,39 @@ _GREY = (150, 160, 170, 90)
 _PICTURE_DEPTH = 0.25  # of the camera's picture in the scene, of the distance to the fish
 NOMINAL_DEPTH = 2.5  # of a fish without calibration, in body lengths: it fills half the picture
 RUN = "run"
+_THIN = rr.Radius.ui_points(1.2)
+_DOTS = rr.Radius.ui_points([5.5, 3.5, 3.5])  # head, center, tail: the large one is the head
+_WHITE = (255, 255, 255)
+_SEE_THROUGH = 150  # opacity of a mesh, of 255: the midline shows
 
 
 def color(track_id: int) -> tuple[int, int, int]:
     """The colour of a track, the same in every view."""
     return _PALETTE[track_id % len(_PALETTE)]
+
+
+def appearance(track_id: int, faces: Int[np.ndarray, "F 3"]) -> dict[str, rr.AsComponents]:
+    """What never changes of a fish, by entity path with `{id}` left open."""
+    tint, name = color(track_id), f"fish {track_id}"
+    lines = rr.SeriesLines(
+        names=[name, f"{name} low", f"{name} high"],
+        colors=[tint, (*tint, 110), (*tint, 110)],
+        widths=[2.5, 1.0, 1.0],
+    )
+    curve = rr.SeriesLines(names=name, colors=tint)
+    return {
+        topics.BOX: rr.Boxes2D.from_fields(colors=[tint], labels=[name], radii=_THIN),
+        topics.OUTLINE: rr.LineStrips2D.from_fields(colors=[tint], radii=_THIN),
+        topics.KEYPOINTS_2D: rr.Points2D.from_fields(colors=[tint], radii=_DOTS),
+        topics.MESH: rr.Mesh3D.from_fields(
+            triangle_indices=faces, albedo_factor=(*tint, _SEE_THROUGH)
+        ),
+        topics.KEYPOINTS_3D: rr.Points3D.from_fields(colors=[_WHITE], radii=_DOTS),
+        topics.MIDLINE: rr.LineStrips3D.from_fields(colors=[_WHITE], radii=_THIN),
+        topics.LENGTH: lines,
+        topics.FRAME_LENGTH: rr.SeriesPoints(names=f"{name}, frame", colors=tint, marker_sizes=2.0),
+        **dict.fromkeys((topics.IOU, topics.BENDING, topics.FIT_MS), curve),
+    }
 
 
 def blueprint(calibration: Calibration | None) -> rrb.Blueprint:
@@ -65,7 +94,7 @@ def _series(origin: str, name: str, *, axis_y: rrb.ScalarAxis | None = None) -> 
 
 
 def _scene_view(calibration: Calibration | None) -> rrb.Spatial3DView:
-    depth = NOMINAL_DEPTH if calibration is None else _middle(calibration)[2]
+    depth = NOMINAL_DEPTH if calibration is None else middle_mm(calibration)[2]
     return rrb.Spatial3DView(
         origin="scene",
         contents=["scene/**", "- scene/camera/fish/**"],
@@ -80,23 +109,25 @@ def _scene_view(calibration: Calibration | None) -> rrb.Spatial3DView:
     )
 
 
-def log_camera(rec: rr.RecordingStream, camera: Camera, *, depth: float) -> None:
-    """The camera, for all time, for fish that hang some `depth` away."""
+def log_camera(rec: rr.RecordingStream, camera: Camera, *, depth: float, factor: int) -> None:
+    """The camera, for all time, for fish that hang some `depth` away.
+
+    `factor` is the number of frame pixels per pixel of the picture that is shown.
+    """
     # Rerun counts pixels from the corner of the top-left one, we from its centre.
     shift = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
     pinhole = rr.Pinhole(
-        image_from_camera=shift @ camera.K,
-        resolution=(camera.width, camera.height),
+        image_from_camera=np.diag([1 / factor, 1 / factor, 1.0]) @ shift @ camera.K,
+        resolution=(camera.width / factor, camera.height / factor),
         camera_xyz=rr.ViewCoordinates.RDF,
         image_plane_distance=_PICTURE_DEPTH * depth,
     )
     rec.log(CAMERA, pinhole, static=True)
 
 
-def log_calibration(rec: rr.RecordingStream, calibration: Calibration) -> None:
-    """The camera and the reference plane as a grid of 100 mm, for all time."""
-    middle, camera, plane = _middle(calibration), calibration.camera, calibration.plane
-    log_camera(rec, camera, depth=middle[2])
+def log_plane(rec: rr.RecordingStream, calibration: Calibration) -> None:
+    """The reference plane as a grid of 100 mm, for all time."""
+    middle, camera, plane = middle_mm(calibration), calibration.camera, calibration.plane
     half = 0.6 * middle[2] * max(camera.width / camera.K[0, 0], camera.height / camera.K[1, 1])
     lines = _grid(plane.rotation.T @ (middle - plane.translation_mm), half)
     strips = lines @ plane.rotation.T + plane.translation_mm
@@ -105,7 +136,7 @@ def log_calibration(rec: rr.RecordingStream, calibration: Calibration) -> None:
     )
 
 
-def _middle(calibration: Calibration) -> Float[np.ndarray, "3"]:
+def middle_mm(calibration: Calibration) -> Float[np.ndarray, "3"]:
     """Where the camera's axis meets the plane, or the plane's origin where it doesn't."""
     ray = np.array([[0.0, 0.0, 1.0]])
     depth = calibration.plane.depth_mm(ray)[0]

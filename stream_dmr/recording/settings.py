@@ -14,17 +14,33 @@ class RecordingSettings(Settings):
     rrd: bool = Field(default=True, description="write recording.rrd, the view for Rerun")
     rrd_messages: bool = Field(
         default=True,
-        description="put the exact messages into the .rrd too, so that it can be replayed alone",
+        description="put the messages into the .rrd too, so that it can be replayed alone",
     )
     frames: Literal["reference", "jpeg"] = Field(
-        default="jpeg",
-        description="pictures of the source in the .mcap: a reference into it, or as JPEG",
+        default="reference",
+        description='the source\'s pictures: "reference" (number and checksum), "jpeg"',
     )
-    crops: Literal["png", "jpeg"] = Field(
-        default="png", description="pictures of the crops: exact as PNG, or as JPEG"
+    crops: Literal["none", "jpeg", "png"] = Field(
+        default="none",
+        description='pictures of the crops beside their masks: "none", "jpeg", "png" (exact)',
+    )
+    meshes: Literal["parameters", "vertices"] = Field(
+        default="parameters",
+        description='of each fit: its "parameters", or "vertices" and covariance as well',
     )
     jpeg_quality: int = Field(
         default=85, ge=1, le=100, description="quality of every JPEG, 1 to 100 (no unit)"
+    )
+    view_rate_hz: float = Field(
+        default=10.0,
+        gt=0,
+        le=1000,
+        description="pictures and meshes drawn into the .rrd per second; plots have every frame",
+    )
+    view_px: int = Field(
+        default=960,
+        ge=64,
+        description="pictures in the .rrd are halved until no side is longer, px",
     )
     flush_s: float = Field(
         default=1.0, gt=0, le=60, description="the most that a crash may lose, seconds of recording"

@@ -37,7 +37,7 @@ MESH = "scene/fish/{id}/mesh"
 KEYPOINTS_2D = "scene/camera/fish/{id}/keypoints"
 KEYPOINTS_3D, MIDLINE = "scene/fish/{id}/keypoints", "scene/fish/{id}/midline"
 FRAME_LENGTH, LENGTH = "length/{id}/frame", "length/{id}/estimate"
-IOU, BENDING = "iou/{id}", "bending/{id}"
+IOU, BENDING, FIT_MS = "iou/{id}", "bending/{id}", "fit_ms/{id}"
 LOG, REFUSALS, RESULTS = "log", "log/refusals", "log/lengths"
 CAMERA, PLANE = "scene/camera", "scene/plane"  # static, from the header
 FISH_ROOTS = ("scene/camera/fish", "scene/fish")  # what a new frame clears
@@ -47,7 +47,7 @@ TOPICS: dict[type[Message], Topic] = {
     for row in (
         Topic(message=Frame, topic="/frame", entities=(FRAME,)),
         Topic(message=FishCrop, topic="/crop", entities=(BOX, OUTLINE)),
-        Topic(message=FittedMesh, topic="/fit", entities=(MESH, IOU)),
+        Topic(message=FittedMesh, topic="/fit", entities=(MESH, IOU, FIT_MS)),
         Topic(
             message=LocalizedFish,
             topic="/localized",

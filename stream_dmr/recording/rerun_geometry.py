@@ -1,0 +1,71 @@
+"""Shapes and pictures as the view shows them."""
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+
+from stream_dmr.camera import frame_from_crop
+from stream_dmr.geometry import arc_length
+from stream_dmr.messages import FishCrop, FittedShape, LocalizedFish
+
+
+def place(
+    shape: FittedShape, fish: LocalizedFish
+) -> tuple[Float[np.ndarray, "V 3"] | None, Float[np.ndarray, "3 3"], Float[np.ndarray, "M 3"]]:
+    """Vertices, keypoints and midline of a fit where its fish hangs, in mm in the camera frame.
+
+    Both are in the orientation of the camera, so a scale and a shift do it: the ratio of the
+    midlines' arcs, and center keypoint to center keypoint. Without millimetres the shape is scaled
+    about the camera to a body length of 1, which leaves its picture as it is. Vertices are None
+    where the shape has none.
+    """
+    arc, vertices = arc_length(shape.midline), shape.vertices
+    if fish.keypoints_mm is None or fish.midline_mm is None:
+        placed = None if vertices is None else vertices / arc
+        return placed, shape.keypoints / arc, shape.midline / arc
+    scale = arc_length(fish.midline_mm) / arc
+    if vertices is not None:
+        vertices = (vertices - shape.keypoints[1]) * scale + fish.keypoints_mm[1]
+    return vertices, fish.keypoints_mm, fish.midline_mm
+
+
+def outlines(crop: FishCrop) -> list[Float[np.ndarray, "N 2"]]:
+    """Closed outlines of the mask, in frame pixels."""
+    contours, _ = cv2.findContours(
+        crop.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE
+    )
+    cameras = {"crop_camera": crop.crop_camera, "frame_camera": crop.frame_camera}
+    closed = [np.concatenate([contour, contour[:1]])[:, 0] for contour in contours]
+    return [frame_from_crop(line.astype(float), **cameras) for line in closed]
+
+
+def normals(
+    vertices: Float32[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "V 3"]:
+    """Area-weighted vertex normals, for smooth shading only."""
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    weighted = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    corners = faces.ravel()
+    sums = [np.bincount(corners, weighted[:, axis], len(vertices)) for axis in range(3)]
+    normals = np.stack(sums, axis=1)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+
+
+def view_factor(width: int, height: int, *, most: int) -> int:
+    """Frame pixels per pixel of the view: a power of two that divides the frame's size.
+
+    The smallest with which no side is longer than `most`, so far as there is one.
+    """
+    factor = 1
+    while max(width, height) > most * factor and not (width | height) // factor % 2:
+        factor *= 2
+    return factor
+
+
+def halved(image: UInt8[np.ndarray, "H W 3"], *, most: int) -> UInt8[np.ndarray, "h w 3"]:
+    """The image as small as `view_factor` says, halved again and again, which is quick."""
+    height, width = image.shape[:2]
+    for _ in range(view_factor(width, height, most=most).bit_length() - 1):
+        height, width = height // 2, width // 2
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    return image
