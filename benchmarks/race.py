@@ -52,10 +52,8 @@ class _Reached(Exception):
 class _Watched(ContourSolver):
     """Stops as soon as a minimisation ends at the goal."""
 
-    def _minimise(
-        self, target: Target, start: Float[np.ndarray, "P"], iterations: int, damping: float
-    ) -> Solution:
-        solution = super()._minimise(target, start, iterations, damping)
+    def _minimise(self, *arguments: Any, **options: Any) -> Solution:
+        solution = super()._minimise(*arguments, **options)
         if solution.iou >= GOAL:
             raise _Reached
         return solution

@@ -17,7 +17,13 @@ from targets import Known, Pair
 
 from stream_dmr.body import Body, rest_vector
 from stream_dmr.fitting.adam import AdamSolver
-from stream_dmr.fitting.contour import deformation, levenberg_marquardt, normal_equations, outline
+from stream_dmr.fitting.contour import (
+    deformation,
+    levenberg_marquardt,
+    mesh_terms,
+    normal_equations,
+    outline,
+)
 from stream_dmr.fitting.contour.deformation import KINDS, deform
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.outline import project
@@ -186,7 +192,7 @@ def iteration_parts(setup: Setup, pair: Pair) -> dict[str, Callable[[], object]]
         "- rim": lambda: out.rim_edges(pixels, *mesh),
         "- coverage": lambda: out.coverage(pixels, rim, len(target.mask)),
         "- overlap": lambda: out.overlap(covered, target.mask, target.distance, target.mask_area),
-        "- smoothness": lambda: out.smoothness(body, points, np.exp(flat[5])),
+        "- smoothness": lambda: mesh_terms.smoothness(body, points, np.exp(flat[5])),
         "normal equations": lambda: normal_equations.normal_equations(*problem),
         "- visible rim": lambda: normal_equations.visible_rim(pixels, rim, covered),
         "- jacobian": lambda: deformation.jacobian(body, SPINE, flat, chosen),

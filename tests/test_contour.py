@@ -23,9 +23,12 @@ from stream_dmr.body import JOINT, ROOT, Body
 from stream_dmr.fitting.contour import deformation, normal_equations, outline, rotation
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
+from stream_dmr.fitting.contour.mesh_terms import smoothness_slope
+from stream_dmr.fitting.contour.pull_back import pull_back
 from stream_dmr.fitting.objective import Objective
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target, mask_contour
+from stream_dmr.losses import laplacian_loss, normal_loss
 from stream_dmr.silhouette import project, silhouette
 from stream_dmr.silhouette import rim_edges as torch_rim_edges
 from stream_dmr.skinning import DEFORMATIONS, Parameters, Rig
@@ -177,6 +180,42 @@ def seen(name, flat, *, moved_px=0.0):
 def rim_of(name, pixels):
     body = BODIES[name]
     return outline.rim_edges(pixels, body.faces, body.edges, body.edge_faces)
+
+
+@both_kinds
+@every_template
+class TestMeshTerms:
+    """Eq. (5) and the way back from forces on the points."""
+
+    @five
+    @given(seed=seeds, size=st.sampled_from([0.0, 0.3, 1.0]))
+    def test_pulled_back_forces_are_those_times_the_jacobian(self, name, kind, seed, size):
+        body, flat = BODIES[name], motion(name, seed, size=size)[0].numpy()
+        forces = np.random.default_rng(seed).normal(size=(body.num_vertices, 3))
+        points = deformation.deform(body, KINDS[kind], flat)
+        slopes = deformation.jacobian(body, KINDS[kind], flat, np.arange(body.num_vertices))
+        np.testing.assert_allclose(
+            pull_back(body, KINDS[kind], flat, points, forces),
+            np.einsum("ni,nip->p", forces, slopes),
+            atol=1e-9,
+        )
+
+    @five
+    @given(seed=seeds, size=st.sampled_from([0.0, 0.3, 1.0]))
+    def test_slope_is_autograd_s(self, name, kind, seed, size):
+        flat = motion(name, seed, size=size)
+        rig = RIGS[name]
+
+        def weighted(vector):
+            parameters = Parameters.from_flat(vector[None])
+            vertices = DEFORMATIONS[kind](rig, parameters)[:, : BODIES[name].num_vertices]
+            laplacian = laplacian_loss(vertices / vector[5].exp(), rig)
+            return (0.7 * normal_loss(vertices, rig) + 40.0 * laplacian)[0]
+
+        points = deformation.deform(BODIES[name], KINDS[kind], flat[0].numpy())
+        found = smoothness_slope(BODIES[name], KINDS[kind], flat[0].numpy(), points, 0.7, 40.0)
+        expected = torch_slopes(weighted, flat)
+        np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
 
 
 @every_template

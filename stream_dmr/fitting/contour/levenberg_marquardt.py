@@ -5,8 +5,9 @@ import numpy as np
 from stream_dmr.body import JOINT, ROOT
 from stream_dmr.fitting.compiled import compiled
 from stream_dmr.fitting.contour.deformation import deform
+from stream_dmr.fitting.contour.mesh_terms import smoothness
 from stream_dmr.fitting.contour.normal_equations import normal_equations, prior_loss
-from stream_dmr.fitting.contour.outline import coverage, overlap, project, rim_edges, smoothness
+from stream_dmr.fitting.contour.outline import coverage, overlap, project, rim_edges
 from stream_dmr.fitting.contour.rotation import dot
 
 SETTLED, STUCK, EXHAUSTED = 0, 1, 2

@@ -13,6 +13,7 @@ import numpy as np
 from stream_dmr.body import JOINT, ROOT
 from stream_dmr.fitting.compiled import compiled
 from stream_dmr.fitting.contour.deformation import jacobian
+from stream_dmr.fitting.contour.mesh_terms import smoothness_slope
 from stream_dmr.fitting.contour.rotation import rotation, turn_slope
 
 # Residuals under this are all the same to the reweighting, px: the pixels' own staircase.
@@ -37,6 +38,8 @@ def normal_equations(body, kind, target, lambdas, priors, flat, rest, points, pi
     )
     H, g = weighted_squares(rows, residuals, weights)
     _regularise(target, flat, rest, lambdas, priors, H, g)
+    if lambdas[4] > 0 or lambdas[5] > 0:
+        g += smoothness_slope(body, kind, flat, points, lambdas[4], lambdas[5])
     return H, g
 
 

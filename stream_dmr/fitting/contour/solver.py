@@ -19,7 +19,7 @@ from stream_dmr.fitting.target import Target
 
 # Of a search: iterations of a round, and how many starts go into it at the most.
 _ROUNDS = ((2, 24), (4, 12))
-_NUM_FINISHED = 3
+_NUM_FINISHED = 2
 # Damping at the start: near the answer the model is trusted, far from it less.
 _NEAR, _FAR = 1e-2, 1e-1
 
@@ -32,6 +32,9 @@ class ContourSolver:
         self._settings = settings
         self._kind = KINDS[settings.deformation]
         self._rest = rest_vector(len(body.joints))
+        self._lambdas, self._priors = settings.lambdas(), settings.priors()
+        # The mesh's smoothness tells starts apart no better, and is dear.
+        self._rough_lambdas = self._lambdas * [1, 1, 1, 1, 0, 0]
 
     def refine(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
         """From one start near the answer, and from its mirror image where that is more likely."""
@@ -43,10 +46,11 @@ class ContourSolver:
         return min(found, self._finish(target, mirrored), key=lambda solution: solution.loss)
 
     def _finish(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
-        return self._minimise(target, start, self._settings.contour_iterations, _NEAR)
+        most = self._settings.contour_iterations
+        return self._minimise(target, start, self._lambdas, iterations=most, damping=_NEAR)
 
     def _prior_loss(self, target: Target, flat: Float[np.ndarray, "P"]) -> float:
-        return prior_loss(target, flat, self._rest, self._settings.priors())
+        return prior_loss(target, flat, self._rest, self._priors)
 
     def search(self, target: Target, starts: Float[np.ndarray, "B P"]) -> Solution:
         """The likeliest start to its end; of the others the best after rounds on a coarse picture.
@@ -57,7 +61,7 @@ class ContourSolver:
         flats = sorted(starts, key=lambda flat: self._loss(coarse, flat))
         found = [self.refine(target, flats.pop(0))]
         for iterations, most in _ROUNDS:
-            rough = [self._minimise(coarse, flat, iterations, _FAR) for flat in flats[:most]]
+            rough = [self._rough(coarse, flat, iterations) for flat in flats[:most]]
             rough.sort(key=lambda solution: solution.loss)
             flats = [solution.flat for solution in rough]
         found += [self.refine(target, flat) for flat in flats[:_NUM_FINISHED]]
@@ -65,17 +69,28 @@ class ContourSolver:
 
     def _loss(self, target: Target, flat: Float[np.ndarray, "P"]) -> float:
         terms, *_ = evaluate(self._body, self._kind, target, flat)
-        return float(terms @ self._settings.lambdas()) + self._prior_loss(target, flat)
+        return float(terms @ self._rough_lambdas) + self._prior_loss(target, flat)
+
+    def _rough(self, target: Target, start: Float[np.ndarray, "P"], iterations: int) -> Solution:
+        return self._minimise(
+            target, start, self._rough_lambdas, iterations=iterations, damping=_FAR
+        )
 
     def _minimise(
-        self, target: Target, start: Float[np.ndarray, "P"], iterations: int, damping: float
+        self,
+        target: Target,
+        start: Float[np.ndarray, "P"],
+        lambdas: Float[np.ndarray, "6"],
+        *,
+        iterations: int,
+        damping: float,
     ) -> Solution:
         flat, loss, iou, used, stop = minimise(
             self._body,
             self._kind,
             target,
-            self._settings.lambdas(),
-            self._settings.priors(),
+            lambdas,
+            self._priors,
             start,
             self._rest,
             iterations,

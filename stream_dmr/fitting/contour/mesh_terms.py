@@ -1,0 +1,121 @@
+"""L_normal and L_lap of eq. (5), and their slope to the parameters: compiled loops.
+
+Both are sums over the whole mesh, and their weights are small. As residuals they would cost more
+than all the rest of an iteration, so the normal equations get their gradient alone.
+"""
+
+import numpy as np
+
+from stream_dmr.fitting.compiled import compiled
+from stream_dmr.fitting.contour.pull_back import pull_back
+
+
+@compiled
+def smoothness(body, points, size):
+    """L_normal and L_lap of eq. (5) of a body of this size, so that they are in body lengths."""
+    edges, edge_faces = body.edges, body.edge_faces
+    normals = _face_normals(points, body.faces)
+    normal = 0.0
+    mean = np.zeros((body.num_vertices, 3))
+    for e in range(len(edges)):
+        p, q = edge_faces[e, 0], edge_faces[e, 1]
+        cosine = normals[p, 0] * normals[q, 0] + normals[p, 1] * normals[q, 1]
+        normal += 1.0 - cosine - normals[p, 2] * normals[q, 2]
+        a, b = edges[e, 0], edges[e, 1]
+        for i in range(3):
+            mean[a, i] += points[b, i]
+            mean[b, i] += points[a, i]
+    laplacian = 0.0
+    for v in range(body.num_vertices):
+        share = 1.0 / body.num_neighbors[v]
+        for i in range(3):
+            laplacian += (points[v, i] - share * mean[v, i]) ** 2
+    return normal, laplacian / size**2
+
+
+@compiled
+def _face_normals(points, faces):
+    normals = np.empty((len(faces), 3))
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        u0, v0 = points[b, 0] - points[a, 0], points[c, 0] - points[a, 0]
+        u1, v1 = points[b, 1] - points[a, 1], points[c, 1] - points[a, 1]
+        u2, v2 = points[b, 2] - points[a, 2], points[c, 2] - points[a, 2]
+        n0, n1, n2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+        scale = 1.0 / max(np.sqrt(n0 * n0 + n1 * n1 + n2 * n2), 1e-300)
+        normals[f, 0], normals[f, 1], normals[f, 2] = n0 * scale, n1 * scale, n2 * scale
+    return normals
+
+
+@compiled
+def smoothness_slope(body, kind, flat, points, normal_weight, laplacian_weight):
+    """Slope (P,) of the weighted sum of both terms to the parameters."""
+    size = np.exp(flat[5])
+    forces = np.zeros((body.num_vertices, 3))
+    _normal_forces(body, points, normal_weight, forces)
+    laplacian = _laplacian_forces(body, points, laplacian_weight / size**2, forces)
+    slope = pull_back(body, kind, flat, points, forces)
+    slope[5] -= 2 * laplacian  # L_lap is of the body at size 1
+    return slope
+
+
+@compiled
+def _normal_forces(body, points, weight, forces):
+    """Slope of sum_e (1 - n_p . n_q), by that of each face's normal n = N / |N|, N = u x v."""
+    faces, edges, edge_faces = body.faces, body.edges, body.edge_faces
+    normals = _face_normals(points, faces)
+    pulls = np.zeros((len(faces), 3))
+    for e in range(len(edges)):
+        p, q = edge_faces[e, 0], edge_faces[e, 1]
+        for i in range(3):
+            pulls[p, i] -= weight * normals[q, i]
+            pulls[q, i] -= weight * normals[p, i]
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        u0, v0 = points[b, 0] - points[a, 0], points[c, 0] - points[a, 0]
+        u1, v1 = points[b, 1] - points[a, 1], points[c, 1] - points[a, 1]
+        u2, v2 = points[b, 2] - points[a, 2], points[c, 2] - points[a, 2]
+        n0, n1, n2 = normals[f, 0], normals[f, 1], normals[f, 2]
+        doubled = n0 * (u1 * v2 - u2 * v1) + n1 * (u2 * v0 - u0 * v2) + n2 * (u0 * v1 - u1 * v0)
+        scale = 1.0 / max(doubled, 1e-300)
+        along = pulls[f, 0] * n0 + pulls[f, 1] * n1 + pulls[f, 2] * n2
+        w0 = scale * (pulls[f, 0] - along * n0)
+        w1 = scale * (pulls[f, 1] - along * n1)
+        w2 = scale * (pulls[f, 2] - along * n2)
+        _add_force(forces, a, b, v1 * w2 - v2 * w1, v2 * w0 - v0 * w2, v0 * w1 - v1 * w0)
+        _add_force(forces, a, c, w1 * u2 - w2 * u1, w2 * u0 - w0 * u2, w0 * u1 - w1 * u0)
+
+
+@compiled
+def _add_force(forces, a, b, x, y, z):
+    """On b, and against it on a."""
+    forces[b, 0] += x
+    forces[b, 1] += y
+    forces[b, 2] += z
+    forces[a, 0] -= x
+    forces[a, 1] -= y
+    forces[a, 2] -= z
+
+
+@compiled
+def _laplacian_forces(body, points, weight, forces):
+    """Slope of sum_v |p_v - mean of its neighbours|^2; returns the weighted sum itself."""
+    edges, shares = body.edges, 1.0 / body.num_neighbors
+    off = points[: body.num_vertices].copy()
+    for e in range(len(edges)):
+        a, b = edges[e, 0], edges[e, 1]
+        for i in range(3):
+            off[a, i] -= shares[a] * points[b, i]
+            off[b, i] -= shares[b] * points[a, i]
+    total = 0.0
+    for v in range(len(off)):
+        for i in range(3):
+            total += weight * off[v, i] ** 2
+            off[v, i] *= 2 * weight
+            forces[v, i] += off[v, i]
+    for e in range(len(edges)):
+        a, b = edges[e, 0], edges[e, 1]
+        for i in range(3):
+            forces[b, i] -= shares[a] * off[a, i]
+            forces[a, i] -= shares[b] * off[b, i]
+    return total
