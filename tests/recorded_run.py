@@ -24,7 +24,7 @@ from stream_dmr.messages import (
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.template import Template
 
-WIDTH, HEIGHT, CROP = 1280, 960, 256
+WIDTH, HEIGHT, CROP = 1280, 960, 128
 FRAME_NS = 33_366_667
 LENGTH_MM = 800.0
 
@@ -38,8 +38,8 @@ def calibration() -> Calibration:
 
 
 @cache
-def template(rings: int = 32, around: int = 20) -> Template:
-    """A spindle of about 640 vertices."""
+def template(rings: int = 46, around: int = 30) -> Template:
+    """A spindle of 1382 vertices."""
     x = np.linspace(-0.5, 0.5, rings)
     angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
     girth = np.sin(np.linspace(0.05, np.pi - 0.15, rings))[:, None]

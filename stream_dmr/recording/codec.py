@@ -86,12 +86,12 @@ def check_version(version: int) -> None:
 
 
 def _fill(proto: Proto, value: object, picture: Picture | None = None) -> None:
-    for field in fields(value):  # type: ignore[arg-type]
+    for field in proto.DESCRIPTOR.fields:
         item = getattr(value, field.name)
         if field.name == "image" and item is not None:
             item = picture or compress(item, format="png")
         if item is not None:
-            _set(proto, proto.DESCRIPTOR.fields_by_name[field.name], item)
+            _set(proto, field, item)
 
 
 def _set(proto: Proto, field: Any, item: Any) -> None:

@@ -7,6 +7,7 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 
 _EPOCH_NS = 10**17  # timestamps above are since 1970 (this is 1973), below since the start
@@ -57,9 +58,16 @@ def _column(archetype: Any, name: str, rows: Sequence[_Values]) -> rr.ComponentC
     lengths = [len(row) for row in rows]
     if isinstance(rows[0], np.ndarray):
         values = np.concatenate(rows)
+        if archetype is rr.AnyValues:  # which takes arrays apart, number by number
+            return archetype.columns(**{name: _lists(values, lengths)})
     else:
         values = list(chain.from_iterable(rows))
     return archetype.columns(**{name: values}).partition(lengths)
+
+
+def _lists(values: np.ndarray, lengths: Sequence[int]) -> pa.Array:
+    offsets = np.cumsum([0, *lengths], dtype=np.int32)
+    return pa.ListArray.from_arrays(offsets, values)
 
 
 def _times(moments: Sequence[tuple[int, int]]) -> list[rr.TimeColumn]:

@@ -22,7 +22,7 @@ from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.pictures import compress
 from stream_dmr.recording.record import Record
 from stream_dmr.recording.rerun_columns import Columns, blob
-from stream_dmr.recording.rerun_geometry import halved, normals, outlines, place, view_factor
+from stream_dmr.recording.rerun_geometry import halved, outlines, place, shades, view_factor
 from stream_dmr.recording.rerun_view import (
     NOMINAL_DEPTH,
     appearance,
@@ -34,7 +34,7 @@ from stream_dmr.recording.rerun_view import (
 from stream_dmr.recording.settings import RecordingSettings
 
 _HALF_PIXEL = 0.5  # Rerun counts pixels from the corner of the top-left one, we from its centre
-_JPEG_QUALITY = 80
+_JPEG_QUALITY = 75
 _MOST_PENDING = 64  # frames whose fish may still come
 
 
@@ -141,7 +141,7 @@ class Drawing:
         vertices, keypoints, midline = place(shape, fish)
         if vertices is not None:
             vertices = vertices.astype(np.float32)
-            parts = {"vertex_positions": vertices, "vertex_normals": normals(vertices, self._faces)}
+            parts = {"vertex_positions": vertices, "vertex_colors": shades(vertices, self._faces)}
             self._add(topics.MESH, rr.Mesh3D, fish, **parts)
         self._add(topics.KEYPOINTS_3D, rr.Points3D, fish, positions=keypoints)
         self._add(topics.MIDLINE, rr.LineStrips3D, fish, strips=[midline])

@@ -8,6 +8,9 @@ from stream_dmr.camera import frame_from_crop
 from stream_dmr.geometry import arc_length
 from stream_dmr.messages import FishCrop, FittedShape, LocalizedFish
 
+_LIGHT = np.array([0.3, -0.6, -0.742])  # toward it, in the camera frame: above, right, behind us
+_AMBIENT = 0.25
+
 
 def place(
     shape: FittedShape, fish: LocalizedFish
@@ -39,16 +42,21 @@ def outlines(crop: FishCrop) -> list[Float[np.ndarray, "N 2"]]:
     return [frame_from_crop(line.astype(float), **cameras) for line in closed]
 
 
-def normals(
+def shades(
     vertices: Float32[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
-) -> Float[np.ndarray, "V 3"]:
-    """Area-weighted vertex normals, for smooth shading only."""
+) -> UInt8[np.ndarray, "V 3"]:
+    """Grey of each vertex, lit from above the camera: a third of the bytes of normals.
+
+    Normals are weighted by area, which is what cross products are.
+    """
     a, b, c = vertices[faces].transpose(1, 0, 2)
     weighted = np.repeat(np.cross(b - a, c - a), 3, axis=0)
     corners = faces.ravel()
     sums = [np.bincount(corners, weighted[:, axis], len(vertices)) for axis in range(3)]
     normals = np.stack(sums, axis=1)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    lit = normals @ _LIGHT / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
+    grey = 255 * (_AMBIENT + (1 - _AMBIENT) * (0.5 + 0.5 * lit))
+    return grey.astype(np.uint8)[:, None].repeat(3, axis=1)
 
 
 def view_factor(width: int, height: int, *, most: int) -> int:

@@ -63,7 +63,9 @@ class RerunSink:
     def _log_header(self, header: RunHeader) -> None:
         parts = {"run.json": json.dumps(header.metadata()).encode(), **header.attachments()}
         for name, data in parts.items():
-            self._rec.log([*_HEADER, name], rr.AnyValues(drop_untyped_nones=True, **blob(data)), static=True)
+            self._rec.log(
+                [*_HEADER, name], rr.AnyValues(drop_untyped_nones=True, **blob(data)), static=True
+            )
 
     def _flush(self) -> None:
         self._drawing.send()

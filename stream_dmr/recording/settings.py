@@ -32,7 +32,7 @@ class RecordingSettings(Settings):
         default=85, ge=1, le=100, description="quality of every JPEG, 1 to 100 (no unit)"
     )
     view_rate_hz: float = Field(
-        default=10.0,
+        default=6.0,
         gt=0,
         le=1000,
         description="pictures and meshes drawn into the .rrd per second; plots have every frame",
