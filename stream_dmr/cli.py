@@ -16,6 +16,8 @@ import typer
 
 from stream_dmr import __version__
 from stream_dmr.cli_calibrate import calibrate
+from stream_dmr.cli_export import export
+from stream_dmr.cli_view import convert, view
 from stream_dmr.errors import UserError
 
 app = typer.Typer(
@@ -25,7 +27,8 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.command()(calibrate)
+for command in (calibrate, view, convert, export):
+    app.command()(command)
 
 
 def main() -> None:

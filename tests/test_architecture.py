@@ -48,7 +48,10 @@ WHO_KNOWS = {
     ],
     "filterpy": ["stream_dmr.length_filter"],
     "nodes": [*ASSEMBLY, "nodes"],
-    "typer": ["stream_dmr.cli", "stream_dmr.cli_calibrate", "stream_dmr.demo"],
+    "typer": [
+        *("stream_dmr.cli", "stream_dmr.cli_calibrate", "stream_dmr.cli_export"),
+        *("stream_dmr.cli_view", "stream_dmr.demo"),
+    ],
 }
 
 

@@ -380,7 +380,7 @@ def test_recording_leaves_no_global_rerun_stream(tmp_path: Path):
 
 @pytest.mark.slow
 def test_the_view_opens_without_a_screen(tmp_path: Path, messages: list[Message]):
-    from stream_dmr.recording.screenshot import screenshot
+    from stream_dmr.recording.viewer import screenshot
 
     record(tmp_path, messages, RecordingSettings())
     screenshot(tmp_path / "recording.rrd", tmp_path / "view.png", frame_index=3)

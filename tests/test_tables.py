@@ -11,7 +11,8 @@ from recorded_run import run
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate, LocalizedFish, Message
-from stream_dmr.recording.record import Record
+from stream_dmr.recording.record import make_record
+from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.tables import Tables, seconds
 
 LENGTHS_HEADER = (
@@ -27,7 +28,7 @@ FRAMES_HEADER = (
 
 def write_all(tables: Tables, messages: list[Message]) -> None:
     for message in messages:
-        tables.write(Record(message=message, whole=message, picture=None))
+        tables.write(make_record(message, RecordingSettings()))
 
 
 def write(out: Path, messages: list[Message]) -> tuple[list[dict], list[dict]]:

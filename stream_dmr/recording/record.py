@@ -1,7 +1,8 @@
 """A message on its way into a recording."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, Message
 from stream_dmr.recording.codec import encode
@@ -16,15 +17,12 @@ class Record:
 
     message: Message  # as a recording gives it back, but a frame by reference keeps its pixels
     whole: Message  # with what the recording leaves out: for drawing
-    picture: Picture | None  # of the message; None: encoded with the rest
+    encoding: Callable[[], bytes]
 
     @cached_property
     def payload(self) -> bytes:
         """As `codec.encode` gives it."""
-        picture = self.picture
-        if picture is None and isinstance(self.message, Frame):
-            picture = compress(self.message.image, format="reference")
-        return encode(self.message, picture=picture)
+        return self.encoding()
 
     @property
     def topic(self) -> Topic:
@@ -48,7 +46,13 @@ def make_record(message: Message, settings: RecordingSettings) -> Record:
             recorded = replace(message, shape=replace(shape, vertices=None, covariance=None))
         case _:
             pass
-    return Record(message=recorded, whole=message, picture=picture)
+    return Record(message=recorded, whole=message, encoding=partial(_encode, recorded, picture))
+
+
+def _encode(message: Message, picture: Picture | None) -> bytes:
+    if picture is None and isinstance(message, Frame):
+        picture = compress(message.image, format="reference")
+    return encode(message, picture=picture)
 
 
 def as_recorded(message: Message, settings: RecordingSettings) -> Message:

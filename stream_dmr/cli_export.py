@@ -1,0 +1,41 @@
+"""`stream-dmr export`: what a recording holds, for other programs."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+Meshes = Literal["ply", "glb"]
+Tables = Literal["csv", "parquet"]
+
+
+def export(
+    recording: Annotated[
+        Path, typer.Argument(help="An .mcap, or the folder of a run.", metavar="REC")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder to write to.")],
+    meshes: Annotated[
+        Meshes | None, typer.Option(help="A mesh per fish and frame, in mm, in the camera frame.")
+    ] = None,
+    masks: Annotated[
+        bool, typer.Option("--masks", help="masks.json: every mask as COCO run lengths.")
+    ] = False,
+    tables: Annotated[
+        Tables | None, typer.Option(help="lengths, and frames with the keypoints.")
+    ] = None,
+) -> None:
+    """Write meshes, masks, keypoints and lengths of a recording for other programs."""
+    if not (meshes or masks or tables):
+        raise typer.BadParameter("say what to export: --meshes ply, --masks, --tables csv")
+    from stream_dmr.cli_view import in_folder
+    from stream_dmr.export import export_masks, export_meshes, export_tables
+
+    mcap = in_folder(recording, "recording.mcap")
+    if meshes:
+        count = export_meshes(mcap, out / "meshes", format=meshes)
+        print(f"{out / 'meshes'}: {count} meshes")
+    if masks:
+        print(f"{out / 'masks.json'}: {export_masks(mcap, out / 'masks.json')} masks")
+    if tables:
+        for path in export_tables(mcap, out, format=tables):
+            print(path)

@@ -1,0 +1,109 @@
+"""`stream-dmr view` and `stream-dmr convert`: recordings in Rerun's viewer."""
+
+import signal
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+_Source = Annotated[
+    str | None,
+    typer.Option(help="The clip that was recorded, for pictures recorded by reference."),
+]
+
+
+def view(
+    recording: Annotated[
+        Path, typer.Argument(help="An .rrd, an .mcap, or the folder of a run.", metavar="REC")
+    ],
+    source: _Source = None,
+    web: Annotated[
+        bool, typer.Option("--web", help="For a browser on this machine, in bounded memory.")
+    ] = False,
+    port: Annotated[int, typer.Option(help="Of --web; 0 takes any that is free.")] = 0,
+    screenshot: Annotated[
+        Path | None, typer.Option(help="Save a picture (.png) instead; needs no screen.")
+    ] = None,
+    frame: Annotated[int, typer.Option(help="The frame of --screenshot.")] = 1,
+) -> None:
+    """Look at a recording: frame, 3D scene, lengths, IoU, timings and events."""
+    from stream_dmr.recording import viewer
+
+    # The viewer's process must end with us.
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    with _as_rrd(recording, source) as rrd:
+        if screenshot is not None:
+            viewer.screenshot(rrd, screenshot, frame_index=frame)
+            print(screenshot)
+        elif web:
+            viewer.serve(rrd, port=port)
+        else:
+            viewer.show(rrd)
+
+
+def convert(
+    recording: Annotated[
+        Path, typer.Argument(help="An .mcap, or the folder of a run.", metavar="REC")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="The .rrd to write.", show_default="REC with .rrd for .mcap"),
+    ] = None,
+    source: _Source = None,
+    full_size: Annotated[
+        bool, typer.Option("--full-size", help="Pictures as large as the source's.")
+    ] = False,
+) -> None:
+    """Make the .rrd of an .mcap again, with every frame drawn."""
+    mcap = in_folder(recording, "recording.mcap")
+    rrd = out or mcap.with_suffix(".rrd")
+    _convert(mcap, rrd, source, full_size=full_size)
+    print(rrd)
+
+
+def _convert(mcap: Path, rrd: Path, source: str | None, *, full_size: bool = False) -> None:
+    from stream_dmr.errors import RecordingError
+    from stream_dmr.recording.convert import EVERY_FRAME
+    from stream_dmr.recording.convert import convert as convert_recording
+    from stream_dmr.video import ReadFramesSettings, open_source
+
+    if mcap.suffix == ".rrd":
+        raise RecordingError(f"{mcap}: expected an .mcap, got an .rrd, which needs no conversion")
+    settings = EVERY_FRAME.model_copy(update={"view_px": 1 << 16} if full_size else {})
+    if source is None:
+        convert_recording(mcap, rrd, settings=settings)
+        return
+    with closing(open_source(source, ReadFramesSettings())) as frames:
+        convert_recording(mcap, rrd, frames=frames, settings=settings)
+
+
+@contextmanager
+def _as_rrd(recording: Path, source: str | None) -> Iterator[Path]:
+    """An .rrd as it is, unless it is to be drawn anew from its source; an .mcap converted."""
+    preferred = "recording.rrd" if source is None else "recording.mcap"
+    found = in_folder(recording, preferred, "recording.rrd", "recording.mcap")
+    if found.suffix == ".rrd":
+        yield found
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        rrd = Path(folder) / "recording.rrd"
+        _convert(found, rrd, source)
+        yield rrd
+
+
+def in_folder(recording: Path, *names: str) -> Path:
+    """The recording itself, or the first of `names` that a folder has."""
+    from stream_dmr.errors import RecordingError
+
+    candidates = [recording / name for name in names] if recording.is_dir() else [recording]
+    found = next((path for path in candidates if path.is_file()), None)
+    if found is None:
+        raise RecordingError(
+            f"{recording}: expected a recording or a folder with {names[-1]}, found none; "
+            "check the path"
+        )
+    return found
