@@ -1,12 +1,16 @@
 """Pictures as compressed bytes and back."""
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from io import BytesIO
+from itertools import chain
 from typing import Literal
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
+from PIL import Image
 
 from stream_dmr.errors import RecordingError
 
@@ -45,6 +49,15 @@ def compress_mask(mask: Bool[np.ndarray, "H W"]) -> Picture:
     grey = mask.astype(np.uint8) * np.uint8(255)
     data = cv2.imencode(".png", grey, [cv2.IMWRITE_PNG_BILEVEL, 1])[1].tobytes()
     return _picture("png1", mask, data)
+
+
+def paint(labels: UInt8[np.ndarray, "H W"], palette: Sequence[tuple[int, int, int]]) -> bytes:
+    """A PNG with the RGB colours 1, 2, ... of a palette for these labels, clear where 0."""
+    picture = Image.fromarray(labels)
+    picture.putpalette([0, 0, 0, *chain.from_iterable(palette)])
+    file = BytesIO()
+    picture.save(file, "png", transparency=0, bits=4, compress_level=1)
+    return file.getvalue()
 
 
 def decompress(picture: Picture) -> UInt8[np.ndarray, "H W 3"] | Bool[np.ndarray, "H W"]:

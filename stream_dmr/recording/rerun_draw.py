@@ -1,6 +1,7 @@
 """Draws messages into a Rerun stream: entity paths are those of topics.py."""
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,12 +20,14 @@ from stream_dmr.messages import (
 )
 from stream_dmr.recording import topics
 from stream_dmr.recording.header import RunHeader
-from stream_dmr.recording.pictures import compress
+from stream_dmr.recording.pictures import compress, paint
 from stream_dmr.recording.record import Record
 from stream_dmr.recording.rerun_columns import Columns, blob
-from stream_dmr.recording.rerun_geometry import halved, outlines, place, shades, view_factor
+from stream_dmr.recording.rerun_geometry import fill, halved, outlines, place, shades, view_factor
 from stream_dmr.recording.rerun_view import (
     NOMINAL_DEPTH,
+    PALETTE,
+    PICTURES,
     appearance,
     color,
     log_camera,
@@ -53,13 +56,17 @@ class Drawing:
         self._columns = Columns(rec)
         self._slot = -1  # of capture time, of the last frame that was shown
         self._shown: deque[int] = deque(maxlen=_MOST_PENDING)  # the last frames that were
+        self._boxes: dict[int, np.ndarray] = {}  # of each track, until there is a length
         self._shapes: dict[int, FittedShape] = {}  # of each track, until it is placed
         self._reasons: dict[int, str] = {}  # why each track's last frame was not used
         self._tracks: set[int] = set()
         self._factor: int | None = None  # frame pixels per pixel of the view
+        self._labels = np.zeros((0, 0), np.uint8)  # of the masks of frame `_labels_of` so far
+        self._labels_of = 0
+        self._no_masks = b""
         rec.log("scene", rr.ViewCoordinates.RDF, static=True)
-        jpeg = rr.EncodedImage.from_fields(media_type="image/jpeg")
-        rec.log(topics.FRAME, jpeg, static=True)
+        for path, what in PICTURES.items():
+            rec.log(path, what, static=True)
         if header.calibration is not None:
             log_plane(rec, header.calibration)
             self._set_camera(header.calibration.camera, depth=middle_mm(header.calibration)[2])
@@ -89,6 +96,9 @@ class Drawing:
     def _set_camera(self, camera: Camera, *, depth: float) -> None:
         self._factor = view_factor(camera.width, camera.height, most=self._settings.view_px)
         log_camera(self._rec, camera, depth=depth, factor=self._factor)
+        size = (camera.height // self._factor, camera.width // self._factor)
+        self._labels = np.zeros(size, np.uint8)
+        self._no_masks = paint(self._labels, PALETTE)
 
     def _frame(self, frame: Frame) -> None:
         slot = int(frame.timestamp_ns * self._settings.view_rate_hz // 1e9)
@@ -99,6 +109,8 @@ class Drawing:
         # Comes before the fish of its frame, so it may wipe the fish of the frame before.
         for root in topics.FISH_ROOTS:
             self._add(root, rr.Clear, frame, is_recursive=[True])
+        if self._labels.size:
+            self._add(topics.MASKS, rr.EncodedImage, frame, blob=[self._no_masks])
         if frame.image.size:
             picture = halved(frame.image, most=self._settings.view_px)
             jpeg = compress(picture, format="jpeg", jpeg_quality=_JPEG_QUALITY)
@@ -110,11 +122,18 @@ class Drawing:
         self._introduce(crop.track_id)
         if crop.frame_index not in self._shown:
             return
-        low, high = self._in_view(crop.bbox_xyxy_px.reshape(2, 2) - _HALF_PIXEL)
-        centers, half_sizes = (low + high)[None] / 2, (high - low)[None] / 2
-        self._add(topics.BOX, rr.Boxes2D, crop, centers=centers, half_sizes=half_sizes)
+        self._boxes[crop.track_id] = crop.bbox_xyxy_px
         strips = [self._in_view(line) for line in outlines(crop)]
         self._add(topics.OUTLINE, rr.LineStrips2D, crop, strips=strips)
+        self._mask(strips, crop)
+
+    def _mask(self, strips: Sequence[Float[np.ndarray, "_ 2"]], crop: FishCrop) -> None:
+        """The masks of a frame so far: each replaces the one before it, of the same moment."""
+        if crop.frame_index != self._labels_of:
+            self._labels_of = crop.frame_index
+            self._labels = np.zeros_like(self._labels)
+        fill(self._labels, strips, label=crop.track_id % len(PALETTE) + 1)
+        self._add(topics.MASKS, rr.EncodedImage, crop, blob=[paint(self._labels, PALETTE)])
 
     def _fit(self, fit: FittedMesh) -> None:
         if fit.shape is not None:
@@ -129,13 +148,26 @@ class Drawing:
             self._add(topics.BENDING, rr.Scalars, fish, scalars=[fish.bending_ratio])
         if fish.accepted and fish.length_mm is not None:
             self._add(topics.FRAME_LENGTH, rr.Scalars, fish, scalars=[fish.length_mm])
+        box = self._boxes.pop(fish.track_id, None)
         if fish.frame_index not in self._shown:
             return
+        if box is not None:
+            self._box(box, fish)
         if fish.keypoints_px is not None:
             points = self._in_view(fish.keypoints_px)
             self._add(topics.KEYPOINTS_2D, rr.Points2D, fish, positions=points)
         if shape is not None:
             self._body(shape, fish)
+
+    def _box(self, bbox_xyxy_px: Float[np.ndarray, "4"], fish: LocalizedFish) -> None:
+        """The box, with what this frame says of the fish."""
+        low, high = self._in_view(bbox_xyxy_px.reshape(2, 2) - _HALF_PIXEL)
+        parts = {
+            "centers": (low + high)[None] / 2,
+            "half_sizes": (high - low)[None] / 2,
+            "labels": [f"fish {fish.track_id}: {_finding(fish)}"],
+        }
+        self._add(topics.BOX, rr.Boxes2D, fish, **parts)
 
     def _body(self, shape: FittedShape, fish: LocalizedFish) -> None:
         vertices, keypoints, midline = place(shape, fish)
@@ -182,6 +214,12 @@ class Drawing:
     def _in_view(self, pixels: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
         """Frame pixels as Rerun counts them in the picture of the view."""
         return (pixels + _HALF_PIXEL) / (self._factor or 1)
+
+
+def _finding(fish: LocalizedFish) -> str:
+    if not fish.accepted:
+        return fish.reason
+    return "fitted" if fish.length_mm is None else f"{fish.length_mm:.0f} mm"
 
 
 def _verdict(estimate: LengthEstimate) -> str:

@@ -1,5 +1,7 @@
 """Shapes and pictures as the view shows them."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
@@ -40,6 +42,13 @@ def outlines(crop: FishCrop) -> list[Float[np.ndarray, "N 2"]]:
     cameras = {"crop_camera": crop.crop_camera, "frame_camera": crop.frame_camera}
     closed = [np.concatenate([contour, contour[:1]])[:, 0] for contour in contours]
     return [frame_from_crop(line.astype(float), **cameras) for line in closed]
+
+
+def fill(
+    labels: UInt8[np.ndarray, "H W"], outlines: Sequence[Float[np.ndarray, "_ 2"]], *, label: int
+) -> None:
+    """Write `label` inside closed outlines, which count pixels from the corner of the first."""
+    cv2.fillPoly(labels, [np.round(line - 0.5).astype(np.int32) for line in outlines], label)
 
 
 def shades(

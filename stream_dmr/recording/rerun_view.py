@@ -10,7 +10,7 @@ from stream_dmr.recording import topics
 from stream_dmr.recording.topics import CAMERA, LOG, PLANE
 
 # Okabe and Ito's palette, told apart by the colour-blind too; black and grey left out.
-_PALETTE = (
+PALETTE = (
     (230, 159, 0),
     (86, 180, 233),
     (0, 158, 115),
@@ -27,12 +27,22 @@ RUN = "run"
 _THIN = rr.Radius.ui_points(1.2)
 _DOTS = rr.Radius.ui_points([5.5, 3.5, 3.5])  # head, center, tail: the large one is the head
 _WHITE = (255, 255, 255)
+# Where the 3D views are seen from: close enough to see how a fish is bent; and past the camera.
+# Without a calibration fish seem as far away as they are small.
+_NEAR = np.array([[0.42, -0.18, 0.5], [0.0, 0.0, 0.92]])
+_RELATIVE = np.array([[0.35, -0.2, 0.0], [0.0, 0.0, 1.0]])
+_FAR = np.array([[0.7, -0.4, -0.05], [0.0, -0.02, 0.85]])
+PICTURES = {
+    topics.FRAME: rr.EncodedImage.from_fields(media_type="image/jpeg"),
+    topics.MASKS: rr.EncodedImage.from_fields(media_type="image/png", opacity=0.35, draw_order=1.0),
+}
+_LOG_COLUMNS = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
 _SEE_THROUGH = 150  # opacity of a mesh, of 255: the midline shows
 
 
 def color(track_id: int) -> tuple[int, int, int]:
     """The colour of a track, the same in every view."""
-    return _PALETTE[track_id % len(_PALETTE)]
+    return PALETTE[track_id % len(PALETTE)]
 
 
 def appearance(track_id: int, faces: Int[np.ndarray, "F 3"]) -> dict[str, rr.AsComponents]:
@@ -45,9 +55,9 @@ def appearance(track_id: int, faces: Int[np.ndarray, "F 3"]) -> dict[str, rr.AsC
     )
     curve = rr.SeriesLines(names=name, colors=tint)
     return {
-        topics.BOX: rr.Boxes2D.from_fields(colors=[tint], labels=[name], radii=_THIN),
+        topics.BOX: rr.Boxes2D.from_fields(colors=[tint], radii=rr.Radius.ui_points(0.6)),
         topics.OUTLINE: rr.LineStrips2D.from_fields(colors=[tint], radii=_THIN),
-        topics.KEYPOINTS_2D: rr.Points2D.from_fields(colors=[tint], radii=_DOTS),
+        topics.KEYPOINTS_2D: rr.Points2D.from_fields(colors=[_WHITE], radii=_DOTS),
         topics.MESH: rr.Mesh3D.from_fields(
             triangle_indices=faces, albedo_factor=(*tint, _SEE_THROUGH)
         ),
@@ -67,16 +77,24 @@ def blueprint(calibration: Calibration | None) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
-                rrb.Spatial2DView(origin=CAMERA, name="Frame: outlines, boxes, keypoints"),
-                _scene_view(calibration),
+                rrb.Spatial2DView(origin=CAMERA, name="Frame: masks, outlines, keypoints"),
+                rrb.Tabs(
+                    _scene_view(
+                        calibration, "Fish", eye=_RELATIVE if calibration is None else _NEAR
+                    ),
+                    _scene_view(calibration, "Whole scene", eye=_FAR),
+                ),
             ),
             rrb.Horizontal(
                 _series("bending", "Bending ratio")
                 if calibration is None
                 else _series("length", "Length, its 95 % band, and single frames, mm"),
-                _series("iou", "Silhouette IoU", axis_y=rrb.ScalarAxis(range=(0.5, 1.0))),
+                rrb.Vertical(
+                    _series("iou", "Silhouette IoU", axis_y=rrb.ScalarAxis(range=(0.5, 1.0))),
+                    _series("fit_ms", "Time of a fit, ms"),
+                ),
                 rrb.Tabs(
-                    rrb.TextLogView(origin=LOG, name="Refusals and lengths"),
+                    rrb.TextLogView(origin=LOG, name="Refusals and lengths", columns=_LOG_COLUMNS),
                     rrb.TextDocumentView(origin=RUN, name="Run"),
                 ),
             ),
@@ -93,18 +111,22 @@ def _series(origin: str, name: str, *, axis_y: rrb.ScalarAxis | None = None) -> 
     return rrb.TimeSeriesView(origin=origin, name=name, axis_y=axis_y, plot_legend=legend)
 
 
-def _scene_view(calibration: Calibration | None) -> rrb.Spatial3DView:
+def _scene_view(
+    calibration: Calibration | None,
+    name: str,
+    *,
+    eye: Float[np.ndarray, "2 3"],
+) -> rrb.Spatial3DView:
+    """`eye` is where it stands and where it looks, in units of the fish's distance."""
     depth = NOMINAL_DEPTH if calibration is None else middle_mm(calibration)[2]
+    unit = "relative" if calibration is None else "mm"
     return rrb.Spatial3DView(
         origin="scene",
-        contents=["scene/**", "- scene/camera/fish/**"],
-        name="Scene, camera frame, " + ("relative" if calibration is None else "mm"),
+        contents=["scene/**", "- scene/camera/fish/**", f"- {topics.MASKS}"],
+        name=f"{name} (camera frame, {unit})",
         line_grid=rrb.LineGrid3D(visible=False),
-        # From above the camera's right shoulder, close enough to see how a fish is bent.
         eye_controls=rrb.EyeControls3D(
-            position=(0.7 * depth, -0.4 * depth, -0.05 * depth),
-            look_target=(0.0, -0.02 * depth, 0.85 * depth),
-            eye_up=(0.0, -1.0, 0.0),
+            position=depth * eye[0], look_target=depth * eye[1], eye_up=(0.0, -1.0, 0.0)
         ),
     )
 

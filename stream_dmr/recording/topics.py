@@ -31,7 +31,7 @@ class Topic:
         return f"messages{self.topic}"
 
 
-FRAME = "scene/camera/frame"
+FRAME, MASKS = "scene/camera/frame", "scene/camera/masks"
 BOX, OUTLINE = "scene/camera/fish/{id}/box", "scene/camera/fish/{id}/outline"
 MESH = "scene/fish/{id}/mesh"
 KEYPOINTS_2D = "scene/camera/fish/{id}/keypoints"
@@ -46,12 +46,12 @@ TOPICS: dict[type[Message], Topic] = {
     row.message: row
     for row in (
         Topic(message=Frame, topic="/frame", entities=(FRAME,)),
-        Topic(message=FishCrop, topic="/crop", entities=(BOX, OUTLINE)),
+        Topic(message=FishCrop, topic="/crop", entities=(MASKS, OUTLINE)),
         Topic(message=FittedMesh, topic="/fit", entities=(MESH, IOU, FIT_MS)),
         Topic(
             message=LocalizedFish,
             topic="/localized",
-            entities=(KEYPOINTS_2D, KEYPOINTS_3D, MIDLINE, FRAME_LENGTH, BENDING),
+            entities=(BOX, KEYPOINTS_2D, KEYPOINTS_3D, MIDLINE, FRAME_LENGTH, BENDING),
         ),
         Topic(message=LengthEstimate, topic="/length", entities=(LENGTH, REFUSALS, RESULTS)),
     )

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from rerun.experimental import ViewerClient
 
@@ -22,13 +23,13 @@ _TERMINAL_COLORS = re.compile(r"\x1b\[[0-9;]*m")
 
 def show(rrd: Path) -> None:
     """Open `rrd` in a window; returns when that is closed."""
-    process = _start([str(rrd), "--port", "auto", "--memory-limit", _VIEWER_MEMORY])
-    errors = process.communicate()[0]
-    if process.returncode:
-        raise RecordingError(
-            f"the viewer ended with: {_last_line(errors)}; "
-            "without a screen use --web or --screenshot"
-        )
+    with _running([str(rrd), "--port", "auto", "--memory-limit", _VIEWER_MEMORY]) as process:
+        output = process.communicate()[0]
+        if process.returncode:
+            raise RecordingError(
+                f"the viewer ended with: {_last_line(output)}; "
+                "without a screen use --web or --screenshot"
+            )
 
 
 def serve(rrd: Path, *, port: int) -> None:
@@ -37,14 +38,11 @@ def serve(rrd: Path, *, port: int) -> None:
     Prints the address. Memory is bounded by WEB_MEMORY, and nobody outside this machine can see it.
     """
     options = ["--serve-web", "--port", "auto", "--web-viewer-port", str(port)]
-    process = _start([str(rrd), *options, "--server-memory-limit", WEB_MEMORY])
-    try:
+    with _running([str(rrd), *options, "--server-memory-limit", WEB_MEMORY]) as process:
         for line in process.stdout or ():
             if match := re.search(r"connect at (http\S+)", _TERMINAL_COLORS.sub("", line)):
                 print(f"{match[1]}\nstop with Ctrl-C", flush=True)
         raise RecordingError(f"the viewer's server ended; is port {port} in use? choose another")
-    finally:
-        _end(process)
 
 
 def screenshot(rrd: Path, png: Path, *, frame_index: int) -> None:
@@ -63,15 +61,12 @@ def _headless() -> Iterator[ViewerClient]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    process = _start(["--headless", "--hide-welcome-screen", "--port", str(port)])
-    try:
-        _wait_for(process, port)
+    with _running(["--headless", "--hide-welcome-screen", "--port", str(port)]) as process:
+        _wait_for(process)
         yield ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-    finally:
-        _end(process)
 
 
-def _wait_for(process: subprocess.Popen[str], port: int) -> None:
+def _wait_for(process: subprocess.Popen[str]) -> None:
     """Until the viewer runs, not only listens; RecordingError where it doesn't come up."""
     lines = []
     for line in process.stdout or ():
@@ -107,21 +102,23 @@ def _settled_picture(viewer: ViewerClient) -> bytes:
     return before
 
 
-def _start(options: Sequence[str]) -> subprocess.Popen[str]:
-    """Rerun's program of this very environment, heard on this machine only."""
+@contextmanager
+def _running(options: Sequence[str]) -> Iterator[subprocess.Popen[str]]:
+    """Rerun's program of this very environment, heard on this machine only; ends with us."""
     program = str(files("rerun_cli").joinpath("rerun"))
-    return subprocess.Popen(
-        [program, *options, "--bind", "127.0.0.1"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env={**os.environ, "RUST_LOG": "info", "NO_COLOR": "1"},
-    )
-
-
-def _end(process: subprocess.Popen[str]) -> None:
-    process.terminate()
-    process.communicate()
+    with TemporaryDirectory() as scratch:  # it leaves files behind
+        process = subprocess.Popen(
+            [program, *options, "--bind", "127.0.0.1"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env={**os.environ, "RUST_LOG": "info", "NO_COLOR": "1", "TMPDIR": scratch},
+        )
+        try:
+            yield process
+        finally:
+            process.terminate()
+            process.communicate()
 
 
 def _last_line(output: str) -> str:
