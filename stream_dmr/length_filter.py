@@ -22,6 +22,9 @@ class SmoothLengthSettings(Settings):
     """`[smooth_length]`: from the lengths of frames to the length of a fish."""
 
     min_frames: int = Field(default=3, ge=1, description="fewest good frames that give a length")
+    max_std_ratio: float = Field(
+        default=0.15, gt=0, description="least certain length that is given, std over length"
+    )
     max_frames: int = Field(
         default=2000, ge=1, description="good frames of one fish after which no more are used"
     )

@@ -25,6 +25,7 @@ LONG_ENOUGH = "measured long enough"
 TRACK_ENDED = "track has ended"
 
 MEASURED = "measured"
+UNCERTAIN = "too uncertain"  # its frames contradict each other, or none of them knows
 MEASURING = "measuring"
 
 _STD_PER_CI95 = NormalDist().inv_cdf(0.975)  # 1.96
@@ -119,7 +120,7 @@ class TrackLength:
             last_frame=self._last.frame_index,
             first_timestamp_ns=self._first.timestamp_ns,
             last_timestamp_ns=self._last.timestamp_ns,
-            status=self._status(len(used), is_final=is_final),
+            status=self._status(len(used), is_measured=length_mm is not None, is_final=is_final),
             is_final=is_final,
             smoothed_frames=np.array(used if is_final else [], dtype=np.int64),
             smoothed_mm=smoothed_mm,
@@ -129,11 +130,13 @@ class TrackLength:
     def _result(
         self, num_used: int
     ) -> tuple[float, float, Float[np.ndarray, "2"]] | tuple[None, None, None]:
-        """Length, std and 95 % interval in mm, once there are enough good frames."""
+        """Length, std and 95 % interval in mm, once there are enough good frames that agree."""
         if self._filter is None or num_used < self._settings.min_frames:
             return None, None, None
         length_mm = self._filter.length_mm
         std_mm = float(self._std_mm(np.array([length_mm]), np.array([self._filter.variance]))[0])
+        if std_mm > self._settings.max_std_ratio * length_mm:
+            return None, None, None
         return length_mm, std_mm, length_mm + _STD_PER_CI95 * std_mm * np.array([-1.0, 1.0])
 
     def _smoothed(self) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
@@ -157,13 +160,15 @@ class TrackLength:
         shared = (self._settings.common_std_ratio * length_mm) ** 2
         return np.sqrt(variance * (1.0 - rho + rho * n) + shared)
 
-    def _status(self, num_used: int, *, is_final: bool) -> str:
+    def _status(self, num_used: int, *, is_measured: bool, is_final: bool) -> str:
         if NO_CALIBRATION in self._refused:
             return NO_CALIBRATION
         if not is_final:
             return MEASURING
-        if num_used >= self._settings.min_frames:
+        if is_measured:
             return MEASURED
+        if num_used >= self._settings.min_frames:
+            return UNCERTAIN
         return f"too few good frames ({num_used} of {self._settings.min_frames})"
 
 

@@ -21,6 +21,7 @@ TOUCHES_BORDER = "touches border"
 MOSTLY_HIDDEN = "mostly hidden"
 POOR_FIT = "poor fit"
 UNCERTAIN = "uncertain"
+TURNED_AWAY = "turned away"
 PLANE_BEHIND = "plane behind camera"  # or parallel to the center's ray
 KEYPOINTS_COINCIDE = "keypoints coincide"
 END_ON = "seen end-on"  # head or tail points straight at the camera or away from it
@@ -51,6 +52,15 @@ class LocalizeSettings(Settings):
     plane_std_mm: float = Field(
         default=25.0, gt=0, description="std of the centers' distance from the plane, mm"
     )
+    bending_std: float = Field(
+        default=0.2, ge=0, description="std of what bending adds to a length, as a fraction of it"
+    )
+    slant_std_rad: float = Field(
+        default=0.2, ge=0, description="std of the angle at which the body is seen, rad"
+    )
+    max_slant_rad: float = Field(
+        default=1.0, gt=0, description="most slanting view that counts; 0 is broadside, rad"
+    )
 
 
 class Unlocatable(Exception):
@@ -65,6 +75,7 @@ class Location:
     midline_mm: Float[np.ndarray, "M 3"]
     length_mm: float
     length_std_mm: float | None  # None where the fit can't tell
+    slant_rad: float  # of the chord from the plane across the line of sight: 0 is broadside
 
 
 def center_on_plane(ray: Float[np.ndarray, "3"], plane: ReferencePlane) -> Float[np.ndarray, "3"]:
@@ -149,12 +160,22 @@ def locate(shape: FittedShape, calibration: Calibration, settings: LocalizeSetti
     keypoints_mm = locate_keypoints(shape.keypoints, shape.keypoints_px, calibration)
     chord_mm = float(np.linalg.norm(keypoints_mm[0] - keypoints_mm[2]))
     length_mm = chord_mm * ratio if settings.bending else chord_mm
-    std_mm = length_mm * length_std_ratio(shape, calibration.plane, settings.plane_std_mm)
+    slant_rad = slant(keypoints_mm)
+    parts = [
+        shape.length_std_ratio,
+        plane_std_ratio(calibration.plane, settings),
+        # Two joints can't follow every bend, and the outline doesn't say so.
+        settings.bending_std * (1.0 - chord_mm / length_mm),
+        # The length is the one seen over cos(slant), of which d log / d slant is tan(slant).
+        settings.slant_std_rad * np.tan(slant_rad),
+    ]
+    std_mm = length_mm * float(np.linalg.norm(parts))
     return Location(
         keypoints_mm=keypoints_mm,
         midline_mm=place_midline(shape.midline, shape.keypoints[1], keypoints_mm),
         length_mm=length_mm,
         length_std_mm=std_mm if np.isfinite(std_mm) else None,
+        slant_rad=slant_rad,
     )
 
 
@@ -165,14 +186,21 @@ def bend(shape: FittedShape) -> float | None:
     return bending_ratio(shape.midline)
 
 
-def length_std_ratio(shape: FittedShape, plane: ReferencePlane, plane_std_mm: float) -> float:
-    """Std of one frame's length as a fraction of it: the fit's own and the plane's, independent.
+def plane_std_ratio(plane: ReferencePlane, settings: LocalizeSettings) -> float:
+    """Std of a length as a fraction of it, since centers lie off the plane.
 
     A center off the plane by d scales the whole fish by d over the camera's distance from the
     plane, along its normal: |R_3 . T|, which is the depth where the camera looks at it squarely.
     """
     distance_mm = abs(float(plane.rotation[:, 2] @ plane.translation_mm))
-    return float(np.hypot(shape.length_std_ratio, plane_std_mm / distance_mm))
+    return settings.plane_std_mm / distance_mm
+
+
+def slant(keypoints_mm: Float[np.ndarray, "3 3"]) -> float:
+    """Angle in rad, 0 to pi / 2, of the chord H'T' from the plane across the center's ray."""
+    head, center, tail = keypoints_mm
+    along = abs(float((head - tail) @ center))
+    return float(np.arcsin(min(along / np.linalg.norm(head - tail) / np.linalg.norm(center), 1.0)))
 
 
 def quality_refusal(shape: FittedShape, quality: CropQuality, settings: LocalizeSettings) -> str:
@@ -200,7 +228,10 @@ def localize(
         return _message(mesh, NO_CALIBRATION)
     reason = quality_refusal(mesh.shape, mesh.quality, settings)
     try:
-        return _message(mesh, reason, locate(mesh.shape, calibration, settings))
+        location = locate(mesh.shape, calibration, settings)
+        if location.slant_rad > settings.max_slant_rad:
+            reason = reason or TURNED_AWAY
+        return _message(mesh, reason, location)
     except Unlocatable as problem:
         return _message(mesh, reason or str(problem))
 

@@ -195,6 +195,14 @@ def test_no_single_frame_counts_as_surer_than_the_floor():
     assert measurement.std_ratio == SmoothLengthSettings().min_frame_std_ratio
 
 
+def test_a_fish_whose_frames_contradict_each_other_gets_no_length():
+    frames = [frame(i, 600.0 if i < 6 else 1400.0, std_mm=30.0) for i in range(1, 11)]
+    final = run(frames)[-1]
+    assert (final.length_mm, final.length_std_mm, final.ci95_mm) == (None, None, None)
+    assert final.status == "too uncertain"
+    assert run(frames, max_std_ratio=1.0)[-1].status == "measured"
+
+
 def test_accepted_frame_without_numbers_is_our_fault():
     with pytest.raises(ValueError, match="frame 4, track 1"):
         measurement_of(frame(4, None), SmoothLengthSettings())

@@ -76,6 +76,16 @@ def straight_fish(calibration, *, direction=(1.0, 0.2, 0.3), length_mm=700.0, **
     return make_mesh(make_shape(midline, center, calibration.camera, **kwargs))
 
 
+def bent_fish(calibration, *, bend_rad=1.8, length_mm=700.0, **kwargs):
+    """An arc across the optical axis, with its center on the axis and on the plane."""
+    angles = np.linspace(-0.5, 0.5, 21)[:-1] * bend_rad
+    steps = length_mm / 20 * np.stack([np.cos(angles), np.sin(angles), np.zeros(20)], axis=1)
+    midline = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    center = np.array([0.0, 0.0, calibration.plane.translation_mm[2]])
+    midline += center - midline[10]
+    return make_mesh(make_shape(midline, center, calibration.camera, **kwargs))
+
+
 def localized(mesh, calibration, **changes):
     return localize(mesh, settings=LocalizeSettings(**changes), calibration=calibration)
 
@@ -117,7 +127,7 @@ def exact_scenes(draw):
 @given(exact_scenes())
 def test_exact_data_give_the_exact_length_and_place(scene):
     shape, midline, center, calibration = scene
-    fish = localized(make_mesh(shape), calibration)
+    fish = localized(make_mesh(shape), calibration, max_slant_rad=2.0)
     assert fish.accepted, fish.reason
     assert fish.length_mm == pytest.approx(arc_length(midline), rel=1e-6)
     np.testing.assert_allclose(
@@ -268,15 +278,45 @@ def test_std_of_the_plane_is_what_moving_the_plane_does(tilt_rad):
         translation_mm=calibration.plane.translation_mm + d * normal,
     )
     mesh = straight_fish(calibration, std_ratio=0.0)
-    fish = localized(mesh, calibration, plane_std_mm=d)
+    fish = localized(mesh, calibration, plane_std_mm=d, slant_std_rad=0.0)
     change = localized(mesh, Calibration(camera=calibration.camera, plane=moved)).length_mm - 700.0
     assert fish.length_std_mm == pytest.approx(abs(change), rel=1e-4)
 
 
 def test_std_combines_fit_and_plane_as_independent():
     calibration = make_calibration(depth_mm=2000.0)
-    fish = localized(straight_fish(calibration, std_ratio=0.03), calibration, plane_std_mm=80.0)
+    fish = localized(
+        straight_fish(calibration, std_ratio=0.03),
+        calibration,
+        plane_std_mm=80.0,
+        slant_std_rad=0.0,
+    )
     assert fish.length_std_mm == pytest.approx(700.0 * 0.05)
+
+
+@pytest.mark.parametrize("slant_rad", [0.0, 0.3, -0.6, 1.1])
+def test_slanting_views_are_less_certain_and_refused_in_the_end(slant_rad):
+    """A turn by a small d changes the length behind a seen extent by tan(slant) d."""
+    calibration = make_calibration(depth_mm=50_000.0)  # no perspective along the body
+    direction = (np.cos(slant_rad), 0.0, np.sin(slant_rad))
+    mesh = straight_fish(calibration, direction=direction, std_ratio=0.0)
+    fish = localized(mesh, calibration, plane_std_mm=1e-9, slant_std_rad=0.1)
+    d = 1e-5
+    slope = (np.cos(slant_rad) / np.cos(abs(slant_rad) + d) - 1) / d
+    assert fish.length_std_mm == pytest.approx(700 * 0.1 * slope, rel=1e-3, abs=0.1)
+    assert fish.reason == ("turned away" if slant_rad > 1.0 else "")
+
+
+def test_a_bent_fish_is_less_certain_by_a_part_of_what_bending_adds():
+    calibration = make_calibration(depth_mm=2000.0)
+    mesh = bent_fish(calibration, std_ratio=0.01)
+    options = {"plane_std_mm": 1e-9, "slant_std_rad": 0.0, "bending_std": 0.2}
+    bent = localized(mesh, calibration, **options)
+    added = 1 - np.linalg.norm(bent.keypoints_mm[0] - bent.keypoints_mm[2]) / bent.length_mm
+    assert added > 0.05
+    assert bent.length_std_mm == pytest.approx(bent.length_mm * np.hypot(0.01, 0.2 * added))
+    chord = localized(mesh, calibration, bending=False, **options)
+    assert chord.length_std_mm == pytest.approx(0.01 * chord.length_mm)
 
 
 def test_without_calibration_pixels_and_bending_remain():
