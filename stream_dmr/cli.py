@@ -111,6 +111,9 @@ def run_command(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the results of an earlier run in --out.")
     ] = False,
+    live: Annotated[
+        bool, typer.Option("--live", help="Serve the view on this machine while measuring.")
+    ] = False,
     timings: Annotated[
         bool, typer.Option("--timings", help="At the end, show the time that each stage took.")
     ] = False,
@@ -133,6 +136,7 @@ def run_command(
             template=template,
             config=config,
             overwrite=overwrite,
+            live=live,
             command=_command_line(),
         )
         with RunDisplay() as display:

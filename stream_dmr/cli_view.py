@@ -18,7 +18,11 @@ _Source = Annotated[
 
 def view(
     recording: Annotated[
-        Path, typer.Argument(help="An .rrd, an .mcap, or the folder of a run.", metavar="REC")
+        str,
+        typer.Argument(
+            help="An .rrd, an .mcap, the folder of a run, or the address of a run with --live.",
+            metavar="REC",
+        ),
     ],
     source: _Source = None,
     web: Annotated[
@@ -33,8 +37,8 @@ def view(
     """Look at a recording: frame, 3D scene, lengths, IoU, timings and events."""
     from stream_dmr.recording import viewer
 
-    # The viewer's process must end with us.
-    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    for number in (signal.SIGINT, signal.SIGTERM):  # the viewer's process must end with us
+        signal.signal(number, lambda number, _: sys.exit(128 + number))
     with _as_rrd(recording, source) as rrd:
         if screenshot is not None:
             viewer.screenshot(rrd, screenshot, frame_index=frame)
@@ -82,17 +86,20 @@ def _convert(mcap: Path, rrd: Path, source: str | None, *, full_size: bool = Fal
 
 
 @contextmanager
-def _as_rrd(recording: Path, source: str | None) -> Iterator[Path]:
-    """An .rrd as it is, unless it is to be drawn anew from its source; an .mcap converted."""
+def _as_rrd(recording: str, source: str | None) -> Iterator[str]:
+    """An .rrd or address as it is; an .mcap, and where a source is given, drawn anew."""
+    if "://" in recording:
+        yield recording
+        return
     preferred = "recording.rrd" if source is None else "recording.mcap"
-    found = in_folder(recording, preferred, "recording.rrd", "recording.mcap")
+    found = in_folder(Path(recording), preferred, "recording.rrd", "recording.mcap")
     if found.suffix == ".rrd":
-        yield found
+        yield str(found.resolve())
         return
     with tempfile.TemporaryDirectory() as folder:
         rrd = Path(folder) / "recording.rrd"
         _convert(found, rrd, source)
-        yield rrd
+        yield str(rrd)
 
 
 def in_folder(recording: Path, *names: str) -> Path:

@@ -53,6 +53,9 @@ class RunDisplay(Observer):
             self._warned.add(line)
             self._console.print(f"warning: {line}", markup=False)
 
+    def serving(self, address: str) -> None:  # noqa: D102
+        self._console.print(f"watch it with: stream-dmr view {address}", markup=False)
+
     def begin(self, num_frames: int | None) -> None:  # noqa: D102
         self._num_frames = num_frames
         self._began = self._last_line = time.monotonic()

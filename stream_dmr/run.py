@@ -38,6 +38,7 @@ class RunRequest:
     template: str = "halibut"  # name of a bundled one, or a path
     config: Path | None = None
     overwrite: bool = False  # replace the results of an earlier run in `out`
+    live: bool = False  # serve the view while measuring
     command: str = ""  # as typed, for the recording
 
 
@@ -57,6 +58,9 @@ class Observer:
 
     def warn(self, line: str) -> None:
         """Something the user should know, once each."""
+
+    def serving(self, address: str) -> None:
+        """The view can be watched there from now on."""
 
     def begin(self, num_frames: int | None) -> None:
         """The inputs are fine and the chain starts."""
@@ -91,7 +95,9 @@ def run(
         nodes = [crop_fish, *_later_nodes(config, template=template, calibration=calibration)]
         prepare_folder(request.out, overwrite=request.overwrite)
         header = _header(request, reader.source.name, config, template, calibration)
-        with Recorder(request.out, header, config.recording) as recorder:
+        with Recorder(request.out, header, config.recording, live=request.live) as recorder:
+            if recorder.live_address is not None:
+                observer.serving(recorder.live_address)
             if calibration is None:
                 observer.warn("without --calibration there are relative shapes, no millimetres")
             observer.begin(reader.source.num_frames)

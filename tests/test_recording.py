@@ -383,7 +383,7 @@ def test_the_view_opens_without_a_screen(tmp_path: Path, messages: list[Message]
     from stream_dmr.recording.viewer import screenshot
 
     record(tmp_path, messages, RecordingSettings())
-    screenshot(tmp_path / "recording.rrd", tmp_path / "view.png", frame_index=3)
+    screenshot(str(tmp_path / "recording.rrd"), tmp_path / "view.png", frame_index=3)
     assert (tmp_path / "view.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -10,6 +10,7 @@ from typing import Protocol, runtime_checkable
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import Message
 from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.live import LiveView
 from stream_dmr.recording.mcap_sink import McapSink
 from stream_dmr.recording.record import Record, make_record
 from stream_dmr.recording.rerun_sink import NAME as RRD_NAME
@@ -41,7 +42,11 @@ class Recorder:
     written to: here, at the next `write`, or at `close`.
     """
 
-    def __init__(self, out_dir: Path, header: RunHeader, settings: RecordingSettings) -> None:
+    def __init__(
+        self, out_dir: Path, header: RunHeader, settings: RecordingSettings, *, live: bool = False
+    ) -> None:
+        """With `live`, the view is served as well, at `live_address`."""
+        self.live_address: str | None = None
         self._settings = settings
         self._sinks: list[Sink] = []
         self._refused: list[Sink] = []
@@ -57,6 +62,9 @@ class Recorder:
                 self._sinks.append(McapSink(out_dir, header, flush_s=settings.flush_s))
             if settings.rrd:
                 self._sinks.append(RerunSink(out_dir / RRD_NAME, header, settings))
+            if live:
+                self._sinks.append(view := LiveView(header, settings))
+                self.live_address = view.address
             undo.pop_all()
         self._thread.start()
 

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import rerun as rr
@@ -36,6 +36,8 @@ from stream_dmr.recording.rerun_view import (
 )
 from stream_dmr.recording.settings import RecordingSettings
 
+T = TypeVar("T")
+
 _HALF_PIXEL = 0.5  # Rerun counts pixels from the corner of the top-left one, we from its centre
 _JPEG_QUALITY = 75
 _MOST_PENDING = 64  # frames whose fish may still come
@@ -56,8 +58,8 @@ class Drawing:
         self._columns = Columns(rec)
         self._slot = -1  # of capture time, of the last frame that was shown
         self._shown: deque[int] = deque(maxlen=_MOST_PENDING)  # the last frames that were
-        self._boxes: dict[int, np.ndarray] = {}  # of each track, until there is a length
-        self._shapes: dict[int, FittedShape] = {}  # of each track, until it is placed
+        self._boxes = _Waiting[np.ndarray]()  # until it is known what the frame says of the fish
+        self._shapes = _Waiting[FittedShape]()  # until they are placed
         self._reasons: dict[int, str] = {}  # why each track's last frame was not used
         self._tracks: set[int] = set()
         self._factor: int | None = None  # frame pixels per pixel of the view
@@ -122,7 +124,7 @@ class Drawing:
         self._introduce(crop.track_id)
         if crop.frame_index not in self._shown:
             return
-        self._boxes[crop.track_id] = crop.bbox_xyxy_px
+        self._boxes.put(crop, crop.bbox_xyxy_px)
         strips = [self._in_view(line) for line in outlines(crop)]
         self._add(topics.OUTLINE, rr.LineStrips2D, crop, strips=strips)
         self._mask(strips, crop)
@@ -137,18 +139,18 @@ class Drawing:
 
     def _fit(self, fit: FittedMesh) -> None:
         if fit.shape is not None:
-            self._shapes[fit.track_id] = fit.shape
+            self._shapes.put(fit, fit.shape)
             self._add(topics.IOU, rr.Scalars, fit, scalars=[fit.shape.iou])
         if fit.report is not None:
             self._add(topics.FIT_MS, rr.Scalars, fit, scalars=[1e-6 * fit.report.elapsed_ns])
 
     def _localized(self, fish: LocalizedFish) -> None:
-        shape = self._shapes.pop(fish.track_id, None)
+        shape = self._shapes.take(fish)
         if fish.bending_ratio is not None:
             self._add(topics.BENDING, rr.Scalars, fish, scalars=[fish.bending_ratio])
         if fish.accepted and fish.length_mm is not None:
             self._add(topics.FRAME_LENGTH, rr.Scalars, fish, scalars=[fish.length_mm])
-        box = self._boxes.pop(fish.track_id, None)
+        box = self._boxes.take(fish)
         if fish.frame_index not in self._shown:
             return
         if box is not None:
@@ -214,6 +216,21 @@ class Drawing:
     def _in_view(self, pixels: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
         """Frame pixels as Rerun counts them in the picture of the view."""
         return (pixels + _HALF_PIXEL) / (self._factor or 1)
+
+
+class _Waiting(Generic[T]):
+    """What one stage knows of a fish in a frame, until a later stage, some frames behind, asks."""
+
+    def __init__(self) -> None:
+        self._items: dict[tuple[int, int], T] = {}
+
+    def put(self, fish: FishCrop | FittedMesh, item: T) -> None:
+        self._items[fish.track_id, fish.frame_index] = item
+        if len(self._items) > _MOST_PENDING:  # a live view misses messages
+            del self._items[next(iter(self._items))]
+
+    def take(self, fish: LocalizedFish) -> T | None:
+        return self._items.pop((fish.track_id, fish.frame_index), None)
 
 
 def _finding(fish: LocalizedFish) -> str:

@@ -1,4 +1,7 @@
-"""Opens a recording in Rerun's own viewer: in a window, in a browser, or without a screen."""
+"""Opens a recording in Rerun's own viewer: in a window, in a browser, or without a screen.
+
+It is given as the absolute path of an .rrd, or as the address of a `LiveView`.
+"""
 
 import os
 import re
@@ -21,9 +24,9 @@ _SETTLE_S, _MOST_SETTLES = 1.0, 15
 _TERMINAL_COLORS = re.compile(r"\x1b\[[0-9;]*m")
 
 
-def show(rrd: Path) -> None:
+def show(rrd: str) -> None:
     """Open `rrd` in a window; returns when that is closed."""
-    with _running([str(rrd), "--port", "auto", "--memory-limit", _VIEWER_MEMORY]) as process:
+    with _running([rrd, "--port", "auto", "--memory-limit", _VIEWER_MEMORY]) as process:
         output = process.communicate()[0]
         if process.returncode:
             raise RecordingError(
@@ -32,26 +35,26 @@ def show(rrd: Path) -> None:
             )
 
 
-def serve(rrd: Path, *, port: int) -> None:
+def serve(rrd: str, *, port: int) -> None:
     """Serve `rrd` and a viewer for browsers at 127.0.0.1, until interrupted.
 
     Prints the address. Memory is bounded by WEB_MEMORY, and nobody outside this machine can see it.
     """
     options = ["--serve-web", "--port", "auto", "--web-viewer-port", str(port)]
-    with _running([str(rrd), *options, "--server-memory-limit", WEB_MEMORY]) as process:
+    with _running([rrd, *options, "--server-memory-limit", WEB_MEMORY]) as process:
         for line in process.stdout or ():
             if match := re.search(r"connect at (http\S+)", _TERMINAL_COLORS.sub("", line)):
                 print(f"{match[1]}\nstop with Ctrl-C", flush=True)
         raise RecordingError(f"the viewer's server ended; is port {port} in use? choose another")
 
 
-def screenshot(rrd: Path, png: Path, *, frame_index: int) -> None:
+def screenshot(rrd: str, png: Path, *, frame_index: int) -> None:
     """Open `rrd` at one frame in a viewer without a screen and save what it shows.
 
     Needs a Vulkan driver; a software one does (Debian: mesa-vulkan-drivers). Takes some 5 seconds.
     """
     with _headless() as viewer:
-        viewer.open([str(rrd.resolve())])
+        viewer.open([rrd])
         _go_to(viewer, frame_index)
         png.write_bytes(_settled_picture(viewer))
 
