@@ -1,6 +1,6 @@
 """Draws messages into a Rerun stream: entity paths are those of topics.py."""
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from typing import Any, Generic, TypeVar
 
@@ -62,6 +62,7 @@ class Drawing:
         self._shapes = _Waiting[FittedShape]()  # until they are placed
         self._reasons: dict[int, str] = {}  # why each track's last frame was not used
         self._tracks: set[int] = set()
+        self._numbers: Counter[str] = Counter()  # of the messages of each kind, so far
         self._factor: int | None = None  # frame pixels per pixel of the view
         self._labels = np.zeros((0, 0), np.uint8)  # of the masks of frame `_labels_of` so far
         self._labels_of = 0
@@ -88,8 +89,11 @@ class Drawing:
                 self._length(estimate)
 
     def keep(self, record: Record) -> None:
-        """Put the encoded message beside the drawing."""
-        self._add(record.topic.payload, rr.AnyValues, record.message, **blob(record.payload))
+        """Put the encoded message beside the drawing, numbered, since Rerun sorts by time."""
+        path = record.topic.payload
+        number = np.array([self._numbers[path]], np.uint64)
+        self._numbers[path] += 1
+        self._add(path, rr.AnyValues, record.message, number=number, **blob(record.payload))
 
     def send(self) -> None:
         """Hand what was drawn over to Rerun."""

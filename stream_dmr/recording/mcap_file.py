@@ -1,0 +1,147 @@
+"""Reads a .mcap from its start to its end, also where the end is missing.
+
+Every byte is under a checksum: chunks have their own, and the data section has one over all of it,
+which is why a whole read is made in file order. A read of a time range goes by the index instead,
+and is guarded by the checksums of its chunks.
+"""
+
+import struct
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+from mcap.exceptions import EndOfFile, McapError
+from mcap.reader import SeekingReader
+from mcap.records import Attachment, Channel, Chunk, Metadata
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC
+from zstandard import ZstdError
+
+from stream_dmr.errors import RecordingError
+from stream_dmr.messages import Message
+from stream_dmr.recording.codec import check_version
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.topics import TOPICS
+
+# What the mcap library lets through on damaged bytes; its CRC error is a ValueError.
+_DAMAGE = (
+    *(McapError, ValueError, KeyError, IndexError, RuntimeError, struct.error, ZstdError),
+    *(OverflowError, MemoryError, AttributeError, TypeError),
+)
+_LARGEST_RECORD = 1 << 30  # bytes; a damaged length must not ask for all memory
+
+
+class McapFile:
+    """One .mcap."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises RecordingError where not even the header can be read."""
+        self.path = path
+        self.warnings: list[str] = []
+        self.header = self._read_header()
+
+    def payloads(
+        self, kinds: Collection[type[Message]], *, time_ns: tuple[int, int] | None = None
+    ) -> Iterator[tuple[type[Message], bytes]]:
+        """See `opened.Recording`. A torn file gives what is whole, and a warning."""
+        topics = {TOPICS[kind].topic: kind for kind in kinds}
+        with self._open() as stream:
+            if time_ns is not None and not self._is_torn(stream):
+                yield from self._by_index(stream, topics, time_ns)
+            else:
+                yield from self._in_order(stream, topics, time_ns)
+
+    def _by_index(
+        self, stream: IO[bytes], topics: dict[str, type[Message]], time_ns: tuple[int, int]
+    ) -> Iterator[tuple[type[Message], bytes]]:
+        reader = SeekingReader(stream, validate_crcs=True)
+        first, last = time_ns
+        for _, channel, message in reader.iter_messages(
+            list(topics), start_time=first, end_time=last, log_time_order=False
+        ):
+            yield topics[channel.topic], message.data
+
+    def _in_order(
+        self,
+        stream: IO[bytes],
+        topics: dict[str, type[Message]],
+        time_ns: tuple[int, int] | None,
+    ) -> Iterator[tuple[type[Message], bytes]]:
+        is_torn, count = self._is_torn(stream), 0
+        kinds: dict[int, type[Message]] = {}
+        try:
+            for record in _records(stream):
+                if isinstance(record, Channel) and record.topic in topics:
+                    kinds[record.id] = topics[record.topic]
+                elif isinstance(record, McapMessage):
+                    count += 1
+                    kind = kinds.get(record.channel_id)
+                    if kind and (time_ns is None or time_ns[0] <= record.log_time < time_ns[1]):
+                        yield kind, record.data
+        except EndOfFile:
+            if not is_torn:
+                raise
+        if is_torn:
+            self._warn(f"{self.path}: torn; {count} messages are whole, what came after is lost")
+
+    def _warn(self, line: str) -> None:
+        if line not in self.warnings:
+            self.warnings.append(line)
+
+    def _read_header(self) -> RunHeader:
+        metadata: dict[str, str] = {}
+        attachments: dict[str, bytes] = {}
+        with self._open() as stream:
+            try:
+                for record in _records(stream, emit_chunks=True):
+                    if isinstance(record, Chunk):
+                        break
+                    if isinstance(record, Metadata) and record.name == "run":
+                        metadata = record.metadata
+                        check_version(int(metadata["codec_version"]))
+                    elif isinstance(record, Attachment):
+                        attachments[record.name] = record.data
+            except EndOfFile:
+                pass
+            try:
+                return RunHeader.from_parts(metadata, attachments)
+            except KeyError as error:
+                raise RecordingError(
+                    f"expected a recording of stream-dmr, but it lacks {error}; it ends too early "
+                    "or is of another program"
+                ) from error
+
+    def _is_torn(self, stream: IO[bytes]) -> bool:
+        """Does the end of the file lack the magic that closes it?"""
+        size = stream.seek(0, 2)
+        stream.seek(max(size - len(MCAP0_MAGIC), 0))
+        end = stream.read()
+        stream.seek(0)
+        return end != MCAP0_MAGIC
+
+    @contextmanager
+    def _open(self) -> Iterator[IO[bytes]]:
+        try:
+            with self.path.open("rb") as stream:
+                yield stream
+        except OSError as error:
+            raise RecordingError(
+                f"{self.path}: expected a recording (.mcap or .rrd), got: {error.strerror}; "
+                "check the path"
+            ) from error
+        except RecordingError as error:
+            raise RecordingError(f"{self.path}: {error}") from error
+        except _DAMAGE as error:
+            raise RecordingError(
+                f"{self.path}: expected a whole recording, got a damaged one ({error}); "
+                "what was read before the damage is sound"
+            ) from error
+
+
+def _records(stream: IO[bytes], *, emit_chunks: bool = False) -> Iterator[object]:
+    reader = StreamReader(
+        stream, emit_chunks=emit_chunks, validate_crcs=True, record_size_limit=_LARGEST_RECORD
+    )
+    return reader.records

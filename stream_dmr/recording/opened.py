@@ -1,0 +1,77 @@
+"""Opens recordings of any kind for replay: .mcap, torn .mcap, .rrd, or many in a row as one."""
+
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from stream_dmr.errors import RecordingError
+from stream_dmr.messages import Message
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.mcap_file import McapFile
+from stream_dmr.recording.rrd_file import RrdFile
+
+Kinds = Collection[type[Message]]
+
+
+@runtime_checkable
+class Recording(Protocol):
+    """What a run left."""
+
+    header: RunHeader
+    warnings: list[str]  # what is lost, a line each; complete once everything was read
+
+    def payloads(
+        self, kinds: Kinds, *, time_ns: tuple[int, int] | None = None
+    ) -> Iterator[tuple[type[Message], bytes]]:
+        """Type and encoding of the messages of `kinds`, in the order in which each was written.
+
+        With `time_ns` only those of capture times from the first (included) to the second
+        (excluded). Raises RecordingError where the recording is damaged.
+        """
+        ...
+
+
+def open_recordings(paths: Sequence[Path]) -> Recording:
+    """One recording of all that is given: files, and folders of a run or of its segments.
+
+    Raises RecordingError where one can't be read, or where they aren't of the same run.
+    """
+    files = [file for path in paths for file in _files_of(path)]
+    parts = [RrdFile(file) if file.suffix == ".rrd" else McapFile(file) for file in files]
+    return parts[0] if len(parts) == 1 else _Row(files, parts)
+
+
+def _files_of(path: Path) -> list[Path]:
+    """A folder stands for its .mcap files, whole or torn; for its .rrd where it has none."""
+    if not path.is_dir():
+        return [path]
+    for pattern in ("*.mcap", "*.mcap.part", "*.rrd"):
+        if found := sorted(path.glob(pattern)):
+            return found + (sorted(path.glob("*.mcap.part")) if pattern == "*.mcap" else [])
+    raise RecordingError(f"{path}: expected a folder with a recording, found no .mcap and no .rrd")
+
+
+class _Row:
+    """Segments of one run, one after the other."""
+
+    def __init__(self, files: Sequence[Path], parts: Sequence[Recording]) -> None:
+        self._parts = parts
+        self.header = parts[0].header
+        for file, part in zip(files, parts, strict=True):
+            if part.header.attachments() != self.header.attachments():
+                raise RecordingError(
+                    f"{file}: expected a segment of the same run as {files[0]}, got one with "
+                    "another config, template or calibration; replay them one by one"
+                )
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is lost of each."""
+        return [line for part in self._parts for line in part.warnings]
+
+    def payloads(
+        self, kinds: Kinds, *, time_ns: tuple[int, int] | None = None
+    ) -> Iterator[tuple[type[Message], bytes]]:
+        """Those of each part in turn."""
+        for part in self._parts:
+            yield from part.payloads(kinds, time_ns=time_ns)

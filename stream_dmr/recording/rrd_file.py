@@ -1,0 +1,91 @@
+"""Reads the messages back that an .rrd carries beside its view.
+
+An .rrd has no checksum of its own, so each message and each part of the header has a CRC-32 beside
+it, and the messages of each kind are numbered.
+"""
+
+import json
+import zlib
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from rerun.chunk import RrdReader
+
+from stream_dmr.errors import RecordingError
+from stream_dmr.messages import Message
+from stream_dmr.recording.codec import check_version
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.topics import TOPICS
+
+_HEADER = "/messages/header/"
+
+
+class RrdFile:
+    """One .rrd with `rrd_messages`, in memory."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises RecordingError where it can't be read or holds no messages."""
+        self.path = path
+        self.warnings: list[str] = []
+        # By entity: number, capture time, encoding.
+        self._rows: dict[str, list[tuple[int, int, bytes]]] = {}
+        try:
+            for chunk in RrdReader(str(path)).stream():
+                if str(chunk.entity_path).startswith("/messages/"):
+                    self._take(str(chunk.entity_path), chunk.to_record_batch())
+        except (ValueError, RuntimeError, OSError, KeyError, pa.ArrowException) as error:
+            raise RecordingError(
+                f"{path}: expected a recording (.rrd), but it can't be read: {error}"
+            ) from error
+        for entity, rows in self._rows.items():
+            rows.sort()
+            if [number for number, _, _ in rows] != list(range(len(rows))):
+                raise RecordingError(f"{path}: damaged: messages are missing in {entity}")
+        self.header = self._read_header()
+
+    def payloads(
+        self, kinds: Collection[type[Message]], *, time_ns: tuple[int, int] | None = None
+    ) -> Iterator[tuple[type[Message], bytes]]:
+        """See `opened.Recording`; here one kind after the other."""
+        for kind in kinds:
+            for _, timestamp_ns, payload in self._rows.get(f"/{TOPICS[kind].payload}", ()):
+                if time_ns is None or time_ns[0] <= timestamp_ns < time_ns[1]:
+                    yield kind, payload
+
+    def _take(self, entity: str, batch: pa.RecordBatch) -> None:
+        times = [0] * batch.num_rows  # of what is static
+        if "time" in batch.schema.names:
+            times = batch.column("time").cast(pa.int64()).to_pylist()
+        numbers = [0] * batch.num_rows
+        if "number" in batch.schema.names:
+            numbers = [values[0].as_py() for values in batch.column("number")]
+        columns = (numbers, times, batch.column("payload"), batch.column("crc32"))
+        for number, timestamp_ns, payload, crc32 in zip(*columns, strict=True):
+            data = np.asarray(payload.values).astype(np.uint8, copy=False).tobytes()
+            if zlib.crc32(data) != crc32.values[0].as_py():
+                raise RecordingError(
+                    f"{self.path}: damaged: the checksum of a message in {entity} is wrong"
+                )
+            self._rows.setdefault(entity, []).append((number, timestamp_ns, data))
+
+    def _read_header(self) -> RunHeader:
+        parts = {
+            entity.removeprefix(_HEADER): rows[0][2]
+            for entity, rows in self._rows.items()
+            if entity.startswith(_HEADER)
+        }
+        if "run.json" not in parts:
+            raise RecordingError(
+                f"{self.path}: expected a recording that carries its messages, got only the view; "
+                "replay the .mcap, or record with rrd_messages = true"
+            )
+        metadata = json.loads(parts.pop("run.json"))
+        try:
+            check_version(int(metadata["codec_version"]))
+            return RunHeader.from_parts(metadata, parts)
+        except RecordingError as error:
+            raise RecordingError(f"{self.path}: {error}") from error
+        except KeyError as error:
+            raise RecordingError(f"{self.path}: lacks {error}, not a complete recording") from error
