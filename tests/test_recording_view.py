@@ -248,6 +248,16 @@ def test_what_is_no_recording_is_refused(tmp_path: Path):
     assert invoke(f"export {tmp_path}", {"--out": str(tmp_path)}).code == 2
 
 
+def test_without_a_screen_the_ways_to_do_without_are_named(
+    clip: Path, monkeypatch: pytest.MonkeyPatch
+):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    outcome = invoke(f"view {clip / 'out'}")
+    assert outcome.code == 2
+    assert "--web or --screenshot" in outcome.error
+
+
 @pytest.mark.slow
 def test_a_picture_of_the_view_needs_no_screen(clip: Path, tmp_path: Path):
     png = tmp_path / "view.png"

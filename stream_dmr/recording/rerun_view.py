@@ -9,7 +9,7 @@ from stream_dmr.camera import Calibration, Camera
 from stream_dmr.recording import topics
 from stream_dmr.recording.topics import CAMERA, LOG, PLANE
 
-# Okabe and Ito's palette, told apart by the colour-blind too; black and grey left out.
+# After Okabe and Ito, told apart by the colour-blind too; bright enough for a dark ground.
 PALETTE = (
     (230, 159, 0),
     (86, 180, 233),
@@ -17,7 +17,7 @@ PALETTE = (
     (240, 228, 66),
     (204, 121, 167),
     (213, 94, 0),
-    (0, 114, 178),
+    (122, 130, 255),
 )
 _GRID_MM = 100.0
 _GREY = (150, 160, 170, 90)
@@ -91,7 +91,7 @@ def blueprint(calibration: Calibration | None) -> rrb.Blueprint:
                 else _series("length", "Length, its 95 % band, and single frames, mm"),
                 rrb.Vertical(
                     _series("iou", "Silhouette IoU", axis_y=rrb.ScalarAxis(range=(0.5, 1.0))),
-                    _series("fit_ms", "Time of a fit, ms"),
+                    _series("fit_ms", "Time of a fit, ms", axis_y=rrb.ScalarAxis(range=(0, 100))),
                 ),
                 rrb.Tabs(
                     rrb.TextLogView(origin=LOG, name="Refusals and lengths", columns=_LOG_COLUMNS),

@@ -30,8 +30,8 @@ def show(rrd: str) -> None:
         output = process.communicate()[0]
         if process.returncode:
             raise RecordingError(
-                f"the viewer ended with: {_last_line(output)}; "
-                "without a screen use --web or --screenshot"
+                f"expected a screen to show the viewer on, got: {_last_line(output)}; "
+                "use --web or --screenshot"
             )
 
 
@@ -109,19 +109,20 @@ def _settled_picture(viewer: ViewerClient) -> bytes:
 def _running(options: Sequence[str]) -> Iterator[subprocess.Popen[str]]:
     """Rerun's program of this very environment, heard on this machine only; ends with us."""
     program = str(files("rerun_cli").joinpath("rerun"))
-    with TemporaryDirectory() as scratch:  # it leaves files behind
-        process = subprocess.Popen(
+    with (
+        TemporaryDirectory() as scratch,  # it leaves files behind
+        subprocess.Popen(
             [program, *options, "--bind", "127.0.0.1"],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
             env={**os.environ, "RUST_LOG": "info", "NO_COLOR": "1", "TMPDIR": scratch},
-        )
+        ) as process,
+    ):
         try:
             yield process
         finally:
             process.terminate()
-            process.communicate()
 
 
 def _last_line(output: str) -> str:
