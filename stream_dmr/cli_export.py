@@ -11,7 +11,7 @@ Tables = Literal["csv", "parquet"]
 
 def export(
     recording: Annotated[
-        Path, typer.Argument(help="An .mcap, or the folder of a run.", metavar="REC")
+        Path, typer.Argument(help="An .mcap or .rrd, or the folder of a run.", metavar="REC")
     ],
     out: Annotated[Path, typer.Option(help="Folder to write to.")],
     meshes: Annotated[
@@ -27,15 +27,13 @@ def export(
     """Write meshes, masks, keypoints and lengths of a recording for other programs."""
     if not (meshes or masks or tables):
         raise typer.BadParameter("say what to export: --meshes ply, --masks, --tables csv")
-    from stream_dmr.cli_view import in_folder
     from stream_dmr.export import export_masks, export_meshes, export_tables
 
-    mcap = in_folder(recording, "recording.mcap")
     if meshes:
-        count = export_meshes(mcap, out / "meshes", format=meshes)
+        count = export_meshes(recording, out / "meshes", format=meshes)
         print(f"{out / 'meshes'}: {count} meshes")
     if masks:
-        print(f"{out / 'masks.json'}: {export_masks(mcap, out / 'masks.json')} masks")
+        print(f"{out / 'masks.json'}: {export_masks(recording, out / 'masks.json')} masks")
     if tables:
-        for path in export_tables(mcap, out, format=tables):
+        for path in export_tables(recording, out, format=tables):
             print(path)

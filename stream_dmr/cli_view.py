@@ -63,26 +63,29 @@ def convert(
     ] = False,
 ) -> None:
     """Make the .rrd of an .mcap again, with every frame drawn."""
-    mcap = in_folder(recording, "recording.mcap")
-    rrd = out or mcap.with_suffix(".rrd")
-    _convert(mcap, rrd, source, full_size=full_size)
+    rrd = out or (
+        recording / "recording.rrd" if recording.is_dir() else recording.with_suffix(".rrd")
+    )
+    _convert(recording, rrd, source, full_size=full_size)
     print(rrd)
 
 
-def _convert(mcap: Path, rrd: Path, source: str | None, *, full_size: bool = False) -> None:
+def _convert(recording: Path, rrd: Path, source: str | None, *, full_size: bool = False) -> None:
     from stream_dmr.errors import RecordingError
     from stream_dmr.recording.convert import EVERY_FRAME
     from stream_dmr.recording.convert import convert as convert_recording
     from stream_dmr.video import ReadFramesSettings, open_source
 
-    if mcap.suffix == ".rrd":
-        raise RecordingError(f"{mcap}: expected an .mcap, got an .rrd, which needs no conversion")
+    if recording.suffix == ".rrd":
+        raise RecordingError(
+            f"{recording}: expected an .mcap, got an .rrd; it is converted already"
+        )
     settings = EVERY_FRAME.model_copy(update={"view_px": 1 << 16} if full_size else {})
     if source is None:
-        convert_recording(mcap, rrd, settings=settings)
+        convert_recording(recording, rrd, settings=settings)
         return
     with closing(open_source(source, ReadFramesSettings())) as frames:
-        convert_recording(mcap, rrd, frames=frames, settings=settings)
+        convert_recording(recording, rrd, frames=frames, settings=settings)
 
 
 @contextmanager
@@ -91,26 +94,12 @@ def _as_rrd(recording: str, source: str | None) -> Iterator[str]:
     if "://" in recording:
         yield recording
         return
-    preferred = "recording.rrd" if source is None else "recording.mcap"
-    found = in_folder(Path(recording), preferred, "recording.rrd", "recording.mcap")
-    if found.suffix == ".rrd":
-        yield str(found.resolve())
+    path = Path(recording)
+    drawn = path / "recording.rrd" if path.is_dir() else path
+    if drawn.suffix == ".rrd" and drawn.is_file() and source is None:
+        yield str(drawn.resolve())
         return
     with tempfile.TemporaryDirectory() as folder:
         rrd = Path(folder) / "recording.rrd"
-        _convert(found, rrd, source)
+        _convert(path, rrd, source)
         yield str(rrd)
-
-
-def in_folder(recording: Path, *names: str) -> Path:
-    """The recording itself, or the first of `names` that a folder has."""
-    from stream_dmr.errors import RecordingError
-
-    candidates = [recording / name for name in names] if recording.is_dir() else [recording]
-    found = next((path for path in candidates if path.is_file()), None)
-    if found is None:
-        raise RecordingError(
-            f"{recording}: expected a recording or a folder with {names[-1]}, found none; "
-            "check the path"
-        )
-    return found

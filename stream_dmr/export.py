@@ -13,8 +13,9 @@ from jaxtyping import Bool
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate, LocalizedFish, Message
+from stream_dmr.recording.codec import decode
 from stream_dmr.recording.meshes import Meshes
-from stream_dmr.recording.reader import read_header, read_messages
+from stream_dmr.recording.opened import Recording, open_recordings
 from stream_dmr.recording.record import make_record
 from stream_dmr.recording.rerun_geometry import place
 from stream_dmr.recording.settings import RecordingSettings
@@ -29,10 +30,10 @@ def export_meshes(recording: Path, out: Path, *, format: MeshFormat) -> int:
 
     Vertices are in the camera frame, in mm; without a calibration a fish is one body length long.
     """
-    template = read_header(recording).template
-    meshes = Meshes(template)
-    count = 0
-    for fit, fish in _pairs(read_messages(recording, [FittedMesh, LocalizedFish])):
+    opened = open_recordings([recording])
+    template = opened.header.template
+    meshes, count = Meshes(template), 0
+    for fit, fish in _pairs(_messages(opened, FittedMesh, LocalizedFish)):
         shape = meshes.with_vertices(fit).shape
         vertices = None if shape is None else place(shape, fish)[0]
         if vertices is None:
@@ -50,7 +51,7 @@ def export_masks(recording: Path, path: Path) -> int:
     The masks are the crops', so as coarse as those, put back into the frame with its distortion.
     """
     images, annotations = {}, []
-    for crop in read_messages(recording, [FishCrop]):
+    for crop in _messages(open_recordings([recording]), FishCrop):
         assert isinstance(crop, FishCrop)
         camera = crop.frame_camera
         size = {"width": camera.width, "height": camera.height}
@@ -71,7 +72,7 @@ def export_masks(recording: Path, path: Path) -> int:
 def export_tables(recording: Path, out: Path, *, format: TableFormat) -> list[Path]:
     """Write lengths and frames (keypoints, one row a fish and frame) into `out`, as `run` does."""
     tables = Tables(_folder(out))
-    for message in read_messages(recording, [LocalizedFish, LengthEstimate]):
+    for message in _messages(open_recordings([recording]), LocalizedFish, LengthEstimate):
         tables.write(make_record(message, RecordingSettings()))
     tables.close()
     paths = [out / "lengths.csv", out / "frames.csv"]
@@ -100,6 +101,11 @@ def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
     edges = np.concatenate([[0], changes, [len(pixels)]])
     counts = np.diff(edges).tolist()
     return [0, *counts] if pixels[0] else counts
+
+
+def _messages(recording: Recording, *kinds: type[Message]) -> Iterator[Message]:
+    for kind, payload in recording.payloads(kinds):
+        yield decode(kind, payload)
 
 
 def _extent(crop: FishCrop) -> tuple[int, int, int, int]:

@@ -244,7 +244,7 @@ def test_what_is_no_recording_is_refused(tmp_path: Path):
     for command in ("view", "convert"):
         outcome = invoke(f"{command} {tmp_path}")
         assert outcome.code == 2
-        assert "check the path" in outcome.error
+        assert "found no .mcap" in outcome.error
     assert invoke(f"export {tmp_path}", {"--out": str(tmp_path)}).code == 2
 
 

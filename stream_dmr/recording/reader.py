@@ -41,19 +41,11 @@ def read_messages(path: Path, types: Collection[type[Message]] | None = None) ->
     Raises RecordingError for a file that is damaged, torn, or of a newer codec; what comes before
     the damage has then been given already.
     """
-    for kind, payload in read_payloads(path, types):
-        yield decode(kind, payload)
-
-
-def read_payloads(
-    path: Path, types: Collection[type[Message]] | None = None
-) -> Iterator[tuple[type[Message], bytes]]:
-    """What `read_messages` decodes: type and encoding of each message."""
     kinds = {TOPICS[kind].topic: kind for kind in types or TOPICS}
     with _open(path) as reader:
         _metadata(reader)
         for _, channel, record in reader.iter_messages(list(kinds), log_time_order=False):
-            yield kinds[channel.topic], record.data
+            yield decode(kinds[channel.topic], record.data)
 
 
 def _metadata(reader: SeekingReader) -> dict[str, str]:
