@@ -1,15 +1,12 @@
 """The command `stream-dmr`. What is heavy is imported inside the commands: --help must be quick."""
 
 import re
-import shlex
 import signal
 import sys
-import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Annotated
 
 import typer
@@ -17,6 +14,8 @@ import typer
 from stream_dmr import __version__
 from stream_dmr.cli_calibrate import calibrate
 from stream_dmr.cli_export import export
+from stream_dmr.cli_replay import replay
+from stream_dmr.cli_support import command_line, stop_on_signals, without_password
 from stream_dmr.cli_view import convert, view
 from stream_dmr.errors import UserError
 
@@ -27,7 +26,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (calibrate, view, convert, export):
+for command in (calibrate, replay, view, convert, export):
     app.command()(command)
 
 
@@ -123,7 +122,7 @@ def run_command(
     Writes lengths.csv, frames.csv, recording.mcap and recording.rrd into --out. Ctrl-C ends the
     run early and keeps what was done.
     """
-    with _stop_on_signals() as stop:
+    with stop_on_signals() as stop:
         from stream_dmr.display import RunDisplay, print_fish, print_timings
         from stream_dmr.run import RunRequest, run
 
@@ -137,7 +136,7 @@ def run_command(
             config=config,
             overwrite=overwrite,
             live=live,
-            command=_command_line(),
+            command=command_line(),
         )
         with RunDisplay() as display:
             summary = run(request, stop=stop, observer=display)
@@ -157,42 +156,9 @@ def default_out(source: str) -> Path:
     if source.isdecimal() and not Path(source).exists():
         return Path("runs") / f"camera-{source}"
     if "://" in source:
-        address = _without_password(source).split("://", 1)[1]
+        address = without_password(source).split("://", 1)[1]
         return Path("runs") / re.sub(r"[^A-Za-z0-9._-]+", "-", address).strip("-")
     return Path("runs") / Path(source).resolve().stem
-
-
-def _without_password(text: str) -> str:
-    return re.sub(r"(?<=://)[^/\s]*@", "", text)
-
-
-def _command_line() -> str:
-    return _without_password(shlex.join(["stream-dmr", *sys.argv[1:]]))
-
-
-class _Stop(threading.Event):
-    """Set by a signal, which it remembers."""
-
-    signal_number = 0
-
-
-@contextmanager
-def _stop_on_signals() -> Iterator[_Stop]:
-    """Ctrl-C and SIGTERM set the event instead of breaking in; repeated ones change nothing."""
-    stop = _Stop()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        if not stop.is_set():
-            stop.signal_number = number
-            stop.set()
-
-    signals = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, on_signal) for number in signals]
-    try:
-        yield stop
-    finally:
-        for number, handler in zip(signals, before, strict=True):
-            signal.signal(number, handler)
 
 
 @app.command("simulate")

@@ -64,15 +64,21 @@ def load_config(path: Path | str | None) -> Config:
     if path is None:
         return Config()
     try:
-        return Config.model_validate(tomllib.loads(Path(path).read_text(encoding="utf-8")))
+        return parse_config(Path(path).read_text(encoding="utf-8"), where=str(path))
     except OSError as error:
         raise ConfigError(f"{path}: expected a config.toml, got: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: expected TOML in UTF-8, got other bytes") from error
+
+
+def parse_config(text: str, *, where: str) -> Config:
+    """Read the text of a config.toml; `where` names it in errors, which are `load_config`'s."""
+    try:
+        return Config.model_validate(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: expected TOML, got a mistake in it: {error}") from error
+        raise ConfigError(f"{where}: expected TOML, got a mistake in it: {error}") from error
     except ValidationError as error:
-        raise ConfigError(f"{path}{_explain(error.errors()[0])}") from error
+        raise ConfigError(f"{where}{_explain(error.errors()[0])}") from error
 
 
 def to_toml(config: Config) -> str:

@@ -11,10 +11,12 @@ from rich.table import Table
 
 from stream_dmr.evaluation import Evaluation, summary_rows
 from stream_dmr.messages import LengthEstimate
+from stream_dmr.replay.replay import ReplaySummary
 from stream_dmr.run import Observer, RunSummary
 
 _LINE_EVERY_S = 10.0  # where there is no terminal to draw a bar on
 _PLAIN_WIDTH = 120
+_MOST_SHOWN = 20  # differences of a replay
 
 
 class RunDisplay(Observer):
@@ -92,7 +94,26 @@ def print_fish(fish: Sequence[LengthEstimate]) -> None:
     _stdout().print(table if fish else "no fish")
 
 
-def print_timings(summary: RunSummary) -> None:
+def print_check(summary: ReplaySummary) -> None:
+    """Print what a replay computed otherwise than it was recorded, to stdout."""
+    found = summary.mismatches
+    for item in found[:_MOST_SHOWN]:
+        print(
+            f"frame {item.frame_index}, fish {item.track_id}, {item.kind}, "
+            f"{item.difference.field}: recorded {item.difference.logged}, "
+            f"now {item.difference.computed}"
+        )
+    if len(found) > _MOST_SHOWN:
+        print(f"... and {len(found) - _MOST_SHOWN} more")
+    kinds = ", ".join(sorted({item.kind for item in found}))
+    print(
+        f"check: {len(found)} fields differ, in {kinds}"
+        if found
+        else f"check: {summary.num_compared} messages are the recorded ones to the last bit"
+    )
+
+
+def print_timings(summary: RunSummary | ReplaySummary) -> None:
     """Print what each stage of the chain took, its part of the recording included, to stdout."""
     table = _table("stage", "messages in", "out", "busy ms/frame", "CPU ms/frame", "busy %")
     for counter in summary.counters:

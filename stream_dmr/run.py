@@ -92,7 +92,7 @@ def run(
             require_size(calibration, width=reader.source.width, height=reader.source.height)
         camera = None if calibration is None else calibration.camera
         crop_fish = CropFish(config.crop_fish, camera=camera, detections=detections)
-        nodes = [crop_fish, *_later_nodes(config, template=template, calibration=calibration)]
+        nodes = [crop_fish, *later_nodes(config, template=template, calibration=calibration)]
         prepare_folder(request.out, overwrite=request.overwrite)
         header = _header(request, reader.source.name, config, template, calibration)
         with Recorder(request.out, header, config.recording, live=request.live) as recorder:
@@ -133,7 +133,7 @@ def prepare_folder(out: Path, *, overwrite: bool) -> None:
         ) from error
 
 
-def _later_nodes(
+def later_nodes(
     config: Config, *, template: Template, calibration: Calibration | None
 ) -> list[Node]:
     """The nodes that a crop passes, from the fit to the length."""

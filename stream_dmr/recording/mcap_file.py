@@ -114,7 +114,7 @@ class McapFile:
                 ) from error
 
     def _is_torn(self, stream: IO[bytes]) -> bool:
-        """Does the end of the file lack the magic that closes it?"""
+        """Say whether the end of the file lacks the magic that closes it."""
         size = stream.seek(0, 2)
         stream.seek(max(size - len(MCAP0_MAGIC), 0))
         end = stream.read()

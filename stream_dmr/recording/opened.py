@@ -18,7 +18,11 @@ class Recording(Protocol):
     """What a run left."""
 
     header: RunHeader
-    warnings: list[str]  # what is lost, a line each; complete once everything was read
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """What is lost, a line each; complete once everything was read."""
+        ...
 
     def payloads(
         self, kinds: Kinds, *, time_ns: tuple[int, int] | None = None
@@ -65,7 +69,7 @@ class _Row:
                 )
 
     @property
-    def warnings(self) -> list[str]:
+    def warnings(self) -> Sequence[str]:
         """What is lost of each."""
         return [line for part in self._parts for line in part.warnings]
 

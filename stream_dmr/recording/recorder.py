@@ -76,9 +76,13 @@ class Recorder:
         what is not recorded it lacks; only a frame by reference keeps its pixels.
         """
         record = make_record(message, self._settings)
+        self.put(record)
+        return record.message
+
+    def put(self, record: Record) -> None:
+        """Record a message as it is encoded already."""
         self._queue.put(record)
         self._raise_failure()
-        return record.message
 
     def close(self) -> None:
         """Write what is waiting and close every sink, also where another one fails. Idempotent.

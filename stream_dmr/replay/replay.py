@@ -1,0 +1,198 @@
+"""Replay: the chain with a recording in place of the nodes before the first recomputed one."""
+
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from nodes.crop_fish import CropFish
+from nodes.read_frames import ReadFrames
+from stream_dmr.calibration import load_calibration
+from stream_dmr.camera import Calibration
+from stream_dmr.config import Config, load_config, parse_config, to_toml
+from stream_dmr.errors import UserError
+from stream_dmr.messages import (
+    FishCrop,
+    FittedMesh,
+    Frame,
+    LengthEstimate,
+    LocalizedFish,
+    Message,
+)
+from stream_dmr.pipeline import Node, StageCounters, run_chain
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.opened import open_recordings
+from stream_dmr.recording.recorder import Recorder
+from stream_dmr.recording.restored import Pictures
+from stream_dmr.replay.judge import Judge, Mismatch, Scribe
+from stream_dmr.replay.tape import Playback, Tape
+from stream_dmr.run import Observer, later_nodes, prepare_folder
+from stream_dmr.segmentation.detections import open_annotations
+from stream_dmr.template import Template, load_template
+
+STAGES: dict[str, type[Message]] = {
+    "crop": FishCrop,
+    "fit": FittedMesh,
+    "localize": LocalizedFish,
+    "smooth": LengthEstimate,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayRequest:
+    """What the user asks for; what is None is as it was recorded."""
+
+    recordings: Sequence[Path]  # files or folders, in order
+    first: str = "fit"  # of STAGES: computed anew, and what follows it
+    config: Path | None = None
+    calibration: Path | None = None
+    template: str | None = None
+    source: str | None = None  # the recorded clip: for `crop`, where pictures are by reference
+    boxes: Path | None = None  # for `crop`
+    masks: Path | None = None
+    time_s: tuple[float, float] | None = None  # of capture: from, to
+    tracks: frozenset[int] | None = None
+    out: Path | None = None  # None: nothing is written
+    overwrite: bool = False
+    check: bool = False  # compare with what was recorded
+    command: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplaySummary:
+    """How a replay went."""
+
+    fish: Sequence[LengthEstimate]  # the final ones, by track id
+    num_frames: int
+    elapsed_s: float
+    recorded_s: float  # of capture time, from the first frame to the last
+    counters: Sequence[StageCounters]
+    num_compared: int
+    mismatches: Sequence[Mismatch]
+
+
+def replay(
+    request: ReplayRequest, *, stop: threading.Event, observer: Observer | None = None
+) -> ReplaySummary:
+    """Compute a recording anew from one stage on; with `check`, compare with what was recorded.
+
+    Raises a UserError where an input is wrong or the recording damaged; a torn recording is
+    replayed as far as it is whole, and `observer` is warned of what is lost.
+    """
+    observer = observer or Observer()
+    _refuse_impossible(request)
+    recording = open_recordings(request.recordings)
+    config, template, calibration = _inputs(request, recording.header)
+    tape = Tape(recording, tracks=request.tracks, time_s=request.time_s)
+    order = [*STAGES.values()]
+    first = order.index(STAGES[request.first])
+    with ExitStack() as stack:
+        frames, nodes = _chain(request, tape, config, template, calibration, stack, first)
+        recorder = None
+        if request.out is not None:
+            prepare_folder(request.out, overwrite=request.overwrite)
+            header = _header(request, recording.header, config, template, calibration)
+            recorder = stack.enter_context(Recorder(request.out, header, config.recording))
+        recomputed = order[first:]
+        judge = Judge(tape, recomputed) if request.check else None
+        scribe = Scribe(tape, recorder, judge, config.recording, recomputed)
+        observer.begin(None)
+        began = time.perf_counter()
+        counters = run_chain(
+            frames, nodes, on_message=scribe.take, on_frame=observer.frame_done, stop=stop
+        )
+    if judge is not None:
+        judge.finish()
+    for line in recording.warnings:
+        observer.warn(line)
+    return ReplaySummary(
+        fish=sorted(scribe.final, key=lambda estimate: estimate.track_id),
+        num_frames=scribe.num_frames,
+        elapsed_s=time.perf_counter() - began,
+        recorded_s=scribe.recorded_s,
+        counters=counters,
+        num_compared=judge.num_compared if judge else 0,
+        mismatches=judge.mismatches if judge else [],
+    )
+
+
+def _refuse_impossible(request: ReplayRequest) -> None:
+    if request.check and request.time_s is not None:
+        raise UserError(
+            "--check with --time: each fit starts from the frame before, so a part of a recording "
+            "can't equal the whole; leave out one of them"
+        )
+    if request.template is not None and request.first not in ("crop", "fit"):
+        raise UserError(
+            f"--template with --from {request.first}: a template matters to the fit; use --from fit"
+        )
+    if request.first == "crop" and request.tracks is not None:
+        raise UserError("--track with --from crop: crops are made of whole frames; use --from fit")
+    if request.first == "crop" and request.boxes is None and request.masks is None:
+        raise UserError(
+            "--from crop: expected to be told where the fish are, as in the run; "
+            "give its --boxes, --masks or both"
+        )
+
+
+def _inputs(
+    request: ReplayRequest, header: RunHeader
+) -> tuple[Config, Template, Calibration | None]:
+    """As recorded, but for what the user gives."""
+    config = (
+        load_config(request.config)
+        if request.config is not None
+        else parse_config(header.config_toml, where="the recording's config.toml")
+    )
+    template = header.template if request.template is None else load_template(request.template)
+    calibration = header.calibration
+    if request.calibration is not None:
+        calibration = load_calibration(request.calibration)
+    return config, template, calibration
+
+
+def _header(
+    request: ReplayRequest,
+    recorded: RunHeader,
+    config: Config,
+    template: Template,
+    calibration: Calibration | None,
+) -> RunHeader:
+    file = request.calibration
+    return RunHeader(
+        source=recorded.source,
+        command=request.command,
+        config_toml=to_toml(config),
+        template=template,
+        calibration=calibration,
+        calibration_file=recorded.calibration_file if file is None else file.read_bytes(),
+    )
+
+
+def _chain(
+    request: ReplayRequest,
+    tape: Tape,
+    config: Config,
+    template: Template,
+    calibration: Calibration | None,
+    stack: ExitStack,
+    first: int,
+) -> tuple[Iterable[Frame], list[Node]]:
+    """The frames and the nodes; what is only needed for a new recording is left out without one."""
+    computed = later_nodes(config, template=template, calibration=calibration)
+    if first == 0:
+        camera = None if calibration is None else calibration.camera
+        detections = open_annotations(boxes=request.boxes, masks=request.masks)
+        pictures = None
+        if request.source is not None:
+            reader = ReadFrames(request.source, config.read_frames)
+            stack.callback(reader.close)
+            pictures = Pictures(reader)
+        crop_fish = CropFish(config.crop_fish, camera=camera, detections=detections)
+        return tape.pictures(pictures), [crop_fish, *computed]
+    logged = [*STAGES.values()][:first]
+    if request.out is None:
+        logged = logged[-1:]
+    return tape.frames(), [*(Playback(tape, kind) for kind in logged), *computed[first - 1 :]]

@@ -1,0 +1,89 @@
+"""The recorded messages, and the nodes that give them instead of computing them."""
+
+from collections.abc import Iterator, Sequence
+
+from stream_dmr.errors import RecordingError
+from stream_dmr.messages import FishCrop, FittedMesh, Frame, Message
+from stream_dmr.recording.codec import decode
+from stream_dmr.recording.opened import Recording
+from stream_dmr.recording.restored import Pictures
+
+
+class Tape:
+    """The recorded messages of each kind, in their order."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        *,
+        tracks: frozenset[int] | None = None,
+        time_s: tuple[float, float] | None = None,
+    ) -> None:
+        self._recording = recording
+        self._tracks = tracks
+        self._time_ns = None
+        if time_s is not None:
+            self._time_ns = (round(time_s[0] * 1e9), round(time_s[1] * 1e9))
+        self._payloads: dict[int, bytes] = {}  # of messages on their way to a new recording
+
+    def messages(self, kind: type[Message], *, keep: bool = True) -> Iterator[Message]:
+        """Those of the wanted tracks and times."""
+        for _, payload in self._recording.payloads([kind], time_ns=self._time_ns):
+            message = decode(kind, payload)
+            track_id = getattr(message, "track_id", None)
+            if self._tracks is None or track_id is None or track_id in self._tracks:
+                if keep:
+                    self._payloads[id(message)] = payload
+                yield message
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames, without pictures where they were recorded by reference."""
+        for message in self.messages(Frame):
+            assert isinstance(message, Frame)
+            yield message
+
+    def pictures(self, found: Pictures | None) -> Iterator[Frame]:
+        """The frames with their pictures, of which those by reference are `found`."""
+        for frame in self.frames():
+            payload = self._payloads.pop(id(frame))
+            whole = frame if found is None else found.restore(frame, payload)
+            if whole.image.size == 0:
+                raise RecordingError(
+                    "--from crop: the recording refers to its source's pictures; give --source"
+                )
+            self._payloads[id(whole)] = payload
+            yield whole
+
+    def payload(self, message: Message) -> bytes:
+        """The encoding of a message that came from here; once."""
+        return self._payloads.pop(id(message))
+
+
+class Playback:
+    """In place of a node: gives the messages that it gave when it was recorded."""
+
+    def __init__(self, tape: Tape, kind: type[Message]) -> None:
+        self._messages = tape.messages(kind)
+        self._next = next(self._messages, None)
+
+    def step(self, message: Frame | FishCrop | FittedMesh, /) -> Sequence[Message]:
+        """Give all of a frame, or that of one fish of it."""
+        given: list[Message] = []
+        while self._next is not None and self._next.frame_index <= message.frame_index:
+            if self._next.frame_index == message.frame_index:
+                if not isinstance(message, Frame) and self._track_id() != message.track_id:
+                    break
+                given.append(self._next)
+            self._next = next(self._messages, None)
+        return given
+
+    def _track_id(self) -> int:
+        return getattr(self._next, "track_id", 0)
+
+    def tick(self, timestamp_ns: int, /) -> Sequence[Message]:
+        """Nothing but what was recorded."""
+        return ()
+
+    def close(self) -> Sequence[Message]:
+        """Nothing but what was recorded."""
+        return ()
