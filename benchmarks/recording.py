@@ -35,6 +35,7 @@ CASES = {
     "and vertices and covariance": EXACT,
     "and every frame drawn": EXACT | {"view_rate_hz": 1000.0},
     "and frames as JPEG: everything": EXACT | {"view_rate_hz": 1000.0, "frames": "jpeg"},
+    "default, with foxglove topics": {"foxglove": True},
 }
 
 

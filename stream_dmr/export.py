@@ -17,7 +17,7 @@ from stream_dmr.recording.codec import decode
 from stream_dmr.recording.meshes import Meshes
 from stream_dmr.recording.opened import Recording, open_recordings
 from stream_dmr.recording.record import make_record
-from stream_dmr.recording.rerun_geometry import place
+from stream_dmr.recording.view_geometry import place
 from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.tables import Tables
 

@@ -22,6 +22,7 @@ from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.segmentation.detections import open_annotations
 from stream_dmr.template import Template, load_template
+from stream_dmr.video import LiveStream
 
 RESULTS = ("lengths.csv", "frames.csv", "recording.mcap", "recording.rrd")
 
@@ -100,6 +101,11 @@ def run(
                 observer.serving(recorder.live_address)
             if calibration is None:
                 observer.warn("without --calibration there are relative shapes, no millimetres")
+            if isinstance(reader.source, LiveStream) and config.recording.frames == "reference":
+                observer.warn(
+                    "a live source can't be read again, so its pictures are not kept but for the "
+                    'view; record them with [recording] frames = "jpeg"'
+                )
             observer.begin(reader.source.num_frames)
             summary = _run_chain(reader, nodes, recorder, request.out, stop=stop, observer=observer)
     finally:

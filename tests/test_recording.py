@@ -10,6 +10,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from threading import Thread
 
+import cv2
 import numpy as np
 import pytest
 from mcap.exceptions import McapError
@@ -36,9 +37,9 @@ from stream_dmr.recording.mcap_sink import McapSink
 from stream_dmr.recording.pictures import checksum
 from stream_dmr.recording.reader import read_header, read_messages, read_metadata
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.recording.rerun_geometry import place
 from stream_dmr.recording.settings import RecordingSettings
-from stream_dmr.recording.topics import TOPICS, topics_table
+from stream_dmr.recording.topics import FOXGLOVE_TOPICS, TOPICS, topics_table
+from stream_dmr.recording.view_geometry import place
 
 EXACT = RecordingSettings(rrd=False, crops="png", meshes="vertices")
 
@@ -376,6 +377,33 @@ def test_recording_leaves_no_global_rerun_stream(tmp_path: Path):
         "assert rr.get_global_data_recording() is None"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])
+
+
+def test_foxglove_topics_are_written_beside_the_messages(tmp_path: Path, messages: list[Message]):
+    record(tmp_path, messages, EXACT.model_copy(update={"foxglove": True}))
+    assert_all_same(
+        list(read_messages(tmp_path / "recording.mcap", [FittedMesh])), only(messages, FittedMesh)
+    )
+    with (tmp_path / "recording.mcap").open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        found = {}
+        for item in reader.iter_decoded_messages(list(FOXGLOVE_TOPICS)):
+            assert item.schema is not None
+            assert item.schema.name == FOXGLOVE_TOPICS[item.channel.topic]
+            found.setdefault(item.channel.topic, item.decoded_message)
+    assert set(found) == set(FOXGLOVE_TOPICS)
+    picture = cv2.imdecode(np.frombuffer(found["/foxglove/picture"].data, np.uint8), 1)
+    camera = found["/foxglove/camera"]
+    assert picture.shape[:2] == (camera.height, camera.width)
+    # The mesh, put through the camera of the picture, covers the outline drawn in it.
+    (entity,) = found["/foxglove/fish"].entities
+    points = np.array([(p.x, p.y, p.z) for p in entity.triangles[0].points])
+    K, D = np.reshape(camera.K, (3, 3)), np.array(camera.D)
+    pixels = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, D)[0].reshape(-1, 2)
+    (outline,) = found["/foxglove/outlines"].points
+    drawn = np.array([(p.x, p.y) for p in outline.points])
+    assert np.abs(pixels.min(axis=0) - drawn.min(axis=0)).max() < 4
+    assert np.abs(pixels.max(axis=0) - drawn.max(axis=0)).max() < 4
 
 
 @pytest.mark.slow

@@ -6,12 +6,14 @@ messages comes first, and every chunk of messages is complete in itself.
 
 import time
 from collections import Counter
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import IO, cast
+from typing import IO, Any, Protocol, cast, runtime_checkable
 
 from mcap.data_stream import RecordBuilder
 from mcap.records import DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from mcap_protobuf.schema import register_schema
 
 from stream_dmr import __version__
 from stream_dmr.errors import OutputError
@@ -26,6 +28,20 @@ _CHUNK_BYTES = 256 * 1024
 _MEDIA_TYPES = {".toml": "application/toml", ".yaml": "application/yaml"}
 
 
+@runtime_checkable
+class ExtraTopics(Protocol):
+    """What other programs read, in protobuf schemas of theirs."""
+
+    @property
+    def topics(self) -> Mapping[str, Any]:
+        """Topic -> class of its messages."""
+        ...
+
+    def draw(self, record: Record, /) -> Iterable[tuple[str, Any]]:
+        """Topics and messages that follow from a record."""
+        ...
+
+
 class McapSink:
     """Writes every record, with the capture time as its log time.
 
@@ -34,11 +50,14 @@ class McapSink:
     which readers do without; where not even that has room, it stays behind as `.part`.
     """
 
-    def __init__(self, out_dir: Path, header: RunHeader, *, flush_s: float) -> None:
+    def __init__(
+        self, out_dir: Path, header: RunHeader, *, flush_s: float, extra: ExtraTopics | None = None
+    ) -> None:
         self.path = out_dir / NAME
         self._part = out_dir / f"{NAME}.part"
         self._flush_ns = int(flush_s * 1e9)
         self._channels: dict[type, int] = {}
+        self._extra, self._extra_channels = extra, dict[str, int]()
         self._sequences: Counter[int] = Counter()
         self._closed = False
         try:
@@ -54,13 +73,12 @@ class McapSink:
         """Append one record; OutputError where the disk refuses it, and the recording is over."""
         if self._closed:
             raise ValueError(f"{self.path} is closed")
-        channel = self._channels[type(record.message)]
-        self._sequences[channel] += 1
         timestamp_ns = record.message.timestamp_ns
         try:
-            self._writer.add_message(
-                channel, timestamp_ns, record.payload, timestamp_ns, self._sequences[channel]
-            )
+            self._add(self._channels[type(record.message)], timestamp_ns, record.payload)
+            for topic, drawn in self._extra.draw(record) if self._extra else ():
+                channel = self._extra_channels[topic]
+                self._add(channel, timestamp_ns, drawn.SerializeToString())
             if time.monotonic_ns() >= self._flush_at_ns:
                 self._flush()
         except OSError as error:
@@ -81,10 +99,20 @@ class McapSink:
             self._end_without_index(whole)
             raise self._refusal(error) from error
 
+    def _add(self, channel: int, timestamp_ns: int, data: bytes) -> None:
+        self._sequences[channel] += 1
+        self._writer.add_message(
+            channel, timestamp_ns, data, timestamp_ns, self._sequences[channel]
+        )
+
     def _register_topics(self) -> None:
         for kind, row in TOPICS.items():
             schema = self._writer.register_schema(row.schema, "protobuf", schema_bytes())
             self._channels[kind] = self._writer.register_channel(row.topic, "protobuf", schema)
+        for topic, kind in self._extra.topics.items() if self._extra else ():
+            schema = register_schema(self._writer, kind)
+            channel = self._writer.register_channel(topic, "protobuf", schema)
+            self._extra_channels[topic] = channel
 
     def _flush(self) -> None:
         self._writer.flush()
@@ -121,7 +149,10 @@ class McapSink:
 
 def _start(file: WholeFile, header: RunHeader) -> Writer:
     writer = Writer(
-        cast(IO[bytes], file), chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD
+        cast(IO[bytes], file),
+        chunk_size=_CHUNK_BYTES,
+        compression=CompressionType.ZSTD,
+        enable_data_crcs=True,  # else metadata and attachments have no checksum
     )
     writer.start(profile="stream-dmr", library=f"stream-dmr {__version__}")
     writer.add_metadata("run", header.metadata())

@@ -7,11 +7,11 @@ from threading import Lock, Thread
 from types import TracebackType
 from typing import Protocol, runtime_checkable
 
-from stream_dmr.errors import OutputError
+from stream_dmr.errors import ConfigError, OutputError
 from stream_dmr.messages import Message
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.live import LiveView
-from stream_dmr.recording.mcap_sink import McapSink
+from stream_dmr.recording.mcap_sink import ExtraTopics, McapSink
 from stream_dmr.recording.record import Record, make_record
 from stream_dmr.recording.rerun_sink import NAME as RRD_NAME
 from stream_dmr.recording.rerun_sink import RerunSink
@@ -59,7 +59,8 @@ class Recorder:
             undo.callback(self._close_sinks)
             self._sinks.append(Tables(out_dir))
             if settings.mcap:
-                self._sinks.append(McapSink(out_dir, header, flush_s=settings.flush_s))
+                extra = _foxglove(header, settings) if settings.foxglove else None
+                self._sinks.append(McapSink(out_dir, header, flush_s=settings.flush_s, extra=extra))
             if settings.rrd:
                 self._sinks.append(RerunSink(out_dir / RRD_NAME, header, settings))
             if live:
@@ -139,6 +140,17 @@ class Recorder:
         with ExitStack() as stack:
             for sink in self._sinks:
                 stack.callback(sink.close)
+
+
+def _foxglove(header: RunHeader, settings: RecordingSettings) -> ExtraTopics:
+    try:
+        from stream_dmr.recording.foxglove import FoxgloveView
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"[recording] foxglove = true: expected the package of its schemas, found no "
+            f"{error.name}; install it with: pip install foxglove-schemas-protobuf"
+        ) from error
+    return FoxgloveView(header, settings)
 
 
 def _make_folder(folder: Path) -> None:

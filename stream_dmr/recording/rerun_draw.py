@@ -1,8 +1,8 @@
 """Draws messages into a Rerun stream: entity paths are those of topics.py."""
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Sequence
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -20,27 +20,24 @@ from stream_dmr.messages import (
 )
 from stream_dmr.recording import topics
 from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.palette import PALETTE, color
 from stream_dmr.recording.pictures import compress, paint
 from stream_dmr.recording.record import Record
 from stream_dmr.recording.rerun_columns import Columns, blob
-from stream_dmr.recording.rerun_geometry import fill, halved, outlines, place, shades, view_factor
 from stream_dmr.recording.rerun_view import (
     NOMINAL_DEPTH,
-    PALETTE,
     PICTURES,
     appearance,
-    color,
     log_camera,
     log_plane,
     middle_mm,
 )
 from stream_dmr.recording.settings import RecordingSettings
-
-T = TypeVar("T")
+from stream_dmr.recording.showing import Pace, Waiting
+from stream_dmr.recording.view_geometry import fill, halved, outlines, place, shades, view_factor
 
 _HALF_PIXEL = 0.5  # Rerun counts pixels from the corner of the top-left one, we from its centre
 _JPEG_QUALITY = 75
-_MOST_PENDING = 64  # frames whose fish may still come
 
 
 class Drawing:
@@ -56,10 +53,9 @@ class Drawing:
         self._settings = settings
         self._faces = header.template.faces
         self._columns = Columns(rec)
-        self._slot = -1  # of capture time, of the last frame that was shown
-        self._shown: deque[int] = deque(maxlen=_MOST_PENDING)  # the last frames that were
-        self._boxes = _Waiting[np.ndarray]()  # until it is known what the frame says of the fish
-        self._shapes = _Waiting[FittedShape]()  # until they are placed
+        self._pace = Pace(settings.view_rate_hz)
+        self._boxes = Waiting[np.ndarray]()  # until it is known what the frame says of the fish
+        self._shapes = Waiting[FittedShape]()  # until they are placed
         self._reasons: dict[int, str] = {}  # why each track's last frame was not used
         self._tracks: set[int] = set()
         self._numbers: Counter[str] = Counter()  # of the messages of each kind, so far
@@ -107,11 +103,8 @@ class Drawing:
         self._no_masks = paint(self._labels, PALETTE)
 
     def _frame(self, frame: Frame) -> None:
-        slot = int(frame.timestamp_ns * self._settings.view_rate_hz // 1e9)
-        if slot == self._slot:
+        if not self._pace.shows(frame):
             return
-        self._slot = slot
-        self._shown.append(frame.frame_index)
         # Comes before the fish of its frame, so it may wipe the fish of the frame before.
         for root in topics.FISH_ROOTS:
             self._add(root, rr.Clear, frame, is_recursive=[True])
@@ -126,7 +119,7 @@ class Drawing:
         if self._factor is None:
             self._set_camera(crop.frame_camera, depth=NOMINAL_DEPTH)
         self._introduce(crop.track_id)
-        if crop.frame_index not in self._shown:
+        if not self._pace.has_shown(crop.frame_index):
             return
         self._boxes.put(crop, crop.bbox_xyxy_px)
         strips = [self._in_view(line) for line in outlines(crop)]
@@ -155,7 +148,7 @@ class Drawing:
         if fish.accepted and fish.length_mm is not None:
             self._add(topics.FRAME_LENGTH, rr.Scalars, fish, scalars=[fish.length_mm])
         box = self._boxes.take(fish)
-        if fish.frame_index not in self._shown:
+        if not self._pace.has_shown(fish.frame_index):
             return
         if box is not None:
             self._box(box, fish)
@@ -220,21 +213,6 @@ class Drawing:
     def _in_view(self, pixels: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
         """Frame pixels as Rerun counts them in the picture of the view."""
         return (pixels + _HALF_PIXEL) / (self._factor or 1)
-
-
-class _Waiting(Generic[T]):
-    """What one stage knows of a fish in a frame, until a later stage, some frames behind, asks."""
-
-    def __init__(self) -> None:
-        self._items: dict[tuple[int, int], T] = {}
-
-    def put(self, fish: FishCrop | FittedMesh, item: T) -> None:
-        self._items[fish.track_id, fish.frame_index] = item
-        if len(self._items) > _MOST_PENDING:  # a live view misses messages
-            del self._items[next(iter(self._items))]
-
-    def take(self, fish: LocalizedFish) -> T | None:
-        return self._items.pop((fish.track_id, fish.frame_index), None)
 
 
 def _finding(fish: LocalizedFish) -> str:

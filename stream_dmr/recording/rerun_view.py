@@ -7,18 +7,9 @@ from jaxtyping import Float, Int
 
 from stream_dmr.camera import Calibration, Camera
 from stream_dmr.recording import topics
+from stream_dmr.recording.palette import color
 from stream_dmr.recording.topics import CAMERA, LOG, PLANE
 
-# After Okabe and Ito, told apart by the colour-blind too; bright enough for a dark ground.
-PALETTE = (
-    (230, 159, 0),
-    (86, 180, 233),
-    (0, 158, 115),
-    (240, 228, 66),
-    (204, 121, 167),
-    (213, 94, 0),
-    (122, 130, 255),
-)
 _GRID_MM = 100.0
 _GREY = (150, 160, 170, 90)
 _PICTURE_DEPTH = 0.25  # of the camera's picture in the scene, of the distance to the fish
@@ -38,11 +29,6 @@ PICTURES = {
 }
 _LOG_COLUMNS = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
 _SEE_THROUGH = 150  # opacity of a mesh, of 255: the midline shows
-
-
-def color(track_id: int) -> tuple[int, int, int]:
-    """The colour of a track, the same in every view."""
-    return PALETTE[track_id % len(PALETTE)]
 
 
 def appearance(track_id: int, faces: Int[np.ndarray, "F 3"]) -> dict[str, rr.AsComponents]:

@@ -42,6 +42,10 @@ class RecordingSettings(Settings):
         ge=64,
         description="pictures in the .rrd are halved until no side is longer, px",
     )
+    foxglove: bool = Field(
+        default=False,
+        description="in the .mcap, also what Foxglove Studio draws, as often as in the .rrd",
+    )
     flush_s: float = Field(
         default=1.0, gt=0, le=60, description="the most that a crash may lose, seconds of recording"
     )

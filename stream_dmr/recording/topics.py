@@ -58,10 +58,27 @@ TOPICS: dict[type[Message], Topic] = {
 }
 
 
+FOXGLOVE_TOPICS = {
+    "/foxglove/picture": "foxglove.CompressedImage",
+    "/foxglove/camera": "foxglove.CameraCalibration",
+    "/foxglove/plane": "foxglove.FrameTransform",
+    "/foxglove/fish": "foxglove.SceneUpdate",
+    "/foxglove/outlines": "foxglove.ImageAnnotations",
+    "/foxglove/keypoints": "foxglove.ImageAnnotations",
+}
+"""In the .mcap, beside the messages, with `foxglove = true`: topic -> schema."""
+
+
 def topics_table() -> str:
-    """The table as Markdown, for `docs/recording.md`."""
+    """The tables in `docs/recording.md`; `python -m stream_dmr.recording.topics` prints them."""
     lines = ["| message | topic (.mcap) | schema | entities (.rrd) |", "|---|---|---|---|"]
     for row in TOPICS.values():
         entities = ", ".join(f"`{path}`" for path in row.entities)
         lines.append(f"| `{row.message.__name__}` | `{row.topic}` | `{row.schema}` | {entities} |")
+    lines += ["", "| topic with `foxglove = true` | schema |", "|---|---|"]
+    lines += [f"| `{topic}` | `{schema}` |" for topic, schema in FOXGLOVE_TOPICS.items()]
     return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(topics_table())
