@@ -6,6 +6,7 @@ and is guarded by the checksums of its chunks.
 """
 
 import struct
+import zlib
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import IO
 
 from mcap.exceptions import EndOfFile, McapError
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Chunk, Metadata
+from mcap.records import Attachment, Channel, Chunk, Footer, Metadata
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
@@ -30,6 +31,7 @@ _DAMAGE = (
     *(McapError, ValueError, KeyError, IndexError, RuntimeError, struct.error, ZstdError),
     *(OverflowError, MemoryError, AttributeError, TypeError),
 )
+_CUT_OFF = (EndOfFile, struct.error)
 _LARGEST_RECORD = 1 << 30  # bytes; a damaged length must not ask for all memory
 
 
@@ -59,7 +61,7 @@ class McapFile:
         reader = SeekingReader(stream, validate_crcs=True)
         first, last = time_ns
         for _, channel, message in reader.iter_messages(
-            list(topics), start_time=first, end_time=last, log_time_order=False
+            list(topics), starting_at=first, ending_before=last, log_time_order=False
         ):
             yield topics[channel.topic], message.data
 
@@ -75,12 +77,14 @@ class McapFile:
             for record in _records(stream):
                 if isinstance(record, Channel) and record.topic in topics:
                     kinds[record.id] = topics[record.topic]
+                elif isinstance(record, Footer):
+                    _check_summary(stream, record)
                 elif isinstance(record, McapMessage):
                     count += 1
                     kind = kinds.get(record.channel_id)
                     if kind and (time_ns is None or time_ns[0] <= record.log_time < time_ns[1]):
                         yield kind, record.data
-        except EndOfFile:
+        except _CUT_OFF:
             if not is_torn:
                 raise
         if is_torn:
@@ -103,7 +107,7 @@ class McapFile:
                         check_version(int(metadata["codec_version"]))
                     elif isinstance(record, Attachment):
                         attachments[record.name] = record.data
-            except EndOfFile:
+            except _CUT_OFF:
                 pass
             try:
                 return RunHeader.from_parts(metadata, attachments)
@@ -138,6 +142,17 @@ class McapFile:
                 f"{self.path}: expected a whole recording, got a damaged one ({error}); "
                 "what was read before the damage is sound"
             ) from error
+
+
+def _check_summary(stream: IO[bytes], footer: Footer) -> None:
+    """The mcap library writes this checksum and never looks at it."""
+    if footer.summary_crc:
+        place = stream.tell()
+        stream.seek(footer.summary_start)
+        rest = stream.read()[: -len(MCAP0_MAGIC) - 4]
+        stream.seek(place)
+        if zlib.crc32(rest) != footer.summary_crc:
+            raise ValueError("the checksum of its index is wrong")
 
 
 def _records(stream: IO[bytes], *, emit_chunks: bool = False) -> Iterator[object]:

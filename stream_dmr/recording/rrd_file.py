@@ -7,6 +7,9 @@ it, and the messages of each kind are numbered.
 import json
 import zlib
 from collections.abc import Collection, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +25,10 @@ from stream_dmr.recording.topics import TOPICS
 _HEADER = "/messages/header/"
 
 
+# By entity: number, capture time, encoding.
+Rows = dict[str, list[tuple[int, int, bytes]]]
+
+
 class RrdFile:
     """One .rrd with `rrd_messages`, in memory."""
 
@@ -29,20 +36,7 @@ class RrdFile:
         """Raises RecordingError where it can't be read or holds no messages."""
         self.path = path
         self.warnings: list[str] = []
-        # By entity: number, capture time, encoding.
-        self._rows: dict[str, list[tuple[int, int, bytes]]] = {}
-        try:
-            for chunk in RrdReader(str(path)).stream():
-                if str(chunk.entity_path).startswith("/messages/"):
-                    self._take(str(chunk.entity_path), chunk.to_record_batch())
-        except (ValueError, RuntimeError, OSError, KeyError, pa.ArrowException) as error:
-            raise RecordingError(
-                f"{path}: expected a recording (.rrd), but it can't be read: {error}"
-            ) from error
-        for entity, rows in self._rows.items():
-            rows.sort()
-            if [number for number, _, _ in rows] != list(range(len(rows))):
-                raise RecordingError(f"{path}: damaged: messages are missing in {entity}")
+        self._rows = _read_apart(path)
         self.header = self._read_header()
 
     def payloads(
@@ -53,22 +47,6 @@ class RrdFile:
             for _, timestamp_ns, payload in self._rows.get(f"/{TOPICS[kind].payload}", ()):
                 if time_ns is None or time_ns[0] <= timestamp_ns < time_ns[1]:
                     yield kind, payload
-
-    def _take(self, entity: str, batch: pa.RecordBatch) -> None:
-        times = [0] * batch.num_rows  # of what is static
-        if "time" in batch.schema.names:
-            times = batch.column("time").cast(pa.int64()).to_pylist()
-        numbers = [0] * batch.num_rows
-        if "number" in batch.schema.names:
-            numbers = [values[0].as_py() for values in batch.column("number")]
-        columns = (numbers, times, batch.column("payload"), batch.column("crc32"))
-        for number, timestamp_ns, payload, crc32 in zip(*columns, strict=True):
-            data = np.asarray(payload.values).astype(np.uint8, copy=False).tobytes()
-            if zlib.crc32(data) != crc32.values[0].as_py():
-                raise RecordingError(
-                    f"{self.path}: damaged: the checksum of a message in {entity} is wrong"
-                )
-            self._rows.setdefault(entity, []).append((number, timestamp_ns, data))
 
     def _read_header(self) -> RunHeader:
         parts = {
@@ -89,3 +67,47 @@ class RrdFile:
             raise RecordingError(f"{self.path}: {error}") from error
         except KeyError as error:
             raise RecordingError(f"{self.path}: lacks {error}, not a complete recording") from error
+
+
+def _read_apart(path: Path) -> Rows:
+    """Read in a process of its own: on some damaged files Rerun takes its process down."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        try:
+            return pool.submit(_read, path).result()
+        except BrokenProcessPool as error:
+            raise RecordingError(
+                f"{path}: damaged: Rerun's reader breaks down on it; replay the .mcap instead"
+            ) from error
+
+
+def _read(path: Path) -> Rows:
+    rows: Rows = {}
+    try:
+        for chunk in RrdReader(str(path)).stream():
+            entity = str(chunk.entity_path)
+            if entity.startswith("/messages/"):
+                rows.setdefault(entity, []).extend(_rows_of(chunk.to_record_batch()))
+    except (ValueError, RuntimeError, OSError, KeyError, TypeError, pa.ArrowException) as error:
+        raise RecordingError(
+            f"{path}: expected a whole recording (.rrd), but it can't be read: {error}"
+        ) from error
+    for entity, found in rows.items():
+        found.sort()
+        if [number for number, _, _ in found] != list(range(len(found))):
+            raise RecordingError(f"{path}: damaged: messages are missing in {entity}")
+    return rows
+
+
+def _rows_of(batch: pa.RecordBatch) -> Iterator[tuple[int, int, bytes]]:
+    """Numbers, times and encodings; those of the header, which is static, are 0."""
+    times, numbers = [0] * batch.num_rows, [0] * batch.num_rows
+    if "time" in batch.schema.names:
+        times = batch.column("time").cast(pa.int64()).to_pylist()
+    if "number" in batch.schema.names:
+        numbers = [values[0].as_py() for values in batch.column("number")]
+    columns = (numbers, times, batch.column("payload"), batch.column("crc32"))
+    for number, timestamp_ns, payload, crc32 in zip(*columns, strict=True):
+        data = np.asarray(payload.values).astype(np.uint8, copy=False).tobytes()
+        if zlib.crc32(data) != crc32.values[0].as_py():
+            raise ValueError("the checksum of a message is wrong")
+        yield number, timestamp_ns, data
