@@ -1,0 +1,201 @@
+"""The contour solver for backlogs: thousands of fits side by side, on a GPU where there is one."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from stream_dmr.body import Body
+from stream_dmr.errors import ConfigError
+from stream_dmr.fitting.batched.levenberg_marquardt import evaluate, minimise
+from stream_dmr.fitting.batched.model import Model
+from stream_dmr.fitting.batched.normal_equations import prior_loss
+from stream_dmr.fitting.batched.targets import Targets
+from stream_dmr.fitting.contour.levenberg_marquardt import SETTLED, STOP_REASONS, STUCK
+from stream_dmr.fitting.contour.solver import _FAR, _NEAR, _NUM_FINISHED, _ROUNDS, mirror
+from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.solver import Solution
+from stream_dmr.fitting.target import Target
+
+# Of the memory that fits may take at once: what caches like on a CPU, a share of what is free else.
+_BYTES_ON_CPU = 1 << 28
+_SHARE_OF_GPU = 0.25
+
+
+class Solutions(NamedTuple):
+    """`Solution` of each fit, on the device."""
+
+    flat: Float[Tensor, "B P"]
+    loss: Float[Tensor, "B"]
+    iou: Float[Tensor, "B"]
+    iterations: Int[Tensor, "B"]
+    stop: Int[Tensor, "B"]
+
+    def to_list(self) -> list[Solution]:
+        """One by one, in float64 on the CPU."""
+        flats = self.flat.double().cpu().numpy()
+        rest = (part.tolist() for part in self[1:])
+        return [
+            Solution(flat, loss, iou, used, stop in (SETTLED, STUCK), STOP_REASONS[stop])
+            for flat, loss, iou, used, stop in zip(flats, *rest, strict=True)
+        ]
+
+    def lower(self, other: "Solutions") -> "Solutions":
+        """Of each fit the one with the lower loss, this one where they are equal."""
+        is_theirs = other.loss < self.loss
+        return Solutions(
+            torch.where(is_theirs[:, None], other.flat, self.flat),
+            *(torch.where(is_theirs, b, a) for a, b in zip(self[1:], other[1:], strict=True)),
+        )
+
+
+class BatchedSolver:
+    """`ContourSolver` for batches; the search of a cold fit is one batch as well."""
+
+    def __init__(
+        self, body: Body, settings: FitMeshSettings, *, dtype: torch.dtype = torch.float32
+    ) -> None:
+        """Raises ConfigError where the settings name a device that is not there."""
+        if settings.device == "cuda" and not torch.cuda.is_available():
+            raise ConfigError(
+                "[fit_mesh]: expected a CUDA device and a CUDA build of torch for "
+                'device = "cuda", found none; set device = "cpu"'
+            )
+        self._settings = settings
+        self._kind = {"device": settings.device, "dtype": dtype}
+        self.model = Model.from_body(body, settings, **self._kind)
+        self._mirror = self.tensor(mirror(np.ones(len(self.model.rest))))
+        # The mesh's smoothness tells starts apart no better.
+        self._rough_lambdas = self.model.lambdas * self.tensor([1, 1, 1, 1, 0, 0])
+
+    def tensor(self, array: object) -> Tensor:
+        """On the solver's device, in its kind of float."""
+        return torch.as_tensor(array, **self._kind)
+
+    def refine(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
+        """From one start near the answer."""
+        targets = Targets.stack([target], **self._kind)
+        return self.refine_many(targets, self.tensor(start[None])).to_list()[0]
+
+    def search(self, target: Target, starts: Float[np.ndarray, "B P"]) -> Solution:
+        """From many starts, of which at least one leads to the answer."""
+        targets = Targets.stack([target], **self._kind)
+        return self.search_many(targets, self.tensor(starts[None])).to_list()[0]
+
+    @torch.no_grad()
+    def refine_many(self, targets: Targets, starts: Float[Tensor, "B P"]) -> Solutions:
+        """From one start of each target, and from its mirror image where that is more likely."""
+        return self._refined(targets, torch.arange(len(starts), device=starts.device), starts)
+
+    @torch.no_grad()
+    def search_many(self, targets: Targets, starts: Float[Tensor, "B S P"]) -> Solutions:
+        """From many starts of each target; see `ContourSolver.search`."""
+        coarse, every = targets.coarse(), torch.arange(len(starts), device=starts.device)
+        which = every[:, None].expand(starts.shape[:2])
+        losses = self._losses(coarse, which.flatten(), starts.flatten(0, 1)).view_as(which)
+        flats = _ordered(starts, losses)
+        best = self._refined(targets, every, flats[:, 0])
+        flats = flats[:, 1:]
+        for iterations, most in _ROUNDS:
+            flats = flats[:, :most]
+            rough = self._minimised(
+                coarse,
+                which[:, : flats.shape[1]].flatten(),
+                flats.flatten(0, 1),
+                self._rough_lambdas,
+                iterations=iterations,
+                damping=_FAR,
+            )
+            flats = _ordered(rough.flat.view_as(flats), rough.loss.view(flats.shape[:2]))
+        for column in range(min(_NUM_FINISHED, flats.shape[1])):
+            best = best.lower(self._refined(targets, every, flats[:, column]))
+        return best
+
+    def _refined(self, targets: Targets, which: Tensor, starts: Tensor) -> Solutions:
+        found = self._finished(targets, which, starts)
+        mirrored = found.flat * self._mirror
+        chosen = targets.select(which)
+        gain = prior_loss(self.model, chosen, found.flat) - prior_loss(self.model, chosen, mirrored)
+        index = torch.nonzero(gain >= self._settings.tolerance)[:, 0]
+        if len(index) == 0:
+            return found
+        other = self._finished(targets, which[index], mirrored[index])
+        other = Solutions(*(part[index] for part in found)).lower(other)
+        return Solutions(
+            *(old.index_copy(0, index, new) for old, new in zip(found, other, strict=True))
+        )
+
+    def _finished(self, targets: Targets, which: Tensor, starts: Tensor) -> Solutions:
+        most = self._settings.contour_iterations
+        return self._minimised(
+            targets, which, starts, self.model.lambdas, iterations=most, damping=_NEAR
+        )
+
+    def _minimised(
+        self,
+        targets: Targets,
+        which: Tensor,
+        starts: Tensor,
+        lambdas: Tensor,
+        *,
+        iterations: int,
+        damping: float,
+    ) -> Solutions:
+        """From starts, each with the index of its target."""
+        tolerance = self._settings.tolerance
+        parts = []
+        for some in self._chunks(targets, len(starts)):
+            state = minimise(
+                self.model,
+                targets.select(which[some]),
+                starts[some],
+                lambdas,
+                iterations=iterations,
+                tolerance=tolerance,
+                damping=damping,
+            )
+            parts.append((state.flat, state.loss, state.iou, state.iterations, state.stop))
+        return Solutions(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+    def _losses(self, targets: Targets, which: Tensor, flats: Tensor) -> Tensor:
+        parts = []
+        for some in self._chunks(targets, len(flats)):
+            chosen = targets.select(which[some])
+            found = evaluate(self.model, chosen, flats[some], self._rough_lambdas)
+            rough = found.terms @ self._rough_lambdas
+            parts.append(rough + prior_loss(self.model, chosen, flats[some]))
+        return torch.cat(parts)
+
+    def _chunks(self, targets: Targets, count: int) -> Iterator[slice]:
+        """As many fits at a time as memory allows."""
+        room = _BYTES_ON_CPU
+        if self._settings.device == "cuda":
+            room = int(_SHARE_OF_GPU * torch.cuda.mem_get_info()[0])
+        floats = most_floats(
+            self.model, size=targets.mask.shape[1], points=targets.contour.shape[1]
+        )
+        step = max(1, room // (floats * self.model.points.element_size()))
+        return (slice(first, first + step) for first in range(0, count, step))
+
+
+def most_floats(model: Model, *, size: int, points: int) -> int:
+    """About how many numbers one fit of `size` x `size` pixels holds at its fullest.
+
+    The rim has about as many edges as the contour has `points`; packing lengthens it by half.
+    """
+    rim, count = 3 * points // 2, len(model.rest)
+    pictures = 6 * size * size
+    pairs = 6 * points * rim
+    slopes = 12 * count * 2 * len(model.stations) + 12 * count * rim
+    rows = 6 * count * (rim + points)
+    mesh = 12 * (len(model.points) + 3 * len(model.faces))
+    return pictures + pairs + slopes + rows + mesh
+
+
+def _ordered(flats: Float[Tensor, "B S P"], losses: Float[Tensor, "B S"]) -> Float[Tensor, "B S P"]:
+    """The starts of each target by their loss."""
+    order = losses.argsort(dim=1, stable=True)
+    return flats.gather(1, order[..., None].expand_as(flats))
