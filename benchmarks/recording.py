@@ -30,12 +30,11 @@ EXACT = {"crops": "png", "meshes": "vertices"}
 CASES = {
     ".mcap only": {"rrd": False},
     "the default: .mcap, and .rrd with the messages": {},
-    "and crops as JPEG": {"crops": "jpeg"},
-    "and crops as PNG": {"crops": "png"},
+    "crops as JPEG too": {"crops": "jpeg"},
+    "or crops as PNG": {"crops": "png"},
     "and vertices and covariance": EXACT,
     "and every frame drawn": EXACT | {"view_rate_hz": 1000.0},
     "and frames as JPEG: everything": EXACT | {"view_rate_hz": 1000.0, "frames": "jpeg"},
-    "default, with foxglove topics": {"foxglove": True},
 }
 
 

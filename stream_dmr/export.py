@@ -11,14 +11,14 @@ import trimesh
 from jaxtyping import Bool
 
 from stream_dmr.camera import frame_from_crop
-from stream_dmr.errors import OutputError
 from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate, LocalizedFish, Message
 from stream_dmr.recording.codec import decode
 from stream_dmr.recording.meshes import Meshes
 from stream_dmr.recording.opened import Recording, open_recordings
 from stream_dmr.recording.record import make_record
-from stream_dmr.recording.view_geometry import place
 from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.view_geometry import place
+from stream_dmr.recording.whole_file import make_folder, writing_to
 from stream_dmr.tables import Tables
 
 MeshFormat = Literal["ply", "glb"]
@@ -38,9 +38,10 @@ def export_meshes(recording: Path, out: Path, *, format: MeshFormat) -> int:
         vertices = None if shape is None else place(shape, fish)[0]
         if vertices is None:
             continue
-        folder = _folder(out / f"fish-{fit.track_id}")
+        folder = make_folder(out / f"fish-{fit.track_id}")
         mesh = trimesh.Trimesh(vertices, template.faces, process=False)
-        mesh.export(folder / f"{fit.frame_index:06d}.{format}")
+        with writing_to(folder):
+            mesh.export(folder / f"{fit.frame_index:06d}.{format}")
         count += 1
     return count
 
@@ -64,14 +65,15 @@ def export_masks(recording: Path, path: Path) -> int:
         annotations.append(_annotation(crop, mask, number=len(annotations) + 1))
     categories = [{"id": 1, "name": "fish"}]
     coco = {"images": [*images.values()], "annotations": annotations, "categories": categories}
-    _folder(path.parent)
-    path.write_text(json.dumps(coco))
+    make_folder(path.parent)
+    with writing_to(path):
+        path.write_text(json.dumps(coco))
     return len(annotations)
 
 
 def export_tables(recording: Path, out: Path, *, format: TableFormat) -> list[Path]:
     """Write lengths and frames (keypoints, one row a fish and frame) into `out`, as `run` does."""
-    tables = Tables(_folder(out))
+    tables = Tables(make_folder(out))
     for message in _messages(open_recordings([recording]), LocalizedFish, LengthEstimate):
         tables.write(make_record(message, RecordingSettings()))
     tables.close()
@@ -157,14 +159,4 @@ def _as_parquet(table: Path) -> Path:
     path = table.with_suffix(".parquet")
     parquet.write_table(csv.read_csv(table), path)
     table.unlink()
-    return path
-
-
-def _folder(path: Path) -> Path:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"{path}: expected a folder to write to, got: {error.strerror}; choose another --out"
-        ) from error
     return path

@@ -212,7 +212,9 @@ def test_every_sink_is_closed_where_one_fails(tmp_path: Path, messages: list[Mes
 
 def test_a_folder_that_cannot_be_made_is_refused_in_one_line(tmp_path: Path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match=r"expected a folder.*choose another --out") as refusal:
+    with pytest.raises(
+        OutputError, match=r"expected a place to write to.*choose another"
+    ) as refusal:
         Recorder(tmp_path / "file" / "out", header(), EXACT)
     assert "\n" not in str(refusal.value)
 

@@ -27,8 +27,8 @@ from stream_dmr.recording.pictures import checksum
 from stream_dmr.recording.reader import read_header, read_messages
 from stream_dmr.recording.record import make_record
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.recording.view_geometry import halved, view_factor
 from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.view_geometry import halved, view_factor
 
 sizes = st.integers(1, 40)
 

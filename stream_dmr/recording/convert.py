@@ -14,6 +14,7 @@ from stream_dmr.recording.rerun_sink import RerunSink
 from stream_dmr.recording.restored import Pictures
 from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.recording.topics import TOPICS
+from stream_dmr.recording.whole_file import writing_to
 
 EVERY_FRAME = RecordingSettings(view_rate_hz=1000.0)
 
@@ -44,4 +45,5 @@ def convert(
             elif isinstance(message, FittedMesh):
                 whole = meshes.with_vertices(message)
             sink.write(Record(message=message, whole=whole, encoding=partial(bytes, payload)))
-    part.replace(rrd)
+    with writing_to(rrd):
+        part.replace(rrd)

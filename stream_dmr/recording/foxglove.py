@@ -29,7 +29,7 @@ from stream_dmr.recording.topics import FOXGLOVE_TOPICS
 from stream_dmr.recording.view_geometry import halved, outlines, place, view_factor
 
 _CAMERA, _PLANE = "camera", "plane"
-_JPEG_QUALITY = 75
+_JPEG_QUALITY = 70
 _LIFETIME_NS = 2_000_000_000  # of a fish that is seen no more
 _M_PER_MM = 1e-3
 _OPACITY = 0.7

@@ -7,7 +7,7 @@ from threading import Lock, Thread
 from types import TracebackType
 from typing import Protocol, runtime_checkable
 
-from stream_dmr.errors import ConfigError, OutputError
+from stream_dmr.errors import ConfigError
 from stream_dmr.messages import Message
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.live import LiveView
@@ -16,6 +16,7 @@ from stream_dmr.recording.record import Record, make_record
 from stream_dmr.recording.rerun_sink import NAME as RRD_NAME
 from stream_dmr.recording.rerun_sink import RerunSink
 from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.whole_file import make_folder
 from stream_dmr.tables import Tables
 
 _QUEUE_MESSAGES = 64  # some 6 frames; where the disk can't keep up, the run waits: nothing is lost
@@ -54,7 +55,7 @@ class Recorder:
         self._lock = Lock()
         self._queue: Queue[Record | None] = Queue(_QUEUE_MESSAGES)
         self._thread = Thread(target=self._write_all, name="recorder", daemon=True)
-        _make_folder(out_dir)
+        make_folder(out_dir)
         with ExitStack() as undo:
             undo.callback(self._close_sinks)
             self._sinks.append(Tables(out_dir))
@@ -151,12 +152,3 @@ def _foxglove(header: RunHeader, settings: RecordingSettings) -> ExtraTopics:
             f"{error.name}; install it with: pip install foxglove-schemas-protobuf"
         ) from error
     return FoxgloveView(header, settings)
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: expected a folder to write to, got: {error.strerror}; choose another --out"
-        ) from error

@@ -37,7 +37,7 @@ from stream_dmr.recording.showing import Pace, Waiting
 from stream_dmr.recording.view_geometry import fill, halved, outlines, place, shades, view_factor
 
 _HALF_PIXEL = 0.5  # Rerun counts pixels from the corner of the top-left one, we from its centre
-_JPEG_QUALITY = 75
+_JPEG_QUALITY = 70
 
 
 class Drawing:

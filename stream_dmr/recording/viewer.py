@@ -17,6 +17,7 @@ from tempfile import TemporaryDirectory
 from rerun.experimental import ViewerClient
 
 from stream_dmr.errors import RecordingError
+from stream_dmr.recording.whole_file import writing_to
 
 WEB_MEMORY = "512MiB"  # of the server; what is older is dropped
 _VIEWER_MEMORY = "4GiB"
@@ -56,7 +57,8 @@ def screenshot(rrd: str, png: Path, *, frame_index: int) -> None:
     with _headless() as viewer:
         viewer.open([rrd])
         _go_to(viewer, frame_index)
-        png.write_bytes(_settled_picture(viewer))
+        with writing_to(png):
+            png.write_bytes(_settled_picture(viewer))
 
 
 @contextmanager

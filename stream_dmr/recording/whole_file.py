@@ -1,7 +1,11 @@
 """A file in which every write happens completely or not at all."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from stream_dmr.errors import OutputError
 
 
 class WholeFile:
@@ -57,3 +61,21 @@ def rename_durably(path: Path, target: Path) -> None:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+@contextmanager
+def writing_to(path: Path) -> Iterator[None]:
+    """Turn what the system refuses while writing to `path` into an OutputError."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(
+            f"{path}: expected a place to write to, got: {error.strerror}; choose another"
+        ) from error
+
+
+def make_folder(path: Path) -> Path:
+    """Make a folder where there is none; OutputError where that can't be."""
+    with writing_to(path):
+        path.mkdir(parents=True, exist_ok=True)
+    return path
