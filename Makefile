@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-slow bench check format config clean
+.PHONY: demo test test-slow bench check format golden config clean
 
 demo: $(STAMP)  ## the main job on the embedded scene, lengths beside the truth
 	$(BIN)/python -m stream_dmr.demo
@@ -28,6 +28,9 @@ check: $(STAMP)  ## style and types
 format: $(STAMP)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+golden: $(STAMP)  ## recordings/golden anew, after saying what moved
+	$(BIN)/python recordings/make_golden.py
 
 config: $(STAMP)  ## config.toml anew from the settings classes
 	$(BIN)/python -m stream_dmr.config > config.toml.new

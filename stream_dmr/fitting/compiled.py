@@ -31,8 +31,10 @@ def _cache_folder() -> Path:
     that it calls, in another file, has changed.
     """
     here = Path(__file__).parent
-    sources = [*sorted(here.rglob("*.py")), here.parent / "body.py"]
-    version = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
+    texts = [path.read_bytes() for path in sorted(here.rglob("*.py"))]
+    sources = [text for text in texts if b"compiled" in text]
+    sources.append((here.parent / "body.py").read_bytes())
+    version = hashlib.sha256(b"".join(sources)).hexdigest()[:16]
     if os.access(here, os.W_OK):
         return here / "__pycache__" / f"compiled-{version}"
     return Path(tempfile.gettempdir()) / f"stream-dmr-{os.getuid()}" / f"compiled-{version}"

@@ -3,13 +3,14 @@
 import platform
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 from stream_dmr import __version__
 from stream_dmr.camera import Calibration
 from stream_dmr.recording.codec import CODEC_VERSION, decode, encode
 from stream_dmr.template import Template
 
-_LIBRARIES = ("numpy", "opencv-python-headless", "torch", "scipy", "mcap", "rerun-sdk")
+_LIBRARIES = ("numpy", "opencv-python-headless", "torch", "scipy", "numba", "mcap", "rerun-sdk")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -31,7 +32,8 @@ class RunHeader:
             "codec_version": str(CODEC_VERSION),
             "stream_dmr": __version__,
             "python": platform.python_version(),
-            "platform": platform.platform(),
+            "platform": f"{platform.system()} {platform.machine()} {' '.join(platform.libc_ver())}",
+            "cpu": _cpu(),
             **{name: _version(name) for name in _LIBRARIES},
         }
 
@@ -55,6 +57,16 @@ class RunHeader:
             calibration=None if calibration is None else decode(Calibration, calibration),
             calibration_file=attachments.get("calibration.yaml", b""),
         )
+
+
+def _cpu() -> str:
+    """The processor: another one may round the last bits of sines and sums otherwise."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or platform.machine()
 
 
 def _version(library: str) -> str:

@@ -42,6 +42,7 @@ class McapFile:
         """Raises RecordingError where not even the header can be read."""
         self.path = path
         self.warnings: list[str] = []
+        self.metadata: dict[str, str] = {}
         self.header = self._read_header()
 
     def payloads(
@@ -95,7 +96,6 @@ class McapFile:
             self.warnings.append(line)
 
     def _read_header(self) -> RunHeader:
-        metadata: dict[str, str] = {}
         attachments: dict[str, bytes] = {}
         with self._open() as stream:
             try:
@@ -103,14 +103,14 @@ class McapFile:
                     if isinstance(record, Chunk):
                         break
                     if isinstance(record, Metadata) and record.name == "run":
-                        metadata = record.metadata
-                        check_version(int(metadata["codec_version"]))
+                        self.metadata = record.metadata
+                        check_version(int(self.metadata["codec_version"]))
                     elif isinstance(record, Attachment):
                         attachments[record.name] = record.data
             except _CUT_OFF:
                 pass
             try:
-                return RunHeader.from_parts(metadata, attachments)
+                return RunHeader.from_parts(self.metadata, attachments)
             except KeyError as error:
                 raise RecordingError(
                     f"expected a recording of stream-dmr, but it lacks {error}; it ends too early "

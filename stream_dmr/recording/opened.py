@@ -18,6 +18,7 @@ class Recording(Protocol):
     """What a run left."""
 
     header: RunHeader
+    metadata: dict[str, str]  # who recorded it, with which versions
 
     @property
     def warnings(self) -> Sequence[str]:
@@ -60,7 +61,7 @@ class _Row:
 
     def __init__(self, files: Sequence[Path], parts: Sequence[Recording]) -> None:
         self._parts = parts
-        self.header = parts[0].header
+        self.header, self.metadata = parts[0].header, parts[0].metadata
         for file, part in zip(files, parts, strict=True):
             if part.header.attachments() != self.header.attachments():
                 raise RecordingError(

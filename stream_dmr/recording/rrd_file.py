@@ -59,10 +59,10 @@ class RrdFile:
                 f"{self.path}: expected a recording that carries its messages, got only the view; "
                 "replay the .mcap, or record with rrd_messages = true"
             )
-        metadata = json.loads(parts.pop("run.json"))
+        self.metadata: dict[str, str] = json.loads(parts.pop("run.json"))
         try:
-            check_version(int(metadata["codec_version"]))
-            return RunHeader.from_parts(metadata, parts)
+            check_version(int(self.metadata["codec_version"]))
+            return RunHeader.from_parts(self.metadata, parts)
         except RecordingError as error:
             raise RecordingError(f"{self.path}: {error}") from error
         except KeyError as error:

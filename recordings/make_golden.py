@@ -1,0 +1,53 @@
+"""Makes recordings/golden: a run of the demo's first fish that every change is replayed against.
+
+    make golden
+
+An intended change of numbers is a reviewed change of this folder; what moved is printed.
+"""
+
+import shutil
+import sys
+import tempfile
+import threading
+from pathlib import Path
+
+from stream_dmr.replay.replay import ReplayRequest, replay
+from stream_dmr.run import RunRequest, run
+
+HERE = Path(__file__).parent
+GOLDEN = HERE / "golden"
+
+
+def main() -> None:
+    """Say what moved since the last time, then replace it."""
+    if (GOLDEN / "recording.mcap").exists():
+        _print_moved()
+    demo = HERE / "demo"
+    with tempfile.TemporaryDirectory() as folder:
+        request = RunRequest(
+            source=str(demo / "video.mp4"),
+            boxes=demo / "boxes.txt",
+            masks=demo / "masks",
+            calibration=demo / "calibration.yaml",
+            out=Path(folder) / "out",
+            command="make golden",
+        )
+        run(request, stop=threading.Event())
+        GOLDEN.mkdir(exist_ok=True)
+        for name in ("recording.mcap", "lengths.csv"):
+            shutil.copy(request.out / name, GOLDEN / name)
+
+
+def _print_moved() -> None:
+    request = ReplayRequest(recordings=[GOLDEN / "recording.mcap"], check=True)
+    moved = replay(request, stop=threading.Event()).mismatches
+    kinds = sorted({item.kind for item in moved})
+    print(f"{len(moved)} fields moved: {', '.join(kinds) or 'none'}", file=sys.stderr)
+    for item in moved:
+        if item.difference.field in ("length_mm", "status"):
+            field, was, now = item.difference
+            print(f"  frame {item.frame_index}, fish {item.track_id}, {field}: {was} -> {now}")
+
+
+if __name__ == "__main__":
+    main()
