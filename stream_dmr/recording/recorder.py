@@ -77,6 +77,8 @@ class Recorder:
         exactly. With a lossy picture setting its pixels are those that the recording holds, and
         what is not recorded it lacks; only a frame by reference keeps its pixels.
         """
+        if not self._thread.is_alive():
+            raise ValueError("the recorder is closed")
         record = make_record(message, self._settings)
         self.put(record)
         return record.message
