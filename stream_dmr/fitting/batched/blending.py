@@ -43,13 +43,15 @@ def blend(
     return Blend(weights, -y[..., _ROWS] * u[..., _COLUMNS] * inner, firsts, weights @ firsts)
 
 
-def weighted_slope(at: Blend, own: Float[Tensor, "B X J K"], mean: Float[Tensor, "B X K"]):
+def weighted_slope(
+    at: Blend, own: Float[Tensor, "B X J K"], mean: Float[Tensor, "B X K"]
+) -> Float[Tensor, "B X K J 6"]:
     """Slope of a blend `mean` of the joints' `own` to the factors of Q, (B, X, K, J, 6)."""
     pulls = at.weights[..., None] * (own - mean[:, :, None])
     return pulls.transpose(2, 3)[..., None] * at.exponent_slopes[:, :, None]
 
 
-def blend_slope(at: Blend) -> Float[Tensor, "B X 7 J*13"]:
+def blend_slope(at: Blend) -> Float[Tensor, "B X 7 Q"]:
     """Slope of the seven blended numbers to all the joints' parameters."""
     num_fits, num_places, num_joints = at.weights.shape
     own = at.values[:, None].expand(-1, num_places, -1, -1)

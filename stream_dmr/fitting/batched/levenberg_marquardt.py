@@ -12,11 +12,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stream_dmr.fitting.batched import normal_equations as equations
-from stream_dmr.fitting.batched.linear_blend import LinearBlend
+from stream_dmr.fitting.batched.deformation import Body, deform
 from stream_dmr.fitting.batched.model import Model
 from stream_dmr.fitting.batched.outline import Rim, coverage, overlap, project, rim_edges
 from stream_dmr.fitting.batched.smoothness import Smoothness, smoothness
-from stream_dmr.fitting.batched.spine import Spine
 from stream_dmr.fitting.batched.targets import Targets
 from stream_dmr.fitting.contour.levenberg_marquardt import (
     _GROWTH,
@@ -28,7 +27,6 @@ from stream_dmr.fitting.contour.levenberg_marquardt import (
 )
 
 _RUNNING = -1
-_DEFORMATIONS = {"spine": Spine, "linear-blend": LinearBlend}
 
 
 class Evaluation(NamedTuple):
@@ -36,7 +34,7 @@ class Evaluation(NamedTuple):
 
     terms: Float[Tensor, "B 6"]
     iou: Float[Tensor, "B"]
-    body: Spine | LinearBlend
+    body: Body
     smooth: Smoothness
     pixels: Float[Tensor, "B V 2"]
     rim: Rim
@@ -66,7 +64,7 @@ def evaluate(
     model: Model, targets: Targets, flat: Float[Tensor, "B P"], lambdas: Float[Tensor, "6"]
 ) -> Evaluation:
     """One iterate of each fit; the lambdas only weight the slopes of `smooth`."""
-    body = _DEFORMATIONS[model.deformation](model, flat)
+    body = deform(model, flat)
     vertices = body.points[:, : model.num_vertices]
     pixels = project(vertices, targets)
     rim = rim_edges(pixels, model)

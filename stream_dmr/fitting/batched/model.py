@@ -25,7 +25,7 @@ class Model(NamedTuple):
     segments: Int[Tensor, "U"]
     fractions: Float[Tensor, "U"]
     joints: Float[Tensor, "J 3"]
-    steps: Float[Tensor, "M-1 3"]  # of the midline
+    steps: Float[Tensor, "L 3"]  # of the midline, segment by segment
     faces: Int[Tensor, "F 3"]
     edges: Int[Tensor, "E 2"]
     edge_faces: Int[Tensor, "E 2"]
@@ -76,3 +76,9 @@ class Model(NamedTuple):
     def joint_values(self, flat: Float[Tensor, "B P"]) -> Float[Tensor, "B J 13"]:
         """The parameters of the joints, of each joint a row."""
         return flat[:, ROOT:].unflatten(1, (-1, JOINT))
+
+    def double(self) -> "Model":
+        """In float64."""
+        parts = self._asdict().items()
+        real = {k: v.double() for k, v in parts if isinstance(v, Tensor) and v.is_floating_point()}
+        return self._replace(**real)

@@ -1,11 +1,10 @@
 """The contour solver for backlogs: thousands of fits side by side, on a GPU where there is one."""
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from stream_dmr.body import Body
@@ -13,43 +12,17 @@ from stream_dmr.errors import ConfigError
 from stream_dmr.fitting.batched.levenberg_marquardt import evaluate, minimise
 from stream_dmr.fitting.batched.model import Model
 from stream_dmr.fitting.batched.normal_equations import prior_loss
+from stream_dmr.fitting.batched.solutions import Solutions
 from stream_dmr.fitting.batched.targets import Targets
-from stream_dmr.fitting.contour.levenberg_marquardt import SETTLED, STOP_REASONS, STUCK
 from stream_dmr.fitting.contour.solver import _FAR, _NEAR, _NUM_FINISHED, _ROUNDS, mirror
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution
 from stream_dmr.fitting.target import Target
+from stream_dmr.messages import FishCrop
 
 # Of the memory that fits may take at once: what caches like on a CPU, a share of what is free else.
 _BYTES_ON_CPU = 1 << 28
 _SHARE_OF_GPU = 0.25
-
-
-class Solutions(NamedTuple):
-    """`Solution` of each fit, on the device."""
-
-    flat: Float[Tensor, "B P"]
-    loss: Float[Tensor, "B"]
-    iou: Float[Tensor, "B"]
-    iterations: Int[Tensor, "B"]
-    stop: Int[Tensor, "B"]
-
-    def to_list(self) -> list[Solution]:
-        """One by one, in float64 on the CPU."""
-        flats = self.flat.double().cpu().numpy()
-        rest = (part.tolist() for part in self[1:])
-        return [
-            Solution(flat, loss, iou, used, stop in (SETTLED, STUCK), STOP_REASONS[stop])
-            for flat, loss, iou, used, stop in zip(flats, *rest, strict=True)
-        ]
-
-    def lower(self, other: "Solutions") -> "Solutions":
-        """Of each fit the one with the lower loss, this one where they are equal."""
-        is_theirs = other.loss < self.loss
-        return Solutions(
-            torch.where(is_theirs[:, None], other.flat, self.flat),
-            *(torch.where(is_theirs, b, a) for a, b in zip(self[1:], other[1:], strict=True)),
-        )
 
 
 class BatchedSolver:
@@ -71,9 +44,20 @@ class BatchedSolver:
         # The mesh's smoothness tells starts apart no better.
         self._rough_lambdas = self.model.lambdas * self.tensor([1, 1, 1, 1, 0, 0])
 
+    @property
+    def dtype(self) -> torch.dtype:
+        """The kind of float in which fits are made."""
+        return self.model.rest.dtype
+
     def tensor(self, array: object) -> Tensor:
         """On the solver's device, in its kind of float."""
         return torch.as_tensor(array, **self._kind)
+
+    def prepare(
+        self, crops: Sequence[FishCrop], *, plane_normal: Float[np.ndarray, "3"]
+    ) -> Targets:
+        """Masks of one size as `refine_many` and `search_many` take them."""
+        return Targets.from_crops(crops, plane_normal=plane_normal, **self._kind)
 
     def refine(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
         """From one start near the answer."""
@@ -123,10 +107,7 @@ class BatchedSolver:
         if len(index) == 0:
             return found
         other = self._finished(targets, which[index], mirrored[index])
-        other = Solutions(*(part[index] for part in found)).lower(other)
-        return Solutions(
-            *(old.index_copy(0, index, new) for old, new in zip(found, other, strict=True))
-        )
+        return found.replaced(index, found.select(index).lower(other))
 
     def _finished(self, targets: Targets, which: Tensor, starts: Tensor) -> Solutions:
         most = self._settings.contour_iterations
@@ -147,7 +128,7 @@ class BatchedSolver:
         """From starts, each with the index of its target."""
         tolerance = self._settings.tolerance
         parts = []
-        for some in self._chunks(targets, len(starts)):
+        for some in self.chunks(targets, len(starts)):
             state = minimise(
                 self.model,
                 targets.select(which[some]),
@@ -162,22 +143,21 @@ class BatchedSolver:
 
     def _losses(self, targets: Targets, which: Tensor, flats: Tensor) -> Tensor:
         parts = []
-        for some in self._chunks(targets, len(flats)):
+        for some in self.chunks(targets, len(flats)):
             chosen = targets.select(which[some])
             found = evaluate(self.model, chosen, flats[some], self._rough_lambdas)
             rough = found.terms @ self._rough_lambdas
             parts.append(rough + prior_loss(self.model, chosen, flats[some]))
         return torch.cat(parts)
 
-    def _chunks(self, targets: Targets, count: int) -> Iterator[slice]:
-        """As many fits at a time as memory allows."""
+    def chunks(self, targets: Targets, count: int) -> Iterator[slice]:
+        """As many fits at a time as memory allows, in float64 even."""
         room = _BYTES_ON_CPU
         if self._settings.device == "cuda":
             room = int(_SHARE_OF_GPU * torch.cuda.mem_get_info()[0])
-        floats = most_floats(
-            self.model, size=targets.mask.shape[1], points=targets.contour.shape[1]
-        )
-        step = max(1, room // (floats * self.model.points.element_size()))
+        size, points = targets.mask.shape[1], targets.contour.shape[1]
+        floats = most_floats(self.model, size=size, points=points)
+        step = max(1, room // (8 * floats))
         return (slice(first, first + step) for first in range(0, count, step))
 
 

@@ -44,7 +44,7 @@ class Spine:
         )
         return torch.cat([bases[:, :, None], turn[:, :num_places]], dim=2)
 
-    def _swept(self, steps: Float[Tensor, "B M-1 *K"]) -> Float[Tensor, "B U *K"]:
+    def _swept(self, steps: Float[Tensor, "B L *K"]) -> Float[Tensor, "B U *K"]:
         """Sums of steps of the midline up to each place, from the center; slopes add up alike."""
         model = self._model
         nodes = torch.cat([torch.zeros_like(steps[:, :1]), steps.cumsum(dim=1)], dim=1)
@@ -92,7 +92,7 @@ class SpineSlopes:
         root_slope: Float[Tensor, "B 3 3 3"],
         local: Float[Tensor, "B N 3"],
         moved: Float[Tensor, "B N 3"],
-        place_slopes: Float[Tensor, "B U 12 J*13"],
+        place_slopes: Float[Tensor, "B U 12 Q"],
     ) -> None:
         self._model, self._size = model, size
         self._root, self._root_slope = root, root_slope

@@ -90,9 +90,13 @@ class Targets(NamedTuple):
             contour_lengths=self.contour_lengths[:, ::2],
         )
 
-    def select(self, index: Int[Tensor, "K"]) -> "Targets":
+    def select(self, index: Int[Tensor, "K"] | slice) -> "Targets":
         """Some of them, in a new order."""
         return Targets(*(part[index] for part in self))
+
+    def double(self) -> "Targets":
+        """In float64."""
+        return Targets(*(part.double() for part in self))
 
 
 def _padded(contours: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> dict[str, np.ndarray]:

@@ -1,0 +1,165 @@
+"""The batched descent and search against the compiled ones, and a backlog of crops."""
+
+import numpy as np
+import pytest
+import torch
+from batches import (
+    BODIES,
+    PLANE_NORMAL,
+    TEMPLATES,
+    crops_of_poses,
+    every_device,
+    moved,
+    targets_of,
+)
+
+from stream_dmr.errors import ConfigError
+from stream_dmr.fitting.batched.fitter import BatchedFitter
+from stream_dmr.fitting.batched.solver import BatchedSolver
+from stream_dmr.fitting.batched.targets import Targets
+from stream_dmr.fitting.cold_start import cold_starts
+from stream_dmr.fitting.contour.deformation import KINDS
+from stream_dmr.fitting.contour.solver import ContourSolver
+from stream_dmr.fitting.fit import Fitter
+from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.solver import Solver
+
+BODY, HALIBUT = BODIES["halibut"], TEMPLATES["halibut"]
+
+
+def solver_on(device, *, dtype=torch.float64, **settings):
+    return BatchedSolver(BODY, FitMeshSettings(device=device, **settings), dtype=dtype)
+
+
+def warm_fits(seed, *, batch=6, size=1.0):
+    """Targets as the CPU has them, and starts some pixels off."""
+    crops, flats = crops_of_poses("halibut", seed, batch=batch)
+    return targets_of(crops, "cpu")[0], moved(flats, seed, size=size)
+
+
+def refined(solver, targets, starts):
+    stacked = Targets.stack(targets, device=str(solver.model.rest.device), dtype=solver.dtype)
+    return solver.refine_many(stacked, solver.tensor(starts)).to_list()
+
+
+@every_device
+class TestRefine:
+    @pytest.mark.parametrize("kind", KINDS)
+    @pytest.mark.parametrize("size", [1.0, 3.0])
+    def test_goes_the_way_of_the_compiled_solver(self, device, kind, size):
+        targets, starts = warm_fits(1, size=size)
+        solver = solver_on(device, deformation=kind)
+        compiled = ContourSolver(BODY, FitMeshSettings(deformation=kind))
+        expected = [compiled.refine(*job) for job in zip(targets, starts, strict=True)]
+        found = refined(solver, targets, starts)
+        gaps = np.array([abs(a.loss - b.loss) for a, b in zip(found, expected, strict=True)])
+        # The last bit decides ties between edges of the rim, and may lead one elsewhere.
+        assert (gaps < 1e-6).sum() >= len(gaps) - 1
+        assert gaps.max() < FitMeshSettings().tolerance
+        for one, other, gap in zip(found, expected, gaps, strict=True):
+            if gap < 1e-6:
+                assert one.iou == pytest.approx(other.iou, abs=1e-4)
+                assert one[3:] == other[3:]
+
+    def test_of_one_is_that_of_the_batch(self, device):
+        """Fits end at different times and are packed together: none may take another's place."""
+        targets, starts = warm_fits(2, batch=12, size=2.0)
+        solver = solver_on(device)
+        together = refined(solver, targets, starts)
+        assert len({one.iterations for one in together}) > 3
+        for found, target, start in zip(together, targets, starts, strict=True):
+            alone = solver.refine(target, start)
+            assert found.loss == pytest.approx(alone.loss, abs=1e-9)
+            assert found[3:] == alone[3:]
+
+    def test_in_single_precision_ends_as_low(self, device):
+        targets, starts = warm_fits(3, batch=24)
+        exact = refined(solver_on(device), targets, starts)
+        found = refined(solver_on(device, dtype=torch.float32), targets, starts)
+        gaps = np.array([a.loss - b.loss for a, b in zip(found, exact, strict=True)])
+        assert np.median(np.abs(gaps)) < 1e-5
+        # A step that is refused in the one and taken in the other leads elsewhere, both ways.
+        assert gaps.max() < 2e-3
+
+    def test_a_hopeless_fit_leaves_the_others_alone(self, device):
+        targets, starts = warm_fits(4, batch=3)
+        expected = refined(solver_on(device), targets, starts)
+        wild = np.concatenate([starts[:1]] * 4)
+        wild[0, 7], wild[1, 5], wild[2, 3], wild[3, 5] = np.nan, 50.0, 40.0, -40.0
+        found = refined(
+            solver_on(device), targets + targets[:1] * 4, np.concatenate([starts, wild])
+        )
+        for one, other in zip(found, expected, strict=False):
+            assert one.loss == pytest.approx(other.loss, abs=1e-9)
+        assert np.isnan(found[3].loss)
+
+
+@every_device
+def test_search_ends_where_the_compiled_one_does(device):
+    crops, _ = crops_of_poses("halibut", 7, batch=3)
+    targets, _ = targets_of(crops, "cpu")
+    starts = np.stack([cold_starts(target, HALIBUT) for target in targets])
+    solver, compiled = solver_on(device), ContourSolver(BODY, FitMeshSettings())
+    stacked = Targets.stack(targets, device=device, dtype=solver.dtype)
+    together = solver.search_many(stacked, solver.tensor(starts)).to_list()
+    for found, target, some in zip(together, targets, starts, strict=True):
+        assert found.loss == pytest.approx(compiled.search(target, some).loss, abs=1e-5)
+        assert found.iou > 0.97
+
+
+@every_device
+def test_is_a_solver_like_the_others(device):
+    solver, (targets, starts) = solver_on(device), warm_fits(8, batch=1)
+    assert isinstance(solver, Solver)
+    found = solver.search(targets[0], cold_starts(targets[0], HALIBUT))
+    assert found.loss == pytest.approx(solver.refine(targets[0], starts[0]).loss, abs=1e-3)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_device_that_is_not_there_is_refused():
+    with pytest.raises(ConfigError, match="expected a CUDA device"):
+        solver_on("cuda")
+
+
+@every_device
+class TestFitter:
+    def test_fits_a_backlog_as_the_fitter_fits_one_by_one(self, device):
+        crops, flats = crops_of_poses("halibut", 9, batch=4)
+        larger, more = crops_of_poses("halibut", 10, batch=1, size=128)
+        crops, starts = [*crops[:2], *larger, *crops[2:]], moved(np.insert(flats, 2, more, 0), 9)
+        # One that is warm and good, one cold, one whose warm start leads nowhere.
+        warms = [starts[0], None, starts[2], starts[3] + [*[0] * 5, 3.0, *[0] * 26], starts[4]]
+        settings = FitMeshSettings()
+        fitter = Fitter(HALIBUT, settings, plane_normal=PLANE_NORMAL)
+        backlog = BatchedFitter(
+            HALIBUT, solver_on(device), settings, plane_normal=PLANE_NORMAL, clear_gain=0.01
+        )
+        found = backlog.fit(crops, warms)
+        assert [one.is_cold for one in found] == [False, True, False, True, False]
+        for one, crop, warm in zip(found, crops, warms, strict=True):
+            expected = fitter.fit(crop, warm)
+            assert expected.report.cold_start == one.is_cold
+            self.check_alike(one, expected)
+
+    @staticmethod
+    def check_alike(found, expected):
+        shape, other = found.shape, expected.shape
+        assert found.solution.iou == pytest.approx(shape.iou, abs=1e-9)
+        assert found.solution.iterations == expected.report.iterations
+        assert shape.iou == pytest.approx(other.iou, abs=1e-3)
+        assert shape.length_std_ratio == pytest.approx(other.length_std_ratio, rel=1e-2)
+        for name in ("parameters", "vertices", "keypoints", "midline", "covariance"):
+            np.testing.assert_allclose(
+                getattr(shape, name), getattr(other, name), rtol=1e-2, atol=1e-3, err_msg=name
+            )
+        np.testing.assert_allclose(shape.keypoints_px, other.keypoints_px, atol=0.05)
+
+    def test_no_crops_give_no_fits(self, device):
+        backlog = BatchedFitter(
+            HALIBUT,
+            solver_on(device),
+            FitMeshSettings(),
+            plane_normal=PLANE_NORMAL,
+            clear_gain=0.01,
+        )
+        assert backlog.fit([], []) == []
