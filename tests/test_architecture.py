@@ -19,7 +19,13 @@ ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted([*(ROOT / "stream_dmr").rglob("*.py"), *(ROOT / "nodes").rglob("*.py")])
 NODES = [CropFish, FitMesh, Localize, SmoothLength]
 # Who assembles and shows a run; everything else is the library, and knows no nodes.
-ASSEMBLY = ["stream_dmr.run", "stream_dmr.display", "stream_dmr.cli", "stream_dmr.demo"]
+ASSEMBLY = [
+    "stream_dmr.run",
+    "stream_dmr.display",
+    "stream_dmr.cli",
+    "stream_dmr.demo",
+    "stream_dmr.replay.replay",
+]
 # From the ground floor up; a module imports from its own floor and those below.
 FLOORS = [
     ["stream_dmr", "stream_dmr.errors", "stream_dmr.settings", "stream_dmr.geometry"],
@@ -29,7 +35,9 @@ FLOORS = [
     ["stream_dmr.config", "stream_dmr.pipeline"],
     ["nodes"],
     ["stream_dmr.run"],
+    ["stream_dmr.replay.replay"],
     ["stream_dmr.display"],
+    ["stream_dmr.cli_replay"],
     ["stream_dmr.cli"],
     ["stream_dmr.demo"],
 ]
@@ -50,7 +58,7 @@ WHO_KNOWS = {
     "nodes": [*ASSEMBLY, "nodes"],
     "typer": [
         *("stream_dmr.cli", "stream_dmr.cli_calibrate", "stream_dmr.cli_export"),
-        *("stream_dmr.cli_view", "stream_dmr.demo"),
+        *("stream_dmr.cli_replay", "stream_dmr.cli_view", "stream_dmr.demo"),
     ],
 }
 
