@@ -37,7 +37,7 @@ def markdown(results: Results) -> str:
     """All tables."""
     sections = [
         _machine(results),
-        "### Against the issue's targets\n\n" + _goals(results),
+        "### Against what we set out to reach\n\n" + _goals(results),
         "### Time to IoU 0.97\n\n" + _race(results.laps),
         "### Warm fit\n\n" + _warm(results),
         "### Cold fit of bodies that the template can match exactly\n\n" + _cold(results.cold),
