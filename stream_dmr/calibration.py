@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.errors import CalibrationError, OutputError
@@ -41,7 +42,7 @@ def load_calibration(path: Path | str) -> Calibration:
         K=_array(values, "camera_matrix", shapes=[(3, 3)], path=path),
         distortion=_array(values, "distortion_coefficients", shapes=_DISTORTION_SHAPES, path=path),
     )
-    rotation, _ = cv2.Rodrigues(_array(values, "rvec", shapes=[(3,)], path=path))
+    rotation = Rotation.from_rotvec(_array(values, "rvec", shapes=[(3,)], path=path)).as_matrix()
     plane = ReferencePlane(
         rotation=rotation, translation_mm=_array(values, "tvec", shapes=[(3,)], path=path)
     )
@@ -58,7 +59,8 @@ def save_calibration(path: Path | str, calibration: Calibration) -> None:
     """
     path = Path(path)
     camera, plane = calibration.camera, calibration.plane
-    rvec, _ = cv2.Rodrigues(plane.rotation)
+    # OpenCV takes the angle from its cosine, and so loses half the digits of small ones.
+    rvec = Rotation.from_matrix(plane.rotation).as_rotvec()[:, None]
     storage = cv2.FileStorage(
         ".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
     )

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from test_camera import cameras, planes
 
 from stream_dmr.calibration import load_calibration, require_size, save_calibration
@@ -43,6 +44,14 @@ def test_saved_calibration_comes_back(tmp_path_factory, camera, plane, num_disto
     np.testing.assert_array_equal(back.camera.distortion, distortion)
     np.testing.assert_array_equal(back.plane.translation_mm, plane.translation_mm)
     np.testing.assert_allclose(back.plane.rotation, plane.rotation, atol=1e-12)
+
+
+def test_a_plane_turned_by_very_little_comes_back(tmp_path):
+    rotation = Rotation.from_rotvec([0.0, 0.0, 3e-5]).as_matrix()
+    plane = ReferencePlane(rotation=rotation, translation_mm=np.array([0.0, 0.0, 2000.0]))
+    path = tmp_path / "calibration.yaml"
+    save_calibration(path, Calibration(camera=Camera.nominal(width=640, height=480), plane=plane))
+    np.testing.assert_allclose(load_calibration(path).plane.rotation, rotation, atol=1e-15)
 
 
 def test_world_points_go_to_camera_points(tmp_path):
