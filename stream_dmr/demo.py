@@ -36,8 +36,10 @@ def measure_scene(scene: Path, *, out: Path, config: Path | None = None) -> bool
     evaluation = evaluate(out / "lengths.csv", scene / "truth.csv")
     print("\nbeside the truth:\n")
     print_evaluation(evaluation)
-    viewer = os.path.relpath(Path(sys.executable).with_name("rerun"))  # no activated venv needed
-    print(f"\nlook at it: {viewer} {out / 'recording.rrd'}")
+    command = os.path.relpath(
+        Path(sys.executable).with_name("stream-dmr")
+    )  # no activated venv needed
+    print(f"\nlook at it: {command} view {out}")
     return evaluation.fraction_measured == 1.0
 
 

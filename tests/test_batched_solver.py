@@ -1,5 +1,7 @@
 """The batched descent and search against the compiled ones, and a backlog of crops."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -91,7 +93,7 @@ class TestRefine:
         )
         for one, other in zip(found, expected, strict=False):
             assert one.loss == pytest.approx(other.loss, abs=1e-9)
-        assert np.isnan(found[3].loss)
+        assert not np.isfinite(found[3].loss)
 
 
 @every_device
@@ -163,3 +165,30 @@ class TestFitter:
             clear_gain=0.01,
         )
         assert backlog.fit([], []) == []
+
+
+@every_device
+class TestBacklog:
+    """`Fitter.fit_many`, whose interface is the same wherever it runs."""
+
+    def test_gives_a_message_for_each_crop_in_order(self, device):
+        crops, flats = crops_of_poses("halibut", 9, batch=2)
+        empty = replace(crops[0], mask=np.zeros_like(crops[0].mask))
+        settings = FitMeshSettings(device=device)
+        fitter = Fitter(HALIBUT, settings, plane_normal=PLANE_NORMAL)
+        starts = moved(flats, 9)
+        found = fitter.fit_many([crops[0], empty, crops[1]], [starts[0], None, None])
+        assert [one.refusal for one in found] == ["", "no mask", ""]
+        for one, crop, warm in zip(found[::2], crops, [starts[0], None], strict=True):
+            alone = Fitter(HALIBUT, FitMeshSettings(), plane_normal=PLANE_NORMAL).fit(crop, warm)
+            assert one.shape.iou == pytest.approx(alone.shape.iou, abs=2e-3)
+            assert one.report.cold_start == alone.report.cold_start
+            assert one.frame_index == crop.frame_index
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_backlog_without_a_gpu_is_refused():
+    crops, _ = crops_of_poses("halibut", 9, batch=1)
+    fitter = Fitter(HALIBUT, FitMeshSettings(device="cuda"), plane_normal=PLANE_NORMAL)
+    with pytest.raises(ConfigError, match="CUDA"):
+        fitter.fit_many(crops, [None])

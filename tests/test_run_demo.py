@@ -21,7 +21,7 @@ def test_every_fish_must_be_measured(
         assert measure_scene(clip, out=out, config=clip / "quick.toml") == is_measured
     printed = capsys.readouterr().out
     assert "800.0" in printed
-    assert str(out / "recording.rrd") in printed
+    assert f"view {out}" in printed
 
 
 def test_the_embedded_scene_is_whole():

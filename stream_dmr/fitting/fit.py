@@ -1,6 +1,9 @@
 """One crop in, one fitted mesh out: warm from the frame before, cold where that fails."""
 
 import time
+from collections.abc import Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +22,9 @@ from stream_dmr.fitting.uncertainty import covariance
 from stream_dmr.fitting.warm_start import recentered
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms, SolverReport
 from stream_dmr.template import Template
+
+if TYPE_CHECKING:
+    from stream_dmr.fitting.batched.fitter import BatchedFitter
 
 # Without a calibration, fish are taken to hang square to the camera.
 _TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
@@ -62,16 +68,60 @@ class Fitter:
         if not np.isfinite(solution.flat).all() or not np.isfinite(solution.loss):
             return _message(crop, None, None, "fit diverged")
         shape = self._shape(target, solution, crop)
-        report = SolverReport(
+        report = self._report(solution, is_cold=is_cold, since_ns=began)
+        return _message(crop, shape, report, "")
+
+    def fit_many(
+        self, crops: Sequence[FishCrop], warms: Sequence[Float[np.ndarray, "P"] | None]
+    ) -> list[FittedMesh]:
+        """What `fit` says of each: a backlog, side by side on a GPU with `device = "cuda"`.
+
+        Its fits agree with those of `fit` to the solver's tolerance, not to the last bit, and each
+        reports the time of its whole batch. Raises ConfigError where there is no GPU.
+        """
+        if self._settings.device == "cpu" or self._settings.solver != "contour":
+            return [self.fit(crop, warm) for crop, warm in zip(crops, warms, strict=True)]
+        refusals = [self._refusal(crop) for crop in crops]
+        sound = [index for index, refusal in enumerate(refusals) if not refusal]
+        began = time.perf_counter_ns()
+        fitted = self._backlog.fit([crops[i] for i in sound], [warms[i] for i in sound])
+        messages = {
+            index: _message(
+                crops[index],
+                one.shape,
+                self._report(one.solution, is_cold=one.is_cold, since_ns=began),
+                "",
+            )
+            for index, one in zip(sound, fitted, strict=True)
+        }
+        return [
+            messages.get(index) or _message(crop, None, None, refusals[index])
+            for index, crop in enumerate(crops)
+        ]
+
+    @cached_property
+    def _backlog(self) -> "BatchedFitter":
+        from stream_dmr.fitting.batched.fitter import BatchedFitter  # imports torch: a second
+        from stream_dmr.fitting.batched.solver import BatchedSolver
+
+        return BatchedFitter(
+            self._template,
+            BatchedSolver(self._body, self._settings),
+            self._settings,
+            plane_normal=self._plane_normal,
+            clear_gain=_CLEAR_GAIN,
+        )
+
+    def _report(self, solution: Solution, *, is_cold: bool, since_ns: int) -> SolverReport:
+        return SolverReport(
             solver=self._settings.solver,
             deformation=self._settings.deformation,
             iterations=solution.iterations,
             converged=solution.converged,
             stop_reason=solution.stop_reason,
             cold_start=is_cold,
-            elapsed_ns=time.perf_counter_ns() - began,
+            elapsed_ns=time.perf_counter_ns() - since_ns,
         )
-        return _message(crop, shape, report, "")
 
     def _refusal(self, crop: FishCrop) -> str:
         area = int(crop.mask.sum())

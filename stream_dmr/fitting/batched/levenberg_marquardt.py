@@ -1,8 +1,8 @@
 """Damped Gauss-Newton on many contours at once: `contour/levenberg_marquardt.py` for a batch.
 
 Each fit has its own damping and its own end. Those that have ended ride along until they are a
-quarter of the batch; then the rest is packed together, so that the work done is about that of the
-iterations needed, not of the slowest fit.
+quarter of what runs at once; then others take their places. So the device stays busy to the last
+few, and the work done is about that of the iterations needed, not of the slowest fit.
 """
 
 from typing import NamedTuple
@@ -105,39 +105,56 @@ def normal_equations(
 def minimise(
     model: Model,
     targets: Targets,
-    starts: Float[Tensor, "B P"],
+    which: Int[Tensor, "N"],
+    starts: Float[Tensor, "N P"],
     lambdas: Float[Tensor, "6"],
     *,
     iterations: int,
     tolerance: float,
     damping: float,
+    at_once: int,
 ) -> State:
-    """Each fit's best iterate, its L_rec and hard IoU, its iterations and why it stopped."""
-    ended = state = _begin(model, targets, starts, lambdas, damping)
-    which = torch.arange(len(starts), device=starts.device)
-    for iteration in range(1, iterations + 1):
-        step, predicted = _steps(state)
-        is_over = (state.stop == _RUNNING) & (predicted < tolerance)
-        state = _stopped(state, is_over, SETTLED, iteration - 1)
+    """Each fit's best iterate, its L_rec and hard IoU, its iterations and why it stopped.
+
+    A fit has a start and the index of its target. Loss is infinite where the start's is not finite.
+    """
+    ended = _begin(starts, damping)
+    index = torch.arange(min(at_once, len(starts)), device=starts.device)
+    waiting = len(index)  # the first fit that has not begun
+    state, seen = ended.select(index), targets.select(which[index])
+    while len(index):
+        step, state = _judged(state, iterations, tolerance)
         is_running = state.stop == _RUNNING
         count = int(is_running.sum())
-        if count == 0:
-            break
-        if 4 * count <= 3 * len(which):
-            ended = _written(ended, which, state)
-            index = torch.nonzero(is_running)[:, 0]
-            state, targets = state.select(index), targets.select(index)
-            which, step = which[index], step[index]
-        state = _advanced(model, targets, state, step, lambdas, tolerance, iteration)
-    state = _stopped(state, state.stop == _RUNNING, EXHAUSTED, iterations)
-    return _written(ended, which, state)
+        if 4 * count <= 3 * len(index):
+            _write(ended, index, state)
+            next_one = min(waiting + at_once - count, len(starts))
+            new = torch.arange(waiting, next_one, device=index.device)
+            waiting = next_one
+            index = torch.cat([index[is_running], new])
+            state, seen = ended.select(index), targets.select(which[index])
+            step = torch.cat([step[is_running], torch.zeros_like(starts[new])])
+        if len(index):
+            state = _advanced(model, seen, state, step, lambdas, tolerance)
+    return ended
 
 
-def _begin(model: Model, targets: Targets, flat: Tensor, lambdas: Tensor, damping: float) -> State:
-    loss, iou, H, g = _problem(model, targets, flat, lambdas)
-    count = torch.zeros(len(flat), dtype=torch.int64, device=flat.device)
+def _begin(starts: Tensor, damping: float) -> State:
+    """Nothing is known of the starts: any loss is lower, and the first step, of none, is to them."""
+    count, size = starts.shape
+    loss = starts.new_full((count,), torch.inf)
+    whole = torch.zeros(count, dtype=torch.int64, device=starts.device)
     return State(
-        flat, loss, iou, H, g, torch.full_like(loss, damping), count, count, count, count + _RUNNING
+        flat=starts.clone(),
+        loss=loss,
+        iou=torch.zeros_like(loss),
+        H=starts.new_zeros(count, size, size),
+        g=torch.zeros_like(starts),
+        damping=torch.full_like(loss, damping / _SHRINK),
+        calm=whole.clone(),
+        refused=whole.clone(),
+        iterations=whole - 1,
+        stop=whole + _RUNNING,
     )
 
 
@@ -150,10 +167,10 @@ def _problem(
     return loss, found.iou, *normal_equations(model, targets, flat, lambdas, found)
 
 
-def _steps(state: State) -> tuple[Tensor, Tensor]:
-    """(H + damping diag H)^-1 g, and the gain that this promises.
+def _judged(state: State, iterations: int, tolerance: float) -> tuple[Tensor, State]:
+    """The steps (H + damping diag H)^-1 g, and an end to fits that gain too little by theirs.
 
-    Where H has no factor the step is none and the promise endless, so that damping grows.
+    Where H has no factor there is no step, and it is refused, so that damping grows.
     """
     damped = state.H.clone()
     diagonal = damped.diagonal(dim1=1, dim2=2)
@@ -163,7 +180,9 @@ def _steps(state: State) -> tuple[Tensor, Tensor]:
     is_found = (info == 0) & torch.isfinite(step).all(dim=1)
     step = torch.where(is_found[:, None], step, 0.0)
     promise = 0.5 * (state.g * step).sum(dim=1)
-    return step, torch.where(is_found, promise, torch.inf)
+    is_small = is_found & torch.isfinite(state.loss) & (promise < tolerance)
+    state = _stopped(state, state.iterations == iterations, EXHAUSTED)
+    return step, _stopped(state, is_small, SETTLED)
 
 
 def _advanced(
@@ -173,7 +192,6 @@ def _advanced(
     step: Tensor,
     lambdas: Tensor,
     tolerance: float,
-    iteration: int,
 ) -> State:
     """Every fit that runs tries its step; what raises its loss is refused."""
     trial = state.flat - step
@@ -195,20 +213,19 @@ def _advanced(
         state.damping * torch.where(is_better, _SHRINK, _GROWTH).to(loss.dtype),
         torch.where(is_better, (state.calm + 1) * is_calm, state.calm),
         (state.refused + 1) * ~is_better,
-        state.iterations,
+        state.iterations + is_running,
         state.stop,
     )
-    state = _stopped(state, is_better & (state.calm == 2), SETTLED, iteration)
-    return _stopped(state, is_running & (state.refused == _MOST_REFUSED), STUCK, iteration)
+    state = _stopped(state, state.calm == 2, SETTLED)
+    return _stopped(state, state.refused == _MOST_REFUSED, STUCK)
 
 
-def _stopped(state: State, is_over: Bool[Tensor, "B"], reason: int, iterations: int) -> State:
-    return state._replace(
-        stop=torch.where(is_over, reason, state.stop),
-        iterations=torch.where(is_over, iterations, state.iterations),
-    )
+def _stopped(state: State, is_over: Bool[Tensor, "B"], reason: int) -> State:
+    is_over = is_over & (state.stop == _RUNNING)
+    return state._replace(stop=torch.where(is_over, reason, state.stop))
 
 
-def _written(all_fits: State, which: Int[Tensor, "K"], some: State) -> State:
-    """The fits `which` among all of them brought up to date."""
-    return State(*(old.index_copy(0, which, new) for old, new in zip(all_fits, some, strict=True)))
+def _write(all_fits: State, index: Int[Tensor, "K"], some: State) -> None:
+    """Bring some of the fits up to date, in place."""
+    for old, new in zip(all_fits, some, strict=True):
+        old.index_copy_(0, index, new)

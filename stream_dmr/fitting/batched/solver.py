@@ -126,20 +126,18 @@ class BatchedSolver:
         damping: float,
     ) -> Solutions:
         """From starts, each with the index of its target."""
-        tolerance = self._settings.tolerance
-        parts = []
-        for some in self.chunks(targets, len(starts)):
-            state = minimise(
-                self.model,
-                targets.select(which[some]),
-                starts[some],
-                lambdas,
-                iterations=iterations,
-                tolerance=tolerance,
-                damping=damping,
-            )
-            parts.append((state.flat, state.loss, state.iou, state.iterations, state.stop))
-        return Solutions(*(torch.cat(part) for part in zip(*parts, strict=True)))
+        state = minimise(
+            self.model,
+            targets,
+            which,
+            starts,
+            lambdas,
+            iterations=iterations,
+            tolerance=self._settings.tolerance,
+            damping=damping,
+            at_once=self.room(targets),
+        )
+        return Solutions(state.flat, state.loss, state.iou, state.iterations, state.stop)
 
     def _losses(self, targets: Targets, which: Tensor, flats: Tensor) -> Tensor:
         parts = []
@@ -151,14 +149,17 @@ class BatchedSolver:
         return torch.cat(parts)
 
     def chunks(self, targets: Targets, count: int) -> Iterator[slice]:
-        """As many fits at a time as memory allows, in float64 even."""
+        """As many fits at a time as memory allows."""
+        step = self.room(targets)
+        return (slice(first, first + step) for first in range(0, count, step))
+
+    def room(self, targets: Targets) -> int:
+        """How many fits memory allows at once, in float64 even."""
         room = _BYTES_ON_CPU
         if self._settings.device == "cuda":
             room = int(_SHARE_OF_GPU * torch.cuda.mem_get_info()[0])
         size, points = targets.mask.shape[1], targets.contour.shape[1]
-        floats = most_floats(self.model, size=size, points=points)
-        step = max(1, room // (8 * floats))
-        return (slice(first, first + step) for first in range(0, count, step))
+        return max(1, room // (8 * most_floats(self.model, size=size, points=points)))
 
 
 def most_floats(model: Model, *, size: int, points: int) -> int:

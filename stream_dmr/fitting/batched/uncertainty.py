@@ -34,7 +34,8 @@ def covariance(
         rows, index, equations.pixel_slopes(points, slopes.at(chosen), targets)
     )
     prior = weights.new_tensor(_ROOT_PRIOR + _JOINT_PRIOR * len(model.joints))
-    spread = torch.linalg.inv(information + torch.diag(prior**-2.0))
+    # What is not finite has no inverse, and must not stop the others.
+    spread = torch.linalg.inv_ex(information + torch.diag(prior**-2.0)).inverse
     spread = (spread + spread.transpose(1, 2)) / 2
     slope = _log_length_slope(model, found.body.points, slopes)
     return spread, torch.einsum("bp,bpq,bq->b", slope, spread, slope).sqrt()
