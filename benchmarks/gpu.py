@@ -17,6 +17,7 @@ from rates import Setup
 from roofline import Load, Peak, load_of, peak_of, timed
 from targets import Pair, draw_pair, species_template
 
+from stream_dmr.fitting.batched import solver as solver_module
 from stream_dmr.fitting.batched.distance_map import signed_distance
 from stream_dmr.fitting.batched.solver import BatchedSolver
 from stream_dmr.fitting.batched.targets import Targets
@@ -71,6 +72,7 @@ def main() -> None:
     peak = peak_of(arguments.device)
     if arguments.device == "cpu":
         torch.set_num_threads(1)
+        solver_module._BYTES_ON_CPU = 1 << 40  # all at once, as a GPU would have it
         print("No GPU here: nothing below is a measurement of one.\n")
         arguments.batches = arguments.batches[:1]
     print(f"{NUM_TARGETS} simulated fish at {arguments.size} px, warm, float32, {peak.name}:")

@@ -17,6 +17,7 @@ from batches import (
 
 from stream_dmr.errors import ConfigError
 from stream_dmr.fitting.batched.fitter import BatchedFitter
+from stream_dmr.fitting.batched.levenberg_marquardt import minimise
 from stream_dmr.fitting.batched.solver import BatchedSolver
 from stream_dmr.fitting.batched.targets import Targets
 from stream_dmr.fitting.cold_start import cold_starts
@@ -73,6 +74,30 @@ class TestRefine:
             alone = solver.refine(target, start)
             assert found.loss == pytest.approx(alone.loss, abs=1e-9)
             assert found[3:] == alone[3:]
+
+    def test_of_a_few_at_once_is_that_of_all_at_once(self, device):
+        """Places that become free are taken by fits that wait."""
+        targets, starts = warm_fits(5, batch=12, size=2.0)
+        solver = solver_on(device)
+        stacked = Targets.stack(targets, device=device, dtype=solver.dtype)
+        which = torch.arange(12, device=device).flip(0)
+        options = {"iterations": 8, "tolerance": 2e-4, "damping": 1e-2}
+        some, every = (
+            minimise(
+                solver.model,
+                stacked,
+                which,
+                solver.tensor(starts[::-1].copy()),
+                solver.model.lambdas,
+                at_once=at_once,
+                **options,
+            )
+            for at_once in (3, 12)
+        )
+        torch.testing.assert_close(some.loss, every.loss, rtol=0, atol=1e-9)
+        assert some.iterations.tolist() == every.iterations.tolist()
+        assert some.stop.tolist() == every.stop.tolist()
+        assert len(set(some.stop.tolist())) > 1
 
     def test_in_single_precision_ends_as_low(self, device):
         targets, starts = warm_fits(3, batch=24)
