@@ -40,7 +40,6 @@ class Batch:
 
     def prepared(self) -> Targets:
         """Distance maps by the device, contours by the CPU."""
-        # All in one plane: the few simulated cameras see theirs alike.
         crops, normal = [pair.now for pair in self.pairs], self.pairs[0].plane_normal
         return self.solver.prepare(crops, plane_normal=normal)
 
@@ -66,6 +65,8 @@ def main() -> None:
     arguments = parser.parse_args()
     setup = Setup(species_template())
     pairs = [draw_pair(size=arguments.size, seed=seed) for seed in range(NUM_TARGETS)]
+    # All before one plane, so that they make one batch.
+    pairs = [pair._replace(plane_normal=pairs[0].plane_normal) for pair in pairs]
     befores = [setup.before(pair) for pair in pairs]
     settings = FitMeshSettings(device=arguments.device)
     solver = BatchedSolver(setup.body, settings)
@@ -124,7 +125,6 @@ def agreement(setup: Setup, pairs: Sequence[Pair], befores: list, batch: Batch) 
     compiled = ContourSolver(setup.body, setup.settings)
     gaps = []
     for index, pair in enumerate(pairs):
-        pair = pair._replace(plane_normal=pairs[0].plane_normal)
         target, start = setup.start(pair)
         gaps.append(batch.found.loss[index].item() - compiled.refine(target, start).loss)
     print(

@@ -140,7 +140,7 @@ def minimise(
 
 
 def _begin(starts: Tensor, damping: float) -> State:
-    """Nothing is known of the starts: the first step, of none, leads to them from an endless loss."""
+    """Nothing is known of the starts: the first step is none, and lowers an endless loss."""
     count, size = starts.shape
     loss = starts.new_full((count,), torch.inf)
     whole = torch.zeros(count, dtype=torch.int64, device=starts.device)
