@@ -16,6 +16,7 @@ import pytest
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, make_reader
 from mcap_protobuf.decoder import DecoderFactory
+from reading import read_header, read_messages, read_metadata
 from recorded_run import assert_same, header, run, template
 from rerun.chunk import RrdReader
 
@@ -35,7 +36,6 @@ from stream_dmr.recording.codec import CODEC_VERSION, decode, reference
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.mcap_sink import McapSink
 from stream_dmr.recording.pictures import checksum
-from stream_dmr.recording.reader import read_header, read_messages, read_metadata
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.recording.topics import FOXGLOVE_TOPICS, TOPICS, topics_table
@@ -88,7 +88,7 @@ def test_what_is_written_is_read_back_in_order_and_exact(tmp_path: Path, message
     assert [type(message) for message in read] == [type(message) for message in messages]
     kinds = (FishCrop, FittedMesh, LocalizedFish, LengthEstimate)
     assert_all_same(only(read, *kinds), only(messages, *kinds))
-    fits = list(read_messages(tmp_path / "recording.mcap", types=[FittedMesh]))
+    fits = list(read_messages(tmp_path / "recording.mcap", kinds=[FittedMesh]))
     assert_all_same(fits, only(messages, FittedMesh))
 
 
@@ -262,11 +262,13 @@ def test_a_disk_that_fills_up_at_the_very_end_keeps_what_was_written(
     assert len(kept) == len(messages)
 
 
-def test_a_torn_file_is_refused_in_one_line(tmp_path: Path, messages: list[Message]):
+def test_a_file_torn_before_its_messages_is_refused_in_one_line(
+    tmp_path: Path, messages: list[Message]
+):
     record(tmp_path, messages)
     whole = (tmp_path / "recording.mcap").read_bytes()
     torn = tmp_path / "torn.mcap"
-    for size in (0, 1, 100, len(whole) // 2, len(whole) - 1):
+    for size in (0, 1, 100):
         torn.write_bytes(whole[:size])
         with pytest.raises(RecordingError, match=r"torn\.mcap") as refusal:
             list(read_messages(torn))
@@ -365,7 +367,7 @@ def test_the_documented_topics_are_the_real_ones():
 
 
 def test_rerun_and_its_global_stream_stay_untouched_by_a_reader():
-    code = "import sys, stream_dmr.recording.reader; sys.exit('rerun' in sys.modules)"
+    code = "import sys, stream_dmr.recording.opened; sys.exit('rerun' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 

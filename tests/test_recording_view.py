@@ -13,6 +13,7 @@ from command import invoke, rows
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from reading import read_header, read_messages
 from recorded_run import assert_same, header, run
 from rerun.chunk import RrdReader
 from tiny_clip import write_clip
@@ -24,7 +25,6 @@ from stream_dmr.recording.convert import convert
 from stream_dmr.recording.live import LiveView
 from stream_dmr.recording.meshes import Meshes
 from stream_dmr.recording.pictures import checksum
-from stream_dmr.recording.reader import read_header, read_messages
 from stream_dmr.recording.record import make_record
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.settings import RecordingSettings

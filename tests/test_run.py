@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import pytest
 from command import invoke, rows
+from reading import read_header, read_messages
 from tiny_clip import draw_mask, draw_picture, write_clip
 
 from stream_dmr.config import load_config, to_toml
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish
-from stream_dmr.recording.reader import read_header, read_messages
 from stream_dmr.run import RESULTS, Observer, RunRequest, run
 
 COMING_AND_GOING = [[1], [1, 2], [1, 2], [1, 2], [2, 3], [3], [3], []]

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 import torch
 from command import Outcome, invoke, rows
+from reading import read_messages
 from tiny_clip import QUICK, calibration, draw_mask, draw_picture, options, write_clip
 
 from stream_dmr.calibration import save_calibration
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import Frame
-from stream_dmr.recording.reader import read_messages
 
 Options = dict[str, str]
 

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from rerun.chunk import RrdReader
 
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import Message
@@ -81,6 +80,8 @@ def _read_apart(path: Path) -> Rows:
 
 
 def _read(path: Path) -> Rows:
+    from rerun.chunk import RrdReader  # in the other process only
+
     rows: Rows = {}
     try:
         for chunk in RrdReader(str(path)).stream():
