@@ -12,8 +12,6 @@ from torch import Tensor
 
 from stream_dmr.body import JOINT
 
-# Of the entries of Q's factor: which component of y = L^T u, and which of u, each multiplies.
-_ROWS, _COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
 # Of the blended seven numbers of a joint: rotation vector, translation, scale.
 BLENDED = 7
 
@@ -31,16 +29,15 @@ def blend(
     values: Float[Tensor, "B J 13"], places: Float[Tensor, "X 3"], joints: Float[Tensor, "J 3"]
 ) -> Blend:
     """Blend the joints at places of the body at rest."""
-    logs, below = values[..., 7:10], values[..., 10:]
-    factors = torch.cat([logs.exp(), below], dim=-1)[:, None]
-    u = places[:, None] - joints
-    a, b, c, d, e, f = factors.unbind(-1)  # L = [[a, 0, 0], [d, b, 0], [e, f, c]]
-    u0, u1, u2 = u.unbind(-1)
-    y = torch.stack([a * u0 + d * u1 + e * u2, b * u1 + f * u2, c * u2], dim=-1)
-    weights = torch.softmax(-0.5 * y.square().sum(dim=-1), dim=-1)
-    inner = torch.cat([factors[..., :3], torch.ones_like(factors[..., 3:])], dim=-1)
+    # Q's factor L = [[a, 0, 0], [d, b, 0], [e, f, c]], and y = L^T u.
+    a, b, c = values[:, None, :, 7:10].exp().unbind(-1)
+    d, e, f = values[:, None, :, 10:].unbind(-1)
+    u0, u1, u2 = (places[:, None] - joints).unbind(-1)
+    y0, y1, y2 = a * u0 + d * u1 + e * u2, b * u1 + f * u2, c * u2
+    weights = torch.softmax(-0.5 * (y0 * y0 + y1 * y1 + y2 * y2), dim=-1)
+    slopes = [y0 * u0 * a, y1 * u1 * b, y2 * u2 * c, y0 * u1, y0 * u2, y1 * u2]
     firsts = torch.cat([values[..., :6], values[..., 6:7].exp()], dim=-1)
-    return Blend(weights, -y[..., _ROWS] * u[..., _COLUMNS] * inner, firsts, weights @ firsts)
+    return Blend(weights, -torch.stack(slopes, dim=-1), firsts, weights @ firsts)
 
 
 def weighted_slope(
