@@ -65,7 +65,7 @@ class Fitter:
         began = time.perf_counter_ns()
         target = Target.from_crop(crop, plane_normal=self._plane_normal)
         solution, is_cold = self._solve(target, warm)
-        if not np.isfinite(solution.flat).all() or not np.isfinite(solution.loss):
+        if not _is_finite(solution):
             return _message(crop, None, None, "fit diverged")
         shape = self._shape(target, solution, crop)
         report = self._report(solution, is_cold=is_cold, since_ns=began)
@@ -85,15 +85,13 @@ class Fitter:
         sound = [index for index, refusal in enumerate(refusals) if not refusal]
         began = time.perf_counter_ns()
         fitted = self._backlog.fit([crops[i] for i in sound], [warms[i] for i in sound])
-        messages = {
-            index: _message(
-                crops[index],
-                one.shape,
-                self._report(one.solution, is_cold=one.is_cold, since_ns=began),
-                "",
-            )
-            for index, one in zip(sound, fitted, strict=True)
-        }
+        messages = {}
+        for index, one in zip(sound, fitted, strict=True):
+            if not _is_finite(one.solution):
+                refusals[index] = "fit diverged"
+                continue
+            report = self._report(one.solution, is_cold=one.is_cold, since_ns=began)
+            messages[index] = _message(crops[index], one.shape, report, "")
         return [
             messages.get(index) or _message(crop, None, None, refusals[index])
             for index, crop in enumerate(crops)
@@ -172,6 +170,10 @@ class Fitter:
             covariance=spread,
             length_std_ratio=length_std,
         )
+
+
+def _is_finite(solution: Solution) -> bool:
+    return bool(np.isfinite(solution.flat).all() and np.isfinite(solution.loss))
 
 
 def _make_solver(template: Template, body: Body, settings: FitMeshSettings) -> Solver:
