@@ -110,6 +110,10 @@ def run_command(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the results of an earlier run in --out.")
     ] = False,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on after an earlier run in --out; a live source does."),
+    ] = False,
     live: Annotated[
         bool, typer.Option("--live", help="Serve the view on this machine while measuring.")
     ] = False,
@@ -119,8 +123,8 @@ def run_command(
 ) -> None:
     """Measure the fish of a clip.
 
-    Writes lengths.csv, frames.csv, recording.mcap and recording.rrd into --out. Ctrl-C ends the
-    run early and keeps what was done.
+    Writes lengths.db, lengths.csv, frames.csv, recording.mcap and recording.rrd into --out. Ctrl-C
+    ends the run early and keeps what was done.
     """
     with stop_on_signals() as stop:
         from stream_dmr.display import RunDisplay, print_fish, print_timings
@@ -135,6 +139,7 @@ def run_command(
             template=template,
             config=config,
             overwrite=overwrite,
+            resume=resume,
             live=live,
             command=command_line(),
         )

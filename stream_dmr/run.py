@@ -1,9 +1,11 @@
 """Assembles a run: checks every input, builds the nodes and the recorder, runs the chain."""
 
+import itertools
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,15 +18,18 @@ from stream_dmr.calibration import load_calibration, require_size
 from stream_dmr.camera import Calibration
 from stream_dmr.config import Config, load_config, to_toml
 from stream_dmr.errors import OutputError, UserError
-from stream_dmr.messages import LengthEstimate, Message
+from stream_dmr.messages import LengthEstimate
 from stream_dmr.pipeline import Node, StageCounters, run_chain
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.segmentation.detections import open_annotations
+from stream_dmr.store import LengthStore, require_free
+from stream_dmr.tables import write_lengths
+from stream_dmr.tally import Observer, Tally, run_facts
 from stream_dmr.template import Template, load_template
 from stream_dmr.video import LiveStream
 
-RESULTS = ("lengths.csv", "frames.csv", "recording.mcap", "recording.rrd")
+RESULTS = ("lengths.db", "lengths.csv", "frames.csv", "recording.mcap", "recording.rrd")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +44,7 @@ class RunRequest:
     template: str = "halibut"  # name of a bundled one, or a path
     config: Path | None = None
     overwrite: bool = False  # replace the results of an earlier run in `out`
+    resume: bool = False  # go on after them; a live source always does
     live: bool = False  # serve the view while measuring
     command: str = ""  # as typed, for the recording
 
@@ -52,25 +58,6 @@ class RunSummary:
     elapsed_s: float
     counters: Sequence[StageCounters]
     files: Sequence[Path]  # the results
-
-
-class Observer:
-    """Is told how a run goes, from its threads; this one doesn't listen."""
-
-    def warn(self, line: str) -> None:
-        """Something the user should know, once each."""
-
-    def serving(self, address: str) -> None:
-        """The view can be watched there from now on."""
-
-    def begin(self, num_frames: int | None) -> None:
-        """The inputs are fine and the chain starts."""
-
-    def frame_done(self) -> None:
-        """A frame has left the last stage."""
-
-    def fish_seen(self, num_fish: int) -> None:
-        """So many fish were seen so far."""
 
 
 def run(
@@ -94,20 +81,29 @@ def run(
         camera = None if calibration is None else calibration.camera
         crop_fish = CropFish(config.crop_fish, camera=camera, detections=detections)
         nodes = [crop_fish, *later_nodes(config, template=template, calibration=calibration)]
-        prepare_folder(request.out, overwrite=request.overwrite)
+        is_live = isinstance(reader.source, LiveStream)
+        resume = (request.resume or is_live) and not request.overwrite
+        prepare_folder(request.out, overwrite=request.overwrite, resume=resume)
         header = _header(request, reader.source.name, config, template, calibration)
-        with Recorder(request.out, header, config.recording, live=request.live) as recorder:
+        with (
+            closing(LengthStore(request.out, run_facts(header))) as store,
+            _consistent_csv(request.out / "lengths.csv", store, resume=resume),
+            Recorder(
+                request.out, header, config.recording, live=request.live, resume=resume
+            ) as recorder,
+        ):
             if recorder.live_address is not None:
                 observer.serving(recorder.live_address)
             if calibration is None:
                 observer.warn("without --calibration there are relative shapes, no millimetres")
-            if isinstance(reader.source, LiveStream) and config.recording.frames == "reference":
+            if is_live and config.recording.frames == "reference":
                 observer.warn(
                     "a live source can't be read again, so its pictures are not kept but for the "
                     'view; record them with [recording] frames = "jpeg"'
                 )
             observer.begin(reader.source.num_frames)
-            summary = _run_chain(reader, nodes, recorder, request.out, stop=stop, observer=observer)
+            tally = Tally(recorder, store, observer, is_live=is_live)
+            summary = _run_chain(reader, nodes, tally, request.out, stop=stop)
     finally:
         reader.close()
         for line in (*reader.source.warnings, *detections.warnings):
@@ -115,28 +111,54 @@ def run(
     return summary
 
 
-def prepare_folder(out: Path, *, overwrite: bool) -> None:
+def prepare_folder(out: Path, *, overwrite: bool, resume: bool = False) -> None:
     """Make sure that results can be written to `out`, and that none are lost by it.
 
     Raises OutputError where it is no folder, can't be written to, has no room, or holds the
-    results of an earlier run; `overwrite` removes those instead.
+    results of an earlier run; `overwrite` removes those instead, `resume` keeps them.
     """
     earlier = [out / name for name in RESULTS if (out / name).exists()]
-    if earlier and not overwrite:
+    if earlier and not overwrite and not resume:
         raise OutputError(
             f"{out}: expected a folder without results, found {earlier[0].name} of an earlier run; "
-            "choose another --out or add --overwrite"
+            "choose another --out, or add --resume or --overwrite"
         )
     try:
         out.mkdir(parents=True, exist_ok=True)
+        require_free(out)
         for path in earlier:
-            path.unlink()
+            if overwrite:
+                path.unlink()
+                for leftover in ("-wal", "-shm"):  # of a database after a crash
+                    path.with_name(path.name + leftover).unlink(missing_ok=True)
+            elif path.name.startswith("recording"):
+                _set_aside(path)
         with tempfile.TemporaryFile(dir=out) as probe:
             probe.write(bytes(1 << 16))
     except OSError as error:
         raise OutputError(
             f"{out}: expected a folder to write to, got: {error.strerror}; choose another --out"
         ) from error
+
+
+def _set_aside(recording: Path) -> None:
+    """Give the recording of an earlier run a name of its own: recording-1.mcap, ..."""
+    for number in itertools.count(1):
+        aside = recording.with_stem(f"{recording.stem}-{number}")
+        if not aside.exists():
+            recording.rename(aside)
+            return
+
+
+@contextmanager
+def _consistent_csv(path: Path, store: LengthStore, *, resume: bool) -> Iterator[None]:
+    """Begin and end with what the store holds: a crash between the two loses a row of neither."""
+    if resume:
+        write_lengths(path, store.estimates())
+    try:
+        yield
+    finally:
+        write_lengths(path, store.estimates())
 
 
 def later_nodes(
@@ -171,13 +193,11 @@ def _header(
 def _run_chain(
     reader: ReadFrames,
     nodes: Sequence[Node],
-    recorder: Recorder,
+    tally: Tally,
     out: Path,
     *,
     stop: threading.Event,
-    observer: Observer,
 ) -> RunSummary:
-    tally = _Tally(recorder, observer)
     began = time.perf_counter()
     try:
         counters = run_chain(
@@ -194,27 +214,3 @@ def _run_chain(
         counters=counters,
         files=[out / name for name in RESULTS],
     )
-
-
-class _Tally:
-    """Records every message, and counts what the summary and the observer want to know."""
-
-    def __init__(self, recorder: Recorder, observer: Observer) -> None:
-        self._recorder = recorder
-        self._observer = observer
-        self._track_ids: set[int] = set()
-        self.final: list[LengthEstimate] = []
-        self.num_frames = 0
-
-    def record(self, message: Message) -> Message:
-        message = self._recorder.write(message)
-        if isinstance(message, LengthEstimate):
-            self._track_ids.add(message.track_id)
-            self._observer.fish_seen(len(self._track_ids))
-            if message.is_final:
-                self.final.append(message)
-        return message
-
-    def frame_done(self) -> None:
-        self.num_frames += 1
-        self._observer.frame_done()

@@ -5,6 +5,8 @@ Values are rounded to six decimals, far below what is measured; blank means ther
 
 import csv
 import io
+import os
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ from jaxtyping import Float
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate, LocalizedFish
 from stream_dmr.recording.record import Record
-from stream_dmr.recording.whole_file import WholeFile
+from stream_dmr.recording.whole_file import WholeFile, rename_durably
 
 LENGTHS_COLUMNS = [
     *("track_id", "length_mm", "length_std_mm", "ci95_low_mm", "ci95_high_mm"),
@@ -28,6 +30,7 @@ FRAMES_COLUMNS = [
     *("tail_x_mm", "tail_y_mm", "tail_z_mm"),
     *("bending_ratio", "length_mm", "length_std_mm", "iou", "accepted", "reason"),
 ]
+_BLOCK_BYTES = 1 << 16
 
 
 class Tables:
@@ -37,9 +40,10 @@ class Tables:
     that says whether the frame was used; a row of lengths.csv comes with the final estimate.
     """
 
-    def __init__(self, out_dir: Path) -> None:
-        self._lengths = _Table(out_dir / "lengths.csv", LENGTHS_COLUMNS)
-        self._frames = _Table(out_dir / "frames.csv", FRAMES_COLUMNS)
+    def __init__(self, out_dir: Path, *, resume: bool = False) -> None:
+        """With `resume`, the rows of an earlier run stay, but for one that a crash left in part."""
+        self._lengths = _Table(out_dir / "lengths.csv", LENGTHS_COLUMNS, resume=resume)
+        self._frames = _Table(out_dir / "frames.csv", FRAMES_COLUMNS, resume=resume)
         self._waiting: dict[tuple[int, int], LocalizedFish] = {}
 
     def write(self, record: Record) -> None:
@@ -63,6 +67,25 @@ class Tables:
             self._waiting.clear()
             self._frames.close()
             self._lengths.close()
+
+
+def write_lengths(path: Path, estimates: Iterable[LengthEstimate]) -> None:
+    """Write lengths.csv anew, so that at any moment the old or the new one is there whole.
+
+    Raises OutputError where the disk refuses it.
+    """
+    draft = path.with_suffix(".csv.part")
+    table = _Table(draft, LENGTHS_COLUMNS)
+    try:
+        for estimate in estimates:
+            table.add(lengths_row(estimate))
+        table.sync()
+        rename_durably(draft, path)
+    except BaseException:
+        draft.unlink(missing_ok=True)
+        raise
+    finally:
+        table.close()
 
 
 def lengths_row(estimate: LengthEstimate) -> list[str]:
@@ -114,16 +137,32 @@ def _numbers(values: Float[np.ndarray, "..."] | None, count: int) -> list[str]:
     return [""] * count if values is None else [_number(float(value)) for value in values.flat]
 
 
+def _whole_lines(path: Path) -> int:
+    """The bytes of a file up to the end of its last whole line."""
+    with path.open("rb") as file:
+        end = file.seek(0, os.SEEK_END)
+        while end > 0:
+            start = max(0, end - _BLOCK_BYTES)
+            file.seek(start)
+            newline = file.read(end - start).rfind(b"\n")
+            if newline >= 0:
+                return start + newline + 1
+            end = start
+    return 0
+
+
 class _Table:
     """A CSV file with its header from the start, in which every row is whole."""
 
-    def __init__(self, path: Path, columns: list[str]) -> None:
+    def __init__(self, path: Path, columns: list[str], *, resume: bool = False) -> None:
         self._path = path
         try:
-            self._file = WholeFile(path)
+            keep = _whole_lines(path) if resume and path.exists() else 0
+            self._file = WholeFile(path, keep=keep)
         except OSError as error:
             raise self._refusal(error) from error
-        self.add(columns)
+        if keep == 0:
+            self.add(columns)
 
     def add(self, row: list[str]) -> None:
         text = io.StringIO()
@@ -132,6 +171,9 @@ class _Table:
             self._file.write(text.getvalue().encode("utf-8", "backslashreplace"))
         except OSError as error:
             raise self._refusal(error) from error
+
+    def sync(self) -> None:
+        self._file.sync()
 
     def close(self) -> None:
         self._file.close()

@@ -16,6 +16,9 @@ from tiny_clip import draw_mask, draw_picture, write_clip
 from stream_dmr.config import load_config, to_toml
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish
 from stream_dmr.run import RESULTS, Observer, RunRequest, run
+from stream_dmr.store import read_estimates
+from stream_dmr.store_schema import open_database
+from stream_dmr.tables import lengths_row
 
 COMING_AND_GOING = [[1], [1, 2], [1, 2], [1, 2], [2, 3], [3], [3], []]
 
@@ -32,6 +35,10 @@ def assert_readable(out: Path) -> None:
     assert counts[LocalizedFish] == len(frames)
     assert counts[LengthEstimate] == len(frames) + len(lengths)
     assert {row["track_id"] for row in frames} == {row["track_id"] for row in lengths}
+    database = open_database(out / "lengths.db", read_only=True)
+    stored = [list(row.values()) for row in lengths]
+    assert [lengths_row(estimate) for estimate in read_estimates(database)] == stored
+    database.close()
     verified = subprocess.run(
         [sys.executable, "-m", "rerun", "rrd", "verify", str(out / "recording.rrd")],
         capture_output=True,
@@ -183,6 +190,37 @@ def test_earlier_results_are_kept_unless_told_otherwise(tmp_path: Path):
     assert invoke("run", options | {"--overwrite": None}).code == 0
     assert rows(out / "lengths.csv") == []
     assert (out / "notes.txt").read_text() == "mine"
+
+
+def test_a_resumed_run_numbers_fish_and_recordings_on(tmp_path: Path):
+    options = write_clip(tmp_path / "clip", fish=[[1, 2]] * 3)
+    out = Path(options["--out"])
+    assert invoke("run", options).code == 0
+    first = {name: (out / name).read_text() for name in ("lengths.csv", "frames.csv")}
+    recording = (out / "recording.mcap").read_bytes()
+    (out / "frames.csv").write_text(first["frames.csv"] + "3,7,2,torn by a cra")
+
+    outcome = invoke("run", options | {"--resume": None})
+    assert outcome.code == 0, outcome.err
+    assert [row["track_id"] for row in rows(out / "lengths.csv")] == ["1", "2", "3", "4"]
+    frames = rows(out / "frames.csv")
+    assert [row["track_id"] for row in frames] == ["1", "2"] * 3 + ["3", "4"] * 3
+    for name, text in first.items():
+        assert (out / name).read_text().startswith(text)
+    assert (out / "recording-1.mcap").read_bytes() == recording
+    resumed = [m for m in read_messages(out / "recording.mcap") if isinstance(m, LocalizedFish)]
+    assert {fish.track_id for fish in resumed} == {3, 4}
+
+
+def test_lengths_csv_is_mended_from_the_database(tmp_path: Path):
+    options = write_clip(tmp_path / "clip", fish=[[1, 2]] * 3)
+    out = Path(options["--out"])
+    assert invoke("run", options).code == 0
+    text = (out / "lengths.csv").read_text()
+    (out / "lengths.csv").write_text(text[: len(text) // 2])  # as a crash may leave it
+    (tmp_path / "clip" / "boxes.txt").write_text("")
+    assert invoke("run", options | {"--resume": None}).code == 0
+    assert (out / "lengths.csv").read_text() == text
 
 
 class StopAt(Observer):

@@ -44,9 +44,15 @@ class Recorder:
     """
 
     def __init__(
-        self, out_dir: Path, header: RunHeader, settings: RecordingSettings, *, live: bool = False
+        self,
+        out_dir: Path,
+        header: RunHeader,
+        settings: RecordingSettings,
+        *,
+        live: bool = False,
+        resume: bool = False,
     ) -> None:
-        """With `live`, the view is served as well, at `live_address`."""
+        """With `live`, the view is served as well, at `live_address`; `resume` keeps the tables."""
         self.live_address: str | None = None
         self._settings = settings
         self._sinks: list[Sink] = []
@@ -58,7 +64,7 @@ class Recorder:
         make_folder(out_dir)
         with ExitStack() as undo:
             undo.callback(self._close_sinks)
-            self._sinks.append(Tables(out_dir))
+            self._sinks.append(Tables(out_dir, resume=resume))
             if settings.mcap:
                 extra = _foxglove(header, settings) if settings.foxglove else None
                 self._sinks.append(McapSink(out_dir, header, flush_s=settings.flush_s, extra=extra))

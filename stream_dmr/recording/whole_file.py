@@ -14,9 +14,10 @@ class WholeFile:
     So a full disk leaves the file at the end of the last whole record, ready to be ended properly.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
-        self._size = 0
+    def __init__(self, path: Path, *, keep: int = 0) -> None:
+        """Of a file that is there, the first `keep` bytes stay."""
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT, 0o666)
+        self.truncate(keep)
 
     def write(self, data: bytes) -> int:
         """Append `data`; where that fails, OSError, with the file as it was."""

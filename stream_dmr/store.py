@@ -1,0 +1,260 @@
+"""lengths.db: every finished fish in SQLite, durable the moment its track ends.
+
+One file in the output folder, open to any reader of SQLite while it is written: WAL, synchronous
+FULL. It also holds what a restart must not use again: track ids, frame numbers and capture times.
+"""
+
+import fcntl
+import json
+import os
+import sqlite3
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, fields
+from pathlib import Path
+from threading import RLock
+from uuid import uuid4
+
+import numpy as np
+
+from stream_dmr.errors import OutputError
+from stream_dmr.messages import LengthEstimate
+from stream_dmr.store_schema import FISH_COLUMNS, MARK_EVERY_NS, open_database
+
+NAME = "lengths.db"
+_BALLAST = "lengths.reserve"  # room that is given up when the disk is full, so that lengths fit
+_BALLAST_BYTES = 1 << 20
+_BALLAST_SHARE = 0.01  # of the free space, at most
+_MARK = "INSERT INTO marks VALUES (?1, ?2) ON CONFLICT (name) DO UPDATE SET value = ?2"
+_FRAMES_AHEAD = 1000  # frame numbers set aside at a time: a gap after a crash does no harm
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFacts:
+    """What made the lengths of one run; hashes are SHA-256 in hex, "" where there is none."""
+
+    source: str
+    command: str
+    software_version: str
+    config_sha256: str
+    calibration_sha256: str
+    template_sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Marks:
+    """The last of everything that was handed out in this folder; 0 where nothing was."""
+
+    track_id: int = 0
+    frame_index: int = 0
+    timestamp_ns: int = 0
+
+
+class LengthStore:
+    """The lengths of one output folder, and this run's right to add to them. Thread-safe.
+
+    A fish that the disk refuses is kept in memory and tried again with everything that follows;
+    `trouble` says so meanwhile, and `close` raises OutputError if it never got there.
+    """
+
+    def __init__(self, out_dir: Path, facts: RunFacts) -> None:
+        """Raises OutputError where another run writes there or the file can't be used."""
+        self.path = out_dir / NAME
+        self.run_id = uuid4().hex
+        self.trouble = ""  # why the last row could not be written; "" when all are
+        self._facts = facts
+        self._ballast = out_dir / _BALLAST
+        self._lock = RLock()
+        self._pending: list[tuple[str, tuple[object, ...]]] = []
+        self._folder = _lock_folder(out_dir)
+        try:
+            self._database = open_database(self.path)
+            self.before = Marks(**dict(self._database.execute("SELECT name, value FROM marks")))
+            self._begin_run()
+        except BaseException:
+            os.close(self._folder)
+            raise
+        self._handed_out = self.before
+        self._marked_at_ns = time.monotonic_ns()
+        _set_aside(self._ballast)
+
+    def add(self, estimate: LengthEstimate, *, flags: Sequence[str] = ()) -> None:
+        """Make a final estimate durable; `flags` are what a reader of this length must know."""
+        values = fish_row(estimate, flags) | {"run_id": self.run_id, "written_ns": time.time_ns()}
+        marks = ", ".join("?" for _ in values)
+        self._write(f"INSERT INTO fish ({', '.join(values)}) VALUES ({marks})", *values.values())
+
+    def reserve_track(self, track_id: int) -> None:
+        """Take note, durably, that an id is used: no later run in this folder uses it again."""
+        if track_id > self._handed_out.track_id:
+            self._mark(track_id=track_id)
+
+    def frame_passed(self, *, frame_index: int, timestamp_ns: int) -> None:
+        """Take note of a frame; durable for its number at once, for its time within seconds."""
+        is_due = time.monotonic_ns() - self._marked_at_ns > MARK_EVERY_NS
+        if is_due or frame_index > self._handed_out.frame_index:
+            self._marked_at_ns = time.monotonic_ns()
+            self._mark(frame_index=frame_index + _FRAMES_AHEAD, timestamp_ns=timestamp_ns)
+
+    def note(self, kind: str, text: str, *, timestamp_ns: int) -> None:
+        """Write an event that later readers of the lengths should know of."""
+        self._write(
+            "INSERT INTO events (run_id, kind, text, timestamp_ns, written_ns) "
+            "VALUES (?, ?, ?, ?, ?)",
+            *(self.run_id, kind, text, timestamp_ns, time.time_ns()),
+        )
+
+    def estimates(self) -> list[LengthEstimate]:
+        """All finished fish of this folder, in the order in which their tracks ended."""
+        with self._lock:
+            return list(read_estimates(self._database))
+
+    def close(self) -> None:
+        """End the run and leave one file. Idempotent. OutputError where fish are not written."""
+        if self._folder < 0:
+            return
+        self._write("UPDATE runs SET ended_ns = ? WHERE run_id = ?", time.time_ns(), self.run_id)
+        with suppress(sqlite3.Error):
+            self._database.close()
+        with suppress(OSError):
+            self._ballast.unlink(missing_ok=True)
+        os.close(self._folder)
+        self._folder = -1
+        if self.trouble:
+            raise OutputError(
+                f"{self.path}: expected room for {len(self._pending)} more rows, got: "
+                f"{self.trouble}; the recording has them: make room and run stream-dmr recover"
+            )
+
+    def _begin_run(self) -> None:
+        values = {"run_id": self.run_id, "started_ns": time.time_ns()}
+        values |= {field.name: getattr(self._facts, field.name) for field in fields(self._facts)}
+        marks = ", ".join("?" for _ in values)
+        with _refusing(self.path):
+            self._database.execute(
+                f"INSERT INTO runs ({', '.join(values)}) VALUES ({marks})", tuple(values.values())
+            )
+
+    def _mark(self, **marks: int) -> None:
+        with self._lock:
+            now = {field.name: getattr(self._handed_out, field.name) for field in fields(Marks)}
+            self._handed_out = Marks(**{n: max(v, marks.get(n, v)) for n, v in now.items()})
+            self._write_pending()
+
+    def _write(self, statement: str, *values: object) -> None:
+        with self._lock:
+            self._pending.append((statement, values))
+            self._write_pending()
+
+    def _write_pending(self) -> None:
+        """Commit all that waits; where that fails, give up the ballast and try once more."""
+        for is_last in (False, True):
+            try:
+                with _transaction(self._database):
+                    for statement, values in self._pending:
+                        self._database.execute(statement, values)
+                    for field in fields(Marks):
+                        mark = field.name, getattr(self._handed_out, field.name)
+                        self._database.execute(_MARK, mark)
+                self._pending.clear()
+                self.trouble = ""
+                return
+            except sqlite3.IntegrityError:  # a fish that is there already: our own mistake
+                raise
+            except sqlite3.Error as error:
+                self.trouble = str(error)
+            if not is_last:
+                self._make_room()
+
+    def _make_room(self) -> None:
+        with suppress(OSError):
+            self._ballast.unlink(missing_ok=True)
+        # After an I/O error SQLite may hold on to a state of the file that never was.
+        with suppress(sqlite3.Error, OutputError):
+            self._database.close()
+            self._database = open_database(self.path)
+
+
+def fish_row(estimate: LengthEstimate, flags: Sequence[str]) -> dict[str, object]:
+    """The columns of a final estimate."""
+    low, high = (None, None) if estimate.ci95_mm is None else estimate.ci95_mm.tolist()
+    row = {name: getattr(estimate, name) for name in FISH_COLUMNS}
+    return row | {
+        "ci95_low_mm": low,
+        "ci95_high_mm": high,
+        "refused": json.dumps(dict(estimate.refused)),
+        "flags": json.dumps(list(flags)),
+    }
+
+
+def read_estimates(database: sqlite3.Connection) -> Iterator[LengthEstimate]:
+    """The finished fish as they were, but for the smoothed series, which the recordings have."""
+    names = [*FISH_COLUMNS, "ci95_low_mm", "ci95_high_mm", "refused"]
+    for values in database.execute(f"SELECT {', '.join(names)} FROM fish ORDER BY number"):
+        row = dict(zip(names, values, strict=True))
+        ends = row.pop("ci95_low_mm"), row.pop("ci95_high_mm")
+        yield LengthEstimate(
+            **row | {"refused": json.loads(row["refused"])},
+            ci95_mm=None if ends[0] is None else np.array(ends),
+            timestamp_ns=row["last_timestamp_ns"],
+            frame_index=row["last_frame"],
+            is_final=True,
+            is_frame_used=False,
+            frame_reason="",
+            smoothed_frames=np.zeros(0, np.int64),
+            smoothed_mm=np.zeros(0),
+            smoothed_std_mm=np.zeros(0),
+        )
+
+
+@contextmanager
+def _transaction(database: sqlite3.Connection) -> Iterator[None]:
+    database.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+        database.execute("COMMIT")
+    except BaseException:
+        with suppress(sqlite3.Error):
+            database.execute("ROLLBACK")
+        raise
+
+
+@contextmanager
+def _refusing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise OutputError(
+            f"{path}: expected a database of lengths to write to, got: {error}; make room, or "
+            "choose another --out"
+        ) from error
+
+
+def require_free(out_dir: Path) -> None:
+    """Raise OutputError where another run is writing to the folder."""
+    os.close(_lock_folder(out_dir))
+
+
+def _lock_folder(out_dir: Path) -> int:
+    """Take the folder for this process alone; a crash gives it back."""
+    folder = os.open(out_dir, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(folder)
+        raise OutputError(
+            f"{out_dir}: expected a folder of its own for each run, found one that another run is "
+            "writing to; wait for that one or choose another --out"
+        ) from None
+    return folder
+
+
+def _set_aside(ballast: Path) -> None:
+    """Take a little room on the disk beforehand; a disk with hardly any is left alone."""
+    with suppress(OSError):
+        room = os.statvfs(ballast.parent)
+        size = min(_BALLAST_BYTES, int(_BALLAST_SHARE * room.f_bavail * room.f_frsize))
+        if size > 0:
+            with ballast.open("wb") as file:
+                os.posix_fallocate(file.fileno(), 0, size)

@@ -1,0 +1,103 @@
+"""The tables of lengths.db, and how a file of them is opened."""
+
+import sqlite3
+from pathlib import Path
+
+from stream_dmr.errors import OutputError
+
+VERSION = 1  # PRAGMA user_version
+APPLICATION_ID = 0x646D726C  # "dmrl": what `file` and other programs may know it by
+MARK_EVERY_NS = 5_000_000_000  # how much of the capture times a crash may leave unmarked
+_PATIENCE_S = 5.0  # for a reader that holds the file
+
+FISH_COLUMNS = [
+    *("track_id", "length_mm", "length_std_mm", "frames_seen", "frames_used", "first_frame"),
+    *("last_frame", "first_timestamp_ns", "last_timestamp_ns", "status"),
+]
+_TABLES = """
+CREATE TABLE runs (
+    run_id TEXT PRIMARY KEY,
+    started_ns INTEGER NOT NULL, -- wall clock, ns since 1970
+    ended_ns INTEGER, -- NULL: still going, or ended by a crash
+    source TEXT NOT NULL,
+    command TEXT NOT NULL,
+    software_version TEXT NOT NULL,
+    config_sha256 TEXT NOT NULL,
+    calibration_sha256 TEXT NOT NULL, -- '': no calibration
+    template_sha256 TEXT NOT NULL,
+    vessel TEXT, trip TEXT, haul TEXT
+) STRICT;
+CREATE TABLE fish (
+    number INTEGER PRIMARY KEY, -- in the order in which the tracks ended
+    track_id INTEGER NOT NULL UNIQUE,
+    run_id TEXT NOT NULL REFERENCES runs,
+    length_mm REAL, length_std_mm REAL, ci95_low_mm REAL, ci95_high_mm REAL,
+    frames_seen INTEGER NOT NULL, frames_used INTEGER NOT NULL,
+    first_frame INTEGER NOT NULL, last_frame INTEGER NOT NULL,
+    first_timestamp_ns INTEGER NOT NULL, last_timestamp_ns INTEGER NOT NULL, -- capture time
+    status TEXT NOT NULL,
+    refused TEXT NOT NULL, -- JSON: reason -> number of frames
+    flags TEXT NOT NULL, -- JSON: what a reader of this length must know, such as a moved camera
+    written_ns INTEGER NOT NULL -- wall clock
+) STRICT;
+CREATE TABLE marks (name TEXT PRIMARY KEY, value INTEGER NOT NULL) STRICT;
+CREATE TABLE events (
+    number INTEGER PRIMARY KEY,
+    run_id TEXT NOT NULL REFERENCES runs,
+    kind TEXT NOT NULL, text TEXT NOT NULL,
+    timestamp_ns INTEGER NOT NULL, -- capture time
+    written_ns INTEGER NOT NULL
+) STRICT;
+"""
+
+
+def open_database(path: Path, *, read_only: bool = False) -> sqlite3.Connection:
+    """Open a lengths.db, making its tables where there are none; usable from any one thread.
+
+    Raises OutputError where the file is no such database, damaged, or of a newer version.
+    """
+    mode = "ro" if read_only else "rwc"
+    try:
+        database = sqlite3.connect(
+            f"{path.absolute().as_uri()}?mode={mode}",
+            uri=True,
+            timeout=_PATIENCE_S,
+            isolation_level=None,
+            check_same_thread=False,
+        )
+        try:
+            _check(database, path)
+            if not read_only:
+                _prepare(database)
+        except BaseException:
+            database.close()
+            raise
+    except sqlite3.Error as error:
+        raise OutputError(
+            f"{path}: expected a database of lengths, got: {error}; move it away to begin a new "
+            "one, or choose another --out"
+        ) from error
+    return database
+
+
+def _check(database: sqlite3.Connection, path: Path) -> None:
+    (version,) = database.execute("PRAGMA user_version").fetchone()
+    (problem,) = database.execute("PRAGMA quick_check(1)").fetchone()
+    if problem != "ok":
+        raise sqlite3.DatabaseError(problem)
+    if version > VERSION:
+        raise OutputError(
+            f"{path}: expected a database of version {VERSION} or before, got version {version}, "
+            "which a newer stream-dmr wrote; upgrade stream-dmr or choose another --out"
+        )
+
+
+def _prepare(database: sqlite3.Connection) -> None:
+    database.execute("PRAGMA journal_mode = WAL")
+    database.execute("PRAGMA synchronous = FULL")
+    (version,) = database.execute("PRAGMA user_version").fetchone()
+    if version == 0:
+        database.executescript(
+            f"BEGIN; {_TABLES} PRAGMA application_id = {APPLICATION_ID}; "
+            f"PRAGMA user_version = {VERSION}; COMMIT;"
+        )

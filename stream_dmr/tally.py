@@ -1,0 +1,95 @@
+"""What a run does with every message beside passing it on: numbers, stores, records, counts it."""
+
+from dataclasses import replace
+from hashlib import sha256
+
+from stream_dmr import __version__
+from stream_dmr.messages import FishCrop, Frame, LengthEstimate, Message
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.recorder import Recorder
+from stream_dmr.store import LengthStore, RunFacts
+
+
+class Observer:
+    """Is told how a run goes, from its threads; this one doesn't listen."""
+
+    def warn(self, line: str) -> None:
+        """Something the user should know, once each."""
+
+    def serving(self, address: str) -> None:
+        """The view can be watched there from now on."""
+
+    def begin(self, num_frames: int | None) -> None:
+        """The inputs are fine and the chain starts."""
+
+    def frame_done(self) -> None:
+        """A frame has left the last stage."""
+
+    def fish_seen(self, num_fish: int) -> None:
+        """So many fish were seen so far."""
+
+
+class Tally:
+    """Takes every message of the chain, in the thread of its stage.
+
+    A finished fish goes to the store before anything else is done with it, so that no failure of
+    what follows can lose it. After an earlier run in the same folder, ids go on where that one
+    stopped; frames as well for a live source, whose numbers no annotations refer to.
+    """
+
+    def __init__(
+        self, recorder: Recorder, store: LengthStore, observer: Observer, *, is_live: bool
+    ) -> None:
+        self.final: list[LengthEstimate] = []
+        self.num_frames = 0
+        self._recorder = recorder
+        self._store = store
+        self._observer = observer
+        self._first_id = store.before.track_id
+        self._first_frame = store.before.frame_index if is_live else 0
+        self._track_ids: set[int] = set()
+
+    def record(self, message: Message) -> Message:
+        """Return the message as the next stage is to get it."""
+        match message:
+            case Frame(frame_index=index):
+                message = replace(message, frame_index=index + self._first_frame)
+                self._store.frame_passed(
+                    frame_index=message.frame_index, timestamp_ns=message.timestamp_ns
+                )
+            case FishCrop(track_id=track_id):
+                message = replace(message, track_id=track_id + self._first_id)
+                self._store.reserve_track(message.track_id)
+            case LengthEstimate(is_final=True):
+                self._store.add(message)
+                self.final.append(message)
+            case _:
+                pass
+        if self._store.trouble:
+            self._observer.warn(
+                f"{self._store.path}: {self._store.trouble}; lengths wait in memory"
+            )
+        message = self._recorder.write(message)
+        if isinstance(message, LengthEstimate):
+            self._track_ids.add(message.track_id)
+            self._observer.fish_seen(len(self._track_ids))
+        return message
+
+    def frame_done(self) -> None:
+        """Count a frame that has left the last stage."""
+        self.num_frames += 1
+        self._observer.frame_done()
+
+
+def run_facts(header: RunHeader) -> RunFacts:
+    """What the store says of a run; each hash is of the bytes that the recording holds."""
+    parts = header.attachments()
+    hashes = {name: sha256(data).hexdigest() for name, data in parts.items()}
+    return RunFacts(
+        source=header.source,
+        command=header.command,
+        software_version=__version__,
+        config_sha256=hashes["config.toml"],
+        calibration_sha256=hashes.get("calibration.yaml", ""),
+        template_sha256=hashes["template.pb"],
+    )
