@@ -1,0 +1,38 @@
+"""What turns a box into a mask: one small interface, asked on the crop, not on the frame.
+
+A crop is already free of lens distortion, and its pixel map to the frame is in one place
+(`crop.frame_from_crop_map`); a segmenter therefore knows nothing of cameras.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Ends:
+    """Where a fish's snout and the fork of its tail lie in the crop, and how sure that is."""
+
+    head_px: Float[np.ndarray, "2"]
+    tail_px: Float[np.ndarray, "2"]
+    confidence: float  # probability that the two are not the other way round, 0.5 to 1
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Segmented:
+    """The fish that a box means, as a segmenter sees it."""
+
+    probability: Float32[np.ndarray, "S S"]  # of being fish, 0 to 1, at the crop's pixels
+    ends: Ends | None  # None from a segmenter that doesn't look for them
+
+
+class Segmenter(Protocol):
+    """A box in, a mask out."""
+
+    def segment(
+        self, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
+    ) -> Segmented:
+        """The fish in a box, half-open in pixels of the crop `image` (BGR)."""
+        ...
