@@ -58,7 +58,7 @@ class Drawing:
         self._shapes = Waiting[FittedShape]()  # until they are placed
         self._reasons: dict[int, str] = {}  # why each track's last frame was not used
         self._tracks: set[int] = set()
-        self._numbers: Counter[str] = Counter()  # of the messages of each kind, so far
+        self.kept: Counter[str] = Counter()  # messages so far, by entity
         self._factor: int | None = None  # frame pixels per pixel of the view
         self._labels = np.zeros((0, 0), np.uint8)  # of the masks of frame `_labels_of` so far
         self._labels_of = 0
@@ -87,8 +87,8 @@ class Drawing:
     def keep(self, record: Record) -> None:
         """Put the encoded message beside the drawing, numbered, since Rerun sorts by time."""
         path = record.topic.payload
-        number = np.array([self._numbers[path]], np.uint64)
-        self._numbers[path] += 1
+        number = np.array([self.kept[path]], np.uint64)
+        self.kept[path] += 1
         self._add(path, rr.AnyValues, record.message, number=number, **blob(record.payload))
 
     def send(self) -> None:

@@ -13,6 +13,7 @@ from stream_dmr.recording.rerun_columns import blob
 from stream_dmr.recording.rerun_draw import Drawing
 from stream_dmr.recording.rerun_view import RUN, blueprint
 from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.topics import END
 
 NAME = "recording.rrd"
 _HEADER = ["messages", "header"]
@@ -30,6 +31,7 @@ class RerunSink:
         self._flush_ns = int(settings.flush_s * 1e9)
         self._with_messages = settings.rrd_messages
         self._closed = False
+        self._counts: dict[str, int] = {}  # of the rows of the header, by entity
         self._rec = new_stream()
         try:
             sink = rr.FileSink(str(path))
@@ -56,6 +58,9 @@ class RerunSink:
             return
         self._closed = True
         try:
+            self._drawing.send()
+            if self._with_messages:
+                self._log_end()
             self._flush()
         finally:
             self._rec.disconnect()
@@ -63,9 +68,16 @@ class RerunSink:
     def _log_header(self, header: RunHeader) -> None:
         parts = {"run.json": json.dumps(header.metadata()).encode(), **header.attachments()}
         for name, data in parts.items():
-            self._rec.log(
-                [*_HEADER, name], rr.AnyValues(drop_untyped_nones=True, **blob(data)), static=True
-            )
+            self._log([*_HEADER, name], data)
+            self._counts["/".join(["", *_HEADER, name])] = 1
+
+    def _log_end(self) -> None:
+        """How much there is, so that a reader knows when something is missing."""
+        messages = {f"/{path}": count for path, count in self._drawing.kept.items()}
+        self._log(END.split("/"), json.dumps(self._counts | messages).encode())
+
+    def _log(self, path: list[str], data: bytes) -> None:
+        self._rec.log([*path], rr.AnyValues(drop_untyped_nones=True, **blob(data)), static=True)
 
     def _flush(self) -> None:
         self._drawing.send()

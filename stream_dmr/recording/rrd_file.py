@@ -1,16 +1,19 @@
 """Reads the messages back that an .rrd carries beside its view.
 
 An .rrd has no checksum of its own, so each message and each part of the header has a CRC-32 beside
-it, and the messages of each kind are numbered.
+it, the messages of each kind are numbered, and a last row says how many there are.
 """
 
 import json
+import subprocess
+import warnings
 import zlib
 from collections.abc import Collection, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pyarrow as pa
@@ -19,10 +22,12 @@ from stream_dmr.errors import RecordingError
 from stream_dmr.messages import Message
 from stream_dmr.recording.codec import check_version
 from stream_dmr.recording.header import RunHeader
-from stream_dmr.recording.topics import TOPICS
+from stream_dmr.recording.rerun_program import rerun_program
+from stream_dmr.recording.topics import END, TOPICS
 
 _HEADER = "/messages/header/"
-
+_FOOTER_MAGIC = b"RRF2FOOT"  # in the last 16 bytes of a file that was closed
+_DAMAGE = (ValueError, RuntimeError, OSError, KeyError, TypeError, pa.ArrowException)
 
 # By entity: number, capture time, encoding.
 Rows = dict[str, list[tuple[int, int, bytes]]]
@@ -36,6 +41,7 @@ class RrdFile:
         self.path = path
         self.warnings: list[str] = []
         self._rows = _read_apart(path)
+        self._check_end()
         self.header = self._read_header()
 
     def payloads(
@@ -46,6 +52,18 @@ class RrdFile:
             for _, timestamp_ns, payload in self._rows.get(f"/{TOPICS[kind].payload}", ()):
                 if time_ns is None or time_ns[0] <= timestamp_ns < time_ns[1]:
                     yield kind, payload
+
+    def _check_end(self) -> None:
+        """Compare with the last row: without it the file is torn, with other counts damaged."""
+        end = self._rows.pop(f"/{END}", None)
+        counts = {entity: len(rows) for entity, rows in self._rows.items()}
+        if end is None:
+            whole = sum(count for entity, count in counts.items() if _HEADER not in entity)
+            self.warnings.append(
+                f"{self.path}: torn; {whole} messages are whole, what came after is lost"
+            )
+        elif json.loads(end[0][2]) != counts:
+            raise RecordingError(f"{self.path}: damaged: parts of it are missing")
 
     def _read_header(self) -> RunHeader:
         parts = {
@@ -80,23 +98,57 @@ def _read_apart(path: Path) -> Rows:
 
 
 def _read(path: Path) -> Rows:
+    try:
+        return _rows_in(path)
+    except _DAMAGE as error:
+        if path.is_file() and not _is_closed(path) and (rows := _salvaged(path)):
+            return rows
+        raise RecordingError(
+            f"{path}: expected a whole recording (.rrd), but it can't be read: {error}"
+        ) from error
+
+
+def _rows_in(path: Path) -> Rows:
     from rerun.chunk import RrdReader  # in the other process only
 
     rows: Rows = {}
-    try:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that a torn file has no footer, we say ourselves
         for chunk in RrdReader(str(path)).stream():
             entity = str(chunk.entity_path)
             if entity.startswith("/messages/"):
                 rows.setdefault(entity, []).extend(_rows_of(chunk.to_record_batch()))
-    except (ValueError, RuntimeError, OSError, KeyError, TypeError, pa.ArrowException) as error:
-        raise RecordingError(
-            f"{path}: expected a whole recording (.rrd), but it can't be read: {error}"
-        ) from error
     for entity, found in rows.items():
         found.sort()
         if [number for number, _, _ in found] != list(range(len(found))):
-            raise RecordingError(f"{path}: damaged: messages are missing in {entity}")
+            raise ValueError(f"messages are missing in {entity}")
     return rows
+
+
+def _is_closed(path: Path) -> bool:
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - 16, 0))
+        return _FOOTER_MAGIC in file.read()
+
+
+def _salvaged(path: Path) -> Rows:
+    """The whole part of a file that was not closed, of which Rerun's reader wants nothing."""
+    with TemporaryDirectory() as folder:
+        whole = Path(folder) / "whole.rrd"
+        command = [
+            rerun_program(),
+            "rrd",
+            "filter",
+            "--continue-on-error",
+            str(path),
+            "-o",
+            str(whole),
+        ]
+        subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            return _rows_in(whole)
+        except _DAMAGE:
+            return {}
 
 
 def _rows_of(batch: pa.RecordBatch) -> Iterator[tuple[int, int, bytes]]:

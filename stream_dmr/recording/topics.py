@@ -40,6 +40,7 @@ FRAME_LENGTH, LENGTH = "length/{id}/frame", "length/{id}/estimate"
 IOU, BENDING, FIT_MS = "iou/{id}", "bending/{id}", "fit_ms/{id}"
 LOG, REFUSALS, RESULTS = "log", "log/refusals", "log/lengths"
 CAMERA, PLANE = "scene/camera", "scene/plane"  # static, from the header
+END = "messages/end"  # the last row of a whole .rrd: how many messages each payload path has
 FISH_ROOTS = ("scene/camera/fish", "scene/fish")  # what a new frame clears
 
 TOPICS: dict[type[Message], Topic] = {

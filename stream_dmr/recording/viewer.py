@@ -10,13 +10,13 @@ import subprocess
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from rerun.experimental import ViewerClient
 
 from stream_dmr.errors import RecordingError
+from stream_dmr.recording.rerun_program import rerun_program
 from stream_dmr.recording.whole_file import writing_to
 
 WEB_MEMORY = "512MiB"  # of the server; what is older is dropped
@@ -110,11 +110,10 @@ def _settled_picture(viewer: ViewerClient) -> bytes:
 @contextmanager
 def _running(options: Sequence[str]) -> Iterator[subprocess.Popen[str]]:
     """Rerun's program of this very environment, heard on this machine only; ends with us."""
-    program = str(files("rerun_cli").joinpath("rerun"))
     with (
         TemporaryDirectory() as scratch,  # it leaves files behind
         subprocess.Popen(
-            [program, *options, "--bind", "127.0.0.1"],
+            [rerun_program(), *options, "--bind", "127.0.0.1"],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
