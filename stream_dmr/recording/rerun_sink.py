@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import rerun as rr
@@ -76,7 +77,7 @@ class RerunSink:
         messages = {f"/{path}": count for path, count in self._drawing.kept.items()}
         self._log(END.split("/"), json.dumps(self._counts | messages).encode())
 
-    def _log(self, path: list[str], data: bytes) -> None:
+    def _log(self, path: Sequence[object], data: bytes) -> None:
         self._rec.log([*path], rr.AnyValues(drop_untyped_nones=True, **blob(data)), static=True)
 
     def _flush(self) -> None:
