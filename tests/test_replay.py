@@ -14,9 +14,10 @@ from tiny_clip import write_clip
 
 from stream_dmr.calibration import load_calibration, save_calibration
 from stream_dmr.errors import RecordingError
-from stream_dmr.messages import FittedMesh, LengthEstimate, LocalizedFish
+from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish
 from stream_dmr.recording.codec import decode
-from stream_dmr.recording.opened import open_recordings
+from stream_dmr.recording.opened import messages, open_recordings
+from stream_dmr.recording.part import Part
 from stream_dmr.recording.topics import TOPICS
 from stream_dmr.replay.difference import differences
 
@@ -120,9 +121,25 @@ def test_a_part_in_time_is_read_alone(run):
     times = [decode(LocalizedFish, p).timestamp_ns for _, p in whole.payloads([LocalizedFish])]
     low, high = times[3], times[8]
     for name in FORMATS:
-        part = open_recordings([folder / name]).payloads([LocalizedFish], time_ns=(low, high))
+        part = open_recordings([folder / name]).payloads([LocalizedFish], Part(time_ns=(low, high)))
         found = [decode(LocalizedFish, p).timestamp_ns for _, p in part]
         assert found == [t for t in times if low <= t < high]
+
+
+def test_a_fish_is_read_by_the_index(run):
+    """Only the time in which it was seen is read, and the other fish of that time are left out."""
+    recording = open_recordings([run[0]])
+    part = Part(tracks=frozenset({3}))
+    frames = [
+        decode(Frame, payload).frame_index for _, payload in recording.payloads([Frame], part)
+    ]
+    assert frames == [5, 6, 7]
+    kinds = (FittedMesh, LengthEstimate)
+    read = [message for message, _ in messages(recording, kinds, part)]
+    assert read
+    assert all(message.track_id == 3 for message in read)
+    everything = [message for message, _ in messages(recording, kinds)]
+    assert len(read) == sum(message.track_id == 3 for message in everything)
 
 
 def test_segments_are_read_as_one(run, tmp_path):
@@ -137,6 +154,20 @@ class TestDamage:
     @given(seed=st.integers(0, 2**32))
     def test_a_flipped_byte_is_found(self, run, tmp_path_factory, seed):
         _check_flip(run[0] / "recording.mcap", tmp_path_factory.mktemp("flip"), seed)
+
+    @settings(max_examples=30, deadline=None)
+    @given(seed=st.integers(0, 2**32))
+    def test_a_flipped_byte_is_found_or_not_read_by_a_read_of_a_part(
+        self, run, tmp_path_factory, seed
+    ):
+        path = _flipped(run[0] / "recording.mcap", tmp_path_factory.mktemp("flip"), seed)
+        part = Part(tracks=frozenset({2}))
+        with suppress(RecordingError):
+            recording = open_recordings([path])
+            found = list(recording.payloads(TOPICS, part))
+            assert recording.warnings or found == list(
+                open_recordings([run[0]]).payloads(TOPICS, part)
+            )
 
     @settings(max_examples=4, deadline=None)  # a process each
     @given(seed=st.integers(0, 2**32))
@@ -174,13 +205,18 @@ class TestDamage:
         assert "torn" in outcome.err
 
 
-def _check_flip(whole: Path, scratch: Path, seed: int) -> None:
-    """Every flip in a .mcap is reported; in an .rrd, no message changes unnoticed."""
+def _flipped(whole: Path, scratch: Path, seed: int) -> Path:
     rng = np.random.default_rng(seed)
     data = bytearray(whole.read_bytes())
     data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
     path = scratch / whole.name
     path.write_bytes(data)
+    return path
+
+
+def _check_flip(whole: Path, scratch: Path, seed: int) -> None:
+    """Every flip in a .mcap is reported; in an .rrd, no message changes unnoticed."""
+    path = _flipped(whole, scratch, seed)
     found = []
     with suppress(RecordingError):
         recording = open_recordings([path])

@@ -1,12 +1,15 @@
 """What a recording needs beside its messages to be recomputed from."""
 
 import platform
+import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from stream_dmr import __version__
 from stream_dmr.camera import Calibration
+from stream_dmr.errors import RecordingError
 from stream_dmr.recording.codec import CODEC_VERSION, decode, encode
 from stream_dmr.template import Template
 
@@ -30,6 +33,7 @@ class RunHeader:
             "source": self.source,
             "command": self.command,
             "codec_version": str(CODEC_VERSION),
+            "attachments_crc32": str(_checksum(self.attachments())),
             "stream_dmr": __version__,
             "python": platform.python_version(),
             "platform": f"{platform.system()} {platform.machine()} {' '.join(platform.libc_ver())}",
@@ -47,9 +51,12 @@ class RunHeader:
 
     @classmethod
     def from_parts(cls, metadata: dict[str, str], attachments: dict[str, bytes]) -> "RunHeader":
-        """The inverse of `metadata` and `attachments`, exact. KeyError where a part is missing."""
+        """The inverse of `metadata` and `attachments`, exact.
+
+        KeyError where a part is missing, RecordingError where one is damaged.
+        """
         calibration = attachments.get("calibration.pb")
-        return cls(
+        header = cls(
             source=metadata["source"],
             command=metadata["command"],
             config_toml=attachments["config.toml"].decode(),
@@ -57,6 +64,18 @@ class RunHeader:
             calibration=None if calibration is None else decode(Calibration, calibration),
             calibration_file=attachments.get("calibration.yaml", b""),
         )
+        recorded = metadata.get("attachments_crc32")  # the first recordings have none
+        if recorded is not None and recorded != str(_checksum(attachments)):
+            raise RecordingError("its config, template or calibration is damaged or missing")
+        return header
+
+
+def _checksum(attachments: Mapping[str, bytes]) -> int:
+    """To tell whether all are there and as they were: readers by index check nothing else."""
+    crc32 = 0
+    for name, data in sorted(attachments.items()):
+        crc32 = zlib.crc32(name.encode() + data, crc32)
+    return crc32
 
 
 def _cpu() -> str:

@@ -1,10 +1,11 @@
 """Reads a .mcap from its start to its end, also where the end is missing.
 
 Every byte is under a checksum: chunks have their own, and the data section has one over all of it,
-which is why a whole read is made in file order. A read of a time range goes by the index instead,
-and is guarded by the checksums of its chunks.
+which is why a whole read is made in file order. A read of a part goes by the index instead, and is
+guarded by the checksums of the index and of the chunks that are read.
 """
 
+import json
 import struct
 import zlib
 from collections.abc import Collection, Iterator
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import IO
 
 from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Chunk, Footer, Metadata
 from mcap.records import Message as McapMessage
@@ -24,7 +26,8 @@ from stream_dmr.errors import RecordingError
 from stream_dmr.messages import Message
 from stream_dmr.recording.codec import check_version
 from stream_dmr.recording.header import RunHeader
-from stream_dmr.recording.topics import TOPICS
+from stream_dmr.recording.part import WHOLE, Part, Spans
+from stream_dmr.recording.topics import SPANS, TOPICS, VIDEO
 
 # What the mcap library lets through on damaged bytes; its CRC error is a ValueError.
 _DAMAGE = (
@@ -32,6 +35,7 @@ _DAMAGE = (
     *(OverflowError, MemoryError, AttributeError, TypeError),
 )
 _CUT_OFF = (EndOfFile, struct.error)
+_FOOTER_BYTES = 1 + 8 + 8 + 8 + 4
 _LARGEST_RECORD = 1 << 30  # bytes; a damaged length must not ask for all memory
 
 
@@ -46,45 +50,41 @@ class McapFile:
         self.header = self._read_header()
 
     def payloads(
-        self, kinds: Collection[type[Message]], *, time_ns: tuple[int, int] | None = None
+        self, kinds: Collection[type[Message]], part: Part = WHOLE
     ) -> Iterator[tuple[type[Message], bytes]]:
         """See `opened.Recording`. A torn file gives what is whole, and a warning."""
         topics = {TOPICS[kind].topic: kind for kind in kinds}
-        with self._open() as stream:
-            if time_ns is not None and not self._is_torn(stream):
-                yield from self._by_index(stream, topics, time_ns)
-            else:
-                yield from self._in_order(stream, topics, time_ns)
+        for topic, message in self._messages(topics, part):
+            yield topics[topic], message.data
 
-    def _by_index(
-        self, stream: IO[bytes], topics: dict[str, type[Message]], time_ns: tuple[int, int]
-    ) -> Iterator[tuple[type[Message], bytes]]:
-        reader = SeekingReader(stream, validate_crcs=True)
-        first, last = time_ns
-        for _, channel, message in reader.iter_messages(
-            list(topics), starting_at=first, ending_before=last, log_time_order=False
-        ):
-            yield topics[channel.topic], message.data
+    def video(self, part: Part = WHOLE) -> Iterator[bytes]:
+        """See `opened.Recording`."""
+        for _, message in self._messages([VIDEO], part):
+            yield message.data
+
+    def _messages(self, topics: Collection[str], part: Part) -> Iterator[tuple[str, McapMessage]]:
+        with self._open() as stream:
+            if part.is_whole or self._is_torn(stream) or not _has_index(stream):
+                yield from self._in_order(stream, topics, part)
+            else:
+                yield from _by_index(stream, topics, part)
 
     def _in_order(
-        self,
-        stream: IO[bytes],
-        topics: dict[str, type[Message]],
-        time_ns: tuple[int, int] | None,
-    ) -> Iterator[tuple[type[Message], bytes]]:
+        self, stream: IO[bytes], topics: Collection[str], part: Part
+    ) -> Iterator[tuple[str, McapMessage]]:
         is_torn, count = self._is_torn(stream), 0
-        kinds: dict[int, type[Message]] = {}
+        wanted: dict[int, str] = {}  # topics by channel
         try:
             for record in _records(stream):
                 if isinstance(record, Channel) and record.topic in topics:
-                    kinds[record.id] = topics[record.topic]
+                    wanted[record.id] = record.topic
                 elif isinstance(record, Footer):
-                    _check_summary(stream, record)
+                    _check_index(stream, record)
                 elif isinstance(record, McapMessage):
                     count += 1
-                    kind = kinds.get(record.channel_id)
-                    if kind and (time_ns is None or time_ns[0] <= record.log_time < time_ns[1]):
-                        yield kind, record.data
+                    topic = wanted.get(record.channel_id)
+                    if topic and part.has_time(record.log_time):
+                        yield topic, record
         except _CUT_OFF:
             if not is_torn:
                 raise
@@ -105,7 +105,7 @@ class McapFile:
                     if isinstance(record, Metadata) and record.name == "run":
                         self.metadata = record.metadata
                         check_version(int(self.metadata["codec_version"]))
-                    elif isinstance(record, Attachment):
+                    elif isinstance(record, Attachment) and record.name != SPANS:
                         attachments[record.name] = record.data
             except _CUT_OFF:
                 pass
@@ -144,7 +144,51 @@ class McapFile:
             ) from error
 
 
-def _check_summary(stream: IO[bytes], footer: Footer) -> None:
+def _by_index(
+    stream: IO[bytes], topics: Collection[str], part: Part
+) -> Iterator[tuple[str, McapMessage]]:
+    stream.seek(-_FOOTER_BYTES - len(MCAP0_MAGIC), 2)
+    _check_index(stream, _footer(stream))
+    stream.seek(0)
+    reader = SeekingReader(stream, validate_crcs=True)
+    first, last = part.within(_spans(stream, reader)).time_ns or (None, None)
+    for _, channel, message in reader.iter_messages(
+        list(topics), starting_at=first, ending_before=last, log_time_order=False
+    ):
+        yield channel.topic, message
+
+
+def _spans(stream: IO[bytes], reader: SeekingReader) -> Spans:
+    """When each fish was seen."""
+    summary = reader.get_summary()
+    for index in summary.attachment_indexes if summary else ():
+        if index.name == SPANS:
+            stream.seek(index.offset)
+            record = stream.read(index.length)  # 9 bytes of head, content, CRC-32
+            if zlib.crc32(record[9:-4]) != int.from_bytes(record[-4:], "little"):
+                raise ValueError(f"the checksum of {SPANS} is wrong")
+            text = record[-4 - index.data_size : -4]
+            return {int(track_id): tuple(span) for track_id, span in json.loads(text).items()}
+    return {}
+
+
+def _has_index(stream: IO[bytes]) -> bool:
+    """Not where a full disk left no room for one."""
+    stream.seek(-_FOOTER_BYTES - len(MCAP0_MAGIC), 2)
+    footer = _footer(stream)
+    stream.seek(0)
+    return footer.summary_start > 0
+
+
+def _footer(stream: IO[bytes]) -> Footer:
+    """The footer that stands here."""
+    opcode, _, *fields = struct.unpack("<BQQQI", stream.read(_FOOTER_BYTES))
+    if opcode != Opcode.FOOTER:
+        raise ValueError("it has no footer")
+    return Footer(*fields)
+
+
+def _check_index(stream: IO[bytes], footer: Footer) -> None:
     """The mcap library writes this checksum and never looks at it."""
     if footer.summary_crc:
         place = stream.tell()

@@ -4,6 +4,7 @@ Written as `recording.mcap.part` and renamed once it is closed. Whatever is need
 messages comes first, and every chunk of messages is complete in itself.
 """
 
+import json
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -17,10 +18,11 @@ from mcap_protobuf.schema import register_schema
 
 from stream_dmr import __version__
 from stream_dmr.errors import OutputError
+from stream_dmr.messages import Frame
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.record import Record
 from stream_dmr.recording.schema import schema_bytes
-from stream_dmr.recording.topics import TOPICS
+from stream_dmr.recording.topics import SPANS, TOPICS
 from stream_dmr.recording.whole_file import WholeFile, rename_durably
 
 NAME = "recording.mcap"
@@ -59,6 +61,7 @@ class McapSink:
         self._channels: dict[type, int] = {}
         self._extra, self._extra_channels = extra, dict[str, int]()
         self._sequences: Counter[int] = Counter()
+        self._spans: dict[int, tuple[int, int]] = {}  # first and last capture time of each track
         self._closed = False
         try:
             _set_aside(self._part)
@@ -76,6 +79,8 @@ class McapSink:
         timestamp_ns = record.message.timestamp_ns
         try:
             self._add(self._channels[type(record.message)], timestamp_ns, record.payload)
+            if not isinstance(record.message, Frame):
+                self._saw(record.message.track_id, timestamp_ns)
             for topic, drawn in self._extra.draw(record) if self._extra else ():
                 channel = self._extra_channels[topic]
                 self._add(channel, timestamp_ns, drawn.SerializeToString())
@@ -93,6 +98,8 @@ class McapSink:
         try:
             self._flush()
             whole = self._file.tell()
+            spans = json.dumps(self._spans).encode()
+            self._writer.add_attachment(0, 0, SPANS, "application/json", spans)
             self._writer.finish()
             self._end()
         except OSError as error:
@@ -104,6 +111,10 @@ class McapSink:
         self._writer.add_message(
             channel, timestamp_ns, data, timestamp_ns, self._sequences[channel]
         )
+
+    def _saw(self, track_id: int, timestamp_ns: int) -> None:
+        first, last = self._spans.get(track_id, (timestamp_ns, timestamp_ns))
+        self._spans[track_id] = min(first, timestamp_ns), max(last, timestamp_ns)
 
     def _register_topics(self) -> None:
         for kind, row in TOPICS.items():

@@ -6,8 +6,10 @@ from typing import Protocol, runtime_checkable
 
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import Message
+from stream_dmr.recording.codec import decode
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.mcap_file import McapFile
+from stream_dmr.recording.part import WHOLE, Part
 from stream_dmr.recording.rrd_file import RrdFile
 
 Kinds = Collection[type[Message]]
@@ -25,14 +27,17 @@ class Recording(Protocol):
         """What is lost, a line each; complete once everything was read."""
         ...
 
-    def payloads(
-        self, kinds: Kinds, *, time_ns: tuple[int, int] | None = None
-    ) -> Iterator[tuple[type[Message], bytes]]:
+    def payloads(self, kinds: Kinds, part: Part = WHOLE) -> Iterator[tuple[type[Message], bytes]]:
         """Type and encoding of the messages of `kinds`, in the order in which each was written.
 
-        With `time_ns` only those of capture times from the first (included) to the second
-        (excluded). Raises RecordingError where the recording is damaged.
+        Only those of the part's time, and, where an index tells it, of the time in which its
+        tracks were seen: `messages` leaves out the other fish. Raises RecordingError where the
+        recording is damaged.
         """
+        ...
+
+    def video(self, part: Part = WHOLE) -> Iterator[bytes]:
+        """The encoded CompressedVideo messages of `frames = "h264"`; none in an .rrd."""
         ...
 
 
@@ -42,8 +47,18 @@ def open_recordings(paths: Sequence[Path]) -> Recording:
     Raises RecordingError where one can't be read, or where they aren't of the same run.
     """
     files = [file for path in paths for file in _files_of(path)]
-    parts = [RrdFile(file) if file.suffix == ".rrd" else McapFile(file) for file in files]
-    return parts[0] if len(parts) == 1 else _Row(files, parts)
+    segments = [RrdFile(file) if file.suffix == ".rrd" else McapFile(file) for file in files]
+    return segments[0] if len(segments) == 1 else _Row(files, segments)
+
+
+def messages(
+    recording: Recording, kinds: Kinds, part: Part = WHOLE
+) -> Iterator[tuple[Message, bytes]]:
+    """The messages of a part of a recording, each with its encoding."""
+    for kind, payload in recording.payloads(kinds, part):
+        message = decode(kind, payload)
+        if part.has(message):
+            yield message, payload
 
 
 def _files_of(path: Path) -> list[Path]:
@@ -59,11 +74,11 @@ def _files_of(path: Path) -> list[Path]:
 class _Row:
     """Segments of one run, one after the other."""
 
-    def __init__(self, files: Sequence[Path], parts: Sequence[Recording]) -> None:
-        self._parts = parts
-        self.header, self.metadata = parts[0].header, parts[0].metadata
-        for file, part in zip(files, parts, strict=True):
-            if part.header.attachments() != self.header.attachments():
+    def __init__(self, files: Sequence[Path], segments: Sequence[Recording]) -> None:
+        self._segments = segments
+        self.header, self.metadata = segments[0].header, segments[0].metadata
+        for file, segment in zip(files, segments, strict=True):
+            if segment.header.attachments() != self.header.attachments():
                 raise RecordingError(
                     f"{file}: expected a segment of the same run as {files[0]}, got one with "
                     "another config, template or calibration; replay them one by one"
@@ -72,11 +87,14 @@ class _Row:
     @property
     def warnings(self) -> Sequence[str]:
         """What is lost of each."""
-        return [line for part in self._parts for line in part.warnings]
+        return [line for segment in self._segments for line in segment.warnings]
 
-    def payloads(
-        self, kinds: Kinds, *, time_ns: tuple[int, int] | None = None
-    ) -> Iterator[tuple[type[Message], bytes]]:
-        """Those of each part in turn."""
-        for part in self._parts:
-            yield from part.payloads(kinds, time_ns=time_ns)
+    def payloads(self, kinds: Kinds, part: Part = WHOLE) -> Iterator[tuple[type[Message], bytes]]:
+        """Those of each segment in turn."""
+        for segment in self._segments:
+            yield from segment.payloads(kinds, part)
+
+    def video(self, part: Part = WHOLE) -> Iterator[bytes]:
+        """That of each segment in turn."""
+        for segment in self._segments:
+            yield from segment.video(part)

@@ -22,6 +22,7 @@ from stream_dmr.errors import RecordingError
 from stream_dmr.messages import Message
 from stream_dmr.recording.codec import check_version
 from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.part import WHOLE, Part
 from stream_dmr.recording.rerun_program import rerun_program
 from stream_dmr.recording.topics import END, TOPICS
 
@@ -45,13 +46,17 @@ class RrdFile:
         self.header = self._read_header()
 
     def payloads(
-        self, kinds: Collection[type[Message]], *, time_ns: tuple[int, int] | None = None
+        self, kinds: Collection[type[Message]], part: Part = WHOLE
     ) -> Iterator[tuple[type[Message], bytes]]:
         """See `opened.Recording`; here one kind after the other."""
         for kind in kinds:
             for _, timestamp_ns, payload in self._rows.get(f"/{TOPICS[kind].payload}", ()):
-                if time_ns is None or time_ns[0] <= timestamp_ns < time_ns[1]:
+                if part.has_time(timestamp_ns):
                     yield kind, payload
+
+    def video(self, part: Part = WHOLE) -> Iterator[bytes]:
+        """None."""
+        return iter(())
 
     def _check_end(self) -> None:
         """Compare with the last row: without it the file is torn, with other counts damaged."""

@@ -41,6 +41,8 @@ IOU, BENDING, FIT_MS = "iou/{id}", "bending/{id}", "fit_ms/{id}"
 LOG, REFUSALS, RESULTS = "log", "log/refusals", "log/lengths"
 CAMERA, PLANE = "scene/camera", "scene/plane"  # static, from the header
 END = "messages/end"  # the last row of a whole .rrd: how many messages each payload path has
+SPANS = "tracks.json"  # attachment of a whole .mcap: each track's first and last capture time, ns
+VIDEO = "/video"  # in the .mcap with frames = "h264": foxglove.CompressedVideo
 FISH_ROOTS = ("scene/camera/fish", "scene/fish")  # what a new frame clears
 
 TOPICS: dict[type[Message], Topic] = {

@@ -24,6 +24,7 @@ from stream_dmr.messages import (
 from stream_dmr.pipeline import Node, StageCounters, run_chain
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.opened import open_recordings
+from stream_dmr.recording.part import Part
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.restored import Pictures
 from stream_dmr.replay.judge import Judge, Mismatch, Scribe
@@ -85,7 +86,7 @@ def replay(
     _refuse_impossible(request)
     recording = open_recordings(request.recordings)
     config, template, calibration = _inputs(request, recording.header)
-    tape = Tape(recording, tracks=request.tracks, time_s=request.time_s)
+    tape = Tape(recording, Part.of_seconds(request.time_s, request.tracks))
     order = [*STAGES.values()]
     first = order.index(STAGES[request.first])
     with ExitStack() as stack:

@@ -4,37 +4,25 @@ from collections.abc import Iterator, Sequence
 
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, Message
-from stream_dmr.recording.codec import decode
-from stream_dmr.recording.opened import Recording
+from stream_dmr.recording.opened import Recording, messages
+from stream_dmr.recording.part import WHOLE, Part
 from stream_dmr.recording.restored import Pictures
 
 
 class Tape:
     """The recorded messages of each kind, in their order."""
 
-    def __init__(
-        self,
-        recording: Recording,
-        *,
-        tracks: frozenset[int] | None = None,
-        time_s: tuple[float, float] | None = None,
-    ) -> None:
+    def __init__(self, recording: Recording, part: Part = WHOLE) -> None:
         self._recording = recording
-        self._tracks = tracks
-        self._time_ns = None
-        if time_s is not None:
-            self._time_ns = (round(time_s[0] * 1e9), round(time_s[1] * 1e9))
+        self._part = part
         self._payloads: dict[int, bytes] = {}  # of messages on their way to a new recording
 
     def messages(self, kind: type[Message], *, keep: bool = True) -> Iterator[Message]:
         """Those of the wanted tracks and times."""
-        for _, payload in self._recording.payloads([kind], time_ns=self._time_ns):
-            message = decode(kind, payload)
-            track_id = getattr(message, "track_id", None)
-            if self._tracks is None or track_id is None or track_id in self._tracks:
-                if keep:
-                    self._payloads[id(message)] = payload
-                yield message
+        for message, payload in messages(self._recording, [kind], self._part):
+            if keep:
+                self._payloads[id(message)] = payload
+            yield message
 
     def frames(self) -> Iterator[Frame]:
         """The frames, without pictures where they were recorded by reference."""
