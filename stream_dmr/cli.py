@@ -13,6 +13,7 @@ import typer
 
 from stream_dmr import __version__
 from stream_dmr.cli_calibrate import calibrate
+from stream_dmr.cli_evaluate import evaluate
 from stream_dmr.cli_export import export
 from stream_dmr.cli_replay import replay
 from stream_dmr.cli_support import command_line, stop_on_signals, without_password
@@ -26,7 +27,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (calibrate, replay, view, convert, export):
+for command in (calibrate, replay, view, convert, export, evaluate):
     app.command()(command)
 
 
@@ -179,18 +180,6 @@ def simulate_command(
 
     simulate(out, num_fish=fish, num_frames=frames, preset=preset, seed=seed)
     print(f"scene in {out}: video.mp4, boxes.txt, masks, calibration.yaml, truth.csv, species.ply")
-
-
-@app.command("evaluate")
-def evaluate_command(
-    lengths: Annotated[Path, typer.Option(help="lengths.csv of a run.")],
-    truth: Annotated[Path, typer.Option(help="truth.csv with track_id,length_mm.")],
-) -> None:
-    """Compare measured lengths with known ones."""
-    from stream_dmr.display import print_evaluation
-    from stream_dmr.evaluation import evaluate
-
-    print_evaluation(evaluate(lengths, truth))
 
 
 if __name__ == "__main__":

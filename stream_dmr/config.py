@@ -17,6 +17,7 @@ from stream_dmr.errors import ConfigError
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.length_filter import SmoothLengthSettings
 from stream_dmr.localization import LocalizeSettings
+from stream_dmr.metrics import EvaluateSettings
 from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.segmentation.crop import CropFishSettings
 from stream_dmr.settings import Settings
@@ -52,6 +53,9 @@ class Config(Settings):
     )
     recording: RecordingSettings = Field(
         default_factory=RecordingSettings, description="what is recorded, and how exactly"
+    )
+    evaluate: EvaluateSettings = Field(
+        default_factory=EvaluateSettings, description="how `stream-dmr evaluate` compares lengths"
     )
 
 

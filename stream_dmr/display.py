@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from stream_dmr.evaluation import Evaluation, summary_rows
+from stream_dmr.evaluation import Distributions, Evaluation, distribution_rows, summary_rows
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.replay.replay import ReplaySummary
 from stream_dmr.run import Observer, RunSummary
@@ -136,10 +136,19 @@ def print_evaluation(evaluation: Evaluation) -> None:
         error_mm = "-" if row.error_mm is None else f"{row.error_mm:+.1f}"
         percent = "-" if row.error_mm is None else f"{100 * row.error_mm / row.truth_mm:+.2f}"
         fish.add_row(str(row.track_id), f"{row.truth_mm:.1f}", measured, error_mm, percent)
-    figures = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
-    for name, value in summary_rows(evaluation):
-        figures.add_row(name, value)
-    _stdout().print(fish, "", figures, sep="\n")
+    _stdout().print(fish, "", _figures(summary_rows(evaluation)), sep="\n")
+
+
+def print_distributions(distributions: Distributions) -> None:
+    """Print the figures of two histograms to stdout."""
+    _stdout().print(_figures(distribution_rows(distributions)))
+
+
+def _figures(rows: list[tuple[str, str]]) -> Table:
+    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+    for name, value in rows:
+        table.add_row(name, value)
+    return table
 
 
 def _stdout() -> Console:

@@ -4,15 +4,47 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import entropy, wasserstein_distance
+from pydantic import Field
+from scipy.special import rel_entr
+
+from stream_dmr.settings import Settings
+
+
+class EvaluateSettings(Settings):
+    """`[evaluate]`: how distributions of lengths are compared.
+
+    The paper keeps 500 to 1000 mm and does not state its bin width; 50 mm is ours.
+    """
+
+    first_bin_mm: float = Field(
+        default=500.0,
+        ge=0,
+        description="lower end of the histograms, shorter fish are left out, mm",
+    )
+    bin_width_mm: float = Field(default=50.0, gt=0, description="width of a bin, mm")
+    num_bins: int = Field(
+        default=10, ge=1, le=10000, description="number of bins; longer fish are left out"
+    )
+    pseudo_count: float = Field(
+        default=0.5, gt=0, description="fish added to every bin for KL, so that none is empty"
+    )
+
+    def edges_mm(self) -> Float[np.ndarray, "E"]:
+        """Ends of the bins: 500, 550, ..., 1000 mm by default."""
+        return self.first_bin_mm + self.bin_width_mm * np.arange(self.num_bins + 1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Histogram:
-    """Shares of fish in bins of equal width; they sum to 1."""
+    """Numbers of fish in bins of length."""
 
-    centers_mm: Float[np.ndarray, "B"]  # middle of each bin
-    counts: Float[np.ndarray, "B"]  # fish in each bin
+    edges_mm: Float[np.ndarray, "E"]  # rising
+    counts: Float[np.ndarray, "B"]  # fish in each bin; not all zero
+
+    @property
+    def centers_mm(self) -> Float[np.ndarray, "B"]:
+        """Middle of each bin."""
+        return (self.edges_mm[:-1] + self.edges_mm[1:]) / 2
 
     @property
     def shares(self) -> Float[np.ndarray, "B"]:
@@ -21,25 +53,13 @@ class Histogram:
 
 
 def length_histogram(
-    lengths_mm: Float[np.ndarray, "N"],
-    *,
-    bin_width_mm: float = 50.0,
-    kept_mm: tuple[float, float] = (500.0, 1000.0),
+    lengths_mm: Float[np.ndarray, "N"], edges_mm: Float[np.ndarray, "E"]
 ) -> Histogram | None:
-    """Histogram of the lengths within `kept_mm`, both ends included; None where there are none.
-
-    The paper keeps 500 to 1000 mm and does not state its bin width; 50 mm is ours.
-    Raises ValueError where the bins don't fill the kept range.
-    """
-    low, high = kept_mm
-    num_bins = round((high - low) / bin_width_mm)
-    if num_bins < 1 or not np.isclose(num_bins * bin_width_mm, high - low):
-        raise ValueError(f"expected bins that fill {low} to {high} mm, got {bin_width_mm} mm wide")
-    counts, edges_mm = np.histogram(lengths_mm, bins=num_bins, range=kept_mm)
+    """Histogram of the lengths within the edges, both ends included; None where there are none."""
+    counts, _ = np.histogram(lengths_mm, bins=edges_mm)
     if counts.sum() == 0:
         return None
-    centers_mm = (edges_mm[:-1] + edges_mm[1:]) / 2
-    return Histogram(centers_mm=centers_mm, counts=counts.astype(np.float64))
+    return Histogram(edges_mm=edges_mm, counts=counts.astype(np.float64))
 
 
 def histogram_bias_mm(predicted: Histogram, truth: Histogram) -> float:
@@ -49,6 +69,8 @@ def histogram_bias_mm(predicted: Histogram, truth: Histogram) -> float:
 
 def histogram_emd_mm(predicted: Histogram, truth: Histogram) -> float:
     """Earth mover's distance in mm: how far, on average, a fish must move (Wasserstein-1)."""
+    from scipy.stats import wasserstein_distance  # half a second, of every command's start
+
     return float(
         wasserstein_distance(predicted.centers_mm, truth.centers_mm, predicted.shares, truth.shares)
     )
@@ -59,14 +81,14 @@ def histogram_rmsd(predicted: Histogram, truth: Histogram) -> float:
     return float(np.sqrt(np.mean((predicted.shares - truth.shares) ** 2)))
 
 
-def histogram_kl(predicted: Histogram, truth: Histogram, *, pseudo_count: float = 0.5) -> float:
+def histogram_kl(predicted: Histogram, truth: Histogram, *, pseudo_count: float) -> float:
     """Kullback-Leibler divergence of the predicted distribution from the true one, in nats.
 
     sum_b t_b log(t_b / p_b). An empty bin would make it infinite, so `pseudo_count` fish are added
     to every bin of both beforehand (1/2: Krichevsky and Trofimov, 1981).
     """
-    # entropy(p, q) normalises both
-    return float(entropy(truth.counts + pseudo_count, predicted.counts + pseudo_count))
+    t, p = (h.counts + pseudo_count for h in (truth, predicted))
+    return float(rel_entr(t / t.sum(), p / p.sum()).sum())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,17 +102,14 @@ class DistributionErrors:
 
 
 def distribution_errors(
-    predicted_mm: Float[np.ndarray, "P"], truth_mm: Float[np.ndarray, "T"]
-) -> DistributionErrors | None:
-    """Compare two sets of lengths without pairing them; None where one has no fish in range."""
-    predicted, truth = length_histogram(predicted_mm), length_histogram(truth_mm)
-    if predicted is None or truth is None:
-        return None
+    predicted: Histogram, truth: Histogram, settings: EvaluateSettings
+) -> DistributionErrors:
+    """Compare two histograms of the same bins."""
     return DistributionErrors(
         bias_mm=histogram_bias_mm(predicted, truth),
         emd_mm=histogram_emd_mm(predicted, truth),
         rmsd=histogram_rmsd(predicted, truth),
-        kl=histogram_kl(predicted, truth),
+        kl=histogram_kl(predicted, truth, pseudo_count=settings.pseudo_count),
     )
 
 
@@ -133,3 +152,35 @@ def is_covered(
 ) -> Bool[np.ndarray, "N"]:
     """Whether each interval, both ends included, holds its true length."""
     return (intervals_mm[:, 0] <= truth_mm) & (truth_mm <= intervals_mm[:, 1])
+
+
+@dataclass(frozen=True, kw_only=True)
+class IntervalFigures:
+    """Whether 95 % intervals hold what they promise, over fish of known length."""
+
+    coverage: float  # fraction of the intervals that hold the truth; 0.95 is right
+    mean_width: float  # of the intervals, as a fraction of the true length
+    nees: float | None  # mean of (error / std)^2; 1 is right; None: no stds
+
+
+def interval_figures(
+    *,
+    predicted_mm: Float[np.ndarray, "N"],
+    truth_mm: Float[np.ndarray, "N"],
+    intervals_mm: Float[np.ndarray, "N 2"],
+    stds_mm: Float[np.ndarray, "N"] | None,
+) -> IntervalFigures | None:
+    """Coverage, width and normalised estimation error squared; None where there are no fish.
+
+    NEES after Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and
+    navigation", 2001, Sec. 5.4: above 1 the stds promise too much, below 1 too little.
+    """
+    if len(truth_mm) == 0:
+        return None
+    widths_mm = intervals_mm[:, 1] - intervals_mm[:, 0]
+    error_mm = predicted_mm - truth_mm
+    return IntervalFigures(
+        coverage=float(np.mean(is_covered(truth_mm, intervals_mm))),
+        mean_width=float(np.mean(widths_mm / truth_mm)),
+        nees=None if stds_mm is None else float(np.mean((error_mm / stds_mm) ** 2)),
+    )

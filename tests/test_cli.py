@@ -104,6 +104,7 @@ def test_evaluate_prints_each_fish_and_the_figures(tmp_path: Path):
 
 
 def test_evaluate_refuses_a_missing_file(tmp_path: Path):
+    (tmp_path / "b.csv").write_text("track_id,length_mm\n1,100\n")
     options = {"--lengths": str(tmp_path / "a.csv"), "--truth": str(tmp_path / "b.csv")}
     outcome = invoke("evaluate", options)
     assert outcome.code == 2
