@@ -24,6 +24,10 @@ class AnnotationError(UserError):
     """A boxes file or a masks folder can't be read or doesn't match the source."""
 
 
+class ModelError(UserError):
+    """A neural network's file can't be used: unreadable, of another kind or of the wrong shape."""
+
+
 class ConfigError(UserError):
     """`config.toml` holds an unknown key, a wrong type or a value out of range."""
 
