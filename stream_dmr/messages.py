@@ -52,6 +52,20 @@ class CropQuality:
     visible_fraction: float  # of the fish, 0 to 1, as the annotations or the tracker say
     sharpness: float  # variance of the Laplacian inside the mask, grey levels squared
     mask_area_px: float  # of the mask, in frame pixels
+    # The IoU that the mask should have by its segmenter's own probabilities; None: given, not found
+    mask_confidence: float | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FishEnds:
+    """Where a segmenter sees the snout and the fork of the tail, and how sure it is."""
+
+    head_px: Float[np.ndarray, "2"]  # crop pixels
+    tail_px: Float[np.ndarray, "2"]
+    confidence: float  # probability that they are not the other way round, 0.5 to 1
+
+    def __post_init__(self) -> None:
+        _freeze(self)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -67,6 +81,7 @@ class FishCrop:
     crop_camera: Camera  # of `image` and `mask`; the orientation is the frame camera's
     frame_camera: Camera  # with crop_camera it gives the exact crop-to-frame pixel map
     quality: CropQuality
+    ends: FishEnds | None = None  # None where nobody looked for them
 
     def __post_init__(self) -> None:
         _freeze(self)

@@ -10,14 +10,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Ends:
-    """Where a fish's snout and the fork of its tail lie in the crop, and how sure that is."""
-
-    head_px: Float[np.ndarray, "2"]
-    tail_px: Float[np.ndarray, "2"]
-    confidence: float  # probability that the two are not the other way round, 0.5 to 1
+from stream_dmr.messages import FishEnds
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -25,7 +18,7 @@ class Segmented:
     """The fish that a box means, as a segmenter sees it."""
 
     probability: Float32[np.ndarray, "S S"]  # of being fish, 0 to 1, at the crop's pixels
-    ends: Ends | None  # None from a segmenter that doesn't look for them
+    ends: FishEnds | None  # None from a segmenter that doesn't look for them
 
 
 class Segmenter(Protocol):
