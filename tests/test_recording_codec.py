@@ -14,6 +14,7 @@ from stream_dmr.errors import RecordingError
 from stream_dmr.messages import (
     CropQuality,
     FishCrop,
+    FishEnds,
     FittedMesh,
     FittedShape,
     Frame,
@@ -53,7 +54,14 @@ cameras = st.builds(
     K=numbers(3, 3),
     distortion=numbers(5) | numbers(8),
 )
-qualities = st.builds(CropQuality, visible_fraction=floats, sharpness=floats, mask_area_px=floats)
+qualities = st.builds(
+    CropQuality,
+    visible_fraction=floats,
+    sharpness=floats,
+    mask_area_px=floats,
+    mask_confidence=optional(floats),
+)
+ends = st.builds(FishEnds, head_px=numbers(2), tail_px=numbers(2), confidence=floats)
 keys = {"frame_index": integers, "timestamp_ns": integers, "track_id": integers}
 frames = st.builds(
     Frame,
@@ -71,6 +79,7 @@ crops = sizes.flatmap(
         crop_camera=cameras,
         frame_camera=cameras,
         quality=qualities,
+        ends=optional(ends),
     )
 )
 shapes = st.tuples(sizes, sizes, sizes).flatmap(

@@ -31,7 +31,8 @@ _DATACLASSES: dict[str, type] = {
     for kind in (
         *(messages.Frame, messages.FishCrop, messages.FittedMesh),
         *(messages.LocalizedFish, messages.LengthEstimate),
-        *(messages.CropQuality, messages.LossTerms, messages.SolverReport, messages.FittedShape),
+        *(messages.CropQuality, messages.FishEnds, messages.FittedShape),
+        *(messages.LossTerms, messages.SolverReport),
         *(Camera, ReferencePlane, Calibration),
     )
 }
