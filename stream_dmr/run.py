@@ -99,7 +99,7 @@ def run(
             if is_live and config.recording.frames == "reference":
                 observer.warn(
                     "a live source can't be read again, so its pictures are not kept but for the "
-                    'view; record them with [recording] frames = "jpeg"'
+                    'view; record them with [recording] frames = "jpeg" or "h264"'
                 )
             observer.begin(reader.source.num_frames)
             tally = Tally(recorder, store, observer, is_live=is_live)

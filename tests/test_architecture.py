@@ -42,6 +42,7 @@ FLOORS = [
     ["stream_dmr.demo"],
 ]
 WHO_KNOWS = {
+    "av": ["stream_dmr.recording"],
     "mcap": ["stream_dmr.recording"],
     "rerun": ["stream_dmr.recording"],
     "foxglove": ["stream_dmr.recording"],

@@ -114,16 +114,6 @@ def test_a_frame_by_reference_keeps_its_pixels_for_the_run_and_its_checksum_for_
     assert [picture.crc32 for picture in frames] == expected
 
 
-@pytest.mark.parametrize("rrd", [True, False])
-def test_lossy_pictures_are_handed_on_as_they_are_recorded(
-    tmp_path: Path, messages: list[Message], rrd: bool
-):
-    settings = RecordingSettings(rrd=rrd, frames="jpeg", crops="jpeg")
-    handed_on = record(tmp_path, messages, settings)
-    assert_all_same(handed_on, list(read_messages(tmp_path / "recording.mcap")))
-    assert (only(handed_on, Frame)[0].image != only(messages, Frame)[0].image).any()
-
-
 def test_the_header_comes_back_exact(tmp_path: Path):
     for calibrated in (True, False):
         given = header(calibrated=calibrated)

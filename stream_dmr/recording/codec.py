@@ -18,10 +18,11 @@ from stream_dmr.errors import RecordingError
 from stream_dmr.recording.pictures import Picture, compress, compress_mask, decompress
 from stream_dmr.recording.schema import proto_class
 
-CODEC_VERSION = 2
+CODEC_VERSION = 3
 """Raised when a file written from now on would be read wrongly by an older reader.
 
 2: a crop may lack its picture, a fit its vertices and covariance.
+3: the JPEG of a frame may not be what the run saw.
 """
 
 T = TypeVar("T")

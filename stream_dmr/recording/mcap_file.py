@@ -151,7 +151,7 @@ def _by_index(
     _check_index(stream, _footer(stream))
     stream.seek(0)
     reader = SeekingReader(stream, validate_crcs=True)
-    first, last = part.within(_spans(stream, reader)).time_ns or (None, None)
+    first, last = part.within(_spans(stream, reader)).bounds_ns
     for _, channel, message in reader.iter_messages(
         list(topics), starting_at=first, ending_before=last, log_time_order=False
     ):

@@ -7,7 +7,8 @@ messages comes first, and every chunk of messages is complete in itself.
 import json
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import IO, Any, Protocol, cast, runtime_checkable
 
@@ -44,6 +45,9 @@ class ExtraTopics(Protocol):
         ...
 
 
+Extras = Sequence[ExtraTopics]
+
+
 class McapSink:
     """Writes every record, with the capture time as its log time.
 
@@ -53,13 +57,13 @@ class McapSink:
     """
 
     def __init__(
-        self, out_dir: Path, header: RunHeader, *, flush_s: float, extra: ExtraTopics | None = None
+        self, out_dir: Path, header: RunHeader, *, flush_s: float, extras: Extras = ()
     ) -> None:
         self.path = out_dir / NAME
         self._part = out_dir / f"{NAME}.part"
         self._flush_ns = int(flush_s * 1e9)
         self._channels: dict[type, int] = {}
-        self._extra, self._extra_channels = extra, dict[str, int]()
+        self._extras, self._extra_channels = extras, dict[str, int]()
         self._sequences: Counter[int] = Counter()
         self._spans: dict[int, tuple[int, int]] = {}  # first and last capture time of each track
         self._closed = False
@@ -81,7 +85,7 @@ class McapSink:
             self._add(self._channels[type(record.message)], timestamp_ns, record.payload)
             if not isinstance(record.message, Frame):
                 self._saw(record.message.track_id, timestamp_ns)
-            for topic, drawn in self._extra.draw(record) if self._extra else ():
+            for topic, drawn in chain.from_iterable(e.draw(record) for e in self._extras):
                 channel = self._extra_channels[topic]
                 self._add(channel, timestamp_ns, drawn.SerializeToString())
             if time.monotonic_ns() >= self._flush_at_ns:
@@ -120,7 +124,7 @@ class McapSink:
         for kind, row in TOPICS.items():
             schema = self._writer.register_schema(row.schema, "protobuf", schema_bytes())
             self._channels[kind] = self._writer.register_channel(row.topic, "protobuf", schema)
-        for topic, kind in self._extra.topics.items() if self._extra else ():
+        for topic, kind in chain.from_iterable(e.topics.items() for e in self._extras):
             schema = register_schema(self._writer, kind)
             channel = self._writer.register_channel(topic, "protobuf", schema)
             self._extra_channels[topic] = channel

@@ -12,6 +12,7 @@ class Part:
 
     time_ns: tuple[int, int] | None = None  # of capture: first (included), last (excluded)
     tracks: frozenset[int] | None = None
+    lead_ns: int = 0  # so much time before it as well
 
     @classmethod
     def of_seconds(
@@ -26,9 +27,19 @@ class Part:
         """Whether nothing is left out."""
         return self.time_ns is None and self.tracks is None
 
+    @property
+    def bounds_ns(self) -> tuple[int | None, int | None]:
+        """First capture time (included) and last one (excluded), None where there is no bound."""
+        return (
+            (None, None)
+            if self.time_ns is None
+            else (self.time_ns[0] - self.lead_ns, self.time_ns[1])
+        )
+
     def has_time(self, timestamp_ns: int) -> bool:
         """Whether a capture time is wanted."""
-        return self.time_ns is None or self.time_ns[0] <= timestamp_ns < self.time_ns[1]
+        first, last = self.bounds_ns
+        return (first is None or first <= timestamp_ns) and (last is None or timestamp_ns < last)
 
     def has(self, message: object) -> bool:
         """Whether the fish of a message is wanted; a frame always is."""

@@ -27,7 +27,7 @@ class Picture:
     height: int
     width: int
     data: bytes  # empty for a reference
-    crc32: int = 0  # of the pixels that a reference stands for, see `checksum`
+    crc32: int = 0  # of the pixels that the run saw, see `checksum`; 0: those of `data`
 
 
 def compress(
@@ -36,12 +36,16 @@ def compress(
     """A BGR picture as "png" (exact), "jpeg" or "reference" (its size and checksum)."""
     if format == "reference":
         return _picture(format, image, b"", crc32=checksum(image))
+    return _picture(format, image, _encoded(image, format, jpeg_quality))
+
+
+def _encoded(image: UInt8[np.ndarray, "H W 3"], format: Format, jpeg_quality: int) -> bytes:
     if format == "jpeg":
         parameters = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
     else:
         # Level 1: on sensor noise the higher ones cost many times as much and gain 2 %.
         parameters = [cv2.IMWRITE_PNG_COMPRESSION, 1]
-    return _picture(format, image, cv2.imencode(f".{format}", image, parameters)[1].tobytes())
+    return cv2.imencode(f".{format}", image, parameters)[1].tobytes()
 
 
 def compress_mask(mask: Bool[np.ndarray, "H W"]) -> Picture:

@@ -1,6 +1,7 @@
 """Records a run: every message of every stage, to every sink."""
 
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from queue import Queue
 from threading import Lock, Thread
@@ -66,8 +67,9 @@ class Recorder:
             undo.callback(self._close_sinks)
             self._sinks.append(Tables(out_dir, resume=resume))
             if settings.mcap:
-                extra = _foxglove(header, settings) if settings.foxglove else None
-                self._sinks.append(McapSink(out_dir, header, flush_s=settings.flush_s, extra=extra))
+                extras = list(_extras(header, settings))
+                sink = McapSink(out_dir, header, flush_s=settings.flush_s, extras=extras)
+                self._sinks.append(sink)
             if settings.rrd:
                 self._sinks.append(RerunSink(out_dir / RRD_NAME, header, settings))
             if live:
@@ -151,12 +153,23 @@ class Recorder:
                 stack.callback(sink.close)
 
 
-def _foxglove(header: RunHeader, settings: RecordingSettings) -> ExtraTopics:
+def _extras(header: RunHeader, settings: RecordingSettings) -> Iterator[ExtraTopics]:
+    if settings.foxglove:
+        with _needs("foxglove", "foxglove = true"):
+            from stream_dmr.recording.foxglove import FoxgloveView
+        yield FoxgloveView(header, settings)
+    if settings.frames == "h264":
+        with _needs("h264", 'frames = "h264"'):
+            from stream_dmr.recording.video import H264Topic
+        yield H264Topic(crf=settings.h264_crf)
+
+
+@contextmanager
+def _needs(extra: str, setting: str) -> Iterator[None]:
     try:
-        from stream_dmr.recording.foxglove import FoxgloveView
+        yield
     except ModuleNotFoundError as error:
         raise ConfigError(
-            f"[recording] foxglove = true: expected the package of its schemas, found no "
-            f"{error.name}; install it with: pip install foxglove-schemas-protobuf"
+            f"[recording] {setting}: expected the package {error.name}, found none; install it "
+            f"with: pip install 'stream-dmr[{extra}]'"
         ) from error
-    return FoxgloveView(header, settings)

@@ -11,7 +11,9 @@ import zlib
 from collections.abc import Collection, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from heapq import merge
 from multiprocessing import get_context
+from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -48,11 +50,15 @@ class RrdFile:
     def payloads(
         self, kinds: Collection[type[Message]], part: Part = WHOLE
     ) -> Iterator[tuple[type[Message], bytes]]:
-        """See `opened.Recording`; here one kind after the other."""
-        for kind in kinds:
+        """See `opened.Recording`; the kinds are mixed by capture time."""
+
+        def wanted(kind: type[Message]) -> Iterator[tuple[int, type[Message], bytes]]:
             for _, timestamp_ns, payload in self._rows.get(f"/{TOPICS[kind].payload}", ()):
                 if part.has_time(timestamp_ns):
-                    yield kind, payload
+                    yield timestamp_ns, kind, payload
+
+        for _, kind, payload in merge(*map(wanted, kinds), key=itemgetter(0)):
+            yield kind, payload
 
     def video(self, part: Part = WHOLE) -> Iterator[bytes]:
         """None."""

@@ -16,9 +16,10 @@ class RecordingSettings(Settings):
         default=True,
         description="put the messages into the .rrd too, so that it can be replayed alone",
     )
-    frames: Literal["reference", "jpeg"] = Field(
+    frames: Literal["reference", "jpeg", "h264"] = Field(
         default="reference",
-        description='the source\'s pictures: "reference" (number and checksum), "jpeg"',
+        description='the source\'s pictures: "reference" (number and checksum), "jpeg", '
+        '"h264" (small, for the eye)',
     )
     crops: Literal["none", "jpeg", "png"] = Field(
         default="none",
@@ -30,6 +31,9 @@ class RecordingSettings(Settings):
     )
     jpeg_quality: int = Field(
         default=85, ge=1, le=100, description="quality of every JPEG, 1 to 100 (no unit)"
+    )
+    h264_crf: int = Field(
+        default=25, ge=0, le=51, description="coarseness of H.264 pictures, x264's CRF (no unit)"
     )
     view_rate_hz: float = Field(
         default=6.0,

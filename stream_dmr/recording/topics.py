@@ -42,6 +42,7 @@ LOG, REFUSALS, RESULTS = "log", "log/refusals", "log/lengths"
 CAMERA, PLANE = "scene/camera", "scene/plane"  # static, from the header
 END = "messages/end"  # the last row of a whole .rrd: how many messages each payload path has
 SPANS = "tracks.json"  # attachment of a whole .mcap: each track's first and last capture time, ns
+KEY_FRAME_NS = 1_000_000_000  # of capture time, from one key frame of the video to the next
 VIDEO = "/video"  # in the .mcap with frames = "h264": foxglove.CompressedVideo
 FISH_ROOTS = ("scene/camera/fish", "scene/fish")  # what a new frame clears
 

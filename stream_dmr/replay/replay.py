@@ -26,7 +26,7 @@ from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.opened import open_recordings
 from stream_dmr.recording.part import Part
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.recording.restored import Pictures
+from stream_dmr.recording.restored import SourcePictures
 from stream_dmr.replay.judge import Judge, Mismatch, Scribe
 from stream_dmr.replay.tape import Playback, Tape
 from stream_dmr.run import Observer, later_nodes, prepare_folder
@@ -106,7 +106,7 @@ def replay(
         )
     if judge is not None:
         judge.finish()
-    for line in recording.warnings:
+    for line in (*recording.warnings, *tape.notes):
         observer.warn(line)
     return ReplaySummary(
         fish=sorted(scribe.final, key=lambda estimate: estimate.track_id),
@@ -190,9 +190,9 @@ def _chain(
         if request.source is not None:
             reader = ReadFrames(request.source, config.read_frames)
             stack.callback(reader.close)
-            pictures = Pictures(reader)
+            pictures = SourcePictures(reader)
         crop_fish = CropFish(config.crop_fish, camera=camera, detections=detections)
-        return tape.pictures(pictures), [crop_fish, *computed]
+        return tape.pictures(pictures, exact=request.check), [crop_fish, *computed]
     logged = [*STAGES.values()][:first]
     if request.out is None:
         logged = logged[-1:]

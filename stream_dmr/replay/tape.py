@@ -6,7 +6,7 @@ from stream_dmr.errors import RecordingError
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, Message
 from stream_dmr.recording.opened import Recording, messages
 from stream_dmr.recording.part import WHOLE, Part
-from stream_dmr.recording.restored import Pictures
+from stream_dmr.recording.restored import RecordedPictures, Restorer, is_as_seen
 
 
 class Tape:
@@ -15,6 +15,7 @@ class Tape:
     def __init__(self, recording: Recording, part: Part = WHOLE) -> None:
         self._recording = recording
         self._part = part
+        self.notes: list[str] = []  # what the user should know of this replay
         self._payloads: dict[int, bytes] = {}  # of messages on their way to a new recording
 
     def messages(self, kind: type[Message], *, keep: bool = True) -> Iterator[Message]:
@@ -30,17 +31,30 @@ class Tape:
             assert isinstance(message, Frame)
             yield message
 
-    def pictures(self, found: Pictures | None) -> Iterator[Frame]:
-        """The frames with their pictures, of which those by reference are `found`."""
+    def pictures(self, found: Restorer | None, *, exact: bool) -> Iterator[Frame]:
+        """The frames with their pictures, `found` or as the recording holds them.
+
+        Raises RecordingError where it holds none, and, with `exact`, where they are not to the
+        last bit those that the run went on from; without it, `notes` says so.
+        """
+        found = found or RecordedPictures(self._recording, self._part)
         for frame in self.frames():
             payload = self._payloads.pop(id(frame))
-            whole = frame if found is None else found.restore(frame, payload)
+            whole = found.restore(frame, payload)
             if whole.image.size == 0:
                 raise RecordingError(
                     "--from crop: the recording refers to its source's pictures; give --source"
                 )
+            if not is_as_seen(whole, payload):
+                self._note_for_the_eye(exact=exact)
             self._payloads[id(whole)] = payload
             yield whole
+
+    def _note_for_the_eye(self, *, exact: bool) -> None:
+        line = "the recording's pictures are for the eye, the run saw better ones"
+        if exact:
+            raise RecordingError(f"--from crop --check: {line}; give --source")
+        self.notes = [f"{line}: crops come out a little otherwise; --source would mend that"]
 
     def payload(self, message: Message) -> bytes:
         """The encoding of a message that came from here; once."""
