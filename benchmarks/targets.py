@@ -13,6 +13,7 @@ from stream_dmr.fitting.contour.deformation import KINDS, deform
 from stream_dmr.messages import CropQuality, FishCrop, Frame
 from stream_dmr.segmentation.crop import CropFishSettings, crop_fish
 from stream_dmr.segmentation.detections import Detection
+from stream_dmr.segmentation.grabcut import GrabCut
 from stream_dmr.simulation.body import HALIBUT, JOINT_ARCS, body_mesh, keypoints
 from stream_dmr.simulation.render import draw_mask
 from stream_dmr.simulation.scene import Scene, Visit, make_scene
@@ -118,7 +119,7 @@ def _crop(scene: Scene, visit: Visit, frame_index: int, *, size: int) -> FishCro
     image = np.zeros((*mask.shape, 3), np.uint8)
     frame = Frame(frame_index=frame_index, timestamp_ns=0, image=image, source="simulation")
     settings = CropFishSettings(crop_size_px=size)
-    return crop_fish(frame, detection, frame_camera=camera, settings=settings)
+    return crop_fish(frame, detection, frame_camera=camera, settings=settings, segmenter=GrabCut())
 
 
 def _box(mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "4"]:

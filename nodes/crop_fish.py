@@ -6,6 +6,7 @@ from stream_dmr.camera import Camera
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.crop import CropFishSettings, crop_fish
 from stream_dmr.segmentation.detections import Annotations
+from stream_dmr.segmentation.segmenters import open_segmenter
 
 
 class CropFish:
@@ -14,7 +15,9 @@ class CropFish:
     def __init__(
         self, settings: CropFishSettings, *, camera: Camera | None, detections: Annotations
     ) -> None:
+        """Raises ModelError where the model that `settings.segmenter` names can't be used."""
         self.detections = detections
+        self._segmenter = open_segmenter(settings.segmenter)
         self._settings = settings
         self._camera = camera
 
@@ -24,7 +27,13 @@ class CropFish:
             height, width = frame.image.shape[:2]
             self._camera = Camera.nominal(width=width, height=height)
         return [
-            crop_fish(frame, detection, frame_camera=self._camera, settings=self._settings)
+            crop_fish(
+                frame,
+                detection,
+                frame_camera=self._camera,
+                settings=self._settings,
+                segmenter=self._segmenter,
+            )
             for detection in self.detections.detect(frame)
         ]
 

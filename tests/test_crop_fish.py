@@ -15,6 +15,8 @@ from stream_dmr.segmentation.crop import (
     frame_from_crop_map,
 )
 from stream_dmr.segmentation.detections import Annotations, Detection
+from stream_dmr.segmentation.grabcut import GrabCut
+from stream_dmr.segmentation.segmenter import Segmented
 
 SETTINGS = CropFishSettings()
 WIDE = Camera(  # strong barrel distortion, off-centre, unequal focal lengths
@@ -48,6 +50,7 @@ def crop_of(mask, camera, *, box=None, frame=None, **knobs):
         detection_of(mask, box=box),
         frame_camera=camera,
         settings=CropFishSettings(**knobs),
+        segmenter=GrabCut(),
     )
 
 
@@ -297,10 +300,65 @@ def test_the_node_crops_every_fish_and_stands_in_for_a_missing_camera():
     assert (*node.tick(1), *node.close()) == ()
 
 
+class Painter:
+    """A segmenter that takes every white pixel for fish, and half believes the grey ones."""
+
+    def segment(self, image, bbox_xyxy_px):
+        self.bbox_xyxy_px = bbox_xyxy_px
+        return Segmented(probability=image[..., 0].astype(np.float32) / 255, ends=None)
+
+
+def segmented(picture, box, camera, **knobs):
+    detection = Detection(
+        track_id=1, bbox_xyxy_px=np.array(box, np.float64), mask=None, visible_fraction=1.0
+    )
+    painter = Painter()
+    crop = crop_fish(
+        frame_of(np.repeat(picture[..., None], 3, axis=2)),
+        detection,
+        frame_camera=camera,
+        settings=CropFishSettings(**knobs),
+        segmenter=painter,
+    )
+    return crop, painter.bbox_xyxy_px
+
+
+@given(cameras, st.floats(30, 400), st.floats(30, 300), st.floats(40, 200), st.floats(40, 200))
+@settings(max_examples=30, deadline=None)
+def test_a_mask_found_in_the_crop_is_the_one_given_in_the_frame(camera, x, y, w, h):
+    x0, y0, x1, y1 = np.round([x, y, x + w, y + h]).astype(int)
+    mask = np.zeros((480, 640), bool)
+    mask[y0:y1, x0:x1] = True
+    box = [x0, y0, min(x1, 640), min(y1, 480)]
+    given_mask = crop_of(mask, camera, box=box)
+    found, in_crop = segmented(mask.astype(np.uint8) * 255, box, camera)
+    assert (found.mask != given_mask.mask).mean() < 0.002
+    assert found.quality.mask_area_px == pytest.approx(mask.sum(), rel=0.15)  # the lens bulges
+    assert found.quality.touches_border == given_mask.quality.touches_border
+    rows, columns = np.nonzero(found.mask)
+    extent = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+    np.testing.assert_allclose(in_crop, extent, atol=4.0)
+
+
+def test_a_doubtful_mask_is_trusted_less():
+    camera = Camera.nominal(width=200, height=200)
+    picture = np.zeros((200, 200), np.uint8)
+    picture[80:120, 60:140] = 255
+    sure, _ = segmented(picture, [60, 80, 140, 120], camera)
+    picture[90:110, 60:140] = 160
+    doubtful, _ = segmented(picture, [60, 80, 140, 120], camera)
+    assert sure.quality.mask_confidence > 0.97
+    assert doubtful.quality.mask_confidence == pytest.approx(0.5 + 0.5 * 160 / 255, abs=0.03)
+    nothing, _ = segmented(np.zeros_like(picture), [60, 80, 140, 120], camera)
+    assert (nothing.quality.mask_confidence, nothing.quality.mask_area_px) == (0.0, 0.0)
+    assert crop_of(picture > 0, camera).quality.mask_confidence is None
+
+
 @pytest.mark.scenes
 def test_masks_of_a_scene_fill_their_crops(scenes):
+    from stream_dmr.read_settings import ReadFramesSettings
     from stream_dmr.segmentation.detections import open_annotations
-    from stream_dmr.video import ReadFramesSettings, open_source
+    from stream_dmr.video import open_source
 
     scene = scenes / "realistic"
     detections = open_annotations(boxes=scene / "boxes.txt", masks=scene / "masks")

@@ -1,15 +1,17 @@
 """Cuts a fish out of a frame: image and mask as an ideal pinhole camera would have seen them."""
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from pydantic import Field
 
-from stream_dmr.camera import Camera
-from stream_dmr.messages import CropQuality, FishCrop, Frame
+from stream_dmr.camera import Camera, crop_from_frame, frame_from_crop
+from stream_dmr.messages import CropQuality, FishCrop, FishEnds, Frame
 from stream_dmr.segmentation.detections import Detection
+from stream_dmr.segmentation.segmenter import Segmenter
 from stream_dmr.settings import Settings
 
 _SMALLEST_PART = 0.05  # of the largest part's area: the tail behind a gaff stays, specks go
@@ -33,38 +35,129 @@ class CropFishSettings(Settings):
     min_mask_area_px: int = Field(
         default=64, ge=1, description="a smaller mask counts as none, in frame px"
     )
+    segmenter: str = Field(
+        default="grabcut",
+        min_length=1,
+        description='what finds the mask in a box: "unet", "grabcut", weights of `stream-dmr train` '
+        "(.pt), or a promptable model (.onnx)",
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Fish:
+    """What is known of the fish in a crop, however its mask came about."""
+
+    mask: Bool[np.ndarray, "S S"]
+    area_px: float  # in frame pixels
+    touches_border: bool
+    confidence: float | None
+    ends: FishEnds | None
 
 
 def crop_fish(
-    frame: Frame, detection: Detection, *, frame_camera: Camera, settings: CropFishSettings
+    frame: Frame,
+    detection: Detection,
+    *,
+    frame_camera: Camera,
+    settings: CropFishSettings,
+    segmenter: Segmenter,
 ) -> FishCrop:
-    """One fish, seen through a crop camera around the union of its box and its mask."""
-    mask = clean_mask(detection.mask, min_area_px=settings.min_mask_area_px)
-    extent = _extent(mask)
+    """One fish, seen through a crop camera around its box and, where it is given, its mask.
+
+    Where no mask is given the segmenter looks for it in the crop.
+    """
+    given = detection.mask
+    if given is not None:
+        given = clean_mask(given, min_area_px=settings.min_mask_area_px)
     crop_camera = _camera_around(
-        _union(detection.bbox_xyxy_px, extent, shape=mask.shape),
+        _union(detection.bbox_xyxy_px, given, frame.image),
         frame_camera=frame_camera,
         settings=settings,
     )
     image, crop_mask = _resample(
-        frame.image, mask, crop_camera=crop_camera, frame_camera=frame_camera
+        frame.image, given, crop_camera=crop_camera, frame_camera=frame_camera
     )
+    if given is None or crop_mask is None:
+        cameras = crop_camera, frame_camera
+        fish = _segment(image, detection, cameras, settings=settings, segmenter=segmenter)
+    else:
+        fish = _Fish(
+            mask=crop_mask,
+            area_px=float(np.count_nonzero(given)),
+            touches_border=_touches_border(_extent(given), shape=given.shape),
+            confidence=None,
+            ends=None,
+        )
     return FishCrop(
         frame_index=frame.frame_index,
         timestamp_ns=frame.timestamp_ns,
         track_id=detection.track_id,
         bbox_xyxy_px=detection.bbox_xyxy_px,
         image=image,
-        mask=crop_mask,
+        mask=fish.mask,
         crop_camera=crop_camera,
         frame_camera=frame_camera,
         quality=CropQuality(
-            touches_border=_touches_border(extent, shape=mask.shape),
+            touches_border=fish.touches_border,
             visible_fraction=detection.visible_fraction,
-            sharpness=_sharpness(image, crop_mask),
-            mask_area_px=float(np.count_nonzero(mask)),
+            sharpness=_sharpness(image, fish.mask),
+            mask_area_px=fish.area_px,
+            mask_confidence=fish.confidence,
         ),
+        ends=fish.ends,
     )
+
+
+def _segment(
+    image: UInt8[np.ndarray, "S S 3"],
+    detection: Detection,
+    cameras: tuple[Camera, Camera],
+    *,
+    settings: CropFishSettings,
+    segmenter: Segmenter,
+) -> _Fish:
+    """Find the mask in a crop; `cameras` are the crop's and the frame's."""
+    crop_camera, frame_camera = cameras
+    found = segmenter.segment(image, _box_in_crop(detection.bbox_xyxy_px, cameras))
+    area = float(np.linalg.det(frame_camera.K) / np.linalg.det(crop_camera.K))  # of a crop pixel
+    least = math.ceil(settings.min_mask_area_px / area)
+    mask = clean_mask(found.probability > 0.5, min_area_px=least)
+    rows, columns = np.nonzero(mask)
+    where = np.column_stack([columns, rows]).astype(np.float64)
+    extent = None
+    if len(where):
+        # The frame pixels that its pixels' centres lie in, as a box.
+        where = np.round(frame_from_crop(where, crop_camera=crop_camera, frame_camera=frame_camera))
+        extent = np.concatenate([where.min(axis=0), where.max(axis=0) + 1])
+    shape = (frame_camera.height, frame_camera.width)
+    return _Fish(
+        mask=mask,
+        area_px=area * len(where),
+        touches_border=_touches_border(extent, shape=shape),
+        confidence=expected_iou(found.probability, mask),
+        ends=found.ends,
+    )
+
+
+def expected_iou(probability: Float32[np.ndarray, "S S"], mask: Bool[np.ndarray, "S S"]) -> float:
+    """The IoU that a mask should have with the truth, if the probabilities are right.
+
+    Expected intersection over expected union: sum over the mask of p / (area + sum outside of p).
+    Blurred outlines and doubtful parts lower it. 0 for an empty mask.
+    """
+    outside = float(probability[~mask].sum())
+    return float(probability[mask].sum()) / max(np.count_nonzero(mask) + outside, 1.0)
+
+
+def _box_in_crop(
+    bbox_xyxy_px: Float[np.ndarray, "4"], cameras: tuple[Camera, Camera]
+) -> Float[np.ndarray, "4"]:
+    """The box, half-open, in the crop's pixels: by the middles of its edges."""
+    x0, y0, x1, y1 = bbox_xyxy_px - 0.5  # half-open counts from pixel edges, cameras from centres
+    x, y = (x0 + x1) / 2, (y0 + y1) / 2
+    middles = np.array([[x0, y], [x, y0], [x1, y], [x, y1]])
+    pixels = crop_from_frame(middles, crop_camera=cameras[0], frame_camera=cameras[1])
+    return pixels[np.arange(4), [0, 1, 0, 1]] + 0.5
 
 
 def clean_mask(mask: Bool[np.ndarray, "H W"], *, min_area_px: int) -> Bool[np.ndarray, "H W"]:
@@ -108,13 +201,13 @@ def _extent(mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "4"] | None:
 
 def _union(
     bbox_xyxy_px: Float[np.ndarray, "4"],
-    extent: Float[np.ndarray, "4"] | None,
-    *,
-    shape: tuple[int, ...],
+    mask: Bool[np.ndarray, "H W"] | None,
+    image: UInt8[np.ndarray, "H W 3"],
 ) -> Float[np.ndarray, "4"]:
-    """The smallest box around the mask's extent and what the frame shows of the box."""
-    height, width = shape
+    """The smallest box around what the frame shows of the box and, where it is given, the mask."""
+    height, width = image.shape[:2]
     box = np.clip(bbox_xyxy_px, 0, [width, height, width, height])
+    extent = None if mask is None else _extent(mask)
     if extent is None:
         return box
     return np.concatenate([np.minimum(box[:2], extent[:2]), np.maximum(box[2:], extent[2:])])
@@ -148,12 +241,12 @@ def _camera_around(
 
 def _resample(
     image: UInt8[np.ndarray, "H W 3"],
-    mask: Bool[np.ndarray, "H W"],
+    mask: Bool[np.ndarray, "H W"] | None,
     *,
     crop_camera: Camera,
     frame_camera: Camera,
-) -> tuple[UInt8[np.ndarray, "S S 3"], Bool[np.ndarray, "S S"]]:
-    """Image and mask in the crop: black and empty where the frame ends.
+) -> tuple[UInt8[np.ndarray, "S S 3"], Bool[np.ndarray, "S S"] | None]:
+    """Image and mask (where there is one) in the crop: black and empty where the frame ends.
 
     A crop pixel is the mean of n x n samples, about one per frame pixel, since single samples of a
     shrunken mask jump along its outline; it belongs to the mask by majority. Known shapes through
@@ -168,7 +261,7 @@ def _resample(
         fine = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
         return cv2.resize(fine, (size, size), interpolation=cv2.INTER_AREA)
 
-    return mean(image), mean(mask * np.uint8(255)) > 127
+    return mean(image), None if mask is None else mean(mask * np.uint8(255)) > 127
 
 
 def frame_from_crop_map(

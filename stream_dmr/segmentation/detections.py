@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Integer
 from stream_dmr.errors import UserError
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.annotations import Box, Masks, load_boxes
-from stream_dmr.segmentation.grabcut import segment_box
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -19,7 +18,8 @@ class Detection:
 
     track_id: int
     bbox_xyxy_px: Float[np.ndarray, "4"]  # half-open, frame pixels
-    mask: Bool[np.ndarray, "H W"]  # of the frame's size; all False where nothing is segmented
+    # Of the frame's size, all False where there is nothing; None: for a segmenter to find.
+    mask: Bool[np.ndarray, "H W"] | None
     visible_fraction: float  # 0 to 1
 
 
@@ -39,8 +39,8 @@ def open_annotations(*, boxes: Path | None, masks: Path | None) -> "Annotations"
 class Annotations:
     """Fish by boxes and masks from files.
 
-    Boxes alone: GrabCut finds the masks. Masks alone: they give the boxes. Both: the boxes say
-    which fish there are; one whose mask is missing keeps its box and gets an empty mask.
+    Boxes alone: a segmenter is to find the masks. Masks alone: they give the boxes. Both: the boxes
+    say which fish there are; one whose mask is missing keeps its box and gets an empty mask.
     """
 
     def __init__(self, *, boxes: dict[int, list[Box]] | None, masks: Masks | None) -> None:
@@ -114,9 +114,9 @@ class Annotations:
 
     def _mask(
         self, frame: Frame, box: Box, labels: Integer[np.ndarray, "H W"] | None
-    ) -> Bool[np.ndarray, "H W"]:
+    ) -> Bool[np.ndarray, "H W"] | None:
         if self._masks is None:
-            return segment_box(frame.image, box.bbox_xyxy_px)
+            return None
         if labels is None:
             return np.zeros(frame.image.shape[:2], bool)
         return labels == box.track_id

@@ -8,16 +8,29 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from stream_dmr.segmentation.segmenter import Segmented
+
 _CONTEXT = 0.2  # of the box's longer side: the ring around it that shows what is not fish
 _WORKING_PX = 256  # of the longer side: finer costs much time and moves the outline little
 _SMALLEST_PX = 12  # below, GrabCut's two mixtures of 5 Gaussians have too few pixels
 _ITERATIONS = 5
 
 
+class GrabCut:
+    """A `Segmenter` without weights; it looks for no ends."""
+
+    def segment(
+        self, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
+    ) -> Segmented:
+        """The fish in a box; its probability is 0 or 1, since GrabCut knows no doubt."""
+        mask = segment_box(image, bbox_xyxy_px)
+        return Segmented(probability=mask.astype(np.float32), ends=None)
+
+
 def segment_box(
     image: UInt8[np.ndarray, "H W 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
 ) -> Bool[np.ndarray, "H W"]:
-    """The fish in a box, as a mask of the whole frame; empty where the box is too small.
+    """The fish in a box, as a mask of the whole picture; empty where the box is too small.
 
     Deterministic, and independent of every other frame.
     """

@@ -5,7 +5,7 @@ A crop is already free of lens distortion, and its pixel map to the frame is in 
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -21,6 +21,7 @@ class Segmented:
     ends: FishEnds | None  # None from a segmenter that doesn't look for them
 
 
+@runtime_checkable
 class Segmenter(Protocol):
     """A box in, a mask out."""
 

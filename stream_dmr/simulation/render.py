@@ -37,7 +37,7 @@ def draw_mask(
     """
     pixels = camera.project(vertices_camera)
     nothing = np.zeros((len(pixels), 0), np.float32)
-    face, _ = _rasterize(
+    face, _ = rasterize(
         pixels, vertices_camera[:, 2], faces, nothing, width=camera.width, height=camera.height
     )
     return face >= 0
@@ -50,10 +50,10 @@ def draw_fish_patch(posed: PosedFish, *, camera: Camera, seed: int) -> Patch:
     width, height = np.ceil(pixels.max(axis=0)).astype(int) + _MARGIN_PX + 1 - low
     mesh = posed.fish.mesh
     shade = _AMBIENT + (1 - _AMBIENT) * np.maximum(
-        _vertex_normals(posed.vertices, posed.faces) @ _TOWARDS_LIGHT, 0.0
+        vertex_normals(posed.vertices, posed.faces) @ _TOWARDS_LIGHT, 0.0
     )
     attributes = np.column_stack([mesh.points[:, 0], mesh.across, shade]).astype(np.float32)
-    face, values = _rasterize(
+    face, values = rasterize(
         pixels - low,
         posed.vertices[:, 2],
         posed.faces,
@@ -125,7 +125,7 @@ def _motion_kernel(motion_px: Float[np.ndarray, "2"]) -> Float32[np.ndarray, "K 
     return kernel / kernel.sum()
 
 
-def _vertex_normals(
+def vertex_normals(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "V 3"]:
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
@@ -136,7 +136,7 @@ def _vertex_normals(
     return normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12)
 
 
-def _rasterize(
+def rasterize(
     pixels: Float[np.ndarray, "V 2"],
     depths: Float[np.ndarray, "V"],
     faces: Int[np.ndarray, "F 3"],

@@ -1,0 +1,123 @@
+"""Light, weather and camera: what happens to a picture without moving a fish in it."""
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+Picture = Float32[np.ndarray, "S S 3"]  # BGR, 0 to 255
+
+
+def weather(rng: np.random.Generator, picture: Picture) -> Picture:
+    """Shadow, haze, glare, spray and foam, each in some pictures; two in five have none."""
+    size = len(picture)
+    if rng.random() < 0.4:
+        return picture
+    if rng.random() < 0.35:
+        shadow = _cloud(rng, size, rng.uniform(10.0, 50.0)) * rng.uniform(0.1, 0.6)
+        picture = picture * (1 - shadow[..., None])
+    if rng.random() < 0.25:
+        haze, colour = rng.uniform(0.0, 0.55), rng.uniform(40.0, 230.0) * rng.uniform(0.7, 1.3, 3)
+        picture = picture + np.float32(haze) * (colour.astype(np.float32) - picture)
+    if rng.random() < 0.2:
+        picture = picture + 255 * _glare(rng, size)[..., None]
+    if rng.random() < 0.15:
+        veil = np.clip(_cloud(rng, size, rng.uniform(2.0, 14.0)) * 1.8 - 0.9, 0.0, 0.7)
+        picture = picture + veil[..., None] * (235 - picture)
+    if rng.random() < 0.12:
+        _draw_drops(rng, picture)
+    return picture
+
+
+def photograph(rng: np.random.Generator, picture: Picture) -> UInt8[np.ndarray, "S S 3"]:
+    """Optics, sensor, processing and compression; by a good camera for two in five."""
+    is_good = rng.random() < 0.4
+    picture = _tone(rng, np.clip(_smear(rng, picture), 0, 255))
+    if not is_good and rng.random() < 0.4:
+        picture = _lose_detail(rng, picture)
+    if rng.random() < 0.7:
+        level = rng.uniform(0.3, 2.5 if is_good else 10.0)
+        grain = (level * rng.standard_normal(picture.shape, np.float32)).astype(np.float32)
+        if rng.random() < 0.4:
+            grain = 1.5 * cv2.GaussianBlur(grain, (0, 0), rng.uniform(0.5, 1.0))
+        picture = picture + grain
+    if rng.random() < 0.2:
+        blurred = cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.8, 2.0))
+        picture = picture + rng.uniform(0.3, 1.2) * (picture - blurred)  # sharpened by the camera
+    pixels = np.clip(np.round(picture), 0, 255).astype(np.uint8)
+    worst = 60 if is_good else 15
+    return _compress(pixels, int(rng.integers(worst, 96))) if rng.random() < 0.6 else pixels
+
+
+def motion_kernel(rng: np.random.Generator, reach: float) -> Float32[np.ndarray, "K K"]:
+    """A straight smear of this length in pixels, in any direction."""
+    half = int(np.ceil(reach / 2))
+    kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
+    angle = rng.uniform(0.0, np.pi)
+    way = reach / 2 * np.array([np.cos(angle), np.sin(angle)])
+    for part in np.linspace(-1.0, 1.0, 4 * half + 1):
+        column, row = np.round(half + part * way).astype(int)
+        kernel[row, column] += 1.0
+    return kernel / kernel.sum()
+
+
+def _smear(rng: np.random.Generator, picture: Picture) -> Picture:
+    if rng.random() < 0.5:
+        picture = cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.3, 1.4))
+    if rng.random() < 0.15:
+        picture = cv2.filter2D(picture, -1, motion_kernel(rng, rng.uniform(1.5, 6.0)))
+    return picture
+
+
+def _tone(rng: np.random.Generator, picture: Picture) -> Picture:
+    """Exposure, contrast curve, white balance and saturation."""
+    picture = 255 * (picture / 255) ** np.float32(np.exp(rng.normal(0.0, 0.25)))
+    picture = picture * np.exp(rng.normal(0.0, 0.12, 3)).astype(np.float32)
+    grey = picture.mean(axis=2, keepdims=True)
+    saturation = 0.0 if rng.random() < 0.05 else rng.uniform(0.4, 1.4)
+    picture = grey + np.float32(saturation) * (picture - grey)
+    low, high = rng.uniform(0.0, 50.0), rng.uniform(150.0, 290.0)
+    return np.clip(low + picture * np.float32((high - low) / 255), 0, 255)
+
+
+def _lose_detail(rng: np.random.Generator, picture: Picture) -> Picture:
+    """A fish that was small in its frame, enlarged."""
+    size = len(picture)
+    small = max(16, round(size / rng.uniform(1.0, 3.5)))
+    shrunken = cv2.resize(picture, (small, small), interpolation=cv2.INTER_AREA)
+    if rng.random() < 0.5:
+        pixels = np.clip(shrunken, 0, 255).astype(np.uint8)
+        shrunken = _compress(pixels, int(rng.integers(30, 96))).astype(np.float32)
+    return cv2.resize(shrunken, (size, size), interpolation=cv2.INTER_LINEAR)
+
+
+def _compress(pixels: UInt8[np.ndarray, "H W 3"], quality: int) -> UInt8[np.ndarray, "H W 3"]:
+    _, encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+
+
+def _glare(rng: np.random.Generator, size: int) -> Float32[np.ndarray, "S S"]:
+    canvas = np.zeros((size, size), np.float32)
+    for _ in range(rng.integers(1, 5)):
+        center, axes = rng.integers(0, size, 2).tolist(), rng.uniform(1.0, 14.0, 2)
+        axes = tuple(np.ceil(axes).astype(int).tolist())
+        cv2.ellipse(canvas, center, axes, float(rng.uniform(0, 180)), 0, 360, 1.0, -1)
+    return np.float32(rng.uniform(0.3, 1.5)) * cv2.GaussianBlur(
+        canvas, (0, 0), rng.uniform(0.6, 4.0)
+    )
+
+
+def _draw_drops(rng: np.random.Generator, picture: Picture) -> None:
+    """Drops on the way or on the lens: small, bright, half transparent."""
+    for _ in range(rng.integers(5, 60)):
+        x, y = rng.integers(0, len(picture), 2)
+        radius = int(rng.integers(0, 3))
+        area = picture[max(0, y - radius) : y + radius + 1, max(0, x - radius) : x + radius + 1]
+        area += np.float32(rng.uniform(0.2, 0.9)) * (np.float32(rng.uniform(180, 255)) - area)
+
+
+def _cloud(rng: np.random.Generator, size: int, grain: float) -> Float32[np.ndarray, "S S"]:
+    """Smooth noise between 0 and 1."""
+    cells = max(2, round(size / grain) + 1)
+    return cv2.resize(
+        rng.random((cells, cells), np.float32), (size, size), interpolation=cv2.INTER_LINEAR
+    )
