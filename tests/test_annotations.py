@@ -94,7 +94,8 @@ def test_other_formats_are_refused_by_line(tmp_path, text):
     [
         ("1,1,10,10,-20,20,1,1,1", "above 0, got -20 x 20"),
         ("1,1,10,10,20,0,1,1,1", "above 0, got 20 x 0"),
-        ("1,-1,10,10,20,20,0.9,-1,-1,-1", "got -1; detections without ids"),
+        ("1,-1,10,10,20,20,0.9,-1,-1,-1\n1,2,10,10,20,20,1,1,1", "line 2: expected ids for all"),
+        ("1,-2,10,10,20,20,0.9,-1,-1,-1", "or -1 in every line for detections, got -2"),
         ("1,0,10,10,20,20,1,1,1", "an id of 1 or more"),
         ("1,1.5,10,10,20,20,1,1,1", "got 1.5"),
         ("0,1,10,10,20,20,1,1,1", "frame number, counted from 1, got 0"),

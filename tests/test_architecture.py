@@ -55,7 +55,8 @@ WHO_KNOWS = {
             for name in ("template", "skinning", "silhouette", "losses", "body")
         ),
     ],
-    "filterpy": ["stream_dmr.length_filter"],
+    "filterpy": ["stream_dmr.length_filter", "stream_dmr.segmentation"],
+    "onnxruntime": ["stream_dmr.segmentation"],
     "nodes": [*ASSEMBLY, "nodes"],
     "typer": [
         *("stream_dmr.cli", "stream_dmr.cli_calibrate", "stream_dmr.cli_export"),

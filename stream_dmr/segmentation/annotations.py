@@ -6,52 +6,42 @@ Masks: one label picture per frame, as in DAVIS 2017 (Pont-Tuset et al., arXiv:1
 
 import math
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Integer
+from jaxtyping import Integer
 from PIL import Image
 
 from stream_dmr.errors import AnnotationError
+from stream_dmr.segmentation.boxes import UNKNOWN_ID, Box, by_frame, corners
+from stream_dmr.segmentation.coco import load_coco
+from stream_dmr.segmentation.cvat import load_cvat
 
 _COLUMNS = "frame,id,x,y,w,h,conf,class,visibility"
 _MASK_NAME = re.compile(r"\d{6,}\.png")
 _LABEL_MODES = {"1", "L", "P", "I", "I;16", "I;16B"}  # one channel; "P": palette indices
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Box:
-    """One fish of one frame, as a boxes file has it."""
-
-    track_id: int
-    bbox_xyxy_px: Float[np.ndarray, "4"]  # half-open, frame pixels; may reach out of the frame
-    visibility: float  # of the fish, 0 to 1; 1 where the file doesn't say
-
-
 def load_boxes(path: Path) -> dict[int, list[Box]]:
     """Boxes by frame (from 1), within a frame by id; an empty file means that there are no fish.
 
-    Columns: frame, id, x, y, w, h, conf and optionally class and visibility; with ten columns the
-    last three are MOT15's world coordinates. conf and class are not used; a visibility of -1
-    means "not given", as everywhere in MOT.
+    `.json` is read as COCO, `.xml` as CVAT, everything else as MOT Challenge text. Its columns:
+    frame, id, x, y, w, h, conf and optionally class and visibility; with ten columns the last
+    three are MOT15's world coordinates. The class is not used; a visibility of -1 means "not
+    given", as everywhere in MOT, and so does an id of -1, in all lines or in none.
 
     Raises AnnotationError with the line's number and what was expected there.
     """
-    frames: dict[int, dict[int, Box]] = {}
-    for number, line in enumerate(_read_text(path).splitlines(), start=1):
-        if not line.strip():
-            continue
-        where = f"{path}, line {number}"
-        frame_index, box = _parse_box(line, where)
-        boxes = frames.setdefault(frame_index, {})
-        if box.track_id in boxes:
-            raise AnnotationError(
-                f"{where}: expected one box per fish and frame, "
-                f"got a second one of id {box.track_id} in frame {frame_index}; remove one"
-            )
-        boxes[box.track_id] = box
-    return {index: [frames[index][i] for i in sorted(frames[index])] for index in sorted(frames)}
+    text = _read_text(path)
+    match path.suffix.lower():
+        case ".json":
+            return load_coco(text, path)
+        case ".xml":
+            return load_cvat(text, path)
+    lines = enumerate(text.splitlines(), start=1)
+    return by_frame(
+        _parse_box(line, f"{path}, line {number}") for number, line in lines if line.strip()
+    )
 
 
 def _read_text(path: Path) -> str:
@@ -67,30 +57,27 @@ def _read_text(path: Path) -> str:
         ) from None
 
 
-def _parse_box(line: str, where: str) -> tuple[int, Box]:
+def _parse_box(line: str, where: str) -> tuple[str, int, Box]:
     values = _parse_numbers(line, where)
-    frame, track_id, x, y, width, height = values[:6]
+    frame, track_id, x, y, width, height, confidence = values[:7]
     if frame < 1 or frame != int(frame):
         raise AnnotationError(f"{where}: expected a frame number, counted from 1, got {frame:g}")
-    if track_id < 1 or track_id != int(track_id):
+    if track_id != -1 and (track_id < 1 or track_id != int(track_id)):
         raise AnnotationError(
-            f"{where}: expected an id of 1 or more that follows one fish, got {track_id:g}; "
-            "detections without ids must be tracked first"
+            f"{where}: expected an id of 1 or more that follows one fish, "
+            f"or -1 in every line for detections, got {track_id:g}"
         )
-    if width <= 0 or height <= 0:
-        raise AnnotationError(
-            f"{where}: expected a width and height above 0, got {width:g} x {height:g}"
-        )
+    bbox = corners(x, y, width, height, where=where)
     visibility = values[8] if len(values) == 9 else -1.0
     if visibility != -1 and not 0 <= visibility <= 1:
         raise AnnotationError(f"{where}: expected a visibility from 0 to 1, got {visibility:g}")
-    corners = np.array([x, y, x + width, y + height])
     box = Box(
-        track_id=int(track_id),
-        bbox_xyxy_px=corners,
+        track_id=UNKNOWN_ID if track_id == -1 else int(track_id),
+        bbox_xyxy_px=bbox,
         visibility=1.0 if visibility == -1 else visibility,
+        score=confidence if 0 <= confidence <= 1 else 1.0,
     )
-    return int(frame), box
+    return where, int(frame), box
 
 
 def _parse_numbers(line: str, where: str) -> list[float]:
