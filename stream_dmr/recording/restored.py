@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import chain
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
@@ -17,6 +17,7 @@ from stream_dmr.recording.pictures import checksum
 from stream_dmr.recording.topics import KEY_FRAME_NS
 
 
+@runtime_checkable
 class Restorer(Protocol):
     """Gives the recorded frames their pictures, in the order of the recording."""
 
