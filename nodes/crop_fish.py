@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from stream_dmr.camera import Camera
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.crop import CropFishSettings, crop_fish
-from stream_dmr.segmentation.detections import Annotations
+from stream_dmr.segmentation.fish_finder import FishFinder
 from stream_dmr.segmentation.segmenters import open_segmenter
 
 
@@ -13,7 +13,7 @@ class CropFish:
     """Frame -> FishCrop, one per fish. Without a calibrated camera a nominal one stands in."""
 
     def __init__(
-        self, settings: CropFishSettings, *, camera: Camera | None, detections: Annotations
+        self, settings: CropFishSettings, *, camera: Camera | None, detections: FishFinder
     ) -> None:
         """Raises ModelError where the model that `settings.segmenter` names can't be used."""
         self.detections = detections

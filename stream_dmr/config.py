@@ -20,6 +20,8 @@ from stream_dmr.localization import LocalizeSettings
 from stream_dmr.metrics import EvaluateSettings
 from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.segmentation.crop import CropFishSettings
+from stream_dmr.segmentation.detectors import DetectFishSettings
+from stream_dmr.segmentation.followed import TrackFishSettings
 from stream_dmr.settings import Settings
 from stream_dmr.video import ReadFramesSettings
 
@@ -36,6 +38,14 @@ class Config(Settings):
 
     read_frames: ReadFramesSettings = Field(
         default_factory=ReadFramesSettings, description="from a video, folder or camera to frames"
+    )
+    detect_fish: DetectFishSettings = Field(
+        default_factory=DetectFishSettings,
+        description="where fish are in a video that comes without boxes and masks",
+    )
+    track_fish: TrackFishSettings = Field(
+        default_factory=TrackFishSettings,
+        description="from detections to fish with ids, each counted once",
     )
     crop_fish: CropFishSettings = Field(
         default_factory=CropFishSettings, description="from frames to one crop and mask per fish"

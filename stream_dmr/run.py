@@ -22,7 +22,7 @@ from stream_dmr.messages import LengthEstimate
 from stream_dmr.pipeline import Node, StageCounters, run_chain
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.segmentation.detections import open_annotations
+from stream_dmr.segmentation.fish_finder import open_finder
 from stream_dmr.store import LengthStore, require_free
 from stream_dmr.tables import write_lengths
 from stream_dmr.tally import Observer, Tally, run_facts
@@ -73,7 +73,12 @@ def run(
     config = load_config(request.config)
     template = load_template(request.template)
     calibration = None if request.calibration is None else load_calibration(request.calibration)
-    detections = open_annotations(boxes=request.boxes, masks=request.masks)
+    detections = open_finder(
+        boxes=request.boxes,
+        masks=request.masks,
+        detect=config.detect_fish,
+        track=config.track_fish,
+    )
     reader = ReadFrames(request.source, config.read_frames)
     try:
         if calibration is not None:

@@ -24,13 +24,13 @@ from stream_dmr.messages import (
 from stream_dmr.pipeline import Node, StageCounters, run_chain
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.opened import open_recordings
-from stream_dmr.recording.part import Part
+from stream_dmr.recording.part import WHOLE, Part
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.restored import SourcePictures
 from stream_dmr.replay.judge import Judge, Mismatch, Scribe
 from stream_dmr.replay.tape import Playback, Tape
 from stream_dmr.run import Observer, later_nodes, prepare_folder
-from stream_dmr.segmentation.detections import open_annotations
+from stream_dmr.segmentation.fish_finder import open_finder
 from stream_dmr.template import Template, load_template
 
 STAGES: dict[str, type[Message]] = {
@@ -53,8 +53,7 @@ class ReplayRequest:
     source: str | None = None  # the recorded clip: for `crop`, where pictures are by reference
     boxes: Path | None = None  # for `crop`
     masks: Path | None = None
-    time_s: tuple[float, float] | None = None  # of capture: from, to
-    tracks: frozenset[int] | None = None
+    part: Part = WHOLE
     out: Path | None = None  # None: nothing is written
     overwrite: bool = False
     check: bool = False  # compare with what was recorded
@@ -86,7 +85,7 @@ def replay(
     _refuse_impossible(request)
     recording = open_recordings(request.recordings)
     config, template, calibration = _inputs(request, recording.header)
-    tape = Tape(recording, Part.of_seconds(request.time_s, request.tracks))
+    tape = Tape(recording, request.part)
     order = [*STAGES.values()]
     first = order.index(STAGES[request.first])
     with ExitStack() as stack:
@@ -120,7 +119,7 @@ def replay(
 
 
 def _refuse_impossible(request: ReplayRequest) -> None:
-    if request.check and request.time_s is not None:
+    if request.check and request.part.time_ns is not None:
         raise UserError(
             "--check with --time: each fit starts from the frame before, so a part of a recording "
             "can't equal the whole; leave out one of them"
@@ -129,7 +128,7 @@ def _refuse_impossible(request: ReplayRequest) -> None:
         raise UserError(
             f"--template with --from {request.first}: a template matters to the fit; use --from fit"
         )
-    if request.first == "crop" and request.tracks is not None:
+    if request.first == "crop" and request.part.tracks is not None:
         raise UserError("--track with --from crop: crops are made of whole frames; use --from fit")
     if request.first == "crop" and request.boxes is None and request.masks is None:
         raise UserError(
@@ -185,7 +184,12 @@ def _chain(
     computed = later_nodes(config, template=template, calibration=calibration)
     if first == 0:
         camera = None if calibration is None else calibration.camera
-        detections = open_annotations(boxes=request.boxes, masks=request.masks)
+        detections = open_finder(
+            boxes=request.boxes,
+            masks=request.masks,
+            detect=config.detect_fish,
+            track=config.track_fish,
+        )
         pictures = None
         if request.source is not None:
             reader = ReadFrames(request.source, config.read_frames)

@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator
 
 from stream_dmr.segmentation.tracking import Sighting
 from stream_dmr.settings import Settings
@@ -23,12 +23,13 @@ class CounterSettings(Settings):
         description="left, top, right, bottom of where fish count, as fractions of the picture",
     )
 
-    @model_validator(mode="after")
-    def _has_an_inside(self) -> "CounterSettings":
-        left, top, right, bottom = self.zone
+    @field_validator("zone")
+    @classmethod
+    def _has_an_inside(cls, zone: list[float]) -> list[float]:
+        left, top, right, bottom = zone
         if not (left < right and top < bottom):
-            raise ValueError("left below right and top below bottom")
-        return self
+            raise ValueError("left, top, right, bottom with left < right and top < bottom")
+        return zone
 
 
 class FishCounter:

@@ -8,16 +8,21 @@ from stream_dmr.errors import ModelError
 from stream_dmr.segmentation.detector import Detector
 from stream_dmr.segmentation.motion import MotionDetector, MotionSettings
 from stream_dmr.segmentation.onnx_detector import OnnxDetector, OnnxSettings
+from stream_dmr.settings import Settings
 
 
-class DetectFishSettings(MotionSettings, OnnxSettings):
-    """`[detect_fish]`: how fish are found in a video that comes without boxes and masks."""
+class DetectorSettings(Settings):
+    """The part of `[detect_fish]` that says who looks for fish."""
 
     detector: str = Field(
         default="motion",
         min_length=1,
         description='what finds fish in the picture: "motion", or a detector\'s file (.onnx)',
     )
+
+
+class DetectFishSettings(OnnxSettings, MotionSettings, DetectorSettings):
+    """`[detect_fish]`: how fish are found in a video that comes without boxes and masks."""
 
 
 def open_detector(settings: DetectFishSettings) -> Detector:

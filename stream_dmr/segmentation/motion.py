@@ -24,19 +24,19 @@ _REST = np.eye(2, 3)
 class MotionSettings(Settings):
     """The part of `[detect_fish]` that the detector "motion" reads."""
 
-    working_px: int = Field(
+    motion_working_px: int = Field(
         default=480, ge=120, le=4096, description="longer side of the pictures it works on, px"
     )
-    memory_frames: float = Field(
+    motion_memory_frames: float = Field(
         default=20.0, ge=2, description="frames over which the background is learnt"
     )
-    min_distance: float = Field(
+    motion_min_distance: float = Field(
         default=5.0, gt=0, description="how foreign a fish's colours are at least, std"
     )
-    min_length: float = Field(
+    motion_min_length: float = Field(
         default=0.03, gt=0, le=1, description="shortest fish, as a fraction of the longer side"
     )
-    max_length: float = Field(
+    motion_max_length: float = Field(
         default=0.7, gt=0, le=1, description="longest fish, as a fraction of the longer side"
     )
 
@@ -55,14 +55,14 @@ class MotionDetector:
     def find(self, frame: Frame) -> list[Candidate]:
         """The moving shapes of a frame that may be fish, by size and thickness."""
         height, width = frame.image.shape[:2]
-        scale = min(1.0, self._settings.working_px / max(width, height))
+        scale = min(1.0, self._settings.motion_working_px / max(width, height))
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
         small = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
         moving = self._moving(small)
         shapes = fish_shapes(
             moving,
-            min_length_px=self._settings.min_length * max(size),
-            max_length_px=self._settings.max_length * max(size),
+            min_length_px=self._settings.motion_min_length * max(size),
+            max_length_px=self._settings.motion_max_length * max(size),
         )
         return [_candidate(shape, width=width, height=height) for shape in shapes]
 
@@ -72,7 +72,7 @@ class MotionDetector:
         picture = shown.astype(np.float32)
         background.meet(picture)
         distance = background.distance(picture)
-        foreign = _foreign(distance, self._settings.min_distance)
+        foreign = _foreign(distance, self._settings.motion_min_distance)
         still = _still(foreign, shown, self._before)
         rate = np.where(cv2.dilate(foreign, _disc(5)) > 0, _HIDDEN_RATE, 1.0).astype(np.float32)
         rate[still] = _STILL_RATE
@@ -90,7 +90,7 @@ class MotionDetector:
         if self._background is None or self._is_foreign is None or self._before is None:
             self._camera.step(grey, is_background=np.ones(grey.shape, bool))
             self._background = Background(
-                small.astype(np.float32), memory_frames=self._settings.memory_frames
+                small.astype(np.float32), memory_frames=self._settings.motion_memory_frames
             )
             self._before = small
             return self._background, small
