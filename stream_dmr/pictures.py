@@ -88,7 +88,7 @@ def _pictures_in(folder: Path) -> list[Path]:
         ) from None
     pictures = [p for p in files if p.suffix.lower() in _PICTURES]
     if pictures:
-        return sorted(pictures, key=_natural_order)
+        return sorted(pictures, key=natural_order)
     if any(p.suffix.lower() in _VIDEOS for p in files):
         raise SourceError(
             f"{folder}: expected a folder of pictures, found videos; give one of them, "
@@ -99,7 +99,7 @@ def _pictures_in(folder: Path) -> list[Path]:
     )
 
 
-def _natural_order(path: Path) -> tuple[list[str | int], str]:
+def natural_order(path: Path) -> tuple[list[str | int], str]:
     parts = re.split(r"([0-9]+)", path.name)
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 
