@@ -18,12 +18,12 @@ from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.length_filter import SmoothLengthSettings
 from stream_dmr.localization import LocalizeSettings
 from stream_dmr.metrics import EvaluateSettings
+from stream_dmr.read_settings import ReadFramesSettings
 from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.segmentation.crop import CropFishSettings
 from stream_dmr.segmentation.detectors import DetectFishSettings
 from stream_dmr.segmentation.followed import TrackFishSettings
 from stream_dmr.settings import Settings
-from stream_dmr.video import ReadFramesSettings
 
 _HEADER = """\
 # Every knob of stream-dmr with its default. Keep only the lines that you change, if you like;

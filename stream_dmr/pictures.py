@@ -12,7 +12,6 @@ from stream_dmr.errors import SourceError
 from stream_dmr.messages import Frame
 
 _PICTURES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
-_VIDEOS = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv"}
 _SECOND_NS = 1_000_000_000
 
 
@@ -22,6 +21,8 @@ class PictureFolder:
     Grey and 16-bit pictures become 8-bit BGR. One that can't be decoded is left out with a warning
     but keeps its frame index, so that boxes and masks stay with their pictures.
     """
+
+    is_endless = False
 
     def __init__(self, folder: Path, *, fps: float) -> None:
         self._paths = _pictures_in(folder)
@@ -73,10 +74,16 @@ def check_size(
 ) -> None:
     """Raises SourceError, naming both sizes, where a picture isn't `width` x `height` px."""
     if image.shape[:2] != (height, width):
-        raise SourceError(
-            f"{where}: expected {width}x{height} px, as the first frame has, got "
-            f"{image.shape[1]}x{image.shape[0]} px; pictures of one source must have one size"
-        )
+        size = image.shape[1], image.shape[0]
+        raise size_error(size, expected=(width, height), where=where)
+
+
+def size_error(size: tuple[int, int], *, expected: tuple[int, int], where: str) -> SourceError:
+    """What to tell about a frame of another size; both are width and height in px."""
+    return SourceError(
+        f"{where}: expected {expected[0]}x{expected[1]} px, as the first frame has, got "
+        f"{size[0]}x{size[1]} px; pictures of one source must have one size"
+    )
 
 
 def _pictures_in(folder: Path) -> list[Path]:
@@ -89,17 +96,14 @@ def _pictures_in(folder: Path) -> list[Path]:
     pictures = [p for p in files if p.suffix.lower() in _PICTURES]
     if pictures:
         return sorted(pictures, key=natural_order)
-    if any(p.suffix.lower() in _VIDEOS for p in files):
-        raise SourceError(
-            f"{folder}: expected a folder of pictures, found videos; give one of them, "
-            "or run `stream-dmr batch` over a list of them"
-        )
     raise SourceError(
-        f"{folder}: expected a folder of pictures ({', '.join(sorted(_PICTURES))}), found none"
+        f"{folder}: expected a folder of pictures ({', '.join(sorted(_PICTURES))}) or of videos, "
+        "found none"
     )
 
 
 def natural_order(path: Path) -> tuple[list[str | int], str]:
+    """A sorting key by which `2.png` comes before `10.png`."""
     parts = re.split(r"([0-9]+)", path.name)
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 

@@ -27,6 +27,7 @@ _BALLAST = "lengths.reserve"  # room that is given up when the disk is full, so 
 _BALLAST_BYTES = 1 << 20
 _BALLAST_SHARE = 0.01  # of the free space, at most
 _MARK = "INSERT INTO marks VALUES (?1, ?2) ON CONFLICT (name) DO UPDATE SET value = ?2"
+_CLIP = "INSERT OR REPLACE INTO clips VALUES (?, ?, ?)"
 _FRAMES_AHEAD = 1000  # frame numbers set aside at a time: a gap after a crash does no harm
 
 
@@ -67,6 +68,7 @@ class LengthStore:
         self._ballast = out_dir / _BALLAST
         self._lock = RLock()
         self._pending: list[tuple[str, tuple[object, ...]]] = []
+        self._clip: tuple[str, int] | None = None  # in work, and its frames done
         self._folder = _lock_folder(out_dir)
         try:
             self._database = open_database(self.path)
@@ -96,6 +98,27 @@ class LengthStore:
         if is_due or frame_index > self._handed_out.frame_index:
             self._marked_at_ns = time.monotonic_ns()
             self._mark(frame_index=frame_index + _FRAMES_AHEAD, timestamp_ns=timestamp_ns)
+
+    def clip_progress(self, name: str, *, frames_done: int) -> None:
+        """Keep in mind how far a clip is: it becomes durable with the next fish or mark.
+
+        So a restart neither repeats a finished fish nor begins the clip anew.
+        """
+        with self._lock:
+            if self._clip is not None and self._clip[0] != name:
+                self._pending.append((_CLIP, (*self._clip, 1)))
+            self._clip = name, frames_done
+
+    def clips_before(self) -> tuple[set[str], dict[str, int]]:
+        """Of earlier runs: the clips that are done, and the frames done of others."""
+        rows = self._database.execute("SELECT name, frames_done, is_done FROM clips").fetchall()
+        done = {name for name, _, is_done in rows if is_done}
+        return done, {name: frames for name, frames, is_done in rows if not is_done}
+
+    def resume_after_ns(self) -> int:
+        """The capture time after which a live source goes on, whatever the clock was set to."""
+        mark_ns = self.before.timestamp_ns
+        return mark_ns if time.time_ns() > mark_ns else mark_ns + MARK_EVERY_NS
 
     def note(self, kind: str, text: str, *, timestamp_ns: int) -> None:
         """Write an event that later readers of the lengths should know of."""
@@ -154,6 +177,8 @@ class LengthStore:
                 with _transaction(self._database):
                     for statement, values in self._pending:
                         self._database.execute(statement, values)
+                    if self._clip is not None:
+                        self._database.execute(_CLIP, (*self._clip, 0))
                     for field in fields(Marks):
                         mark = field.name, getattr(self._handed_out, field.name)
                         self._database.execute(_MARK, mark)

@@ -41,6 +41,11 @@ CREATE TABLE fish (
     written_ns INTEGER NOT NULL -- wall clock
 ) STRICT;
 CREATE TABLE marks (name TEXT PRIMARY KEY, value INTEGER NOT NULL) STRICT;
+CREATE TABLE clips (
+    name TEXT PRIMARY KEY,
+    frames_done INTEGER NOT NULL, -- from its start, that have left the chain
+    is_done INTEGER NOT NULL -- 1: the clip after it has begun
+) STRICT;
 CREATE TABLE events (
     number INTEGER PRIMARY KEY,
     run_id TEXT NOT NULL REFERENCES runs,

@@ -1,5 +1,7 @@
 """What a run does with every message beside passing it on: numbers, stores, records, counts it."""
 
+from collections import Counter, deque
+from collections.abc import Mapping
 from dataclasses import replace
 from hashlib import sha256
 
@@ -34,19 +36,28 @@ class Tally:
 
     A finished fish goes to the store before anything else is done with it, so that no failure of
     what follows can lose it. After an earlier run in the same folder, ids go on where that one
-    stopped; frames as well for a live source, whose numbers no annotations refer to.
+    stopped; frames as well where the source has no end and no annotations count its frames.
     """
 
     def __init__(
-        self, recorder: Recorder, store: LengthStore, observer: Observer, *, is_live: bool
+        self,
+        recorder: Recorder,
+        store: LengthStore,
+        observer: Observer,
+        *,
+        numbers_frames_on: bool,
+        clips: Mapping[str, int] | None = None,
     ) -> None:
+        """`clips`: the source is a folder of clips, of which so many frames were done before."""
         self.final: list[LengthEstimate] = []
         self.num_frames = 0
         self._recorder = recorder
         self._store = store
         self._observer = observer
         self._first_id = store.before.track_id
-        self._first_frame = store.before.frame_index if is_live else 0
+        self._first_frame = store.before.frame_index if numbers_frames_on else 0
+        self._clips = None if clips is None else Counter(clips)
+        self._in_flight: deque[str] = deque()  # the clips of frames that are in the chain
         self._track_ids: set[int] = set()
 
     def record(self, message: Message) -> Message:
@@ -54,6 +65,7 @@ class Tally:
         match message:
             case Frame(frame_index=index):
                 message = replace(message, frame_index=index + self._first_frame)
+                self._in_flight.append(message.source)
                 self._store.frame_passed(
                     frame_index=message.frame_index, timestamp_ns=message.timestamp_ns
                 )
@@ -78,6 +90,10 @@ class Tally:
     def frame_done(self) -> None:
         """Count a frame that has left the last stage."""
         self.num_frames += 1
+        clip = self._in_flight.popleft()
+        if self._clips is not None:
+            self._clips[clip] += 1
+            self._store.clip_progress(clip, frames_done=self._clips[clip])
         self._observer.frame_done()
 
 

@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 from nodes.read_frames import ReadFrames
 from stream_dmr.errors import SourceError
 from stream_dmr.pictures import nominal_ns
-from stream_dmr.video import LiveStream, ReadFramesSettings, container_ns, open_source
+from stream_dmr.read_settings import ReadFramesSettings
+from stream_dmr.video import open_source
+from stream_dmr.video_file import container_ns
 
 SETTINGS = ReadFramesSettings()
 SECOND_NS = 10**9
@@ -145,15 +147,6 @@ def test_refuses_a_camera_and_a_stream_that_are_not_there():
     assert message.startswith("rtsp://127.0.0.1:9/rail: expected")
 
 
-def test_live_streams_are_stamped_by_the_clock(tmp_path, monkeypatch):
-    write_video(tmp_path / "a.avi", num_frames=5)
-    ticks = iter([100, 90, 90, 300, 300])  # clocks may stand still or be set back
-    monkeypatch.setattr("stream_dmr.video.time.time_ns", lambda: next(ticks))
-    frames = list(LiveStream(f"file://{tmp_path / 'a.avi'}", SETTINGS))
-    assert [f.timestamp_ns for f in frames] == [100, 101, 102, 300]
-    assert [f.frame_index for f in frames] == [1, 2, 3, 4]
-
-
 def stamps(milliseconds):
     times = []
     for frame_index, ms in enumerate(milliseconds, start=1):
@@ -258,7 +251,7 @@ def test_refuses_folders_without_pictures(tmp_path):
     (tmp_path / "1.png").write_bytes(b"no picture")
     assert "none of its 1 can be decoded" in refusal(tmp_path)
     (tmp_path / "1.png").rename(tmp_path / "1.mp4")
-    assert "found videos" in refusal(tmp_path)
+    assert "1.mp4: expected a video" in refusal(tmp_path)
 
 
 def test_frames_cannot_be_written_to(tmp_path):

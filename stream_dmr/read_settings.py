@@ -1,0 +1,45 @@
+"""The table [read_frames] of config.toml."""
+
+from pydantic import Field
+
+from stream_dmr.settings import Settings
+
+
+class ReadFramesSettings(Settings):
+    """`[read_frames]`: how a source is read."""
+
+    images_fps: float = Field(
+        default=30.0,
+        gt=0,
+        allow_inf_nan=False,
+        description="frames/s of folders of pictures and of videos without timestamps",
+    )
+    silence_s: float = Field(
+        default=20.0,
+        ge=0.1,
+        le=3600,
+        description="a camera or decoder that gives no frame for so long is started anew, s",
+    )
+    connect_s: float = Field(
+        default=6.0,
+        ge=0.1,
+        le=3600,
+        description="how long a camera may take to a first frame; more than between key frames, s",
+    )
+    retry_s: float = Field(
+        default=3.0,
+        ge=0.1,
+        le=3600,
+        description="the longest pause between two attempts to reach a lost camera, s",
+    )
+    live_queue: int = Field(
+        default=4,
+        ge=1,
+        le=1000,
+        description="frames of a live source that may wait; where more come, the oldest is dropped",
+    )
+    clips_wait_s: float = Field(
+        default=30.0,
+        ge=0,
+        description="a folder of clips ends when no new clip came for so long, s; at sea 1e9",
+    )
