@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,6 +20,7 @@ class Candidate:
     foreground: Bool[np.ndarray, "h w"] | None = None
 
 
+@runtime_checkable
 class Detector(Protocol):
     """Finds fish in consecutive frames; it may learn from those before."""
 

@@ -1,7 +1,7 @@
 """Where the fish of a run come from: files that somebody made, or the video itself."""
 
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.annotations import load_boxes
@@ -12,6 +12,7 @@ from stream_dmr.segmentation.detectors import DetectFishSettings, open_detector
 from stream_dmr.segmentation.followed import FollowedFish, TrackFishSettings
 
 
+@runtime_checkable
 class FishFinder(Protocol):
     """Which fish are in a frame."""
 
