@@ -27,7 +27,7 @@ from stream_dmr.store import LengthStore, require_free
 from stream_dmr.tables import write_lengths
 from stream_dmr.tally import Observer, Tally, run_facts
 from stream_dmr.template import Template, load_template
-from stream_dmr.video import LiveStream
+from stream_dmr.video import ClipFolder, LiveStream, Source
 
 RESULTS = ("lengths.db", "lengths.csv", "frames.csv", "recording.mcap", "recording.rrd")
 
@@ -86,8 +86,7 @@ def run(
         camera = None if calibration is None else calibration.camera
         crop_fish = CropFish(config.crop_fish, camera=camera, detections=detections)
         nodes = [crop_fish, *later_nodes(config, template=template, calibration=calibration)]
-        is_live = isinstance(reader.source, LiveStream)
-        resume = (request.resume or is_live) and not request.overwrite
+        resume = (request.resume or reader.source.is_endless) and not request.overwrite
         prepare_folder(request.out, overwrite=request.overwrite, resume=resume)
         header = _header(request, reader.source.name, config, template, calibration)
         with (
@@ -101,13 +100,19 @@ def run(
                 observer.serving(recorder.live_address)
             if calibration is None:
                 observer.warn("without --calibration there are relative shapes, no millimetres")
-            if is_live and config.recording.frames == "reference":
+            if isinstance(reader.source, LiveStream) and config.recording.frames == "reference":
                 observer.warn(
                     "a live source can't be read again, so its pictures are not kept but for the "
                     'view; record them with [recording] frames = "jpeg" or "h264"'
                 )
             observer.begin(reader.source.num_frames)
-            tally = Tally(recorder, store, observer, is_live=is_live)
+            tally = Tally(
+                recorder,
+                store,
+                observer,
+                numbers_frames_on=reader.source.is_endless and not (request.boxes or request.masks),
+                clips=_go_on(reader.source, store, observer),
+            )
             summary = _run_chain(reader, nodes, tally, request.out, stop=stop)
     finally:
         reader.close()
@@ -153,6 +158,18 @@ def _set_aside(recording: Path) -> None:
         if not aside.exists():
             recording.rename(aside)
             return
+
+
+def _go_on(source: Source, store: LengthStore, observer: Observer) -> dict[str, int] | None:
+    """Let a source without an end go on where an earlier run stopped; the frames done of clips."""
+    if isinstance(source, LiveStream):
+        source.resume_after(store.resume_after_ns())
+        source.listen(observer.warn)
+    if not isinstance(source, ClipFolder):
+        return None
+    done, frames_done = store.clips_before()
+    source.resume(done=done, frames_done=frames_done, after_ns=store.before.timestamp_ns)
+    return frames_done
 
 
 @contextmanager
