@@ -11,12 +11,14 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 from stream_dmr.messages import Frame, Message
 
 _QUEUE_FRAMES = 2  # between two stages: enough to keep both busy, few enough to stop soon
 _POLL_S = 0.1  # how soon a waiting stage notices that the chain stops
+_DONE = {True: "processed", False: "dropped"}
 _SOURCE_GRACE_S = 1.0  # a camera that hangs in a read is left behind after this
 
 
@@ -42,9 +44,13 @@ class Node(Protocol):
 
 @dataclass(kw_only=True)
 class StageCounters:
-    """What one stage did."""
+    """What one stage did; at the end, frames in = processed + dropped + failed."""
 
     stage: str
+    frames_in: int = 0
+    frames_processed: int = 0
+    frames_dropped: int = 0  # not begun, or not finished, when the chain was stopped
+    frames_failed: int = 0  # an exception in some part of it; what came before it went on
     messages_in: int = 0
     messages_out: int = 0
     busy_s: float = 0.0  # from taking a frame to passing it on; waiting for a core included
@@ -69,6 +75,8 @@ def run_chain(
     on_message: Callable[[Message], Message],
     stop: threading.Event,
     on_frame: Callable[[], None] = lambda: None,
+    on_start: Callable[["Chain"], None] = lambda chain: None,
+    on_failure: Callable[[str, Exception], bool] = lambda stage, error: False,
 ) -> list[StageCounters]:
     """Run every frame of `source` through `nodes`; return the counters of source and nodes.
 
@@ -77,13 +85,18 @@ def run_chain(
     called when a frame has left the last stage. Setting `stop` ends the chain soon: the busiest
     stage and those before it drop what they have not begun, those after it finish what they were
     given, and every node is closed. An exception ends the chain in the same way, at the stage
-    where it happened, and is raised here.
+    where it happened, and is raised here; but where `on_failure` says true of it, only what the
+    node was doing is lost. `on_start` gets the chain, to be watched while it runs.
     """
-    return _Chain(source, nodes, on_message=on_message, on_frame=on_frame, stop=stop).run()
+    chain = Chain(
+        source, nodes, on_message=on_message, on_frame=on_frame, on_failure=on_failure, stop=stop
+    )
+    on_start(chain)
+    return chain.run()
 
 
-class _Chain:
-    """One run: stage 0 is the source, stage k the k-th node."""
+class Chain:
+    """One run: stage 0 is the source, stage k the k-th node. May be watched from any thread."""
 
     def __init__(
         self,
@@ -92,22 +105,34 @@ class _Chain:
         *,
         on_message: Callable[[Message], Message],
         on_frame: Callable[[], None],
+        on_failure: Callable[[str, Exception], bool],
         stop: threading.Event,
     ) -> None:
         self._source = source
         self._nodes = nodes
         self._on_message = on_message
         self._on_frame = on_frame
+        self._on_failure = on_failure
         self._stop = stop
         self._inboxes = [_Inbox(_QUEUE_FRAMES) for _ in nodes]  # of stages 1, 2, ...
-        self._counters = [StageCounters(stage=type(stage).__name__) for stage in (source, *nodes)]
-        self._busy_since: list[float | None] = [None] * len(self._counters)
+        self.counters = [StageCounters(stage=type(stage).__name__) for stage in (source, *nodes)]
+        self._busy_since: list[float | None] = [None] * len(self.counters)
         self._is_stopped = False  # has `stop` been seen?
         self._cut = -1  # the last stage that drops what it has not begun
         self._failure: BaseException | None = None
         self._lock = threading.Lock()
 
+    def waiting(self) -> list[int]:
+        """Frames that wait before each node."""
+        return [inbox.qsize() for inbox in self._inboxes]
+
+    def longest_busy_s(self) -> float:
+        """How long the slowest node has had the frame (or its fish) that it is working on."""
+        now = time.perf_counter()
+        return max((now - s for s in self._busy_since[1:] if s is not None), default=0.0)
+
     def run(self) -> list[StageCounters]:
+        """Run to the end, once; what `run_chain` says."""
         threads = [threading.Thread(target=self._run_source, name="source", daemon=True)]
         threads += [
             threading.Thread(target=self._run_node, args=(stage,), name=f"stage-{stage}")
@@ -126,9 +151,10 @@ class _Chain:
         finally:
             self._cut = len(self._nodes)
             threads[0].join(_SOURCE_GRACE_S)
+            self._count_leftovers()
         if self._failure is not None:
             raise self._failure
-        return self._counters
+        return self.counters
 
     def _run_source(self) -> None:
         try:
@@ -143,10 +169,14 @@ class _Chain:
         """Wait for the next frame; None at the end of the source or of the chain."""
         with self._busy(0):
             frame = next(frames, None)
-            if frame is None or self._is_cut(0):
+            if frame is None:
+                return None
+            if self._is_cut(0):
+                self._count(0, "dropped")
                 return None
             batch = _Batch(timestamp_ns=frame.timestamp_ns)
-            self._emit(0, [frame], batch)
+            is_done = self._attempt(0, lambda: [frame], batch)
+            self._count(0, "processed" if is_done else "failed")
             return batch
 
     def _run_node(self, stage: int) -> None:
@@ -159,31 +189,57 @@ class _Chain:
 
     def _process(self, stage: int, node: Node, batch: _Batch, *, close: bool = False) -> _Batch:
         """Step through a batch, then tick or close. What came before an exception still goes on."""
-        made = _Batch(timestamp_ns=batch.timestamp_ns)
+        made, is_done = _Batch(timestamp_ns=batch.timestamp_ns), True
         with self._busy(stage):
-            try:
-                for message in batch.messages:
-                    if self._is_cut(stage):
-                        break
-                    self._counters[stage].messages_in += 1
-                    self._emit(stage, node.step(message), made)
-                if batch.timestamp_ns is not None and not self._is_cut(stage):
-                    self._emit(stage, node.tick(batch.timestamp_ns), made)
-                    if stage == len(self._nodes):
-                        self._on_frame()
-            except BaseException as error:
-                self._fail(stage, error)
-            try:
-                if close:
-                    self._emit(stage, node.close(), made)
-            except BaseException as error:
-                self._fail(stage, error)
+            for message in batch.messages:
+                if self._is_cut(stage):
+                    break
+                self.counters[stage].messages_in += 1
+                is_done &= self._attempt(stage, partial(node.step, message), made)
+            if batch.timestamp_ns is not None:
+                is_whole = not self._is_cut(stage)
+                if is_whole:
+                    is_done &= self._attempt(stage, partial(node.tick, batch.timestamp_ns), made)
+                self._count(stage, "failed" if not is_done else _DONE[is_whole])
+                if is_whole and stage == len(self._nodes):
+                    self._attempt(stage, self._say_done, made)
+            if close:
+                self._attempt(stage, node.close, made)
         return made
+
+    def _say_done(self) -> Sequence[Message]:
+        self._on_frame()
+        return ()
+
+    def _attempt(self, stage: int, work: Callable[[], Sequence[Message]], made: _Batch) -> bool:
+        """Do a part of a frame's work; false where that failed, which may end the chain."""
+        try:
+            self._emit(stage, work(), made)
+        except BaseException as error:
+            name = self.counters[stage].stage
+            if not isinstance(error, Exception) or not self._on_failure(name, error):
+                self._fail(stage, error)
+            return False
+        return True
+
+    def _count(self, stage: int, outcome: str, frames: int = 1) -> None:
+        with self._lock:
+            counters = self.counters[stage]
+            counters.frames_in += frames
+            name = f"frames_{outcome}"
+            setattr(counters, name, getattr(counters, name) + frames)
+
+    def _count_leftovers(self) -> None:
+        """Frames that were handed to a stage which was to take no more."""
+        for stage, inbox in enumerate(self._inboxes, start=1):
+            with inbox.mutex:
+                left = sum(batch.timestamp_ns is not None for batch in inbox.queue)
+            self._count(stage, "dropped", left)
 
     def _emit(self, stage: int, messages: Sequence[Message], made: _Batch) -> None:
         for message in messages:
             made.messages.append(self._on_message(message))
-            self._counters[stage].messages_out += 1
+            self.counters[stage].messages_out += 1
 
     def _take(self, stage: int) -> _Batch | None:
         """Wait for the next batch of a stage; None once it has to drop what waits."""
@@ -201,6 +257,9 @@ class _Chain:
                 return self._inboxes[stage].put(batch, timeout=_POLL_S)
             except queue.Full:
                 continue
+        if stage < len(self._nodes) and batch.timestamp_ns is not None:
+            self._count(stage + 1, "dropped")
+        return None
 
     def _fail(self, stage: int, error: BaseException) -> None:
         """Keep the first exception, and end this stage and those before it."""
@@ -222,7 +281,7 @@ class _Chain:
         now = time.perf_counter()
         busy = [
             counters.busy_s + (0.0 if since is None else now - since)
-            for counters, since in zip(self._counters, self._busy_since, strict=True)
+            for counters, since in zip(self.counters, self._busy_since, strict=True)
         ]
         return busy.index(max(busy))
 
@@ -235,5 +294,5 @@ class _Chain:
             yield
         finally:
             self._busy_since[stage] = None
-            self._counters[stage].busy_s += time.perf_counter() - began
-            self._counters[stage].cpu_s += time.thread_time() - cpu_began
+            self.counters[stage].busy_s += time.perf_counter() - began
+            self.counters[stage].cpu_s += time.thread_time() - cpu_began

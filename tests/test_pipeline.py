@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stream_dmr.messages import Frame, Message
-from stream_dmr.pipeline import run_chain
+from stream_dmr.pipeline import Chain, StageCounters, run_chain
 
 BLACK = np.zeros((2, 2, 3), np.uint8)
 
@@ -239,3 +239,75 @@ def test_an_exception_in_the_recorder_ends_the_chain(stage):
     with pytest.raises(BrokenError, match="disk full"):
         run_chain(frames(9), nodes, on_message=full, stop=threading.Event())
     assert [node.closed for node in nodes] == [1, 1]
+
+
+def assert_counted(counters: Sequence[StageCounters]) -> None:
+    for one in counters:
+        assert one.frames_in == one.frames_processed + one.frames_dropped + one.frames_failed, one
+
+
+@given(
+    st.integers(0, 12),
+    st.lists(st.tuples(st.integers(0, 2), st.booleans()), min_size=1, max_size=3),
+    st.none() | st.integers(1, 12),
+    st.booleans(),
+)
+@settings(max_examples=40)
+def test_frames_in_are_processed_dropped_or_failed(count, shapes, stop_at, is_endless: bool):
+    """However the chain ends, and wherever it is slow or broken."""
+    nodes = [
+        (Broken if is_broken else Repeat)(f"{k}", copies=1 + k, delay_s=delay / 2000)
+        for k, (delay, is_broken) in enumerate(shapes)
+    ]
+    stop, done = threading.Event(), []
+    chains: list[Chain] = []
+
+    def on_frame() -> None:
+        done.append(1)
+        if len(done) == (stop_at or 12):
+            stop.set()
+
+    run_chain(
+        endless() if is_endless else frames(count),
+        nodes,
+        on_message=lambda m: m,
+        on_frame=on_frame,
+        on_start=chains.append,
+        on_failure=lambda stage, error: True,
+        stop=stop,
+    )
+    assert_counted(chains[0].counters)
+    assert chains[0].counters[-1].frames_processed <= len(done)
+    if not is_endless and stop_at is None:
+        assert [c.frames_in for c in chains[0].counters] == [count] * (1 + len(nodes))
+        assert sum(c.frames_dropped for c in chains[0].counters) == 0
+
+
+@pytest.mark.parametrize("position", [0, 1, 2])
+def test_a_frame_that_breaks_a_stage_is_lost_alone_where_that_is_allowed(position):
+    nodes = [Repeat("a"), Repeat("b"), Repeat("c")]
+    nodes[position] = Broken(nodes[position].name)
+    recorded, failures = Recorded(), []
+
+    def on_failure(stage: str, error: Exception) -> bool:
+        failures.append((stage, str(error)))
+        return True
+
+    counters = run_chain(
+        frames(7), nodes, on_message=recorded, on_failure=on_failure, stop=threading.Event()
+    )
+    assert_counted(counters)
+    assert failures == [("Broken", "third")]
+    assert [one.frames_failed for one in counters[1:]] == [int(k == position) for k in range(3)]
+    assert set(recorded.of("c")) == {1, 2, 4, 5, 6, 7}
+
+
+def test_an_exception_leaves_the_counters_right():
+    nodes = [Repeat("a", delay_s=0.002), Broken("b"), Repeat("c", delay_s=0.004)]
+    chains: list[Chain] = []
+    with pytest.raises(BrokenError):
+        run_chain(
+            endless(), nodes, on_message=lambda m: m, on_start=chains.append, stop=threading.Event()
+        )
+    assert_counted(chains[0].counters)
+    assert chains[0].counters[2].frames_failed == 1
