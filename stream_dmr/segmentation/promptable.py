@@ -17,7 +17,7 @@ from stream_dmr.segmentation.onnx_session import open_session
 from stream_dmr.segmentation.segmenter import Segmented
 
 _FREE_SIDE_PX = 256  # where the model takes pictures of any size
-_CORNER_LABELS = (2.0, 3.0)
+_CORNER_LABELS = np.array([2.0, 3.0], np.float32)
 
 
 class PromptableModel:
@@ -55,10 +55,9 @@ class PromptableModel:
         rgb = picture[..., ::-1].transpose(2, 0, 1)[None].astype(np.float32) / 255
         # From half-open edges to pixel centres, at which such models count.
         corners = (bbox_xyxy_px * scale - 0.5).astype(np.float32)
-        feed = {self._picture: np.ascontiguousarray(rgb)}
+        feed: dict[str, np.ndarray] = {self._picture: np.ascontiguousarray(rgb)}
         for name, shape in self._prompts.items():
-            numbers = np.float32(_CORNER_LABELS) if "label" in name.lower() else corners
-            feed[name] = numbers.reshape(shape)
+            feed[name] = (_CORNER_LABELS if "label" in name.lower() else corners).reshape(shape)
         masks, *others = self._session.run(None, feed)
         masks = np.asarray(masks, np.float32).reshape(-1, *masks.shape[-2:])
         if len(masks) == 1 or not others or others[0].size != len(masks):

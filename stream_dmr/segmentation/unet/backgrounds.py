@@ -1,4 +1,4 @@
-"""Random surroundings: sea, murk, rock, deck, table, steel, clutter, and two of them side by side."""
+"""Random surroundings: sea, murk, rock, deck, table, steel, clutter, or two of them."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""The drawn fish and backgrounds that training pictures are put together from, made once and kept."""
+"""The fish and backgrounds that training pictures are put together from, drawn once and kept."""
 
 import os
 import tempfile
@@ -28,7 +28,7 @@ class Bank:
 def make_bank(
     *, num_fish: int, num_backgrounds: int, seed: int, progress: Callable[[], None]
 ) -> Bank:
-    """Draw a bank, some 20 ms an item; `progress` is called after each. Equal seeds, equal banks."""
+    """Draw a bank, some 20 ms an item; `progress` is called after each. Equal seeds give equals."""
     bank = Bank(
         fish=np.empty((num_fish, PATCH_PX, PATCH_PX, 4), np.uint8),
         ends_px=np.empty((num_fish, 2, 2), np.float32),

@@ -104,7 +104,7 @@ def _draw_fish(
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     linear = scale * rotation @ stretch
     middle = np.full(2, (PATCH_PX - 1) / 2)
-    tint = np.append(rng.uniform(20.0, 230.0, 3), rng.uniform(0.0, 0.6) * (rng.random() < 0.3))
+    tint = np.append(rng.uniform(20.0, 230.0, 3), rng.uniform(0.0, 0.6) * (rng.random() < 0.2))
     return _Fish(
         patch=int(rng.integers(len(bank.fish))),
         scene_from_patch=np.column_stack([linear, at - linear @ middle]),

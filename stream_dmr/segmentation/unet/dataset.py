@@ -1,4 +1,4 @@
-"""Pictures for training, each a function of seed, epoch and index alone, so that a run can resume."""
+"""Pictures for training: each follows from seed, epoch and index alone, so a run can resume."""
 
 from collections.abc import Callable
 

@@ -78,7 +78,7 @@ def _find_ends(maps: Float32[np.ndarray, "2 s s"], *, scale: float) -> FishEnds:
 
 
 def _peak(log_probability: Float32[np.ndarray, "s s"]) -> Float[np.ndarray, "2"]:
-    """x and y of the highest cell, refined by the mean of those around it."""
+    """Column and row of the highest cell, refined by the mean of those around it."""
     row, column = np.unravel_index(int(log_probability.argmax()), log_probability.shape)
     top, left = max(0, int(row) - _PEAK_REACH), max(0, int(column) - _PEAK_REACH)
     around = np.exp(

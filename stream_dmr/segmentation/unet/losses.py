@@ -48,7 +48,7 @@ def mask_iou(logits: Float[Tensor, "B S S"], masks: Float[Tensor, "B S S"]) -> F
 def ends_are_right(
     logits: Float[Tensor, "B 2 s s"], ends_px: Float[Tensor, "B 2 2"]
 ) -> tuple[Bool[Tensor, "B"], Bool[Tensor, "B"]]:
-    """Is the found head nearer to the true head than to the true tail, and can that be asked?"""
+    """Whether the found head is nearer to the true head than to the true tail, and is known."""
     size = logits.shape[-1]
     peak = logits[:, 0].flatten(1).argmax(dim=1)
     found = torch.stack([peak % size, peak // size], dim=1) * ENDS_STRIDE + (ENDS_STRIDE - 1) / 2

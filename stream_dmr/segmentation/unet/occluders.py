@@ -5,6 +5,7 @@ so that it can be drawn into any crop.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -24,7 +25,7 @@ class Occluder:
 
 def draw_occluders(rng: np.random.Generator) -> list[Occluder]:
     """None for most fish, else one or two."""
-    chances = {_draw_pole: 0.13, _draw_glove: 0.10, _draw_rope: 0.06, _draw_edge: 0.05}
+    chances = {_draw_pole: 0.18, _draw_glove: 0.10, _draw_rope: 0.06, _draw_edge: 0.05}
     return [draw(rng) for draw, chance in chances.items() if rng.random() < chance]
 
 
@@ -60,9 +61,7 @@ def _draw_pole(rng: np.random.Generator) -> Occluder:
         turns = angle + np.pi + np.linspace(-0.4, 2.6, 9) * rng.choice([-1.0, 1.0])
         arc = tip + rng.uniform(0.04, 0.09) * np.column_stack([np.cos(turns), np.sin(turns)])
         arc = arc - arc[0] + tip
-        polygons += [
-            _bar(a, b, 0.3 * width, 0.3 * width) for a, b in zip(arc, arc[1:], strict=False)
-        ]
+        polygons += [_bar(a, b, 0.3 * width, 0.3 * width) for a, b in pairwise(arc)]
     return Occluder(polygons=polygons, colour=_colour(rng), hides=True)
 
 

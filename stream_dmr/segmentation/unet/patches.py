@@ -1,4 +1,4 @@
-"""Random fish, drawn once and pasted many times: small pictures with transparency, head to the left."""
+"""Random fish by themselves: small pictures with transparency, heads to the left."""
 
 from dataclasses import dataclass
 
@@ -75,12 +75,12 @@ def _draw_light(
     rng: np.random.Generator, normals: Float[np.ndarray, "V 3"]
 ) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:
     """Diffuse shade and gloss (Blinn, SIGGRAPH 1977) under one lamp somewhere before the fish."""
-    lamp = rng.normal(0.0, [0.7, 0.7, 0.3]) + [0.0, -0.3, -1.0]
+    lamp = rng.normal([0.0, -0.3, -1.0], [0.7, 0.7, 0.3])
     lamp /= np.linalg.norm(lamp)
     ambient = rng.uniform(0.3, 0.9)
     facing = np.where(normals[:, 2] > 0, -1.0, 1.0)[:, None] * normals  # thin fins have two sides
     shade = ambient + (1 - ambient) * np.maximum(facing @ lamp, 0.0)
-    halfway = lamp + [0.0, 0.0, -1.0]
+    halfway = lamp - np.array([0.0, 0.0, 1.0])
     halfway /= np.linalg.norm(halfway)
     sharpness = rng.uniform(6.0, 60.0)
     strength = max(0.0, rng.uniform(-0.3, 0.7))

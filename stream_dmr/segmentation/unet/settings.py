@@ -9,7 +9,7 @@ class TrainSettings(Settings):
     """`[train]`: how `stream-dmr train` teaches the U-Net."""
 
     seed: int = Field(default=1, ge=0, description="equal seeds draw equal pictures")
-    epochs: int = Field(default=40, ge=1, description="most epochs; fewer where nothing improves")
+    epochs: int = Field(default=34, ge=1, description="most epochs; fewer where nothing improves")
     crops_per_epoch: int = Field(default=2048, ge=32, description="pictures between two checks")
     validation_crops: int = Field(
         default=512, ge=16, description="pictures that each check is made on, none of them learnt"

@@ -64,7 +64,7 @@ def pose_shape(rng: np.random.Generator, shape: Shape) -> Posed:
     spine = bend_spine(_draw_bends(rng, shape.is_flatfish), length_mm=1.0)
     middle = spine.frames[len(spine.frames) // 2]
     about_axis = rng.choice([0.0, np.pi]) + np.radians(rng.normal(0.0, 22.0))
-    if rng.random() < 0.12:
+    if rng.random() < 0.2:
         about_axis = rng.uniform(0.0, 2 * np.pi)  # edge on, or from above
     towards = np.radians(np.clip(rng.normal(0.0, 20.0), -60.0, 60.0))
     turn = Rotation.from_euler("YX", [towards, about_axis]).as_matrix() @ middle.T

@@ -7,18 +7,21 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Bool
 from torch import Tensor
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim.swa_utils import AveragedModel
 
 from stream_dmr.errors import ModelError, UserError
-from stream_dmr.segmentation.unet.dataset import Batch, Draw, Pictures, load
+from stream_dmr.segmentation.unet.dataset import Batch, Draw, Pictures, collate, load
 from stream_dmr.segmentation.unet.losses import ends_are_right, ends_loss, mask_iou, mask_loss
 from stream_dmr.segmentation.unet.network import UNet, normalise
+from stream_dmr.segmentation.unet.sample import Sample
 from stream_dmr.segmentation.unet.settings import TrainSettings
 from stream_dmr.segmentation.unet.weights import save_weights
 
-_AVERAGE = 0.995  # share of the old in the running average of the weights, per step
+_AVERAGE = 0.995  # most of the running average of the weights that a step leaves as it was
 _WARM_UP = 0.04  # of all steps
 _FINE_TUNING = 0.3  # of the learning rate, where training starts from weights
 
@@ -59,9 +62,7 @@ class Training:
         if network is not None:
             self.network = network
         self.network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.averaged = AveragedModel(
-            self.network, multi_avg_fn=get_ema_multi_avg_fn(_AVERAGE), use_buffers=True
-        )
+        self.averaged = AveragedModel(self.network, avg_fn=_average, use_buffers=True)
         self.optimizer = torch.optim.AdamW(self.network.parameters(), weight_decay=1e-4)
 
     def resume(self) -> None:
@@ -84,7 +85,7 @@ class Training:
 
     @property
     def is_over(self) -> bool:
-        """Have all epochs gone by, or too many without anything better?"""
+        """Whether all epochs have gone by, or too many without anything better."""
         if len(self.history) >= self.settings.epochs:
             return True
         merits = [scores.merit for scores in self.history]
@@ -133,6 +134,13 @@ class Training:
             is_right, is_asked = ends_are_right(ends_logits, ends_px)
             right, asked = right + int((is_right & is_asked).sum()), asked + int(is_asked.sum())
         return torch.cat(ious), right / asked if asked else math.nan
+
+    @torch.no_grad()
+    def predict(self, samples: list[Sample]) -> Bool[np.ndarray, "B S S"]:
+        """The masks that the averaged weights find."""
+        self.averaged.eval()
+        mask_logits, *_ = self._forward(self.averaged, collate(samples))
+        return (mask_logits > 0).cpu().numpy()
 
     def _forward(self, network: torch.nn.Module, batch: Batch) -> Iterator[Tensor]:
         images, masks, in_box, ends_px = (part.to(self.device) for part in batch)
@@ -188,3 +196,10 @@ class Training:
             **self.settings.model_dump(exclude={"workers", "patience"}),
             "tuned": self.is_fine_tuning,
         }
+
+
+def _average(old: Tensor, new: Tensor, num_averaged: Tensor | int) -> Tensor:
+    """Nearly the plain mean of the first steps, later an exponential one: no start lingers on."""
+    steps = float(num_averaged)
+    keep = min(_AVERAGE, (1 + steps) / (10 + steps))
+    return torch.lerp(new, old, keep) if old.is_floating_point() else new

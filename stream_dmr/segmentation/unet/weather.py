@@ -35,7 +35,7 @@ def photograph(rng: np.random.Generator, picture: Picture) -> UInt8[np.ndarray, 
     if not is_good and rng.random() < 0.4:
         picture = _lose_detail(rng, picture)
     if rng.random() < 0.7:
-        level = rng.uniform(0.3, 2.5 if is_good else 10.0)
+        level = rng.uniform(0.3, 2.5 if is_good else 8.0)
         grain = (level * rng.standard_normal(picture.shape, np.float32)).astype(np.float32)
         if rng.random() < 0.4:
             grain = 1.5 * cv2.GaussianBlur(grain, (0, 0), rng.uniform(0.5, 1.0))
@@ -92,7 +92,7 @@ def _lose_detail(rng: np.random.Generator, picture: Picture) -> Picture:
 
 def _compress(pixels: UInt8[np.ndarray, "H W 3"], quality: int) -> UInt8[np.ndarray, "H W 3"]:
     _, encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR))
 
 
 def _glare(rng: np.random.Generator, size: int) -> Float32[np.ndarray, "S S"]:

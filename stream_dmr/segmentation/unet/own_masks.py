@@ -1,0 +1,151 @@
+"""A user's masks, one fish at a time: label pictures named like the images, or COCO's JSON."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from stream_dmr.errors import AnnotationError
+
+_IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Annotated:
+    """One image with the masks of its fish."""
+
+    path: Path
+    image: UInt8[np.ndarray, "H W 3"]  # BGR
+    masks: list[Bool[np.ndarray, "H W"]]
+
+
+def read_annotated(images: Path, masks: Path) -> Iterator[Annotated]:
+    """The annotated images in the order of their names.
+
+    `masks` is a folder with STEM.png for each image, whose values are the ids of fish and 0 is
+    none, or a COCO file. Raises AnnotationError where images and masks don't fit together.
+    """
+    if not images.is_dir():
+        raise AnnotationError(f"{images}: expected a folder of images, found none there")
+    paths = {path.name: path for path in sorted(images.iterdir()) if path.suffix.lower() in _IMAGES}
+    if not paths:
+        raise AnnotationError(f"{images}: expected images (.png, .jpg, .tif, .bmp), found none")
+    if masks.is_dir():
+        yield from _read_folder(paths, masks)
+    elif masks.suffix.lower() == ".json":
+        yield from _read_coco(paths, masks)
+    else:
+        raise AnnotationError(f"{masks}: expected a folder of PNG masks or a COCO .json")
+
+
+def _read_folder(paths: dict[str, Path], masks: Path) -> Iterator[Annotated]:
+    lacking = [path.name for path in paths.values() if not (masks / f"{path.stem}.png").exists()]
+    if lacking:
+        raise AnnotationError(
+            f"{masks}: expected a mask for each of {len(paths)} images, found none for "
+            f"{len(lacking)}, the first of them {lacking[0]}; a mask is named like its image, .png"
+        )
+    for path in paths.values():
+        image, mask = _read_image(path), masks / f"{path.stem}.png"
+        labels = cv2.imread(str(mask), cv2.IMREAD_UNCHANGED)
+        if labels is None or labels.ndim != 2:
+            raise AnnotationError(f"{mask}: expected a PNG of one channel, the ids of fish")
+        _check_size(mask, labels.shape, image)
+        ids = np.unique(labels[labels > 0]).tolist()
+        yield Annotated(path=path, image=image, masks=[labels == one for one in ids])
+
+
+def _read_coco(paths: dict[str, Path], file: Path) -> Iterator[Annotated]:
+    pictures, annotations = _parse_coco(file)
+    for picture in pictures:
+        name = Path(str(picture["file_name"])).name
+        found = [one for one in annotations if one.get("image_id") == picture["id"]]
+        if not found:
+            continue
+        if name not in paths:
+            raise AnnotationError(f"{file}: expected {name} among the images, found it not there")
+        image = _read_image(paths[name])
+        masks = [_decode(one, file, image.shape[:2]) for one in found]
+        yield Annotated(path=paths[name], image=image, masks=masks)
+
+
+def _parse_coco(file: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        pictures, annotations = content["images"], content["annotations"]
+        pictures = sorted(pictures, key=lambda one: str(one["file_name"]))
+        if all("id" in one for one in pictures) and all("segmentation" in a for a in annotations):
+            return pictures, annotations
+    except OSError as error:
+        raise AnnotationError(f"{file}: expected a COCO .json, got: {error.strerror}") from None
+    except (ValueError, TypeError, KeyError):
+        pass
+    raise AnnotationError(
+        f'{file}: expected COCO\'s JSON with "images" (id, file_name) and "annotations" (image_id, '
+        "segmentation)"
+    )
+
+
+def _decode(
+    annotation: dict[str, Any], file: Path, shape: tuple[int, ...]
+) -> Bool[np.ndarray, "H W"]:
+    """A mask from polygons (x, y, ... from the picture's corner) or from run lengths."""
+    what = annotation["segmentation"]
+    try:
+        if isinstance(what, dict):
+            counts = what["counts"]
+            runs = _unpack(counts) if isinstance(counts, str) else counts
+            if sum(runs) != shape[0] * shape[1] or list(what["size"]) != list(shape):
+                raise AnnotationError(
+                    f"{file}: expected a mask of {shape[1]}x{shape[0]} px, got one of another size "
+                    f"(annotation {annotation.get('id')})"
+                )
+            values = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
+            return np.ascontiguousarray(values.reshape(shape[1], shape[0]).T)
+        canvas = np.zeros(shape, np.uint8)
+        corners = [np.array(ring, np.float64).reshape(-1, 2) - 0.5 for ring in what]
+        cv2.fillPoly(canvas, [np.round(ring * 16).astype(np.int32) for ring in corners], 1, shift=4)
+        return canvas > 0
+    except (ValueError, TypeError, KeyError):
+        raise AnnotationError(
+            f"{file}: expected polygons or run lengths, got something else "
+            f"(annotation {annotation.get('id')})"
+        ) from None
+
+
+def _unpack(text: str) -> list[int]:
+    """COCO's compressed run lengths: 5 bits a character, differences from the last but one."""
+    runs: list[int] = []
+    value = shift = 0
+    for byte in text.encode("ascii"):
+        bits = byte - 48
+        value |= (bits & 31) << shift
+        shift += 5
+        if bits & 32:
+            continue
+        if bits & 16:
+            value -= 1 << shift
+        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+        value = shift = 0
+    return runs
+
+
+def _read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise AnnotationError(f"{path}: expected an image, but it can't be decoded")
+    return image
+
+
+def _check_size(mask: Path, shape: tuple[int, ...], image: UInt8[np.ndarray, "H W 3"]) -> None:
+    height, width = image.shape[:2]
+    if shape != (height, width):
+        raise AnnotationError(
+            f"{mask}: expected a mask of its image's size, {width}x{height} px, "
+            f"got {shape[1]}x{shape[0]} px"
+        )
