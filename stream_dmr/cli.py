@@ -17,6 +17,7 @@ from stream_dmr.cli_evaluate import evaluate
 from stream_dmr.cli_export import export
 from stream_dmr.cli_replay import replay
 from stream_dmr.cli_support import command_line, stop_on_signals, without_password
+from stream_dmr.cli_train import train
 from stream_dmr.cli_view import convert, view
 from stream_dmr.errors import UserError
 
@@ -27,7 +28,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (calibrate, replay, view, convert, export, evaluate):
+for command in (calibrate, replay, view, convert, export, evaluate, train):
     app.command()(command)
 
 

@@ -23,6 +23,7 @@ from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.segmentation.crop import CropFishSettings
 from stream_dmr.segmentation.detectors import DetectFishSettings
 from stream_dmr.segmentation.followed import TrackFishSettings
+from stream_dmr.segmentation.unet.settings import TrainSettings
 from stream_dmr.settings import Settings
 
 _HEADER = """\
@@ -60,6 +61,9 @@ class Config(Settings):
     )
     smooth_length: SmoothLengthSettings = Field(
         default_factory=SmoothLengthSettings, description="from many frames to one length per fish"
+    )
+    train: TrainSettings = Field(
+        default_factory=TrainSettings, description="how `stream-dmr train` teaches the U-Net"
     )
     recording: RecordingSettings = Field(
         default_factory=RecordingSettings, description="what is recorded, and how exactly"

@@ -60,7 +60,7 @@ WHO_KNOWS = {
     "nodes": [*ASSEMBLY, "nodes"],
     "typer": [
         *("stream_dmr.cli", "stream_dmr.cli_calibrate", "stream_dmr.cli_export"),
-        "stream_dmr.cli_evaluate",
+        *("stream_dmr.cli_evaluate", "stream_dmr.cli_train"),
         *("stream_dmr.cli_replay", "stream_dmr.cli_view", "stream_dmr.demo"),
     ],
 }
