@@ -27,14 +27,18 @@ from stream_dmr.recording.settings import RecordingSettings
 
 NUM_FRAMES, RATE_HZ = 90, 30
 EXACT = {"crops": "png", "meshes": "vertices"}
+DRAWN = EXACT | {"view_rate_hz": 1000.0}
 CASES = {
     ".mcap only": {"rrd": False},
     "the default: .mcap, and .rrd with the messages": {},
-    "crops as JPEG too": {"crops": "jpeg"},
+    "and frames as H.264": {"frames": "h264"},
+    "or frames as JPEG, from which crops are made again": {"frames": "jpeg"},
+    "or crops as JPEG": {"crops": "jpeg"},
     "or crops as PNG": {"crops": "png"},
-    "and vertices and covariance": EXACT,
-    "and every frame drawn": EXACT | {"view_rate_hz": 1000.0},
-    "and frames as JPEG: everything": EXACT | {"view_rate_hz": 1000.0, "frames": "jpeg"},
+    "crops as PNG, vertices and covariance": EXACT,
+    "and every frame drawn": DRAWN,
+    "and frames as H.264: everything": DRAWN | {"frames": "h264"},
+    "or frames as JPEG: everything": DRAWN | {"frames": "jpeg"},
 }
 
 

@@ -5,6 +5,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from stream_dmr.cli_support import TimeOption, TrackOption, parse_part, warn
+
 Meshes = Literal["ply", "glb"]
 Tables = Literal["csv", "parquet"]
 
@@ -23,17 +25,20 @@ def export(
     tables: Annotated[
         Tables | None, typer.Option(help="lengths, and frames with the keypoints.")
     ] = None,
+    time: TimeOption = None,
+    track: TrackOption = None,
 ) -> None:
     """Write meshes, masks, keypoints and lengths of a recording for other programs."""
     if not (meshes or masks or tables):
         raise typer.BadParameter("say what to export: --meshes ply, --masks, --tables csv")
-    from stream_dmr.export import export_masks, export_meshes, export_tables
+    from stream_dmr.export import Export
 
+    exported = Export(recording, parse_part(time, track))
     if meshes:
-        count = export_meshes(recording, out / "meshes", format=meshes)
-        print(f"{out / 'meshes'}: {count} meshes")
+        print(f"{out / 'meshes'}: {exported.meshes(out / 'meshes', format=meshes)} meshes")
     if masks:
-        print(f"{out / 'masks.json'}: {export_masks(recording, out / 'masks.json')} masks")
+        print(f"{out / 'masks.json'}: {exported.masks(out / 'masks.json')} masks")
     if tables:
-        for path in export_tables(recording, out, format=tables):
+        for path in exported.tables(out, format=tables):
             print(path)
+    warn(exported.warnings)

@@ -5,7 +5,13 @@ from typing import Annotated, Literal
 
 import typer
 
-from stream_dmr.cli_support import command_line, stop_on_signals
+from stream_dmr.cli_support import (
+    TimeOption,
+    TrackOption,
+    command_line,
+    parse_part,
+    stop_on_signals,
+)
 
 Stage = Literal["crop", "fit", "localize", "smooth"]
 
@@ -34,12 +40,8 @@ def replay(
     source: Annotated[str | None, typer.Option(help="The recorded clip, for --from crop.")] = None,
     boxes: Annotated[Path | None, typer.Option(help="As in the run, for --from crop.")] = None,
     masks: Annotated[Path | None, typer.Option(help="As in the run, for --from crop.")] = None,
-    time: Annotated[
-        str | None, typer.Option(help="Only this time of capture, in s.", metavar="FROM:TO")
-    ] = None,
-    track: Annotated[
-        list[int] | None, typer.Option(help="Only this fish; may be repeated.")
-    ] = None,
+    time: TimeOption = None,
+    track: TrackOption = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for a new recording and new tables.")
     ] = None,
@@ -64,8 +66,7 @@ def replay(
         source=source,
         boxes=boxes,
         masks=masks,
-        time_s=None if time is None else _parse_time(time),
-        tracks=frozenset(track) if track else None,
+        part=parse_part(time, track),
         out=out,
         overwrite=overwrite,
         check=check,
@@ -86,13 +87,3 @@ def replay(
         print_check(summary)
         if summary.mismatches:
             raise typer.Exit(1)
-
-
-def _parse_time(text: str) -> tuple[float, float]:
-    try:
-        first, last = (float(part) for part in text.split(":"))
-    except ValueError:
-        first = last = 0.0
-    if not first < last:
-        raise typer.BadParameter(f"--time: expected FROM:TO in seconds, such as 60:90, got {text}")
-    return first, last

@@ -5,9 +5,22 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from stream_dmr.recording.part import Part
+
+TimeOption = Annotated[
+    str | None, typer.Option("--time", help="Only this time of capture, in s.", metavar="FROM:TO")
+]
+TrackOption = Annotated[
+    list[int] | None, typer.Option("--track", help="Only this fish; may be repeated.")
+]
 
 
 def without_password(text: str) -> str:
@@ -18,6 +31,30 @@ def without_password(text: str) -> str:
 def command_line() -> str:
     """The command as typed, for the recording; passwords are left out."""
     return without_password(shlex.join(["stream-dmr", *sys.argv[1:]]))
+
+
+def warn(lines: Iterable[str]) -> None:
+    """Print what the user should know."""
+    for line in lines:
+        print(f"warning: {line}", file=sys.stderr)
+
+
+def parse_part(time: str | None, track: list[int] | None) -> "Part":
+    """The part of a recording that --time and --track ask for."""
+    from stream_dmr.recording.part import Part
+
+    time_s = None if time is None else _parse_time(time)
+    return Part.of_seconds(time_s, frozenset(track) if track else None)
+
+
+def _parse_time(text: str) -> tuple[float, float]:
+    try:
+        first, last = (float(part) for part in text.split(":"))
+    except ValueError:
+        first = last = 0.0
+    if not first < last:
+        raise typer.BadParameter(f"--time: expected FROM:TO in seconds, such as 60:90, got {text}")
+    return first, last
 
 
 class Stop(threading.Event):

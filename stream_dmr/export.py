@@ -1,7 +1,7 @@
 """Recordings in the formats of others: meshes, COCO masks, tables."""
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,11 +10,13 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool
 
-from stream_dmr.camera import frame_from_crop
-from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate, LocalizedFish, Message
-from stream_dmr.recording.codec import decode
+from stream_dmr.camera import crop_from_frame, frame_from_crop
+from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
+from stream_dmr.recording.codec import reference
 from stream_dmr.recording.meshes import Meshes
-from stream_dmr.recording.opened import Recording, open_recordings
+from stream_dmr.recording.opened import messages, open_recordings
+from stream_dmr.recording.part import WHOLE, Part
+from stream_dmr.recording.pictures import Picture
 from stream_dmr.recording.record import make_record
 from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.recording.view_geometry import place
@@ -25,74 +27,88 @@ MeshFormat = Literal["ply", "glb"]
 TableFormat = Literal["csv", "parquet"]
 
 
-def export_meshes(recording: Path, out: Path, *, format: MeshFormat) -> int:
-    """Write `fish-ID/FRAME.ply` (or .glb) into `out`; returns their number.
+class Export:
+    """A recording, or a part of it, for other programs. Raises RecordingError and OutputError."""
 
-    Vertices are in the camera frame, in mm; without a calibration a fish is one body length long.
-    """
-    opened = open_recordings([recording])
-    template = opened.header.template
-    meshes, count = Meshes(template), 0
-    for fit, fish in _pairs(_messages(opened, FittedMesh, LocalizedFish)):
-        shape = meshes.with_vertices(fit).shape
-        vertices = None if shape is None else place(shape, fish)[0]
-        if vertices is None:
-            continue
-        folder = make_folder(out / f"fish-{fit.track_id}")
-        mesh = trimesh.Trimesh(vertices, template.faces, process=False)
-        with writing_to(folder):
-            mesh.export(folder / f"{fit.frame_index:06d}.{format}")
-        count += 1
-    return count
+    def __init__(self, recording: Path, part: Part = WHOLE) -> None:
+        self._recording = open_recordings([recording])
+        self._part = part
 
+    @property
+    def warnings(self) -> Sequence[str]:
+        """What of the recording is lost, a line each."""
+        return self._recording.warnings
 
-def export_masks(recording: Path, path: Path) -> int:
-    """Write every mask as COCO JSON with run lengths; returns their number.
+    def meshes(self, out: Path, *, format: MeshFormat) -> int:
+        """Write `fish-ID/FRAME.ply` (or .glb) into `out`; returns their number.
 
-    The masks are the crops', so as coarse as those, put back into the frame with its distortion.
-    """
-    images, annotations = {}, []
-    for crop in _messages(open_recordings([recording]), FishCrop):
-        assert isinstance(crop, FishCrop)
-        camera = crop.frame_camera
-        size = {"width": camera.width, "height": camera.height}
-        images[crop.frame_index] = {
-            "id": crop.frame_index,
-            "file_name": f"{crop.frame_index:06d}.png",
-            **size,
-        }
-        mask = mask_in_frame(crop)
-        annotations.append(_annotation(crop, mask, number=len(annotations) + 1))
-    categories = [{"id": 1, "name": "fish"}]
-    coco = {"images": [*images.values()], "annotations": annotations, "categories": categories}
-    make_folder(path.parent)
-    with writing_to(path):
-        path.write_text(json.dumps(coco))
-    return len(annotations)
+        Vertices are in the camera frame, in mm; without a calibration a fish is one body length
+        long.
+        """
+        template = self._recording.header.template
+        restored, count = Meshes(template), 0
+        for fit, fish in _pairs(self._messages(FittedMesh, LocalizedFish)):
+            shape = restored.with_vertices(fit).shape
+            vertices = None if shape is None else place(shape, fish)[0]
+            if vertices is None:
+                continue
+            folder = make_folder(out / f"fish-{fit.track_id}")
+            mesh = trimesh.Trimesh(vertices, template.faces, process=False)
+            with writing_to(folder):
+                mesh.export(folder / f"{fit.frame_index:06d}.{format}")
+            count += 1
+        return count
 
+    def masks(self, path: Path) -> int:
+        """Write every mask as COCO JSON with run lengths; returns their number.
 
-def export_tables(recording: Path, out: Path, *, format: TableFormat) -> list[Path]:
-    """Write lengths and frames (keypoints, one row a fish and frame) into `out`, as `run` does."""
-    tables = Tables(make_folder(out))
-    for message in _messages(open_recordings([recording]), LocalizedFish, LengthEstimate):
-        tables.write(make_record(message, RecordingSettings()))
-    tables.close()
-    paths = [out / "lengths.csv", out / "frames.csv"]
-    return paths if format == "csv" else [_as_parquet(path) for path in paths]
+        They are in the pixels of the frame, lens distortion included. Frames without fish are
+        listed too.
+        """
+        images, annotations = list[dict[str, Any]](), list[dict[str, Any]]()
+        for message, payload in messages(self._recording, (Frame, FishCrop), self._part):
+            if isinstance(message, Frame):
+                images.append(_image(message.frame_index, reference(payload)))
+            elif isinstance(message, FishCrop):
+                annotations.append(_annotation(message, number=len(annotations) + 1))
+        categories = [{"id": 1, "name": "fish"}]
+        coco = {"images": images, "annotations": annotations, "categories": categories}
+        make_folder(path.parent)
+        with writing_to(path):
+            path.write_text(json.dumps(coco))
+        return len(annotations)
+
+    def tables(self, out: Path, *, format: TableFormat) -> list[Path]:
+        """Write lengths and frames (keypoints, one row a fish and frame) into `out`, as `run`."""
+        tables = Tables(make_folder(out))
+        for message in self._messages(LocalizedFish, LengthEstimate):
+            tables.write(make_record(message, RecordingSettings()))
+        tables.close()
+        paths = [out / "lengths.csv", out / "frames.csv"]
+        return paths if format == "csv" else [_as_parquet(path) for path in paths]
+
+    def _messages(self, *kinds: type[Message]) -> Iterator[Message]:
+        for message, _ in messages(self._recording, kinds, self._part):
+            yield message
 
 
 def mask_in_frame(crop: FishCrop) -> Bool[np.ndarray, "H W"]:
-    """The mask of a crop in the pixels of its frame: each takes that of the nearest crop pixel."""
-    frame, size = crop.frame_camera, crop.crop_camera.width
+    """The mask of a crop in the pixels of its frame.
+
+    A frame pixel belongs to it where the crop's mask, interpolated, is above one half: a crop is
+    coarser than its frame, and its nearest pixel would leave steps along the outline.
+    """
+    frame = crop.frame_camera
     mask = np.zeros((frame.height, frame.width), bool)
     x0, y0, x1, y1 = _extent(crop)
     if x1 <= x0 or y1 <= y0:
         return mask
     x, y = np.meshgrid(np.arange(x0, x1), np.arange(y0, y1))
-    rays = frame.back_project(np.stack([x.ravel(), y.ravel()], axis=1).astype(float))
-    u, v = np.round(crop.crop_camera.project(rays)).astype(int).T
-    inside = (u >= 0) & (u < size) & (v >= 0) & (v < size)
-    mask[y.ravel()[inside], x.ravel()[inside]] = crop.mask[v[inside], u[inside]]
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1).astype(float)
+    at = crop_from_frame(pixels, crop_camera=crop.crop_camera, frame_camera=frame)
+    u, v = at.reshape(*x.shape, 2).astype(np.float32).transpose(2, 0, 1)
+    share = cv2.remap(crop.mask.astype(np.float32), u, v, cv2.INTER_LINEAR)
+    mask[y0:y1, x0:x1] = share > 0.5
     return mask
 
 
@@ -103,11 +119,6 @@ def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
     edges = np.concatenate([[0], changes, [len(pixels)]])
     counts = np.diff(edges).tolist()
     return [0, *counts] if pixels[0] else counts
-
-
-def _messages(recording: Recording, *kinds: type[Message]) -> Iterator[Message]:
-    for kind, payload in recording.payloads(kinds):
-        yield decode(kind, payload)
 
 
 def _extent(crop: FishCrop) -> tuple[int, int, int, int]:
@@ -127,7 +138,13 @@ def _extent(crop: FishCrop) -> tuple[int, int, int, int]:
     return int(x0), int(y0), int(x1), int(y1)
 
 
-def _annotation(crop: FishCrop, mask: Bool[np.ndarray, "H W"], *, number: int) -> dict[str, Any]:
+def _image(frame_index: int, picture: Picture) -> dict[str, Any]:
+    name, size = f"{frame_index:06d}.png", {"width": picture.width, "height": picture.height}
+    return {"id": frame_index, "file_name": name, **size}
+
+
+def _annotation(crop: FishCrop, *, number: int) -> dict[str, Any]:
+    mask = mask_in_frame(crop)
     x0, y0, x1, y1 = crop.bbox_xyxy_px.tolist()
     return {
         "id": number,

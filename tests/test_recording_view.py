@@ -177,6 +177,37 @@ def test_everything_is_exported(clip: Path, tmp_path: Path):
     assert [annotation["image_id"] for annotation in coco["annotations"]] == [1, 2, 3]
 
 
+def test_a_part_is_shown_and_exported_alone(clip: Path, tmp_path: Path):
+    """At 10 frames/s: the second frame."""
+    part = {"--time": "0.05:0.15", "--track": "1"}
+    rrd = tmp_path / "part.rrd"
+    for recording in ("recording.mcap", "recording.rrd"):
+        assert invoke(f"convert {clip / 'out' / recording}", part | {"--out": str(rrd)}).code == 0
+        for entity in ("/scene/fish/1/mesh", "/messages/frame", "/messages/fit"):
+            assert drawn(rrd, entity) == [2]
+    options = {"--out": str(tmp_path), "--tables": "csv", "--masks": None} | part
+    assert invoke(f"export {clip / 'out'}", options).code == 0
+    assert [row["frame_index"] for row in rows(tmp_path / "frames.csv")] == ["2"]
+    coco = json.loads((tmp_path / "masks.json").read_text())
+    assert [image["id"] for image in coco["images"]] == [2]
+    options = {"--out": str(tmp_path / "none"), "--masks": None, "--track": "99"}
+    assert invoke(f"export {clip / 'out'}", options).code == 0
+    coco = json.loads((tmp_path / "none" / "masks.json").read_text())
+    assert not coco["annotations"]
+
+
+def test_what_is_lost_of_a_torn_recording_is_said(clip: Path, tmp_path: Path):
+    data = (clip / "out" / "recording.mcap").read_bytes()
+    torn = tmp_path / "recording.mcap.part"
+    torn.write_bytes(data[: -len(data) // 3])
+    outcome = invoke(f"convert {torn}", {"--out": str(tmp_path / "a.rrd")})
+    assert outcome.code == 0
+    assert "torn" in outcome.err
+    outcome = invoke(f"export {torn}", {"--out": str(tmp_path), "--tables": "csv"})
+    assert outcome.code == 0
+    assert "torn" in outcome.err
+
+
 def test_parquet_has_the_same_numbers(clip: Path, tmp_path: Path):
     from pyarrow import parquet
 

@@ -24,7 +24,7 @@ from stream_dmr.messages import (
 from stream_dmr.pipeline import Node, StageCounters, run_chain
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.opened import open_recordings
-from stream_dmr.recording.part import Part
+from stream_dmr.recording.part import WHOLE, Part
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.restored import SourcePictures
 from stream_dmr.replay.judge import Judge, Mismatch, Scribe
@@ -53,8 +53,7 @@ class ReplayRequest:
     source: str | None = None  # the recorded clip: for `crop`, where pictures are by reference
     boxes: Path | None = None  # for `crop`
     masks: Path | None = None
-    time_s: tuple[float, float] | None = None  # of capture: from, to
-    tracks: frozenset[int] | None = None
+    part: Part = WHOLE
     out: Path | None = None  # None: nothing is written
     overwrite: bool = False
     check: bool = False  # compare with what was recorded
@@ -86,7 +85,7 @@ def replay(
     _refuse_impossible(request)
     recording = open_recordings(request.recordings)
     config, template, calibration = _inputs(request, recording.header)
-    tape = Tape(recording, Part.of_seconds(request.time_s, request.tracks))
+    tape = Tape(recording, request.part)
     order = [*STAGES.values()]
     first = order.index(STAGES[request.first])
     with ExitStack() as stack:
@@ -120,7 +119,7 @@ def replay(
 
 
 def _refuse_impossible(request: ReplayRequest) -> None:
-    if request.check and request.time_s is not None:
+    if request.check and request.part.time_ns is not None:
         raise UserError(
             "--check with --time: each fit starts from the frame before, so a part of a recording "
             "can't equal the whole; leave out one of them"
@@ -129,7 +128,7 @@ def _refuse_impossible(request: ReplayRequest) -> None:
         raise UserError(
             f"--template with --from {request.first}: a template matters to the fit; use --from fit"
         )
-    if request.first == "crop" and request.tracks is not None:
+    if request.first == "crop" and request.part.tracks is not None:
         raise UserError("--track with --from crop: crops are made of whole frames; use --from fit")
     if request.first == "crop" and request.boxes is None and request.masks is None:
         raise UserError(
