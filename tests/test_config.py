@@ -115,7 +115,7 @@ def test_every_mistake_is_one_line_that_mends_it(tmp_path: Path, text: str):
 
 
 def test_the_outside_key_names_the_tables_where_none_owns_it(tmp_path: Path):
-    assert "the tables are read_frames, crop_fish" in refusal(tmp_path, "speed = 3")
+    assert "the tables are read_frames, detect_fish" in refusal(tmp_path, "speed = 3")
 
 
 def test_what_is_no_toml_is_refused_with_its_place(tmp_path: Path):

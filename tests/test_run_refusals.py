@@ -158,10 +158,13 @@ def test_a_device_that_is_not_there_is_refused(clip: Path):
     assert_refused(invoke("run", options_of(clip)), r"\[fit_mesh\]: expected a CUDA device")
 
 
-def test_nothing_to_find_the_fish_by_is_refused(clip: Path):
+def test_a_detector_that_is_none_is_refused_before_the_first_frame(clip: Path):
     options = options_of(clip)
     del options["--boxes"], options["--masks"]
-    assert_refused(invoke("run", options), "--boxes.*--masks")
+    options["--config"] = str(clip / "detector.toml")
+    for name, expected in (("yolo", '"motion" or a path'), ("none.onnx", "found none")):
+        (clip / "detector.toml").write_text(f'[detect_fish]\ndetector = "{name}"\n')
+        assert_refused(invoke("run", options), expected)
 
 
 def test_a_missing_option_is_refused(clip: Path):

@@ -13,7 +13,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 class CounterSettings(Settings):
     """The part of `[track_fish]` that says which tracks count as fish; each counts once."""
 
-    min_frames: int = Field(
+    min_track_frames: int = Field(
         default=4, ge=1, description="frames in which a fish is seen before it counts"
     )
     zone: list[Fraction] = Field(
@@ -58,4 +58,4 @@ class FishCounter:
         is_in_zone = (
             left <= (x0 + x1) / 2 / width <= right and top <= (y0 + y1) / 2 / height <= bottom
         )
-        return is_in_zone and sighting.frames_seen >= self._settings.min_frames
+        return is_in_zone and sighting.frames_seen >= self._settings.min_track_frames
