@@ -5,7 +5,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -119,6 +119,9 @@ def run_command(
     live: Annotated[
         bool, typer.Option("--live", help="Serve the view on this machine while measuring.")
     ] = False,
+    log_json: Annotated[
+        bool, typer.Option("--log-json", help="Log lines of JSON to stderr, for a service.")
+    ] = False,
     timings: Annotated[
         bool, typer.Option("--timings", help="At the end, show the time that each stage took.")
     ] = False,
@@ -131,6 +134,7 @@ def run_command(
     with stop_on_signals() as stop:
         from stream_dmr.display import RunDisplay, print_fish, print_timings
         from stream_dmr.run import RunRequest, run
+        from stream_dmr.watch.journal import Journal
 
         request = RunRequest(
             source=source,
@@ -145,8 +149,8 @@ def run_command(
             live=live,
             command=command_line(),
         )
-        with RunDisplay() as display:
-            summary = run(request, stop=stop, observer=display)
+        with nullcontext(Journal()) if log_json else RunDisplay() as observer:
+            summary = run(request, stop=stop, observer=observer)
         print_fish(summary.fish)
         if timings:
             print_timings(summary)

@@ -25,6 +25,7 @@ from stream_dmr.segmentation.detectors import DetectFishSettings
 from stream_dmr.segmentation.followed import TrackFishSettings
 from stream_dmr.segmentation.unet.settings import TrainSettings
 from stream_dmr.settings import Settings
+from stream_dmr.watch.settings import WatchSettings
 
 _HEADER = """\
 # Every knob of stream-dmr with its default. Keep only the lines that you change, if you like;
@@ -67,6 +68,9 @@ class Config(Settings):
     )
     recording: RecordingSettings = Field(
         default_factory=RecordingSettings, description="what is recorded, and how exactly"
+    )
+    watch: WatchSettings = Field(
+        default_factory=WatchSettings, description="who may watch a run, and how"
     )
     evaluate: EvaluateSettings = Field(
         default_factory=EvaluateSettings, description="how `stream-dmr evaluate` compares lengths"

@@ -56,7 +56,7 @@ class RunDisplay(Observer):
             self._console.print(f"warning: {line}", markup=False)
 
     def serving(self, address: str) -> None:  # noqa: D102
-        self._console.print(f"watch it with: stream-dmr view {address}", markup=False)
+        self._console.print(f"watch it with: {address}", markup=False)
 
     def begin(self, num_frames: int | None) -> None:  # noqa: D102
         self._num_frames = num_frames

@@ -17,6 +17,7 @@ from nodes.smooth_length import SmoothLength
 from stream_dmr.calibration import load_calibration, require_size
 from stream_dmr.camera import Calibration
 from stream_dmr.config import Config, load_config, to_toml
+from stream_dmr.endless import Tolerance, go_on
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.pipeline import Node, StageCounters, run_chain
@@ -27,7 +28,8 @@ from stream_dmr.store import LengthStore, require_free
 from stream_dmr.tables import write_lengths
 from stream_dmr.tally import Observer, Tally, run_facts
 from stream_dmr.template import Template, load_template
-from stream_dmr.video import ClipFolder, LiveStream, Source
+from stream_dmr.video import LiveStream
+from stream_dmr.watch.watch import Watch
 
 RESULTS = ("lengths.db", "lengths.csv", "frames.csv", "recording.mcap", "recording.rrd")
 
@@ -92,28 +94,40 @@ def run(
         with (
             closing(LengthStore(request.out, run_facts(header))) as store,
             _consistent_csv(request.out / "lengths.csv", store, resume=resume),
+            closing(
+                Watch(
+                    observer,
+                    config.watch,
+                    source=reader.source,
+                    store=store,
+                    out_dir=request.out,
+                    silence_s=config.read_frames.silence_s,
+                )
+            ) as watch,
             Recorder(
                 request.out, header, config.recording, live=request.live, resume=resume
             ) as recorder,
         ):
             if recorder.live_address is not None:
-                observer.serving(recorder.live_address)
+                observer.serving(f"stream-dmr view {recorder.live_address}")
+            if watch.address is not None:
+                observer.serving(watch.address)
             if calibration is None:
-                observer.warn("without --calibration there are relative shapes, no millimetres")
+                watch.warn("without --calibration there are relative shapes, no millimetres")
             if isinstance(reader.source, LiveStream) and config.recording.frames == "reference":
-                observer.warn(
+                watch.warn(
                     "a live source can't be read again, so its pictures are not kept but for the "
                     'view; record them with [recording] frames = "jpeg" or "h264"'
                 )
-            observer.begin(reader.source.num_frames)
+            watch.begin(reader.source.num_frames)
             tally = Tally(
                 recorder,
                 store,
-                observer,
+                watch,
                 numbers_frames_on=reader.source.is_endless and not (request.boxes or request.masks),
-                clips=_go_on(reader.source, store, observer),
+                clips=go_on(reader.source, store, on_notice=watch.warn),
             )
-            summary = _run_chain(reader, nodes, tally, request.out, stop=stop)
+            summary = _run_chain(reader, nodes, tally, watch, request.out, stop=stop)
     finally:
         reader.close()
         for line in (*reader.source.warnings, *detections.warnings):
@@ -160,18 +174,6 @@ def _set_aside(recording: Path) -> None:
             return
 
 
-def _go_on(source: Source, store: LengthStore, observer: Observer) -> dict[str, int] | None:
-    """Let a source without an end go on where an earlier run stopped; the frames done of clips."""
-    if isinstance(source, LiveStream):
-        source.resume_after(store.resume_after_ns())
-        source.listen(observer.warn)
-    if not isinstance(source, ClipFolder):
-        return None
-    done, frames_done = store.clips_before()
-    source.resume(done=done, frames_done=frames_done, after_ns=store.before.timestamp_ns)
-    return frames_done
-
-
 @contextmanager
 def _consistent_csv(path: Path, store: LengthStore, *, resume: bool) -> Iterator[None]:
     """Begin and end with what the store holds: a crash between the two loses a row of neither."""
@@ -216,14 +218,27 @@ def _run_chain(
     reader: ReadFrames,
     nodes: Sequence[Node],
     tally: Tally,
+    watch: Watch,
     out: Path,
     *,
     stop: threading.Event,
 ) -> RunSummary:
     began = time.perf_counter()
+    tolerance = Tolerance(is_endless=reader.source.is_endless, on_notice=watch.warn)
+
+    def frame_done() -> None:
+        tolerance.frame_done()
+        tally.frame_done()
+
     try:
         counters = run_chain(
-            reader, nodes, on_message=tally.record, on_frame=tally.frame_done, stop=stop
+            reader,
+            nodes,
+            on_message=tally.record,
+            on_frame=frame_done,
+            on_start=watch.attach,
+            on_failure=tolerance.allows,
+            stop=stop,
         )
     except UserError as error:
         if not isinstance(error, OutputError):  # which says so itself

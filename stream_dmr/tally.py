@@ -30,6 +30,12 @@ class Observer:
     def fish_seen(self, num_fish: int) -> None:
         """So many fish were seen so far."""
 
+    def fish_finished(self, estimate: LengthEstimate) -> None:
+        """The track of a fish has ended, and its length is in the store."""
+
+    def take(self, message: Message) -> None:
+        """A message of some stage, as the next one gets it."""
+
 
 class Tally:
     """Takes every message of the chain, in the thread of its stage.
@@ -50,6 +56,7 @@ class Tally:
     ) -> None:
         """`clips`: the source is a folder of clips, of which so many frames were done before."""
         self.final: list[LengthEstimate] = []
+        self.flags: list[str] = []  # what readers of lengths from now on must know
         self.num_frames = 0
         self._recorder = recorder
         self._store = store
@@ -73,8 +80,9 @@ class Tally:
                 message = replace(message, track_id=track_id + self._first_id)
                 self._store.reserve_track(message.track_id)
             case LengthEstimate(is_final=True):
-                self._store.add(message)
+                self._store.add(message, flags=self.flags)
                 self.final.append(message)
+                self._observer.fish_finished(message)
             case _:
                 pass
         if self._store.trouble:
@@ -82,6 +90,7 @@ class Tally:
                 f"{self._store.path}: {self._store.trouble}; lengths wait in memory"
             )
         message = self._recorder.write(message)
+        self._observer.take(message)
         if isinstance(message, LengthEstimate):
             self._track_ids.add(message.track_id)
             self._observer.fish_seen(len(self._track_ids))

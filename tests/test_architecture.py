@@ -34,6 +34,7 @@ FLOORS = [
     ["*"],  # the rooms of the library
     ["stream_dmr.config", "stream_dmr.pipeline"],
     ["nodes"],
+    [f"stream_dmr.watch.{name}" for name in ("state", "metrics", "picture", "server", "watch")],
     ["stream_dmr.run"],
     ["stream_dmr.replay.replay"],
     ["stream_dmr.display"],
@@ -55,6 +56,8 @@ WHO_KNOWS = {
             for name in ("template", "skinning", "silhouette", "losses", "body")
         ),
     ],
+    "prometheus_client": ["stream_dmr.watch"],
+    "sqlite3": ["stream_dmr.store", "stream_dmr.store_schema"],
     "filterpy": ["stream_dmr.length_filter", "stream_dmr.segmentation"],
     "onnxruntime": ["stream_dmr.segmentation"],
     "nodes": [*ASSEMBLY, "nodes"],

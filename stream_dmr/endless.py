@@ -1,0 +1,51 @@
+"""What a run without an end needs: to go on where the one before stopped, and after a bad frame."""
+
+from collections.abc import Callable
+
+from stream_dmr.clips import ClipFolder
+from stream_dmr.errors import OutputError, UserError
+from stream_dmr.live import LiveStream
+from stream_dmr.store import LengthStore
+from stream_dmr.video import Source
+
+_MOST_IN_A_ROW = 100  # failures with no frame between them that went through: the run is broken
+
+
+def go_on(
+    source: Source, store: LengthStore, *, on_notice: Callable[[str], None]
+) -> dict[str, int] | None:
+    """Let a source go on after an earlier run; of a folder of clips, the frames done of each."""
+    if isinstance(source, LiveStream):
+        source.resume_after(store.resume_after_ns())
+        source.listen(on_notice)
+    if not isinstance(source, ClipFolder):
+        return None
+    done, frames_done = store.clips_before()
+    source.resume(done=done, frames_done=frames_done, after_ns=store.before.timestamp_ns)
+    return frames_done
+
+
+class Tolerance:
+    """Says whether a chain goes on after an exception: at sea, one frame must not cost the rest.
+
+    An input that is wrong stays wrong, so it ends the run; a full disk may be emptied.
+    """
+
+    def __init__(self, *, is_endless: bool, on_notice: Callable[[str], None]) -> None:
+        self._is_endless = is_endless
+        self._on_notice = on_notice
+        self._in_a_row = 0
+
+    def frame_done(self) -> None:
+        """Take note that the chain works."""
+        self._in_a_row = 0
+
+    def allows(self, stage: str, error: Exception) -> bool:
+        """Whether to go on after this exception in this stage."""
+        if not self._is_endless or self._in_a_row >= _MOST_IN_A_ROW:
+            return False
+        if isinstance(error, UserError) and not isinstance(error, OutputError):
+            return False
+        self._in_a_row += 1
+        self._on_notice(f"a frame failed in {stage}: {type(error).__name__}: {error}")
+        return True

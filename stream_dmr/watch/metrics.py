@@ -1,0 +1,88 @@
+"""/metrics: what a run counts, in the words of Prometheus, worked out when it is asked for."""
+
+from collections.abc import Iterator
+
+from prometheus_client import CollectorRegistry
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from stream_dmr.live import LiveStream
+from stream_dmr.watch.state import RunState
+
+
+class RunMetrics(Collector):
+    """Every stage: frames in = processed + dropped + failed + in work."""
+
+    def __init__(self, state: RunState) -> None:
+        self._state = state
+
+    def collect(self) -> Iterator[Metric]:
+        """All metrics as they are now."""
+        yield from self._stages()
+        yield from self._camera()
+        yield from self._results()
+
+    def _stages(self) -> Iterator[Metric]:
+        chain = self._state.chain
+        if chain is None:
+            return
+        frames = CounterMetricFamily(
+            "stream_dmr_frames", "Frames of each stage.", labels=["stage", "outcome"]
+        )
+        waiting = GaugeMetricFamily(
+            "stream_dmr_queue_frames", "Frames that wait before a stage.", labels=["stage"]
+        )
+        for one in chain.counters:
+            for outcome in ("in", "processed", "dropped", "failed"):
+                frames.add_metric([one.stage, outcome], getattr(one, f"frames_{outcome}"))
+        for one, number in zip(chain.counters[1:], chain.waiting(), strict=True):
+            waiting.add_metric([one.stage], number)
+        yield frames
+        yield waiting
+
+    def _camera(self) -> Iterator[Metric]:
+        source = self._state.source
+        if not isinstance(source, LiveStream):
+            return
+        frames = CounterMetricFamily(
+            "stream_dmr_camera_frames", "Frames that came from the camera.", labels=["outcome"]
+        )
+        for outcome in ("received", "passed_on", "dropped", "failed"):
+            frames.add_metric([outcome], getattr(source.counts, outcome))
+        yield frames
+        yield _gauge("camera_queue_frames", "Frames that wait for the chain.", source.num_waiting)
+        yield CounterMetricFamily(
+            "stream_dmr_camera_reconnects",
+            "How often a lost camera was found again.",
+            value=source.counts.reconnects,
+        )
+        age_s = self._state.last_frame_age_s()
+        yield _gauge("last_frame_age_seconds", "Since the last frame came.", age_s or 0.0)
+
+    def _results(self) -> Iterator[Metric]:
+        fish = CounterMetricFamily("stream_dmr_fish", "Finished fish.", labels=["status"])
+        for status, number in dict(self._state.num_fish).items():
+            fish.add_metric([status], number)
+        yield fish
+        fit = GaugeMetricFamily(
+            "stream_dmr_fit_seconds", "Time of a fit, of the last 1000.", labels=["quantile"]
+        )
+        for quantile, seconds in self._state.fit_quantiles().items():
+            fit.add_metric([f"{quantile:g}"], seconds)
+        yield fit
+        yield _gauge("frames_per_second", "That left the chain.", self._state.frames_per_s())
+        yield _gauge("disk_free_bytes", "Room for results.", self._state.disk_free_bytes())
+        warnings = sum(warned.count for warned in self._state.warnings())
+        yield _gauge("warnings", "Warnings that are shown.", warnings)
+        yield _gauge("healthy", "1: well, 0: not.", 0.0 if self._state.problems() else 1.0)
+
+
+def _gauge(name: str, text: str, value: float) -> Metric:
+    return GaugeMetricFamily(f"stream_dmr_{name}", text, value=value)
+
+
+def registry_of(state: RunState) -> CollectorRegistry:
+    """A registry of this run alone."""
+    registry = CollectorRegistry()
+    registry.register(RunMetrics(state))
+    return registry
