@@ -53,9 +53,8 @@ class FishCounter:
         return self.count
 
     def _counts(self, sighting: Sighting, *, width: int, height: int) -> bool:
-        x0, y0, x1, y1 = sighting.candidate.bbox_xyxy_px
+        x0, y0, x1, y1 = sighting.candidate.bbox_xyxy_px.tolist()
         left, top, right, bottom = self._settings.zone
-        is_in_zone = (
-            left <= (x0 + x1) / 2 / width <= right and top <= (y0 + y1) / 2 / height <= bottom
-        )
-        return is_in_zone and sighting.frames_seen >= self._settings.min_track_frames
+        is_beside = left * width <= (x0 + x1) / 2 <= right * width
+        is_level = top * height <= (y0 + y1) / 2 <= bottom * height
+        return is_beside and is_level and sighting.frames_seen >= self._settings.min_track_frames

@@ -26,7 +26,8 @@ class WrongShape(ValueError):
 
 def decode(outputs: Sequence[np.ndarray], layout: str, *, input_size: tuple[int, int]) -> Found:
     """Boxes as corners in input pixels, and their scores by class. Raises WrongShape."""
-    return _DECODERS[layout]([np.asarray(output, np.float64) for output in outputs], input_size)
+    with np.errstate(invalid="ignore", over="ignore"):  # NaN in, NaN out: for others to refuse
+        return _DECODERS[layout]([np.asarray(o, np.float64) for o in outputs], input_size)
 
 
 def _yolo(outputs: list[np.ndarray], _: tuple[int, int]) -> Found:

@@ -1,0 +1,167 @@
+"""Ids: kept through gaps and crossings, never given twice; what counts as a fish, and where."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from stream_dmr.messages import Frame
+from stream_dmr.segmentation.detections import Detection
+from stream_dmr.segmentation.detector import Candidate
+from stream_dmr.segmentation.followed import FollowedFish, TrackFishSettings
+
+WIDTH, HEIGHT = 640, 480
+SEA = 60
+Spot = tuple[float, float, int, int, int]  # middle x, y; width, height; grey level
+
+numbers = st.floats(-1, 1)
+
+
+class Script:
+    """A detector that finds what it is told to, frame by frame."""
+
+    def __init__(self, frames: Sequence[Iterable[Spot]]) -> None:
+        self._frames = [list(spots) for spots in frames]
+
+    def picture(self, index: int) -> np.ndarray:
+        image = np.full((HEIGHT, WIDTH, 3), SEA, np.uint8)
+        for x, y, w, h, level in self._frames[index - 1]:
+            left, top = round(x - w / 2), round(y - h / 2)
+            image[max(top, 0) : top + h, max(left, 0) : left + w] = level
+        return image
+
+    def find(self, frame: Frame) -> list[Candidate]:
+        boxes = [
+            np.array([x - w / 2, y - h / 2, x + w / 2, y + h / 2]).clip(0, [WIDTH, HEIGHT] * 2)
+            for x, y, w, h, _ in self._frames[frame.frame_index - 1]
+        ]
+        return [Candidate(bbox_xyxy_px=box, score=1.0) for box in boxes]
+
+
+def follow(
+    frames: Sequence[Iterable[Spot]], *, only: Sequence[int] | None = None, **knobs: object
+) -> dict[int, list[Detection]]:
+    """The detections of each frame; `only`: frames that arrive, as a live source drops some."""
+    script = Script(frames)
+    fish = FollowedFish(script, TrackFishSettings.model_validate({"min_track_frames": 1, **knobs}))
+    indices = only or range(1, len(frames) + 1)
+    return {
+        i: fish.detect(
+            Frame(frame_index=i, timestamp_ns=i, image=script.picture(i), source="script")
+        )
+        for i in indices
+    }
+
+
+def ids(found: dict[int, list[Detection]]) -> list[list[int]]:
+    return [[detection.track_id for detection in found[i]] for i in sorted(found)]
+
+
+def climb(i: int, *, x: float = 300.0, speed: float = 12.0) -> Spot:
+    return (x, 420 - speed * i, 40, 100, 200)
+
+
+def test_a_fish_keeps_its_id_through_a_short_gap_and_gets_a_new_one_after_a_long_one():
+    gaps = {"short": 6, "long": 7}
+    for name, gap in gaps.items():
+        frames = [[climb(i, speed=6)] for i in range(8)] + [[]] * gap
+        frames += [[climb(i, speed=6)] for i in range(8 + gap, 20 + gap)]
+        found = ids(follow(frames))
+        assert found[:8] == [[1]] * 8
+        assert found[8 + gap :] == [[1 if name == "short" else 2]] * 12
+
+
+def test_frames_that_a_live_source_dropped_are_a_gap_like_any_other():
+    frames = [[climb(i)] for i in range(30)]
+    kept = [i for i in range(1, 31) if i not in (9, 10, 11, 20)]
+    assert ids(follow(frames, only=kept)) == [[1]] * 26
+
+
+def test_ids_count_from_1_and_are_never_given_twice():
+    passage = [[climb(i, speed=30)] for i in range(14)]
+    found = ids(follow((passage + [[]] * 10) * 5))
+    in_order = [i for frame in found for i in frame]
+    assert in_order == sorted(in_order)
+    assert set(in_order) == {1, 2, 3, 4, 5}
+
+
+@given(numbers, numbers, st.integers(60, 110), st.booleans())
+@settings(max_examples=40)
+def test_two_fish_that_cross_keep_their_ids(a: float, b: float, length: int, alike: bool):
+    """They pass each other as one candidate while their boxes overlap, as in moving shapes."""
+    frames, owners = [], []
+    for i in range(40):
+        first = (120 + (9 + a) * i, 240 + 2 * a * i, length, 40, 200)
+        second = (520 - (9 + b) * i, 250 + 2 * b * i, length, 40, 200 if alike else 130)
+        if abs(first[0] - second[0]) < length and abs(first[1] - second[1]) < 40:
+            middle = ((first[0] + second[0]) / 2, (first[1] + second[1]) / 2)
+            sides = [round(abs(p - q)) for p, q in zip(first[:2], second[:2], strict=True)]
+            frames.append([(*middle, sides[0] + length, sides[1] + 40, 180)])
+            owners.append(None)
+        else:
+            frames.append([first, second])
+            owners.append((first[0], second[0]))
+    found = follow(frames)
+    for i, owner in enumerate(owners, start=1):
+        if owner is None:
+            continue
+        where = {d.track_id: (d.bbox_xyxy_px[0] + d.bbox_xyxy_px[2]) / 2 for d in found[i]}
+        assert where == pytest.approx({1: owner[0], 2: owner[1]})
+
+
+def test_two_fish_in_one_candidate_are_neither():
+    apart = [[(200 + 8 * i, 200, 80, 40, 200), (440 - 8 * i, 200, 80, 40, 200)] for i in range(10)]
+    together = [[(320, 200, 150, 44, 200)]] * 3
+    found = follow(apart + together)
+    assert [found[i] for i in (11, 12, 13)] == [[], [], []]
+
+
+def test_a_part_of_a_fish_is_no_fish_of_its_own():
+    whole = [[climb(i)] for i in range(5)]
+    cut = [
+        [climb(i), (*climb(i)[:1], climb(i)[1] + 30, 20, 20, 200)]  # behind a gaff
+        for i in range(5, 15)
+    ]
+    assert ids(follow(whole + cut)) == [[1]] * 15
+
+
+def test_a_fish_that_leaves_the_picture_shows_less_and_less_of_itself():
+    frames = [[climb(i, speed=20)] for i in range(18)]
+    frames += [[(300, h / 2, 40, h, 200)] for h in (80, 60, 40, 20)]
+    found = follow(frames)
+    shown = [found[i][0].visible_fraction for i in range(19, 23)]
+    assert found[10][0].visible_fraction == 1
+    np.testing.assert_allclose(shown, [0.8, 0.6, 0.4, 0.2], atol=0.02)
+
+
+def test_a_track_counts_once_it_is_long_enough():
+    frames = [[climb(i)] for i in range(10)]
+    assert ids(follow(frames, min_track_frames=4)) == [[]] * 3 + [[1]] * 7
+    flashes = [[climb(i)] if i < 3 else [] for i in range(10)]
+    assert not any(ids(follow(flashes * 3, min_track_frames=4)))
+
+
+def test_fish_count_in_the_zone_and_keep_their_ids_outside():
+    frames = [[climb(i)] for i in range(30)]
+    found = ids(follow(frames, zone=[0.0, 0.4, 1.0, 0.6]))
+    entered = next(i for i in range(30) if climb(i)[1] <= 0.6 * HEIGHT)
+    assert found == [[]] * entered + [[1]] * (30 - entered)
+    beside = ids(follow(frames, zone=[0.6, 0.0, 1.0, 1.0]))
+    assert not any(beside)
+
+
+def test_ids_go_to_fish_in_the_order_in_which_they_count():
+    def both(i: int) -> list[Spot]:
+        return [(100, 450 - 5 * i, 40, 60, 200), (400, 450 - 12 * i, 40, 60, 200)]
+
+    found = follow([both(i) for i in range(30)], zone=[0.0, 0.0, 1.0, 0.7])
+    assert {d.track_id: d.bbox_xyxy_px[0] for d in found[30]} == {1: 380, 2: 80}
+
+
+@pytest.mark.parametrize("zone", [[0.5, 0.0, 0.5, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 1.1]])
+def test_a_zone_without_an_inside_is_refused(zone: list[float]):
+    with pytest.raises(ValidationError):
+        TrackFishSettings(zone=zone)
