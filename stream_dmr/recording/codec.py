@@ -5,6 +5,7 @@ The schema is `messages.proto`; a dataclass and its protobuf message have the sa
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -119,8 +120,14 @@ def _set(proto: Proto, field: Any, item: Any) -> None:
 
 
 def _build(kind: type[T], proto: Proto) -> T:
-    by_name = proto.DESCRIPTOR.fields_by_name
-    return kind(**{f.name: _get(proto, by_name[f.name]) for f in fields(kind)})  # type: ignore[arg-type]
+    return kind(**{field.name: _get(proto, field) for field in _fields(kind)})
+
+
+@cache
+def _fields(kind: type) -> list[FieldDescriptor]:
+    """Those of its protobuf message, which has a field for each of the dataclass."""
+    by_name = proto_class(kind.__name__).DESCRIPTOR.fields_by_name
+    return [by_name[field.name] for field in fields(kind)]
 
 
 def _get(proto: Proto, field: Any) -> Any:
