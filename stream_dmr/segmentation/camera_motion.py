@@ -22,6 +22,7 @@ _CELL_PX = 20
 _SEEN_LEVELS = 1.5  # a cell tells something if the motion would change it by this, on average
 _UNMOVED = 0.6  # of that change: a cell that changed by less has not moved
 _AT_REST = 0.03  # of all cells unmoved, again and again: the camera rests
+_REST_FRAMES = 4  # between two looks at a camera that rests
 
 Affine = Float[np.ndarray, "2 3"]
 
@@ -33,6 +34,7 @@ class CameraMotion:
         self._before: UInt8[np.ndarray, "H W"] | None = None
         self._explained, self._changed = 0.0, 1e-9  # sums that fade
         self._unmoved, self._telling = np.zeros(()), np.zeros(())  # by cell, likewise
+        self._rest_frames = 0  # until the next look
 
     def step(
         self, picture: UInt8[np.ndarray, "H W"], *, is_background: Bool[np.ndarray, "H W"]
@@ -42,7 +44,8 @@ class CameraMotion:
         `is_background`: where the picture before shows no fish.
         """
         before, self._before = self._before, picture
-        if before is None:
+        self._rest_frames = max(0, self._rest_frames - 1)
+        if before is None or self._rest_frames:
             return None
         affine = similarity(before, picture, is_background=is_background)
         if affine is None:
@@ -53,6 +56,8 @@ class CameraMotion:
         self._compare(_cells(changed), _cells(cv2.absdiff(before, moved)))
         is_all = self._explained > _EXPLAINED * self._changed
         is_at_rest = np.mean(self._unmoved > 0.5 * self._telling) > _AT_REST
+        if is_at_rest:
+            self._rest_frames = _REST_FRAMES
         return affine if is_all and not is_at_rest else None
 
     def _weigh(self, changed: float, remaining: float) -> None:
