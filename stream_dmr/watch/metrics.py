@@ -77,7 +77,7 @@ class RunMetrics(Collector):
         yield _gauge("healthy", "1: well, 0: not.", 0.0 if self._state.problems() else 1.0)
 
 
-def _gauge(name: str, text: str, value: float) -> Metric:
+def _gauge(name: str, text: str, value: float | int) -> Metric:
     return GaugeMetricFamily(f"stream_dmr_{name}", text, value=value)
 
 

@@ -21,7 +21,7 @@ def draw(scene: Scene) -> UInt8[np.ndarray, "H W 3"]:
             continue
         points = np.round(fish.keypoints_px * scale).astype(np.int32)
         colour = _GOOD if fish.accepted else _REFUSED
-        cv2.polylines(drawn, [points], isClosed=False, color=colour, thickness=2)
+        cv2.polylines(drawn, [points], isClosed=False, color=colour, thickness=3)
         for point in points:
             cv2.circle(drawn, point.tolist(), 4, colour, thickness=-1)
         length_mm = scene.lengths_mm.get(fish.track_id)
@@ -36,5 +36,5 @@ def as_jpeg(image: UInt8[np.ndarray, "H W 3"]) -> bytes:
 
 
 def _label(drawn: UInt8[np.ndarray, "H W 3"], text: str, *, at: tuple[int, int]) -> None:
-    for colour, thickness in (((0, 0, 0), 4), ((255, 255, 255), 1)):
-        cv2.putText(drawn, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, thickness, cv2.LINE_AA)
+    for colour, thickness in (((0, 0, 0), 6), ((255, 255, 255), 2)):
+        cv2.putText(drawn, text, at, cv2.FONT_HERSHEY_SIMPLEX, 1.0, colour, thickness, cv2.LINE_AA)

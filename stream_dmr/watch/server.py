@@ -2,6 +2,7 @@
 
 import hmac
 import json
+import sys
 import threading
 import time
 from http import HTTPStatus
@@ -106,7 +107,9 @@ class _Server(ThreadingHTTPServer):
             return self._picture
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A reader who left is no error of ours."""
+        """A reader who left is no error of ours; anything else is one."""
+        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
+            super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):
