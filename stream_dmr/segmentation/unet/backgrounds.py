@@ -4,14 +4,14 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, UInt8
 
 from stream_dmr.simulation.skin import noise
 
 BACKGROUND_PX = 256
 
-Picture = Float32[np.ndarray, "B B 3"]
-Layer = Float32[np.ndarray, "B B"]
+Picture = Float[np.ndarray, "B B 3"]
+Layer = Float[np.ndarray, "B B"]
 
 
 def draw_background(rng: np.random.Generator) -> UInt8[np.ndarray, "B B 3"]:

@@ -22,7 +22,7 @@ from stream_dmr.segmentation.unet.settings import TrainSettings
 from stream_dmr.segmentation.unet.training import Scores, Training
 from stream_dmr.segmentation.unet.weights import SHIPPED, load_weights
 
-_CHECK_FISH, _CHECK_BACKGROUNDS = 300, 100  # in the bank that validation pictures are made from
+_UNSEEN = 10  # times smaller than the bank to learn from is the one to check on
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,19 +114,18 @@ def _prepare(request: TrainRequest) -> Training:
 
 def _sources(request: TrainRequest, observer: TrainObserver) -> tuple[Draw, Draw]:
     """What draws the pictures to learn from, and those to check on."""
-    settings = request.settings
     if request.images is None or request.masks is None:
-        bank = _bank(request, settings.bank_fish, settings.bank_backgrounds, 0, observer)
-        unseen = _bank(request, _CHECK_FISH, _CHECK_BACKGROUNDS, 1, observer)
-        return _Simulated(bank), _Simulated(unseen)
+        simulated = _Simulated(_bank(request, observer))
+        return simulated, _Simulated(_bank(request, observer, is_unseen=True))
     learnt, held_back = load_own_fish(request.images, request.masks)
-    bank = _bank(request, settings.bank_fish, settings.bank_backgrounds, 0, observer)
-    return _Mixed(_Simulated(bank), learnt, settings.own_share), _Own(held_back)
+    simulated = _Simulated(_bank(request, observer))
+    return _Mixed(simulated, learnt, request.settings.own_share), _Own(held_back)
 
 
-def _bank(
-    request: TrainRequest, num_fish: int, num_backgrounds: int, offset: int, observer: TrainObserver
-) -> Bank:
+def _bank(request: TrainRequest, observer: TrainObserver, *, is_unseen: bool = False) -> Bank:
+    settings = request.settings
+    counts = (settings.bank_fish, settings.bank_backgrounds)
+    num_fish, num_backgrounds = (max(1, n // _UNSEEN) for n in counts) if is_unseen else counts
     done = 0
 
     def progress() -> None:
@@ -138,7 +137,7 @@ def _bank(
         request.out / "cache",
         num_fish=num_fish,
         num_backgrounds=num_backgrounds,
-        seed=request.settings.seed + offset,
+        seed=settings.seed + is_unseen,
         progress=progress,
     )
 
