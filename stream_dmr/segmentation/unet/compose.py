@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, UInt8
 from stream_dmr.segmentation.unet.bank import Bank
 from stream_dmr.segmentation.unet.boxes import box_picture, crop_around, jitter
 from stream_dmr.segmentation.unet.network import SIZE_PX
-from stream_dmr.segmentation.unet.occluders import Occluder, coverage, draw_line, draw_occluders
+from stream_dmr.segmentation.unet.occluders import Occluder, draw_into, draw_line, draw_occluders
 from stream_dmr.segmentation.unet.patches import PATCH_PX
 from stream_dmr.segmentation.unet.sample import Sample
 from stream_dmr.segmentation.unet.weather import motion_kernel, photograph, weather
@@ -136,7 +136,7 @@ def _visible_box(bank: Bank, scene: _Scene) -> Float[np.ndarray, "4"] | None:
         seen = seen * (1 - _warp(bank, other, look_from_scene, size=_LOOK_PX)[..., 3])
     for occluder in scene.occluders:
         if occluder.hides:
-            seen = seen * (1 - coverage(occluder, look_from_scene, size=_LOOK_PX))
+            seen = seen * (1 - draw_into(occluder, look_from_scene, size=_LOOK_PX)[0])
     if seen.sum() < _LEAST_VISIBLE * whole.sum():
         return None
     x, y, width, height = cv2.boundingRect((seen > 0.5).astype(np.uint8))
@@ -168,10 +168,10 @@ def _render(
         layer = layer if smear is None else cv2.filter2D(layer, -1, smear)
         picture = picture * (1 - layer[..., 3:]) + layer[..., :3]
     for occluder in scene.occluders:
-        covered = coverage(occluder, crop_from_scene, size=SIZE_PX)
+        covered, tones = draw_into(occluder, crop_from_scene, size=SIZE_PX)
         if occluder.hides:
             mask *= 1 - covered
-        tone = np.float32(1 + 0.15 * rng.standard_normal()) * _texture(rng, bank)
+        tone = tones[..., None] * _texture(rng, bank)
         picture += covered[..., None] * (tone * occluder.colour.astype(np.float32) - picture)
     inside = _inside(scene.frame, crop_from_scene, size=SIZE_PX)
     pixels = photograph(rng, weather(rng, picture))

@@ -16,9 +16,10 @@ _SUBPIXEL = 4  # bits of OpenCV's `shift`
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Occluder:
-    """Opaque shapes of one colour."""
+    """Opaque shapes of one colour, later ones over earlier ones."""
 
     polygons: list[Float[np.ndarray, "_ 2"]]  # scene units
+    tones: list[float]  # of each polygon, as a factor of the colour
     colour: Float[np.ndarray, "3"]  # BGR
     hides: bool  # its pixels are not fish; a line is too thin for that
 
@@ -30,39 +31,44 @@ def draw_occluders(rng: np.random.Generator) -> list[Occluder]:
 
 
 def draw_line(rng: np.random.Generator, start: Float[np.ndarray, "2"]) -> Occluder:
-    """A fishing line from here up, out of sight."""
+    """A fishing line from here up, out of sight; half of them with a hook."""
     angle = np.radians(rng.normal(-90.0, 12.0))
     end = start + 3.0 * np.array([np.cos(angle), np.sin(angle)])
     width = rng.uniform(0.004, 0.02)
+    bars = [_bar(start, end, width, width)]
+    if rng.random() < 0.5:
+        bars += _hook(rng, start, angle, radius=rng.uniform(0.015, 0.04), width=0.012)
     shade = rng.uniform(20, 245) * rng.uniform(0.85, 1.15, 3)
-    return Occluder(polygons=[_bar(start, end, width, width)], colour=shade, hides=False)
+    return Occluder(polygons=bars, tones=[1.0] * len(bars), colour=shade, hides=False)
 
 
-def coverage(
+def draw_into(
     occluder: Occluder, crop_from_scene: Float[np.ndarray, "2 3"], *, size: int
-) -> Float32[np.ndarray, "S S"]:
-    """How much of each crop pixel it covers, 0 to 1."""
-    canvas = np.zeros((size, size), np.uint8)
-    for polygon in occluder.polygons:
+) -> tuple[Float32[np.ndarray, "S S"], Float32[np.ndarray, "S S"]]:
+    """How much of each crop pixel it covers (0 to 1), and the tone there."""
+    covered = np.zeros((size, size), np.float32)
+    tones = np.ones((size, size), np.float32)
+    for polygon, tone in zip(occluder.polygons, occluder.tones, strict=True):
         points = polygon @ crop_from_scene[:, :2].T + crop_from_scene[:, 2]
         fixed = np.round(np.clip(points, -2000, 2000) * (1 << _SUBPIXEL)).astype(np.int32)
+        canvas = np.zeros((size, size), np.uint8)
         cv2.fillPoly(canvas, [fixed], 255, cv2.LINE_AA, _SUBPIXEL)
-    return canvas.astype(np.float32) / np.float32(255)
+        part = canvas.astype(np.float32) / np.float32(255)
+        covered = np.maximum(covered, part)
+        tones += part * (np.float32(tone) - tones)
+    return covered, tones
 
 
 def _draw_pole(rng: np.random.Generator) -> Occluder:
-    """A gaff: a pole whose hook lies somewhere on the fish."""
+    """A gaff: a pole, lit along its middle, whose hook lies somewhere on the fish."""
     tip = rng.normal(0.0, 0.2, 2)
     angle = rng.uniform(0.0, 2 * np.pi)
-    along = np.array([np.cos(angle), np.sin(angle)])
     width = rng.uniform(0.02, 0.09)
-    polygons = [_bar(tip, tip + 3.0 * along, width, width * rng.uniform(1.0, 1.3))]
+    bars, tones = _lit_bar(rng, tip, tip + 3.0 * _towards(angle), width)
     if rng.random() < 0.7:
-        turns = angle + np.pi + np.linspace(-0.4, 2.6, 9) * rng.choice([-1.0, 1.0])
-        arc = tip + rng.uniform(0.04, 0.09) * np.column_stack([np.cos(turns), np.sin(turns)])
-        arc = arc - arc[0] + tip
-        polygons += [_bar(a, b, 0.3 * width, 0.3 * width) for a, b in pairwise(arc)]
-    return Occluder(polygons=polygons, colour=_colour(rng), hides=True)
+        hook = _hook(rng, tip, angle, radius=rng.uniform(0.04, 0.09), width=0.3 * width)
+        bars, tones = bars + hook, tones + [rng.uniform(0.7, 1.6)] * len(hook)
+    return Occluder(polygons=bars, tones=tones, colour=_colour(rng), hides=True)
 
 
 def _draw_glove(rng: np.random.Generator) -> Occluder:
@@ -70,31 +76,59 @@ def _draw_glove(rng: np.random.Generator) -> Occluder:
     palm = rng.normal(0.0, 0.28, 2)
     angle = rng.uniform(0.0, 2 * np.pi)
     size = rng.uniform(0.06, 0.16)
-    arm = palm + 3.0 * np.array([np.cos(angle), np.sin(angle)])
-    polygons = [_bar(palm, arm, 1.5 * size, 2.2 * size), _blob(rng, palm, size)]
+    polygons = [_bar(palm, palm + 3.0 * _towards(angle), 1.5 * size, 2.2 * size)]
+    polygons.append(_blob(rng, palm, size))
     for spread in np.linspace(-0.9, 0.9, rng.integers(3, 6)):
         bend = angle + np.pi + spread + rng.normal(0.0, 0.1)
-        tip = palm + rng.uniform(1.2, 2.4) * size * np.array([np.cos(bend), np.sin(bend)])
+        tip = palm + rng.uniform(1.2, 2.4) * size * _towards(bend)
         polygons.append(_bar(palm, tip, 0.55 * size, 0.4 * size))
-    return Occluder(polygons=polygons, colour=_colour(rng), hides=True)
+    tones = rng.uniform(0.8, 1.2, len(polygons)).tolist()
+    return Occluder(polygons=polygons, tones=tones, colour=_colour(rng), hides=True)
 
 
 def _draw_rope(rng: np.random.Generator) -> Occluder:
-    middle, angle = rng.normal(0.0, 0.3, 2), rng.uniform(0.0, np.pi)
-    reach = 3.0 * np.array([np.cos(angle), np.sin(angle)])
-    width = rng.uniform(0.03, 0.08)
-    rope = _bar(middle - reach, middle + reach, width, width)
-    return Occluder(polygons=[rope], colour=_colour(rng), hides=True)
+    middle, reach = rng.normal(0.0, 0.3, 2), 3.0 * _towards(rng.uniform(0.0, np.pi))
+    bars, tones = _lit_bar(rng, middle - reach, middle + reach, rng.uniform(0.03, 0.08))
+    return Occluder(polygons=bars, tones=tones, colour=_colour(rng), hides=True)
 
 
 def _draw_edge(rng: np.random.Generator) -> Occluder:
     """A rail, a crate or a shoulder that covers one side."""
-    angle = rng.uniform(0.0, 2 * np.pi)
-    out = np.array([np.cos(angle), np.sin(angle)])
+    out = _towards(rng.uniform(0.0, 2 * np.pi))
     near = out * rng.uniform(0.05, 0.5)
-    return Occluder(
-        polygons=[_bar(near, near + 3.0 * out, 5.0, 5.0)], colour=_colour(rng), hides=True
-    )
+    wall = _bar(near, near + 3.0 * out, 5.0, 5.0)
+    return Occluder(polygons=[wall], tones=[1.0], colour=_colour(rng), hides=True)
+
+
+def _lit_bar(
+    rng: np.random.Generator,
+    start: Float[np.ndarray, "2"],
+    end: Float[np.ndarray, "2"],
+    width: float,
+) -> tuple[list[Float[np.ndarray, "_ 2"]], list[float]]:
+    """A round bar: darker at its sides, with a line of light."""
+    shares = [1.0, rng.uniform(0.45, 0.8), rng.uniform(0.1, 0.3)]
+    tones = np.cumprod([rng.uniform(0.5, 1.0), rng.uniform(1.1, 1.9), rng.uniform(1.0, 1.5)])
+    return [_bar(start, end, share * width, share * width) for share in shares], tones.tolist()
+
+
+def _hook(
+    rng: np.random.Generator,
+    at: Float[np.ndarray, "2"],
+    angle: float,
+    *,
+    radius: float,
+    width: float,
+) -> list[Float[np.ndarray, "_ 2"]]:
+    """A bent wire that begins here, on the far side of a bar that goes off at this angle."""
+    turns = angle + np.pi + np.linspace(-0.4, 2.6, 9) * rng.choice([-1.0, 1.0])
+    arc = radius * np.column_stack([np.cos(turns), np.sin(turns)])
+    arc = arc - arc[0] + at
+    return [_bar(a, b, width, width) for a, b in pairwise(arc)]
+
+
+def _towards(angle: float) -> Float[np.ndarray, "2"]:
+    return np.array([np.cos(angle), np.sin(angle)])
 
 
 def _bar(
