@@ -43,7 +43,7 @@ def draw_curve(history: Sequence[Scores], path: Path) -> None:
 
 def draw_worst(training: Training, validation: Pictures, path: Path) -> None:
     """The validation pictures of least IoU; green: the true mask, red: the one found."""
-    ious, _ = training.check(validation)
+    ious = training.ious
     worst = np.argsort(ious.numpy())[:_NUM_WORST].tolist()
     samples = [validation[index] for index in worst]
     found = training.predict(samples)

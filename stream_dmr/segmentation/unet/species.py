@@ -66,7 +66,7 @@ def pose_shape(rng: np.random.Generator, shape: Shape) -> Posed:
     about_axis = rng.choice([0.0, np.pi]) + np.radians(rng.normal(0.0, 22.0))
     if rng.random() < 0.2:
         about_axis = rng.uniform(0.0, 2 * np.pi)  # edge on, or from above
-    towards = np.radians(np.clip(rng.normal(0.0, 20.0), -60.0, 60.0))
+    towards = np.radians(np.clip(rng.normal(0.0, 25.0), -65.0, 65.0))
     turn = Rotation.from_euler("YX", [towards, about_axis]).as_matrix() @ middle.T
     spine = spine.moved(turn, np.zeros(3))
     centre = spine.points.mean(axis=0)
@@ -129,7 +129,7 @@ def _draw_fin(
     along, out = np.meshgrid(
         np.linspace(0.0, 1.0, _FIN_COLUMNS), np.linspace(0.0, 1.0, _FIN_ROWS), indexing="ij"
     )
-    height = rng.uniform(0.01, 0.14) * (end - start) ** 0.3  # 0.01: folded down
+    height = rng.uniform(0.01, 0.17) * (end - start) ** 0.3  # 0.01: folded down
     peak = rng.uniform(0.1, 0.6)
     profile = np.interp(along, [0.0, peak, 1.0], [0.0, 1.0, rng.uniform(0.0, 0.6)]) ** 0.7
     s = start + along * (end - start)

@@ -55,6 +55,7 @@ class Training:
         torch.manual_seed(self.settings.seed)
         self.network = UNet()
         self.history: list[Scores] = []
+        self.ious = torch.empty(0)  # of each validation picture, after the last epoch
         self.best = -math.inf
 
     def begin(self, network: UNet | None) -> None:
@@ -112,12 +113,12 @@ class Training:
             self._set_rate((epoch - 1 + step / len(batches)) / settings.epochs)
             losses.append(self._step(batch))
             progress(len(batch[0]))
-        iou, right = self.check(validation)
+        self.ious, right = self.check(validation)
         scores = Scores(
             epoch=epoch,
             loss=sum(losses) / len(losses),
-            iou=float(iou.mean()),
-            iou_p10=float(iou.quantile(0.1)),
+            iou=float(self.ious.mean()),
+            iou_p10=float(self.ious.quantile(0.1)),
             ends_right=right,
         )
         self._keep(scores)
