@@ -139,7 +139,8 @@ def _foreign(distance: Float32[np.ndarray, "h w"], threshold: float) -> UInt8[np
     nearly = cv2.morphologyEx(_above(distance, _NEARLY * threshold), cv2.MORPH_OPEN, _disc(3))
     beside = cv2.bitwise_and(nearly, cv2.dilate(surely, _disc(_NEAR_PX)))
     foreign = cv2.bitwise_or(surely, beside)
-    return cv2.morphologyEx(foreign, cv2.MORPH_CLOSE, _disc(5))
+    # Small holes close; two lines side by side must not become one fish.
+    return cv2.morphologyEx(foreign, cv2.MORPH_CLOSE, _disc(3))
 
 
 def _above(distance: Float32[np.ndarray, "h w"], threshold: float) -> UInt8[np.ndarray, "h w"]:

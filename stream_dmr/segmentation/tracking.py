@@ -33,7 +33,8 @@ _FARTHEST = 1.2  # sizes between a fish and where it was expected
 _LEARN = 0.2  # of a fish's size and colour, per frame
 _SWALLOWED = 0.55  # of a fish's expected box inside a candidate
 _SWOLLEN = 1.3  # times the larger of two fish: a candidate that is both
-_MOST_WAITED = 45  # frames that two fish may stay one candidate
+_FLEETING = 2  # frames: what was seen in no more is not waited for
+_MOST_WAITED = 30  # frames that two fish may stay one candidate
 _BESIDE = 0.3  # of a candidate inside a followed fish's box: a part of it, no new fish
 
 
@@ -74,6 +75,7 @@ class Tracker:
         swallowed = self._swallowed(looks)
         looks = [look for i, look in enumerate(looks) if i not in swallowed]
         free = self._assign(looks)
+        self._hide(looks)
         self._drop_lost(frame)
         seen = [track for track in self._tracks if track.lost_frames == 0]
         for look in free:
@@ -86,13 +88,22 @@ class Tracker:
         """The candidates that are several fish at once; those fish wait until they part."""
         found = set()
         for i, look in enumerate(looks):
-            inside = [t for t in self._tracks if t.share_in(look.box) > _SWALLOWED]
+            inside = [t for t in self._tracks if t.may_hide and t.share_in(look.box) > _SWALLOWED]
             largest = max((track.area for track in inside), default=0.0)
             if len(inside) > 1 and look.area > _SWOLLEN * largest:
                 found.add(i)
                 for track in inside:
-                    track.wait()
+                    track.wait(look)
         return found
+
+    def _hide(self, looks: Sequence["_Look"]) -> None:
+        """Let fish wait that should be where another one has just been seen: they are behind it."""
+        for track in self._tracks:
+            if track.lost_frames > 0 and track.may_hide:
+                for look in looks:
+                    if track.share_in(look.box) > _SWALLOWED:
+                        track.wait(look)
+                        break
 
     def _assign(self, looks: Sequence["_Look"]) -> list["_Look"]:
         """Give each track its candidate; the candidates left over are returned."""
@@ -175,20 +186,30 @@ class _Track:
         drift = np.vstack([dt**2 / 2 * np.eye(2), dt * np.eye(2)])
         self._filter.predict(F=F, Q=drift @ drift.T * (_ACCELERATION_STD * self.size) ** 2)
 
-    def wait(self) -> None:
-        """Another fish hides this one, or it hides the other: it is there, but not to be seen."""
+    @property
+    def may_hide(self) -> bool:
+        """Whether this was seen for long enough to be taken for a fish that another one hides."""
+        return self.frames_seen > _FLEETING
+
+    def wait(self, look: _Look) -> None:
+        """Another fish hides this one, or it hides the other: it is somewhere in the candidate."""
         self._waited += 1
-        if self._waited <= _MOST_WAITED:
-            self.lost_frames = 1
+        if self._waited > _MOST_WAITED:
+            return
+        self.lost_frames = 1
+        quarter = np.minimum(self.look.box[2:] - self.look.box[:2], look.box[2:] - look.box[:2]) / 4
+        inside = self.middle.clip(look.box[:2] + quarter, look.box[2:] - quarter)
+        self._filter.x[:2, 0] = inside
 
     def update(self, look: _Look) -> None:
         """Take a candidate for this fish."""
         self.look, self.lost_frames, self._waited = look, 0, 0
         self.frames_seen += 1
         self._filter.update(look.middle[:, None])
-        if not look.touches_border:  # what is cut off says nothing of the size
-            self.area *= (look.area / self.area) ** _LEARN
-        self.colour = self.colour + _LEARN * (look.colour - self.colour)
+        rate = max(_LEARN, 1 / self.frames_seen)
+        if not look.touches_border or look.area > self.area:  # what is cut off shows too little
+            self.area *= (look.area / self.area) ** rate
+        self.colour = self.colour + rate * (look.colour - self.colour)
 
     def cost(self, look: _Look) -> float:
         """How little a candidate is this fish, as a sum of squares over their variances."""
