@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from pydantic import Field
 
-from stream_dmr.camera import Camera, crop_from_frame, frame_from_crop
+from stream_dmr.camera import Camera, crop_from_frame
 from stream_dmr.messages import CropQuality, FishCrop, FishEnds, Frame
 from stream_dmr.segmentation.detections import Detection
 from stream_dmr.segmentation.segmenter import Segmenter
@@ -38,8 +38,8 @@ class CropFishSettings(Settings):
     segmenter: str = Field(
         default="grabcut",
         min_length=1,
-        description='what finds the mask in a box: "unet", "grabcut", weights of `stream-dmr train` '
-        "(.pt), or a promptable model (.onnx)",
+        description='what finds the mask in a box: "unet", "grabcut", weights of `stream-dmr train`'
+        " (.pt), or a promptable model (.onnx)",
     )
 
 
@@ -119,22 +119,24 @@ def _segment(
     """Find the mask in a crop; `cameras` are the crop's and the frame's."""
     crop_camera, frame_camera = cameras
     found = segmenter.segment(image, _box_in_crop(detection.bbox_xyxy_px, cameras))
-    area = float(np.linalg.det(frame_camera.K) / np.linalg.det(crop_camera.K))  # of a crop pixel
-    least = math.ceil(settings.min_mask_area_px / area)
-    mask = clean_mask(found.probability > 0.5, min_area_px=least)
-    rows, columns = np.nonzero(mask)
-    where = np.column_stack([columns, rows]).astype(np.float64)
-    extent = None
-    if len(where):
-        # The frame pixels that its pixels' centres lie in, as a box.
-        where = np.round(frame_from_crop(where, crop_camera=crop_camera, frame_camera=frame_camera))
-        extent = np.concatenate([where.min(axis=0), where.max(axis=0) + 1])
+    x, y = frame_from_crop_map(crop_camera, frame_camera=frame_camera)
     shape = (frame_camera.height, frame_camera.width)
+    is_seen = (x > -0.5) & (x < shape[1] - 0.5) & (y > -0.5) & (y < shape[0] - 0.5)
+    probability = found.probability * is_seen  # beyond the frame nothing is known
+    (x_down, x_right), (y_down, y_right) = np.gradient(x), np.gradient(y)
+    areas = np.abs(x_right * y_down - x_down * y_right)  # of the crop's pixels, in frame pixels
+    least = math.ceil(settings.min_mask_area_px / float(areas.mean()))
+    mask = clean_mask(probability > 0.5, min_area_px=least)
+    extent = None
+    if mask.any():  # the frame pixels that its pixels' centres lie in, as a box
+        columns, rows = np.round(x[mask]), np.round(y[mask])
+        low, high = (columns.min(), rows.min()), (columns.max() + 1, rows.max() + 1)
+        extent = np.array([*low, *high], np.float64)
     return _Fish(
         mask=mask,
-        area_px=area * len(where),
+        area_px=float(areas[mask].sum()),
         touches_border=_touches_border(extent, shape=shape),
-        confidence=expected_iou(found.probability, mask),
+        confidence=expected_iou(probability, mask),
         ends=found.ends,
     )
 
