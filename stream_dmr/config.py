@@ -13,6 +13,7 @@ from pydantic import Field, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+from stream_dmr.drift import DriftSettings
 from stream_dmr.errors import ConfigError
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.length_filter import SmoothLengthSettings
@@ -68,6 +69,9 @@ class Config(Settings):
     )
     recording: RecordingSettings = Field(
         default_factory=RecordingSettings, description="what is recorded, and how exactly"
+    )
+    drift: DriftSettings = Field(
+        default_factory=DriftSettings, description="when a camera at sea is no longer trusted"
     )
     watch: WatchSettings = Field(
         default_factory=WatchSettings, description="who may watch a run, and how"

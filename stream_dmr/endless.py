@@ -3,8 +3,10 @@
 from collections.abc import Callable
 
 from stream_dmr.clips import ClipFolder
+from stream_dmr.drift import DriftSettings, FitWatch, SceneWatch, decode_scene, encode_scene
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.live import LiveStream
+from stream_dmr.messages import Frame
 from stream_dmr.store import LengthStore
 from stream_dmr.video import Source
 
@@ -23,6 +25,49 @@ def go_on(
     done, frames_done = store.clips_before()
     source.resume(done=done, frames_done=frames_done, after_ns=store.before.timestamp_ns)
     return frames_done
+
+
+class DriftWatch:
+    """Looks after scene and fits of a run, and marks the lengths measured since an alarm."""
+
+    def __init__(
+        self, store: LengthStore, settings: DriftSettings, *, on_notice: Callable[[str], None]
+    ) -> None:
+        self._store = store
+        self._on_notice = on_notice
+        kept = store.scene()
+        self._scene = SceneWatch(settings, reference=None if kept is None else decode_scene(kept))
+        self._is_kept = self._scene.reference is not None
+        self._fits = FitWatch(settings, reference=store.first_ious(settings.reference_fish))
+        self._alarms: tuple[str, ...] = ()
+
+    def take_frame(self, frame: Frame) -> None:
+        """Look at what the camera sees."""
+        self._scene.take(frame.image, frame.timestamp_ns)
+        if not self._is_kept and self._scene.reference is not None:
+            self._store.keep_scene(encode_scene(self._scene.reference))
+            self._is_kept = True
+        self._say(frame.timestamp_ns)
+
+    def take_fish(self, iou: float | None, timestamp_ns: int) -> list[str]:
+        """Look at the fits of a finished fish; what a reader of its length must know."""
+        if iou is not None:
+            self._fits.take(iou)
+        self._say(timestamp_ns)
+        return list(self._alarms)
+
+    def _say(self, timestamp_ns: int) -> None:
+        alarms = tuple(alarm for alarm in (self._scene.alarm, self._fits.alarm) if alarm)
+        if [_kind(alarm) for alarm in alarms] == [_kind(alarm) for alarm in self._alarms]:
+            return
+        self._alarms = alarms
+        text = "; ".join(alarms) or "the camera sees again what it was calibrated for"
+        self._store.note("drift", text, timestamp_ns=timestamp_ns)
+        self._on_notice(f"{text}; lengths are marked from now on" if alarms else text)
+
+
+def _kind(alarm: str) -> str:
+    return alarm.partition(" (")[0]
 
 
 class Tolerance:

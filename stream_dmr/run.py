@@ -17,7 +17,7 @@ from nodes.smooth_length import SmoothLength
 from stream_dmr.calibration import load_calibration, require_size
 from stream_dmr.camera import Calibration
 from stream_dmr.config import Config, load_config, to_toml
-from stream_dmr.endless import Tolerance, go_on
+from stream_dmr.endless import DriftWatch, Tolerance, go_on
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.pipeline import Node, StageCounters, run_chain
@@ -126,6 +126,9 @@ def run(
                 watch,
                 numbers_frames_on=reader.source.is_endless and not (request.boxes or request.masks),
                 clips=go_on(reader.source, store, on_notice=watch.warn),
+                drift=DriftWatch(store, config.drift, on_notice=watch.warn)
+                if reader.source.is_endless and calibration is not None
+                else None,
             )
             summary = _run_chain(reader, nodes, tally, watch, request.out, stop=stop)
     finally:

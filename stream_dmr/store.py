@@ -81,9 +81,12 @@ class LengthStore:
         self._marked_at_ns = time.monotonic_ns()
         _set_aside(self._ballast)
 
-    def add(self, estimate: LengthEstimate, *, flags: Sequence[str] = ()) -> None:
+    def add(
+        self, estimate: LengthEstimate, *, iou: float | None = None, flags: Sequence[str] = ()
+    ) -> None:
         """Make a final estimate durable; `flags` are what a reader of this length must know."""
-        values = fish_row(estimate, flags) | {"run_id": self.run_id, "written_ns": time.time_ns()}
+        values = fish_row(estimate, flags) | {"iou": iou, "run_id": self.run_id}
+        values["written_ns"] = time.time_ns()
         marks = ", ".join("?" for _ in values)
         self._write(f"INSERT INTO fish ({', '.join(values)}) VALUES ({marks})", *values.values())
 
@@ -119,6 +122,26 @@ class LengthStore:
         """The capture time after which a live source goes on, whatever the clock was set to."""
         mark_ns = self.before.timestamp_ns
         return mark_ns if time.time_ns() > mark_ns else mark_ns + MARK_EVERY_NS
+
+    def scene(self) -> bytes | None:
+        """What the camera saw when this run's calibration was first used here."""
+        query = "SELECT data FROM scenes WHERE calibration_sha256 = ?"
+        row = self._database.execute(query, (self._facts.calibration_sha256,)).fetchone()
+        return None if row is None else row[0]
+
+    def keep_scene(self, data: bytes) -> None:
+        """Keep the scene of this calibration, for this run and later ones."""
+        key = self._facts.calibration_sha256
+        self._write("INSERT OR IGNORE INTO scenes VALUES (?, ?)", key, data)
+
+    def first_ious(self, count: int) -> list[float]:
+        """Of the first fish that were measured here with this calibration."""
+        query = (
+            "SELECT iou FROM fish JOIN runs USING (run_id) "
+            "WHERE calibration_sha256 = ? AND iou IS NOT NULL ORDER BY number LIMIT ?"
+        )
+        rows = self._database.execute(query, (self._facts.calibration_sha256, count))
+        return [iou for (iou,) in rows]
 
     def note(self, kind: str, text: str, *, timestamp_ns: int) -> None:
         """Write an event that later readers of the lengths should know of."""

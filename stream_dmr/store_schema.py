@@ -37,6 +37,7 @@ CREATE TABLE fish (
     first_timestamp_ns INTEGER NOT NULL, last_timestamp_ns INTEGER NOT NULL, -- capture time
     status TEXT NOT NULL,
     refused TEXT NOT NULL, -- JSON: reason -> number of frames
+    iou REAL, -- median of the frames that were accepted: mesh and mask
     flags TEXT NOT NULL, -- JSON: what a reader of this length must know, such as a moved camera
     written_ns INTEGER NOT NULL -- wall clock
 ) STRICT;
@@ -45,6 +46,10 @@ CREATE TABLE clips (
     name TEXT PRIMARY KEY,
     frames_done INTEGER NOT NULL, -- from its start, that have left the chain
     is_done INTEGER NOT NULL -- 1: the clip after it has begun
+) STRICT;
+CREATE TABLE scenes (
+    calibration_sha256 TEXT PRIMARY KEY,
+    data BLOB NOT NULL -- what the camera saw when the calibration was first used here
 ) STRICT;
 CREATE TABLE events (
     number INTEGER PRIMARY KEY,

@@ -1,12 +1,14 @@
 """What a run does with every message beside passing it on: numbers, stores, records, counts it."""
 
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Mapping
 from dataclasses import replace
 from hashlib import sha256
+from statistics import median
 
 from stream_dmr import __version__
-from stream_dmr.messages import FishCrop, Frame, LengthEstimate, Message
+from stream_dmr.endless import DriftWatch
+from stream_dmr.messages import FishCrop, Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.store import LengthStore, RunFacts
@@ -53,11 +55,13 @@ class Tally:
         *,
         numbers_frames_on: bool,
         clips: Mapping[str, int] | None = None,
+        drift: DriftWatch | None = None,
     ) -> None:
         """`clips`: the source is a folder of clips, of which so many frames were done before."""
         self.final: list[LengthEstimate] = []
-        self.flags: list[str] = []  # what readers of lengths from now on must know
         self.num_frames = 0
+        self._drift = drift
+        self._ious: defaultdict[int, list[float]] = defaultdict(list)  # of the open tracks
         self._recorder = recorder
         self._store = store
         self._observer = observer
@@ -72,6 +76,8 @@ class Tally:
         match message:
             case Frame(frame_index=index):
                 message = replace(message, frame_index=index + self._first_frame)
+                if self._drift is not None:
+                    self._drift.take_frame(message)
                 self._in_flight.append(message.source)
                 self._store.frame_passed(
                     frame_index=message.frame_index, timestamp_ns=message.timestamp_ns
@@ -79,9 +85,10 @@ class Tally:
             case FishCrop(track_id=track_id):
                 message = replace(message, track_id=track_id + self._first_id)
                 self._store.reserve_track(message.track_id)
+            case LocalizedFish(accepted=True, iou=float(iou)):
+                self._ious[message.track_id].append(iou)
             case LengthEstimate(is_final=True):
-                self._store.add(message, flags=self.flags)
-                self.final.append(message)
+                self._finish(message)
                 self._observer.fish_finished(message)
             case _:
                 pass
@@ -95,6 +102,13 @@ class Tally:
             self._track_ids.add(message.track_id)
             self._observer.fish_seen(len(self._track_ids))
         return message
+
+    def _finish(self, estimate: LengthEstimate) -> None:
+        accepted = self._ious.pop(estimate.track_id, [])
+        iou = median(accepted) if accepted else None
+        flags = [] if self._drift is None else self._drift.take_fish(iou, estimate.timestamp_ns)
+        self._store.add(estimate, iou=iou, flags=flags)
+        self.final.append(estimate)
 
     def frame_done(self) -> None:
         """Count a frame that has left the last stage."""
