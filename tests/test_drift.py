@@ -64,7 +64,7 @@ def test_a_shift_is_measured_before_a_rolling_sea(x, y, seed):
     now = scene_of(pictures(deck(shift=(x, y)), seed + 1000), scale=2.0)
     change = compare(before, now)
     assert change.shift_px == pytest.approx(2 * np.hypot(x, y), abs=1.5)
-    assert 0.7 < change.sharpness < 1.4
+    assert 0.6 < change.sharpness < 1.4  # half a pixel softens edges
 
 
 def test_hours_of_sea_and_fish_are_no_alarm():
