@@ -34,12 +34,13 @@ class Rate(NamedTuple):
     busy_ms: dict[str, float]  # of each stage, per frame
 
 
-def write_clip(out: Path, *, num_frames: int, seed: int = 1) -> None:
-    """A simulated clip in which every frame shows three fish, with exact masks and calibration."""
-    slots = make_scene(num_fish=NUM_FISH, num_frames=4 * num_frames, preset="realistic", seed=seed)
+def write_clip(out: Path, *, num_frames: int, num_fish: int = NUM_FISH, seed: int = 1) -> None:
+    """A simulated clip in which every frame shows so many fish, with exact masks and calibration."""
+    num_slots = 4 * num_frames
+    slots = make_scene(num_fish=num_fish, num_frames=num_slots, preset="realistic", seed=seed)
     together = [replace(visit, first_frame=1, is_gaffed=False) for visit in slots.visits]
     scene = replace(slots, visits=together)
-    shots = (shot for shot in film(scene) if _shows_all(shot))
+    shots = (shot for shot in film(scene) if _shows_all(shot, num_fish))
     write_species(out)
     save_calibration(out / "calibration.yaml", scene.calibration)
     (out / "masks").mkdir()
@@ -47,7 +48,7 @@ def write_clip(out: Path, *, num_frames: int, seed: int = 1) -> None:
     video = cv2.VideoWriter(str(out / "video.mp4"), codec, 15, (WIDTH, HEIGHT))
     for index, shot in zip(range(1, num_frames + 1), shots, strict=False):
         video.write(shot.image)
-        _write_mask(out / "masks" / f"{index:06d}.png", shot)
+        _write_mask(out / "masks" / f"{index:06d}.png", shot, num_fish)
     video.release()
 
 
@@ -72,10 +73,10 @@ def measure(clip: Path, recording: dict[str, bool]) -> Rate:
     return Rate(count / summary.elapsed_s, count, cpu_s * 1e3 / count, busy)
 
 
-def _shows_all(shot: Shot) -> bool:
+def _shows_all(shot: Shot, num_fish: int) -> bool:
     visible = [box for box in shot.boxes if box.visible_fraction >= _MOSTLY]
-    return len(visible) == NUM_FISH
+    return len(visible) == num_fish
 
 
-def _write_mask(path: Path, shot: Shot) -> None:
-    path.write_bytes(encode_mask(shot.labels, num_fish=NUM_FISH))
+def _write_mask(path: Path, shot: Shot, num_fish: int) -> None:
+    path.write_bytes(encode_mask(shot.labels, num_fish=num_fish))

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 _POLE = 1 / 50  # of the longer side: what is thinner all along may be a gaff or a line
+_BODY = 3.0  # squares of a pole's width: a smaller thick part is a knee of something thin
 _TAIL = 0.35  # of its body's length that a fish's tail and snout may add
 _THICKNESS = 0.06  # of its length: fish seen edge-on are thicker on average
 _FEW_PX = 3.5
@@ -42,7 +43,7 @@ def _without_poles(shape: Bool[np.ndarray, "H W"], pole_px: int) -> Bool[np.ndar
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (pole_px, pole_px))
     body = cv2.morphologyEx(part, cv2.MORPH_OPEN, kernel)
     body = _largest(body)
-    if not body.any():
+    if np.count_nonzero(body) < _BODY * pole_px**2:
         height, width = shape.shape
         touches = min(x, y, width - x - w, height - y - h) <= 1
         return None if touches else shape

@@ -25,12 +25,12 @@ from stream_dmr.settings import Settings
 _PLACE_STD = 0.08  # of a candidate's middle
 _SPEED_STD = 0.5  # of a new fish, per frame
 _ACCELERATION_STD = 0.06  # per frame squared
-_LOG_AREA_STD = 0.35  # from frame to frame: fish turn
-_COLOUR_STD = 15.0  # grey levels
+_LOG_AREA_STD = 0.5  # from frame to frame: flatfish turn edge-on within three
+_COLOUR_STD = 25.0  # grey levels: one side of a flatfish is dark, and turning shades it
 _MOST_COST = 25.0  # a sum of four squares, each about 1
 _NEVER = 1e6
 _FARTHEST = 1.2  # sizes between a fish and where it was expected
-_LEARN = 0.2  # of a fish's size and colour, per frame
+_LEARN = 0.35  # of a fish's size and colour, per frame
 _SWALLOWED = 0.55  # of a fish's expected box inside a candidate
 _SWOLLEN = 1.3  # times the larger of two fish: a candidate that is both
 _FLEETING = 2  # frames: what was seen in no more is not waited for

@@ -1,0 +1,200 @@
+"""The whole chain on nothing but video: fish counted, masks, lengths, and what the time goes into.
+
+    .venv/bin/python benchmarks/raw_video.py [SCENE...]           one row a scene
+    .venv/bin/python benchmarks/raw_video.py --simulate 6         scenes of our own, every preset
+    .venv/bin/python benchmarks/raw_video.py --speed              1280x960, two fish in view
+
+A scene is a folder as `stream-dmr simulate` writes it. Its boxes and masks are used to compare
+with, and by the second run that shows what lengths true masks would give; the first run sees the
+video alone. Mask IoU is of crops: the mask found against the true one through the same crop camera.
+"""
+
+import argparse
+import tempfile
+import threading
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from chain import write_clip
+
+from nodes.crop_fish import CropFish
+from nodes.read_frames import ReadFrames
+from stream_dmr.calibration import load_calibration
+from stream_dmr.config import load_config
+from stream_dmr.evaluation_files import read_truth
+from stream_dmr.messages import FishCrop, LengthEstimate, Message
+from stream_dmr.pipeline import StageCounters, run_chain
+from stream_dmr.run import later_nodes
+from stream_dmr.segmentation.annotations import Masks
+from stream_dmr.segmentation.crop import frame_from_crop_map
+from stream_dmr.segmentation.fish_finder import open_finder
+from stream_dmr.simulation.presets import PRESETS
+from stream_dmr.simulation.writer import simulate
+from stream_dmr.template import load_template
+
+
+class Ran(NamedTuple):
+    """One run of the chain."""
+
+    crops: list[FishCrop]
+    lengths: list[LengthEstimate]
+    counters: list[StageCounters]
+
+
+class Row(NamedTuple):
+    """One scene: what was found against what is true."""
+
+    name: str
+    num_fish: int
+    counted: int
+    iou: float  # mean over all crops
+    error: float  # mean absolute error of the lengths, as a fraction
+    error_given: float  # the same with true masks
+    measured: int  # fish that got a length
+
+
+def measure(scene: Path, config: Path | None, template: str) -> Row:
+    """Run a scene twice, from the video alone and with its masks, and compare."""
+    truth = read_truth(scene / "truth.csv")
+    raw = chain(scene, config, template or str(scene / "species.ply"), given=False)
+    given = chain(scene, config, template or str(scene / "species.ply"), given=True)
+    ious, names = _against_masks(raw.crops, Masks(scene / "masks"))
+    errors = _errors(raw.lengths, truth, names)
+    return Row(
+        name=scene.name,
+        num_fish=len(truth),
+        counted=len({length.track_id for length in raw.lengths}),
+        iou=float(np.mean(ious)) if ious else float("nan"),
+        error=float(np.mean(errors)) if errors else float("nan"),
+        error_given=float(np.mean(_errors(given.lengths, truth, {i: i for i in truth}))),
+        measured=len(errors),
+    )
+
+
+def chain(scene: Path, path: Path | None, template: str, *, given: bool) -> Ran:
+    """The nodes as `run` assembles them, without a recording."""
+    config = load_config(path)
+    calibration = load_calibration(scene / "calibration.yaml")
+    finder = open_finder(
+        boxes=scene / "boxes.txt" if given else None,
+        masks=scene / "masks" if given else None,
+        detect=config.detect_fish,
+        track=config.track_fish,
+    )
+    crop_fish = CropFish(config.crop_fish, camera=calibration.camera, detections=finder)
+    later = later_nodes(config, template=load_template(template), calibration=calibration)
+    ran = Ran([], [], [])
+
+    def note(message: Message) -> Message:
+        if isinstance(message, FishCrop):
+            ran.crops.append(message)
+        elif isinstance(message, LengthEstimate) and message.is_final:
+            ran.lengths.append(message)
+        return message
+
+    reader = ReadFrames(str(scene / "video.mp4"), config.read_frames)
+    stop = threading.Event()
+    ran.counters.extend(run_chain(reader, [crop_fish, *later], on_message=note, stop=stop))
+    reader.close()
+    return ran
+
+
+def _against_masks(crops: Iterable[FishCrop], masks: Masks) -> tuple[list[float], dict[int, int]]:
+    """The IoU of every crop's mask, and which true fish each found one mostly is (0: none)."""
+    ious, votes = [], {}
+    for crop in crops:
+        camera = crop.frame_camera
+        labels = masks.labels(crop.frame_index, width=camera.width, height=camera.height)
+        if labels is None:
+            continue
+        x, y = frame_from_crop_map(crop.crop_camera, frame_camera=camera)
+        seen = cv2.remap(labels.astype(np.uint16), x, y, cv2.INTER_NEAREST)
+        ids = Counter(seen[crop.mask & (seen > 0)].tolist())
+        name = ids.most_common(1)[0][0] if ids else 0
+        votes.setdefault(crop.track_id, Counter())[name] += 1
+        true = seen == name if name else np.zeros_like(crop.mask)
+        ious.append(float((crop.mask & true).sum() / max((crop.mask | true).sum(), 1)))
+    return ious, {track: count.most_common(1)[0][0] for track, count in votes.items()}
+
+
+def _errors(
+    lengths: Iterable[LengthEstimate], truth: Mapping[int, float], names: Mapping[int, int]
+) -> list[float]:
+    """How far each measured fish's length is off, as a fraction."""
+    return [
+        abs(length.length_mm / truth[names[length.track_id]] - 1)
+        for length in lengths
+        if length.length_mm is not None and names.get(length.track_id, 0) in truth
+    ]
+
+
+def print_rows(rows: Iterable[Row]) -> None:
+    """A Markdown table, and what it comes to."""
+    print("| scene | fish | counted | measured | mask IoU | length error | with true masks |")
+    print("|---|---|---|---|---|---|---|")
+    rows = list(rows)
+    for row in rows:
+        print(
+            f"| {row.name} | {row.num_fish} | {row.counted} | {row.measured} | {row.iou:.3f} "
+            f"| {row.error:.1%} | {row.error_given:.1%} |",
+            flush=True,
+        )
+    exact = sum(row.counted == row.num_fish for row in rows)
+    print(
+        f"\nexact counts: {exact}/{len(rows)}; mask IoU {np.nanmean([r.iou for r in rows]):.3f}; "
+        f"length error {np.nanmean([r.error for r in rows]):.1%}, "
+        f"with true masks {np.nanmean([r.error_given for r in rows]):.1%}"
+    )
+
+
+def print_speed(config: Path | None) -> None:
+    """Frames per second of a clip in which every frame shows fish, and each stage's share."""
+    with tempfile.TemporaryDirectory() as folder:
+        clip = Path(folder)
+        write_clip(clip, num_frames=60, num_fish=2)
+        chain(clip, config, str(clip / "species.ply"), given=False)  # compiles
+        ran = chain(clip, config, str(clip / "species.ply"), given=False)
+    num_frames = ran.counters[1].messages_in
+    total = sum(counter.cpu_s for counter in ran.counters)
+    print(f"{num_frames} frames, {len(ran.crops)} crops")
+    for counter in ran.counters:
+        print(
+            f"{counter.stage:13} CPU {counter.cpu_s / num_frames * 1e3:6.1f} ms/frame "
+            f"{counter.cpu_s / total:4.0%}, busy {counter.busy_s / num_frames * 1e3:6.1f} ms/frame"
+        )
+    slowest = max(counter.busy_s for counter in ran.counters)
+    print(f"{num_frames / slowest:.1f} frames/s")
+
+
+def main() -> None:
+    """Print what was asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", nargs="*", type=Path)
+    parser.add_argument("--config", type=Path)
+    parser.add_argument("--template", default="", help="default: the scene's species.ply")
+    parser.add_argument("--simulate", type=int, default=0, help="scenes of every preset")
+    parser.add_argument("--speed", action="store_true")
+    arguments = parser.parse_args()
+    if arguments.speed:
+        print_speed(arguments.config)
+    if arguments.scenes:
+        print_rows(measure(s, arguments.config, arguments.template) for s in arguments.scenes)
+    if arguments.simulate:
+        with tempfile.TemporaryDirectory() as folder:
+            print_rows(_simulated(Path(folder), arguments.simulate, arguments.config))
+
+
+def _simulated(folder: Path, count: int, config: Path | None) -> Iterable[Row]:
+    for preset in PRESETS:
+        for seed in range(900, 900 + count):
+            scene = folder / f"{preset}-{seed}"
+            simulate(scene, num_fish=5, num_frames=75, preset=preset, seed=seed)
+            yield measure(scene, config, "")
+
+
+if __name__ == "__main__":
+    main()
