@@ -35,7 +35,7 @@ class Rate(NamedTuple):
 
 
 def write_clip(out: Path, *, num_frames: int, num_fish: int = NUM_FISH, seed: int = 1) -> None:
-    """A simulated clip in which every frame shows so many fish, with exact masks and calibration."""
+    """A simulated clip with so many fish in every frame, with exact masks and calibration."""
     num_slots = 4 * num_frames
     slots = make_scene(num_fish=num_fish, num_frames=num_slots, preset="realistic", seed=seed)
     together = [replace(visit, first_frame=1, is_gaffed=False) for visit in slots.visits]
