@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-slow bench check format golden config clean
+.PHONY: demo test test-slow bench faults soak table1 check format golden config clean
 
 demo: $(STAMP)  ## the main job on the embedded scene, lengths beside the truth
 	$(BIN)/python -m stream_dmr.demo
@@ -19,6 +19,16 @@ bench: $(STAMP)  ## the fit beside other renderers, and the chain: docs/performa
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[bench]' \
 		|| echo "the extra bench could not be installed: what needs it is left out"
 	$(BIN)/python benchmarks/solvers.py
+
+table1: $(STAMP)  ## Table 1 of the paper on simulated fish: docs/accuracy.md; FISH=60 for a quick look
+	cd benchmarks && ../$(BIN)/python -m table1 $(if $(FISH),--fish $(FISH)) \
+		$(if $(ROWS),--rows $(ROWS)) $(if $(AGAIN),--again)
+
+faults: $(STAMP)  ## kills, power cuts, lost cameras, mutated inputs: docs/reliability.md, an hour or two
+	$(BIN)/python benchmarks/reliability/faults.py $(FAULTS)
+
+soak: $(STAMP)  ## an hour of a looped live stream; SOAK="--minutes 5" for less
+	$(BIN)/python benchmarks/reliability/soak.py $(SOAK)
 
 check: $(STAMP)  ## style and types
 	$(BIN)/ruff format --check .

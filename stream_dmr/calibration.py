@@ -118,16 +118,32 @@ def _read_values(path: Path) -> dict[str, float | np.ndarray]:
 def _value(node: cv2.FileNode, key: str, *, path: Path) -> float | np.ndarray:
     if node.isInt() or node.isReal():
         return node.real()
-    try:
-        matrix = node.mat()
-    except (cv2.error, SystemError):
-        matrix = None
+    matrix = _matrix(node)
     if matrix is None:
         raise CalibrationError(
             f"{path}: {key}: expected a number or an !!opencv-matrix whose data match its rows and "
             f"cols, got something else; {_REMEDY}"
         )
-    return np.asarray(matrix)
+    return matrix
+
+
+def _matrix(node: cv2.FileNode) -> Float[np.ndarray, "rows cols"] | None:
+    """An !!opencv-matrix; None where it is none.
+
+    Number by number: `FileNode.mat` writes beyond its memory where the data don't match the size.
+    """
+    if not node.isMap():
+        return None
+    rows, cols, data = (node.getNode(name) for name in ("rows", "cols", "data"))
+    if not (rows.isInt() and cols.isInt() and data.isSeq()):
+        return None
+    numbers = [data.at(index) for index in range(data.size())]
+    if not all(number.isInt() or number.isReal() for number in numbers):
+        return None
+    shape = int(rows.real()), int(cols.real())
+    if min(shape) < 1 or shape[0] * shape[1] != len(numbers):
+        return None
+    return np.array([number.real() for number in numbers]).reshape(shape)
 
 
 def _positive_int(values: dict[str, float | np.ndarray], key: str, *, path: Path) -> int:

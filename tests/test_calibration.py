@@ -132,6 +132,26 @@ def test_matrix_with_too_few_numbers_is_refused(tmp_path):
         load_calibration(path)
 
 
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("cols: 1", "c0ols: 1"),  # by which OpenCV's own reading wrote beyond its memory
+        ("rows: 3\n   cols: 1", "rows: -3\n   cols: -1"),
+        ("rows: 3\n   cols: 1", "rows: 300000000\n   cols: 1"),
+        ("cols: 1", "cols: [1]"),
+        ("data: [", 'data: ["one", '),
+        ("data: [", "daata: ["),
+    ],
+)
+def test_a_matrix_that_is_none_is_refused(tmp_path, before, after):
+    path = write(tmp_path / "c.yaml")
+    head, rvec = path.read_text().split("rvec:")
+    assert before in rvec
+    path.write_text(head + "rvec:" + rvec.replace(before, after, 1))
+    with pytest.raises(CalibrationError, match="rvec: expected a number or"):
+        load_calibration(path)
+
+
 def test_missing_file_and_folder_are_refused(tmp_path):
     with pytest.raises(CalibrationError, match="got none there"):
         load_calibration(tmp_path / "none.yaml")

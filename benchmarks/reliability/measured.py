@@ -1,0 +1,105 @@
+"""A measurement as a service runs it, from a camera on loopback, to be disturbed."""
+
+import json
+import os
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "tests"))
+
+from camera import Camera, free_port, require_server  # noqa: E402, F401
+
+CONFIG = """
+[read_frames]
+silence_s = 20.0
+[recording]
+rrd = false
+[watch]
+port = {port}
+"""
+
+
+class Measurement:
+    """`stream-dmr run` on a scene that a camera plays again and again."""
+
+    def __init__(self, folder: Path, scene: Path, *, fps: int) -> None:
+        self.out, self.scene, self.folder = folder / "out", scene, folder
+        self.port = free_port()
+        pictures = folder / "pictures"
+        if not pictures.exists():
+            pictures.mkdir(parents=True)
+            write_pictures(scene / "video.mp4", pictures)
+        (folder / "config.toml").write_text(CONFIG.format(port=self.port))
+        self.camera = Camera("--jpegs", str(pictures), "--fps", str(fps))
+        self.process: subprocess.Popen[str] | None = None
+        self.log: list[dict] = []
+
+    def start(self) -> None:
+        """Start it; `log` is written from now on."""
+        template = self.scene / "species.ply"
+        template = template if template.exists() else self.scene.parent / "species.ply"
+        command = [sys.executable, "-m", "stream_dmr.cli", "run", "--log-json"]
+        command += ["--source", self.camera.address, "--out", str(self.out)]
+        command += ["--calibration", str(self.scene / "calibration.yaml")]
+        command += ["--template", str(template), "--config", str(self.folder / "config.toml")]
+        environment = os.environ | {"OMP_NUM_THREADS": "1"}
+        log = (self.folder / "log.jsonl").open("a")
+        self.process = subprocess.Popen(
+            command, stderr=log, stdout=subprocess.DEVNULL, env=environment, text=True, cwd=ROOT
+        )
+        log.close()
+
+    def wait_for(self, event: str, *, more_than: int = 0, patience_s: float = 120.0) -> None:
+        """Wait until the log has more than so many lines of an event."""
+        until = time.monotonic() + patience_s
+        while len(self.events(event)) <= more_than:
+            if self.process is not None and self.process.poll() is not None:
+                raise RuntimeError(f"the run ended with {self.process.returncode}")
+            if time.monotonic() > until:
+                raise TimeoutError(f"no {event} within {patience_s} s")
+            time.sleep(0.05)
+
+    def events(self, event: str) -> list[dict]:
+        """The lines of an event, whole ones, of all runs."""
+        try:
+            lines = (self.folder / "log.jsonl").read_text().split("\n")[:-1]
+        except FileNotFoundError:
+            return []
+        said = [json.loads(line) for line in lines if line.startswith("{")]
+        return [line for line in said if line["event"] == event]
+
+    def fish(self) -> list[int]:
+        """The ids in the database, in the order in which they came."""
+        database = sqlite3.connect(f"file:{self.out / 'lengths.db'}?mode=ro", uri=True)
+        try:
+            return [i for (i,) in database.execute("SELECT track_id FROM fish ORDER BY number")]
+        finally:
+            database.close()
+
+
+def write_pictures(video: Path, folder: Path) -> None:
+    """The frames of a video as JPEGs, for the camera to play."""
+    capture, number = cv2.VideoCapture(str(video)), 0
+    while (read := capture.read())[0]:
+        cv2.imwrite(str(folder / f"{number:05d}.jpg"), read[1], [cv2.IMWRITE_JPEG_QUALITY, 90])
+        number += 1
+
+
+def resources(pid: int) -> dict[str, float]:
+    """Resident memory in MB, descriptors, threads and children of a process."""
+    status = dict(
+        line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines()
+    )
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return {
+        "rss_mb": int(status["VmRSS"].split()[0]) / 1024,
+        "descriptors": len(os.listdir(f"/proc/{pid}/fd")),
+        "threads": int(status["Threads"]),
+        "children": len(children),
+    }
