@@ -65,7 +65,7 @@ def climb(i: int, *, x: float = 300.0, speed: float = 12.0) -> Spot:
 
 
 def test_a_fish_keeps_its_id_through_a_short_gap_and_gets_a_new_one_after_a_long_one():
-    gaps = {"short": 6, "long": 7}
+    gaps = {"short": 4, "long": 5}
     for name, gap in gaps.items():
         frames = [[climb(i, speed=6)] for i in range(8)] + [[]] * gap
         frames += [[climb(i, speed=6)] for i in range(8 + gap, 20 + gap)]

@@ -42,7 +42,7 @@ class TrackerSettings(Settings):
     """The part of `[track_fish]` that says how fish are followed from frame to frame."""
 
     max_lost_frames: int = Field(
-        default=6, ge=0, description="a fish unseen for more frames in a row is gone"
+        default=4, ge=0, description="a fish unseen for more frames in a row is gone"
     )
     min_score: float = Field(
         default=0.3, ge=0, le=1, description="least score of a detector's candidate that counts"
