@@ -15,6 +15,7 @@ from stream_dmr.geometry import arc_lengths
 BUNDLED = Path(__file__).parent / "templates"
 NUM_MIDLINE_POINTS = 33
 # A keypoint or joint may stick out of the mesh by this much, in body lengths.
+_LARGEST = 1e12  # coordinate, in any unit; their squares must stay finite
 _MAX_OUTSIDE = 0.02
 
 
@@ -100,8 +101,15 @@ def _load_mesh(path: Path) -> trimesh.Trimesh:
             f"template {path}: expected one mesh with faces, got an empty one; export the surface"
         )
     # Before merging, which would drop such vertices without a word.
-    if not np.isfinite(mesh.vertices).all():
-        raise TemplateError(f"template {path}: expected finite vertices, got NaN or infinity")
+    if not (np.abs(mesh.vertices) < _LARGEST).all():
+        raise TemplateError(
+            f"template {path}: expected finite vertices, got NaN, infinity or above {_LARGEST:g}"
+        )
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise TemplateError(
+            f"template {path}: expected faces of its {len(mesh.vertices)} vertices, got others; "
+            "the file is damaged"
+        )
     # Some formats repeat a vertex for each face, or along the seams of a texture.
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     if not (mesh.is_watertight and mesh.is_winding_consistent):
@@ -144,7 +152,7 @@ def _points(values: Any, path: Path, name: str) -> Float[np.ndarray, "N 3"]:
         points = np.empty((0, 0))
     if points.ndim != 2 or points.shape[1] != 3:
         raise TemplateError(f"template {path}: expected {name} as [x, y, z], got {values}")
-    if not np.isfinite(points).all():
+    if not (np.abs(points) < _LARGEST).all():
         raise TemplateError(f"template {path}: expected finite {name}, got {values}")
     return points
 

@@ -201,6 +201,14 @@ class TestRefusals:
     def test_mesh(self, tmp_path, mesh, match):
         self.assert_refused(write_fish(tmp_path, mesh=mesh()), match)
 
+    def test_faces_of_vertices_that_are_not_there(self, tmp_path):
+        path = write_fish(tmp_path)
+        damaged = path.with_suffix(".ply")
+        text = fish_mesh().export(file_type="ply", encoding="ascii").decode()
+        first, _, last = text.rstrip().rpartition(" ")
+        damaged.write_text(f"{first} {int(last) + 500_000}\n")
+        self.assert_refused(damaged, "expected faces of its .* vertices, got others")
+
     @pytest.mark.parametrize(
         ("points", "match"),
         [
