@@ -38,7 +38,7 @@ FLOORS = [
     ["stream_dmr.run"],
     ["stream_dmr.replay.replay"],
     ["stream_dmr.display"],
-    ["stream_dmr.cli_replay", "stream_dmr.cli_evaluate"],
+    ["stream_dmr.cli_replay", "stream_dmr.cli_evaluate", "stream_dmr.cli_train"],
     ["stream_dmr.cli"],
     ["stream_dmr.demo"],
 ]
@@ -63,7 +63,7 @@ WHO_KNOWS = {
     "nodes": [*ASSEMBLY, "nodes"],
     "typer": [
         *("stream_dmr.cli", "stream_dmr.cli_calibrate", "stream_dmr.cli_export"),
-        *("stream_dmr.cli_evaluate", "stream_dmr.cli_train"),
+        *("stream_dmr.cli_evaluate", "stream_dmr.cli_support", "stream_dmr.cli_train"),
         *("stream_dmr.cli_replay", "stream_dmr.cli_view", "stream_dmr.demo"),
     ],
 }
