@@ -168,9 +168,7 @@ def _still(
     return np.asarray(is_still)[np.asarray(labels)]
 
 
-def _shrink(
-    image: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]
-) -> UInt8[np.ndarray, "h w 3"]:
+def _shrink(image: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
     """Area means; halves first, which is five times as fast as one step by an odd factor."""
     while image.shape[1] >= 2 * size[0] and image.shape[0] >= 2 * size[1]:
         half = (image.shape[1] // 2, image.shape[0] // 2)
