@@ -165,7 +165,7 @@ def _still(
     in_shape = np.bincount(labels[changed], minlength=count)
     is_still = in_shape < _STILL * stats[:, cv2.CC_STAT_AREA]
     is_still[0] = False
-    return np.asarray(is_still)[np.asarray(labels)]
+    return np.asarray(is_still)[np.asarray(labels, np.intp)]
 
 
 def _shrink(image: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
