@@ -128,6 +128,7 @@ def _motion_kernel(motion_px: Float[np.ndarray, "2"]) -> Float32[np.ndarray, "K 
 def vertex_normals(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "V 3"]:
+    """Unit vectors, from the faces around each vertex; larger faces weigh more."""
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     of_faces = np.cross(b - a, c - a)  # as long as twice the face's area: larger faces weigh more
     normals = np.zeros_like(vertices)
