@@ -333,11 +333,18 @@ def test_a_mask_found_in_the_crop_is_the_one_given_in_the_frame(camera, x, y, w,
     given_mask = crop_of(mask, camera, box=box)
     found, in_crop = segmented(mask.astype(np.uint8) * 255, box, camera)
     assert (found.mask != given_mask.mask).mean() < 0.002
-    assert found.quality.mask_area_px == pytest.approx(mask.sum(), rel=0.03)
+    # Pixels count whole: the outline is right to half a crop pixel.
+    outline_px = 2 * (w + h) * np.sqrt(found.quality.mask_area_px / found.mask.sum())
+    assert found.quality.mask_area_px == pytest.approx(mask.sum(), abs=0.6 * outline_px)
     assert found.quality.touches_border == given_mask.quality.touches_border
     rows, columns = np.nonzero(found.mask)
     extent = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
-    np.testing.assert_allclose(in_crop, extent, atol=4.0)
+    if not camera.distortion.any():
+        np.testing.assert_allclose(in_crop, extent, atol=1.5)
+    # Through a lens the box's edges are arcs; their middles lie inside the corners.
+    assert np.all(
+        (in_crop[:2] > np.array(extent[:2]) - 1.5) & (in_crop[2:] < np.array(extent[2:]) + 1.5)
+    )
 
 
 def test_a_doubtful_mask_is_trusted_less():

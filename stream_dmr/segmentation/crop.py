@@ -36,7 +36,7 @@ class CropFishSettings(Settings):
         default=64, ge=1, description="a smaller mask counts as none, in frame px"
     )
     segmenter: str = Field(
-        default="grabcut",
+        default="unet",
         min_length=1,
         description='what finds the mask in a box: "unet", "grabcut", weights of `stream-dmr train`'
         " (.pt), or a promptable model (.onnx)",
