@@ -73,7 +73,7 @@ def test_heads_and_tails_lie_at_the_ends_of_their_fish(bank):
     for seed in range(80):
         sample = draw_sample(np.random.default_rng((2, seed)), bank)
         if sample.ends_px is None:
-            assert sample.in_box.min() == 1
+            assert sample.in_box.min() == 1 or not sample.mask.any()  # no box, or no fish in it
             continue
         rows, columns = np.nonzero(sample.mask > 0.5)
         fish = np.column_stack([columns, rows])

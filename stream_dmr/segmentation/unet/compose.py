@@ -20,6 +20,7 @@ from stream_dmr.segmentation.unet.weather import motion_kernel, photograph, weat
 
 _LOOK_PX, _LOOK_UNITS = 96, 2.0  # the coarse look at the whole scene, in which the box is found
 _NO_BOX_SHARE = 0.12  # of the pictures, where every fish is wanted wherever it is
+_NO_FISH_SHARE = 0.07  # of the pictures, where the box is around no fish: a detector's mistake
 _LEAST_VISIBLE = 0.2  # of the fish; with less to be seen the scene is drawn anew
 
 
@@ -43,29 +44,38 @@ class _Scene:
     occluders: list[Occluder]
     frame: Float[np.ndarray, "4"]  # x0, y0, x1, y1: the picture ends there
 
+    @property
+    def fish(self) -> list[_Fish]:
+        """All of them, from the farthest to the nearest."""
+        return [*self.behind, self.wanted, *self.before]
+
 
 def draw_sample(rng: np.random.Generator, bank: Bank) -> Sample:
     """One crop with its truth."""
-    is_boxed = rng.random() >= _NO_BOX_SHARE
+    kind = rng.random()
+    is_boxed, is_empty = kind >= _NO_BOX_SHARE, kind >= 1 - _NO_FISH_SHARE
     while True:
         scene = _draw_scene(rng, bank)
-        if (box := _visible_box(bank, scene)) is not None:
+        box = _empty_box(rng, bank, scene) if is_empty else _visible_box(bank, scene)
+        if box is not None:
             break
     box = jitter(rng, box, limits=scene.frame)
+    asked = [] if is_empty else [scene.wanted]
     if is_boxed:
         crop_from_scene = crop_around(box, margin=rng.uniform(0.08, 0.22), size=SIZE_PX)
     else:
         center, side = rng.normal(0.0, 0.35, 2), rng.uniform(0.9, 3.2)
         anywhere = np.concatenate([center - side / 2, center + side / 2])
         crop_from_scene = crop_around(anywhere, margin=0.0, size=SIZE_PX)
-    picture, mask = _render(rng, bank, scene, crop_from_scene, every_fish=not is_boxed)
+        asked = scene.fish
+    picture, mask = _render(rng, bank, scene, crop_from_scene, asked=asked)
     low, high = box.reshape(2, 2) @ crop_from_scene[:, :2].T + crop_from_scene[:, 2]
     in_box = box_picture(np.concatenate([low, high]) + 0.5, size=SIZE_PX)
     return Sample(
         image=picture,
         mask=mask,
         in_box=in_box if is_boxed else np.ones_like(in_box),
-        ends_px=_ends(bank, scene.wanted, crop_from_scene) if is_boxed else None,
+        ends_px=_ends(bank, scene.wanted, crop_from_scene) if is_boxed and asked else None,
     )
 
 
@@ -146,23 +156,46 @@ def _visible_box(bank: Bank, scene: _Scene) -> Float[np.ndarray, "4"] | None:
     return (edges - np.tile(look_from_scene[:, 2], 2)) / look_from_scene[0, 0]
 
 
+def _empty_box(
+    rng: np.random.Generator, bank: Bank, scene: _Scene
+) -> Float[np.ndarray, "4"] | None:
+    """A box beside every fish, mostly around a piece of a pole or of lines; None: none found."""
+    half = rng.uniform(0.1, 0.45, 2)
+    middle = rng.uniform(-1.0 + half, 1.0 - half)
+    window = np.concatenate([middle - half, middle + half])
+    look_from_scene = crop_around(np.array([-1.0, -1.0, 1.0, 1.0]), margin=0.0, size=_LOOK_PX)
+    part = _inside(window, look_from_scene, size=_LOOK_PX)
+    part = part * _inside(scene.frame, look_from_scene, size=_LOOK_PX)
+    layers = (_warp(bank, fish, look_from_scene, size=_LOOK_PX)[..., 3] for fish in scene.fish)
+    if part.sum() < 40 or any((part * layer).sum() > 0.01 * part.sum() for layer in layers):
+        return None
+    if rng.random() < 0.8:
+        things = (draw_into(one, look_from_scene, size=_LOOK_PX)[0] for one in scene.occluders)
+        part = part * np.maximum.reduce([*things, np.zeros_like(part)])
+    x, y, width, height = cv2.boundingRect((part > 0.2).astype(np.uint8))
+    if max(width, height) < 8:
+        return None
+    edges = np.array([x, y, x + max(width, 2), y + max(height, 2)]) - 0.5
+    return (edges - np.tile(look_from_scene[:, 2], 2)) / look_from_scene[0, 0]
+
+
 def _render(
     rng: np.random.Generator,
     bank: Bank,
     scene: _Scene,
     crop_from_scene: Float[np.ndarray, "2 3"],
     *,
-    every_fish: bool,
+    asked: list[_Fish],
 ) -> tuple[UInt8[np.ndarray, "S S 3"], Float32[np.ndarray, "S S"]]:
-    """Picture and mask: of the wanted fish, or of every fish."""
+    """Picture, and the mask of those fish that are asked for."""
     picture = _draw_backdrop(rng, bank)
     mask = np.zeros((SIZE_PX, SIZE_PX), np.float32)
     smear = motion_kernel(rng, rng.uniform(1.0, 5.0)) if rng.random() < 0.2 else None
     softness = rng.uniform(0.3, 1.2) if rng.random() < 0.5 else 0.0
-    for fish in (*scene.behind, scene.wanted, *scene.before):
+    for fish in scene.fish:
         layer = _warp(bank, fish, crop_from_scene, size=SIZE_PX)
         mask *= 1 - layer[..., 3]
-        if every_fish or fish is scene.wanted:
+        if fish in asked:
             mask += layer[..., 3]
         layer = cv2.GaussianBlur(layer, (0, 0), softness) if softness else layer
         layer = layer if smear is None else cv2.filter2D(layer, -1, smear)

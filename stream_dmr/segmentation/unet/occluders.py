@@ -26,7 +26,7 @@ class Occluder:
 
 def draw_occluders(rng: np.random.Generator) -> list[Occluder]:
     """None for most fish, else one or two."""
-    chances = {_draw_pole: 0.18, _draw_glove: 0.10, _draw_rope: 0.06, _draw_edge: 0.05}
+    chances = {_draw_pole: 0.26, _draw_glove: 0.10, _draw_rope: 0.06, _draw_edge: 0.05}
     return [draw(rng) for draw, chance in chances.items() if rng.random() < chance]
 
 
@@ -106,9 +106,11 @@ def _lit_bar(
     end: Float[np.ndarray, "2"],
     width: float,
 ) -> tuple[list[Float[np.ndarray, "_ 2"]], list[float]]:
-    """A round bar: darker at its sides, with a line of light."""
+    """A round bar: darker at its sides, with a line of light; one in four is flat."""
     shares = [1.0, rng.uniform(0.45, 0.8), rng.uniform(0.1, 0.3)]
     tones = np.cumprod([rng.uniform(0.5, 1.0), rng.uniform(1.1, 1.9), rng.uniform(1.0, 1.5)])
+    if rng.random() < 0.25:
+        tones[:] = 1.0
     return [_bar(start, end, share * width, share * width) for share in shares], tones.tolist()
 
 
