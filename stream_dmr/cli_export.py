@@ -25,12 +25,25 @@ def export(
     tables: Annotated[
         Tables | None, typer.Option(help="lengths, and frames with the keypoints.")
     ] = None,
+    fish: Annotated[
+        Tables | None,
+        typer.Option(help="What a fishery asks: total and fork length, cm, weight, legal size."),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="Its [fisheries] instead of the run's, for --fish.")
+    ] = None,
     time: TimeOption = None,
     track: TrackOption = None,
 ) -> None:
-    """Write meshes, masks, keypoints and lengths of a recording for other programs."""
-    if not (meshes or masks or tables):
-        raise typer.BadParameter("say what to export: --meshes ply, --masks, --tables csv")
+    """Write meshes, masks, keypoints and lengths of a recording for other programs.
+
+    provenance.json beside them says what made them; `stream-dmr verify` checks it.
+    """
+    if not (meshes or masks or tables or fish):
+        raise typer.BadParameter(
+            "say what to export: --fish csv, --meshes ply, --masks, --tables csv"
+        )
+    from stream_dmr.config import load_config, parse_config
     from stream_dmr.export import Export
 
     exported = Export(recording, parse_part(time, track))
@@ -41,4 +54,12 @@ def export(
     if tables:
         for path in exported.tables(out, format=tables):
             print(path)
+    if fish:
+        settings = (
+            parse_config(exported.config_toml, where=f"{recording}: its config.toml")
+            if config is None
+            else load_config(config)
+        )
+        print(exported.fish(out, settings.fisheries, format=fish))
+    print(exported.provenance(out))
     warn(exported.warnings)

@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 
 from stream_dmr.drift import DriftSettings
 from stream_dmr.errors import ConfigError
+from stream_dmr.fisheries import FisheriesSettings
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.length_filter import SmoothLengthSettings
 from stream_dmr.localization import LocalizeSettings
@@ -75,6 +76,9 @@ class Config(Settings):
     )
     watch: WatchSettings = Field(
         default_factory=WatchSettings, description="who may watch a run, and how"
+    )
+    fisheries: FisheriesSettings = Field(
+        default_factory=FisheriesSettings, description="what the exports make of a length"
     )
     evaluate: EvaluateSettings = Field(
         default_factory=EvaluateSettings, description="how `stream-dmr evaluate` compares lengths"

@@ -11,7 +11,10 @@ import trimesh
 from jaxtyping import Bool
 
 from stream_dmr.camera import crop_from_frame, frame_from_crop
+from stream_dmr.fish_table import fish_record, write_csv, write_parquet
+from stream_dmr.fisheries import FisheriesSettings
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
+from stream_dmr.provenance import write_provenance
 from stream_dmr.recording.codec import reference
 from stream_dmr.recording.meshes import Meshes
 from stream_dmr.recording.opened import messages, open_recordings
@@ -21,7 +24,9 @@ from stream_dmr.recording.record import make_record
 from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.recording.view_geometry import place
 from stream_dmr.recording.whole_file import make_folder, writing_to
+from stream_dmr.results import database_of, read_fish, read_runs
 from stream_dmr.tables import Tables
+from stream_dmr.tally import run_facts
 
 MeshFormat = Literal["ply", "glb"]
 TableFormat = Literal["csv", "parquet"]
@@ -31,8 +36,15 @@ class Export:
     """A recording, or a part of it, for other programs. Raises RecordingError and OutputError."""
 
     def __init__(self, recording: Path, part: Part = WHOLE) -> None:
+        self._path = recording
         self._recording = open_recordings([recording])
         self._part = part
+        self._written: list[Path] = []
+
+    @property
+    def config_toml(self) -> str:
+        """The settings of the run."""
+        return self._recording.header.config_toml
 
     @property
     def warnings(self) -> Sequence[str]:
@@ -54,8 +66,10 @@ class Export:
                 continue
             folder = make_folder(out / f"fish-{fit.track_id}")
             mesh = trimesh.Trimesh(vertices, template.faces, process=False)
+            target = folder / f"{fit.frame_index:06d}.{format}"
             with writing_to(folder):
-                mesh.export(folder / f"{fit.frame_index:06d}.{format}")
+                mesh.export(target)
+            self._written.append(target)
             count += 1
         return count
 
@@ -76,6 +90,7 @@ class Export:
         make_folder(path.parent)
         with writing_to(path):
             path.write_text(json.dumps(coco))
+        self._written.append(path)
         return len(annotations)
 
     def tables(self, out: Path, *, format: TableFormat) -> list[Path]:
@@ -85,7 +100,27 @@ class Export:
             tables.write(make_record(message, RecordingSettings()))
         tables.close()
         paths = [out / "lengths.csv", out / "frames.csv"]
-        return paths if format == "csv" else [_as_parquet(path) for path in paths]
+        paths = paths if format == "csv" else [_as_parquet(path) for path in paths]
+        self._written += paths
+        return paths
+
+    def fish(self, out: Path, settings: FisheriesSettings, *, format: TableFormat) -> Path:
+        """Write fish.csv (or .parquet): what a fishery asks, what reviewers said, what made it."""
+        template = self._recording.header.template
+        records = [
+            fish_record(fish, template, settings)
+            for fish in read_fish(self._path, self._recording, self._part)
+        ]
+        write = write_csv if format == "csv" else write_parquet
+        path = write(make_folder(out) / "fish", records)
+        self._written.append(path)
+        return path
+
+    def provenance(self, out: Path) -> Path:
+        """Write beside all that was written into `out` what made it, and its checksums."""
+        database = database_of(self._path)
+        runs = {"": run_facts(self._recording.header)} if database is None else read_runs(database)
+        return write_provenance(out, self._written, runs=runs, origin=str(self._path))
 
     def _messages(self, *kinds: type[Message]) -> Iterator[Message]:
         for message, _ in messages(self._recording, kinds, self._part):

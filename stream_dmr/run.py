@@ -21,6 +21,8 @@ from stream_dmr.endless import DriftWatch, Tolerance, go_on
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.pipeline import Node, StageCounters, run_chain
+from stream_dmr.provenance import NAME as PROVENANCE
+from stream_dmr.provenance import sealed
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.segmentation.fish_finder import open_finder
@@ -31,7 +33,10 @@ from stream_dmr.template import Template, load_template
 from stream_dmr.video import LiveStream
 from stream_dmr.watch.watch import Watch
 
-RESULTS = ("lengths.db", "lengths.csv", "frames.csv", "recording.mcap", "recording.rrd")
+RESULTS = (
+    *("lengths.db", "lengths.csv", "frames.csv", "recording.mcap", "recording.rrd"),
+    PROVENANCE,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +54,9 @@ class RunRequest:
     resume: bool = False  # go on after them; a live source always does
     live: bool = False  # serve the view while measuring
     command: str = ""  # as typed, for the recording
+    vessel: str = ""  # where the fish come from, for the exports
+    trip: str = ""
+    haul: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,8 +99,12 @@ def run(
         resume = (request.resume or reader.source.is_endless) and not request.overwrite
         prepare_folder(request.out, overwrite=request.overwrite, resume=resume)
         header = _header(request, reader.source.name, config, template, calibration)
+        facts = run_facts(header, vessel=request.vessel, trip=request.trip, haul=request.haul)
         with (
-            closing(LengthStore(request.out, run_facts(header))) as store,
+            sealed(
+                request.out, with_recordings=not reader.source.is_endless, on_notice=observer.warn
+            ),
+            closing(LengthStore(request.out, facts)) as store,
             _consistent_csv(request.out / "lengths.csv", store, resume=resume),
             closing(
                 Watch(

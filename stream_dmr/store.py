@@ -41,6 +41,9 @@ class RunFacts:
     config_sha256: str
     calibration_sha256: str
     template_sha256: str
+    vessel: str = ""
+    trip: str = ""
+    haul: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

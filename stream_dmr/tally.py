@@ -120,7 +120,7 @@ class Tally:
         self._observer.frame_done()
 
 
-def run_facts(header: RunHeader) -> RunFacts:
+def run_facts(header: RunHeader, *, vessel: str = "", trip: str = "", haul: str = "") -> RunFacts:
     """What the store says of a run; each hash is of the bytes that the recording holds."""
     parts = header.attachments()
     hashes = {name: sha256(data).hexdigest() for name, data in parts.items()}
@@ -132,3 +132,6 @@ def run_facts(header: RunHeader) -> RunFacts:
         calibration_sha256=hashes.get("calibration.yaml", ""),
         template_sha256=hashes["template.pb"],
     )
+        vessel=vessel,
+        trip=trip,
+        haul=haul,

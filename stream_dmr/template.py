@@ -1,7 +1,7 @@
 """The species' template: a closed mesh with joints, keypoints and a midline, in canonical form."""
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from stream_dmr.geometry import arc_lengths
 
 BUNDLED = Path(__file__).parent / "templates"
 NUM_MIDLINE_POINTS = 33
+TAILS = ("fork", "total")
 # A keypoint or joint may stick out of the mesh by this much, in body lengths.
 _LARGEST = 1e12  # coordinate, in any unit; their squares must stay finite
 _MAX_OUTSIDE = 0.02
@@ -33,14 +34,17 @@ class Template:
     keypoints: Float[np.ndarray, "3 3"]  # head, center, tail
     joints: Float[np.ndarray, "J 3"]  # from head to tail, J >= 2
     midline: Float[np.ndarray, "M 3"]  # through head, joints and tail, evenly spaced
+    tail_gives: str | None = None  # which length the tail keypoint ends: one of TAILS; None: unsaid
+    total_per_fork: float | None = None  # total length over fork length
 
 
 def load_template(path: str | Path) -> Template:
     """Read a template: a bundled one by name, or any mesh that trimesh reads with a TOML beside it.
 
     The TOML has the mesh's name and holds `joints` (two or more points, in any order) and
-    `[keypoints] head, center, tail`, all in the mesh's own coordinates. Raises TemplateError
-    where the mesh or the TOML breaks that contract.
+    `[keypoints] head, center, tail`, all in the mesh's own coordinates; it may say in `[length]`
+    which length the tail keypoint ends, `tail = "fork"` or `"total"`, and `total_per_fork`. Raises
+    TemplateError where the mesh or the TOML breaks that contract.
     """
     mesh_path = BUNDLED / f"{path}.ply" if str(path) in bundled_names() else Path(path)
     if not mesh_path.is_file():
@@ -48,9 +52,11 @@ def load_template(path: str | Path) -> Template:
             f"template {path}: expected a mesh file or one of {', '.join(bundled_names())}; "
             "found neither; check the path"
         )
-    return make_template(
-        _load_mesh(mesh_path), _load_points(mesh_path.with_suffix(".toml")), name=mesh_path.stem
-    )
+    toml = mesh_path.with_suffix(".toml")
+    mesh, table = _load_mesh(mesh_path), _load_table(toml)
+    template = make_template(mesh, _points_of(table, toml), name=mesh_path.stem)
+    tail_gives, total_per_fork = _length_of(table, toml)
+    return replace(template, tail_gives=tail_gives, total_per_fork=total_per_fork)
 
 
 def bundled_names() -> list[str]:
@@ -122,15 +128,34 @@ def _load_mesh(path: Path) -> trimesh.Trimesh:
     return mesh
 
 
-def _load_points(path: Path) -> dict[str, Float[np.ndarray, "N 3"]]:
+def _load_table(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise TemplateError(
             f"template: expected {path} beside the mesh, with joints and [keypoints]; it is missing"
         )
     try:
-        table = tomllib.loads(path.read_text())
+        return tomllib.loads(path.read_text())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise TemplateError(f"template {path}: expected TOML, got: {error}") from error
+
+
+def _length_of(table: dict[str, Any], path: Path) -> tuple[str | None, float | None]:
+    length = table.get("length", {})
+    if not isinstance(length, dict):
+        raise TemplateError(f"template {path}: expected a table [length], got {length}")
+    tail, factor = length.get("tail"), length.get("total_per_fork")
+    if tail is not None and tail not in TAILS:
+        raise TemplateError(f'template {path}: expected tail = "fork" or "total", got {tail!r}')
+    if factor is None:
+        return tail, None
+    if isinstance(factor, bool) or not isinstance(factor, int | float) or not 1 <= factor < 2:
+        raise TemplateError(
+            f"template {path}: expected total_per_fork from 1 to below 2, got {factor!r}"
+        )
+    return tail, float(factor)
+
+
+def _points_of(table: dict[str, Any], path: Path) -> dict[str, Float[np.ndarray, "N 3"]]:
     keypoints = table.get("keypoints")
     keypoints = keypoints if isinstance(keypoints, dict) else {}
     missing = [key for key in ("head", "center", "tail") if key not in keypoints]

@@ -38,7 +38,10 @@ FLOORS = [
     ["stream_dmr.run"],
     ["stream_dmr.replay.replay"],
     ["stream_dmr.display"],
-    ["stream_dmr.cli_replay", "stream_dmr.cli_evaluate", "stream_dmr.cli_train"],
+    [
+        f"stream_dmr.cli_{name}"
+        for name in ("replay", "evaluate", "train", "export", "report", "batch")
+    ],
     ["stream_dmr.cli"],
     ["stream_dmr.demo"],
 ]
@@ -57,7 +60,10 @@ WHO_KNOWS = {
         ),
     ],
     "prometheus_client": ["stream_dmr.watch"],
-    "sqlite3": ["stream_dmr.store", "stream_dmr.store_schema"],
+    "sqlite3": [
+        *("stream_dmr.store", "stream_dmr.store_schema"),
+        *("stream_dmr.results", "stream_dmr.verdicts"),
+    ],
     "filterpy": ["stream_dmr.length_filter", "stream_dmr.segmentation"],
     "onnxruntime": ["stream_dmr.segmentation"],
     "nodes": [*ASSEMBLY, "nodes"],
@@ -65,6 +71,8 @@ WHO_KNOWS = {
         *("stream_dmr.cli", "stream_dmr.cli_calibrate", "stream_dmr.cli_export"),
         *("stream_dmr.cli_evaluate", "stream_dmr.cli_support", "stream_dmr.cli_train"),
         *("stream_dmr.cli_replay", "stream_dmr.cli_view", "stream_dmr.demo"),
+        "stream_dmr.cli_recover",
+        *("stream_dmr.cli_report", "stream_dmr.cli_batch"),
     ],
 }
 

@@ -170,6 +170,8 @@ def _toml(species: Species) -> str:
         f"joints = [{', '.join(map(point, species.joints))}]\n"
         "[keypoints]\n"
         f"head = {point(0.0)}\ncenter = {point(species.center)}\ntail = {point(1.0)}\n"
+        "[length]  # of this template: the tail keypoint is the middle of the fin\n"
+        f'tail = "fork"\ntotal_per_fork = {1 + species.lobe:g}\n'
     )
 
 

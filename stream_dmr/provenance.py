@@ -1,0 +1,105 @@
+"""provenance.json: what made the files of a folder, and their SHA-256."""
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from hashlib import file_digest, sha256
+from pathlib import Path
+from typing import Any
+
+from stream_dmr import __version__
+from stream_dmr.errors import OutputError
+from stream_dmr.recording.whole_file import rename_durably, writing_to
+from stream_dmr.results import database_of, fish_by_run, read_runs
+from stream_dmr.store import NAME as DATABASE
+from stream_dmr.store import RunFacts
+
+NAME = "provenance.json"
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, in hex."""
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()
+
+
+@contextmanager
+def sealed(
+    folder: Path, *, with_recordings: bool, on_notice: Callable[[str], None]
+) -> Iterator[None]:
+    """Write the provenance of a run's results when it ends, however it does.
+
+    Recordings of months are left out: a run that is told to stop has no time to read them. What a
+    full disk refuses is a notice: the lengths are there.
+    """
+    try:
+        yield
+    finally:
+        if database_of(folder) is not None:
+            try:
+                seal_run(folder, with_recordings=with_recordings)
+            except OutputError as error:
+                on_notice(str(error))
+
+
+def seal_run(folder: Path, *, with_recordings: bool) -> None:
+    """Write the provenance of a run's own results. OutputError.
+
+    Reviewers go on writing to the database, so of it the fish of each run are summed up.
+    """
+    database = folder / DATABASE
+    kinds = ("*.csv", "*.mcap", "*.rrd") if with_recordings else ("*.csv",)
+    files = [path for kind in kinds for path in folder.glob(kind)]
+    write_provenance(
+        folder,
+        files,
+        runs=read_runs(database),
+        fish={run_id: fish_sha256(lines) for run_id, lines in fish_by_run(database).items()},
+    )
+
+
+def fish_sha256(lines: Iterable[str]) -> str:
+    """Of all that is stored of the fish of one run."""
+    return sha256("\n".join(lines).encode()).hexdigest()
+
+
+def write_provenance(
+    folder: Path,
+    files: Iterable[Path],
+    *,
+    runs: dict[str, RunFacts],
+    fish: dict[str, str] | None = None,
+    origin: str = "",
+) -> Path:
+    """Say of `files` in `folder` what they are and what made them. Raises OutputError.
+
+    `origin` is the folder or recording that they were exported from.
+    """
+    made = {
+        "software_version": __version__,
+        "origin": origin,
+        "runs": {run_id: asdict(facts) for run_id, facts in runs.items()},
+        "fish_sha256": fish or {},
+        "files": {
+            path.relative_to(folder).as_posix(): sha256_of(path) for path in sorted(set(files))
+        },
+    }
+    target, draft = folder / NAME, folder / f"{NAME}.part"
+    with writing_to(target):
+        draft.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
+        rename_durably(draft, target)
+    return target
+
+
+def read_provenance(folder: Path) -> dict[str, Any] | None:
+    """What `write_provenance` wrote; None where nothing was. ValueError where it is damaged."""
+    path = folder / NAME
+    if not path.is_file():
+        return None
+    made = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(made, dict) or not all(
+        isinstance(made.get(key), dict) for key in ("runs", "fish_sha256", "files")
+    ):
+        raise ValueError("it is not as stream-dmr writes it")
+    return made
