@@ -131,7 +131,7 @@ def run_facts(header: RunHeader, *, vessel: str = "", trip: str = "", haul: str 
         config_sha256=hashes["config.toml"],
         calibration_sha256=hashes.get("calibration.yaml", ""),
         template_sha256=hashes["template.pb"],
-    )
         vessel=vessel,
         trip=trip,
         haul=haul,
+    )
