@@ -116,10 +116,10 @@ def run_command(
         bool,
         typer.Option("--resume", help="Go on after an earlier run in --out; a live source does."),
     ] = False,
-    live: Annotated[
     vessel: Annotated[str, typer.Option(help="Where the fish come from, for the exports.")] = "",
     trip: Annotated[str, typer.Option(help="Of this vessel, for the exports.")] = "",
     haul: Annotated[str, typer.Option(help="Of this trip, for the exports.")] = "",
+    live: Annotated[
         bool, typer.Option("--live", help="Serve the view on this machine while measuring.")
     ] = False,
     log_json: Annotated[
@@ -151,10 +151,10 @@ def run_command(
             resume=resume,
             live=live,
             command=command_line(),
-        )
             vessel=vessel,
             trip=trip,
             haul=haul,
+        )
         with nullcontext(Journal()) if log_json else RunDisplay() as observer:
             summary = run(request, stop=stop, observer=observer)
         print_fish(summary.fish)
