@@ -136,13 +136,13 @@ def spine(rig: Rig, parameters: Parameters) -> Float[Tensor, "B N 3"]:
     """The length-keeping variant: rotations are blended as rotations, and the body is swept.
 
     At each place s of the midline the joints give one rotation R(s) = exp(sum_j W_j(s) log R_j)
-    and one scale S(s). The bent midline is the integral of S(s) R(s) m'(s), so bending alone
-    can't change its length; each cross-section moves rigidly with the frame at its foot.
+    and one scale S(s). The bent midline is the integral of R(s) m'(s), so its length is the root's
+    scale alone; each cross-section moves with the frame at its foot, S(s) times as broad and thick.
     """
     nodes = rig.midline
     middles = (nodes[1:] + nodes[:-1]) / 2
-    rotation, scale, _ = _frames(rig, parameters, middles)
-    steps = scale[..., None] * torch.einsum("bmkl,ml->bmk", rotation, nodes[1:] - nodes[:-1])
+    rotation, _, _ = _frames(rig, parameters, middles)
+    steps = torch.einsum("bmkl,ml->bmk", rotation, nodes[1:] - nodes[:-1])
     bent = torch.cat([torch.zeros_like(steps[:, :1]), steps.cumsum(dim=1)], dim=1)
     place = bent[:, rig.foot_segments] + rig.foot_fractions[:, None] * steps[:, rig.foot_segments]
     center = place[:, rig.num_vertices + 1][:, None]  # the foot of the center keypoint is the root

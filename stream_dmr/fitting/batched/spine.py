@@ -35,14 +35,15 @@ class Spine:
         """Of each place: where its foot is, and where the unit offsets x, y, z from it go."""
         model, num_places = self._model, len(self._model.segments)
         shift, scale = self._blend.blended[..., 3:6], self._blend.blended[..., 6:]
-        turn = scale[..., None] * self._turn.transpose(2, 3)  # rows are the images of x, y, z
+        turn = self._turn.transpose(2, 3)  # rows are the images of x, y, z
         steps = torch.einsum(
             "bsk,bski->bsi", model.steps.expand(len(turn), -1, -1), turn[:, num_places:]
         )
+        turn = scale[:, :num_places, :, None] * turn[:, :num_places]
         bases = self._swept(steps) + torch.einsum(
             "buij,buj->bui", self._turn[:, :num_places], shift[:, :num_places]
         )
-        return torch.cat([bases[:, :, None], turn[:, :num_places]], dim=2)
+        return torch.cat([bases[:, :, None], turn], dim=2)
 
     def _swept(self, steps: Float[Tensor, "B L *K"]) -> Float[Tensor, "B U *K"]:
         """Sums of steps of the midline up to each place, from the center; slopes add up alike."""
@@ -65,8 +66,10 @@ class Spine:
         )
         moves[:, :, 0, :, :3] = torch.einsum("bxk,bxkim->bxim", shift, A)
         moves[:, :, 0, :, 3:6] = self._turn
-        moves[:, :, 1:, :, :3] = scale[..., None] * A
-        moves[:, :, 1:, :, 6] = self._turn.transpose(2, 3)
+        # Scales make cross-sections larger, not the steps along the midline.
+        moves[:, :num_places, 1:, :, :3] = (scale[..., None] * A)[:, :num_places]
+        moves[:, num_places:, 1:, :, :3] = A[:, num_places:]
+        moves[:, :num_places, 1:, :, 6] = self._turn[:, :num_places].transpose(2, 3)
         slopes = moves[:, :num_places].flatten(2, 3) @ of_blend[:, :num_places]
         along = torch.einsum("sk,bskim->bsim", self._model.steps, moves[:, num_places:, 1:])
         slopes[:, :, :3] += self._swept(along @ of_blend[:, num_places:])

@@ -103,7 +103,10 @@ def _share(body, u, i, force, nodes):
 
 @compiled
 def _through_joints(body, flat, places, push, offsets, out):
-    """Slopes to the joints' parameters of the sum of f . R (s d + t) over the places."""
+    """Slopes to the joints' parameters of the sum of f . R (s d + t) over the places.
+
+    First the U places of the body, then the segments of its midline, whose scale s is 1.
+    """
     joints, num_joints = body.joints, len(body.joints)
     L, S = factors(flat, num_joints), joint_scales(flat, num_joints)
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
@@ -123,6 +126,8 @@ def _through_joints(body, flat, places, push, offsets, out):
                 for k in range(3):
                     turned[i, m] += offsets[u, i, k] * R[k, m]
         swell = turned[0, 0] + turned[1, 1] + turned[2, 2]
+        if u >= len(body.places):  # scales don't make the steps of the midline longer
+            scale, swell = 1.0, 0.0
         torque[0] = scale * (turned[1, 2] - turned[2, 1])
         torque[1] = scale * (turned[2, 0] - turned[0, 2])
         torque[2] = scale * (turned[0, 1] - turned[1, 0])

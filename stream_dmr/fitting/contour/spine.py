@@ -110,7 +110,6 @@ def spine_jacobian(body, flat, L, chosen, out):
 def spine_nodes(body, flat, L, with_slope):
     """The bent midline from its head, (M, 3), and its slope to the joints' parameters."""
     num_joints, count = len(body.joints), len(body.midline)
-    S = joint_scales(flat, num_joints)
     place = np.zeros((count, 3))
     slope = np.zeros((count if with_slope else 0, 3, JOINT * num_joints))
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
@@ -125,9 +124,8 @@ def spine_nodes(body, flat, L, with_slope):
             step[i] = body.midline[k + 1, i] - body.midline[k, i]
         turn(omega, R)
         apply(R, step, Rd)
-        scale = dot(W, S)
         for i in range(3):
-            place[k + 1, i] = place[k, i] + scale * Rd[i]
+            place[k + 1, i] = place[k, i] + Rd[i]
         if not with_slope:
             continue
         turn_and_slope(omega, R, J)
@@ -136,11 +134,10 @@ def spine_nodes(body, flat, L, with_slope):
         for j in range(num_joints):
             o, base = JOINT * j, ROOT + JOINT * j
             for i in range(3):
-                along = (S[j] - scale) * Rd[i]
+                along = 0.0
                 for c in range(3):
-                    slope[k + 1, i, o + c] += W[j] * scale * A[i, c]
-                    along += scale * A[i, c] * (flat[base + c] - omega[c])
-                slope[k + 1, i, o + 6] += W[j] * S[j] * Rd[i]
+                    slope[k + 1, i, o + c] += W[j] * A[i, c]
+                    along += A[i, c] * (flat[base + c] - omega[c])
                 for q in range(6):
                     slope[k + 1, i, o + 7 + q] += W[j] * along * dE[j, q]
     return place, slope
