@@ -86,10 +86,10 @@ class Race:
         """Every solver, side by side, on one target; nothing where warm is there already."""
         target = _target(pair)
         fitter = Fitter(self._template, FitMeshSettings(), plane_normal=pair.plane_normal)
-        before = fitter.fit(pair.before, None).shape
+        before = fitter.fit(pair.before, None).best
         assert before is not None
         known = self._known_start(target)
-        runs = {"cold": self._cold(pair), "warm": self._warm(pair, before.parameters)}
+        runs = {"cold": self._cold(pair), "warm": self._warm(pair, before)}
         if size > _MOST_SIZE_OF_A_BATCH:
             del runs["cold"]["adam"]
         if known is not None:

@@ -80,9 +80,9 @@ class Setup:
 
     def before(self, pair: Pair) -> Float[np.ndarray, "P"]:
         """Parameters of the frame before, fitted from cold."""
-        shape = self.fitter(pair).fit(pair.before, None).shape
-        assert shape is not None
-        return shape.parameters
+        best = self.fitter(pair).fit(pair.before, None).best
+        assert best is not None
+        return best
 
     def start(self, pair: Pair) -> tuple[Target, Float[np.ndarray, "P"]]:
         """What the solver of a warm fit is given."""
@@ -107,7 +107,7 @@ def warm(setup: Setup, pair: Pair) -> Warm:
 def cold(setup: Setup, known: Known) -> Cold:
     """A fit that starts from nothing."""
     fitter, fitted = Fitter(setup.template, setup.settings), []
-    lap = took(lambda: fitted.append(fitter.fit(known.crop, None)))
+    lap = took(lambda: fitted.append(fitter.fit(known.crop, None).mesh))
     shape = fitted[0].shape
     v, K = setup.body.num_vertices, known.crop.crop_camera.K
     points = deform(setup.body, SPINE, known.flat)[v : v + 3]
@@ -221,7 +221,7 @@ mask = cv2.ellipse(np.zeros((128, 128), np.uint8), (64, 64), (45, 16), 20, 0, 36
 crop = crop_of_mask(mask, Camera.nominal(width=128, height=128))
 fitter = Fitter(species_template(), FitMeshSettings())
 ready = time.perf_counter()
-flat = fitter.fit(crop, None).shape.parameters
+flat = fitter.fit(crop, None).best
 fitter.fit(crop, flat)
 first = time.perf_counter()
 fitter.fit(crop, None)

@@ -28,11 +28,16 @@ class FitMesh:
 
     def step(self, crop: FishCrop, /) -> list[FittedMesh]:
         """Fit one crop; a poor fit, or one of half a fish, is passed on but warms no other."""
-        fitted = self._fitter.fit(crop, self._warm.get(crop.track_id))
+        fitted, best = self._fitter.fit(crop, self._warm.get(crop.track_id))
         shape = fitted.shape
         is_whole = not crop.quality.touches_border
-        if is_whole and shape is not None and shape.iou >= self._settings.cold_below_iou:
-            self._warm[crop.track_id] = shape.parameters
+        if (
+            best is not None
+            and is_whole
+            and shape is not None
+            and shape.iou >= self._settings.cold_below_iou
+        ):
+            self._warm[crop.track_id] = best
         return [fitted]
 
     def tick(self, timestamp_ns: int, /) -> Sequence[FittedMesh]:

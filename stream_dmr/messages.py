@@ -128,7 +128,7 @@ class FittedShape:
     iou: float  # of the hard silhouette with the mask
     losses: LossTerms
     covariance: Float[np.ndarray, "P P"] | None  # of `parameters`; None: not recorded
-    length_std_ratio: float  # std of the arc length, as a fraction of it, by `covariance`
+    length_std_ratio: float  # std of the arc length, as a fraction of it
 
     def __post_init__(self) -> None:
         _freeze(self)

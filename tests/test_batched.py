@@ -28,7 +28,6 @@ from stream_dmr.fitting.batched.deformation import deform
 from stream_dmr.fitting.batched.distance_map import signed_distance
 from stream_dmr.fitting.batched.normal_equations import contour_rows, visible_rim
 from stream_dmr.fitting.batched.targets import Targets
-from stream_dmr.fitting.batched.uncertainty import covariance
 from stream_dmr.fitting.batched.warm_start import recentered
 from stream_dmr.fitting.contour import deformation
 from stream_dmr.fitting.contour.deformation import KINDS
@@ -38,7 +37,6 @@ from stream_dmr.fitting.contour.outline import coverage, rim_edges
 from stream_dmr.fitting.contour.pull_back import pull_back
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
-from stream_dmr.fitting.uncertainty import covariance as compiled_covariance
 from stream_dmr.fitting.warm_start import recentered as compiled_recentered
 
 every_template = pytest.mark.parametrize("name", TEMPLATES)
@@ -200,25 +198,6 @@ def test_terms_and_normal_equations_are_the_compiled_ones(name, kind, device, se
         for shown, expected in ((H[b], expected_H), (g[b], expected_g)):
             error = 1e-8 * np.abs(expected).max()
             np.testing.assert_allclose(numpy(shown), expected, rtol=0, atol=error)
-
-
-@every_device
-@both_kinds
-def test_covariances_are_the_compiled_ones(kind, device):
-    crops, flats = crops_of_poses("halibut", 3)
-    ours, targets = targets_of(crops, device)
-    options = FitMeshSettings(deformation=kind)
-    model, body = model_of("halibut", device, deformation=kind), BODIES["halibut"]
-    found = batched.evaluate(model, targets, torch.as_tensor(flats, device=device), model.lambdas)
-    spread, length_std = covariance(model, targets, options, found)
-    names = ("points", "pixels", "rim", "covered")
-    for b, (target, flat) in enumerate(zip(ours, flats, strict=True)):
-        outlined = dict(zip(names, evaluate(body, KINDS[kind], target, flat)[2:], strict=True))
-        expected, expected_std = compiled_covariance(body, target, options, flat, **outlined)
-        np.testing.assert_allclose(
-            numpy(spread[b]), expected, atol=1e-8 * np.abs(expected).max(), rtol=1e-6
-        )
-        assert length_std[b].item() == pytest.approx(expected_std, rel=1e-8)
 
 
 def test_a_target_without_a_contour_is_padded():

@@ -45,6 +45,7 @@ RIG = Rig.from_template(HALIBUT)
 SPINE = KINDS["spine"]
 SETTINGS = FitMeshSettings()
 LAMBDAS, PRIORS, REST = SETTINGS.lambdas(), SETTINGS.priors(), rest_vector(2)
+FREE = np.zeros(len(REST), bool)  # nothing is held
 TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
 twenty = settings(max_examples=20)
 
@@ -84,7 +85,7 @@ def energy(target, flat, *, kind=SPINE):
 
 def descend(target, start, *, iterations=30, tolerance=1e-4, damping=1e-2, kind=SPINE):
     return minimise(
-        BODY, kind, target, LAMBDAS, PRIORS, start, REST, iterations, tolerance, damping
+        BODY, kind, target, LAMBDAS, PRIORS, start, REST, FREE, iterations, tolerance, damping
     )
 
 
@@ -278,7 +279,7 @@ def fitted_from_cold(seed, **options):
     """IoU, error of the length, and the keypoints' largest gap over the length in the picture."""
     flat = hooked(seed, **options)
     crop = crop_of(flat, RIG, size=128)
-    shape = Fitter(HALIBUT, SETTINGS).fit(crop, None).shape
+    shape = Fitter(HALIBUT, SETTINGS).fit(crop, None).mesh.shape
     _, deformed = picture(flat, RIG, crop.crop_camera)
     middle = crop.crop_camera.middle_ray()
     ends = crop.crop_camera.project(deformed.keypoints[0].numpy() + middle)[[0, 2]]
@@ -343,7 +344,7 @@ def test_the_length_s_std_is_that_of_ragged_masks():
             correlation_px=SETTINGS.edge_correlation_px,
         )
         crop = crop_from_mask(mask, camera=crop_camera(size=128))
-        shape = fitter.fit(crop, flat[0].numpy()).shape
+        shape = fitter.fit(crop, flat[0].numpy()).mesh.shape
         length = arc_length(picture(flat, RIG, crop.crop_camera)[1].midline[0].numpy())
         scores.append(np.log(arc_length(shape.midline) / length) / shape.length_std_ratio)
     ratio = np.sqrt(np.mean(np.square(scores)))

@@ -80,7 +80,7 @@ def crop():
 
 @pytest.fixture(scope="module")
 def warm_fit(fitter, crop):
-    return fitter.fit(crop, near(true_pose(0)))
+    return fitter.fit(crop, near(true_pose(0))).mesh
 
 
 class TestFinds:
@@ -89,7 +89,7 @@ class TestFinds:
     def check_cold(self, fitter, seed, *, template=TEMPLATE, rig=RIG):
         flat = true_pose(seed)
         crop = crop_of(flat, rig, size=96)
-        fitted = fitter.fit(crop, None)
+        fitted = fitter.fit(crop, None).mesh
         assert_found(fitted, flat, rig, crop)
         assert fitted.report.cold_start
 
@@ -115,7 +115,7 @@ class TestFinds:
     def test_a_fish_from_the_frame_before(self, fitter, seed):
         flat = true_pose(seed)
         crop = crop_of(flat, RIG, size=96)
-        fitted = fitter.fit(crop, near(flat, seed=seed))
+        fitted = fitter.fit(crop, near(flat, seed=seed)).mesh
         assert_found(fitted, flat, RIG, crop)
         assert not fitted.report.cold_start
 
@@ -125,7 +125,7 @@ class TestFinds:
         crop = crop_of(flat, RIG, size=96)
         swapped = flat.clone()
         swapped[0, 2] += np.pi
-        fitted = fitter.fit(crop, swapped[0].numpy())
+        fitted = fitter.fit(crop, swapped[0].numpy()).mesh
         assert_found(fitted, flat, RIG, crop)
         assert fitted.report.cold_start
 
@@ -150,7 +150,7 @@ class TestReports:
     def test_shape_and_losses_follow_from_the_parameters(self, crop, solver, deformation):
         """As the torch reference has them, whatever the solver computed them with."""
         settings = FitMeshSettings(solver=solver, deformation=deformation)
-        shape = Fitter(TEMPLATE, settings).fit(crop, near(true_pose(0))).shape
+        shape = Fitter(TEMPLATE, settings).fit(crop, near(true_pose(0))).mesh.shape
         flat = torch.as_tensor(shape.parameters.copy())[None]
         deformed = deform(RIG, flat, DEFORMATIONS[deformation])
         for name in ("vertices", "keypoints", "midline"):
@@ -191,7 +191,11 @@ class TestUncertainty:
         np.testing.assert_allclose(spread, spread.T, rtol=1e-9, atol=1e-15)
         assert np.linalg.eigvalsh(spread).min() > 0
 
-    def test_the_length_s_std_follows_from_it(self, warm_fit):
+    @pytest.mark.parametrize("solver", SOLVERS)
+    def test_without_a_scan_the_length_s_std_follows_from_it(self, crop, solver):
+        plain = FitMeshSettings(solver=solver, scan_iterations=0)
+        warm_fit = Fitter(TEMPLATE, plain).fit(crop, near(true_pose(0))).mesh
+
         def log_length(flat):
             midline = deform(RIG, flat[None], DEFORMATIONS["spine"]).midline[0]
             return (midline[1:] - midline[:-1]).norm(dim=1).sum().log()
@@ -206,7 +210,7 @@ class TestUncertainty:
         ratios = [
             Fitter(TEMPLATE, FitMeshSettings(solver=solver, edge_std_px=std))
             .fit(crop, near(true_pose(0)))
-            .shape.length_std_ratio
+            .mesh.shape.length_std_ratio
             for std in (0.5, 1.0, 2.0)
         ]
         assert ratios == sorted(ratios)
@@ -233,7 +237,7 @@ class TestRefuses:
         ],
     )
     def test_what_can_not_be_fitted_with_its_reason(self, fitter, mask, reason):
-        fitted = fitter.fit(crop_from_mask(mask), None)
+        fitted = fitter.fit(crop_from_mask(mask), None).mesh
         assert fitted.refusal == reason
         assert fitted.shape is None
         assert fitted.report is None
@@ -251,7 +255,9 @@ class TestRefuses:
     )
     @pytest.mark.parametrize("solver", ["contour", pytest.param("adam", marks=pytest.mark.slow)])
     def test_or_fits_finitely_what_is_no_fish(self, solver, mask):
-        fitted = Fitter(TEMPLATE, FitMeshSettings(solver=solver)).fit(crop_from_mask(mask), None)
+        fitted = (
+            Fitter(TEMPLATE, FitMeshSettings(solver=solver)).fit(crop_from_mask(mask), None).mesh
+        )
         assert (fitted.shape is None) == bool(fitted.refusal)
         if fitted.shape is not None:
             assert_finite(fitted.shape)
@@ -268,7 +274,7 @@ def bits(fitted):
 
 class TestRepeats:
     def test_the_same_crop_gives_the_same_bits(self, fitter, crop, warm_fit):
-        again = fitter.fit(crop, near(true_pose(0)))
+        again = fitter.fit(crop, near(true_pose(0))).mesh
         assert bits(again) == bits(warm_fit)
 
     @pytest.mark.parametrize("solver", ["contour", pytest.param("adam", marks=pytest.mark.slow)])

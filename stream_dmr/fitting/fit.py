@@ -1,9 +1,10 @@
-"""One crop in, one fitted mesh out: warm from the frame before, cold where that fails."""
+"""One crop in, one fitted mesh out: warm from the frame before, else cold; then sized."""
 
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +17,7 @@ from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.outline import project
 from stream_dmr.fitting.contour.solver import ContourSolver
 from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.size_scanner import SizeScanner
 from stream_dmr.fitting.solver import Solution, Solver
 from stream_dmr.fitting.target import Target
 from stream_dmr.fitting.uncertainty import covariance
@@ -24,7 +26,7 @@ from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms, So
 from stream_dmr.template import Template
 
 if TYPE_CHECKING:
-    from stream_dmr.fitting.batched.fitter import BatchedFitter
+    from stream_dmr.fitting.batched.fitter import BatchedFitter, Fitted
 
 # Without a calibration, fish are taken to hang square to the camera.
 _TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
@@ -33,6 +35,13 @@ _TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
 # In L_rec: by so much must a cold fit be better to give up the pose of the frame before, and which
 # end is the head.
 _CLEAR_GAIN = 0.01
+
+
+class Fit(NamedTuple):
+    """What came of one crop."""
+
+    mesh: FittedMesh
+    best: Float[np.ndarray, "P"] | None  # the likeliest parameters: where the next frame begins
 
 
 class Fitter:
@@ -53,27 +62,24 @@ class Fitter:
         self._body = Body.from_template(template)
         self._kind = KINDS[settings.deformation]
         self._solver = _make_solver(template, self._body, settings)
+        self._scanner = SizeScanner(self._body, settings)
 
-    def fit(self, crop: FishCrop, warm: Float[np.ndarray, "P"] | None) -> FittedMesh:
-        """Fit the template to a crop's mask, starting from the parameters of the frame before.
+    def fit(self, crop: FishCrop, warm: Float[np.ndarray, "P"] | None) -> Fit:
+        """Fit the template to a crop's mask, starting from `best` of the frame before.
 
         What can't be fitted comes back with its reason in `refusal`.
         """
         refusal = self._refusal(crop)
         if refusal:
-            return _message(crop, None, None, refusal)
+            return Fit(_message(crop, None, None, refusal), None)
         began = time.perf_counter_ns()
         target = Target.from_crop(crop, plane_normal=self._plane_normal)
         solution, is_cold = self._solve(target, warm)
-        if not _is_finite(solution):
-            return _message(crop, None, None, "fit diverged")
-        shape = self._shape(target, solution, crop)
-        report = self._report(solution, is_cold=is_cold, since_ns=began)
-        return _message(crop, shape, report, "")
+        return self._answer(crop, target, solution, is_cold=is_cold, since_ns=began)
 
     def fit_many(
         self, crops: Sequence[FishCrop], warms: Sequence[Float[np.ndarray, "P"] | None]
-    ) -> list[FittedMesh]:
+    ) -> list[Fit]:
         """What `fit` says of each: a backlog, side by side on a GPU with `device = "cuda"`.
 
         Its fits agree with those of `fit` to the solver's tolerance, not to the last bit, and each
@@ -85,17 +91,39 @@ class Fitter:
         sound = [index for index, refusal in enumerate(refusals) if not refusal]
         began = time.perf_counter_ns()
         fitted = self._backlog.fit([crops[i] for i in sound], [warms[i] for i in sound])
-        messages = {}
-        for index, one in zip(sound, fitted, strict=True):
-            if not _is_finite(one.solution):
-                refusals[index] = "fit diverged"
-                continue
-            report = self._report(one.solution, is_cold=one.is_cold, since_ns=began)
-            messages[index] = _message(crops[index], one.shape, report, "")
-        return [
-            messages.get(index) or _message(crop, None, None, refusals[index])
-            for index, crop in enumerate(crops)
+        answers = [
+            Fit(_message(c, None, None, r), None) for c, r in zip(crops, refusals, strict=True)
         ]
+
+        def answer(index: int, one: "Fitted") -> Fit:
+            target = Target.from_crop(crops[index], plane_normal=self._plane_normal)
+            return self._answer(
+                crops[index], target, one.solution, is_cold=one.is_cold, since_ns=began
+            )
+
+        with ThreadPoolExecutor() as pool:
+            for index, found in zip(sound, pool.map(answer, sound, fitted), strict=True):
+                answers[index] = found
+        return answers
+
+    def _answer(
+        self,
+        crop: FishCrop,
+        target: Target,
+        solution: Solution,
+        *,
+        is_cold: bool,
+        since_ns: int,
+    ) -> Fit:
+        """The message of a fit, at the size that is to be expected of it."""
+        sized, size_std = solution, None
+        if _is_finite(solution) and self._settings.scans_sizes:
+            sized, size_std = self._scanner.expected(target, solution)
+        if not _is_finite(sized):
+            return Fit(_message(crop, None, None, "fit diverged"), None)
+        shape = self._shape(target, sized, crop, size_std)
+        report = self._report(solution, is_cold=is_cold, since_ns=since_ns)
+        return Fit(_message(crop, shape, report, ""), solution.flat)
 
     @cached_property
     def _backlog(self) -> "BatchedFitter":
@@ -142,7 +170,10 @@ class Fitter:
             return solution, False
         return cold, True
 
-    def _shape(self, target: Target, solution: Solution, crop: FishCrop) -> FittedShape:
+    def _shape(
+        self, target: Target, solution: Solution, crop: FishCrop, size_std: float | None
+    ) -> FittedShape:
+        """`size_std` of the log size, where it is known better than by the covariance."""
         flat, v = solution.flat, self._body.num_vertices
         terms, iou, points, pixels, rim, covered = evaluate(self._body, self._kind, target, flat)
         spread, length_std = covariance(
@@ -168,7 +199,7 @@ class Fitter:
             iou=iou,
             losses=LossTerms(**dict(zip(LossTerms.__slots__, terms.tolist(), strict=True))),
             covariance=spread,
-            length_std_ratio=length_std,
+            length_std_ratio=length_std if size_std is None else size_std,
         )
 
 

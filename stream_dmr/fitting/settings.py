@@ -30,7 +30,7 @@ class FitMeshSettings(Settings):
     tilt_std_rad: float = Field(
         default=0.25, gt=0, description="how far a fish hangs out of the reference plane, rad"
     )
-    bend_std_rad: float = Field(default=1.0, gt=0, description="how far a joint bends, rad")
+    bend_std_rad: float = Field(default=0.5, gt=0, description="how far a joint bends, rad")
     twist_std_rad: float = Field(default=0.3, gt=0, description="how far a joint twists, rad")
     weight_std: float = Field(
         default=0.5, gt=0, description="spread of the logs that shape the skinning weights"
@@ -40,6 +40,11 @@ class FitMeshSettings(Settings):
     )
     contour_iterations: int = Field(
         default=30, ge=1, description="most iterations of a contour fit"
+    )
+    scan_iterations: int = Field(
+        default=3,
+        ge=0,
+        description="of a fit at each size that a fish might have; 0: the best fit's own size",
     )
     adam_iterations: int = Field(default=150, ge=1, description="most iterations of an adam fit")
     tolerance: float = Field(
@@ -59,6 +64,15 @@ class FitMeshSettings(Settings):
     edge_correlation_px: float = Field(
         default=8.0, gt=0, description="how far along the edge such an error reaches, crop pixels"
     )
+
+    @property
+    def scans_sizes(self) -> bool:
+        """Whether a fit's size is what is to be expected rather than the likeliest.
+
+        Only the spine's size is its length; and the paper's solver is left as the paper has it.
+        """
+        is_ours = self.deformation == "spine" and self.solver == "contour"
+        return is_ours and self.scan_iterations > 0 and self.prior_weight > 0
 
     def lambdas(self) -> Float[np.ndarray, "6"]:
         """Weights of the terms of eq. (3): iou, boundary, scale, translation, normal, laplacian."""

@@ -1,4 +1,4 @@
-"""Many crops in, many fitted shapes out: `Fitter.fit` for a backlog, on a GPU."""
+"""Many crops in, the best fit of each out: what `Fitter.fit` looks for, for a backlog on a GPU."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -10,18 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stream_dmr.camera import frame_from_crop
-from stream_dmr.fitting.batched.levenberg_marquardt import evaluate
-from stream_dmr.fitting.batched.outline import project
 from stream_dmr.fitting.batched.solver import BatchedSolver, Solutions
 from stream_dmr.fitting.batched.targets import Targets
-from stream_dmr.fitting.batched.uncertainty import covariance
 from stream_dmr.fitting.batched.warm_start import recentered
 from stream_dmr.fitting.cold_start import cold_starts
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution
 from stream_dmr.fitting.target import Target
-from stream_dmr.messages import FishCrop, FittedShape, LossTerms
+from stream_dmr.messages import FishCrop
 from stream_dmr.template import Template
 
 # A full load of a large GPU, which takes milliseconds an iteration; more would only take memory.
@@ -33,7 +29,6 @@ class Fitted(NamedTuple):
 
     solution: Solution
     is_cold: bool
-    shape: FittedShape
 
 
 class BatchedFitter:
@@ -51,8 +46,6 @@ class BatchedFitter:
         """`clear_gain` in L_rec makes a cold fit better than a poor warm one."""
         self._template, self._solver, self._settings = template, solver, settings
         self._plane_normal, self._clear_gain = plane_normal, clear_gain
-        # What is reported of the results is worked out once for each fit, and in float64.
-        self._exact = solver.model.double()
 
     def fit(
         self, crops: Sequence[FishCrop], warms: Sequence[Float[np.ndarray, "P"] | None]
@@ -76,8 +69,7 @@ class BatchedFitter:
         """Crops of one size."""
         targets = self._solver.prepare(crops, plane_normal=self._plane_normal)
         found, is_cold = self._solved(crops, targets, warms)
-        shapes = self._shapes(crops, targets, found.flat)
-        return [Fitted(*one) for one in zip(found.to_list(), is_cold.tolist(), shapes, strict=True)]
+        return [Fitted(*one) for one in zip(found.to_list(), is_cold.tolist(), strict=True)]
 
     def _solved(
         self, crops: list[FishCrop], targets: Targets, warms: list[Float[np.ndarray, "P"] | None]
@@ -108,47 +100,3 @@ class BatchedFitter:
 
         with ThreadPoolExecutor() as pool:
             return self._solver.tensor(np.array(list(pool.map(starts, crops))))
-
-    def _shapes(
-        self, crops: list[FishCrop], targets: Targets, flats: Float[Tensor, "B P"]
-    ) -> list[FittedShape]:
-        shapes, model = [], self._exact
-        for some in self._solver.chunks(targets, len(flats)):
-            exact, flat = targets.select(some).double(), flats[some].double()
-            found = evaluate(model, exact, flat, model.lambdas)
-            spread, length_std = covariance(model, exact, self._settings, found)
-            placed = found.body.points + exact.anchor[:, None]
-            v = model.num_vertices
-            keypoints_px = project(found.body.points[:, v : v + 3], exact)
-            columns = (flat, placed, keypoints_px, found.terms, found.iou, spread, length_std)
-            rows = zip(crops[some], *(column.cpu().numpy() for column in columns), strict=True)
-            shapes += [_shape(*row, num_vertices=v) for row in rows]
-        return shapes
-
-
-def _shape(
-    crop: FishCrop,
-    flat: Float[np.ndarray, "P"],
-    placed: Float[np.ndarray, "N 3"],
-    keypoints_px: Float[np.ndarray, "3 2"],
-    terms: Float[np.ndarray, "6"],
-    iou: float,
-    spread: Float[np.ndarray, "P P"],
-    length_std: float,
-    *,
-    num_vertices: int,
-) -> FittedShape:
-    v = num_vertices
-    return FittedShape(
-        parameters=flat,
-        vertices=placed[:v],
-        keypoints=placed[v : v + 3],
-        keypoints_px=frame_from_crop(
-            keypoints_px, crop_camera=crop.crop_camera, frame_camera=crop.frame_camera
-        ),
-        midline=placed[v + 3 :],
-        iou=float(iou),
-        losses=LossTerms(**dict(zip(LossTerms.__slots__, terms.tolist(), strict=True))),
-        covariance=spread,
-        length_std_ratio=float(length_std),
-    )

@@ -37,7 +37,9 @@ def evaluate(body, kind, target, flat):
 
 
 @compiled
-def minimise(body, kind, target, lambdas, priors, start, rest, iterations, tolerance, damping):
+def minimise(
+    body, kind, target, lambdas, priors, start, rest, held, iterations, tolerance, damping
+):
     """Best parameters, their L_rec and hard IoU, the iterations used and why it stopped."""
     flat = start.copy()
     terms, hard, points, pixels, rim, covered = evaluate(body, kind, target, flat)
@@ -47,6 +49,7 @@ def minimise(body, kind, target, lambdas, priors, start, rest, iterations, toler
     )
     calm, refused = 0, 0
     for iteration in range(1, iterations + 1):
+        hold(held, H, g)
         step = _solve(H, g, damping)
         if 0.5 * dot(g, step) < tolerance:
             return flat, loss, hard, iteration - 1, SETTLED
@@ -75,19 +78,37 @@ def minimise(body, kind, target, lambdas, priors, start, rest, iterations, toler
 
 
 @compiled
-def _solve(H, g, damping):
-    """(H + damping diag H)^-1 g by Cholesky: H is a sum of squares, so the factor exists."""
-    count = len(g)
+def hold(held, H, g):
+    """Take parameters out of the problem: their step is 0."""
+    for p in range(len(g)):
+        if held[p]:
+            g[p] = 0.0
+            H[p] = 0.0
+            H[:, p] = 0.0
+            H[p, p] = 1.0
+
+
+@compiled
+def factorise(H, damping):
+    """Lower triangular L with L L^T = H + damping diag H: H is a sum of squares, so it exists."""
     L = H.copy()
-    x = g.copy()
-    for p in range(count):
+    for p in range(len(H)):
         L[p, p] += damping * H[p, p] + 1e-12
-    for p in range(count):
+    for p in range(len(H)):
         for q in range(p + 1):
             total = L[p, q]
             for k in range(q):
                 total -= L[p, k] * L[q, k]
             L[p, q] = np.sqrt(max(total, 1e-30)) if p == q else total / L[q, q]
+    return L
+
+
+@compiled
+def _solve(H, g, damping):
+    """(H + damping diag H)^-1 g."""
+    L = factorise(H, damping)
+    x = g.copy()
+    count = len(g)
     for p in range(count):
         for k in range(p):
             x[p] -= L[p, k] * x[k]

@@ -93,6 +93,7 @@ class ContourSolver:
             self._priors,
             start,
             self._rest,
+            np.zeros(len(start), np.bool_),  # nothing is held
             iterations,
             self._settings.tolerance,
             damping,

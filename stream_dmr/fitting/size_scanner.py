@@ -1,0 +1,96 @@
+"""The size to be expected of a fish, given one mask: the mean over all sizes, not the best fit's.
+
+A silhouette tells the size of a fish one-sidedly. A fish that seems to be flat may be a slanting
+one that is longer, but not a shorter one; and a long fish, slanting and bent, can look like a short
+one in more ways than the other way round. The best fit alone is therefore too short on average, or
+wherever its search has led it. So sizes near it are tried, with everything else fitted anew.
+"""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import PchipInterpolator
+
+from stream_dmr.body import Body, rest_vector
+from stream_dmr.fitting.contour.deformation import KINDS
+from stream_dmr.fitting.contour.levenberg_marquardt import EXHAUSTED, STOP_REASONS, minimise
+from stream_dmr.fitting.contour.size_scan import NEAR, SIZE, only_size, scan_sizes
+from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.solver import Solution
+from stream_dmr.fitting.target import Target
+
+# Log sizes that are tried, beside the best fit's own.
+_OFFSETS = np.array([-0.2, -0.1, -0.04, 0.0, 0.04, 0.1, 0.2])
+# How much the room of poses around a fit counts beside its loss: 1 would be a Laplace integral over
+# them, 0 the profile likelihood. A flat pose has more room by its curvature than it has in truth,
+# since what it would see of its slant is of second order. Between them, by our simulated scenes.
+_ROOM = 0.5
+_STEP = 0.002  # of the integration over log sizes
+_BEYOND = 0.15  # how far it goes past the sizes tried
+_STEEPEST_END = 10.0  # nats per unit of log size: past the ends sizes get at least so unlikely
+
+
+class SizeScanner:
+    """Tries the sizes of one template."""
+
+    def __init__(self, body: Body, settings: FitMeshSettings) -> None:
+        self._body, self._settings = body, settings
+        self._kind = KINDS[settings.deformation]
+        self._rest = rest_vector(len(body.joints))
+        self._lambdas, self._priors = settings.lambdas(), settings.priors()
+        # The mesh's smoothness tells sizes apart no better, and is dear.
+        self._rough_lambdas = self._lambdas * [1, 1, 1, 1, 0, 0]
+
+    def expected(self, target: Target, best: Solution) -> tuple[Solution, float]:
+        """The fit at the expected size of the fish, and the std of the log of this size.
+
+        With edges that are off by a pixel, `prior_weight` in L_rec is one nat: the priors' halved
+        squares are nats by themselves. Rougher edges say less.
+        """
+        fits, losses, rooms = scan_sizes(
+            self._body,
+            self._kind,
+            target.coarse(),
+            self._rough_lambdas,
+            self._priors,
+            best.flat,
+            self._rest,
+            _OFFSETS,
+            self._settings.scan_iterations,
+            self._settings.tolerance,
+        )
+        nat = self._settings.prior_weight * self._settings.edge_std_px**2
+        mean, std = mean_and_std(_OFFSETS, losses / nat + _ROOM * rooms)
+        start = fits[np.argmin(np.abs(_OFFSETS - mean))]
+        start[SIZE] = best.flat[SIZE] + mean
+        return self._fit_of_this_size(target, start), std
+
+    def _fit_of_this_size(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
+        flat, loss, iou, used, stop = minimise(
+            self._body,
+            self._kind,
+            target,
+            self._lambdas,
+            self._priors,
+            start,
+            self._rest,
+            only_size(len(start)),
+            self._settings.contour_iterations,
+            self._settings.tolerance,
+            NEAR,
+        )
+        return Solution(flat, loss, iou, used, stop != EXHAUSTED, STOP_REASONS[stop])
+
+
+def mean_and_std(
+    offsets: Float[np.ndarray, "G"], nats: Float[np.ndarray, "G"]
+) -> tuple[float, float]:
+    """Of the density exp(-nats) over log sizes, which between those tried is a smooth curve."""
+    x = np.arange(offsets[0] - _BEYOND, offsets[-1] + _BEYOND, _STEP)
+    curve = PchipInterpolator(offsets, nats)(x.clip(offsets[0], offsets[-1]))
+    first, last = np.diff(nats)[[0, -1]] / np.diff(offsets)[[0, -1]]
+    curve += np.maximum(offsets[0] - x, 0) * max(-first, _STEEPEST_END)
+    curve += np.maximum(x - offsets[-1], 0) * max(last, _STEEPEST_END)
+    density = np.exp(curve.min() - curve)
+    density /= density.sum()
+    mean = float(density @ x)
+    return mean, float(np.sqrt(density @ (x - mean) ** 2))

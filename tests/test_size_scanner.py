@@ -1,0 +1,110 @@
+"""The expected size: of known densities, and of simulated fish whose sizes are known."""
+
+import numpy as np
+import pytest
+from batches import PLANE_NORMAL, crops_of_poses, moved
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stream_dmr.body import Body, rest_vector
+from stream_dmr.fitting.contour.deformation import KINDS
+from stream_dmr.fitting.contour.levenberg_marquardt import minimise
+from stream_dmr.fitting.contour.size_scan import NEAR, SIZE, only_size, scan_sizes
+from stream_dmr.fitting.contour.solver import ContourSolver
+from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.size_scanner import SizeScanner, mean_and_std
+from stream_dmr.fitting.target import Target
+from stream_dmr.template import load_template
+
+OFFSETS = np.linspace(-0.3, 0.3, 13)
+THREE = np.array([-0.1, 0.0, 0.1])
+BODY = Body.from_template(load_template("halibut"))
+SETTINGS = FitMeshSettings()
+
+
+@settings(deadline=None)
+@given(mean=st.floats(-0.1, 0.1), std=st.floats(0.03, 0.08))
+def test_of_a_normal_density_they_are_its_own(mean, std):
+    found = mean_and_std(OFFSETS, 0.5 * ((OFFSETS - mean) / std) ** 2)
+    assert found == pytest.approx((mean, std), abs=0.01)
+
+
+@given(shift=st.floats(-1e3, 1e3))
+def test_a_constant_changes_nothing(shift):
+    nats = 40.0 * np.abs(OFFSETS - 0.05)
+    assert mean_and_std(OFFSETS, nats + shift) == pytest.approx(mean_and_std(OFFSETS, nats))
+
+
+def test_the_mean_leans_to_where_sizes_stay_likely():
+    """Short is impossible, long is merely unlikely: the fish is longer than the best fit."""
+    nats = np.where(OFFSETS < 0, 400.0, 12.0) * np.abs(OFFSETS)
+    mean, std = mean_and_std(OFFSETS, nats)
+    assert 0.03 < mean < std + 0.03
+
+
+def test_without_any_preference_nothing_is_known():
+    _, std = mean_and_std(OFFSETS, np.zeros(len(OFFSETS)))
+    assert std > 0.15
+
+
+@pytest.fixture(scope="module")
+def known():
+    """Three targets, and the fits found from near the truth."""
+    crops, flats = crops_of_poses("halibut", 5, batch=3)
+    solver = ContourSolver(BODY, SETTINGS)
+    targets = [Target.from_crop(crop, plane_normal=PLANE_NORMAL) for crop in crops]
+    starts = moved(flats, 5)
+    return [(t, solver.refine(t, s), f) for t, s, f in zip(targets, starts, flats, strict=True)]
+
+
+def scanned(target, flat):
+    return scan_sizes(
+        BODY, KINDS["spine"], target, SETTINGS.lambdas(), SETTINGS.priors(), flat,
+        rest_vector(2), THREE, 4, SETTINGS.tolerance,
+    )  # fmt: skip
+
+
+def test_every_fit_of_a_scan_has_the_size_it_is_to_have(known):
+    for target, best, _ in known:
+        fits, losses, rooms = scanned(target, best.flat)
+        np.testing.assert_allclose(fits[:, SIZE], best.flat[SIZE] + THREE, atol=1e-12)
+        assert np.isfinite(losses).all()
+        assert np.isfinite(rooms).all()
+
+
+def test_a_scan_is_no_worse_than_a_fit_of_that_size(known):
+    """The pass back may only better what the pass out has found."""
+    for target, best, _ in known:
+        _, losses, _ = scanned(target, best.flat)
+        start = best.flat.copy()
+        start[SIZE] += 0.1
+        lambdas, priors = SETTINGS.lambdas(), SETTINGS.priors()
+        args = (rest_vector(2), only_size(len(start)), 4, SETTINGS.tolerance, NEAR)
+        _, alone, *_ = minimise(BODY, KINDS["spine"], target, lambdas, priors, start, *args)
+        assert losses[1] <= alone + 1e-9
+
+
+def test_known_fish_have_the_size_to_be_expected(known):
+    """To a few percent by one mask, and within what the std says."""
+    scanner = SizeScanner(BODY, SETTINGS)
+    for target, best, flat in known:
+        sized, std = scanner.expected(target, best)
+        assert sized.flat[SIZE] == pytest.approx(flat[SIZE], abs=3 * std + 0.01)
+        assert 0.003 < std < 0.3
+        assert sized.iou > best.iou - 0.05
+
+
+def test_rougher_edges_say_less(known):
+    target, best, _ = known[0]
+    stds = [
+        SizeScanner(BODY, FitMeshSettings(edge_std_px=px)).expected(target, best)[1]
+        for px in (0.5, 1.0, 2.0)
+    ]
+    assert stds == sorted(stds)
+
+
+def test_the_paper_s_ways_are_left_alone():
+    assert FitMeshSettings().scans_sizes
+    assert not FitMeshSettings(solver="adam").scans_sizes
+    assert not FitMeshSettings(deformation="linear-blend").scans_sizes
+    assert not FitMeshSettings(scan_iterations=0).scans_sizes
