@@ -41,10 +41,10 @@ class SmoothLengthSettings(Settings):
         default=0.005, gt=0, description="no frame counts as surer than this, std over length"
     )
     frame_correlation: float = Field(
-        default=0.2, ge=0, le=1, description="of the errors of one fish's frames, 0 to 1"
+        default=0.1, ge=0, le=1, description="of the errors of one fish's frames, 0 to 1"
     )
     common_std_ratio: float = Field(
-        default=0.015,
+        default=0.01,
         ge=0,
         description="error that all frames of a fish share (proportions, plane), std over length",
     )

@@ -53,10 +53,15 @@ class LocalizeSettings(Settings):
         default=25.0, gt=0, description="std of the centers' distance from the plane, mm"
     )
     bending_std: float = Field(
-        default=0.2, ge=0, description="std of what bending adds to a length, as a fraction of it"
+        default=0.15, ge=0, description="std of what bending adds to a length, as a fraction of it"
     )
     slant_std_rad: float = Field(
-        default=0.2, ge=0, description="std of the angle at which the body is seen, rad"
+        default=0.15, ge=0, description="std of the angle at which the body is seen, rad"
+    )
+    misfit_std: float = Field(
+        default=0.12,
+        ge=0,
+        description="std that the misfit of an IoU of 0.9 adds to a length, as a fraction of it",
     )
     max_slant_rad: float = Field(
         default=1.0, gt=0, description="most slanting view that counts; 0 is broadside, rad"
@@ -168,6 +173,8 @@ def locate(shape: FittedShape, calibration: Calibration, settings: LocalizeSetti
         settings.bending_std * (1.0 - chord_mm / length_mm),
         # The length is the one seen over cos(slant), of which d log / d slant is tan(slant).
         settings.slant_std_rad * np.tan(slant_rad),
+        # What the body can't follow may be anything; little of it is the mask's own roughness.
+        settings.misfit_std * ((1.0 - shape.iou) / 0.1) ** 3,
     ]
     std_mm = length_mm * float(np.linalg.norm(parts))
     return Location(

@@ -278,7 +278,7 @@ def test_std_of_the_plane_is_what_moving_the_plane_does(tilt_rad):
         translation_mm=calibration.plane.translation_mm + d * normal,
     )
     mesh = straight_fish(calibration, std_ratio=0.0)
-    fish = localized(mesh, calibration, plane_std_mm=d, slant_std_rad=0.0)
+    fish = localized(mesh, calibration, plane_std_mm=d, slant_std_rad=0.0, misfit_std=0.0)
     change = localized(mesh, Calibration(camera=calibration.camera, plane=moved)).length_mm - 700.0
     assert fish.length_std_mm == pytest.approx(abs(change), rel=1e-4)
 
@@ -290,6 +290,7 @@ def test_std_combines_fit_and_plane_as_independent():
         calibration,
         plane_std_mm=80.0,
         slant_std_rad=0.0,
+        misfit_std=0.0,
     )
     assert fish.length_std_mm == pytest.approx(700.0 * 0.05)
 
@@ -300,7 +301,7 @@ def test_slanting_views_are_less_certain_and_refused_in_the_end(slant_rad):
     calibration = make_calibration(depth_mm=50_000.0)  # no perspective along the body
     direction = (np.cos(slant_rad), 0.0, np.sin(slant_rad))
     mesh = straight_fish(calibration, direction=direction, std_ratio=0.0)
-    fish = localized(mesh, calibration, plane_std_mm=1e-9, slant_std_rad=0.1)
+    fish = localized(mesh, calibration, plane_std_mm=1e-9, slant_std_rad=0.1, misfit_std=0)
     d = 1e-5
     slope = (np.cos(slant_rad) / np.cos(abs(slant_rad) + d) - 1) / d
     assert fish.length_std_mm == pytest.approx(700 * 0.1 * slope, rel=1e-3, abs=0.1)
@@ -310,13 +311,21 @@ def test_slanting_views_are_less_certain_and_refused_in_the_end(slant_rad):
 def test_a_bent_fish_is_less_certain_by_a_part_of_what_bending_adds():
     calibration = make_calibration(depth_mm=2000.0)
     mesh = bent_fish(calibration, std_ratio=0.01)
-    options = {"plane_std_mm": 1e-9, "slant_std_rad": 0.0, "bending_std": 0.2}
+    options = {"plane_std_mm": 1e-9, "slant_std_rad": 0.0, "misfit_std": 0, "bending_std": 0.2}
     bent = localized(mesh, calibration, **options)
     added = 1 - np.linalg.norm(bent.keypoints_mm[0] - bent.keypoints_mm[2]) / bent.length_mm
     assert added > 0.05
     assert bent.length_std_mm == pytest.approx(bent.length_mm * np.hypot(0.01, 0.2 * added))
     chord = localized(mesh, calibration, bending=False, **options)
     assert chord.length_std_mm == pytest.approx(0.01 * chord.length_mm)
+
+
+@pytest.mark.parametrize(("iou", "std_ratio"), [(1.0, 0.0), (0.95, 0.015), (0.9, 0.12)])
+def test_a_poor_fit_is_less_certain(iou, std_ratio):
+    calibration = make_calibration(depth_mm=50_000.0)
+    mesh = straight_fish(calibration, std_ratio=0.0, iou=iou)
+    fish = localized(mesh, calibration, plane_std_mm=1e-9, slant_std_rad=0.0, misfit_std=0.12)
+    assert fish.length_std_mm == pytest.approx(700 * std_ratio, abs=0.1)
 
 
 def test_without_calibration_pixels_and_bending_remain():
