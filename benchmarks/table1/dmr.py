@@ -1,0 +1,106 @@
+"""DMR: ours, through the nodes of the chain; and ours as the paper wrote it."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from stream_dmr.config import Config
+from stream_dmr.evaluation_files import LengthRow
+from stream_dmr.localization import LocalizeSettings
+from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish, Message
+from stream_dmr.pipeline import Node
+from stream_dmr.run import later_nodes
+from stream_dmr.template import Template
+from table1.fish import Haul
+
+ROWS = ("dmr", "dmr-flat")
+PAPER_ROWS = ("paper", "paper-flat")
+PAPER_FRAMES = 4  # of each fish, and of every fourth scene: Adam takes a hundred times as long
+_PAPER = {"fit_mesh": {"deformation": "linear-blend", "solver": "adam"}}
+
+
+class Dmr:
+    """The default settings, and the same fits without bending."""
+
+    def __init__(self, template: Template) -> None:
+        self._template = template
+
+    def measure(self, haul: Haul) -> dict[str, dict[int, LengthRow]]:
+        """Lengths by row and track id, as `stream-dmr run` gives them."""
+        crops = [sighting.crop for frame in haul.frames for sighting in frame]
+        measured = {}
+        for row, nodes in zip(ROWS, _fit_once({}, self._template, haul, crops), strict=True):
+            estimates = [m for m in nodes if isinstance(m, LengthEstimate) and m.is_final]
+            measured[row] = {estimate.track_id: _row(estimate) for estimate in estimates}
+        return measured
+
+
+class Paper:
+    """Linear blend, Adam, the plain mean over frames: a random few of those that may count."""
+
+    def __init__(self, template: Template) -> None:
+        self._template = template
+
+    def measure(self, haul: Haul) -> dict[str, dict[int, LengthRow]]:
+        """Lengths by row and track id."""
+        measured = {}
+        located = _fit_once(_PAPER, self._template, haul, chosen_crops(haul))
+        for row, messages in zip(PAPER_ROWS, located, strict=True):
+            lengths_mm: dict[int, list[float]] = {track_id: [] for track_id in haul.truth_mm}
+            for fish in messages:
+                if isinstance(fish, LocalizedFish) and fish.accepted:
+                    lengths_mm[fish.track_id].append(fish.length_mm or np.nan)
+            measured[row] = {
+                track_id: LengthRow(length_mm=float(np.mean(frames)) if frames else None)
+                for track_id, frames in lengths_mm.items()
+            }
+        return measured
+
+
+def chosen_crops(haul: Haul) -> list[FishCrop]:
+    """At most PAPER_FRAMES of each fish, in order: whole ones, not too much hidden."""
+    gates = LocalizeSettings()
+    usable: dict[int, list[FishCrop]] = {}
+    for sighting in (sighting for frame in haul.frames for sighting in frame):
+        quality = sighting.crop.quality
+        if not quality.touches_border and quality.visible_fraction >= gates.min_visible_fraction:
+            usable.setdefault(sighting.crop.track_id, []).append(sighting.crop)
+    chosen = []
+    for track_id, crops in usable.items():
+        rng = np.random.default_rng(track_id)
+        some = rng.choice(len(crops), min(PAPER_FRAMES, len(crops)), replace=False)
+        chosen += [crops[n] for n in sorted(some)]
+    return chosen
+
+
+def _fit_once(
+    changes: dict[str, dict[str, str]], template: Template, haul: Haul, crops: Iterable[Message]
+) -> tuple[list[Message], list[Message]]:
+    """Everything that the nodes say after the fit, with bending and without."""
+    bent, flat = (
+        later_nodes(
+            Config.model_validate(changes | {"localize": {"bending": bending}}),
+            template=template,
+            calibration=haul.calibration,
+        )
+        for bending in (True, False)
+    )
+    meshes = _through(crops, bent[0])
+    return _through_all(meshes, bent[1:]), _through_all(meshes, flat[1:])
+
+
+def _through_all(messages: Sequence[Message], nodes: Sequence[Node]) -> list[Message]:
+    said: list[Message] = []
+    for node in nodes:
+        messages = _through(messages, node)
+        said += messages
+    return said
+
+
+def _through(messages: Iterable[Message], node: Node) -> list[Message]:
+    return [*(out for message in messages for out in node.step(message)), *node.close()]
+
+
+def _row(estimate: LengthEstimate) -> LengthRow:
+    ci95_mm = None if estimate.ci95_mm is None else (estimate.ci95_mm[0], estimate.ci95_mm[1])
+    return LengthRow(length_mm=estimate.length_mm, std_mm=estimate.length_std_mm, ci95_mm=ci95_mm)

@@ -1,0 +1,56 @@
+"""All methods by name, made when first needed, and the work of one process: one scene."""
+
+from collections.abc import Callable, Iterable
+from functools import cache as cached
+from pathlib import Path
+
+from targets import species_template
+
+from stream_dmr.evaluation_files import LengthRow
+from table1 import results, stereo
+from table1.bfs import BruteForce
+from table1.dmr import Dmr, Paper
+from table1.fish import Haul, table_scene, watch
+from table1.monopose import MonoPose
+from table1.plate import Plate
+from table1.silhouettes import open_database
+
+METHODS = ("stereo", "monopose", "bfs", "dmr", "paper")
+LOG2_DATABASE = 20  # a million entries
+_PAPER_EVERY = 4  # scenes: see table1.dmr
+
+Measure = Callable[[Haul], dict[str, dict[int, LengthRow]]]
+
+
+def scenes_of(method: str, scenes: Iterable[int]) -> list[int]:
+    """Those scenes that a method measures."""
+    return [scene for scene in scenes if method != "paper" or scene % _PAPER_EVERY == 0]
+
+
+def measure_scene(task: tuple[int, list[str], Path]) -> int:
+    """Film one scene, measure it by these methods, keep what they say; the scene's number."""
+    scene, methods, cache = task
+    haul = watch(table_scene(scene), with_second="stereo" in methods)
+    for method in methods:
+        measured = make_method(method, cache)(haul)
+        results.save(method, scene, haul.truth_mm, measured, cache=cache)
+    return scene
+
+
+@cached
+def make_method(method: str, cache: Path, log2_database: int = LOG2_DATABASE) -> Measure:
+    """What a method does with a haul; all of them get the species' mean shape."""
+    template = species_template()
+    match method:
+        case "stereo":
+            return stereo.measure
+        case "monopose":
+            return MonoPose(Plate.from_template(template)).measure
+        case "bfs":
+            database = open_database(template, log2_size=log2_database, cache=cache)
+            return BruteForce(template, database).measure
+        case "dmr":
+            return Dmr(template).measure
+        case "paper":
+            return Paper(template).measure
+    raise ValueError(f"expected one of {', '.join(METHODS)}, got {method}")
