@@ -54,7 +54,8 @@ def crops_of(scene: Path, segmenter: str) -> Iterator[tuple[FishCrop, Bool[np.nd
 
 
 def iou(found: Bool[np.ndarray, "S S"], truth: Bool[np.ndarray, "S S"]) -> float:
-    return np.count_nonzero(found & truth) / np.count_nonzero(found | truth)
+    """Intersection over union; 0 where both are empty."""
+    return np.count_nonzero(found & truth) / max(np.count_nonzero(found | truth), 1)
 
 
 def tile(crop: FishCrop, truth: Bool[np.ndarray, "S S"]) -> UInt8[np.ndarray, "T S 3"]:

@@ -1,6 +1,6 @@
 """The whole chain on nothing but video: fish counted, masks, lengths, and what the time goes into.
 
-    .venv/bin/python benchmarks/raw_video.py [SCENE...]           one row a scene
+    .venv/bin/python benchmarks/raw_video.py [SCENE...]           one row a scene; --sheet masks.png
     .venv/bin/python benchmarks/raw_video.py --simulate 6         scenes of our own, every preset
     .venv/bin/python benchmarks/raw_video.py --speed              1280x960, two fish in view
 
@@ -14,12 +14,15 @@ import tempfile
 import threading
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from chain import write_clip
+from jaxtyping import Bool
+from masks import iou, write_sheet
 
 from nodes.crop_fish import CropFish
 from nodes.read_frames import ReadFrames
@@ -57,18 +60,23 @@ class Row(NamedTuple):
     measured: int  # fish that got a length
 
 
-def measure(scene: Path, config: Path | None, template: str) -> Row:
+def measure(scene: Path, arguments: argparse.Namespace) -> Row:
     """Run a scene twice, from the video alone and with its masks, and compare."""
     truth = read_truth(scene / "truth.csv")
-    raw = chain(scene, config, template or str(scene / "species.ply"), given=False)
-    given = chain(scene, config, template or str(scene / "species.ply"), given=True)
-    ious, names = _against_masks(raw.crops, Masks(scene / "masks"))
+    folder = scene if (scene / "species.ply").exists() else scene.parent
+    template = arguments.template or str(folder / "species.ply")
+    raw = chain(scene, arguments.config, template, given=False)
+    given = chain(scene, arguments.config, template, given=True)
+    pairs, names = _against_masks(raw.crops, Masks(scene / "masks"))
+    ious = np.array([iou(crop.mask, true) for crop, true in pairs])
+    if arguments.sheet:
+        write_sheet(pairs, ious, arguments.sheet.with_stem(f"{arguments.sheet.stem}-{scene.name}"))
     errors = _errors(raw.lengths, truth, names)
     return Row(
         name=scene.name,
         num_fish=len(truth),
         counted=len({length.track_id for length in raw.lengths}),
-        iou=float(np.mean(ious)) if ious else float("nan"),
+        iou=float(ious.mean()) if len(ious) else float("nan"),
         error=float(np.mean(errors)) if errors else float("nan"),
         error_given=float(np.mean(_errors(given.lengths, truth, {i: i for i in truth}))),
         measured=len(errors),
@@ -103,9 +111,11 @@ def chain(scene: Path, path: Path | None, template: str, *, given: bool) -> Ran:
     return ran
 
 
-def _against_masks(crops: Iterable[FishCrop], masks: Masks) -> tuple[list[float], dict[int, int]]:
-    """The IoU of every crop's mask, and which true fish each found one mostly is (0: none)."""
-    ious, votes = [], {}
+def _against_masks(
+    crops: Iterable[FishCrop], masks: Masks
+) -> tuple[list[tuple[FishCrop, Bool[np.ndarray, "S S"]]], dict[int, int]]:
+    """Every crop with its true mask, and which true fish each found one mostly is (0: none)."""
+    pairs, votes = [], {}
     for crop in crops:
         camera = crop.frame_camera
         labels = masks.labels(crop.frame_index, width=camera.width, height=camera.height)
@@ -116,9 +126,8 @@ def _against_masks(crops: Iterable[FishCrop], masks: Masks) -> tuple[list[float]
         ids = Counter(seen[crop.mask & (seen > 0)].tolist())
         name = ids.most_common(1)[0][0] if ids else 0
         votes.setdefault(crop.track_id, Counter())[name] += 1
-        true = seen == name if name else np.zeros_like(crop.mask)
-        ious.append(float((crop.mask & true).sum() / max((crop.mask | true).sum(), 1)))
-    return ious, {track: count.most_common(1)[0][0] for track, count in votes.items()}
+        pairs.append((crop, seen == name if name else np.zeros_like(crop.mask)))
+    return pairs, {track: count.most_common(1)[0][0] for track, count in votes.items()}
 
 
 def _errors(
@@ -136,18 +145,19 @@ def print_rows(rows: Iterable[Row]) -> None:
     """A Markdown table, and what it comes to."""
     print("| scene | fish | counted | measured | mask IoU | length error | with true masks |")
     print("|---|---|---|---|---|---|---|")
-    rows = list(rows)
+    done = []
     for row in rows:
+        done.append(row)
         print(
             f"| {row.name} | {row.num_fish} | {row.counted} | {row.measured} | {row.iou:.3f} "
             f"| {row.error:.1%} | {row.error_given:.1%} |",
             flush=True,
         )
-    exact = sum(row.counted == row.num_fish for row in rows)
+    exact = sum(row.counted == row.num_fish for row in done)
     print(
-        f"\nexact counts: {exact}/{len(rows)}; mask IoU {np.nanmean([r.iou for r in rows]):.3f}; "
-        f"length error {np.nanmean([r.error for r in rows]):.1%}, "
-        f"with true masks {np.nanmean([r.error_given for r in rows]):.1%}"
+        f"\nexact counts: {exact}/{len(done)}; mask IoU {np.nanmean([r.iou for r in done]):.3f}; "
+        f"length error {np.nanmean([r.error for r in done]):.1%}, "
+        f"with true masks {np.nanmean([r.error_given for r in done]):.1%}"
     )
 
 
@@ -177,23 +187,26 @@ def main() -> None:
     parser.add_argument("--config", type=Path)
     parser.add_argument("--template", default="", help="default: the scene's species.ply")
     parser.add_argument("--simulate", type=int, default=0, help="scenes of every preset")
+    parser.add_argument("--sheet", type=Path, help="a picture of masks per scene, named after it")
     parser.add_argument("--speed", action="store_true")
     arguments = parser.parse_args()
     if arguments.speed:
         print_speed(arguments.config)
     if arguments.scenes:
-        print_rows(measure(s, arguments.config, arguments.template) for s in arguments.scenes)
+        print_rows(measure(scene, arguments) for scene in arguments.scenes)
     if arguments.simulate:
         with tempfile.TemporaryDirectory() as folder:
-            print_rows(_simulated(Path(folder), arguments.simulate, arguments.config))
+            print_rows(_simulated(Path(folder), arguments))
 
 
-def _simulated(folder: Path, count: int, config: Path | None) -> Iterable[Row]:
+def _simulated(folder: Path, arguments: argparse.Namespace) -> Iterable[Row]:
+    """Scenes with exact masks; those that `simulate` writes are as ragged as people's."""
     for preset in PRESETS:
-        for seed in range(900, 900 + count):
+        PRESETS[preset] = replace(PRESETS[preset], ragged_px=0.0)
+        for seed in range(900, 900 + arguments.simulate):
             scene = folder / f"{preset}-{seed}"
             simulate(scene, num_fish=5, num_frames=75, preset=preset, seed=seed)
-            yield measure(scene, config, "")
+            yield measure(scene, arguments)
 
 
 if __name__ == "__main__":

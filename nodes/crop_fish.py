@@ -26,7 +26,7 @@ class CropFish:
         if self._camera is None:
             height, width = frame.image.shape[:2]
             self._camera = Camera.nominal(width=width, height=height)
-        return [
+        crops = [
             crop_fish(
                 frame,
                 detection,
@@ -36,6 +36,7 @@ class CropFish:
             )
             for detection in self.detections.detect(frame)
         ]
+        return self.detections.admit(crops)
 
     def tick(self, timestamp_ns: int, /) -> Sequence[FishCrop]:
         """Nothing waits for time to pass here."""

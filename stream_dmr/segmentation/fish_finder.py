@@ -1,9 +1,10 @@
 """Where the fish of a run come from: files that somebody made, or the video itself."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from stream_dmr.messages import Frame
+from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.annotations import load_boxes
 from stream_dmr.segmentation.box_detector import BoxDetector
 from stream_dmr.segmentation.boxes import UNKNOWN_ID
@@ -22,7 +23,11 @@ class FishFinder(Protocol):
         ...
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """The fish of one frame, by id. Raises AnnotationError where its mask can't be used."""
+        """What may be fish in one frame. Raises AnnotationError where its mask can't be used."""
+        ...
+
+    def admit(self, crops: Iterable[FishCrop]) -> list[FishCrop]:
+        """Those of the frame's crops that are of fish, by the fish's ids."""
         ...
 
 

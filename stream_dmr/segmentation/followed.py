@@ -1,6 +1,9 @@
 """Fish from nothing but the video: found in every frame, followed, and counted once each."""
 
-from stream_dmr.messages import Frame
+from collections.abc import Iterable
+from dataclasses import replace
+
+from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.counting import CounterSettings, FishCounter
 from stream_dmr.segmentation.detections import Detection
 from stream_dmr.segmentation.detector import Detector
@@ -12,7 +15,7 @@ class TrackFishSettings(TrackerSettings, CounterSettings):
 
 
 class FollowedFish:
-    """A detector's candidates as fish with ids; their masks are for the segmenter to find."""
+    """A detector's candidates, followed; those whose masks look like fish get a fish's id."""
 
     def __init__(self, detector: Detector, settings: TrackFishSettings) -> None:
         self._detector = detector
@@ -20,23 +23,22 @@ class FollowedFish:
         self._counter = FishCounter(settings)
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """The fish of one frame, by id. Frames must come in order."""
-        height, width = frame.image.shape[:2]
-        sightings = self._tracker.step(frame, self._detector.find(frame))
-        known = [
-            (self._counter.track_id(sighting, width=width, height=height), sighting)
-            for sighting in sightings
-        ]
+        """What may be fish in one frame, by the numbers of their tracks. Frames come in order."""
         return [
             Detection(
-                track_id=track_id,
+                track_id=sighting.number,
                 bbox_xyxy_px=sighting.candidate.bbox_xyxy_px,
                 mask=None,
                 visible_fraction=sighting.visible_fraction,
             )
-            for track_id, sighting in sorted(known, key=lambda one: one[0] or 0)
-            if track_id is not None
+            for sighting in self._tracker.step(frame, self._detector.find(frame))
         ]
+
+    def admit(self, crops: Iterable[FishCrop]) -> list[FishCrop]:
+        """The crops of those tracks that count as fish by now, by the fish's ids."""
+        known = [(self._counter.track_id(crop), crop) for crop in crops]
+        fish = [replace(crop, track_id=i) for i, crop in known if i is not None]
+        return sorted(fish, key=lambda crop: crop.track_id)
 
     @property
     def warnings(self) -> list[str]:

@@ -19,6 +19,7 @@ from scipy.optimize import linear_sum_assignment
 
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.detector import Candidate, whole_pixels
+from stream_dmr.segmentation.parting import Expected, part
 from stream_dmr.settings import Settings
 
 # Standard deviations; those of motion are fractions of the fish's size, so that any zoom will do.
@@ -54,7 +55,6 @@ class Sighting:
     """One followed fish in one frame."""
 
     number: int  # of the track; not a fish's id yet
-    frames_seen: int
     candidate: Candidate
     visible_fraction: float  # 0 to 1
 
@@ -72,6 +72,7 @@ class Tracker:
         looks = [_Look(frame.image, c) for c in candidates if c.score >= self._settings.min_score]
         for track in self._tracks:
             track.predict(frame.frame_index)
+        looks = [piece for look in looks for piece in self._part(frame, look)]
         swallowed = self._swallowed(looks)
         looks = [look for i, look in enumerate(looks) if i not in swallowed]
         free = self._assign(looks)
@@ -83,6 +84,16 @@ class Tracker:
                 self._started += 1
                 self._tracks.append(_Track(look, self._started, frame.frame_index))
         return [track.sighting() for track in self._tracks if track.lost_frames == 0]
+
+    def _part(self, frame: Frame, look: "_Look") -> list["_Look"]:
+        """A candidate, or its pieces where several fish share it."""
+        inside = [t for t in self._tracks if t.may_hide and t.share_in(look.box) > _SWALLOWED]
+        largest = max((track.area for track in inside), default=np.inf)
+        if look.area < _SWOLLEN * largest or any(t.look.touches_border for t in inside):
+            return [look]
+        expected = [track.expected() for track in inside]
+        pieces = part(look.candidate, [one for one in expected if one is not None])
+        return [look] if len(pieces) < 2 else [_Look(frame.image, piece) for piece in pieces]
 
     def _swallowed(self, looks: Sequence["_Look"]) -> set[int]:
         """The candidates that are several fish at once; those fish wait until they part."""
@@ -231,8 +242,18 @@ class _Track:
 
     def share_in(self, box: Float[np.ndarray, "4"]) -> float:
         """The share of the box where this fish is expected that lies in another."""
-        here = self.look.box - np.tile(self.look.middle, 2) + np.tile(self.middle, 2)
-        return _share_in(here, box)
+        return _share_in(self.look.box + np.tile(self._way, 2), box)
+
+    def expected(self) -> Expected | None:
+        """The fish's last shape, moved on; None where the detector gives no shapes."""
+        shape = self.look.candidate.foreground
+        corner = self.look.box[:2] + self._way
+        return None if shape is None else Expected(shape=shape, corner=corner)
+
+    @property
+    def _way(self) -> Float[np.ndarray, "2"]:
+        """From where the fish was seen to where it is expected, px."""
+        return self.middle - self.look.middle
 
     def is_inside(self, width: int, height: int) -> bool:
         """Whether the fish is in the picture, as far as one can tell."""
@@ -243,7 +264,6 @@ class _Track:
         is_cut = self.look.touches_border
         return Sighting(
             number=self.number,
-            frames_seen=self.frames_seen,
             candidate=self.look.candidate,
             visible_fraction=min(1.0, self.look.area / self.area) if is_cut else 1.0,
         )

@@ -32,7 +32,7 @@ def jitter(
     *,
     limits: Float[np.ndarray, "4"],
 ) -> Float[np.ndarray, "4"]:
-    """A box drawn as people and detectors do: some per cent off, one in four by much more.
+    """A box drawn as people and detectors do: some per cent off, one in three by much more.
 
     Detectors lose thin tails, and take a piece of line or gaff for a part of the fish.
     """
@@ -40,7 +40,7 @@ def jitter(
     sides = np.tile(high - low, 2)
     spread = 0.10 if rng.random() < 0.12 else rng.uniform(0.0, 0.04)
     moved = bbox_xyxy + sides * rng.laplace(0.0, spread / np.sqrt(2), 4).clip(-0.2, 0.2)
-    if rng.random() < 0.15:
+    if rng.random() < 0.25:
         edge, outwards = rng.integers(4), rng.uniform(-0.25, 0.5)
         reach = outwards * (sides.max() if outwards > 0 else sides[edge])
         moved[edge] += reach if edge >= 2 else -reach

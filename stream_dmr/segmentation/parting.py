@@ -1,0 +1,97 @@
+"""One moving shape that several fish share, cut into theirs by where each should be now.
+
+Shapes of moving things run into one another long before fish hide each other. A fish hardly changes
+from one frame to the next, so its last shape, moved on, says which pixels are its own; what is left
+over and as large as a fish is another one, even one that nobody has seen yet.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from stream_dmr.segmentation.detector import Candidate, whole_pixels
+
+_REACH = 0.1  # of a fish's length: so far from where it is expected its outline may be
+_FISH = 0.3  # of the smallest fish's area: a smaller piece is none
+_THREAD = 0.06  # of a fish's length: what is thinner is a line or a sliver
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Expected:
+    """A fish's last shape, where it should be now."""
+
+    shape: Bool[np.ndarray, "h w"]
+    corner: Float[np.ndarray, "2"]  # frame x, y of its first pixel
+
+    @property
+    def length_px(self) -> int:
+        """The longer side of its box."""
+        return max(self.shape.shape)
+
+
+def part(candidate: Candidate, fish: Sequence[Expected]) -> list[Candidate]:
+    """The candidate's pieces: one for each of the fish that shows enough, and those of no fish.
+
+    The candidate itself where it has no `foreground`, or no second piece is to be found.
+    """
+    if candidate.foreground is None or not fish:
+        return [candidate]
+    x, y, _, _ = whole_pixels(candidate.bbox_xyxy_px)
+    away = np.stack([_away(one, candidate.foreground.shape, (x, y)) for one in fish])
+    nearest = away.argmin(axis=0)
+    reach = np.array([max(2.0, _REACH * one.length_px) for one in fish])
+    is_near = away.min(axis=0) <= reach[nearest]
+    least = _FISH * min(np.count_nonzero(one.shape) for one in fish)
+    thread = round(_THREAD * min(one.length_px for one in fish)) | 1
+    owned = [candidate.foreground & is_near & (nearest == i) for i in range(len(fish))]
+    pieces = [_largest(_opened(one, thread)) for one in owned]
+    pieces += _components(_opened(candidate.foreground & ~is_near, thread))
+    pieces = [piece for piece in pieces if np.count_nonzero(piece) >= least]
+    if len(pieces) < 2:
+        return [candidate]
+    return [_candidate(piece, candidate, (x, y)) for piece in pieces]
+
+
+def _away(
+    fish: Expected, shape: tuple[int, ...], corner: tuple[int, int]
+) -> Float[np.ndarray, "H W"]:
+    """How far each pixel of a region is from a fish's expected shape, px."""
+    sea = np.ones(shape, np.uint8)
+    x, y = np.round(fish.corner - corner).astype(int).tolist()
+    h, w = fish.shape.shape
+    top, left = max(0, y), max(0, x)
+    inside = fish.shape[top - y : shape[0] - y, left - x : shape[1] - x]
+    if inside.size == 0 or h + y <= 0 or w + x <= 0:
+        return np.full(shape, np.inf)
+    sea[top : top + inside.shape[0], left : left + inside.shape[1]] = ~inside
+    if sea.all():
+        return np.full(shape, np.inf)
+    return cv2.distanceTransform(sea, cv2.DIST_L2, cv2.DIST_MASK_3).astype(np.float64)
+
+
+def _opened(mask: Bool[np.ndarray, "H W"], diameter: int) -> UInt8[np.ndarray, "H W"]:
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (diameter, diameter))
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, disc)
+
+
+def _components(mask: UInt8[np.ndarray, "H W"]) -> list[Bool[np.ndarray, "H W"]]:
+    count, labels, _, _ = cv2.connectedComponentsWithStats(mask)
+    return [labels == label for label in range(1, count)]
+
+
+def _largest(mask: UInt8[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    parts = _components(mask)
+    return max(parts, key=np.count_nonzero) if parts else mask > 0
+
+
+def _candidate(
+    piece: Bool[np.ndarray, "H W"], whole: Candidate, corner: tuple[int, int]
+) -> Candidate:
+    x, y, w, h = cv2.boundingRect(piece.view(np.uint8))
+    box = np.array([x, y, x + w, y + h], np.float64) + np.tile(corner, 2)
+    return Candidate(
+        bbox_xyxy_px=box, score=whole.score, foreground=piece[y : y + h, x : x + w].copy()
+    )
