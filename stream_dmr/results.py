@@ -10,7 +10,7 @@ from pathlib import Path
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate
-from stream_dmr.recording.opened import Recording, messages, open_recordings
+from stream_dmr.recording.opened import Recording, messages
 from stream_dmr.recording.part import WHOLE, Part
 from stream_dmr.store import NAME, RunFacts, read_estimates
 from stream_dmr.store_schema import open_database
@@ -48,26 +48,25 @@ def read_fish(path: Path, recording: Recording, part: Part = WHOLE) -> list[Fish
     Raises OutputError or RecordingError where they can't be read.
     """
     database = database_of(path)
-    if database is None:
-        facts = run_facts(recording.header)
-        found = (message for message, _ in messages(recording, [LengthEstimate], part))
+    if database is not None:
+        fish = read_stored(database)
         return [
-            FishResult(estimate=estimate, facts=facts, run_id="")
-            for estimate in found
-            if isinstance(estimate, LengthEstimate) and estimate.is_final
+            one
+            for one in fish
+            if part.has(one.estimate) and part.has_time(one.estimate.last_timestamp_ns)
         ]
-    held = reviews(read_verdicts(database))
+    facts = run_facts(recording.header)
+    found = (message for message, _ in messages(recording, [LengthEstimate], part))
     return [
-        fish
-        for fish in _stored_fish(database, held)
-        if part.has(fish.estimate) and part.has_time(fish.estimate.last_timestamp_ns)
+        FishResult(estimate=estimate, facts=facts, run_id="")
+        for estimate in found
+        if isinstance(estimate, LengthEstimate) and estimate.is_final
     ]
 
 
-def read_results(path: Path, part: Part = WHOLE) -> tuple[Recording, list[FishResult]]:
-    """The recording of a folder (or a recording itself), and its fish."""
-    recording = open_recordings([path])
-    return recording, read_fish(path, recording, part)
+def read_stored(database: Path) -> list[FishResult]:
+    """All fish of a lengths.db. OutputError where it is damaged."""
+    return _stored_fish(database, reviews(read_verdicts(database)))
 
 
 def read_runs(database: Path) -> dict[str, RunFacts]:
@@ -83,14 +82,6 @@ def fish_by_run(database: Path) -> dict[str, list[str]]:
         for row in connection.execute("SELECT run_id, * FROM fish ORDER BY number"):
             lines.setdefault(row[0], []).append(json.dumps(row[1:]))
     return lines
-
-
-def unended_runs(database: Path) -> set[str]:
-    """Runs that are still going, or that a crash ended."""
-    with _opened(database) as connection:
-        return {
-            row[0] for row in connection.execute("SELECT run_id FROM runs WHERE ended_ns IS NULL")
-        }
 
 
 def _opened(database: Path) -> closing[sqlite3.Connection]:

@@ -1,0 +1,182 @@
+"""Whether results are still what their run measured: every file against what made it.
+
+The recording is the witness of the database, the database of lengths.csv, the recording of
+frames.csv, and provenance.json of them all. Who changes all of these alike can't be found here:
+keep a copy of provenance.json elsewhere.
+"""
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import NamedTuple
+
+from stream_dmr.errors import OutputError, RecordingError, UserError
+from stream_dmr.messages import LengthEstimate, LocalizedFish
+from stream_dmr.provenance import NAME as PROVENANCE
+from stream_dmr.provenance import fish_sha256, read_provenance, sha256_of
+from stream_dmr.recording.opened import messages, open_recordings
+from stream_dmr.recording.part import WHOLE
+from stream_dmr.results import FishResult, database_of, fish_by_run, read_runs, read_stored
+from stream_dmr.store import NAME as DATABASE
+from stream_dmr.store import RunFacts
+from stream_dmr.tables import FRAMES_COLUMNS, LENGTHS_COLUMNS, frames_row, lengths_row
+from stream_dmr.tally import run_facts
+
+_MADE_BY = ("config_sha256", "calibration_sha256", "template_sha256")
+_COMPARED = (
+    *("length_mm", "length_std_mm", "frames_seen", "frames_used", "first_frame", "last_frame"),
+    *("first_timestamp_ns", "last_timestamp_ns", "status"),
+)
+
+
+class Change(NamedTuple):
+    """One thing that is not as it was made."""
+
+    path: Path
+    what: str
+
+
+def verify(folder: Path) -> tuple[list[Change], int]:
+    """Check a folder of results or exports and those in it; what was changed, and files checked.
+
+    Raises UserError where there is nothing to check.
+    """
+    places = {path.parent for name in (DATABASE, PROVENANCE) for path in folder.rglob(name)}
+    if not places:
+        raise UserError(
+            f"{folder}: expected a folder with {DATABASE} or {PROVENANCE}, found neither; give the "
+            "--out of a run or of an export"
+        )
+    changes, num_files = list[Change](), 0
+    for place in sorted(places):
+        found = list(_changes(place))
+        num_files += sum(1 for path in place.iterdir() if path.is_file())
+        changes += dict.fromkeys(found)
+    return changes, num_files
+
+
+def _changes(folder: Path) -> Iterator[Change]:
+    yield from _against_provenance(folder)
+    database = database_of(folder)
+    if database is None:
+        return
+    try:
+        runs = read_runs(database)
+        fish = {one.estimate.track_id: one for one in read_stored(database)}
+    except OutputError as error:
+        yield Change(database, f"damaged: {error}")
+        return
+    lengths = [(str(f.estimate.track_id), lengths_row(f.estimate)) for f in fish.values()]
+    yield from _csv(folder / "lengths.csv", LENGTHS_COLUMNS, dict(lengths), whole=True)
+    frames: dict[str, list[str]] = {}
+    for recording in sorted([*folder.glob("*.mcap"), *folder.glob("*.mcap.part")]):
+        yield from _recording(recording, runs, fish, frames)
+    if frames:
+        yield from _csv(folder / "frames.csv", FRAMES_COLUMNS, frames, whole=False)
+
+
+def _against_provenance(folder: Path) -> Iterator[Change]:
+    try:
+        made = read_provenance(folder)
+    except (ValueError, OSError) as error:
+        yield Change(folder / PROVENANCE, f"damaged: {error}")
+        return
+    if made is None:
+        return
+    for name, expected in made["files"].items():
+        path = folder / name
+        if not path.is_file():
+            yield Change(path, "is missing")
+        elif sha256_of(path) != expected:
+            yield Change(path, f"was changed: its SHA-256 is not that in {PROVENANCE}")
+    database = database_of(folder)
+    if database is None:
+        return
+    try:
+        stored, runs = fish_by_run(database), read_runs(database)
+    except OutputError:
+        return  # `_changes` says so
+    for run_id, expected in made["fish_sha256"].items():
+        if fish_sha256(stored.get(run_id, [])) != expected:
+            yield Change(database, f"the fish of run {run_id} are not those that were measured")
+    for run_id, facts in made["runs"].items():
+        for field in fields(RunFacts):
+            now = getattr(runs.get(run_id), field.name, "missing")
+            if now != facts.get(field.name):
+                was = facts.get(field.name)
+                yield Change(database, f"run {run_id}: {field.name} is {now!r}, was {was!r}")
+
+
+def _recording(
+    path: Path,
+    runs: dict[str, RunFacts],
+    fish: dict[int, FishResult],
+    frames: dict[str, list[str]],
+) -> Iterator[Change]:
+    """Compare a recording with the database; its rows of frames.csv are added to `frames`."""
+    try:
+        recording = open_recordings([path])
+        made = run_facts(recording.header)
+        if not any(all(getattr(r, n) == getattr(made, n) for n in _MADE_BY) for r in runs.values()):
+            of_run = next(iter(runs.values()), None)
+            for name in _MADE_BY:
+                if getattr(of_run, name, None) != getattr(made, name):
+                    yield Change(path, f"{name} is {getattr(made, name)}, no run in {DATABASE} has")
+        waiting: dict[tuple[int, int], LocalizedFish] = {}
+        for message, _ in messages(recording, [LocalizedFish, LengthEstimate], WHOLE):
+            key = message.frame_index, getattr(message, "track_id", 0)
+            if isinstance(message, LocalizedFish):
+                waiting[key] = message
+            elif isinstance(message, LengthEstimate):
+                if (seen := waiting.pop(key, None)) is not None:
+                    row = frames_row(seen, message.is_frame_used, message.frame_reason)
+                    frames[f"{key[0]},{key[1]}"] = row
+                if message.is_final:
+                    yield from _estimate(path, message, fish.get(message.track_id))
+        for line in recording.warnings:
+            yield Change(path, line)
+    except RecordingError as error:
+        yield Change(path, f"damaged: {error}")
+
+
+def _estimate(path: Path, recorded: LengthEstimate, fish: FishResult | None) -> Iterator[Change]:
+    database = path.parent / DATABASE
+    if fish is None:
+        yield Change(database, f"fish {recorded.track_id} is missing; {path.name} has it")
+        return
+    for name in _COMPARED:
+        stored, measured = getattr(fish.estimate, name), getattr(recorded, name)
+        if stored != measured:
+            what = f"fish {recorded.track_id}: {name} is {stored}, {path.name} says {measured}"
+            yield Change(database, what)
+
+
+def _csv(
+    path: Path, columns: Sequence[str], expected: dict[str, list[str]], *, whole: bool
+) -> Iterator[Change]:
+    """Compare a table with the rows it should have; without `whole`, it may have others too."""
+    if not path.is_file():
+        yield Change(path, "is missing")
+        return
+    text = path.read_text(encoding="utf-8", errors="replace")
+    rows = list(csv.reader(io.StringIO(text)))
+    if not rows or rows[0] != list(columns):
+        yield Change(path, "its columns are not those of stream-dmr")
+        return
+    key = columns.index("track_id")
+    found: dict[str, list[str]] = {}
+    for row in rows[1:]:
+        if len(row) == len(columns):
+            found[row[0] if key == 0 else f"{row[0]},{row[key]}"] = row
+    for name, row in expected.items():
+        label = f"fish {name}" if key == 0 else "frame {}, fish {}".format(*name.split(","))
+        if name not in found:
+            yield Change(path, f"{label} is missing")
+            continue
+        for column, now, was in zip(columns, found[name], row, strict=True):
+            if now != was:
+                yield Change(path, f"{label}: {column} is {now or 'blank'}, was {was or 'blank'}")
+    for name in found.keys() - expected.keys() if whole else ():
+        yield Change(path, f"fish {name} is no fish of {DATABASE}")

@@ -1,0 +1,123 @@
+"""`stream-dmr verify`: nothing is said of sound results, and every change is found and named."""
+
+import json
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from command import invoke
+from fish_run import measure
+
+from stream_dmr.errors import UserError
+from stream_dmr.provenance import NAME
+from stream_dmr.verdicts import Verdict, add_verdict
+from stream_dmr.verify import verify
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return measure(tmp_path_factory.mktemp("fish"), vessel="Sea Bird")
+
+
+@pytest.fixture
+def out(finished: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished, tmp_path / "out"))
+
+
+def changed(folder: Path) -> list[str]:
+    return [f"{change.path.name}: {change.what}" for change in verify(folder)[0]]
+
+
+def sql(out: Path, statement: str) -> None:
+    with closing(sqlite3.connect(out / "lengths.db")) as database:
+        database.execute(statement)
+        database.commit()
+
+
+def test_sound_results_and_exports_are_found_sound(out: Path):
+    export = invoke("export", {"--out": str(out / "exp"), "--fish": "csv"} | {str(out): None})
+    assert export.code == 0, export.err
+    outcome = invoke("verify", {str(out): None})
+    assert outcome.code == 0, outcome.out
+    assert "nothing was changed" in outcome.out
+    add_verdict(out / "lengths.db", Verdict(track_id=1, kind="accept", reviewer="Ada"))
+    assert changed(out) == []  # a verdict changes no measurement
+
+
+@pytest.mark.parametrize(
+    ("statement", "expected"),
+    [
+        ("UPDATE fish SET length_mm = 999.0 WHERE track_id = 2", "fish 2: length_mm is 999.0"),
+        ("UPDATE fish SET iou = 1.0 WHERE track_id = 1", "are not those that were measured"),
+        ("DELETE FROM fish WHERE track_id = 1", "fish 1 is missing; recording.mcap has it"),
+        ("UPDATE runs SET vessel = 'Other'", "vessel is 'Other', was 'Sea Bird'"),
+        ("UPDATE runs SET config_sha256 = 'f00d'", "config_sha256 is 'f00d'"),
+    ],
+)
+def test_a_changed_database(out: Path, statement: str, expected: str):
+    sql(out, statement)
+    assert any(expected in line for line in changed(out)), changed(out)
+
+
+@pytest.mark.parametrize("name", ["lengths.csv", "frames.csv"])
+@pytest.mark.parametrize("is_resealed", [False, True])
+def test_a_changed_cell_is_named(out: Path, name: str, is_resealed: bool):
+    path = out / name
+    lines = path.read_text().splitlines()
+    column = lines[0].split(",").index("length_mm")
+    cells = lines[2].split(",")
+    before, cells[column] = cells[column], "1234.000000"
+    lines[2] = ",".join(cells)
+    path.write_text("\n".join(lines) + "\n")
+    if is_resealed:
+        made = json.loads((out / NAME).read_text())
+        del made["files"][name]
+        (out / NAME).write_text(json.dumps(made))
+    found = [line for line in changed(out) if f"length_mm is 1234.000000, was {before}" in line]
+    assert len(found) == 1
+    assert found[0].startswith(name)
+
+
+def test_a_fish_too_many_and_a_file_too_few(out: Path):
+    with (out / "lengths.csv").open("a") as file:
+        file.write("7,800,1,1,1,3,3,1,3,0,1,measured\n")
+    (out / "frames.csv").unlink()
+    found = changed(out)
+    assert "lengths.csv: fish 7 is no fish of lengths.db" in found
+    assert "frames.csv: is missing" in found
+
+
+@pytest.mark.parametrize("name", ["recording.mcap", "recording.rrd"])
+def test_a_changed_recording(out: Path, name: str):
+    path = out / name
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    assert any(line.startswith(name) for line in changed(out))
+
+
+def test_another_runs_recording(out: Path, tmp_path: Path):
+    other = measure(tmp_path / "other", template="halibut")
+    shutil.copy(other / "recording.mcap", out / "recording.mcap")
+    (out / NAME).unlink()
+    assert any("template_sha256" in line for line in changed(out))
+
+
+def test_a_changed_export(out: Path):
+    invoke("export", {"--out": str(out / "exp"), "--tables": "csv"} | {str(out): None})
+    with (out / "exp" / "lengths.csv").open("a") as file:
+        file.write("\n")
+    (line,) = changed(out)
+    assert "lengths.csv: was changed" in line
+    (out / "exp" / NAME).write_text("{}")
+    (line,) = changed(out)
+    assert line.startswith(f"{NAME}: damaged")
+
+
+def test_nothing_to_check_is_refused(tmp_path: Path):
+    with pytest.raises(UserError, match="found neither"):
+        verify(tmp_path)
+    outcome = invoke("verify", {str(tmp_path): None})
+    assert outcome.code == 2
