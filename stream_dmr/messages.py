@@ -54,6 +54,7 @@ class CropQuality:
     mask_area_px: float  # of the mask, in frame pixels
     # The IoU that the mask should have by its segmenter's own probabilities; None: given, not found
     mask_confidence: float | None = None
+    glare: float | None = None  # share of the mask that is blown out; None: an older recording
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -239,6 +239,19 @@ def test_blur_is_less_sharp():
     assert 0 < blurred.quality.sharpness < 0.2 * sharp.quality.sharpness
 
 
+def test_glare_is_the_share_of_the_fish_that_is_blown_out():
+    camera = Camera.nominal(width=200, height=200)
+    mask = np.zeros((200, 200), bool)
+    mask[50:150, 40:160] = True
+    image = np.full((200, 200, 3), 180, np.uint8)
+    image[50:150, 40:70] = 255  # a quarter of the fish
+    image[:50] = 255  # foam beside it
+    image[50:150, 100:130, 0] = 255  # blue, not white
+    assert crop_of(mask, camera, frame=frame_of(image)).quality.glare == pytest.approx(
+        0.25, abs=0.02
+    )
+
+
 def test_specks_go_and_halves_stay():
     mask = np.zeros((100, 200), bool)
     mask[40:60, 20:180] = True

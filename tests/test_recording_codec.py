@@ -60,6 +60,7 @@ qualities = st.builds(
     sharpness=floats,
     mask_area_px=floats,
     mask_confidence=optional(floats),
+    glare=optional(floats),
 )
 ends = st.builds(FishEnds, head_px=numbers(2), tail_px=numbers(2), confidence=floats)
 keys = {"frame_index": integers, "timestamp_ns": integers, "track_id": integers}

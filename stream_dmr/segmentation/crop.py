@@ -16,6 +16,7 @@ from stream_dmr.settings import Settings
 
 _SMALLEST_PART = 0.05  # of the largest part's area: the tail behind a gaff stays, specks go
 _LARGEST_HOLE = 0.01  # of the mask's area: pinholes are noise, larger ones something in front
+_BLOWN = 250  # grey level of every channel: no skin is so bright
 _BORDER_PX = 1  # a mask this near to the frame's edge touches it
 _MOST_SAMPLES = 4  # per crop pixel and axis; more cost time and change nothing that we measured
 
@@ -103,6 +104,7 @@ def crop_fish(
             sharpness=_sharpness(image, fish.mask),
             mask_area_px=fish.area_px,
             mask_confidence=fish.confidence,
+            glare=_glare(image, fish.mask),
         ),
         ends=fish.ends,
     )
@@ -290,6 +292,12 @@ def _touches_border(extent: Float[np.ndarray, "4"] | None, *, shape: tuple[int, 
     height, width = shape
     x0, y0, x1, y1 = extent
     return bool(min(x0, y0, width - x1, height - y1) <= _BORDER_PX)
+
+
+def _glare(image: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]) -> float:
+    """The share of the mask where the sensor saw nothing but light; 0 for an empty one."""
+    is_blown = cv2.inRange(image, np.full(3, _BLOWN), np.full(3, 255)) > 0
+    return float(np.count_nonzero(is_blown & mask) / max(np.count_nonzero(mask), 1))
 
 
 def _sharpness(image: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]) -> float:
