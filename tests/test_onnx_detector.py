@@ -237,5 +237,7 @@ def test_outputs_that_cannot_be_are_refused_before_the_first_frame(
 
 
 def test_a_name_that_is_no_detector_is_refused():
-    with pytest.raises(ModelError, match=r'"motion" or a path that ends in \.onnx, got "yolo"'):
+    with pytest.raises(
+        ModelError, match=r'"unet" or a path that ends in \.pt or \.onnx, got "yolo"'
+    ):
         open_detector(DetectFishSettings(detector="yolo"))

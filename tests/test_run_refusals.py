@@ -162,7 +162,7 @@ def test_a_detector_that_is_none_is_refused_before_the_first_frame(clip: Path):
     options = options_of(clip)
     del options["--boxes"], options["--masks"]
     options["--config"] = str(clip / "detector.toml")
-    for name, expected in (("yolo", '"motion" or a path'), ("none.onnx", "found none")):
+    for name, expected in (("yolo", '"unet" or a path'), ("none.onnx", "found none")):
         (clip / "detector.toml").write_text(f'[detect_fish]\ndetector = "{name}"\n')
         assert_refused(invoke("run", options), expected)
 

@@ -5,7 +5,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stream_dmr.errors import ModelError
+from stream_dmr.messages import Frame
 from stream_dmr.segmentation.unet.boxes import box_picture, crop_around, jitter
+from stream_dmr.segmentation.unet.detector import UNetDetector
 from stream_dmr.segmentation.unet.inference import UNetSegmenter, _find_ends, _fuse
 from stream_dmr.segmentation.unet.losses import ends_are_right, ends_loss, mask_iou, mask_loss
 from stream_dmr.segmentation.unet.network import ENDS_STRIDE, UNet, normalise
@@ -177,3 +179,26 @@ def test_crops_of_any_size_are_segmented_at_their_own(size):
     assert found.probability.shape == (size, size)
     assert np.isfinite(found.probability).all()
     assert torch.get_num_threads() == threads
+
+
+class Bright(UNet):
+    """A network that takes what is brighter than the mean for fish, at the input's size."""
+
+    def forward(self, inputs):
+        maps = inputs.new_zeros(len(inputs), 2, inputs.shape[2] // 4, inputs.shape[3] // 4)
+        return 20 * inputs[:, 0] - 10, maps
+
+
+def test_the_whole_frame_is_searched_and_boxes_are_the_frames():
+    image = np.full((480, 640, 3), 40, np.uint8)
+    image[100:180, 200:400] = 220
+    image[300:360, 50:110] = 220
+    image[400:404, 500:504] = 220  # a speck
+    detector = UNetDetector(UNetSegmenter(Bright()), longer_px=320)
+    found = detector.find(Frame(frame_index=1, timestamp_ns=0, image=image, source=""))
+    boxes = sorted(candidate.bbox_xyxy_px.tolist() for candidate in found)
+    np.testing.assert_allclose(boxes, [[50, 300, 110, 360], [200, 100, 400, 180]], atol=3)
+    for candidate in found:
+        assert candidate.score > 0.9
+        x0, y0, x1, y1 = candidate.bbox_xyxy_px.astype(int)
+        assert candidate.foreground.shape == (y1 - y0, x1 - x0)

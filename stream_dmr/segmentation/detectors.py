@@ -17,24 +17,41 @@ class DetectorSettings(Settings):
     detector: str = Field(
         default="motion",
         min_length=1,
-        description='what finds fish in the picture: "motion", or a detector\'s file (.onnx)',
+        description='what finds fish in the picture: "motion", "unet", weights of '
+        "`stream-dmr train` (.pt), or a detector's file (.onnx)",
     )
 
 
-class DetectFishSettings(OnnxSettings, MotionSettings, DetectorSettings):
+class UNetDetectorSettings(Settings):
+    """The part of `[detect_fish]` that the detector "unet" reads."""
+
+    unet_working_px: int = Field(
+        default=256, ge=64, le=2048, description="longer side of the picture the network sees, px"
+    )
+
+
+class DetectFishSettings(OnnxSettings, UNetDetectorSettings, MotionSettings, DetectorSettings):
     """`[detect_fish]`: how fish are found in a video that comes without boxes and masks."""
 
 
 def open_detector(settings: DetectFishSettings) -> Detector:
-    """The detector of `[detect_fish] detector`: a name, or a path to an ONNX file.
+    """The detector of `[detect_fish] detector`: a name, or a path to weights or to an ONNX file.
 
     Raises ModelError for another name, and where the file can't be used.
     """
     if settings.detector == "motion":
         return MotionDetector(settings)
-    if Path(settings.detector).suffix.lower() == ".onnx":
+    suffix = Path(settings.detector).suffix.lower()
+    if settings.detector == "unet" or suffix == ".pt":
+        from stream_dmr.segmentation.unet.detector import UNetDetector
+        from stream_dmr.segmentation.unet.inference import UNetSegmenter
+        from stream_dmr.segmentation.unet.weights import SHIPPED
+
+        weights = SHIPPED if settings.detector == "unet" else Path(settings.detector)
+        return UNetDetector(UNetSegmenter.load(weights), longer_px=settings.unet_working_px)
+    if suffix == ".onnx":
         return OnnxDetector(Path(settings.detector), settings)
     raise ModelError(
-        f'[detect_fish] detector: expected "motion" or a path that ends in .onnx, '
+        f'[detect_fish] detector: expected "motion", "unet" or a path that ends in .pt or .onnx, '
         f'got "{settings.detector}"'
     )

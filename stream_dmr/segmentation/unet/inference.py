@@ -51,13 +51,19 @@ class UNetSegmenter:
             ends=_find_ends(ends[0], scale=scale),
         )
 
+    def look(self, picture: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
+        """Probabilities of being any fish; H and W are multiples of 16."""
+        with _one_thread():
+            nowhere = np.ones(picture.shape[:2], np.float32)
+            return self.segment_batch(picture[None], nowhere[None])[0][0]
+
     @torch.inference_mode()
     def segment_batch(
-        self, images: UInt8[np.ndarray, "B S S 3"], in_boxes: Float32[np.ndarray, "B S S"]
-    ) -> tuple[Float32[np.ndarray, "B S S"], Float32[np.ndarray, "B 2 s s"]]:
+        self, images: UInt8[np.ndarray, "B H W 3"], in_boxes: Float32[np.ndarray, "B H W"]
+    ) -> tuple[Float32[np.ndarray, "B H W"], Float32[np.ndarray, "B 2 h w"]]:
         """Probabilities of fish, and log probabilities of head and tail at a quarter of the size.
 
-        S is a multiple of 16; the network was taught at 128. A picture whose `in_boxes` (see
+        H and W are multiples of 16; the network was taught at 128. A picture whose `in_boxes` (see
         `boxes.box_picture`) is 1 everywhere has no box: then every fish in it is found.
         """
         pictures = torch.from_numpy(images).to(self._device).float()

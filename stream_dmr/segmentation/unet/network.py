@@ -31,8 +31,8 @@ class UNet(nn.Module):
         self.ends = nn.Conv2d(_WIDTHS[1], 2, 3, padding=1)
 
     def forward(
-        self, inputs: Float[Tensor, "B 4 S S"]
-    ) -> tuple[Float[Tensor, "B S S"], Float[Tensor, "B 2 s s"]]:
+        self, inputs: Float[Tensor, "B 4 H W"]
+    ) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B 2 h w"]]:
         """Logits of the mask at the input's size, and of head and tail at a quarter of it."""
         x = self.stem(inputs)
         levels = [x]
@@ -48,8 +48,8 @@ class UNet(nn.Module):
 
 
 def normalise(
-    images: Float32[Tensor, "B S S 3"], in_box: Float32[Tensor, "B S S"]
-) -> Float32[Tensor, "B 4 S S"]:
+    images: Float32[Tensor, "B H W 3"], in_box: Float32[Tensor, "B H W"]
+) -> Float32[Tensor, "B 4 H W"]:
     """What the network gets: BGR pictures (0 to 255) freed of colour cast and contrast, the box.
 
     Each channel's mean goes and the picture's overall spread is set to one, so that neither the
