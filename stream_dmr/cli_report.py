@@ -5,8 +5,6 @@ from typing import Annotated
 
 import typer
 
-from stream_dmr.cli_support import warn
-
 
 def verify(
     folder: Annotated[Path, typer.Argument(help="The --out of runs or of exports.", metavar="DIR")],
@@ -20,28 +18,3 @@ def verify(
     if changes:
         raise typer.Exit(1)
     print(f"{folder}: {num_files} files, nothing was changed")
-
-
-def report(
-    path: Annotated[
-        Path, typer.Argument(help="The --out of a run, or a recording.", metavar="DIR|REC")
-    ],
-    out: Annotated[Path, typer.Option(help="The page to write.")] = Path("report.html"),
-    source: Annotated[
-        str | None,
-        typer.Option(
-            help="The recorded clip, for pictures of the fish.",
-            show_default="the one that the recorded command names",
-        ),
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="Its [fisheries] instead of the run's.")
-    ] = None,
-) -> None:
-    """Write results as one page that opens offline: plots, a table of fish, their best frames."""
-    from stream_dmr.report.report import open_report, write_report
-
-    opened = open_report(path, source=source, config=config)
-    size = write_report(opened, out)
-    warn(opened.recording.warnings)
-    print(f"{out}: {len(opened.fish)} fish, {size / 1e6:.1f} MB")

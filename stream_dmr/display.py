@@ -105,6 +105,8 @@ def print_check(summary: ReplaySummary) -> None:
         )
     if len(found) > _MOST_SHOWN:
         print(f"... and {len(found) - _MOST_SHOWN} more")
+    if summary.num_beyond:
+        print(f"{summary.num_beyond} messages more than were recorded: it was cut off before them")
     kinds = ", ".join(sorted({item.kind for item in found}))
     print(
         f"check: {len(found)} fields differ, in {kinds}"

@@ -1,12 +1,15 @@
 """What a run without an end needs: to go on where the one before stopped, and after a bad frame."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from stream_dmr.clips import ClipFolder
 from stream_dmr.drift import DriftSettings, FitWatch, SceneWatch, decode_scene, encode_scene
-from stream_dmr.errors import OutputError, UserError
+from stream_dmr.errors import OutputError, RecordingError, UserError
 from stream_dmr.live import LiveStream
-from stream_dmr.messages import Frame
+from stream_dmr.messages import Frame, LocalizedFish
+from stream_dmr.recording.carried import unfinished
+from stream_dmr.recording.opened import open_recordings
+from stream_dmr.recording.recover import Repair
 from stream_dmr.store import LengthStore
 from stream_dmr.video import Source
 
@@ -25,6 +28,21 @@ def go_on(
     done, frames_done = store.clips_before()
     source.resume(done=done, frames_done=frames_done, after_ns=store.before.timestamp_ns)
     return frames_done
+
+
+def left_open(
+    repairs: Sequence[Repair], store: LengthStore, *, on_notice: Callable[[str], None]
+) -> list[LocalizedFish]:
+    """What a crash left of the fish that were in view: their frames, by the repaired recordings."""
+    torn = [repair.path for repair in repairs if repair.path.suffix == ".mcap"]
+    if not torn:
+        return []
+    finished = {estimate.track_id for estimate in store.estimates()}
+    try:
+        return list(unfinished(open_recordings(torn), finished=finished))
+    except RecordingError as error:
+        on_notice(f"fish that were in view at the crash can't be finished: {error}")
+        return []
 
 
 class DriftWatch:

@@ -4,9 +4,10 @@ import itertools
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from nodes.crop_fish import CropFish
@@ -17,14 +18,17 @@ from nodes.smooth_length import SmoothLength
 from stream_dmr.calibration import load_calibration, require_size
 from stream_dmr.camera import Calibration
 from stream_dmr.config import Config, load_config, to_toml
-from stream_dmr.endless import DriftWatch, Tolerance, go_on
+from stream_dmr.endless import DriftWatch, Tolerance, go_on, left_open
 from stream_dmr.errors import OutputError, UserError
-from stream_dmr.messages import LengthEstimate
+from stream_dmr.messages import LengthEstimate, LocalizedFish
 from stream_dmr.pipeline import Node, StageCounters, run_chain
 from stream_dmr.provenance import NAME as PROVENANCE
 from stream_dmr.provenance import sealed
+from stream_dmr.recording.files import STEM, open_files
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.recorder import Recorder
+from stream_dmr.recording.recover import Repair, recover
+from stream_dmr.recording.segments import open_segments
 from stream_dmr.segmentation.fish_finder import open_finder
 from stream_dmr.store import LengthStore, require_free
 from stream_dmr.tables import write_lengths
@@ -37,6 +41,7 @@ RESULTS = (
     *("lengths.db", "lengths.csv", "frames.csv", "recording.mcap", "recording.rrd"),
     PROVENANCE,
 )
+SEGMENTED = ("lengths.db", "lengths.csv", "frames.csv", f"{STEM}-*")  # of a source without an end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,16 +101,15 @@ def run(
         camera = None if calibration is None else calibration.camera
         crop_fish = CropFish(config.crop_fish, camera=camera, detections=detections)
         nodes = [crop_fish, *later_nodes(config, template=template, calibration=calibration)]
-        resume = (request.resume or reader.source.is_endless) and not request.overwrite
-        prepare_folder(request.out, overwrite=request.overwrite, resume=resume)
+        is_endless = reader.source.is_endless
+        goes_on = (request.resume or is_endless) and not request.overwrite
+        repairs = prepare_folder(request.out, overwrite=request.overwrite, resume=goes_on)
         header = _header(request, reader.source.name, config, template, calibration)
         facts = run_facts(header, vessel=request.vessel, trip=request.trip, haul=request.haul)
         with (
-            sealed(
-                request.out, with_recordings=not reader.source.is_endless, on_notice=observer.warn
-            ),
+            sealed(request.out, with_recordings=not is_endless, on_notice=observer.warn),
             closing(LengthStore(request.out, facts)) as store,
-            _consistent_csv(request.out / "lengths.csv", store, resume=resume),
+            _consistent_csv(request.out / "lengths.csv", store, resume=goes_on),
             closing(
                 Watch(
                     observer,
@@ -116,10 +120,23 @@ def run(
                     silence_s=config.read_frames.silence_s,
                 )
             ) as watch,
+            nullcontext(
+                left_open(repairs if is_endless else [], store, on_notice=watch.warn)
+            ) as left,
             Recorder(
-                request.out, header, config.recording, live=request.live, resume=resume
+                request.out,
+                header,
+                config.recording,
+                live=request.live,
+                resume=goes_on,
+                files=partial(open_segments, left=left, on_notice=watch.warn)
+                if is_endless
+                else open_files,
             ) as recorder,
         ):
+            for repair in repairs:
+                watch.warn(repair.line)
+            resume(nodes, left)
             if recorder.live_address is not None:
                 observer.serving(f"stream-dmr view {recorder.live_address}")
             if watch.address is not None:
@@ -136,10 +153,11 @@ def run(
                 recorder,
                 store,
                 watch,
-                numbers_frames_on=reader.source.is_endless and not (request.boxes or request.masks),
+                numbers_frames_on=is_endless and not (request.boxes or request.masks),
                 clips=go_on(reader.source, store, on_notice=watch.warn),
+                left=left,
                 drift=DriftWatch(store, config.drift, on_notice=watch.warn)
-                if reader.source.is_endless and calibration is not None
+                if is_endless and calibration is not None
                 else None,
             )
             summary = _run_chain(reader, nodes, tally, watch, request.out, stop=stop)
@@ -150,13 +168,15 @@ def run(
     return summary
 
 
-def prepare_folder(out: Path, *, overwrite: bool, resume: bool = False) -> None:
+def prepare_folder(out: Path, *, overwrite: bool, resume: bool = False) -> list[Repair]:
     """Make sure that results can be written to `out`, and that none are lost by it.
 
     Raises OutputError where it is no folder, can't be written to, has no room, or holds the
-    results of an earlier run; `overwrite` removes those instead, `resume` keeps them.
+    results of an earlier run; `overwrite` removes those instead, `resume` keeps them. Returns what
+    was done about recordings that a crash left unfinished.
     """
     earlier = [out / name for name in RESULTS if (out / name).exists()]
+    earlier += sorted(out.glob(f"{STEM}-*"))
     if earlier and not overwrite and not resume:
         raise OutputError(
             f"{out}: expected a folder without results, found {earlier[0].name} of an earlier run; "
@@ -165,12 +185,13 @@ def prepare_folder(out: Path, *, overwrite: bool, resume: bool = False) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         require_free(out)
-        for path in earlier:
-            if overwrite:
-                path.unlink()
-                for leftover in ("-wal", "-shm"):  # of a database after a crash
+        if overwrite:
+            for path in (*earlier, *out.glob(f"{STEM}.*")):
+                for leftover in ("", "-wal", "-shm"):  # of a database after a crash
                     path.with_name(path.name + leftover).unlink(missing_ok=True)
-            elif path.name.startswith("recording"):
+        repairs = list(recover(out))
+        for path in (out / f"{STEM}.mcap", out / f"{STEM}.rrd"):
+            if path.exists():
                 _set_aside(path)
         with tempfile.TemporaryFile(dir=out) as probe:
             probe.write(bytes(1 << 16))
@@ -178,6 +199,7 @@ def prepare_folder(out: Path, *, overwrite: bool, resume: bool = False) -> None:
         raise OutputError(
             f"{out}: expected a folder to write to, got: {error.strerror}; choose another --out"
         ) from error
+    return repairs
 
 
 def _set_aside(recording: Path) -> None:
@@ -209,6 +231,12 @@ def later_nodes(
         Localize(config.localize, calibration=calibration),
         SmoothLength(config.smooth_length),
     ]
+
+
+def resume(nodes: Sequence[Node], left: Iterable[LocalizedFish]) -> None:
+    """Let a chain's last node finish what an earlier recording left of fish in view."""
+    for fish in left:
+        nodes[-1].step(fish)
 
 
 def _header(
@@ -264,5 +292,5 @@ def _run_chain(
         num_frames=tally.num_frames,
         elapsed_s=time.perf_counter() - began,
         counters=counters,
-        files=[out / name for name in RESULTS],
+        files=[out / name for name in (SEGMENTED if reader.source.is_endless else RESULTS)],
     )

@@ -1,7 +1,7 @@
 """What a run does with every message beside passing it on: numbers, stores, records, counts it."""
 
 from collections import Counter, defaultdict, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from hashlib import sha256
 from statistics import median
@@ -12,6 +12,8 @@ from stream_dmr.messages import FishCrop, Frame, LengthEstimate, LocalizedFish, 
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.store import LengthStore, RunFacts
+
+INTERRUPTED = "interrupted by a restart, finished with what was recorded; it may count twice"
 
 
 class Observer:
@@ -55,13 +57,20 @@ class Tally:
         *,
         numbers_frames_on: bool,
         clips: Mapping[str, int] | None = None,
+        left: Sequence[LocalizedFish] = (),
         drift: DriftWatch | None = None,
     ) -> None:
-        """`clips`: the source is a folder of clips, of which so many frames were done before."""
+        """`clips`: the source is a folder of clips, of which so many frames were done before.
+
+        `left`: frames of fish that a crash interrupted, and that this run finishes.
+        """
         self.final: list[LengthEstimate] = []
         self.num_frames = 0
         self._drift = drift
         self._ious: defaultdict[int, list[float]] = defaultdict(list)  # of the open tracks
+        self._left = {fish.track_id for fish in left}
+        for fish in left:
+            self._take_iou(fish)
         self._recorder = recorder
         self._store = store
         self._observer = observer
@@ -85,8 +94,8 @@ class Tally:
             case FishCrop(track_id=track_id):
                 message = replace(message, track_id=track_id + self._first_id)
                 self._store.reserve_track(message.track_id)
-            case LocalizedFish(accepted=True, iou=float(iou)):
-                self._ious[message.track_id].append(iou)
+            case LocalizedFish():
+                self._take_iou(message)
             case LengthEstimate(is_final=True):
                 self._finish(message)
                 self._observer.fish_finished(message)
@@ -103,10 +112,16 @@ class Tally:
             self._observer.fish_seen(len(self._track_ids))
         return message
 
+    def _take_iou(self, fish: LocalizedFish) -> None:
+        if fish.accepted and fish.iou is not None:
+            self._ious[fish.track_id].append(fish.iou)
+
     def _finish(self, estimate: LengthEstimate) -> None:
         accepted = self._ious.pop(estimate.track_id, [])
         iou = median(accepted) if accepted else None
         flags = [] if self._drift is None else self._drift.take_fish(iou, estimate.timestamp_ns)
+        if estimate.track_id in self._left:
+            flags.append(INTERRUPTED)
         self._store.add(estimate, iou=iou, flags=flags)
         self.final.append(estimate)
 

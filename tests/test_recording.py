@@ -161,13 +161,11 @@ def test_a_flush_leaves_all_messages_so_far_readable_in_the_part(
     assert found == [message.timestamp_ns for message in messages]
 
 
-def test_a_part_left_by_a_crash_is_set_aside(tmp_path: Path):
-    for _ in range(2):
-        (tmp_path / "recording.mcap.part").write_bytes(b"precious")
-        Recorder(tmp_path, header(), EXACT).close()
-    for number in (1, 2):
-        aside = tmp_path / f"recording.crashed-{number}.mcap.part"
-        assert aside.read_bytes() == b"precious"
+def test_a_part_left_by_a_crash_is_not_written_over(tmp_path: Path):
+    (tmp_path / "recording.mcap.part").write_bytes(b"precious")
+    with pytest.raises(OutputError, match="stream-dmr recover"):
+        Recorder(tmp_path, header(), EXACT)
+    assert (tmp_path / "recording.mcap.part").read_bytes() == b"precious"
 
 
 def test_two_threads_write_whole_records(tmp_path: Path, messages: list[Message]):
@@ -240,7 +238,7 @@ def test_a_disk_that_fills_up_at_the_very_end_keeps_what_was_written(
     tmp_path: Path, messages: list[Message]
 ):
     with files_no_longer_than(2**40):
-        sink = McapSink(tmp_path, header(), flush_s=1e-9)
+        sink = McapSink(tmp_path / "recording.mcap", header(), flush_s=1e-9)
     recorder = Recorder(tmp_path / "b", header(), EXACT.model_copy(update={"flush_s": 1e-9}))
     sink.close()
     write_all(recorder, messages)

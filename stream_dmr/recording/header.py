@@ -4,6 +4,7 @@ import platform
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -27,13 +28,18 @@ class RunHeader:
     calibration: Calibration | None = None
     calibration_file: bytes = b""  # the user's file as it was; empty where there is none
 
+    @cached_property
+    def checksum(self) -> int:
+        """Of the attachments: runs with the same one had the same inputs but for the source."""
+        return _checksum(self.attachments())
+
     def metadata(self) -> dict[str, str]:
         """The record `run`: who wrote this, from what, and with which versions."""
         return {
             "source": self.source,
             "command": self.command,
             "codec_version": str(CODEC_VERSION),
-            "attachments_crc32": str(_checksum(self.attachments())),
+            "attachments_crc32": str(self.checksum),
             "stream_dmr": __version__,
             "python": platform.python_version(),
             "platform": f"{platform.system()} {platform.machine()} {' '.join(platform.libc_ver())}",

@@ -9,7 +9,7 @@ import json
 import struct
 import zlib
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
@@ -27,7 +27,7 @@ from stream_dmr.messages import Message
 from stream_dmr.recording.codec import check_version
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.part import WHOLE, Part, Spans
-from stream_dmr.recording.topics import SPANS, TOPICS, VIDEO
+from stream_dmr.recording.topics import CARRIED, RECOVERED, RUN, SEGMENT, SPANS, TOPICS, VIDEO
 
 # What the mcap library lets through on damaged bytes; its CRC error is a ValueError.
 _DAMAGE = (
@@ -47,7 +47,19 @@ class McapFile:
         self.path = path
         self.warnings: list[str] = []
         self.metadata: dict[str, str] = {}
+        self.is_segment = self.ends_early = False
         self.header = self._read_header()
+
+    @property
+    def is_torn(self) -> bool:
+        """Whether its end is missing."""
+        with self._open() as stream:
+            return self._is_torn(stream)
+
+    def carried(self) -> Iterator[bytes]:
+        """See `opened.Recording`."""
+        for _, message in self._messages([CARRIED], WHOLE) if self.is_segment else ():
+            yield message.data
 
     def payloads(
         self, kinds: Collection[type[Message]], part: Part = WHOLE
@@ -98,13 +110,13 @@ class McapFile:
     def _read_header(self) -> RunHeader:
         attachments: dict[str, bytes] = {}
         with self._open() as stream:
+            self.ends_early = self._is_torn(stream)
             try:
                 for record in _records(stream, emit_chunks=True):
                     if isinstance(record, Chunk):
                         break
-                    if isinstance(record, Metadata) and record.name == "run":
-                        self.metadata = record.metadata
-                        check_version(int(self.metadata["codec_version"]))
+                    if isinstance(record, Metadata):
+                        self._take(record)
                     elif isinstance(record, Attachment) and record.name != SPANS:
                         attachments[record.name] = record.data
             except _CUT_OFF:
@@ -116,6 +128,15 @@ class McapFile:
                     f"expected a recording of stream-dmr, but it lacks {error}; it ends too early "
                     "or is of another program"
                 ) from error
+
+    def _take(self, record: Metadata) -> None:
+        if record.name == RUN:
+            self.metadata = record.metadata
+            check_version(int(self.metadata["codec_version"]))
+        elif record.name == RECOVERED:
+            self._warn(f"{self.path}: recovered after a crash; what came after that is lost")
+        self.is_segment |= record.name == SEGMENT
+        self.ends_early |= record.name in (SEGMENT, RECOVERED)
 
     def _is_torn(self, stream: IO[bytes]) -> bool:
         """Say whether the end of the file lacks the magic that closes it."""
@@ -142,6 +163,12 @@ class McapFile:
                 f"{self.path}: expected a whole recording, got a damaged one ({error}); "
                 "what was read before the damage is sound"
             ) from error
+
+
+def whole_records(path: Path) -> Iterator[object]:
+    """Every record before the end of a file, or before the first damage in it."""
+    with path.open("rb") as stream, suppress(*_DAMAGE, *_CUT_OFF):
+        yield from _records(stream)
 
 
 def _by_index(

@@ -1,13 +1,14 @@
-"""recording.mcap: the record of truth, whole up to the last second after a crash.
+"""An .mcap: the record of truth, whole up to the last second after a crash.
 
-Written as `recording.mcap.part` and renamed once it is closed. Whatever is needed to read the
+Written as `.mcap.part` and renamed once it is closed. Whatever is needed to read the
 messages comes first, and every chunk of messages is complete in itself.
 """
 
 import json
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
 from typing import IO, Any, Protocol, cast, runtime_checkable
@@ -19,14 +20,14 @@ from mcap_protobuf.schema import register_schema
 
 from stream_dmr import __version__
 from stream_dmr.errors import OutputError
-from stream_dmr.messages import Frame
+from stream_dmr.messages import Frame, LocalizedFish
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.record import Record
 from stream_dmr.recording.schema import schema_bytes
-from stream_dmr.recording.topics import SPANS, TOPICS
-from stream_dmr.recording.whole_file import WholeFile, rename_durably
+from stream_dmr.recording.topics import CARRIED, RUN, SEGMENT, SPANS, TOPICS
+from stream_dmr.recording.whole_file import WholeFile, rename_durably, sync_path
 
-NAME = "recording.mcap"
+PART = ".part"  # after the name of a file that is not closed yet
 _CHUNK_BYTES = 256 * 1024
 _MEDIA_TYPES = {".toml": "application/toml", ".yaml": "application/yaml"}
 
@@ -57,31 +58,49 @@ class McapSink:
     """
 
     def __init__(
-        self, out_dir: Path, header: RunHeader, *, flush_s: float, extras: Extras = ()
+        self,
+        path: Path,
+        header: RunHeader,
+        *,
+        flush_s: float,
+        extras: Extras = (),
+        number: int | None = None,
     ) -> None:
-        self.path = out_dir / NAME
-        self._part = out_dir / f"{NAME}.part"
+        """`number` is that of a segment. Raises OutputError where the disk refuses the file."""
+        self.path = path
+        self._part = path.with_name(path.name + PART)
+        if self._part.exists():
+            raise OutputError(
+                f"{self._part}: expected no unfinished recording, found one; repair it with "
+                f"stream-dmr recover {path.parent}"
+            )
         self._flush_ns = int(flush_s * 1e9)
         self._channels: dict[type, int] = {}
+        self._carried_channel = 0
         self._extras, self._extra_channels = extras, dict[str, int]()
         self._sequences: Counter[int] = Counter()
         self._spans: dict[int, tuple[int, int]] = {}  # first and last capture time of each track
         self._closed = False
         try:
-            _set_aside(self._part)
             self._file = WholeFile(self._part)
-            self._writer = _start(self._file, header)
-            self._register_topics()
+            sync_path(path.parent)
+            self._writer = _start(self._file, header, number)
+            self._register_topics(is_segment=number is not None)
             self._flush()
         except OSError as error:
             raise self._refusal(error) from error
+
+    @property
+    def size(self) -> int:
+        """Bytes written so far."""
+        return self._file.tell()
 
     def write(self, record: Record) -> None:
         """Append one record; OutputError where the disk refuses it, and the recording is over."""
         if self._closed:
             raise ValueError(f"{self.path} is closed")
         timestamp_ns = record.message.timestamp_ns
-        try:
+        with self._refusing():
             self._add(self._channels[type(record.message)], timestamp_ns, record.payload)
             if not isinstance(record.message, Frame):
                 self._saw(record.message.track_id, timestamp_ns)
@@ -90,6 +109,18 @@ class McapSink:
                 self._add(channel, timestamp_ns, drawn.SerializeToString())
             if time.monotonic_ns() >= self._flush_at_ns:
                 self._flush()
+
+    def carry(self, records: Iterable[Record]) -> None:
+        """Append, durably, what is taken over from before, in a topic of its own."""
+        with self._refusing():
+            for record in records:
+                self._add(self._carried_channel, record.message.timestamp_ns, record.payload)
+            self._flush()
+
+    @contextmanager
+    def _refusing(self) -> Iterator[None]:
+        try:
+            yield
         except OSError as error:
             self._end_without_index(self._file.tell())
             raise self._refusal(error) from error
@@ -120,10 +151,12 @@ class McapSink:
         first, last = self._spans.get(track_id, (timestamp_ns, timestamp_ns))
         self._spans[track_id] = min(first, timestamp_ns), max(last, timestamp_ns)
 
-    def _register_topics(self) -> None:
+    def _register_topics(self, *, is_segment: bool) -> None:
         for kind, row in TOPICS.items():
             schema = self._writer.register_schema(row.schema, "protobuf", schema_bytes())
             self._channels[kind] = self._writer.register_channel(row.topic, "protobuf", schema)
+            if is_segment and kind is LocalizedFish:
+                self._carried_channel = self._writer.register_channel(CARRIED, "protobuf", schema)
         for topic, kind in chain.from_iterable(e.topics.items() for e in self._extras):
             schema = register_schema(self._writer, kind)
             channel = self._writer.register_channel(topic, "protobuf", schema)
@@ -162,7 +195,8 @@ class McapSink:
         )
 
 
-def _start(file: WholeFile, header: RunHeader) -> Writer:
+def new_writer(file: WholeFile) -> Writer:
+    """A writer of chunks that stand alone, with checksums on all that it writes."""
     writer = Writer(
         cast(IO[bytes], file),
         chunk_size=_CHUNK_BYTES,
@@ -170,18 +204,15 @@ def _start(file: WholeFile, header: RunHeader) -> Writer:
         enable_data_crcs=True,  # else metadata and attachments have no checksum
     )
     writer.start(profile="stream-dmr", library=f"stream-dmr {__version__}")
-    writer.add_metadata("run", header.metadata())
+    return writer
+
+
+def _start(file: WholeFile, header: RunHeader, number: int | None) -> Writer:
+    writer = new_writer(file)
+    writer.add_metadata(RUN, header.metadata())
+    if number is not None:
+        writer.add_metadata(SEGMENT, {"number": str(number)})
     for name, data in header.attachments().items():
         media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/protobuf")
         writer.add_attachment(0, 0, name, media_type, data)
     return writer
-
-
-def _set_aside(part: Path) -> None:
-    """Rename what a crashed run left, so that it is not overwritten."""
-    number = 1
-    while part.exists():
-        aside = part.with_name(f"recording.crashed-{number}.mcap.part")
-        if not aside.exists():
-            part.rename(aside)
-        number += 1

@@ -6,6 +6,7 @@ from typing import Protocol, runtime_checkable
 
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import Message
+from stream_dmr.pictures import natural_order
 from stream_dmr.recording.codec import decode
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.mcap_file import McapFile
@@ -21,6 +22,7 @@ class Recording(Protocol):
 
     header: RunHeader
     metadata: dict[str, str]  # who recorded it, with which versions
+    ends_early: bool  # it is one of several, or a crash cut it off: what follows is not in it
 
     @property
     def warnings(self) -> Sequence[str]:
@@ -34,6 +36,10 @@ class Recording(Protocol):
         tracks were seen: `messages` leaves out the other fish. Raises RecordingError where the
         recording is damaged.
         """
+        ...
+
+    def carried(self) -> Iterator[bytes]:
+        """The LocalizedFish from before this recording began of fish that were in view then."""
         ...
 
     def video(self, part: Part = WHOLE) -> Iterator[bytes]:
@@ -65,9 +71,9 @@ def _files_of(path: Path) -> list[Path]:
     """A folder stands for its .mcap files, whole or torn; for its .rrd where it has none."""
     if not path.is_dir():
         return [path]
-    for pattern in ("*.mcap", "*.mcap.part", "*.rrd"):
-        if found := sorted(path.glob(pattern)):
-            return found + (sorted(path.glob("*.mcap.part")) if pattern == "*.mcap" else [])
+    for patterns in (("*.mcap", "*.mcap.part"), ("*.rrd",)):
+        if found := [file for pattern in patterns for file in path.glob(pattern)]:
+            return sorted(found, key=natural_order)
     raise RecordingError(f"{path}: expected a folder with a recording, found no .mcap and no .rrd")
 
 
@@ -77,8 +83,9 @@ class _Row:
     def __init__(self, files: Sequence[Path], segments: Sequence[Recording]) -> None:
         self._segments = segments
         self.header, self.metadata = segments[0].header, segments[0].metadata
+        self.ends_early = any(segment.ends_early for segment in segments)
         for file, segment in zip(files, segments, strict=True):
-            if segment.header.attachments() != self.header.attachments():
+            if segment.header.checksum != self.header.checksum:
                 raise RecordingError(
                     f"{file}: expected a segment of the same run as {files[0]}, got one with "
                     "another config, template or calibration; replay them one by one"
@@ -93,6 +100,10 @@ class _Row:
         """Those of each segment in turn."""
         for segment in self._segments:
             yield from segment.payloads(kinds, part)
+
+    def carried(self) -> Iterator[bytes]:
+        """That of the first segment: the others continue it."""
+        return self._segments[0].carried()
 
     def video(self, part: Part = WHOLE) -> Iterator[bytes]:
         """That of each segment in turn."""

@@ -1,21 +1,16 @@
 """Records a run: every message of every stage, to every sink."""
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from queue import Queue
 from threading import Lock, Thread
 from types import TracebackType
-from typing import Protocol, runtime_checkable
 
-from stream_dmr.errors import ConfigError
 from stream_dmr.messages import Message
+from stream_dmr.recording.files import OpenSinks, Sink, open_files
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.live import LiveView
-from stream_dmr.recording.mcap_sink import ExtraTopics, McapSink
 from stream_dmr.recording.record import Record, make_record
-from stream_dmr.recording.rerun_sink import NAME as RRD_NAME
-from stream_dmr.recording.rerun_sink import RerunSink
 from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.recording.whole_file import make_folder
 from stream_dmr.tables import Tables
@@ -23,21 +18,8 @@ from stream_dmr.tables import Tables
 _QUEUE_MESSAGES = 64  # some 6 frames; where the disk can't keep up, the run waits: nothing is lost
 
 
-@runtime_checkable
-class Sink(Protocol):
-    """One kind of output."""
-
-    def write(self, record: Record, /) -> None:
-        """Take one record; OutputError where the disk refuses it."""
-        ...
-
-    def close(self) -> None:
-        """Leave a valid file. Idempotent."""
-        ...
-
-
 class Recorder:
-    """Writes recording.mcap, recording.rrd, lengths.csv and frames.csv into one folder.
+    """Writes recording.mcap and .rrd, or segments of them, and the tables, into one folder.
 
     A thread of its own encodes and writes, so that measuring waits for no disk. Thread-safe; the
     messages of one stage must come in their order. Raises OutputError where the folder can't be
@@ -52,8 +34,13 @@ class Recorder:
         *,
         live: bool = False,
         resume: bool = False,
+        files: OpenSinks = open_files,
     ) -> None:
-        """With `live`, the view is served as well, at `live_address`; `resume` keeps the tables."""
+        """With `live`, the view is served as well, at `live_address`; `resume` keeps the tables.
+
+        `files` opens those of the recording: `open_files` or, for a run without an end,
+        `open_segments`.
+        """
         self.live_address: str | None = None
         self._settings = settings
         self._sinks: list[Sink] = []
@@ -66,12 +53,7 @@ class Recorder:
         with ExitStack() as undo:
             undo.callback(self._close_sinks)
             self._sinks.append(Tables(out_dir, resume=resume))
-            if settings.mcap:
-                extras = list(_extras(header, settings))
-                sink = McapSink(out_dir, header, flush_s=settings.flush_s, extras=extras)
-                self._sinks.append(sink)
-            if settings.rrd:
-                self._sinks.append(RerunSink(out_dir / RRD_NAME, header, settings))
+            self._sinks += files(out_dir, header, settings)
             if live:
                 self._sinks.append(view := LiveView(header, settings))
                 self.live_address = view.address
@@ -151,25 +133,3 @@ class Recorder:
         with ExitStack() as stack:
             for sink in self._sinks:
                 stack.callback(sink.close)
-
-
-def _extras(header: RunHeader, settings: RecordingSettings) -> Iterator[ExtraTopics]:
-    if settings.foxglove:
-        with _needs("foxglove", "foxglove = true"):
-            from stream_dmr.recording.foxglove import FoxgloveView
-        yield FoxgloveView(header, settings)
-    if settings.frames == "h264":
-        with _needs("h264", 'frames = "h264"'):
-            from stream_dmr.recording.video import H264Topic
-        yield H264Topic(crf=settings.h264_crf)
-
-
-@contextmanager
-def _needs(extra: str, setting: str) -> Iterator[None]:
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"[recording] {setting}: expected the package {error.name}, found none; install it "
-            f"with: pip install 'stream-dmr[{extra}]'"
-        ) from error

@@ -1,4 +1,4 @@
-"""recording.rrd: the view of a run, and, with `rrd_messages`, its messages as well."""
+"""An .rrd: the view of a run, and, with `rrd_messages`, its messages as well."""
 
 import json
 import time
@@ -16,7 +16,6 @@ from stream_dmr.recording.rerun_view import RUN, blueprint
 from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.recording.topics import END
 
-NAME = "recording.rrd"
 _HEADER = ["messages", "header"]
 _FLUSH_TIMEOUT_S = 30.0
 

@@ -60,14 +60,19 @@ class RrdFile:
         for _, kind, payload in merge(*map(wanted, kinds), key=itemgetter(0)):
             yield kind, payload
 
+    def carried(self) -> Iterator[bytes]:
+        """None: it is in the .mcap."""
+        return iter(())
+
     def video(self, part: Part = WHOLE) -> Iterator[bytes]:
-        """None."""
+        """None: it is in the .mcap."""
         return iter(())
 
     def _check_end(self) -> None:
         """Compare with the last row: without it the file is torn, with other counts damaged."""
         end = self._rows.pop(f"/{END}", None)
         counts = {entity: len(rows) for entity, rows in self._rows.items()}
+        self.ends_early = end is None
         if end is None:
             whole = sum(count for entity, count in counts.items() if _HEADER not in entity)
             self.warnings.append(
@@ -112,7 +117,7 @@ def _read(path: Path) -> Rows:
     try:
         return _rows_in(path)
     except _DAMAGE as error:
-        if path.is_file() and not _is_closed(path) and (rows := _salvaged(path)):
+        if path.is_file() and not is_closed(path) and (rows := _salvaged(path)):
             return rows
         raise RecordingError(
             f"{path}: expected a whole recording (.rrd), but it can't be read: {error}"
@@ -136,7 +141,8 @@ def _rows_in(path: Path) -> Rows:
     return rows
 
 
-def _is_closed(path: Path) -> bool:
+def is_closed(path: Path) -> bool:
+    """Whether an .rrd has its footer."""
     with path.open("rb") as file:
         file.seek(max(path.stat().st_size - 16, 0))
         return _FOOTER_MAGIC in file.read()

@@ -51,5 +51,16 @@ class RecordingSettings(Settings):
         description="in the .mcap, also what Foxglove Studio draws, as often as in the .rrd",
     )
     flush_s: float = Field(
-        default=1.0, gt=0, le=60, description="the most that a crash may lose, seconds of recording"
+        default=0.5,
+        gt=0,
+        le=60,
+        description="the most that waits for the disk, seconds: what a crash may lose",
+    )
+    segment_s: float = Field(
+        default=60.0,
+        ge=2,
+        description="a source without an end is recorded in files of so many seconds",
+    )
+    segment_mb: float = Field(
+        default=512.0, ge=1, description="or of so many MB of .mcap, if that comes first"
     )

@@ -41,6 +41,9 @@ IOU, BENDING, FIT_MS = "iou/{id}", "bending/{id}", "fit_ms/{id}"
 LOG, REFUSALS, RESULTS = "log", "log/refusals", "log/lengths"
 CAMERA, PLANE = "scene/camera", "scene/plane"  # static, from the header
 END = "messages/end"  # the last row of a whole .rrd: how many messages each payload path has
+# Metadata records of an .mcap: of the run; of one of several files, with its `number`; of one that
+# a crash left unfinished.
+RUN, SEGMENT, RECOVERED = "run", "segment", "recovered"
 SPANS = "tracks.json"  # attachment of a whole .mcap: each track's first and last capture time, ns
 KEY_FRAME_NS = 1_000_000_000  # of capture time, from one key frame of the video to the next
 VIDEO = "/video"  # in the .mcap with frames = "h264": foxglove.CompressedVideo
@@ -61,6 +64,9 @@ TOPICS: dict[type[Message], Topic] = {
     )
 }
 
+
+CARRIED = "/carried/localized"
+"""In a segment: of the fish that were in view at its beginning, what was seen before."""
 
 FOXGLOVE_TOPICS = {
     "/foxglove/picture": "foxglove.CompressedImage",

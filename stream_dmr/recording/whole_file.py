@@ -57,11 +57,16 @@ class WholeFile:
 def rename_durably(path: Path, target: Path) -> None:
     """Rename within a folder, replacing `target`, so that the name survives a power loss."""
     path.replace(target)
-    folder = os.open(target.parent, os.O_RDONLY)
+    sync_path(target.parent)
+
+
+def sync_path(path: Path) -> None:
+    """Wait until the disk has a file, or the names in a folder."""
+    fd = os.open(path, os.O_RDONLY)
     try:
-        os.fsync(folder)
+        os.fsync(fd)
     finally:
-        os.close(folder)
+        os.close(fd)
 
 
 @contextmanager

@@ -29,7 +29,7 @@ from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.restored import SourcePictures
 from stream_dmr.replay.judge import Judge, Mismatch, Scribe
 from stream_dmr.replay.tape import Playback, Tape
-from stream_dmr.run import Observer, later_nodes, prepare_folder
+from stream_dmr.run import Observer, later_nodes, prepare_folder, resume
 from stream_dmr.segmentation.fish_finder import open_finder
 from stream_dmr.template import Template, load_template
 
@@ -70,6 +70,7 @@ class ReplaySummary:
     recorded_s: float  # of capture time, from the first frame to the last
     counters: Sequence[StageCounters]
     num_compared: int
+    num_beyond: int  # computed anew where the recording was cut off before them
     mismatches: Sequence[Mismatch]
 
 
@@ -88,15 +89,20 @@ def replay(
     tape = Tape(recording, request.part)
     order = [*STAGES.values()]
     first = order.index(STAGES[request.first])
+    carried = _carried(request, tape)
     with ExitStack() as stack:
         frames, nodes = _chain(request, tape, config, template, calibration, stack, first)
+        resume(nodes, carried)
         recorder = None
         if request.out is not None:
             prepare_folder(request.out, overwrite=request.overwrite)
             header = _header(request, recording.header, config, template, calibration)
             recorder = stack.enter_context(Recorder(request.out, header, config.recording))
         recomputed = order[first:]
-        judge = Judge(tape, recomputed) if request.check else None
+        judge = None
+        if request.check:
+            unlike = {fish.track_id for fish in carried} if FittedMesh in recomputed else ()
+            judge = Judge(tape, recomputed, leave_out=unlike)
         scribe = Scribe(tape, recorder, judge, config.recording, recomputed)
         observer.begin(None)
         began = time.perf_counter()
@@ -114,6 +120,7 @@ def replay(
         recorded_s=scribe.recorded_s,
         counters=counters,
         num_compared=judge.num_compared if judge else 0,
+        num_beyond=judge.num_beyond if judge else 0,
         mismatches=judge.mismatches if judge else [],
     )
 
@@ -151,6 +158,21 @@ def _inputs(
     if request.calibration is not None:
         calibration = load_calibration(request.calibration)
     return config, template, calibration
+
+
+def _carried(request: ReplayRequest, tape: Tape) -> list[LocalizedFish]:
+    """What counts towards a length though it is from before this recording; notes say so."""
+    carried = tape.carried()
+    fish = ", ".join(str(track_id) for track_id in sorted({fish.track_id for fish in carried}))
+    if not carried or request.first == "smooth":
+        return carried
+    in_view = f"fish {fish} came into view before this recording began"
+    if request.calibration is not None or request.config is not None:
+        tape.notes.append(f"{in_view}: only what is in it counts")
+        return []
+    if request.first in ("crop", "fit"):
+        tape.notes.append(f"{in_view}: their fits start from others, and --check leaves them out")
+    return carried
 
 
 def _header(

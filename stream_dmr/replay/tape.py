@@ -3,7 +3,8 @@
 from collections.abc import Iterator, Sequence
 
 from stream_dmr.errors import RecordingError
-from stream_dmr.messages import FishCrop, FittedMesh, Frame, Message
+from stream_dmr.messages import FishCrop, FittedMesh, Frame, LocalizedFish, Message
+from stream_dmr.recording.codec import decode
 from stream_dmr.recording.opened import Recording, messages
 from stream_dmr.recording.part import WHOLE, Part
 from stream_dmr.recording.restored import RecordedPictures, Restorer, is_as_seen
@@ -17,6 +18,21 @@ class Tape:
         self._part = part
         self.notes: list[str] = []  # what the user should know of this replay
         self._payloads: dict[int, bytes] = {}  # of messages on their way to a new recording
+
+    @property
+    def ends_early(self) -> bool:
+        """Whether more followed than was recorded."""
+        return self._recording.ends_early
+
+    def carried(self) -> list[LocalizedFish]:
+        """The frames, before this recording, of fish that were in view when it began.
+
+        A part in time begins without them.
+        """
+        if self._part.time_ns is not None:
+            return []
+        fish = [decode(LocalizedFish, payload) for payload in self._recording.carried()]
+        return [message for message in fish if self._part.has(message)]
 
     def messages(self, kind: type[Message], *, keep: bool = True) -> Iterator[Message]:
         """Those of the wanted tracks and times."""
@@ -54,7 +70,9 @@ class Tape:
         line = "the recording's pictures are for the eye, the run saw better ones"
         if exact:
             raise RecordingError(f"--from crop --check: {line}; give --source")
-        self.notes = [f"{line}: crops come out a little otherwise; --source would mend that"]
+        note = f"{line}: crops come out a little otherwise; --source would mend that"
+        if note not in self.notes:
+            self.notes.append(note)
 
     def payload(self, message: Message) -> bytes:
         """The encoding of a message that came from here; once."""

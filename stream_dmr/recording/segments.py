@@ -1,0 +1,173 @@
+"""Recordings of a bounded length, one after the other, for a source without an end."""
+
+import re
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+
+from stream_dmr.errors import OutputError
+from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish
+from stream_dmr.recording.carried import Carried, carried_record
+from stream_dmr.recording.files import STEM, Sink, open_files
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.mcap_sink import McapSink
+from stream_dmr.recording.record import Record
+from stream_dmr.recording.settings import RecordingSettings
+
+_NUMBERED = re.compile(rf"{STEM}-(\d+)\..*")
+_RETRY_NS = 5_000_000_000  # of capture time, after the disk refused a new segment
+_MOST_IN_FLIGHT = 16  # frames between the source and the end of the chain: fewer, in fact
+
+
+class Segments:
+    """Writes recording-000001.mcap and .rrd, recording-000002.mcap and .rrd, ...
+
+    A cut comes between two frames. The stages are some frames apart, so for a moment two segments
+    are open: what belongs to frames from the cut on goes to the new one. A segment is complete
+    when the last stage has reached the cut; the fish in view are then carried over to the next.
+    What the disk refuses is told by `on_notice` and tried again with a new segment.
+    """
+
+    def __init__(
+        self,
+        out_dir: Path,
+        header: RunHeader,
+        settings: RecordingSettings,
+        *,
+        left: Iterable[LocalizedFish] = (),
+        on_notice: Callable[[str], None],
+    ) -> None:
+        """`left`: of the fish that an earlier run left unfinished, which this one finishes.
+
+        Raises OutputError where the first segment can't be opened.
+        """
+        self._out_dir, self._header, self._settings = out_dir, header, settings
+        self._on_notice = on_notice
+        self._number = _last_number(out_dir)
+        self._began_ns: int | None = None  # capture time of the first frame
+        self._cut_ns: int | None = None  # of the first frame of `_next`
+        self._retry_ns = 0
+        self._frames_since_cut = 0
+        self._carried, self._ahead = Carried(), list[Record]()
+        for fish in left:
+            self._carried.take(carried_record(fish))
+        self._open: list[Sink] = self._open_next()
+        self._next: list[Sink] = []
+        self._carry_to(self._open)
+
+    def write(self, record: Record) -> None:
+        """Take one record; never raises OutputError."""
+        message = record.message
+        if isinstance(message, Frame):
+            self._see(message)
+        is_after = self._cut_ns is not None and message.timestamp_ns >= self._cut_ns
+        if isinstance(message, LengthEstimate):
+            if is_after and not message.is_final:
+                self._complete()
+            is_after = False  # a final one belongs where it was made, whenever its fish was seen
+        if is_after:
+            self._ahead.append(record)
+        else:
+            self._carried.take(record)
+        sinks = self._next if is_after else self._open
+        self._each(sinks, lambda sink: sink.write(record))
+
+    def close(self) -> None:
+        """Close what is open. Idempotent."""
+        if self._cut_ns is not None:
+            self._complete()
+        self._close_all(self._open)
+
+    def _see(self, frame: Frame) -> None:
+        """Cut before this frame if it is time; complete the segment before an earlier cut."""
+        if self._cut_ns is not None:
+            self._frames_since_cut += 1
+            if self._frames_since_cut >= _MOST_IN_FLIGHT:
+                self._complete()
+        elif self._began_ns is None:
+            self._began_ns = frame.timestamp_ns
+        elif self._is_due(frame.timestamp_ns, self._began_ns):
+            self._cut(frame.timestamp_ns)
+
+    def _is_due(self, now_ns: int, began_ns: int) -> bool:
+        if now_ns < self._retry_ns:
+            return False
+        size = sum(sink.size for sink in self._open if isinstance(sink, McapSink))
+        is_long = now_ns - began_ns >= self._settings.segment_s * 1e9
+        return is_long or size >= self._settings.segment_mb * 1e6 or not self._open
+
+    def _cut(self, now_ns: int) -> None:
+        try:
+            self._next = self._open_next()
+        except OutputError as error:
+            self._retry_ns = now_ns + _RETRY_NS
+            self._on_notice(f"{error}; tried again in some seconds")
+            return
+        self._cut_ns, self._frames_since_cut = now_ns, 0
+
+    def _complete(self) -> None:
+        """The last stage has reached the cut: end the segment before it.
+
+        What is carried over is on the disk before that: one of the two always has a fish whole.
+        """
+        self._carry_to(self._next)
+        self._close_all(self._open)
+        self._open, self._next = self._next, []
+        self._began_ns, self._cut_ns = self._cut_ns, None
+        for record in self._ahead:
+            self._carried.take(record)
+        self._ahead.clear()
+
+    def _open_next(self) -> list[Sink]:
+        number = self._number + 1
+        files = open_files(
+            self._out_dir, self._header, self._settings, stem=f"{STEM}-{number:06d}", number=number
+        )
+        self._number = number
+        return files
+
+    def _carry_to(self, sinks: list[Sink]) -> None:
+        def carry(sink: Sink) -> None:
+            if isinstance(sink, McapSink):
+                sink.carry(self._carried.records())
+
+        self._each(sinks, carry)
+
+    def _each(self, sinks: list[Sink], write: Callable[[Sink], None]) -> None:
+        """Write to each; one that the disk refuses is over."""
+        for sink in [*sinks]:
+            try:
+                write(sink)
+            except OutputError as error:
+                sinks.remove(sink)
+                self._on_notice(f"{error}; tried again with the next segment")
+                with suppress(OutputError):
+                    sink.close()
+
+    def _close_all(self, sinks: list[Sink]) -> None:
+        for sink in sinks:
+            try:
+                sink.close()
+            except OutputError as error:
+                self._on_notice(str(error))
+        sinks.clear()
+
+
+def open_segments(
+    out_dir: Path,
+    header: RunHeader,
+    settings: RecordingSettings,
+    *,
+    left: Iterable[LocalizedFish] = (),
+    on_notice: Callable[[str], None],
+) -> list[Sink]:
+    """`Segments`, where anything is recorded."""
+    if not (settings.mcap or settings.rrd):
+        return []
+    return [Segments(out_dir, header, settings, left=left, on_notice=on_notice)]
+
+
+def _last_number(out_dir: Path) -> int:
+    """Of the segments in a folder, whole or not; 0 where there are none."""
+    found = [_NUMBERED.fullmatch(path.name) for path in out_dir.iterdir()]
+    return max((int(match[1]) for match in found if match), default=0)
