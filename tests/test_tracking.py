@@ -105,7 +105,7 @@ def climb(i: int, *, x: float = 300.0, speed: float = 12.0) -> Spot:
 
 
 def test_a_fish_keeps_its_id_through_a_short_gap_and_gets_a_new_one_after_a_long_one():
-    gaps = {"short": 4, "long": 5}
+    gaps = {"short": 7, "long": 8}
     for name, gap in gaps.items():
         frames = [[climb(i, speed=6)] for i in range(8)] + [[]] * gap
         frames += [[climb(i, speed=6)] for i in range(8 + gap, 20 + gap)]
@@ -180,7 +180,7 @@ def test_a_fish_that_leaves_the_picture_shows_less_and_less_of_itself():
 def test_a_track_counts_once_it_is_long_enough():
     frames = [[climb(i)] for i in range(10)]
     assert ids(follow(frames, min_track_frames=4)) == [[]] * 3 + [[1]] * 7
-    flashes = [[climb(i)] if i < 3 else [] for i in range(10)]
+    flashes = [[climb(i)] if i < 3 else [] for i in range(12)]
     assert not any(ids(follow(flashes * 3, min_track_frames=4)))
 
 

@@ -16,20 +16,19 @@ from stream_dmr.segmentation.detector import Candidate, whole_pixels
 
 _REACH = 0.1  # of a fish's length: so far from where it is expected its outline may be
 _FISH = 0.3  # of the smallest fish's area: a smaller piece is none
+_LONGER = 1.3  # times the longest fish's length, and it may be several
+_WIDER = 0.6  # of the longest fish's length, likewise: turning makes no fish so wide
 _THREAD = 0.06  # of a fish's length: what is thinner is a line or a sliver
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Expected:
-    """A fish's last shape, where it should be now."""
+    """A fish's last shape, where it should be now, and what is known of its size."""
 
     shape: Bool[np.ndarray, "h w"]
     corner: Float[np.ndarray, "2"]  # frame x, y of its first pixel
-
-    @property
-    def length_px(self) -> int:
-        """The longer side of its box."""
-        return max(self.shape.shape)
+    length_px: float
+    area_px: float
 
 
 def part(candidate: Candidate, fish: Sequence[Expected]) -> list[Candidate]:
@@ -37,14 +36,14 @@ def part(candidate: Candidate, fish: Sequence[Expected]) -> list[Candidate]:
 
     The candidate itself where it has no `foreground`, or no second piece is to be found.
     """
-    if candidate.foreground is None or not fish:
+    if candidate.foreground is None or not fish or not _may_be_several(candidate.foreground, fish):
         return [candidate]
     x, y, _, _ = whole_pixels(candidate.bbox_xyxy_px)
     away = np.stack([_away(one, candidate.foreground.shape, (x, y)) for one in fish])
     nearest = away.argmin(axis=0)
     reach = np.array([max(2.0, _REACH * one.length_px) for one in fish])
     is_near = away.min(axis=0) <= reach[nearest]
-    least = _FISH * min(np.count_nonzero(one.shape) for one in fish)
+    least = _FISH * min(one.area_px for one in fish)
     thread = round(_THREAD * min(one.length_px for one in fish)) | 1
     owned = [candidate.foreground & is_near & (nearest == i) for i in range(len(fish))]
     pieces = [_largest(_opened(one, thread)) for one in owned]
@@ -53,6 +52,20 @@ def part(candidate: Candidate, fish: Sequence[Expected]) -> list[Candidate]:
     if len(pieces) < 2:
         return [candidate]
     return [_candidate(piece, candidate, (x, y)) for piece in pieces]
+
+
+def _may_be_several(shape: Bool[np.ndarray, "H W"], fish: Sequence[Expected]) -> bool:
+    """Whether this is too long or too wide for one of these fish; one that turns only widens."""
+    length = max(one.length_px for one in fish)
+    width_px, length_px = extent(shape)
+    return length_px > _LONGER * length or width_px > _WIDER * length
+
+
+def extent(shape: Bool[np.ndarray, "H W"]) -> tuple[float, float]:
+    """Width and length of the smallest rectangle around it, px; 0 where there is nothing."""
+    points = cv2.findNonZero(shape.view(np.uint8))
+    sides = (0.0, 0.0) if points is None else cv2.minAreaRect(points)[1]
+    return min(sides), max(sides)
 
 
 def _away(

@@ -19,7 +19,7 @@ from scipy.optimize import linear_sum_assignment
 
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.detector import Candidate, whole_pixels
-from stream_dmr.segmentation.parting import Expected, part
+from stream_dmr.segmentation.parting import Expected, extent, part
 from stream_dmr.settings import Settings
 
 # Standard deviations; those of motion are fractions of the fish's size, so that any zoom will do.
@@ -31,6 +31,7 @@ _COLOUR_STD = 25.0  # grey levels: one side of a flatfish is dark, and turning s
 _MOST_COST = 25.0  # a sum of four squares, each about 1
 _NEVER = 1e6
 _FARTHEST = 1.2  # sizes between a fish and where it was expected
+_SHORTER = 0.93  # times its length a fish may seem in the next frame, turning to or fro
 _LEARN = 0.35  # of a fish's size and colour, per frame
 _SWALLOWED = 0.55  # of a fish's expected box inside a candidate
 _SWOLLEN = 1.3  # times the larger of two fish: a candidate that is both
@@ -43,7 +44,7 @@ class TrackerSettings(Settings):
     """The part of `[track_fish]` that says how fish are followed from frame to frame."""
 
     max_lost_frames: int = Field(
-        default=4, ge=0, description="a fish unseen for more frames in a row is gone"
+        default=7, ge=0, description="a fish unseen for more frames in a row is gone"
     )
     min_score: float = Field(
         default=0.3, ge=0, le=1, description="least score of a detector's candidate that counts"
@@ -83,7 +84,7 @@ class Tracker:
             if not any(look.share_in(track.look.box) > _BESIDE for track in seen):
                 self._started += 1
                 self._tracks.append(_Track(look, self._started, frame.frame_index))
-        return [track.sighting() for track in self._tracks if track.lost_frames == 0]
+        return [t.sighting() for t in self._tracks if t.lost_frames == 0 and t.was_alone]
 
     def _part(self, frame: Frame, look: "_Look") -> list["_Look"]:
         """A candidate, or its pieces where several fish share it."""
@@ -93,7 +94,9 @@ class Tracker:
             return [look]
         expected = [track.expected() for track in inside]
         pieces = part(look.candidate, [one for one in expected if one is not None])
-        return [look] if len(pieces) < 2 else [_Look(frame.image, piece) for piece in pieces]
+        if len(pieces) < 2:
+            return [look]
+        return [_Look(frame.image, piece, is_piece=True) for piece in pieces]
 
     def _swallowed(self, looks: Sequence["_Look"]) -> set[int]:
         """The candidates that are several fish at once; those fish wait until they part."""
@@ -141,8 +144,10 @@ class Tracker:
 class _Look:
     """What a candidate looks like to the tracker."""
 
-    def __init__(self, image: UInt8[np.ndarray, "H W 3"], candidate: Candidate) -> None:
-        self.candidate = candidate
+    def __init__(
+        self, image: UInt8[np.ndarray, "H W 3"], candidate: Candidate, *, is_piece: bool = False
+    ) -> None:
+        self.candidate, self.is_piece = candidate, is_piece
         self.box = candidate.bbox_xyxy_px
         self.middle = (self.box[:2] + self.box[2:]) / 2
         x0, y0, x1, y1 = whole_pixels(self.box)
@@ -152,6 +157,7 @@ class _Look:
             axes = ((x1 - x0) // 3, (y1 - y0) // 3)
             cv2.ellipse(fish, ((x1 - x0) // 2, (y1 - y0) // 2), axes, 0, 0, 360, 1, cv2.FILLED)
         self.area = float(max(1, np.count_nonzero(fish)))
+        self.length = extent(fish > 0)[1]
         part = image[y0:y1, x0:x1]
         self.colour = np.array(
             cv2.mean(part, fish[: part.shape[0], : part.shape[1]].astype(np.uint8))[:3]
@@ -169,7 +175,8 @@ class _Track:
 
     def __init__(self, look: _Look, number: int, frame_index: int) -> None:
         self.look, self.number, self.frame_index = look, number, frame_index
-        self.area, self.colour = look.area, look.colour
+        self.area, self.colour, self.length = look.area, look.colour, look.length
+        self.was_alone = not look.is_piece  # once at least: what is always a piece may be no fish
         self.lost_frames, self.frames_seen, self._waited = 0, 1, 0
         self._filter = KalmanFilter(dim_x=4, dim_z=2)  # middle x, y; speed per frame
         self._filter.x = np.array([*look.middle, 0.0, 0.0])[:, None]
@@ -216,6 +223,8 @@ class _Track:
         """Take a candidate for this fish."""
         self.look, self.lost_frames, self._waited = look, 0, 0
         self.frames_seen += 1
+        self.was_alone |= not look.is_piece
+        self.length = max(look.length, _SHORTER * self.length)
         self._filter.update(look.middle[:, None])
         rate = max(_LEARN, 1 / self.frames_seen)
         if not look.touches_border or look.area > self.area:  # what is cut off shows too little
@@ -248,7 +257,9 @@ class _Track:
         """The fish's last shape, moved on; None where the detector gives no shapes."""
         shape = self.look.candidate.foreground
         corner = self.look.box[:2] + self._way
-        return None if shape is None else Expected(shape=shape, corner=corner)
+        if shape is None:
+            return None
+        return Expected(shape=shape, corner=corner, length_px=self.length, area_px=self.area)
 
     @property
     def _way(self) -> Float[np.ndarray, "2"]:
