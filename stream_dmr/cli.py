@@ -17,7 +17,7 @@ from stream_dmr.cli_evaluate import evaluate
 from stream_dmr.cli_export import export
 from stream_dmr.cli_recover import recover
 from stream_dmr.cli_replay import replay
-from stream_dmr.cli_report import verify
+from stream_dmr.cli_report import report, review, verify
 from stream_dmr.cli_support import command_line, stop_on_signals, without_password
 from stream_dmr.cli_train import train
 from stream_dmr.cli_view import convert, view
@@ -30,7 +30,10 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (calibrate, replay, recover, view, convert, export, verify, evaluate, train):
+for command in (
+    *(calibrate, replay, recover, view, convert, export),
+    *(report, review, verify, evaluate, train),
+):
     app.command()(command)
 
 

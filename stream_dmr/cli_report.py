@@ -1,9 +1,12 @@
 """`stream-dmr verify`, `report` and `review`: what a reviewer does with results."""
 
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from stream_dmr.cli_support import stop_on_signals, warn
 
 
 def verify(
@@ -18,3 +21,62 @@ def verify(
     if changes:
         raise typer.Exit(1)
     print(f"{folder}: {num_files} files, nothing was changed")
+
+
+def report(
+    path: Annotated[
+        Path, typer.Argument(help="The --out of a run, or a recording.", metavar="DIR|REC")
+    ],
+    out: Annotated[Path, typer.Option(help="The page to write.")] = Path("report.html"),
+    source: Annotated[
+        str | None,
+        typer.Option(
+            help="The recorded clip, for pictures of the fish.",
+            show_default="the one that the recorded command names",
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="Its [fisheries] instead of the run's.")
+    ] = None,
+) -> None:
+    """Write results as one page that opens offline: plots, a table of fish, their best frames."""
+    from stream_dmr.report.report import open_report, write_report
+
+    opened = open_report(path, source=source, config=config)
+    size = write_report(opened, out)
+    warn(opened.recording.warnings)
+    print(f"{out}: {len(opened.fish)} fish, {size / 1e6:.1f} MB")
+
+
+def review(
+    folder: Annotated[Path, typer.Argument(help="The --out of a run.", metavar="DIR")],
+    reviewer: Annotated[
+        str, typer.Option(help="Your name, for the verdicts.", show_default="who is logged in")
+    ] = "",
+    port: Annotated[int, typer.Option(help="On this machine; 0: any free one.")] = 0,
+    source: Annotated[
+        str | None,
+        typer.Option(
+            help="The recorded clip, for pictures of the fish.",
+            show_default="the one that the recorded command names",
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="Its [fisheries] instead of the run's.")
+    ] = None,
+) -> None:
+    """Serve the page of `report` on this machine and take verdicts into lengths.db.
+
+    Verdicts stand beside the measurements, which stay as they are; Ctrl-C ends it.
+    """
+    with stop_on_signals() as stop:
+        from getpass import getuser
+
+        from stream_dmr.report.report import open_report
+        from stream_dmr.review.server import ReviewServer
+
+        opened = open_report(folder, source=source, config=config)
+        warn(opened.recording.warnings)
+        with closing(ReviewServer(opened, reviewer=reviewer or getuser(), port=port)) as server:
+            print(f"open {server.address}\nCtrl-C ends it", flush=True)
+            stop.wait()

@@ -64,7 +64,6 @@ class Review:
     species: str = ""
     length_mm: float | None = None  # as corrected
     length_std_mm: float | None = None
-    corrected_frames: frozenset[int] = frozenset()
     reviewer: str = ""  # the last one
     written_ns: int = 0
 
@@ -77,9 +76,8 @@ class Review:
             case "species":
                 return replace(self, species=verdict.species, **signed)
             case "correct":
-                frames = self.corrected_frames | {verdict.frame_index or 0}
                 lengths = {"length_mm": verdict.length_mm, "length_std_mm": verdict.length_std_mm}
-                return replace(self, corrected_frames=frames, **lengths, **signed)
+                return replace(self, **lengths, **signed)
             case _:
                 said = {"reason": verdict.reason, "duplicate_of": verdict.duplicate_of}
                 return replace(self, decision=verdict.kind, **said, **signed)
@@ -127,6 +125,17 @@ def read_verdicts(path: Path) -> list[Verdict]:
         names = [field.name for field in fields(Verdict)]
         rows = database.execute(f"SELECT {', '.join(names)} FROM verdicts ORDER BY number")
         return [Verdict(**dict(zip(names, row, strict=True))) for row in rows]
+
+
+def corrections(verdicts: list[Verdict], track_id: int) -> dict[int, Verdict]:
+    """The corrections of a fish that hold: the last one of each frame, since it was taken back."""
+    held: dict[int, Verdict] = {}
+    for verdict in verdicts:
+        if verdict.track_id == track_id and verdict.kind == "withdraw":
+            held.clear()
+        elif verdict.track_id == track_id and verdict.frame_index is not None:
+            held[verdict.frame_index] = verdict
+    return held
 
 
 def reviews(verdicts: list[Verdict]) -> dict[int, Review]:

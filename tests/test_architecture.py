@@ -35,7 +35,8 @@ FLOORS = [
     ["stream_dmr.config", "stream_dmr.pipeline"],
     ["nodes"],
     [f"stream_dmr.watch.{name}" for name in ("state", "metrics", "picture", "server", "watch")],
-    ["stream_dmr.run"],
+    ["stream_dmr.run", "stream_dmr.report.report"],
+    [f"stream_dmr.review.{name}" for name in ("corrected", "judge", "server")],
     ["stream_dmr.replay.replay"],
     ["stream_dmr.display"],
     [

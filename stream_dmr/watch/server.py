@@ -1,31 +1,23 @@
 """Serves the status page, its picture, /metrics and /health over HTTP."""
 
-import hmac
-import json
-import sys
 import threading
 import time
 from http import HTTPStatus
-from http.cookies import CookieError, SimpleCookie
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
 
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from stream_dmr.errors import ConfigError, OutputError
+from stream_dmr.token_server import TokenHandler, TokenServer
 from stream_dmr.watch.metrics import registry_of
 from stream_dmr.watch.picture import as_jpeg, draw
 from stream_dmr.watch.settings import WatchSettings
 from stream_dmr.watch.state import RunState
 
 _PICTURE_S = 0.5  # a picture serves all who ask for so long: watching must not slow the measuring
-_PATIENCE_S = 10.0  # for a slow reader
-_MOST_READERS = 16
-_COOKIE = "stream_dmr_token"
 
 
 class WatchServer:
@@ -85,18 +77,13 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    block_on_close = False
-
+class _Server(TokenServer):
     def __init__(self, address: tuple[str, int], state: RunState, token: str) -> None:
         self.state = state
-        self.token = token
         self.registry = registry_of(state)
-        self.readers = threading.BoundedSemaphore(_MOST_READERS)
         self._picture_lock = threading.Lock()
         self._picture, self._picture_until_s = b"", 0.0
-        super().__init__(address, _Handler)
+        super().__init__(address, _Handler, token=token)
 
     def picture(self) -> bytes:
         with self._picture_lock:
@@ -106,94 +93,30 @@ class _Server(ThreadingHTTPServer):
                 self._picture_until_s = time.monotonic() + _PICTURE_S
             return self._picture
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """A reader who left is no error of ours; anything else is one."""
-        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
-            super().handle_error(request, client_address)
 
-
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(TokenHandler):
     server: _Server  # pyright: ignore[reportIncompatibleVariableOverride]
-    server_version = "stream-dmr"
-    sys_version = ""
-    timeout = _PATIENCE_S
 
-    def do_GET(self) -> None:
-        url = urlsplit(self.path)
-        if not self.server.readers.acquire(blocking=False):
-            return self._answer(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", b"too many readers\n")
-        try:
-            given = parse_qs(url.query).get("token", [""])[0]
-            if given and self._is_right(given):
-                return self._let_in(url.path)
-            if not self._may_read():
-                return self._answer(
-                    HTTPStatus.UNAUTHORIZED, "text/plain", b"open this page with ?token=...\n"
-                )
-            self._serve(url.path)
-        finally:
-            self.server.readers.release()
-
-    def _serve(self, path: str) -> None:
+    def serve(self, path: str) -> None:
         state = self.server.state
         match path:
             case "/":
                 page = files("stream_dmr.watch").joinpath("page.html").read_bytes()
-                self._answer(HTTPStatus.OK, "text/html; charset=utf-8", page)
+                self.answer(HTTPStatus.OK, "text/html; charset=utf-8", page)
             case "/status.json":
-                self._json(HTTPStatus.OK, status_of(state))
+                self.json(HTTPStatus.OK, status_of(state))
             case "/picture.jpg":
-                self._answer(HTTPStatus.OK, "image/jpeg", self.server.picture())
+                self.answer(HTTPStatus.OK, "image/jpeg", self.server.picture())
             case "/metrics":
-                self._answer(
+                self.answer(
                     HTTPStatus.OK, CONTENT_TYPE_LATEST, generate_latest(self.server.registry)
                 )
             case "/health":
                 problems = state.problems()
                 code = HTTPStatus.SERVICE_UNAVAILABLE if problems else HTTPStatus.OK
-                self._json(code, {"healthy": not problems, "problems": problems})
+                self.json(code, {"healthy": not problems, "problems": problems})
             case _:
-                self._answer(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
-
-    def _let_in(self, path: str) -> None:
-        """Keep the token as a cookie, so that it stands in no address that is shown or logged."""
-        self.send_response(HTTPStatus.SEE_OTHER)
-        cookie = f"{_COOKIE}={self.server.token}; Path=/; HttpOnly; SameSite=Strict"
-        self.send_header("Set-Cookie", cookie)
-        self.send_header("Location", "/" + path.lstrip("/"))
-        self.send_header("Content-Length", "0")
-        self.end_headers()
-
-    def _may_read(self) -> bool:
-        if not self.server.token:
-            return True
-        scheme, _, token = self.headers.get("Authorization", "").partition(" ")
-        if scheme.lower() == "bearer" and self._is_right(token.strip()):
-            return True
-        try:
-            cookie = SimpleCookie(self.headers.get("Cookie", "")).get(_COOKIE)
-        except CookieError:
-            return False
-        return cookie is not None and self._is_right(cookie.value)
-
-    def _is_right(self, token: str) -> bool:
-        return hmac.compare_digest(token.encode(), self.server.token.encode())
-
-    def _json(self, code: HTTPStatus, content: object) -> None:
-        self._answer(code, "application/json", json.dumps(content).encode())
-
-    def _answer(self, code: HTTPStatus, media_type: str, content: bytes) -> None:
-        self.send_response(code)
-        self.send_header("Content-Type", media_type)
-        self.send_header("Content-Length", str(len(content)))
-        self.send_header("Cache-Control", "no-store")
-        self.send_header("X-Content-Type-Options", "nosniff")
-        self.send_header("Referrer-Policy", "no-referrer")
-        self.end_headers()
-        self.wfile.write(content)
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Say nothing: who reads is not what the log is for."""
+                self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
 
 
 def status_of(state: RunState) -> dict[str, Any]:

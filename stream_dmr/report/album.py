@@ -1,0 +1,104 @@
+"""The best views of all fish, drawn: one way through the source for all of them."""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from stream_dmr.errors import SourceError
+from stream_dmr.recording.meshes import Meshes
+from stream_dmr.recording.opened import Recording
+from stream_dmr.recording.view_geometry import place
+from stream_dmr.report.gather import Track, View
+from stream_dmr.report.pictures import (
+    Outlines,
+    drawn,
+    frames_of,
+    named_source,
+    outlines_of,
+    picture_of,
+)
+
+_LARGE_PX, _THUMB_PX = 240, 72
+_LARGE_QUALITY, _THUMB_QUALITY = 72, 70
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Shot:
+    """One view of one fish, drawn."""
+
+    view: View
+    crop_size: int  # px; the outlines are in crop pixels
+    picture: bytes  # JPEG, as the fish was seen
+    thumb: bytes  # JPEG, small, with everything drawn over it
+    outlines: Outlines
+    vertices: Float[np.ndarray, "V 3"] | None  # camera frame, mm; body lengths without calibration
+    midline: Float[np.ndarray, "M 3"]
+
+
+Album = Mapping[int, list[Shot]]  # track id -> its best views, the best first
+
+
+def make_album(
+    tracks: Mapping[int, Track], recording: Recording, source: str | None = None
+) -> Album:
+    """Draw the views of all tracks, with the pictures of `source` or of the recording.
+
+    Without `source`, the one that the recorded command names is tried. Fish whose pictures are
+    nowhere are drawn by their masks. Raises SourceError where a given `source` is another one.
+    """
+    meshes = Meshes(recording.header.template)
+    waiting: defaultdict[int, list[tuple[int, View]]] = defaultdict(list)
+    for track_id, track in tracks.items():
+        for view in track.views:
+            waiting[view.row.fish.frame_index].append((track_id, view))
+    shots: defaultdict[int, list[Shot]] = defaultdict(list)
+    for frame_index, image in _frames(recording, set(waiting), source):
+        for track_id, view in waiting.pop(frame_index, []):
+            shots[track_id].append(_shot(view, meshes, recording, image))
+    for views in waiting.values():
+        for track_id, view in views:
+            shots[track_id].append(_shot(view, meshes, recording, None))
+    for of_track in shots.values():
+        of_track.sort(key=lambda shot: shot.view.rank, reverse=True)
+    return shots
+
+
+def _frames(
+    recording: Recording, wanted: set[int], source: str | None
+) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
+    if source is not None:
+        yield from frames_of(recording, wanted, source)
+        return
+    with suppress(SourceError):  # of the same name, but another clip by now
+        yield from frames_of(recording, wanted, named_source(recording))
+
+
+def _shot(
+    view: View, meshes: Meshes, recording: Recording, frame: UInt8[np.ndarray, "H W 3"] | None
+) -> Shot:
+    crop, fit = view.decoded(meshes)
+    shape = fit.shape
+    assert shape is not None  # a view has keypoints
+    outlines = outlines_of(crop, shape, recording.header.template.faces)
+    picture = picture_of(crop, frame, size=_LARGE_PX)
+    size = crop.mask.shape[0]
+    small = cv2.resize(picture, (2 * _THUMB_PX,) * 2, interpolation=cv2.INTER_AREA)
+    vertices, _, midline = place(shape, view.row.fish)
+    return Shot(
+        view=view,
+        crop_size=size,
+        picture=_jpeg(picture, _LARGE_QUALITY),
+        thumb=_jpeg(drawn(small, outlines, crop_size=size), _THUMB_QUALITY),
+        outlines=outlines,
+        vertices=vertices,
+        midline=midline,
+    )
+
+
+def _jpeg(image: UInt8[np.ndarray, "H W 3"], quality: int) -> bytes:
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

@@ -1,0 +1,67 @@
+// The page as a whole: filters, choice, keys.
+
+const DATA = JSON.parse(document.getElementById("data").textContent);
+const FACES = unpacked(DATA.faces, Uint16Array);
+const FILTERS = ["search", "status", "verdict", "shortest", "longest", "frames"];
+
+function wanted() {
+  return Object.fromEntries(FILTERS.map((name) => [name, document.getElementById(name).value]));
+}
+
+function show() {
+  state.shown = sorted(filtered(DATA.fish, wanted()));
+  document.getElementById("count").textContent = `${state.shown.length} of ${DATA.fish.length} fish`;
+  drawHead(show);
+  drawRows(choose);
+  drawSummary(state.shown);
+  drawHistogram(state.shown);
+  drawTime(state.shown, choose);
+}
+
+function choose(id) {
+  const fish = DATA.fish.find((one) => one.track_id === id);
+  if (!fish) return;
+  state.chosen = id;
+  drawRows(choose);
+  drawDetail(fish);
+}
+
+function replaceFish(fish) {
+  DATA.fish[DATA.fish.findIndex((one) => one.track_id === fish.track_id)] = fish;
+  show();
+  choose(fish.track_id);
+}
+
+// What was said of fish since the page was made.
+async function refresh() {
+  const answer = await fetch("judged.json");
+  for (const fish of await answer.json()) DATA.fish[DATA.fish.findIndex((one) => one.track_id === fish.track_id)] = fish;
+  show();
+}
+
+function step(by) {
+  const at = state.shown.findIndex((one) => one.track_id === state.chosen) + by;
+  const fish = state.shown[Math.max(0, Math.min(state.shown.length - 1, at))];
+  if (!fish) return;
+  const table = document.getElementById("table");
+  const top = state.shown.indexOf(fish) * ROW_PX;
+  if (top < table.scrollTop || top + ROW_PX > table.scrollTop + table.clientHeight) table.scrollTop = top;
+  choose(fish.track_id);
+}
+
+let waiting = 0;
+document.getElementById("filters").oninput = () => {
+  clearTimeout(waiting);
+  waiting = setTimeout(() => { document.getElementById("table").scrollTop = 0; show(); }, 150);
+};
+document.getElementById("filters").onsubmit = (event) => event.preventDefault();
+document.getElementById("table").onscroll = () => requestAnimationFrame(() => drawRows(choose));
+document.getElementById("table").onkeydown = (event) => {
+  const by = { ArrowDown: 1, ArrowUp: -1 }[event.key];
+  if (by) { event.preventDefault(); step(by); }
+};
+document.getElementById("made").textContent = `stream-dmr ${DATA.software}, template ${DATA.template}`;
+document.getElementById("notes").replaceChildren(...DATA.notes.map((note) => element("li", { textContent: note })));
+show();
+if (DATA.reviewer !== null) refresh();
+if (location.hash.startsWith("#fish-")) choose(Number(location.hash.slice(6)));

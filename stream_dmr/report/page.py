@@ -1,0 +1,156 @@
+"""The page of a report: data as JSON, pictures as data URIs, plotly, all in one file."""
+
+import json
+from base64 import b64encode
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr import __version__
+from stream_dmr.fish_table import fish_record
+from stream_dmr.fisheries import FisheriesSettings
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.report.album import Album, Shot
+from stream_dmr.report.gather import FrameRow, Track
+from stream_dmr.results import FishResult
+
+_PER_RUN = ("source", "command")  # of the facts; the rest stand in the exports too
+_FINEST = 32000  # int16 for the largest coordinate of a mesh
+
+
+def page(
+    *,
+    title: str,
+    header: RunHeader,
+    fish: Sequence[FishResult],
+    tracks: Mapping[int, Track],
+    album: Album,
+    settings: FisheriesSettings,
+    notes: Sequence[str] = (),
+    reviewer: str | None = None,
+) -> str:
+    """The whole page; with a `reviewer`, it asks for verdicts and sends them to its server."""
+    data = {
+        "title": title,
+        "software": __version__,
+        "template": header.template.name,
+        "faces": _packed(header.template.faces.astype("<u2")),
+        "fisheries": settings.model_dump(),
+        "runs": {one.run_id: asdict(one.facts) for one in fish},
+        "notes": list(notes),
+        "reviewer": reviewer,
+        "fish": [summary(one, header, settings, album) for one in fish],
+    }
+    details = "".join(
+        _script(f"fish-{one.estimate.track_id}", detail(one, tracks, album)) for one in fish
+    )
+    room = files("stream_dmr.report")
+    parts = {
+        "TITLE": title.replace("&", "&amp;").replace("<", "&lt;"),
+        "STYLE": room.joinpath("page.css").read_text(encoding="utf-8"),
+        "PLOTLY": files("plotly").joinpath("package_data/plotly.min.js").read_text("utf-8"),
+        "DATA": _script("data", data) + details,
+        "CODE": "".join(
+            room.joinpath(name).read_text(encoding="utf-8")
+            for name in ("table.js", "plots.js", "detail.js", "review.js", "page.js")
+        ),
+    }
+    text = room.joinpath("page.html").read_text(encoding="utf-8")
+    pieces = text.split("@@")  # text, name, text, name, ..., text
+    return "".join(parts[piece] if k % 2 else piece for k, piece in enumerate(pieces))
+
+
+def summary(
+    fish: FishResult, header: RunHeader, settings: FisheriesSettings, album: Album
+) -> dict[str, Any]:
+    """The row of a fish in the table: that of fish.csv, and its best view, small."""
+    record = fish_record(fish, header.template, settings)
+    of_run = asdict(fish.facts)
+    row = {name: value for name, value in record.items() if name not in of_run}
+    shots = album.get(fish.estimate.track_id, [])
+    return row | {
+        "vessel": fish.facts.vessel,
+        "trip": fish.facts.trip,
+        "haul": fish.facts.haul,
+        "time_s": fish.estimate.first_timestamp_ns / 1e9,
+        "refused": dict(fish.estimate.refused),
+        "flags": list(fish.flags),
+        "thumb": _uri(shots[0].thumb) if shots else "",
+    }
+
+
+def detail(fish: FishResult, tracks: Mapping[int, Track], album: Album) -> dict[str, Any]:
+    """What a row opens: best views, every frame, the mesh."""
+    track_id = fish.estimate.track_id
+    shots = album.get(track_id, [])
+    track = tracks.get(track_id)
+    return {
+        "frames": [_frame(row) for row in track.rows] if track else [],
+        "shots": [_shot(shot) for shot in shots],
+        "mesh": _mesh(shots[0]) if shots else None,
+    }
+
+
+def _frame(row: FrameRow) -> list[Any]:
+    """frame, time, length, std, used, reason, IoU, running length, its low and high end."""
+    fish, estimate = row.fish, row.estimate
+    low, high = (None, None) if estimate.ci95_mm is None else estimate.ci95_mm.tolist()
+    numbers = (fish.length_mm, fish.length_std_mm)
+    running = (estimate.length_mm, low, high)
+    return [
+        fish.frame_index,
+        round(fish.timestamp_ns / 1e9, 4),
+        *(None if number is None else round(number, 2) for number in numbers),
+        int(estimate.is_frame_used),
+        estimate.frame_reason,
+        None if fish.iou is None else round(fish.iou, 4),
+        *(None if number is None else round(number, 2) for number in running),
+    ]
+
+
+def _shot(shot: Shot) -> dict[str, Any]:
+    fish = shot.view.row.fish
+    return {
+        "frame": fish.frame_index,
+        "size": shot.crop_size,
+        "uri": _uri(shot.picture),
+        "mask": [_points(line) for line in shot.outlines.mask],
+        "mesh": [_points(line) for line in shot.outlines.mesh],
+        "keypoints": np.round(shot.outlines.keypoints, 2).tolist(),
+    }
+
+
+def _points(line: Float[np.ndarray, "N 2"]) -> str:
+    """For an SVG polygon."""
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in line)
+
+
+def _mesh(shot: Shot) -> dict[str, Any] | None:
+    if shot.vertices is None:
+        return None
+    center = shot.vertices.mean(axis=0)
+    points = np.vstack([shot.vertices, shot.midline]) - center
+    step = float(np.abs(points).max()) / _FINEST
+    return {
+        "step": step,
+        "vertices": len(shot.vertices),
+        "points": _packed(np.round(points / step).astype("<i2")),
+    }
+
+
+def _script(name: str, content: object) -> str:
+    """JSON that waits in the page until it is asked for; no text of it can end its element."""
+    text = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    return f'<script type="application/json" id="{name}">{text}</script>\n'
+
+
+def _packed(array: np.ndarray) -> str:
+    return b64encode(np.ascontiguousarray(array).tobytes()).decode()
+
+
+def _uri(jpeg: bytes) -> str:
+    return f"data:image/jpeg;base64,{b64encode(jpeg).decode()}"

@@ -1,0 +1,135 @@
+"""The pictures of a report: a fish as it was seen, and the outlines of its mask and its mesh."""
+
+import shlex
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from stream_dmr.camera import Camera, crop_from_frame
+from stream_dmr.messages import FishCrop, FittedShape, Frame
+from stream_dmr.read_settings import ReadFramesSettings
+from stream_dmr.recording.opened import Recording, messages
+from stream_dmr.recording.part import WHOLE
+from stream_dmr.recording.restored import RecordedPictures, SourcePictures
+from stream_dmr.segmentation.crop import frame_from_crop_map
+from stream_dmr.video import open_source
+
+MASK, MESH, HEAD, CENTER, TAIL = (
+    *((80, 220, 255), (90, 230, 90)),  # BGR
+    *((60, 60, 255), (255, 255, 255), (255, 160, 60)),
+)
+_FINE = 2  # the outline of a mesh is taken at so many times the resolution
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Outlines:
+    """What is drawn over a crop, in its pixels, whose centres are integers."""
+
+    mask: Sequence[Float[np.ndarray, "_ 2"]]
+    mesh: Sequence[Float[np.ndarray, "_ 2"]]
+    keypoints: Float[np.ndarray, "3 2"]
+
+
+def outlines_of(crop: FishCrop, shape: FittedShape, faces: Int[np.ndarray, "F 3"]) -> Outlines:
+    """The outlines of the mask and of the fitted mesh, and the keypoints."""
+    keypoints = crop_from_frame(
+        shape.keypoints_px, crop_camera=crop.crop_camera, frame_camera=crop.frame_camera
+    )
+    mesh: list[Float[np.ndarray, "_ 2"]] = []
+    if shape.vertices is not None:
+        size = crop.mask.shape[0] * _FINE
+        drawn = np.zeros((size, size), np.uint8)
+        pixels = (crop.crop_camera.project(shape.vertices) + 0.5) * _FINE - 0.5
+        for face in np.round(pixels).astype(np.int32)[faces]:
+            cv2.fillConvexPoly(drawn, face, 1)
+        mesh = [(line + 0.5) / _FINE - 0.5 for line in _polygons(drawn > 0, coarse_px=1.0)]
+    return Outlines(mask=_polygons(crop.mask, coarse_px=0.5), mesh=mesh, keypoints=keypoints)
+
+
+def _polygons(mask: Bool[np.ndarray, "H W"], *, coarse_px: float) -> list[np.ndarray]:
+    lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    simple = (cv2.approxPolyDP(line, coarse_px, closed=True)[:, 0] for line in lines)
+    return [line.astype(float) for line in simple if len(line) > 2]
+
+
+def picture_of(
+    crop: FishCrop, frame: UInt8[np.ndarray, "H W 3"] | None, *, size: int
+) -> UInt8[np.ndarray, "N N 3"]:
+    """A crop as it was seen, `size` px; without any picture, its mask in grey."""
+    if frame is not None:
+        x, y = frame_from_crop_map(_resized(crop.crop_camera, size), frame_camera=crop.frame_camera)
+        return cv2.remap(frame, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    image = crop.image
+    if image is None:
+        image = (40 + 80 * crop.mask.astype(np.uint8))[..., None].repeat(3, axis=2)
+    return cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
+
+
+def drawn(
+    picture: UInt8[np.ndarray, "N N 3"], outlines: Outlines, *, crop_size: int
+) -> UInt8[np.ndarray, "N N 3"]:
+    """A picture with mask, mesh and keypoints drawn over it."""
+    image, scale = picture.copy(), picture.shape[0] / crop_size
+
+    def place(points: Float[np.ndarray, "N 2"]) -> Int[np.ndarray, "N 2"]:
+        return np.round((points + 0.5) * scale * 16 - 8).astype(np.int32)  # 1/16 px
+
+    for lines, colour in ((outlines.mask, MASK), (outlines.mesh, MESH)):
+        polygons = [place(line) for line in lines]
+        cv2.polylines(image, polygons, True, colour, 1, cv2.LINE_AA, 4)
+    for point, colour in zip(place(outlines.keypoints), (HEAD, CENTER, TAIL), strict=True):
+        cv2.circle(image, point.tolist(), 2 * 16, colour, -1, cv2.LINE_AA, 4)
+    return image
+
+
+def frames_of(
+    recording: Recording, wanted: set[int], source: str | None
+) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
+    """The pictures of the wanted frames, from the source or from the recording, where it has any.
+
+    SourceError where the source is not the recorded one.
+    """
+    with closing(_Pictures(recording, source)) as pictures:
+        for message, payload in messages(recording, [Frame], WHOLE):
+            if message.frame_index in wanted and isinstance(message, Frame):
+                frame = pictures.restorer.restore(message, payload)
+                if frame.image.size:
+                    yield frame.frame_index, frame.image
+
+
+def named_source(recording: Recording) -> str | None:
+    """The source by the name that the recorded command gave it, if there is such a file."""
+    words = shlex.split(recording.header.command)
+    named = [after for word, after in pairwise(words) if word == "--source"]
+    return named[0] if named and Path(named[0]).exists() else None
+
+
+class _Pictures:
+    """A restorer, and the source behind it."""
+
+    def __init__(self, recording: Recording, source: str | None) -> None:
+        self._source = None if source is None else open_source(source, ReadFramesSettings())
+        self.restorer = (
+            RecordedPictures(recording, WHOLE)
+            if self._source is None
+            else SourcePictures(self._source)
+        )
+
+    def close(self) -> None:
+        if self._source is not None:
+            self._source.close()
+
+
+def _resized(camera: Camera, size: int) -> Camera:
+    """The camera of the same crop at another number of pixels."""
+    scale = size / camera.width
+    K = camera.K.copy()
+    K[:2] *= scale
+    K[:2, 2] += 0.5 * scale - 0.5  # pixel centres are integers
+    return replace(camera, K=K, width=size, height=size)

@@ -1,0 +1,93 @@
+// Plots of all fish that are shown, and the summary of them.
+
+const QUIET = { displayModeBar: false, responsive: true };
+const BLUE = "#1668a8", ORANGE = "#d55e00";
+
+function counted(fish) {
+  return fish.filter((f) => lengthOf(f) !== null && f.verdict !== "reject" && f.verdict !== "duplicate");
+}
+
+function drawSummary(fish) {
+  const lengths = counted(fish).map((f) => lengthOf(f) / 10).sort((a, b) => a - b);
+  const tiles = [[fish.length, "fish"], [lengths.length, "with a length, not rejected"]];
+  if (lengths.length) {
+    const mean = lengths.reduce((sum, x) => sum + x, 0) / lengths.length;
+    const sd = lengths.length > 1 ? Math.sqrt(lengths.reduce((sum, x) => sum + (x - mean) ** 2, 0) / (lengths.length - 1)) : 0;
+    tiles.push([`${mean.toFixed(1)} cm`, "mean"], [`${sd.toFixed(1)} cm`, "standard deviation"],
+      [`${quantile(lengths, 0.5).toFixed(1)} cm`, "median"],
+      [`${quantile(lengths, 0.25).toFixed(1)} to ${quantile(lengths, 0.75).toFixed(1)} cm`, "middle half"],
+      [`${lengths[0].toFixed(1)} to ${lengths.at(-1).toFixed(1)} cm`, "shortest to longest"]);
+  }
+  const weights = counted(fish).map((f) => f.weight_kg).filter((w) => w !== null);
+  if (weights.length) tiles.push([`${weights.reduce((sum, w) => sum + w, 0).toFixed(1)} kg`, `of ${weights.length} fish, W = a L^b`]);
+  const legal = counted(fish).map((f) => f.is_legal_size).filter((is) => is !== null);
+  if (legal.length) tiles.push([`${legal.filter(Boolean).length} of ${legal.length}`, `from ${DATA.fisheries.legal_cm} cm: legal size`]);
+  document.getElementById("summary").replaceChildren(...tiles.map(([value, name]) => element(
+    "div", { className: "tile" }, element("b", { textContent: value }), element("span", { textContent: name }))));
+}
+
+function quantile(sorted, p) {
+  const at = p * (sorted.length - 1);
+  const low = Math.floor(at);
+  return sorted[low] + (at - low) * ((sorted[low + 1] ?? sorted[low]) - sorted[low]);
+}
+
+// Gaussian kernel density with Silverman's bandwidth, 0.9 min(sd, iqr / 1.34) n^(-1/5).
+function density(sorted, at) {
+  const n = sorted.length;
+  const mean = sorted.reduce((sum, x) => sum + x, 0) / n;
+  const sd = Math.sqrt(sorted.reduce((sum, x) => sum + (x - mean) ** 2, 0) / Math.max(1, n - 1));
+  const spread = Math.min(sd, (quantile(sorted, 0.75) - quantile(sorted, 0.25)) / 1.34) || sd || 1;
+  const h = 0.9 * spread * n ** -0.2;
+  return at.map((x) => sorted.reduce((sum, y) => sum + Math.exp(-0.5 * ((x - y) / h) ** 2), 0) / (n * h * Math.sqrt(2 * Math.PI)));
+}
+
+function layout(title, x, y) {
+  return {
+    title: { text: title, font: { size: 13 }, x: 0.02 },
+    margin: { l: 46, r: 12, t: 28, b: 36 }, font: { size: 11 }, showlegend: false,
+    xaxis: { title: { text: x }, zeroline: false }, yaxis: { title: { text: y }, zeroline: false, rangemode: "normal" },
+  };
+}
+
+function drawHistogram(fish) {
+  const lengths = counted(fish).map((f) => lengthOf(f) / 10).sort((a, b) => a - b);
+  const low = lengths[0] ?? 0, high = lengths.at(-1) ?? 1;
+  const width = [1, 2, 5, 10, 20, 50].find((w) => (high - low) / w <= 30) ?? 100;
+  const first = Math.floor(low / width) * width;
+  const counts = new Array(Math.floor((high - first) / width) + 1).fill(0);
+  for (const x of lengths) counts[Math.floor((x - first) / width)] += 1;
+  const traces = [{ type: "bar", x: counts.map((_, k) => first + (k + 0.5) * width), y: counts, width, marker: { color: "#9cc3e0", line: { color: "#fff", width: 1 } }, hovertemplate: `%{y} fish, %{x} cm \u00b1 ${width / 2}<extra></extra>` }];
+  if (lengths.length > 1) {
+    const at = Array.from({ length: 200 }, (_, k) => first - width + (k / 199) * (high - first + 3 * width));
+    traces.push({ type: "scatter", mode: "lines", x: at, y: density(lengths, at).map((d) => d * lengths.length * width), line: { color: BLUE, width: 2 }, hoverinfo: "skip" });
+  }
+  const drawn = layout("Length frequency (bars) and kernel density (line)", "cm", "fish");
+  const limit = DATA.fisheries.legal_cm;
+  if (fish.some((f) => f.is_legal_size !== null)) drawn.shapes = [{ type: "line", x0: limit, x1: limit, yref: "paper", y0: 0, y1: 1, line: { color: ORANGE, dash: "dot" } }];
+  Plotly.react("histogram", traces, drawn, QUIET);
+}
+
+function drawTime(fish, onChoose) {
+  const measured = fish.filter((f) => lengthOf(f) !== null);
+  const start = Math.min(...DATA.fish.map((f) => f.time_s));
+  const span = Math.max(...DATA.fish.map((f) => f.time_s)) - start;
+  const [unit, seconds] = span < 300 ? ["s", 1] : span < 18000 ? ["minutes", 60] : ["hours", 3600];
+  const at = (f) => (f.time_s - start) / seconds;
+  const bars = { x: [], y: [] };
+  for (const f of measured) {
+    if (f.ci95_low_mm === null) continue;
+    bars.x.push(at(f), at(f), null);
+    bars.y.push(f.ci95_low_mm / 10, f.ci95_high_mm / 10, null);
+  }
+  const counts = new Set(counted(fish));
+  const traces = [
+    { type: "scatter", mode: "lines", ...bars, line: { color: "#c4d4e1", width: 1 }, hoverinfo: "skip" },
+    { type: "scatter", mode: "markers", x: measured.map(at), y: measured.map((f) => lengthOf(f) / 10), customdata: measured.map((f) => f.track_id),
+      marker: { color: measured.map((f) => (counts.has(f) ? BLUE : "#c0c0c0")), size: 6 }, hovertemplate: "fish %{customdata}<br>%{y:.1f} cm<extra></extra>" },
+  ];
+  Plotly.react("time", traces, layout("Fish over time, with 95 % intervals", unit, "cm"), QUIET).then((plot) => {
+    plot.removeAllListeners("plotly_click");
+    plot.on("plotly_click", (event) => event.points[0].customdata && onChoose(event.points[0].customdata));
+  });
+}

@@ -1,0 +1,45 @@
+// Verdicts: only where a server asks for them.
+
+function reviewTools(fish, shots) {
+  if (DATA.reviewer === null) return [];
+  const said = element("p", { id: "said", textContent: "" });
+  const send = async (verdict) => {
+    const answer = await fetch("verdict", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ track_id: fish.track_id, ...verdict }) });
+    const content = await answer.json();
+    if (answer.ok) replaceFish(content);
+    else { said.className = "bad"; said.textContent = content.error; }
+  };
+  const text = (id, placeholder, kind, name, label) => {
+    const input = element("input", { id, placeholder, size: 14 });
+    return element("span", { className: "group" }, input, element("button", { type: "button", id: `do-${kind}`, textContent: label, onclick: () => send({ kind, [name]: name === "duplicate_of" ? Number(input.value) : input.value }) }));
+  };
+  const points = movable(shots);
+  return [element("div", { id: "verdicts" },
+    element("button", { type: "button", id: "do-accept", textContent: "Accept", onclick: () => send({ kind: "accept" }) }),
+    text("reason", "why", "reject", "reason", "Reject"),
+    text("species-name", "species", "species", "species", "Set species"),
+    text("duplicate-of", "fish", "duplicate", "duplicate_of", "Is a duplicate of"),
+    element("button", { type: "button", id: "do-correct", textContent: "Save moved points", onclick: () => points.moved() ? send({ kind: "correct", ...points.moved() }) : (said.textContent = "Drag a head (red) or tail (blue) point first.") }),
+    element("button", { type: "button", id: "do-withdraw", textContent: "Take all back", onclick: () => send({ kind: "withdraw" }) }),
+    element("small", { textContent: `as ${DATA.reviewer}; head and tail points can be dragged` }), said)];
+}
+
+// Head and tail can be dragged; what was dragged last is what is saved, in pixels of its crop.
+function movable(shots) {
+  let last = null;
+  for (const box of shots.querySelectorAll("svg")) {
+    for (const point of box.querySelectorAll('[data-name="head"], [data-name="tail"]')) {
+      point.classList.add("moves");
+      point.onpointerdown = (event) => point.setPointerCapture(event.pointerId);
+      point.onpointermove = (event) => {
+        if (!point.hasPointerCapture(event.pointerId)) return;
+        const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(box.getScreenCTM().inverse());
+        point.setAttribute("cx", at.x);
+        point.setAttribute("cy", at.y);
+        last = box;
+      };
+    }
+  }
+  const at = (name) => { const p = last.querySelector(`[data-name="${name}"]`); return [Number(p.getAttribute("cx")), Number(p.getAttribute("cy"))]; };
+  return { moved: () => last && { frame_index: Number(last.dataset.frame), head: at("head"), tail: at("tail") } };
+}

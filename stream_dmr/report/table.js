@@ -1,0 +1,107 @@
+"use strict";
+// The list of fish: only the rows in sight are in the page, so thousands scroll as easily as ten.
+
+const ROW_PX = 76;
+const COLUMNS = [
+  { title: "", key: null },
+  { title: "Fish", key: (f) => f.track_id },
+  { title: "Length", key: (f) => lengthOf(f) ?? -1 },
+  { title: "Frames", key: (f) => f.frames_used },
+  { title: "Refused", key: (f) => f.frames_seen - f.frames_used },
+  { title: "Flags", key: (f) => f.flags.length },
+  { title: "Verdict", key: (f) => f.verdict ?? "" },
+];
+
+const state = { shown: [], column: 1, down: false, chosen: null };
+
+function lengthOf(fish) {
+  return fish.corrected_length_mm ?? fish.length_mm;
+}
+
+function cm(mm, digits = 1) {
+  return mm === null || mm === undefined ? "-" : (mm / 10).toFixed(digits);
+}
+
+function element(tag, attributes = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name in made) made[name] = value;
+    else made.setAttribute(name, value);
+  }
+  made.append(...children);
+  return made;
+}
+
+function filtered(all, wanted) {
+  const words = wanted.search.toLowerCase().split(/\s+/).filter(Boolean);
+  return all.filter((f) => {
+    const length = lengthOf(f);
+    const text = `${f.track_id} ${f.haul} ${f.trip} ${f.vessel} ${f.species} ${f.status} ${f.verdict ?? ""} ${f.verdict_reason ?? ""} ${f.flags.join(" ")} ${Object.keys(f.refused).join(" ")}`.toLowerCase();
+    return words.every((word) => (/^\d+$/.test(word) ? String(f.track_id) === word || text.includes(word) : text.includes(word)))
+      && (wanted.status !== "measured" || length !== null)
+      && (wanted.status !== "not" || length === null)
+      && (wanted.status !== "flagged" || f.flags.length > 0)
+      && (wanted.verdict === "" || verdictOf(f).includes(wanted.verdict))
+      && (wanted.shortest === "" || (length !== null && length >= 10 * wanted.shortest))
+      && (wanted.longest === "" || (length !== null && length <= 10 * wanted.longest))
+      && (wanted.frames === "" || f.frames_used >= Number(wanted.frames));
+  });
+}
+
+function verdictOf(fish) {
+  return [fish.verdict ?? "none", ...(fish.corrected_length_mm === null ? [] : ["corrected"])];
+}
+
+function sorted(fish) {
+  const key = COLUMNS[state.column].key;
+  const sign = state.down ? -1 : 1;
+  const compare = (a, b) => (a < b ? -1 : a > b ? 1 : 0);
+  return [...fish].sort((a, b) => sign * compare(key(a), key(b)) || a.track_id - b.track_id);
+}
+
+function drawHead(onSort) {
+  const head = document.getElementById("head");
+  head.replaceChildren(...COLUMNS.map((column, k) => element("span", {
+    textContent: column.title + (k === state.column ? (state.down ? " \u2193" : " \u2191") : ""),
+    onclick: () => {
+      if (column.key === null) return;
+      state.down = k === state.column && !state.down;
+      state.column = k;
+      onSort();
+    },
+  })));
+}
+
+function drawRows(onChoose) {
+  const table = document.getElementById("table");
+  const rows = document.getElementById("rows");
+  rows.style.height = `${state.shown.length * ROW_PX}px`;
+  const first = Math.max(0, Math.floor(table.scrollTop / ROW_PX) - 3);
+  const last = Math.min(state.shown.length, Math.ceil((table.scrollTop + table.clientHeight) / ROW_PX) + 3);
+  rows.replaceChildren(...state.shown.slice(first, last).map((fish, k) => {
+    const row = rowOf(fish);
+    row.style.top = `${(first + k) * ROW_PX}px`;
+    row.onclick = () => onChoose(fish.track_id);
+    return row;
+  }));
+}
+
+function rowOf(fish) {
+  const reasons = Object.entries(fish.refused).map(([reason, count]) => `${count} ${reason}`).join(", ");
+  const interval = fish.ci95_low_mm === null ? fish.status : `${cm(fish.ci95_low_mm)} to ${cm(fish.ci95_high_mm)}`;
+  const corrected = fish.corrected_length_mm === null ? [] : [element("small", { textContent: `measured ${cm(fish.length_mm)} cm` })];
+  const verdict = element("span", { textContent: fish.verdict ?? "" }, element("small", { textContent: fish.verdict_reason ?? fish.duplicate_of ?? "" }));
+  if (fish.verdict) verdict.className = fish.verdict === "accept" ? "good" : "bad";
+  const size = fish.is_legal_size === false ? element("small", { className: "bad", textContent: "below legal size" }) : "";
+  return element(
+    "div",
+    { className: fish.track_id === state.chosen ? "row chosen" : "row", role: "row", "data-id": fish.track_id },
+    fish.thumb ? element("img", { src: fish.thumb, alt: "", loading: "lazy" }) : element("span"),
+    element("b", { textContent: fish.track_id }),
+    element("span", {}, element("b", { textContent: `${cm(lengthOf(fish))} cm` }), ...corrected, element("small", { textContent: interval }), size),
+    element("span", { textContent: `${fish.frames_used} of ${fish.frames_seen}` }),
+    element("small", { textContent: reasons, title: reasons }),
+    element("small", { className: "bad", textContent: fish.flags.join(", ") }),
+    verdict,
+  );
+}

@@ -1,0 +1,139 @@
+"""Takes verdicts on the fish of one folder, checks them and writes them down."""
+
+from dataclasses import replace
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from stream_dmr.camera import frame_from_crop
+from stream_dmr.errors import UserError
+from stream_dmr.messages import FishCrop, FittedMesh
+from stream_dmr.recording.codec import decode
+from stream_dmr.report.gather import View
+from stream_dmr.report.page import summary
+from stream_dmr.report.report import Report
+from stream_dmr.results import FishResult, database_of
+from stream_dmr.review.corrected import corrected_fish, corrected_length
+from stream_dmr.verdicts import (
+    NOTHING_SAID,
+    Verdict,
+    add_verdict,
+    check,
+    corrections,
+    read_verdicts,
+    reviews,
+)
+
+_Point = tuple[float, float]
+
+
+class Said(BaseModel):
+    """A verdict as the page sends it; points are in pixels of the frame's crop."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    track_id: int
+    kind: str = Field(max_length=20)
+    reason: str = Field(default="", max_length=500)
+    species: str = Field(default="", max_length=200)
+    duplicate_of: int | None = None
+    frame_index: int | None = None
+    head: _Point | None = None
+    tail: _Point | None = None
+
+
+class Judge:
+    """Verdicts of one reviewer. Thread-safe."""
+
+    def __init__(self, report: Report, reviewer: str) -> None:
+        """UserError where the results have no database to write to."""
+        database = database_of(report.path)
+        if database is None:
+            raise UserError(
+                f"{report.path}: expected the folder of a run, with its lengths.db, for the "
+                "verdicts; got a recording alone"
+            )
+        self._database: Path = database
+        self._report = report
+        self._reviewer = reviewer
+        self._fish = {one.estimate.track_id: one for one in report.fish}
+        self._lock = Lock()
+
+    def take(self, content: bytes) -> dict[str, Any]:
+        """Check and write a verdict, JSON of `Said`; returns the fish's row. UserError."""
+        try:
+            said = Said.model_validate_json(content)
+        except ValidationError as error:
+            raise UserError(f"verdict: {error.errors()[0]['msg']}") from error
+        with self._lock:
+            verdict = Verdict(
+                track_id=said.track_id,
+                kind=said.kind,
+                reviewer=self._reviewer,
+                reason=said.reason.strip() if said.kind == "reject" else "",
+                species=said.species.strip() if said.kind == "species" else "",
+                duplicate_of=said.duplicate_of if said.kind == "duplicate" else None,
+            )
+            check(verdict, set(self._fish))
+            if said.kind == "correct":
+                verdict = self._corrected(verdict, said)
+            add_verdict(self._database, verdict)
+            return self._row(self._fish[said.track_id])
+
+    def judged(self) -> list[dict[str, Any]]:
+        """The rows of all fish of which anything was said."""
+        held = reviews(read_verdicts(self._database))
+        return [self._row(one) for track_id, one in self._fish.items() if track_id in held]
+
+    def _row(self, fish: FishResult) -> dict[str, Any]:
+        held = reviews(read_verdicts(self._database))
+        now = replace(fish, review=held.get(fish.estimate.track_id, NOTHING_SAID))
+        report = self._report
+        return summary(now, report.recording.header, report.settings, report.album)
+
+    def _corrected(self, verdict: Verdict, said: Said) -> Verdict:
+        """The verdict with its points in frame pixels and the length that follows."""
+        if said.frame_index is None or said.head is None or said.tail is None:
+            raise UserError("verdict: expected a frame with its head and tail points")
+        crop = decode(FishCrop, self._view(said.track_id, said.frame_index).crop)
+        head, tail = frame_from_crop(
+            np.array([said.head, said.tail], float),
+            crop_camera=crop.crop_camera,
+            frame_camera=crop.frame_camera,
+        ).tolist()
+        verdict = replace(
+            verdict,
+            frame_index=said.frame_index,
+            head_u=head[0],
+            head_v=head[1],
+            tail_u=tail[0],
+            tail_v=tail[1],
+        )
+        held = corrections(read_verdicts(self._database), said.track_id)
+        held[said.frame_index] = verdict
+        length = self._length(held)
+        return replace(verdict, length_mm=length.length_mm, length_std_mm=length.length_std_mm)
+
+    def _length(self, held: dict[int, Verdict]) -> Any:
+        report = self._report
+        frames = {}
+        for frame_index, verdict in held.items():
+            view = self._view(verdict.track_id, frame_index)
+            points = [[verdict.head_u, verdict.head_v], [verdict.tail_u, verdict.tail_v]]
+            frames[frame_index] = corrected_fish(
+                decode(FittedMesh, view.fit),
+                np.array(points, float),
+                config=report.config,
+                calibration=report.recording.header.calibration,
+            )
+        return corrected_length(frames, report.config)
+
+    def _view(self, track_id: int, frame_index: int) -> View:
+        track = self._report.tracks.get(track_id)
+        for view in track.views if track else ():
+            if view.row.fish.frame_index == frame_index:
+                return view
+        raise UserError(f"verdict: fish {track_id} is not shown in frame {frame_index}")
