@@ -24,25 +24,28 @@ def chromium() -> str:
 def evaluate(page: Path, script: str) -> Any:
     """Run the body of an async function in a copy of the page; what it returns, by JSON.
 
-    An exception there, or in the page, is an error here.
+    An exception there is an error here.
     """
-    probe = (
+    copy = page.with_name(f"probe-{page.name}")
+    before, _, after = page.read_text(encoding="utf-8").rpartition("</body>")
+    copy.write_text(f"{before}{in_page(script)}</body>{after}", encoding="utf-8")
+    return result_of(dump(copy.absolute().as_uri()))
+
+
+def in_page(script: str) -> str:
+    """The body of an async function as an element that leaves its result in the page."""
+    return (
         "<script>(async () => { let result; try { result = await (async () => {"
         + script
         + "})(); } catch (error) { result = { error: String(error) }; }"
         "const place = document.createElement('pre'); place.id = 'probe';"
         "place.textContent = JSON.stringify(result ?? null); document.body.append(place);"
-        "})();</script></body>"
+        "})();</script>"
     )
-    copy = page.with_name(f"probe-{page.name}")
-    watch = (
-        "<head><script>window.onerror = (text) => { document.title = 'ERROR ' + text; };</script>"
-    )
-    text = page.read_text(encoding="utf-8").replace("<head>", watch, 1)
-    before, _, after = text.rpartition("</body>")
-    copy.write_text(before + probe + after, encoding="utf-8")
-    dom = dump(copy.absolute().as_uri())
-    assert "<title>ERROR" not in dom, dom[dom.index("<title>") :][:300]
+
+
+def result_of(dom: str) -> Any:
+    """What the script of `in_page` left."""
     found = re.search(r'<pre id="probe">(.*?)</pre>', dom, re.DOTALL)
     assert found is not None, dom[-2000:]
     result = json.loads(html.unescape(found[1]))
