@@ -14,7 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from hota import score
 
+from nodes.crop_fish import CropFish
 from stream_dmr.messages import Frame
+from stream_dmr.segmentation.crop import CropFishSettings
 from stream_dmr.segmentation.detectors import DetectFishSettings, open_detector
 from stream_dmr.segmentation.followed import FollowedFish, TrackFishSettings
 from stream_dmr.simulation.film import film
@@ -54,6 +56,7 @@ def _swinging(visit: Visit, *, side: int) -> Visit:
 def measure(scene: Scene) -> Outcome:
     """Film a scene, follow its fish, and compare."""
     fish = FollowedFish(open_detector(DetectFishSettings()), TrackFishSettings())
+    node = CropFish(CropFishSettings(), camera=scene.calibration.camera, detections=fish)
     truth, found = [], []
     for shot in film(scene):
         index = shot.frame_index
@@ -65,7 +68,7 @@ def measure(scene: Scene) -> Outcome:
                 if box.visible_fraction >= _LEAST_VISIBLE
             }
         )
-        found.append({one.track_id: one.bbox_xyxy_px for one in fish.detect(frame)})
+        found.append({crop.track_id: crop.bbox_xyxy_px for crop in node.step(frame)})
     scores = score(truth, found)
     num_fish, counted = (len({i for boxes in side for i in boxes}) for side in (truth, found))
     return Outcome(idf1=scores.idf1, hota=scores.hota, num_fish=num_fish, counted=counted)

@@ -81,7 +81,8 @@ class Tracker:
         self._drop_lost(frame)
         seen = [track for track in self._tracks if track.lost_frames == 0]
         for look in free:
-            if not any(look.share_in(track.look.box) > _BESIDE for track in seen):
+            is_beside = not any(look.share_in(track.look.box) > _BESIDE for track in seen)
+            if look.is_piece or is_beside:
                 self._started += 1
                 self._tracks.append(_Track(look, self._started, frame.frame_index))
         return [t.sighting() for t in self._tracks if t.lost_frames == 0 and t.was_alone]
