@@ -1,11 +1,9 @@
 """Assembles a run: checks every input, builds the nodes and the recorder, runs the chain."""
 
-import itertools
-import tempfile
 import threading
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager, nullcontext
+from collections.abc import Iterable, Sequence
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,26 +20,19 @@ from stream_dmr.endless import DriftWatch, Tolerance, go_on, left_open
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.messages import LengthEstimate, LocalizedFish
 from stream_dmr.pipeline import Node, StageCounters, run_chain
-from stream_dmr.provenance import NAME as PROVENANCE
 from stream_dmr.provenance import sealed
-from stream_dmr.recording.files import STEM, open_files
+from stream_dmr.recording.files import open_files
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.recording.recover import Repair, recover
+from stream_dmr.recording.retention import Retention
 from stream_dmr.recording.segments import open_segments
+from stream_dmr.run_folder import RESULTS, SEGMENTED, consistent_csv, prepare_folder
 from stream_dmr.segmentation.fish_finder import open_finder
-from stream_dmr.store import LengthStore, require_free
-from stream_dmr.tables import write_lengths
+from stream_dmr.store import LengthStore, flagged_fish
 from stream_dmr.tally import Observer, Tally, run_facts
 from stream_dmr.template import Template, load_template
 from stream_dmr.video import LiveStream
 from stream_dmr.watch.watch import Watch
-
-RESULTS = (
-    *("lengths.db", "lengths.csv", "frames.csv", "recording.mcap", "recording.rrd"),
-    PROVENANCE,
-)
-SEGMENTED = ("lengths.db", "lengths.csv", "frames.csv", f"{STEM}-*")  # of a source without an end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,13 +94,20 @@ def run(
         nodes = [crop_fish, *later_nodes(config, template=template, calibration=calibration)]
         is_endless = reader.source.is_endless
         goes_on = (request.resume or is_endless) and not request.overwrite
+        retention = Retention(
+            request.out,
+            free_bytes=round(config.recording.keep_free_gb * 1e9) if is_endless else 0,
+            marked=partial(flagged_fish, request.out),
+            on_notice=observer.warn,
+        )
+        retention.make_room()
         repairs = prepare_folder(request.out, overwrite=request.overwrite, resume=goes_on)
         header = _header(request, reader.source.name, config, template, calibration)
         facts = run_facts(header, vessel=request.vessel, trip=request.trip, haul=request.haul)
         with (
             sealed(request.out, with_recordings=not is_endless, on_notice=observer.warn),
             closing(LengthStore(request.out, facts)) as store,
-            _consistent_csv(request.out / "lengths.csv", store, resume=goes_on),
+            consistent_csv(request.out / "lengths.csv", store, resume=goes_on),
             closing(
                 Watch(
                     observer,
@@ -132,10 +130,13 @@ def run(
                 files=partial(open_segments, left=left, on_notice=watch.warn)
                 if is_endless
                 else open_files,
+                on_refusal=watch.warn if is_endless else None,
             ) as recorder,
+            closing(retention),
         ):
             for repair in repairs:
                 watch.warn(repair.line)
+            retention.start()
             resume(nodes, left)
             if recorder.live_address is not None:
                 observer.serving(f"stream-dmr view {recorder.live_address}")
@@ -166,60 +167,6 @@ def run(
         for line in (*reader.source.warnings, *detections.warnings):
             observer.warn(line)
     return summary
-
-
-def prepare_folder(out: Path, *, overwrite: bool, resume: bool = False) -> list[Repair]:
-    """Make sure that results can be written to `out`, and that none are lost by it.
-
-    Raises OutputError where it is no folder, can't be written to, has no room, or holds the
-    results of an earlier run; `overwrite` removes those instead, `resume` keeps them. Returns what
-    was done about recordings that a crash left unfinished.
-    """
-    earlier = [out / name for name in RESULTS if (out / name).exists()]
-    earlier += sorted(out.glob(f"{STEM}-*"))
-    if earlier and not overwrite and not resume:
-        raise OutputError(
-            f"{out}: expected a folder without results, found {earlier[0].name} of an earlier run; "
-            "choose another --out, or add --resume or --overwrite"
-        )
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        require_free(out)
-        if overwrite:
-            for path in (*earlier, *out.glob(f"{STEM}.*")):
-                for leftover in ("", "-wal", "-shm"):  # of a database after a crash
-                    path.with_name(path.name + leftover).unlink(missing_ok=True)
-        repairs = list(recover(out))
-        for path in (out / f"{STEM}.mcap", out / f"{STEM}.rrd"):
-            if path.exists():
-                _set_aside(path)
-        with tempfile.TemporaryFile(dir=out) as probe:
-            probe.write(bytes(1 << 16))
-    except OSError as error:
-        raise OutputError(
-            f"{out}: expected a folder to write to, got: {error.strerror}; choose another --out"
-        ) from error
-    return repairs
-
-
-def _set_aside(recording: Path) -> None:
-    """Give the recording of an earlier run a name of its own: recording-1.mcap, ..."""
-    for number in itertools.count(1):
-        aside = recording.with_stem(f"{recording.stem}-{number}")
-        if not aside.exists():
-            recording.rename(aside)
-            return
-
-
-@contextmanager
-def _consistent_csv(path: Path, store: LengthStore, *, resume: bool) -> Iterator[None]:
-    """Begin and end with what the store holds: a crash between the two loses a row of neither."""
-    if resume:
-        write_lengths(path, store.estimates())
-    try:
-        yield
-    finally:
-        write_lengths(path, store.estimates())
 
 
 def later_nodes(

@@ -10,7 +10,7 @@ import os
 import sqlite3
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from threading import RLock
@@ -280,6 +280,16 @@ def _refusing(path: Path) -> Iterator[None]:
             f"{path}: expected a database of lengths to write to, got: {error}; make room, or "
             "choose another --out"
         ) from error
+
+
+def flagged_fish(out_dir: Path) -> set[int]:
+    """The ids of fish whose length has a flag. Raises OutputError where they can't be read."""
+    path = out_dir / NAME
+    if not path.exists():
+        return set()
+    with _refusing(path), closing(open_database(path, read_only=True)) as database:
+        rows = database.execute("SELECT track_id FROM fish WHERE flags != '[]'")
+        return {track_id for (track_id,) in rows}
 
 
 def require_free(out_dir: Path) -> None:

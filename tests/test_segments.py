@@ -193,13 +193,7 @@ def test_a_length_that_only_the_recording_has_is_taken_over(tmp_path: Path):
 @pytest.fixture(scope="module")
 def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A measurement of clips, killed in the middle of a fish and started again."""
-    folder = tmp_path_factory.mktemp("interrupted")
-    options = write_clip(folder)
-    del options["--boxes"], options["--masks"]
-    Path(options["--config"]).write_text(CLIPS + QUICK.replace("[crop_fish]", GRABCUT))
-    (folder / "clips").mkdir()
-    options["--source"] = str(folder / "clips")
-    write_swaying_fish(folder / "clips" / "1.avi", num_frames=160)
+    options = write_clips(tmp_path_factory.mktemp("interrupted"), num_frames=160)
     out = Path(options["--out"])
     killed = start(options)
     wait_for_rows(out / "frames.csv", 60, killed)
@@ -221,6 +215,16 @@ flush_s = 0.1
 segment_s = 4.0
 """
 GRABCUT = '[crop_fish]\nsegmenter = "grabcut"'
+
+
+def write_clips(folder: Path, *, num_frames: int) -> dict[str, str]:
+    """A folder with a clip, a source without an end; return the options of `run`."""
+    options = write_clip(folder)
+    del options["--boxes"], options["--masks"]
+    Path(options["--config"]).write_text(CLIPS + QUICK.replace("[crop_fish]", GRABCUT))
+    (folder / "clips").mkdir()
+    write_swaying_fish(folder / "clips" / "1.avi", num_frames=num_frames)
+    return options | {"--source": str(folder / "clips")}
 
 
 def write_swaying_fish(path: Path, *, num_frames: int) -> None:

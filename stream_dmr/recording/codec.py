@@ -16,7 +16,13 @@ from google.protobuf.message import Message as Proto
 from stream_dmr import messages
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.errors import RecordingError
-from stream_dmr.recording.pictures import Picture, compress, compress_mask, decompress
+from stream_dmr.recording.pictures import (
+    Picture,
+    checksum,
+    compress,
+    compress_mask,
+    decompress,
+)
 from stream_dmr.recording.schema import proto_class
 
 CODEC_VERSION = 3
@@ -77,6 +83,18 @@ def reference(frame: bytes) -> Picture:
     proto: Any = proto_class("Frame")()
     proto.ParseFromString(frame)
     return _picture(proto.image)
+
+
+def without_picture(frame: bytes) -> bytes:
+    """The same encoded Frame by reference: size and checksum stay, the pixels go."""
+    proto: Any = proto_class("Frame")()
+    proto.ParseFromString(frame)
+    picture = _picture(proto.image)
+    if picture.format == "reference":
+        return frame
+    crc32 = picture.crc32 or checksum(decompress(picture))
+    proto.image.format, proto.image.data, proto.image.crc32 = "reference", b"", crc32
+    return proto.SerializeToString(deterministic=True)
 
 
 def check_version(version: int) -> None:

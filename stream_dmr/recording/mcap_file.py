@@ -23,11 +23,20 @@ from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
 from stream_dmr.errors import RecordingError
-from stream_dmr.messages import Message
-from stream_dmr.recording.codec import check_version
+from stream_dmr.messages import LocalizedFish, Message
+from stream_dmr.recording.codec import check_version, decode
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.part import WHOLE, Part, Spans
-from stream_dmr.recording.topics import CARRIED, RECOVERED, RUN, SEGMENT, SPANS, TOPICS, VIDEO
+from stream_dmr.recording.topics import (
+    CARRIED,
+    RECOVERED,
+    RUN,
+    SEGMENT,
+    SPANS,
+    THINNED,
+    TOPICS,
+    VIDEO,
+)
 
 # What the mcap library lets through on damaged bytes; its CRC error is a ValueError.
 _DAMAGE = (
@@ -47,7 +56,7 @@ class McapFile:
         self.path = path
         self.warnings: list[str] = []
         self.metadata: dict[str, str] = {}
-        self.is_segment = self.ends_early = False
+        self.is_segment = self.is_thinned = self.ends_early = False
         self.header = self._read_header()
 
     @property
@@ -55,6 +64,16 @@ class McapFile:
         """Whether its end is missing."""
         with self._open() as stream:
             return self._is_torn(stream)
+
+    def tracks(self) -> Collection[int]:
+        """The ids of its fish, by the index where it has one."""
+        with self._open() as stream:
+            if not self._is_torn(stream) and _has_index(stream):
+                spans = _spans(stream, SeekingReader(stream, validate_crcs=True))
+                if spans:
+                    return spans.keys()
+        fish = (payload for _, payload in self.payloads([LocalizedFish]))
+        return {decode(LocalizedFish, payload).track_id for payload in fish}
 
     def carried(self) -> Iterator[bytes]:
         """See `opened.Recording`."""
@@ -136,6 +155,7 @@ class McapFile:
         elif record.name == RECOVERED:
             self._warn(f"{self.path}: recovered after a crash; what came after that is lost")
         self.is_segment |= record.name == SEGMENT
+        self.is_thinned |= record.name == THINNED
         self.ends_early |= record.name in (SEGMENT, RECOVERED)
 
     def _is_torn(self, stream: IO[bytes]) -> bool:

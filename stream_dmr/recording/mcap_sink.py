@@ -83,11 +83,16 @@ class McapSink:
         self._closed = False
         try:
             self._file = WholeFile(self._part)
+        except OSError as error:
+            raise self._refusal(error) from error
+        try:
             sync_path(path.parent)
             self._writer = _start(self._file, header, number)
             self._register_topics(is_segment=number is not None)
             self._flush()
         except OSError as error:
+            self._file.close()
+            self._part.unlink(missing_ok=True)
             raise self._refusal(error) from error
 
     @property

@@ -22,6 +22,7 @@ class Recording(Protocol):
 
     header: RunHeader
     metadata: dict[str, str]  # who recorded it, with which versions
+    is_thinned: bool  # pictures and masks are gone from it, to make room
     ends_early: bool  # it is one of several, or a crash cut it off: what follows is not in it
 
     @property
@@ -84,6 +85,7 @@ class _Row:
         self._segments = segments
         self.header, self.metadata = segments[0].header, segments[0].metadata
         self.ends_early = any(segment.ends_early for segment in segments)
+        self.is_thinned = any(segment.is_thinned for segment in segments)
         for file, segment in zip(files, segments, strict=True):
             if segment.header.checksum != self.header.checksum:
                 raise RecordingError(

@@ -1,11 +1,13 @@
 """Records a run: every message of every stage, to every sink."""
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from queue import Queue
 from threading import Lock, Thread
 from types import TracebackType
 
+from stream_dmr.errors import OutputError
 from stream_dmr.messages import Message
 from stream_dmr.recording.files import OpenSinks, Sink, open_files
 from stream_dmr.recording.header import RunHeader
@@ -35,13 +37,16 @@ class Recorder:
         live: bool = False,
         resume: bool = False,
         files: OpenSinks = open_files,
+        on_refusal: Callable[[str], None] | None = None,
     ) -> None:
         """With `live`, the view is served as well, at `live_address`; `resume` keeps the tables.
 
         `files` opens those of the recording: `open_files` or, for a run without an end,
-        `open_segments`.
+        `open_segments`. With `on_refusal`, that is told what the disk refuses, instead of an
+        exception, and each sink is tried again with what follows: measuring goes on.
         """
         self.live_address: str | None = None
+        self._on_refusal = on_refusal
         self._settings = settings
         self._sinks: list[Sink] = []
         self._refused: list[Sink] = []
@@ -115,6 +120,12 @@ class Recorder:
             return
         try:
             sink.write(record)
+        except OutputError as error:
+            if self._on_refusal is not None:
+                self._on_refusal(str(error))
+                return
+            self._refused.append(sink)
+            self._fail(error)
         except Exception as error:  # whatever it is, the run must hear of it
             self._refused.append(sink)
             self._fail(error)

@@ -1,27 +1,22 @@
 """Repairs what a crash or a power cut left of recordings."""
 
 import subprocess
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing
+from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
-from mcap.records import Attachment, Channel, Metadata, Schema
-from mcap.records import Message as McapMessage
-from mcap.writer import Writer
-
-from stream_dmr import __version__
 from stream_dmr.errors import RecordingError
 from stream_dmr.recording.files import STEM
-from stream_dmr.recording.mcap_file import McapFile, whole_records
-from stream_dmr.recording.mcap_sink import PART, new_writer
+from stream_dmr.recording.mcap_file import McapFile
+from stream_dmr.recording.mcap_sink import PART
 from stream_dmr.recording.rerun_program import rerun_program
+from stream_dmr.recording.rewrite import REWRITTEN, rewrite
 from stream_dmr.recording.rrd_file import is_closed
-from stream_dmr.recording.topics import RECOVERED, RUN
-from stream_dmr.recording.whole_file import WholeFile, rename_durably, sync_path
+from stream_dmr.recording.topics import RECOVERED
+from stream_dmr.recording.whole_file import rename_durably, sync_path
 
-_REPAIRED, _DAMAGED = ".repaired", ".damaged"
+_DAMAGED = ".damaged"  # after the name of a file of which nothing is whole
 
 
 class Repair(NamedTuple):
@@ -37,7 +32,7 @@ def recover(folder: Path) -> Iterator[Repair]:
     Nothing may be writing there. Each file is repaired beside itself and replaced at once, so a
     crash in the middle of it does no harm.
     """
-    for leftover in folder.glob(f"{STEM}*{_REPAIRED}"):
+    for leftover in folder.glob(f"{STEM}*{REWRITTEN}"):
         leftover.unlink()
     for part in sorted(folder.glob(f"{STEM}*.mcap{PART}")):
         yield _attempt(part, _repair_mcap)
@@ -63,42 +58,14 @@ def _repair_mcap(part: Path) -> tuple[Path, str]:
     if not McapFile(part).is_torn:  # the crash came before it got its name
         rename_durably(part, target)
         return target, f"it was complete and is {target.name} now"
-    repaired = part.with_name(part.name + _REPAIRED)
-    with closing(WholeFile(repaired)) as file:
-        num_messages = _copy(whole_records(part), new_writer(file))
-        file.sync()
+    repaired, num_messages = rewrite(part, note=RECOVERED)
     rename_durably(repaired, target)
     part.unlink()
     return target, f"its {num_messages} whole messages are in {target.name}"
 
 
-def _copy(records: Iterable[object], writer: Writer) -> int:
-    """Everything but the index, which the writer makes; the number of messages."""
-    schemas, channels, num_messages = {0: 0}, dict[int, int](), 0
-    for record in records:
-        match record:
-            case Metadata(name=name, metadata=metadata):
-                writer.add_metadata(name, metadata)
-                if name == RUN:
-                    writer.add_metadata(RECOVERED, {"by": __version__})
-            case Attachment() as a:
-                writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, a.data)
-            case Schema(id=id_, name=name, encoding=encoding, data=data):
-                schemas[id_] = writer.register_schema(name, encoding, data)
-            case Channel(id=id_, topic=topic, message_encoding=encoding, schema_id=schema):
-                channels[id_] = writer.register_channel(topic, encoding, schemas[schema])
-            case McapMessage() as m:
-                channel = channels[m.channel_id]
-                writer.add_message(channel, m.log_time, m.data, m.publish_time, m.sequence)
-                num_messages += 1
-            case _:
-                pass
-    writer.finish()
-    return num_messages
-
-
 def _repair_rrd(rrd: Path) -> tuple[Path, str]:
-    repaired = rrd.with_name(rrd.name + _REPAIRED)
+    repaired = rrd.with_name(rrd.name + REWRITTEN)
     command = [
         rerun_program(),
         "rrd",

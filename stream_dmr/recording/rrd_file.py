@@ -73,6 +73,7 @@ class RrdFile:
         end = self._rows.pop(f"/{END}", None)
         counts = {entity: len(rows) for entity, rows in self._rows.items()}
         self.ends_early = end is None
+        self.is_thinned = False
         if end is None:
             whole = sum(count for entity, count in counts.items() if _HEADER not in entity)
             self.warnings.append(

@@ -13,9 +13,12 @@ from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.mcap_sink import McapSink
 from stream_dmr.recording.record import Record
 from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.whole_file import free_bytes
 
 _NUMBERED = re.compile(rf"{STEM}-(\d+)\..*")
 _RETRY_NS = 5_000_000_000  # of capture time, after the disk refused a new segment
+_FLOOR = 0.05  # of `keep_free_gb`: with less than that free, nothing but lengths is written
+_NO_ROOM = "hardly any room is left on the disk; nothing is recorded but lengths"
 _MOST_IN_FLIGHT = 16  # frames between the source and the end of the chain: fewer, in fact
 
 
@@ -37,10 +40,7 @@ class Segments:
         left: Iterable[LocalizedFish] = (),
         on_notice: Callable[[str], None],
     ) -> None:
-        """`left`: of the fish that an earlier run left unfinished, which this one finishes.
-
-        Raises OutputError where the first segment can't be opened.
-        """
+        """`left`: of the fish that an earlier run left unfinished, which this one finishes."""
         self._out_dir, self._header, self._settings = out_dir, header, settings
         self._on_notice = on_notice
         self._number = _last_number(out_dir)
@@ -51,8 +51,8 @@ class Segments:
         self._carried, self._ahead = Carried(), list[Record]()
         for fish in left:
             self._carried.take(carried_record(fish))
-        self._open: list[Sink] = self._open_next()
         self._next: list[Sink] = []
+        self._open: list[Sink] = self._try_next(0)
         self._carry_to(self._open)
 
     def write(self, record: Record) -> None:
@@ -80,6 +80,8 @@ class Segments:
 
     def _see(self, frame: Frame) -> None:
         """Cut before this frame if it is time; complete the segment before an earlier cut."""
+        if self._open and self._lacks_room():
+            self._give_up(frame.timestamp_ns)
         if self._cut_ns is not None:
             self._frames_since_cut += 1
             if self._frames_since_cut >= _MOST_IN_FLIGHT:
@@ -97,13 +99,9 @@ class Segments:
         return is_long or size >= self._settings.segment_mb * 1e6 or not self._open
 
     def _cut(self, now_ns: int) -> None:
-        try:
-            self._next = self._open_next()
-        except OutputError as error:
-            self._retry_ns = now_ns + _RETRY_NS
-            self._on_notice(f"{error}; tried again in some seconds")
-            return
-        self._cut_ns, self._frames_since_cut = now_ns, 0
+        self._next = self._try_next(now_ns)
+        if self._next:
+            self._cut_ns, self._frames_since_cut = now_ns, 0
 
     def _complete(self) -> None:
         """The last stage has reached the cut: end the segment before it.
@@ -118,11 +116,34 @@ class Segments:
             self._carried.take(record)
         self._ahead.clear()
 
-    def _open_next(self) -> list[Sink]:
+    def _lacks_room(self) -> bool:
+        """Whether lengths need what room is left on the disk."""
+        return free_bytes(self._out_dir) < _FLOOR * self._settings.keep_free_gb * 1e9
+
+    def _give_up(self, now_ns: int) -> None:
+        """End what is open, while there is room to end it."""
+        if self._cut_ns is not None:
+            self._complete()
+        self._close_all(self._open)
+        self._retry_ns = now_ns + _RETRY_NS
+        self._on_notice(f"{self._out_dir}: {_NO_ROOM}")
+
+    def _try_next(self, now_ns: int) -> list[Sink]:
+        """Open the next segment; none where the disk refuses it."""
+        if self._lacks_room():
+            self._retry_ns = now_ns + _RETRY_NS
+            self._on_notice(f"{self._out_dir}: {_NO_ROOM}")
+            return []
         number = self._number + 1
-        files = open_files(
-            self._out_dir, self._header, self._settings, stem=f"{STEM}-{number:06d}", number=number
-        )
+        stem = f"{STEM}-{number:06d}"
+        try:
+            files = open_files(
+                self._out_dir, self._header, self._settings, stem=stem, number=number
+            )
+        except OutputError as error:
+            self._retry_ns = now_ns + _RETRY_NS
+            self._on_notice(f"{error}; tried again in some seconds")
+            return []
         self._number = number
         return files
 

@@ -64,3 +64,8 @@ class RecordingSettings(Settings):
     segment_mb: float = Field(
         default=512.0, ge=1, description="or of so many MB of .mcap, if that comes first"
     )
+    keep_free_gb: float = Field(
+        default=2.0,
+        ge=0,
+        description="where less is free on the disk, the oldest of those files go, GB; 0: never",
+    )

@@ -42,8 +42,8 @@ LOG, REFUSALS, RESULTS = "log", "log/refusals", "log/lengths"
 CAMERA, PLANE = "scene/camera", "scene/plane"  # static, from the header
 END = "messages/end"  # the last row of a whole .rrd: how many messages each payload path has
 # Metadata records of an .mcap: of the run; of one of several files, with its `number`; of one that
-# a crash left unfinished.
-RUN, SEGMENT, RECOVERED = "run", "segment", "recovered"
+# a crash left unfinished; of one whose pictures and masks went to make room.
+RUN, SEGMENT, RECOVERED, THINNED = "run", "segment", "recovered", "thinned"
 SPANS = "tracks.json"  # attachment of a whole .mcap: each track's first and last capture time, ns
 KEY_FRAME_NS = 1_000_000_000  # of capture time, from one key frame of the video to the next
 VIDEO = "/video"  # in the .mcap with frames = "h264": foxglove.CompressedVideo

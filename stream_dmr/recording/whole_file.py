@@ -54,6 +54,12 @@ class WholeFile:
             self._fd = -1
 
 
+def free_bytes(folder: Path) -> int:
+    """Room on the disk of a folder, for who isn't its administrator."""
+    room = os.statvfs(folder)
+    return room.f_bavail * room.f_frsize
+
+
 def rename_durably(path: Path, target: Path) -> None:
     """Rename within a folder, replacing `target`, so that the name survives a power loss."""
     path.replace(target)

@@ -23,13 +23,14 @@ from stream_dmr.messages import (
 )
 from stream_dmr.pipeline import Node, StageCounters, run_chain
 from stream_dmr.recording.header import RunHeader
-from stream_dmr.recording.opened import open_recordings
+from stream_dmr.recording.opened import Recording, open_recordings
 from stream_dmr.recording.part import WHOLE, Part
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.restored import SourcePictures
 from stream_dmr.replay.judge import Judge, Mismatch, Scribe
 from stream_dmr.replay.tape import Playback, Tape
-from stream_dmr.run import Observer, later_nodes, prepare_folder, resume
+from stream_dmr.run import Observer, later_nodes, resume
+from stream_dmr.run_folder import prepare_folder
 from stream_dmr.segmentation.fish_finder import open_finder
 from stream_dmr.template import Template, load_template
 
@@ -83,8 +84,8 @@ def replay(
     replayed as far as it is whole, and `observer` is warned of what is lost.
     """
     observer = observer or Observer()
-    _refuse_impossible(request)
     recording = open_recordings(request.recordings)
+    _refuse_impossible(request, recording)
     config, template, calibration = _inputs(request, recording.header)
     tape = Tape(recording, request.part)
     order = [*STAGES.values()]
@@ -125,7 +126,12 @@ def replay(
     )
 
 
-def _refuse_impossible(request: ReplayRequest) -> None:
+def _refuse_impossible(request: ReplayRequest, recording: Recording) -> None:
+    if request.first == "fit" and recording.is_thinned:
+        raise UserError(
+            "--from fit: expected a recording with masks, but those of some of it went to make "
+            "room on the disk; use --from localize"
+        )
     if request.check and request.part.time_ns is not None:
         raise UserError(
             "--check with --time: each fit starts from the frame before, so a part of a recording "
@@ -137,7 +143,8 @@ def _refuse_impossible(request: ReplayRequest) -> None:
         )
     if request.first == "crop" and request.part.tracks is not None:
         raise UserError("--track with --from crop: crops are made of whole frames; use --from fit")
-    if request.first == "crop" and request.boxes is None and request.masks is None:
+    was_told = any(f"--{name}" in recording.header.command for name in ("boxes", "masks"))
+    if request.first == "crop" and was_told and request.boxes is None and request.masks is None:
         raise UserError(
             "--from crop: expected to be told where the fish are, as in the run; "
             "give its --boxes, --masks or both"
