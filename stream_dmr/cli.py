@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from stream_dmr import __version__
+from stream_dmr.cli_batch import batch
 from stream_dmr.cli_calibrate import calibrate
 from stream_dmr.cli_evaluate import evaluate
 from stream_dmr.cli_export import export
@@ -32,7 +33,7 @@ app = typer.Typer(
 )
 for command in (
     *(calibrate, replay, recover, view, convert, export),
-    *(report, review, verify, evaluate, train),
+    *(report, review, verify, batch, evaluate, train),
 ):
     app.command()(command)
 

@@ -1,0 +1,126 @@
+"""One video of a batch, from start to end: done as a whole, or not at all."""
+
+import json
+import shlex
+import shutil
+import threading
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from stream_dmr.batch.dataset import write_tables
+from stream_dmr.batch.manifest import Job
+from stream_dmr.batch.progress import Progress
+from stream_dmr.errors import UserError
+from stream_dmr.recording.whole_file import rename_durably
+from stream_dmr.run import RunRequest, run
+from stream_dmr.tally import Observer
+
+OUTCOME = "outcome.json"
+DONE, FAILED = "done", "failed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of a video."""
+
+    name: str
+    key: str  # of the job
+    status: str  # DONE or FAILED
+    reason: str = ""  # why it failed
+    num_frames: int = 0
+    num_fish: int = 0
+    elapsed_s: float = 0.0
+
+
+def folder_of(job: Job, out: Path) -> Path:
+    """Where the results of a job are, once it is over."""
+    return out / "videos" / job.name
+
+
+def outcome_of(job: Job, out: Path) -> Outcome | None:
+    """What became of a job earlier; None where it is not over, or its inputs have changed."""
+    try:
+        text = (folder_of(job, out) / OUTCOME).read_text(encoding="utf-8")
+        outcome = Outcome(**json.loads(text))
+    except (OSError, ValueError, TypeError):
+        return None
+    return outcome if outcome.key == job.key else None
+
+
+def do_job(job: Job, out: Path, *, on_progress: Progress = lambda share: None) -> Outcome:
+    """Measure a video into its folder below `out`.
+
+    All is done in a folder of another name, which gets its own only at the end: a job that is
+    killed leaves nothing that looks done. What is wrong with the video is the outcome.
+    """
+    folder = folder_of(job, out)
+    part = folder.with_name(f"{folder.name}.part")
+    began, key = time.perf_counter(), job.key
+    part.parent.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(part, ignore_errors=True)
+    try:
+        summary = run(request_of(job, part), stop=threading.Event(), observer=_Ticker(on_progress))
+        write_tables(part, job)
+        outcome = Outcome(
+            name=job.name,
+            key=key,
+            status=DONE,
+            num_frames=summary.num_frames,
+            num_fish=len(summary.fish),
+            elapsed_s=round(time.perf_counter() - began, 3),
+        )
+    except UserError as error:
+        shutil.rmtree(part, ignore_errors=True)
+        outcome = Outcome(name=job.name, key=key, status=FAILED, reason=str(error))
+    finish(part, folder, outcome)
+    return outcome
+
+
+def finish(part: Path, folder: Path, outcome: Outcome) -> None:
+    """Write the outcome and give the folder its name, in place of an earlier one."""
+    part.mkdir(exist_ok=True)
+    (part / OUTCOME).write_text(json.dumps(asdict(outcome)) + "\n", encoding="utf-8")
+    shutil.rmtree(folder, ignore_errors=True)
+    rename_durably(part, folder)
+
+
+def request_of(job: Job, out: Path) -> RunRequest:
+    """The run that measures a whole video, as a user would have asked for it."""
+
+    def path(text: str) -> Path | None:
+        return Path(text) if text else None
+
+    options = {"source": job.video, "calibration": job.calibration, "boxes": job.boxes}
+    options |= {"masks": job.masks, "template": job.template, "config": job.config}
+    words = [word for key, value in options.items() if value for word in (f"--{key}", value)]
+    return RunRequest(
+        source=job.video,
+        out=out,
+        calibration=path(job.calibration),
+        boxes=path(job.boxes),
+        masks=path(job.masks),
+        template=job.template,
+        config=path(job.config),
+        command=shlex.join(["stream-dmr", "run", *words]),
+        vessel=job.vessel,
+        trip=job.trip,
+        haul=job.haul,
+    )
+
+
+class _Ticker(Observer):
+    """Turns frames into shares of the video."""
+
+    def __init__(self, on_progress: Progress) -> None:
+        self._on_progress = on_progress
+        self._num_frames: int | None = None
+        self._done = 0
+
+    def begin(self, num_frames: int | None) -> None:
+        self._num_frames = num_frames
+
+    def frame_done(self) -> None:
+        self._done += 1
+        if self._num_frames:
+            self._on_progress(min(1.0, self._done / self._num_frames))

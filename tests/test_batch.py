@@ -1,0 +1,266 @@
+"""`stream-dmr batch`: the same as `run` on each video, whatever is killed in between."""
+
+import csv
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+from command import invoke, rows
+from fish_run import FISH, request
+from pyarrow import dataset
+from tiny_clip import write_clip
+
+from stream_dmr.batch.batch import batch
+from stream_dmr.batch.job import Outcome, do_job, folder_of, outcome_of
+from stream_dmr.batch.local import LocalEngine
+from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
+from stream_dmr.batch.progress import Clock, duration
+from stream_dmr.errors import UserError
+from stream_dmr.run import run
+from stream_dmr.verify import verify
+
+TABLES = ("lengths.csv", "frames.csv")
+
+
+def write_manifest(path: Path, *jobs: dict[str, str]) -> Path:
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(jobs)
+    return path
+
+
+def row(clip: str = "clip", **other: str) -> dict[str, str]:
+    files = {"video": f"{clip}/video.mp4", "calibration": f"{clip}/calibration.yaml"}
+    return (
+        files | {"masks": f"{clip}/masks", "vessel": "Sea/Bird", "trip": "7", "haul": "1"} | other
+    )
+
+
+@pytest.fixture(scope="module")
+def season(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two clips, and what `run` makes of the first."""
+    folder = tmp_path_factory.mktemp("season")
+    write_clip(folder / "clip", fish=FISH)
+    write_clip(folder / "other", fish=[[1], [1], [1], [1, 3], [3], [3]])
+    (folder / "broken").mkdir()
+    (folder / "broken" / "video.mp4").write_bytes(b"this is no video")
+    run(request(folder / "clip", folder / "alone"), stop=threading.Event())
+    return folder
+
+
+def jobs_of(season: Path, tmp_path: Path, *lines: dict[str, str]) -> list[Job]:
+    manifest = write_manifest(season / f"{tmp_path.name}.csv", *lines)
+    clip = season / "clip"
+    return read_manifest(manifest, config=clip / "quick.toml", template=str(clip / "tiny.ply"))
+
+
+class ThisProcess:
+    """An engine without processes, which take seconds to start."""
+
+    def outcomes(
+        self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, clock: Clock
+    ) -> Iterator[Outcome]:
+        for job in jobs:
+            yield do_job(job, out, on_progress=clock.of(job))
+
+
+def measure(jobs: list[Job], out: Path) -> dict[str, str]:
+    summary = batch(jobs, out, ThisProcess(), stop=threading.Event())
+    return {one.name: one.status for one in summary.outcomes}
+
+
+def assert_same_tables(folder: Path, other: Path) -> None:
+    for name in TABLES:
+        assert (folder / name).read_bytes() == (other / name).read_bytes()
+
+
+def test_a_job_is_what_run_makes(season: Path, tmp_path: Path):
+    (job,) = jobs_of(season, tmp_path, row())
+    shares = list[float]()
+    outcome = do_job(job, tmp_path, on_progress=shares.append)
+    folder = folder_of(job, tmp_path)
+    assert_same_tables(folder, season / "alone")
+    assert (outcome.num_frames, outcome.num_fish) == (len(FISH), 2)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    assert verify(folder)[0] == []
+    assert outcome_of(job, tmp_path) == outcome
+
+
+def test_videos_are_measured_and_a_bad_one_fails_alone(season: Path, tmp_path: Path):
+    lines = row(), row("other", trip="8"), row(video="broken/video.mp4"), row(masks="none")
+    jobs = jobs_of(season, tmp_path, *lines, row(video="missing.mp4", vessel=""))
+    assert [job.name for job in jobs] == ["video", "video-2", "video-3", "video-4", "missing"]
+    statuses = measure(jobs, tmp_path / "out")
+    assert list(statuses.values()) == ["done", "done", "failed", "failed", "failed"]
+    assert_same_tables(folder_of(jobs[0], tmp_path / "out"), season / "alone")
+    table = rows(tmp_path / "out" / "videos.csv")
+    assert [line["status"] for line in table] == list(statuses.values())
+    assert "broken" in table[2]["reason"]
+    assert "none" in table[3]["reason"]
+    assert "missing.mp4" in table[4]["reason"]
+    assert not list((tmp_path / "out" / "videos").glob("*.part"))
+
+
+def test_the_data_set_holds_every_fish_and_every_frame(season: Path, tmp_path: Path):
+    jobs = jobs_of(season, tmp_path, row(), row("other", trip="8", haul="2"))
+    measure(jobs, tmp_path)
+    fish = dataset.dataset(tmp_path / "dataset" / "fish", partitioning="hive").to_table()
+    frames = dataset.dataset(tmp_path / "dataset" / "frames", partitioning="hive").to_table()
+    for job in jobs:
+        folder = folder_of(job, tmp_path)
+        measured = rows(folder / "lengths.csv")
+        found = [one for one in fish.to_pylist() if one["video"] == job.name]
+        assert [one["track_id"] for one in found] == [int(one["track_id"]) for one in measured]
+        for one, line in zip(found, measured, strict=True):
+            assert f"{one['length_mm']:.6f}" == line["length_mm"]
+            assert (one["vessel"], str(one["trip"]), one["haul"]) == (
+                "Sea/Bird",
+                job.trip,
+                job.haul,
+            )
+            assert one["run_id"]
+            assert len(one["config_sha256"]) == 64
+        lines = rows(folder / "frames.csv")
+        seen = [one for one in frames.to_pylist() if one["video"] == job.name]
+        assert len(seen) == len(lines)
+        for one, line in zip(seen, lines, strict=True):
+            assert (one["frame_index"], one["reason"]) == (int(line["frame_index"]), line["reason"])
+            assert one["accepted"] is (line["accepted"] == "true")
+            assert one["run_id"] == found[0]["run_id"]
+
+
+def test_what_is_done_is_not_done_again(season: Path, tmp_path: Path):
+    jobs = jobs_of(season, tmp_path, row(), row("other"), row(video="broken/video.mp4"))
+    measure(jobs, tmp_path)
+    before = {p: p.stat().st_mtime_ns for p in tmp_path.glob("videos/*/recording.mcap")}
+    summary = batch(jobs, tmp_path, ThisProcess(), stop=threading.Event())
+    assert summary.num_before == 2
+    assert {p: p.stat().st_mtime_ns for p in tmp_path.glob("videos/*/recording.mcap")} == before
+    assert [one.status for one in summary.outcomes] == ["done", "done", "failed"]
+
+
+def test_another_trip_or_another_config_is_done_again(season: Path, tmp_path: Path):
+    measure(jobs_of(season, tmp_path, row()), tmp_path)
+    (job,) = jobs_of(season, tmp_path, row(trip="9"))
+    assert outcome_of(job, tmp_path) is None
+    measure([job], tmp_path)
+    files = list((tmp_path / "dataset" / "fish").rglob("*.parquet"))
+    assert [path.parent.name for path in files] == ["trip=9"]  # the old row is gone
+
+
+def test_without_results_there_is_no_outcome(season: Path, tmp_path: Path):
+    (job,) = jobs_of(season, tmp_path, row())
+    folder = folder_of(job, tmp_path)
+    for content in ("", "{", "{}", '{"name": "video"}'):
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "outcome.json").write_text(content)
+        assert outcome_of(job, tmp_path) is None
+
+
+def test_killed_at_any_moment_it_goes_on_where_it_was(season: Path, tmp_path: Path):
+    """First its worker is killed, which one video is charged with, then the batch itself."""
+    clip, out = season / "clip", tmp_path / "out"
+    manifest = write_manifest(season / f"{tmp_path.name}.csv", row(), row("other"), row("clip"))
+    command = [sys.executable, "-m", "stream_dmr.cli", "batch", str(manifest), "--out", str(out)]
+    command += ["--config", str(clip / "quick.toml"), "--template", str(clip / "tiny.ply")]
+    command += ["--workers", "1"]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        wait_for(lambda: (out / "videos" / "video.part" / "recording.mcap.part").exists())
+        os.kill(workers(out)[0], signal.SIGKILL)
+        wait_for(lambda: (out / "videos" / "video-3.part" / "recording.mcap.part").exists())
+        process.send_signal(signal.SIGKILL)
+    wait_for(lambda: not workers(out))  # nobody goes on unattended
+    lines = {line["name"]: line for line in rows(out / "videos.csv")}
+    assert "its process ended (-9)" in lines["video"]["reason"]
+    assert [line["status"] for line in lines.values()] == ["failed", "done", "waiting"]
+    done = out / "videos" / "video-2" / "recording.mcap"
+    before = done.stat().st_mtime_ns
+    assert not (out / "videos" / "video-3").exists()
+    jobs = jobs_of(season, tmp_path, row(), row("other"), row("clip"))
+    statuses = measure(jobs, out)
+    assert list(statuses.values()) == ["done"] * 3
+    assert done.stat().st_mtime_ns == before
+    for name in ("video", "video-3"):
+        assert_same_tables(out / "videos" / name, season / "alone")
+
+
+def workers(out: Path) -> list[int]:
+    """Processes that measure into `out`."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            words = (folder / "cmdline").read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if b"stream_dmr.batch.worker" in words and str(out).encode() in words:
+            found.append(int(folder.name))
+    return found
+
+
+def wait_for(condition, seconds: float = 300.0) -> None:  # type: ignore[no-untyped-def]
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+def test_the_command(season: Path, tmp_path: Path):
+    manifest = write_manifest(season / f"{tmp_path.name}.csv", row(), row(video="missing.mp4"))
+    clip = season / "clip"
+    outcome = invoke(
+        "batch",
+        {str(manifest): None, "--out": str(tmp_path), "--config": str(clip / "quick.toml")}
+        | {"--template": str(clip / "tiny.ply"), "--workers": "1"},
+    )
+    assert outcome.code == 2
+    assert "1 of 2 videos are done, 0 of them before, 1 failed" in outcome.out
+    assert "missing: failed: " in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("", "expected the columns"),
+        ("video,calibration\n", "expected the columns"),
+        (f"{','.join(COLUMNS)},more\n", "expected the columns"),
+        (f"{','.join(COLUMNS)}\n", "a row for each video"),
+        (f"{','.join(COLUMNS)}\n,,,,,,\n", "line 2: expected 7 cells"),
+        (f"{','.join(COLUMNS)}\na.mp4,,,,,,,,\n", "line 2: expected 7 cells"),
+    ],
+)
+def test_a_wrong_manifest_is_refused(tmp_path: Path, text: str, match: str):
+    (tmp_path / "m.csv").write_text(text)
+    with pytest.raises(UserError, match=match):
+        read_manifest(tmp_path / "m.csv", config=None, template="cod")
+    with pytest.raises(UserError, match="expected a manifest"):
+        read_manifest(tmp_path / "none.csv", config=None, template="cod")
+
+
+def test_the_time_left_is_by_bytes(season: Path, tmp_path: Path):
+    jobs = jobs_of(season, tmp_path, row(), row())
+    clock = Clock(jobs, print)
+    assert clock.line(10.0).endswith("time left: unknown")
+    clock.of(jobs[0])(0.5)
+    assert clock.line(10.0) == "0 of 2 videos, 25 %, time left: 30 s"
+    clock.over(jobs[0])
+    assert clock.line(10.0) == "1 of 2 videos, 50 %, time left: 10 s"
+    assert (duration(200.0), duration(7200.0)) == ("3 min", "2.0 h")
+
+
+def test_a_stop_ends_it_soon_and_leaves_nothing_half_done(season: Path, tmp_path: Path):
+    jobs = jobs_of(season, tmp_path, row(), row("other"))
+    stop = threading.Event()
+    stop.set()
+    summary = batch(jobs, tmp_path, LocalEngine(1), stop=stop)
+    assert summary.outcomes == []
+    assert shutil.disk_usage(tmp_path).free > 0
+    assert [line["status"] for line in rows(tmp_path / "videos.csv")] == ["waiting"] * 2
