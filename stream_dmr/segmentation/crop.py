@@ -16,6 +16,7 @@ from stream_dmr.settings import Settings
 
 _SMALLEST_PART = 0.05  # of the largest part's area: the tail behind a gaff stays, specks go
 _LARGEST_HOLE = 0.01  # of the mask's area: pinholes are noise, larger ones something in front
+_SAME_BOX = 0.85  # IoU of the mask's box and the one given, from which on they are one
 _BLOWN = 250  # grey level of every channel: no skin is so bright
 _BORDER_PX = 1  # a mask this near to the frame's edge touches it
 _MOST_SAMPLES = 4  # per crop pixel and axis; more cost time and change nothing that we measured
@@ -45,12 +46,23 @@ class CropFishSettings(Settings):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class _Fish:
-    """What is known of the fish in a crop, however its mask came about."""
+class _View:
+    """What there is to see, and how it is to be cut out."""
 
+    image: UInt8[np.ndarray, "H W 3"]
+    camera: Camera
+    settings: CropFishSettings
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Fish:
+    """The crop of a fish and what is known of it, however its mask came about."""
+
+    image: UInt8[np.ndarray, "S S 3"]
+    crop_camera: Camera
     mask: Bool[np.ndarray, "S S"]
     area_px: float  # in frame pixels
-    touches_border: bool
+    extent: Float[np.ndarray, "4"] | None  # the mask's box in frame pixels; None: an empty mask
     confidence: float | None
     ends: FishEnds | None
 
@@ -67,67 +79,76 @@ def crop_fish(
 
     Where no mask is given the segmenter looks for it in the crop.
     """
-    given = detection.mask
-    if given is not None:
-        given = clean_mask(given, min_area_px=settings.min_mask_area_px)
-    crop_camera = _camera_around(
-        _union(detection.bbox_xyxy_px, given, frame.image),
-        frame_camera=frame_camera,
-        settings=settings,
-    )
-    image, crop_mask = _resample(
-        frame.image, given, crop_camera=crop_camera, frame_camera=frame_camera
-    )
-    if given is None or crop_mask is None:
-        cameras = crop_camera, frame_camera
-        fish = _segment(image, detection, cameras, settings=settings, segmenter=segmenter)
+    view = _View(image=frame.image, camera=frame_camera, settings=settings)
+    if detection.mask is None:
+        fish = _find(view, detection.bbox_xyxy_px, segmenter)
     else:
-        fish = _Fish(
-            mask=crop_mask,
-            area_px=float(np.count_nonzero(given)),
-            touches_border=_touches_border(_extent(given), shape=given.shape),
-            confidence=None,
-            ends=None,
-        )
+        fish = _take(view, detection.bbox_xyxy_px, detection.mask)
     return FishCrop(
         frame_index=frame.frame_index,
         timestamp_ns=frame.timestamp_ns,
         track_id=detection.track_id,
         bbox_xyxy_px=detection.bbox_xyxy_px,
-        image=image,
+        image=fish.image,
         mask=fish.mask,
-        crop_camera=crop_camera,
+        crop_camera=fish.crop_camera,
         frame_camera=frame_camera,
         quality=CropQuality(
-            touches_border=fish.touches_border,
+            touches_border=_touches_border(fish.extent, shape=frame.image.shape[:2]),
             visible_fraction=detection.visible_fraction,
-            sharpness=_sharpness(image, fish.mask),
+            sharpness=_sharpness(fish.image, fish.mask),
             mask_area_px=fish.area_px,
             mask_confidence=fish.confidence,
-            glare=_glare(image, fish.mask),
+            glare=_glare(fish.image, fish.mask),
         ),
         ends=fish.ends,
     )
 
 
-def _segment(
-    image: UInt8[np.ndarray, "S S 3"],
-    detection: Detection,
-    cameras: tuple[Camera, Camera],
-    *,
-    settings: CropFishSettings,
-    segmenter: Segmenter,
+def _take(
+    view: _View, bbox_xyxy_px: Float[np.ndarray, "4"], given: Bool[np.ndarray, "H W"]
 ) -> _Fish:
-    """Find the mask in a crop; `cameras` are the crop's and the frame's."""
-    crop_camera, frame_camera = cameras
-    found = segmenter.segment(image, _box_in_crop(detection.bbox_xyxy_px, cameras))
-    x, y = frame_from_crop_map(crop_camera, frame_camera=frame_camera)
-    shape = (frame_camera.height, frame_camera.width)
+    """The fish of a given mask."""
+    given = clean_mask(given, min_area_px=view.settings.min_mask_area_px)
+    crop_camera = _camera_around(_union(bbox_xyxy_px, given, view.image), view)
+    image, mask = _resample(view.image, given, crop_camera=crop_camera, frame_camera=view.camera)
+    assert mask is not None  # one was given
+    return _Fish(
+        image=image,
+        crop_camera=crop_camera,
+        mask=mask,
+        area_px=float(np.count_nonzero(given)),
+        extent=_extent(given),
+        confidence=None,
+        ends=None,
+    )
+
+
+def _find(view: _View, bbox_xyxy_px: Float[np.ndarray, "4"], segmenter: Segmenter) -> _Fish:
+    """The fish that a box means; where it fills another box than that, by a second look there.
+
+    A moving shape may have lost the tail, or hold a piece of line as well.
+    """
+    box = _union(bbox_xyxy_px, None, view.image)
+    first = _segment(view, box, segmenter)
+    if first.extent is None or _overlap(first.extent, box) > _SAME_BOX:
+        return first
+    second = _segment(view, first.extent, segmenter)
+    return max(first, second, key=lambda fish: fish.confidence or 0.0)
+
+
+def _segment(view: _View, bbox_xyxy_px: Float[np.ndarray, "4"], segmenter: Segmenter) -> _Fish:
+    """Find the mask in a box."""
+    crop_camera = _camera_around(bbox_xyxy_px, view)
+    image, _ = _resample(view.image, None, crop_camera=crop_camera, frame_camera=view.camera)
+    found = segmenter.segment(image, _box_in_crop(bbox_xyxy_px, (crop_camera, view.camera)))
+    x, y = frame_from_crop_map(crop_camera, frame_camera=view.camera)
+    shape = view.image.shape[:2]
     is_seen = (x > -0.5) & (x < shape[1] - 0.5) & (y > -0.5) & (y < shape[0] - 0.5)
     probability = found.probability * is_seen  # beyond the frame nothing is known
     (x_down, x_right), (y_down, y_right) = np.gradient(x), np.gradient(y)
     areas = np.abs(x_right * y_down - x_down * y_right)  # of the crop's pixels, in frame pixels
-    least = math.ceil(settings.min_mask_area_px / float(areas.mean()))
+    least = math.ceil(view.settings.min_mask_area_px / float(areas.mean()))
     mask = clean_mask(probability > 0.5, min_area_px=least)
     extent = None
     if mask.any():  # the frame pixels that its pixels' centres lie in, as a box
@@ -135,9 +156,11 @@ def _segment(
         low, high = (columns.min(), rows.min()), (columns.max() + 1, rows.max() + 1)
         extent = np.array([*low, *high], np.float64)
     return _Fish(
+        image=image,
+        crop_camera=crop_camera,
         mask=mask,
         area_px=float(areas[mask].sum()),
-        touches_border=_touches_border(extent, shape=shape),
+        extent=extent,
         confidence=expected_iou(probability, mask),
         ends=found.ends,
     )
@@ -217,9 +240,14 @@ def _union(
     return np.concatenate([np.minimum(box[:2], extent[:2]), np.maximum(box[2:], extent[2:])])
 
 
-def _camera_around(
-    bbox_xyxy_px: Float[np.ndarray, "4"], *, frame_camera: Camera, settings: CropFishSettings
-) -> Camera:
+def _overlap(one: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> float:
+    """Intersection over union of two boxes."""
+    sides = np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2])
+    both = np.prod(np.maximum(sides, 0))
+    return float(both / (np.prod(one[2:] - one[:2]) + np.prod(other[2:] - other[:2]) - both))
+
+
+def _camera_around(bbox_xyxy_px: Float[np.ndarray, "4"], view: _View) -> Camera:
     """The crop camera that has a box with its margins in view.
 
     The box is measured after undistortion, by rays through its outline: near the corners of a wide
@@ -232,14 +260,14 @@ def _camera_around(
         [np.column_stack([x, np.full(9, edge)]) for edge in (y0, y1)]
         + [np.column_stack([np.full(9, edge), y]) for edge in (x0, x1)]
     )
-    rays = frame_camera.back_project(outline)
+    rays = view.camera.back_project(outline)
     low, high = rays.min(axis=0), rays.max(axis=0)
-    extent_px = (high - low)[:2] * frame_camera.K[[0, 1], [0, 1]]
+    extent_px = (high - low)[:2] * view.camera.K[[0, 1], [0, 1]]
     side_px = max(1.0, *extent_px)  # annotators do click by mistake
-    return frame_camera.crop(
-        center_px=frame_camera.project((low + high)[None] / 2)[0],
-        side_px=float(side_px * (1 + 2 * settings.margin)),
-        size=settings.crop_size_px,
+    return view.camera.crop(
+        center_px=view.camera.project((low + high)[None] / 2)[0],
+        side_px=float(side_px * (1 + 2 * view.settings.margin)),
+        size=view.settings.crop_size_px,
     )
 
 
