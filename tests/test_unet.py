@@ -11,7 +11,9 @@ from stream_dmr.segmentation.unet.detector import UNetDetector
 from stream_dmr.segmentation.unet.inference import UNetSegmenter, _find_ends, _fuse
 from stream_dmr.segmentation.unet.losses import ends_are_right, ends_loss, mask_iou, mask_loss
 from stream_dmr.segmentation.unet.network import ENDS_STRIDE, UNet, normalise
-from stream_dmr.segmentation.unet.weights import load_weights, save_weights
+from stream_dmr.segmentation.unet.weights import SHIPPED, load_weights, save_weights
+from stream_dmr.simulation.film import film
+from stream_dmr.simulation.scene import make_scene
 
 numbers = st.floats(-50, 200)
 sides = st.floats(1, 150)
@@ -202,3 +204,21 @@ def test_the_whole_frame_is_searched_and_boxes_are_the_frames():
         assert candidate.score > 0.9
         x0, y0, x1, y1 = candidate.bbox_xyxy_px.astype(int)
         assert candidate.foreground.shape == (y1 - y0, x1 - x0)
+
+
+def test_the_shipped_weights_find_a_fish_and_its_head():
+    scene = make_scene(num_fish=1, num_frames=15, preset="clean", seed=3)
+    segmenter = UNetSegmenter.load(SHIPPED)
+    shots = [shot for shot in film(scene) if any(b.visible_fraction == 1 for b in shot.boxes)]
+    shot = shots[len(shots) // 2]
+    x, y, w, h = shot.boxes[0].xywh_px
+    side = round(1.3 * max(w, h))
+    left, top = x + (w - side) // 2, y + (h - side) // 2
+    found = segmenter.segment(
+        shot.image[top : top + side, left : left + side],
+        np.array([x - left, y - top, x - left + w, y - top + h], np.float64),
+    )
+    mask, truth = found.probability > 0.5, shot.labels[top : top + side, left : left + side] > 0
+    assert (mask & truth).sum() > 0.9 * (mask | truth).sum()
+    assert found.ends.head_px[1] < found.ends.tail_px[1]  # it hangs by its mouth
+    assert found.ends.confidence > 0.9
