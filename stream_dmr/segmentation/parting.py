@@ -16,8 +16,8 @@ from stream_dmr.segmentation.detector import Candidate, whole_pixels
 
 _REACH = 0.1  # of a fish's length: so far from where it is expected its outline may be
 _FISH = 0.3  # of the smallest fish's area: a smaller piece is none
-_LONGER = 1.3  # times the longest fish's length, and it may be several
-_WIDER = 0.6  # of the longest fish's length, likewise: turning makes no fish so wide
+_LONGER = 1.3  # times a fish's length, and it may be several
+_WIDER = 0.6  # of a fish's length, likewise: turning makes none so wide
 _THREAD = 0.06  # of a fish's length: what is thinner is a line or a sliver
 
 
@@ -36,7 +36,9 @@ def part(candidate: Candidate, fish: Sequence[Expected]) -> list[Candidate]:
 
     The candidate itself where it has no `foreground`, or no second piece is to be found.
     """
-    if candidate.foreground is None or not fish or not _may_be_several(candidate.foreground, fish):
+    if candidate.foreground is None or not fish:
+        return [candidate]
+    if len(fish) == 1 and not _may_be_several(candidate.foreground, fish[0]):
         return [candidate]
     x, y, _, _ = whole_pixels(candidate.bbox_xyxy_px)
     away = np.stack([_away(one, candidate.foreground.shape, (x, y)) for one in fish])
@@ -54,11 +56,10 @@ def part(candidate: Candidate, fish: Sequence[Expected]) -> list[Candidate]:
     return [_candidate(piece, candidate, (x, y)) for piece in pieces]
 
 
-def _may_be_several(shape: Bool[np.ndarray, "H W"], fish: Sequence[Expected]) -> bool:
-    """Whether this is too long or too wide for one of these fish; one that turns only widens."""
-    length = max(one.length_px for one in fish)
+def _may_be_several(shape: Bool[np.ndarray, "H W"], fish: Expected) -> bool:
+    """Whether this is too long or too wide for this fish; one that turns only widens."""
     width_px, length_px = extent(shape)
-    return length_px > _LONGER * length or width_px > _WIDER * length
+    return length_px > _LONGER * fish.length_px or width_px > _WIDER * fish.length_px
 
 
 def extent(shape: Bool[np.ndarray, "H W"]) -> tuple[float, float]:
