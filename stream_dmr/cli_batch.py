@@ -3,14 +3,19 @@
 import os
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from stream_dmr.cli_support import stop_on_signals
 
-Engine = Literal["local"]
+if TYPE_CHECKING:
+    from stream_dmr.batch.batch import Engine
+
+Engines = Literal["local", "ray"]
 
 
 def batch(
@@ -22,8 +27,19 @@ def batch(
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the results; a batch goes on there.")],
-    engine: Annotated[Engine, typer.Option(help="Where the videos are measured.")] = "local",
-    workers: Annotated[int, typer.Option(help="Videos at a time.", show_default="one a core")] = 0,
+    engine: Annotated[
+        Engines, typer.Option(help="Where: processes of this machine, or a cluster of many.")
+    ] = "local",
+    address: Annotated[
+        str | None,
+        typer.Option(help="Of a Ray cluster; auto: this machine's. Without it a new one starts."),
+    ] = None,
+    gpus: Annotated[
+        float, typer.Option(help="GPUs for each video on Ray, also a part of one.", min=0)
+    ] = 0.0,
+    workers: Annotated[
+        int, typer.Option(help="Videos at a time, with local.", show_default="one a core")
+    ] = 0,
     template: Annotated[
         str, typer.Option(help="The species: halibut, cod, or a mesh with its TOML beside it.")
     ] = "halibut",
@@ -38,7 +54,6 @@ def batch(
     """
     with stop_on_signals() as stop:
         from stream_dmr.batch.batch import batch as run_batch
-        from stream_dmr.batch.local import LocalEngine
         from stream_dmr.batch.manifest import read_manifest
         from stream_dmr.batch.progress import duration
         from stream_dmr.config import load_config
@@ -47,13 +62,14 @@ def batch(
         load_config(config)
         load_template(template)
         jobs = read_manifest(manifest, config=config, template=template)
-        summary = run_batch(
-            jobs,
-            out,
-            LocalEngine(workers or os.cpu_count() or 1),
-            stop=stop,
-            say=lambda line: print(line, file=sys.stderr, flush=True),
-        )
+        with _engine(engine, workers, address, gpus) as where:
+            summary = run_batch(
+                jobs,
+                out,
+                where,
+                stop=stop,
+                say=lambda line: print(line, file=sys.stderr, flush=True),
+            )
     failed = sum(outcome.status != "done" for outcome in summary.outcomes)
     print(
         f"{len(summary.outcomes) - failed} of {len(jobs)} videos are done, {summary.num_before} of "
@@ -64,3 +80,16 @@ def batch(
         raise typer.Exit(128 + stop.signal_number)
     if failed:
         raise typer.Exit(2)
+
+
+@contextmanager
+def _engine(name: str, workers: int, address: str | None, gpus: float) -> Iterator["Engine"]:
+    if name == "local":
+        from stream_dmr.batch.local import LocalEngine
+
+        yield LocalEngine(workers or os.cpu_count() or 1)
+        return
+    from stream_dmr.batch.ray_engine import RayEngine
+
+    with closing(RayEngine(address=address, gpus=gpus)) as engine:
+        yield engine

@@ -37,7 +37,7 @@ FLOORS = [
     [f"stream_dmr.watch.{name}" for name in ("state", "metrics", "picture", "server", "watch")],
     ["stream_dmr.run", "stream_dmr.report.report"],
     ["stream_dmr.batch.dataset", "stream_dmr.batch.job"],
-    [f"stream_dmr.batch.{name}" for name in ("worker", "local", "ray")],
+    [f"stream_dmr.batch.{name}" for name in ("worker", "local", "ray_engine")],
     ["stream_dmr.batch.batch"],
     [f"stream_dmr.review.{name}" for name in ("corrected", "judge", "server")],
     ["stream_dmr.replay.replay"],
@@ -70,6 +70,7 @@ WHO_KNOWS = {
     ],
     "filterpy": ["stream_dmr.length_filter", "stream_dmr.segmentation"],
     "onnxruntime": ["stream_dmr.segmentation"],
+    "ray": ["stream_dmr.batch.ray_engine"],
     "nodes": [*ASSEMBLY, "nodes"],
     "typer": [
         *("stream_dmr.cli", "stream_dmr.cli_calibrate", "stream_dmr.cli_export"),

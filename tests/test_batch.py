@@ -264,3 +264,21 @@ def test_a_stop_ends_it_soon_and_leaves_nothing_half_done(season: Path, tmp_path
     assert summary.outcomes == []
     assert shutil.disk_usage(tmp_path).free > 0
     assert [line["status"] for line in rows(tmp_path / "videos.csv")] == ["waiting"] * 2
+
+
+@pytest.mark.slow  # a cluster takes a minute to start
+def test_ray_on_two_nodes_loses_a_worker_and_nothing_else(season: Path, tmp_path: Path):
+    pytest.importorskip("ray", reason="needs Ray: pip install 'stream-dmr[ray]'")
+    clip, out = season / "clip", tmp_path / "out"
+    lines = row(), row("other"), row(video="broken/video.mp4"), row("clip")
+    manifest = write_manifest(season / f"{tmp_path.name}.csv", *lines)
+    script = Path(__file__).with_name("ray_cluster.py")
+    command = [sys.executable, str(script), str(manifest), str(clip / "quick.toml")]
+    ended = subprocess.run(
+        [*command, str(clip / "tiny.ply"), str(out)], capture_output=True, text=True, check=False
+    )
+    assert "nodes 2, killed 1, done 3" in ended.stdout, ended.stdout + ended.stderr
+    statuses = [line["status"] for line in rows(out / "videos.csv")]
+    assert statuses == ["done", "done", "failed", "done"]
+    for name in ("video", "video-4"):
+        assert_same_tables(out / "videos" / name, season / "alone")

@@ -1,0 +1,81 @@
+"""Throughput of `stream-dmr batch`: `python benchmarks/backlog.py --videos 4 --engines local ray`.
+
+Copies of the embedded scene, measured with one worker and with two. The first video of each worker
+also pays for its start; `docs/scale.md` has the figures.
+"""
+
+import argparse
+import csv
+import os
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+from stream_dmr.batch.batch import Engine, batch
+from stream_dmr.batch.local import LocalEngine
+from stream_dmr.batch.manifest import COLUMNS, read_manifest
+
+DEMO = Path(__file__).resolve().parents[1] / "recordings" / "demo"
+
+
+@contextmanager
+def engine_of(name: str, workers: int) -> Iterator[Engine]:
+    if name == "local":
+        yield LocalEngine(workers)
+        return
+    from ray.cluster_utils import Cluster
+
+    from stream_dmr.batch.ray_engine import RayEngine
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    for _ in range(workers - 1):
+        cluster.add_node(num_cpus=1)
+    with closing(RayEngine(address=cluster.address)) as engine:
+        yield engine
+    cluster.shutdown()
+
+
+def write_manifest(path: Path, videos: int) -> None:
+    row = {"video": DEMO / "video.mp4", "calibration": DEMO / "calibration.yaml"}
+    row |= {"boxes": DEMO / "boxes.txt", "masks": DEMO / "masks"}
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows([row | {"vessel": "demo", "trip": n} for n in range(videos)])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--videos", type=int, default=4)
+    parser.add_argument("--engines", nargs="+", default=["local"])
+    parser.add_argument("--workers", nargs="+", type=int, default=[1, 2])
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        manifest = Path(folder) / "manifest.csv"
+        write_manifest(manifest, arguments.videos)
+        jobs = read_manifest(manifest, config=None, template=str(DEMO / "species.ply"))
+        for name in arguments.engines:
+            for workers in arguments.workers:
+                out = Path(folder) / f"{name}-{workers}"
+                load = os.getloadavg()[0]
+                began = time.perf_counter()
+                with engine_of(name, workers) as engine:
+                    ready_s = time.perf_counter() - began
+                    summary = batch(jobs, out, engine, stop=threading.Event())
+                frames = sum(one.num_frames for one in summary.outcomes)
+                fish = sum(one.num_fish for one in summary.outcomes)
+                in_work = sum(one.elapsed_s for one in summary.outcomes)
+                print(
+                    f"{name}, {workers} workers: {frames} frames, {fish} fish in "
+                    f"{summary.elapsed_s:.1f} s, {frames / summary.elapsed_s:.2f} frames/s; "
+                    f"{in_work:.1f} s in videos; engine ready in {ready_s:.1f} s; load {load:.1f}",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
