@@ -4,6 +4,7 @@ import logging
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from importlib import import_module  # an extra: nothing here needs it to be installed
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +26,13 @@ class RayEngine:
         ConfigError without the package, UserError where the cluster can't be reached.
         """
         try:
-            import ray
+            ray: Any = import_module("ray")
         except ModuleNotFoundError as error:
             raise ConfigError(
                 "--engine ray: expected the package ray, found none; install it with: "
                 "pip install 'stream-dmr[ray]'"
             ) from error
-        self._ray: Any = ray
+        self._ray = ray
         try:
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
         except (ConnectionError, ValueError) as error:
