@@ -72,7 +72,7 @@ function drawFrames(place, rows) {
   const x = running.map((row) => row[0]);
   const heights = [...known.map((row) => row[2]), ...running.flatMap((row) => row.slice(8))];
   const [low, high] = [Math.min(...heights) / 10, Math.max(...heights) / 10];
-  const drawn = layout("Each frame (x: refused), running estimate, 95 % band", "frame", "cm");
+  const drawn = layout("Frames (x: refused), estimate, 95 %", "frame", "cm");
   if (heights.length) drawn.yaxis.range = [low - 0.1 * (high - low) - 0.5, high + 0.1 * (high - low) + 0.5];
   Plotly.newPlot(place, [
     { type: "scatter", mode: "lines", x: [...x, ...[...x].reverse()], y: [...running.map((row) => row[9] / 10), ...running.map((row) => row[8] / 10).reverse()], fill: "toself", fillcolor: "rgba(22,104,168,.15)", line: { width: 0 }, hoverinfo: "skip" },
@@ -92,9 +92,9 @@ function drawMesh(place, mesh) {
   const axis = (k, from, to) => Array.from({ length: to - from }, (_, n) => points[3 * (from + n) + k] * mesh.step);
   const corner = (k) => Array.from(FACES.filter((_, n) => n % 3 === k));
   const [n, all] = [mesh.vertices, points.length / 3];
-  const scene = { aspectmode: "data", camera: { up: { x: 0, y: -1, z: 0 }, eye: { x: 0.3, y: -0.5, z: -1.9 } }, xaxis: { title: { text: "x mm" } }, yaxis: { title: { text: "y mm" } }, zaxis: { title: { text: "depth mm" } } };
+  const scene = { aspectmode: "data", camera: { up: { x: 0, y: -1, z: 0 }, eye: { x: 0.4, y: -0.6, z: -2.5 } }, xaxis: { title: { text: "x mm" } }, yaxis: { title: { text: "y mm" } }, zaxis: { title: { text: "depth mm" } } };
   Plotly.newPlot(place, [
     { type: "mesh3d", x: axis(0, 0, n), y: axis(1, 0, n), z: axis(2, 0, n), i: corner(0), j: corner(1), k: corner(2), color: "#7fb2d6", flatshading: false, opacity: 0.75, lighting: { ambient: 0.5, diffuse: 0.8 }, hoverinfo: "skip" },
     { type: "scatter3d", mode: "lines", x: axis(0, n, all), y: axis(1, n, all), z: axis(2, n, all), line: { color: ORANGE, width: 6 }, hoverinfo: "skip" },
-  ], { margin: { l: 0, r: 0, t: 24, b: 0 }, scene, showlegend: false, title: { text: "Mesh of the best frame, midline; drag to turn", font: { size: 13 }, x: 0.02 } }, QUIET);
+  ], { margin: { l: 0, r: 0, t: 24, b: 0 }, scene, showlegend: false, title: { text: "Mesh of the best frame", font: { size: 13 }, x: 0.02 } }, QUIET);
 }

@@ -53,7 +53,7 @@ function layout(title, x, y) {
 function drawHistogram(fish) {
   const lengths = counted(fish).map((f) => lengthOf(f) / 10).sort((a, b) => a - b);
   const low = lengths[0] ?? 0, high = lengths.at(-1) ?? 1;
-  const width = [1, 2, 5, 10, 20, 50].find((w) => (high - low) / w <= 30) ?? 100;
+  const width = [1, 2, 5, 10, 20, 50].find((w) => (high - low) / w <= Math.min(30, Math.max(6, 2 * Math.sqrt(lengths.length)))) ?? 100;
   const first = Math.floor(low / width) * width;
   const counts = new Array(Math.floor((high - first) / width) + 1).fill(0);
   for (const x of lengths) counts[Math.floor((x - first) / width)] += 1;
