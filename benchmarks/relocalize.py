@@ -7,6 +7,7 @@ capture times and ids that go on, until it is so long; then the plane is moved b
 """
 
 import argparse
+import resource
 import subprocess
 import sys
 import tempfile
@@ -50,9 +51,18 @@ def main() -> None:
         command = [sys.executable, "-m", "stream_dmr.cli", "replay", str(long)]
         command += ["--from", "localize", "--calibration", str(moved), "--timings"]
         for more in ([], ["--out", str(Path(scratch) / "out")]):
+            used_s = cpu_s()
             done = subprocess.run([*command, *more], capture_output=True, text=True, check=True)
-            said = [line for line in done.stdout.splitlines() if not line[:1].isdigit()]
-            print("\n".join(["with a new recording:" if more else "lengths alone:", *said[-12:]]))
+            used_s = cpu_s() - used_s
+            said = done.stdout[done.stdout.index("stage  ") :]
+            print("with a new recording:" if more else "lengths alone:", f"\n{said.rstrip()}")
+            print(f"{60 * asked.minutes / used_s:.0f} times real time by the CPU time that it took")
+
+
+def cpu_s() -> float:
+    """CPU time of all commands so far."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def repeated(run: Recording, *, minutes: float) -> Iterator[Record]:

@@ -77,17 +77,24 @@ def reference(count: int, nodes: Sequence[Repeat]) -> dict[str, list[tuple[str, 
     return seen
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     count=st.integers(0, 6),
     shapes=st.lists(st.tuples(st.integers(0, 3), st.booleans()), min_size=1, max_size=4),
+    in_one_thread=st.booleans(),
 )
-def test_each_stage_sends_what_it_would_without_threads_in_the_same_order(count, shapes):
+def test_each_stage_sends_what_it_would_alone_in_the_same_order(count, shapes, in_one_thread: bool):
     def nodes() -> list[Repeat]:
         return [Repeat(f"n{i}", copies=c, owes=o) for i, (c, o) in enumerate(shapes)]
 
     recorded = Recorded()
-    counters = run_chain(frames(count), nodes(), on_message=recorded, stop=threading.Event())
+    counters = run_chain(
+        frames(count),
+        nodes(),
+        on_message=recorded,
+        stop=threading.Event(),
+        in_one_thread=in_one_thread,
+    )
     expected = reference(count, nodes())
     for stage, messages in expected.items():
         got = [item for item in recorded.messages if item[0].split(".")[0] == stage]
@@ -200,13 +207,22 @@ class Broken(Repeat):
         return super().step(message)
 
 
+@pytest.mark.parametrize("in_one_thread", [False, True])
 @pytest.mark.parametrize("position", [0, 1, 2])
-def test_an_exception_in_a_node_comes_out_after_everything_before_it_was_finished(position):
+def test_an_exception_in_a_node_comes_out_after_everything_before_it_was_finished(
+    position, in_one_thread: bool
+):
     nodes = [Repeat("a", owes=True), Repeat("b", owes=True), Repeat("c", owes=True)]
     nodes[position] = Broken(nodes[position].name, owes=True)
     recorded = Recorded()
     with pytest.raises(BrokenError, match="third"):
-        run_chain(endless(), nodes, on_message=recorded, stop=threading.Event())
+        run_chain(
+            endless(),
+            nodes,
+            on_message=recorded,
+            stop=threading.Event(),
+            in_one_thread=in_one_thread,
+        )
     name = nodes[position].name
     assert recorded.of(name)[-1] == 2
     assert set(recorded.of("c")) >= {1, 2}
@@ -214,7 +230,8 @@ def test_an_exception_in_a_node_comes_out_after_everything_before_it_was_finishe
     assert [node.closed for node in nodes] == [1, 1, 1]
 
 
-def test_an_exception_in_the_source_loses_nothing_that_was_read():
+@pytest.mark.parametrize("in_one_thread", [False, True])
+def test_an_exception_in_the_source_loses_nothing_that_was_read(in_one_thread: bool):
     def source() -> Iterator[Frame]:
         yield from frames(7)
         raise BrokenError("torn file")
@@ -222,7 +239,13 @@ def test_an_exception_in_the_source_loses_nothing_that_was_read():
     recorded = Recorded()
     nodes = [Repeat("a"), Repeat("b", delay_s=0.01), Repeat("c", owes=True)]
     with pytest.raises(BrokenError):
-        run_chain(source(), nodes, on_message=recorded, stop=threading.Event())
+        run_chain(
+            source(),
+            nodes,
+            on_message=recorded,
+            stop=threading.Event(),
+            in_one_thread=in_one_thread,
+        )
     assert recorded.of("c") == [1, 2, 3, 4, 5, 6, 7]
     assert recorded.of("c.close") == [0]
 
@@ -251,9 +274,12 @@ def assert_counted(counters: Sequence[StageCounters]) -> None:
     st.lists(st.tuples(st.integers(0, 2), st.booleans()), min_size=1, max_size=3),
     st.none() | st.integers(1, 12),
     st.booleans(),
+    st.booleans(),
 )
-@settings(max_examples=40)
-def test_frames_in_are_processed_dropped_or_failed(count, shapes, stop_at, is_endless: bool):
+@settings(max_examples=60)
+def test_frames_in_are_processed_dropped_or_failed(
+    count, shapes, stop_at, is_endless: bool, in_one_thread: bool
+):
     """However the chain ends, and wherever it is slow or broken."""
     nodes = [
         (Broken if is_broken else Repeat)(f"{k}", copies=1 + k, delay_s=delay / 2000)
@@ -275,6 +301,7 @@ def test_frames_in_are_processed_dropped_or_failed(count, shapes, stop_at, is_en
         on_start=chains.append,
         on_failure=lambda stage, error: True,
         stop=stop,
+        in_one_thread=in_one_thread,
     )
     assert_counted(chains[0].counters)
     assert chains[0].counters[-1].frames_processed <= len(done)

@@ -19,6 +19,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     for name, count in (("kills", 300), ("cuts", 300), ("losses", 200), ("mutants", 2000)):
         parser.add_argument(f"--{name}", type=int, default=count)
+    parser.add_argument("--kill-minutes", type=float, default=1e9, help="as many as fit")
     parser.add_argument("--scene", type=Path, default=ROOT / "recordings" / "demo")
     asked = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="faults-"))
@@ -39,7 +40,10 @@ def main() -> None:
     if asked.kills:
         from kills import kills
 
-        show("kill -9", kills(folder / "kills", asked.scene, count=asked.kills))
+        show(
+            "kill -9",
+            kills(folder / "kills", asked.scene, count=asked.kills, minutes=asked.kill_minutes),
+        )
     shutil.rmtree(folder)
 
 

@@ -18,8 +18,13 @@ from camera import Camera, free_port, require_server  # noqa: E402, F401
 CONFIG = """
 [read_frames]
 silence_s = 20.0
+[crop_fish]
+segmenter = "grabcut"
+[smooth_length]
+track_timeout_s = 3.0
 [recording]
 rrd = false
+segment_s = 10.0
 [watch]
 port = {port}
 """
@@ -79,6 +84,15 @@ class Measurement:
         database = sqlite3.connect(f"file:{self.out / 'lengths.db'}?mode=ro", uri=True)
         try:
             return [i for (i,) in database.execute("SELECT track_id FROM fish ORDER BY number")]
+        finally:
+            database.close()
+
+    def interrupted(self) -> int:
+        """How many fish say that a restart interrupted them."""
+        database = sqlite3.connect(f"file:{self.out / 'lengths.db'}?mode=ro", uri=True)
+        try:
+            query = "SELECT count(*) FROM fish WHERE flags LIKE '%interrupted%'"
+            return database.execute(query).fetchone()[0]
         finally:
             database.close()
 

@@ -28,6 +28,7 @@ class Job:
     haul: str = ""
     config: str = ""
     template: str = "halibut"
+    chunk_s: float = 0.0  # 0: the video is measured in one piece
 
     @property
     def key(self) -> str:
@@ -46,7 +47,9 @@ class Job:
         return path.stat().st_size if path.is_file() else 0
 
 
-def read_manifest(path: Path, *, config: Path | None, template: str) -> list[Job]:
+def read_manifest(
+    path: Path, *, config: Path | None, template: str, chunk_s: float = 0.0
+) -> list[Job]:
     """The jobs of a manifest; its relative paths start from its own folder.
 
     Raises UserError where it can't be read or lacks its columns. Files that it names are not
@@ -83,6 +86,7 @@ def read_manifest(path: Path, *, config: Path | None, template: str) -> list[Job
                 **origin,
                 config="" if config is None else str(config.resolve()),
                 template=mesh,
+                chunk_s=chunk_s,
             )
         )
     return jobs

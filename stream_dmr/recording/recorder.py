@@ -38,12 +38,14 @@ class Recorder:
         resume: bool = False,
         files: OpenSinks = open_files,
         on_refusal: Callable[[str], None] | None = None,
+        in_one_thread: bool = False,
     ) -> None:
         """With `live`, the view is served as well, at `live_address`; `resume` keeps the tables.
 
         `files` opens those of the recording: `open_files` or, for a run without an end,
         `open_segments`. With `on_refusal`, that is told what the disk refuses, instead of an
-        exception, and each sink is tried again with what follows: measuring goes on.
+        exception, and each sink is tried again with what follows: measuring goes on. With
+        `in_one_thread` that of the caller does it all, as in `run_chain`.
         """
         self.live_address: str | None = None
         self._on_refusal = on_refusal
@@ -54,6 +56,7 @@ class Recorder:
         self._lock = Lock()
         self._queue: Queue[Record | None] = Queue(_QUEUE_MESSAGES)
         self._thread = Thread(target=self._write_all, name="recorder", daemon=True)
+        self._in_one_thread, self._is_open = in_one_thread, True
         make_folder(out_dir)
         with ExitStack() as undo:
             undo.callback(self._close_sinks)
@@ -63,7 +66,8 @@ class Recorder:
                 self._sinks.append(view := LiveView(header, settings))
                 self.live_address = view.address
             undo.pop_all()
-        self._thread.start()
+        if not in_one_thread:
+            self._thread.start()
 
     def write(self, message: Message) -> Message:
         """Record a message; returns it as a replay will read it back.
@@ -72,7 +76,7 @@ class Recorder:
         exactly. With a lossy picture setting its pixels are those that the recording holds, and
         what is not recorded it lacks; only a frame by reference keeps its pixels.
         """
-        if not self._thread.is_alive():
+        if not self._is_open:
             raise ValueError("the recorder is closed")
         record = make_record(message, self._settings)
         self.put(record)
@@ -80,7 +84,10 @@ class Recorder:
 
     def put(self, record: Record) -> None:
         """Record a message as it is encoded already."""
-        self._queue.put(record)
+        if self._in_one_thread:
+            self._write_to_all(record)
+        else:
+            self._queue.put(record)
         self._raise_failure()
 
     def close(self) -> None:
@@ -88,9 +95,11 @@ class Recorder:
 
         A failure that was not yet raised is raised then.
         """
-        if self._thread.is_alive():
-            self._queue.put(None)
-            self._thread.join()
+        if self._is_open:
+            self._is_open = False
+            if not self._in_one_thread:
+                self._queue.put(None)
+                self._thread.join()
             self._close_sinks()
         self._raise_failure()
 
@@ -107,9 +116,12 @@ class Recorder:
 
     def _write_all(self) -> None:
         while (record := self._queue.get()) is not None:
-            for sink in self._sinks:
-                self._write_to(sink, record)
+            self._write_to_all(record)
             self._queue.task_done()
+
+    def _write_to_all(self, record: Record) -> None:
+        for sink in self._sinks:
+            self._write_to(sink, record)
 
     def _write_to(self, sink: Sink, record: Record) -> None:
         """Write to one sink; once it has failed, never again.

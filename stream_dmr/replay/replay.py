@@ -90,6 +90,8 @@ def replay(
     tape = Tape(recording, request.part)
     order = [*STAGES.values()]
     first = order.index(STAGES[request.first])
+    recomputed = order[first:]
+    is_light = FittedMesh not in recomputed  # no stage computes outside of Python for long
     carried = _carried(request, tape)
     with ExitStack() as stack:
         frames, nodes = _chain(request, tape, config, template, calibration, stack, first)
@@ -98,8 +100,9 @@ def replay(
         if request.out is not None:
             prepare_folder(request.out, overwrite=request.overwrite)
             header = _header(request, recording.header, config, template, calibration)
-            recorder = stack.enter_context(Recorder(request.out, header, config.recording))
-        recomputed = order[first:]
+            recorder = stack.enter_context(
+                Recorder(request.out, header, config.recording, in_one_thread=is_light)
+            )
         judge = None
         if request.check:
             unlike = {fish.track_id for fish in carried} if FittedMesh in recomputed else ()
@@ -108,7 +111,12 @@ def replay(
         observer.begin(None)
         began = time.perf_counter()
         counters = run_chain(
-            frames, nodes, on_message=scribe.take, on_frame=observer.frame_done, stop=stop
+            frames,
+            nodes,
+            on_message=scribe.take,
+            on_frame=observer.frame_done,
+            stop=stop,
+            in_one_thread=is_light,
         )
     if judge is not None:
         judge.finish()
