@@ -32,6 +32,7 @@ _MOST_COST = 25.0  # a sum of four squares, each about 1
 _NEVER = 1e6
 _FARTHEST = 1.2  # sizes between a fish and where it was expected
 _SHORTER = 0.93  # times its length a fish may seem in the next frame, turning to or fro
+_PIECE_DOUBT = 9.0  # times the variance of a candidate's middle is that of a piece's
 _LEARN = 0.35  # of a fish's size and colour, per frame
 _SWALLOWED = 0.55  # of a fish's expected box inside a candidate
 _SWOLLEN = 1.3  # times the larger of two fish: a candidate that is both
@@ -176,6 +177,7 @@ class _Track:
 
     def __init__(self, look: _Look, number: int, frame_index: int) -> None:
         self.look, self.number, self.frame_index = look, number, frame_index
+        self._whole = look  # as last seen by itself; pieces would lead it astray, bit by bit
         self.area, self.colour, self.length = look.area, look.colour, look.length
         self.was_alone = not look.is_piece  # once at least: what is always a piece may be no fish
         self.lost_frames, self.frames_seen, self._waited = 0, 1, 0
@@ -188,7 +190,7 @@ class _Track:
     @property
     def size(self) -> float:
         """The longer side of the box, px."""
-        return float(max(self.look.box[2:] - self.look.box[:2]))
+        return float(max(self._whole.box[2:] - self._whole.box[:2]))
 
     @property
     def middle(self) -> Float[np.ndarray, "2"]:
@@ -224,7 +226,11 @@ class _Track:
         """Take a candidate for this fish."""
         self.look, self.lost_frames, self._waited = look, 0, 0
         self.frames_seen += 1
-        self.was_alone |= not look.is_piece
+        if look.is_piece and self.was_alone:
+            self._filter.update(look.middle[:, None], R=_PIECE_DOUBT * self._filter.R)
+            return
+        self._whole = look
+        self.was_alone = not look.is_piece
         self.length = max(look.length, _SHORTER * self.length)
         self._filter.update(look.middle[:, None])
         rate = max(_LEARN, 1 / self.frames_seen)
@@ -252,20 +258,20 @@ class _Track:
 
     def share_in(self, box: Float[np.ndarray, "4"]) -> float:
         """The share of the box where this fish is expected that lies in another."""
-        return _share_in(self.look.box + np.tile(self._way, 2), box)
+        return _share_in(self._whole.box + np.tile(self._way, 2), box)
 
     def expected(self) -> Expected | None:
         """The fish's last shape, moved on; None where the detector gives no shapes."""
-        shape = self.look.candidate.foreground
-        corner = self.look.box[:2] + self._way
+        shape = self._whole.candidate.foreground
+        corner = self._whole.box[:2] + self._way
         if shape is None:
             return None
         return Expected(shape=shape, corner=corner, length_px=self.length, area_px=self.area)
 
     @property
     def _way(self) -> Float[np.ndarray, "2"]:
-        """From where the fish was seen to where it is expected, px."""
-        return self.middle - self.look.middle
+        """From where the whole fish was seen to where it is expected, px."""
+        return self.middle - self._whole.middle
 
     def is_inside(self, width: int, height: int) -> bool:
         """Whether the fish is in the picture, as far as one can tell."""
