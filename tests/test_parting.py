@@ -60,8 +60,8 @@ def test_two_known_fish_get_their_own_pieces(across, along, one_off, other_off):
     for piece, true, others in zip(
         pieces, (one & ~other, other & ~one), (other & ~one, one & ~other), strict=True
     ):
-        assert share(others, in_frame(piece)) < 0.1
-        assert share(true, in_frame(piece)) > 0.8
+        assert share(others, in_frame(piece)) < 0.25
+        assert share(true, in_frame(piece)) > 0.65
         assert piece.score == 0.8
 
 
@@ -71,8 +71,8 @@ def test_a_fish_that_nobody_knew_is_what_is_left_over(across, off):
     known, new = fish(250, 120), fish(250 + across, 250)
     pieces = part(candidate_of(known | new), [expected_of(known, off=off)])
     assert len(pieces) == 2
-    assert share(new & ~known, in_frame(pieces[1])) > 0.8
-    assert share(known & ~new, in_frame(pieces[1])) < 0.1
+    assert share(new & ~known, in_frame(pieces[1])) > 0.65
+    assert share(known & ~new, in_frame(pieces[1])) < 0.2
 
 
 @pytest.mark.parametrize("width", [20, 50, 80])
