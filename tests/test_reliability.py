@@ -23,6 +23,8 @@ def test_nothing_is_lost_by_kills_power_cuts_losses_and_mutants():
     rows = [json.loads(line) for line in outcome.stdout.splitlines()]
     by_test = {row["test"]: row for row in rows}
     assert by_test["power cuts"]["unusable"] == by_test["power cuts"]["durable fish lost"] == 0
+    cuts = by_test["power cuts of recordings"]
+    assert cuts["unreadable"] == cuts["durable messages lost in"] == 0
     assert by_test["camera losses"]["frames again after s, most"] < 10
     assert by_test["camera losses"]["growth"]["descriptors"] <= 0
     assert by_test["kill -9"]["finished fish lost"] == by_test["kill -9"]["ids used twice"] == 0

@@ -24,9 +24,11 @@ def main() -> None:
     asked = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="faults-"))
     if asked.cuts:
-        from power import power_cuts
+        from power import power_cuts, power_cuts_of_recordings
 
         show("power cuts", power_cuts(folder / "power", count=asked.cuts))
+        figures = power_cuts_of_recordings(folder / "power-recording", count=asked.cuts)
+        show("power cuts of recordings", figures)
     if asked.losses:
         from losses import losses
 

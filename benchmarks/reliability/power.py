@@ -1,12 +1,23 @@
-"""A power cut: lengths.db as a disk may leave it that had everything up to the last fsync."""
+"""A power cut: lengths.db and a recording as a disk may leave them that had all up to an fsync."""
 
 import random
 import shutil
 import sqlite3
 from pathlib import Path
 
+from kills import unreadable_ones
 from measured import ROOT  # noqa: F401
+from recorded_run import header, run
 from test_store import FACTS, LengthStore, fish
+
+from stream_dmr.recording.mcap_sink import McapSink
+from stream_dmr.recording.opened import open_recordings
+from stream_dmr.recording.record import make_record
+from stream_dmr.recording.recover import recover
+from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.topics import TOPICS
+
+_NAME = "recording-000001.mcap"
 
 
 def power_cuts(folder: Path, *, count: int, seed: int = 0) -> dict[str, object]:
@@ -38,3 +49,41 @@ def power_cuts(folder: Path, *, count: int, seed: int = 0) -> dict[str, object]:
         after += number in kept
     store.close()
     return {"cuts": count, "unusable": unusable, "durable fish lost": lost, "kept beyond": after}
+
+
+class Watched(McapSink):
+    """Knows how much of it an fsync has made durable."""
+
+    durable = (0, 0)  # messages; bytes
+
+    def _flush(self) -> None:
+        super()._flush()
+        self.durable = sum(self._sequences.values()), self.size
+
+
+def power_cuts_of_recordings(folder: Path, *, count: int, seed: int = 0) -> dict[str, object]:
+    """Cut a segment at any byte after what was durable, with and without rubbish; repair it."""
+    rng, messages = random.Random(seed), list(run(40))
+    settings = RecordingSettings(rrd=False)
+    unreadable = lost = 0
+    for _ in range(count):
+        shutil.rmtree(folder, ignore_errors=True)
+        live, cut = folder / "live", folder / "cut"
+        live.mkdir(parents=True)
+        cut.mkdir()
+        sink = Watched(live / _NAME, header(), flush_s=0.01, number=1)
+        for message in messages[: rng.randint(1, len(messages))]:
+            sink.write(make_record(message, settings))
+        (num_durable, size), part = sink.durable, f"{_NAME}.part"
+        data = (live / part).read_bytes()
+        at = rng.randint(size, len(data))
+        rubbish = rng.randbytes(rng.randint(0, 4096)) if rng.random() < 0.5 else b""
+        (cut / part).write_bytes(data[:at] + rubbish)
+        sink.close()
+        list(recover(cut))
+        checked: set[Path] = set()
+        unreadable += unreadable_ones(cut, checked) or len(checked) != 1
+        kept = list(open_recordings([cut / _NAME]).payloads(TOPICS)) if checked else []
+        whole = list(open_recordings([live / _NAME]).payloads(TOPICS))
+        lost += len(kept) < num_durable or kept != whole[: len(kept)]
+    return {"cuts": count, "unreadable": unreadable, "durable messages lost in": lost}

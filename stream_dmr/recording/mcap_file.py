@@ -59,16 +59,10 @@ class McapFile:
         self.is_segment = self.is_thinned = self.ends_early = False
         self.header = self._read_header()
 
-    @property
-    def is_torn(self) -> bool:
-        """Whether its end is missing."""
-        with self._open() as stream:
-            return self._is_torn(stream)
-
     def tracks(self) -> Collection[int]:
         """The ids of its fish, by the index where it has one."""
         with self._open() as stream:
-            if not self._is_torn(stream) and _has_index(stream):
+            if not _is_torn(stream) and _has_index(stream):
                 spans = _spans(stream, SeekingReader(stream, validate_crcs=True))
                 if spans:
                     return spans.keys()
@@ -95,7 +89,7 @@ class McapFile:
 
     def _messages(self, topics: Collection[str], part: Part) -> Iterator[tuple[str, McapMessage]]:
         with self._open() as stream:
-            if part.is_whole or self._is_torn(stream) or not _has_index(stream):
+            if part.is_whole or _is_torn(stream) or not _has_index(stream):
                 yield from self._in_order(stream, topics, part)
             else:
                 yield from _by_index(stream, topics, part)
@@ -103,7 +97,7 @@ class McapFile:
     def _in_order(
         self, stream: IO[bytes], topics: Collection[str], part: Part
     ) -> Iterator[tuple[str, McapMessage]]:
-        is_torn, count = self._is_torn(stream), 0
+        is_torn, count = _is_torn(stream), 0
         wanted: dict[int, str] = {}  # topics by channel
         try:
             for record in _records(stream):
@@ -129,7 +123,7 @@ class McapFile:
     def _read_header(self) -> RunHeader:
         attachments: dict[str, bytes] = {}
         with self._open() as stream:
-            self.ends_early = self._is_torn(stream)
+            self.ends_early = _is_torn(stream)
             try:
                 for record in _records(stream, emit_chunks=True):
                     if isinstance(record, Chunk):
@@ -158,14 +152,6 @@ class McapFile:
         self.is_thinned |= record.name == THINNED
         self.ends_early |= record.name in (SEGMENT, RECOVERED)
 
-    def _is_torn(self, stream: IO[bytes]) -> bool:
-        """Say whether the end of the file lacks the magic that closes it."""
-        size = stream.seek(0, 2)
-        stream.seek(max(size - len(MCAP0_MAGIC), 0))
-        end = stream.read()
-        stream.seek(0)
-        return end != MCAP0_MAGIC
-
     @contextmanager
     def _open(self) -> Iterator[IO[bytes]]:
         try:
@@ -183,6 +169,21 @@ class McapFile:
                 f"{self.path}: expected a whole recording, got a damaged one ({error}); "
                 "what was read before the damage is sound"
             ) from error
+
+
+def is_torn(path: Path) -> bool:
+    """Whether a file lacks its end."""
+    with path.open("rb") as stream:
+        return _is_torn(stream)
+
+
+def _is_torn(stream: IO[bytes]) -> bool:
+    """Whether a file lacks the magic that closes it; back to its start."""
+    size = stream.seek(0, 2)
+    stream.seek(max(size - len(MCAP0_MAGIC), 0))
+    end = stream.read()
+    stream.seek(0)
+    return end != MCAP0_MAGIC
 
 
 def whole_records(path: Path) -> Iterator[object]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from stream_dmr.errors import RecordingError
 from stream_dmr.recording.files import STEM
-from stream_dmr.recording.mcap_file import McapFile
+from stream_dmr.recording.mcap_file import McapFile, is_torn
 from stream_dmr.recording.mcap_sink import PART
 from stream_dmr.recording.rerun_program import rerun_program
 from stream_dmr.recording.rewrite import REWRITTEN, rewrite
@@ -55,10 +55,15 @@ def _attempt(path: Path, repair: Callable[[Path], tuple[Path, str]]) -> Repair:
 
 def _repair_mcap(part: Path) -> tuple[Path, str]:
     target = _free_name(part.with_name(part.name.removesuffix(PART)))
-    if not McapFile(part).is_torn:  # the crash came before it got its name
+    if not is_torn(part):  # the crash came before it got its name
         rename_durably(part, target)
         return target, f"it was complete and is {target.name} now"
     repaired, num_messages = rewrite(part, note=RECOVERED)
+    try:
+        McapFile(repaired)
+    except RecordingError:
+        repaired.unlink()
+        raise
     rename_durably(repaired, target)
     part.unlink()
     return target, f"its {num_messages} whole messages are in {target.name}"
