@@ -40,6 +40,14 @@ def batch(
     workers: Annotated[
         int, typer.Option(help="Videos at a time, with local.", show_default="one a core")
     ] = 0,
+    piece_frames: Annotated[
+        int,
+        typer.Option(
+            help="Longer videos with boxes or masks are measured in pieces of so many frames; "
+            "0: never.",
+            min=0,
+        ),
+    ] = 20000,
     template: Annotated[
         str, typer.Option(help="The species: halibut, cod, or a mesh with its TOML beside it.")
     ] = "halibut",
@@ -67,6 +75,7 @@ def batch(
                 jobs,
                 out,
                 where,
+                piece_frames=piece_frames,
                 stop=stop,
                 say=lambda line: print(line, file=sys.stderr, flush=True),
             )

@@ -28,6 +28,7 @@ from stream_dmr.recording.retention import Retention
 from stream_dmr.recording.segments import open_segments
 from stream_dmr.run_folder import RESULTS, SEGMENTED, consistent_csv, prepare_folder
 from stream_dmr.segmentation.fish_finder import open_finder
+from stream_dmr.segmentation.only import Only, OnlyFish, OnlyFrames
 from stream_dmr.store import LengthStore, flagged_fish
 from stream_dmr.tally import Observer, Tally, run_facts
 from stream_dmr.template import Template, load_template
@@ -53,6 +54,7 @@ class RunRequest:
     vessel: str = ""  # where the fish come from, for the exports
     trip: str = ""
     haul: str = ""
+    only: Only | None = None  # a piece of the source
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +87,10 @@ def run(
         detect=config.detect_fish,
         track=config.track_fish,
     )
-    reader = ReadFrames(request.source, config.read_frames)
+    reader: ReadFrames | OnlyFrames = ReadFrames(request.source, config.read_frames)
+    if request.only is not None:
+        detections = OnlyFish(detections, request.only)
+        reader = OnlyFrames(reader, request.only)
     try:
         if calibration is not None:
             require_size(calibration, width=reader.source.width, height=reader.source.height)
@@ -205,7 +210,7 @@ def _header(
 
 
 def _run_chain(
-    reader: ReadFrames,
+    reader: ReadFrames | OnlyFrames,
     nodes: Sequence[Node],
     tally: Tally,
     watch: Watch,

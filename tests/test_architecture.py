@@ -38,6 +38,7 @@ FLOORS = [
     ["stream_dmr.run", "stream_dmr.report.report"],
     ["stream_dmr.batch.dataset", "stream_dmr.batch.job"],
     [f"stream_dmr.batch.{name}" for name in ("worker", "local", "ray_engine")],
+    ["stream_dmr.batch.pieces"],
     ["stream_dmr.batch.batch"],
     [f"stream_dmr.review.{name}" for name in ("corrected", "judge", "server")],
     ["stream_dmr.replay.replay"],

@@ -21,6 +21,7 @@ from stream_dmr.batch.batch import batch
 from stream_dmr.batch.job import Outcome, do_job, folder_of, outcome_of
 from stream_dmr.batch.local import LocalEngine
 from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
+from stream_dmr.batch.pieces import pieces_of
 from stream_dmr.batch.progress import Clock, duration
 from stream_dmr.errors import UserError
 from stream_dmr.run import run
@@ -251,7 +252,7 @@ def test_the_time_left_is_by_bytes(season: Path, tmp_path: Path):
     assert clock.line(10.0).endswith("time left: unknown")
     clock.of(jobs[0])(0.5)
     assert clock.line(10.0) == "0 of 2 videos, 25 %, time left: 30 s"
-    clock.over(jobs[0])
+    clock.over(jobs[0].name)
     assert clock.line(10.0) == "1 of 2 videos, 50 %, time left: 10 s"
     assert (duration(200.0), duration(7200.0)) == ("3 min", "2.0 h")
 
@@ -282,3 +283,57 @@ def test_ray_on_two_nodes_loses_a_worker_and_nothing_else(season: Path, tmp_path
     assert statuses == ["done", "done", "failed", "done"]
     for name in ("video", "video-4"):
         assert_same_tables(out / "videos" / name, season / "alone")
+
+
+COMING_AND_GOING = [
+    *([1, 2], [1, 2], [1, 2], [1, 2], [1], [1, 3], [1, 3], [3], [3], [3]),
+    *([], [4], [4], [4], [4], [4], [4], [4], [2, 4], [2]),
+]
+
+
+@pytest.mark.parametrize(("timeout_s", "piece_frames"), [(0.25, 4), (100.0, 9)])
+def test_pieces_make_the_tables_of_the_whole(tmp_path: Path, timeout_s: float, piece_frames: int):
+    clip = tmp_path / "clip"
+    write_clip(clip, fish=COMING_AND_GOING)  # fish cross every cut; 2 comes back at the end
+    config = clip / "quick.toml"
+    text = config.read_text() + f"\n[smooth_length]\ntrack_timeout_s = {timeout_s}\n"
+    config.write_text(text + "max_std_ratio = 1e9\n")
+    run(request(clip, tmp_path / "alone"), stop=threading.Event())
+    manifest = write_manifest(tmp_path / "manifest.csv", row())
+    (job,) = read_manifest(manifest, config=config, template=str(clip / "tiny.ply"))
+    pieces = pieces_of(job, piece_frames)
+    assert len(pieces) >= 2
+    assert sorted(i for piece in pieces for i in piece.tracks) == [1, 2, 3, 4]
+    out = tmp_path / "out"
+    summary = batch([job], out, ThisProcess(), piece_frames=piece_frames, stop=threading.Event())
+    assert [one.status for one in summary.outcomes] == ["done"]
+    assert summary.outcomes[0].num_fish == 4
+    folder = folder_of(job, out)
+    assert_same_tables(folder, tmp_path / "alone")
+    assert verify(folder)[0] == []
+    assert [path.name for path in (out / "videos").iterdir()] == ["video"]
+    fish = dataset.dataset(out / "dataset" / "fish", partitioning="hive").to_table()
+    assert fish.num_rows == 4
+
+
+def test_pieces_that_are_done_are_kept(tmp_path: Path):
+    clip = tmp_path / "clip"
+    write_clip(clip, fish=COMING_AND_GOING)
+    manifest = write_manifest(tmp_path / "manifest.csv", row())
+    (job,) = read_manifest(manifest, config=clip / "quick.toml", template=str(clip / "tiny.ply"))
+    out = tmp_path / "out"
+    first = pieces_of(job, 9)[0]
+    do_job(first, out)
+    before = (folder_of(first, out) / "recording.mcap").stat().st_ino
+    summary = batch([job], out, ThisProcess(), piece_frames=9, stop=threading.Event())
+    assert [one.status for one in summary.outcomes] == ["done"]
+    assert (folder_of(job, out) / "recording-1.mcap").stat().st_ino == before
+
+
+def test_what_says_not_which_fish_it_is_stays_whole(season: Path, tmp_path: Path):
+    (job,) = jobs_of(season, tmp_path, row(masks=""))
+    assert pieces_of(job, 2) == [job]
+    (job,) = jobs_of(season, tmp_path, row(masks="none"))
+    assert pieces_of(job, 2) == [job]
+    (job,) = jobs_of(season, tmp_path, row())
+    assert pieces_of(job, 100) == [job]

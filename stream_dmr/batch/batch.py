@@ -5,13 +5,15 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from stream_dmr.batch.dataset import publish, withdraw_others
-from stream_dmr.batch.job import DONE, Outcome, finish, folder_of, outcome_of
+from stream_dmr.batch.job import DONE, FAILED, Outcome, finish, folder_of, outcome_of
 from stream_dmr.batch.manifest import Job
+from stream_dmr.batch.pieces import pieces_of, stitch
 from stream_dmr.batch.progress import Clock
 from stream_dmr.errors import OutputError
 from stream_dmr.recording.whole_file import make_folder
@@ -49,12 +51,14 @@ def batch(
     out: Path,
     engine: Engine,
     *,
+    piece_frames: int = 0,
     stop: threading.Event,
     say: Callable[[str], None] = lambda line: None,
 ) -> BatchSummary:
     """Measure every video that is not done yet; results below `out`. Raises OutputError.
 
-    Failed ones are tried again by the next batch. Setting `stop` ends it soon.
+    Failed ones are tried again by the next batch; videos of more than `piece_frames` (0: none) are
+    measured in pieces. Setting `stop` ends it soon.
     """
     make_folder(out / "videos")
     _drop_parts(out)
@@ -66,12 +70,24 @@ def batch(
         if job.name in outcomes:
             publish(folder_of(job, out), job, out)
     todo = [job for job in jobs if job.name not in outcomes]
-    clock = Clock(todo, say)
-    by_name = {job.name: job for job in jobs}
-    for outcome in engine.outcomes(todo, out, stop=stop, clock=clock):
-        job = by_name[outcome.name]
-        outcomes[outcome.name] = outcome
-        clock.over(job)
+    videos = [Video(job, out, piece_frames) for job in todo]
+    clock = Clock([piece for video in videos for piece in video.pieces], say)
+    owners = {piece.name: video for video in videos for piece in video.pieces}
+    for video in videos:
+        for name in video.done:
+            clock.over(name)
+    waiting = [piece for video in videos for piece in video.missing]
+    over = chain(
+        [piece for video in videos for piece in video.done.values()],
+        engine.outcomes(waiting, out, stop=stop, clock=clock),
+    )
+    for piece in over:
+        clock.over(piece.name)
+        outcome = owners[piece.name].take(piece)
+        if outcome is None:
+            continue
+        job = owners[piece.name].job
+        outcomes[job.name] = outcome
         if outcome.status == DONE:
             publish(folder_of(job, out), job, out)
         else:
@@ -86,6 +102,31 @@ def batch(
         num_before=num_before,
         elapsed_s=time.perf_counter() - began,
     )
+
+
+class Video:
+    """A video on its way: in one piece, or in some."""
+
+    def __init__(self, job: Job, out: Path, piece_frames: int) -> None:
+        self.job = job
+        self._out = out
+        self.pieces = pieces_of(job, piece_frames) if piece_frames else [job]
+        self.done: dict[str, Outcome] = {}  # pieces of an earlier batch
+        for piece in self.pieces if len(self.pieces) > 1 else ():
+            outcome = outcome_of(piece, out)
+            if outcome is not None and outcome.status == DONE:
+                self.done[piece.name] = outcome
+        self.missing = [piece for piece in self.pieces if piece.name not in self.done]
+        self._left = {piece.name for piece in self.pieces}
+
+    def take(self, piece: Outcome) -> Outcome | None:
+        """What became of the video, once that is certain by what became of a piece."""
+        if len(self.pieces) == 1:
+            return replace(piece, name=self.job.name, key=self.job.key)
+        self._left.discard(piece.name)
+        if piece.status != DONE:
+            return Outcome(name=self.job.name, key=self.job.key, status=FAILED, reason=piece.reason)
+        return None if self._left else stitch(self.job, self.pieces, self._out)
 
 
 def _drop_parts(out: Path) -> None:

@@ -14,6 +14,7 @@ from stream_dmr.batch.progress import Progress
 from stream_dmr.errors import UserError
 from stream_dmr.recording.whole_file import rename_durably
 from stream_dmr.run import RunRequest, run
+from stream_dmr.segmentation.only import Only
 from stream_dmr.tally import Observer
 
 OUTCOME = "outcome.json"
@@ -60,7 +61,9 @@ def do_job(job: Job, out: Path, *, on_progress: Progress = lambda share: None) -
     part.parent.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(part, ignore_errors=True)
     try:
-        summary = run(request_of(job, part), stop=threading.Event(), observer=_Ticker(on_progress))
+        summary = run(
+            request_of(job, part), stop=threading.Event(), observer=_Ticker(job, on_progress)
+        )
         write_tables(part, job)
         outcome = Outcome(
             name=job.name,
@@ -86,7 +89,7 @@ def finish(part: Path, folder: Path, outcome: Outcome) -> None:
 
 
 def request_of(job: Job, out: Path) -> RunRequest:
-    """The run that measures a whole video, as a user would have asked for it."""
+    """The run that measures a video, as a user would have asked for it, or a piece of it."""
 
     def path(text: str) -> Path | None:
         return Path(text) if text else None
@@ -106,19 +109,22 @@ def request_of(job: Job, out: Path) -> RunRequest:
         vessel=job.vessel,
         trip=job.trip,
         haul=job.haul,
+        only=Only(first=job.first_frame, last=job.last_frame, tracks=frozenset(job.tracks))
+        if job.tracks
+        else None,
     )
 
 
 class _Ticker(Observer):
     """Turns frames into shares of the video."""
 
-    def __init__(self, on_progress: Progress) -> None:
+    def __init__(self, job: Job, on_progress: Progress) -> None:
         self._on_progress = on_progress
-        self._num_frames: int | None = None
+        self._num_frames = job.last_frame - job.first_frame + 1 if job.tracks else None
         self._done = 0
 
     def begin(self, num_frames: int | None) -> None:
-        self._num_frames = num_frames
+        self._num_frames = self._num_frames or num_frames
 
     def frame_done(self) -> None:
         self._done += 1

@@ -4,6 +4,7 @@ import csv
 import json
 import re
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -28,7 +29,10 @@ class Job:
     haul: str = ""
     config: str = ""
     template: str = "halibut"
-    chunk_s: float = 0.0  # 0: the video is measured in one piece
+    tracks: Sequence[int] = ()  # of a piece of the video: the fish that are measured
+    first_frame: int = 0
+    last_frame: int = 0
+    share: float = 1.0  # of the work that the whole video is
 
     @property
     def key(self) -> str:
@@ -41,15 +45,13 @@ class Job:
         return sha256(json.dumps(made_of).encode()).hexdigest()
 
     @property
-    def num_bytes(self) -> int:
+    def num_bytes(self) -> float:
         """Of the video: by these the time left is estimated."""
         path = Path(self.video)
-        return path.stat().st_size if path.is_file() else 0
+        return self.share * path.stat().st_size if path.is_file() else 0.0
 
 
-def read_manifest(
-    path: Path, *, config: Path | None, template: str, chunk_s: float = 0.0
-) -> list[Job]:
+def read_manifest(path: Path, *, config: Path | None, template: str) -> list[Job]:
     """The jobs of a manifest; its relative paths start from its own folder.
 
     Raises UserError where it can't be read or lacks its columns. Files that it names are not
@@ -82,11 +84,15 @@ def read_manifest(
         jobs.append(
             Job(
                 name=name,
-                **files,
-                **origin,
+                video=files["video"],
+                calibration=files["calibration"],
+                boxes=files["boxes"],
+                masks=files["masks"],
+                vessel=origin["vessel"],
+                trip=origin["trip"],
+                haul=origin["haul"],
                 config="" if config is None else str(config.resolve()),
                 template=mesh,
-                chunk_s=chunk_s,
             )
         )
     return jobs

@@ -13,7 +13,7 @@ class Clock:
     """Progress over all videos by their bytes, with an estimate of the time left."""
 
     def __init__(self, jobs: Sequence[Job], say: Callable[[str], None]) -> None:
-        self._weights = {job.name: max(1, job.num_bytes) for job in jobs}
+        self._weights = {job.name: max(1.0, job.num_bytes) for job in jobs}
         self._shares = dict.fromkeys(self._weights, 0.0)
         self._say = say
         self._began = self._said = time.monotonic()
@@ -26,9 +26,9 @@ class Clock:
 
         return take
 
-    def over(self, job: Job) -> None:
+    def over(self, name: str) -> None:
         """One is over, well or not."""
-        self._shares[job.name] = 1.0
+        self._shares[name] = 1.0
         self._said = -_SAY_S
 
     def pause(self) -> None:
