@@ -31,6 +31,7 @@ def expected_of(mask, *, off=(0.0, 0.0)):
         corner=one.bbox_xyxy_px[:2] + off,
         length_px=extent(mask)[1],
         area_px=float(mask.sum()),
+        is_whole=True,
     )
 
 
@@ -93,3 +94,8 @@ def test_boxes_alone_are_not_cut():
     whole = candidate_of(fish(200, 120) | fish(210, 240))
     box = Candidate(bbox_xyxy_px=whole.bbox_xyxy_px, score=1.0)
     assert part(box, [expected_of(fish(200, 120))]) == [box]
+
+
+def test_a_fish_that_has_gone_gets_no_piece_of_another():
+    gone, here = fish(250, 110), fish(250, 250)
+    assert len(part(candidate_of(here), [expected_of(gone), expected_of(here)])) == 1

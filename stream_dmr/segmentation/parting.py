@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from stream_dmr.segmentation.detector import Candidate, whole_pixels
 
+_THERE = 0.6  # of a fish's expected shape is to be seen, or it is not there
 _REACH = 0.1  # of a fish's length: so far from where it is expected its outline may be
 _FISH = 0.3  # of the smallest fish's area: a smaller piece is none
 _LONGER = 1.3  # times a fish's length, and it may be several
@@ -29,6 +30,7 @@ class Expected:
     corner: Float[np.ndarray, "2"]  # frame x, y of its first pixel
     length_px: float
     area_px: float
+    is_whole: bool  # it was seen by itself, so its size is known
 
 
 def part(candidate: Candidate, fish: Sequence[Expected]) -> list[Candidate]:
@@ -36,11 +38,12 @@ def part(candidate: Candidate, fish: Sequence[Expected]) -> list[Candidate]:
 
     The candidate itself where it has no `foreground`, or no second piece is to be found.
     """
-    if candidate.foreground is None or not fish:
-        return [candidate]
-    if len(fish) == 1 and not _may_be_several(candidate.foreground, fish[0]):
+    if candidate.foreground is None:
         return [candidate]
     x, y, _, _ = whole_pixels(candidate.bbox_xyxy_px)
+    fish = [one for one in fish if _share(one, candidate.foreground, (x, y)) > _THERE]
+    if not fish or (len(fish) == 1 and not _may_be_several(candidate.foreground, fish[0])):
+        return [candidate]
     away = np.stack([_away(one, candidate.foreground.shape, (x, y)) for one in fish])
     nearest = away.argmin(axis=0)
     reach = np.array([max(2.0, _REACH * one.length_px) for one in fish])
@@ -58,6 +61,8 @@ def part(candidate: Candidate, fish: Sequence[Expected]) -> list[Candidate]:
 
 def _may_be_several(shape: Bool[np.ndarray, "H W"], fish: Expected) -> bool:
     """Whether this is too long or too wide for this fish; one that turns only widens."""
+    if not fish.is_whole:
+        return False
     width_px, length_px = extent(shape)
     return length_px > _LONGER * fish.length_px or width_px > _WIDER * fish.length_px
 
@@ -69,21 +74,30 @@ def extent(shape: Bool[np.ndarray, "H W"]) -> tuple[float, float]:
     return min(sides), max(sides)
 
 
+def _share(fish: Expected, foreground: Bool[np.ndarray, "H W"], corner: tuple[int, int]) -> float:
+    """How much of a fish's expected shape a region, which begins at `corner`, shows."""
+    seen = foreground & _placed(fish, foreground.shape, corner)
+    return np.count_nonzero(seen) / max(np.count_nonzero(fish.shape), 1)
+
+
 def _away(
     fish: Expected, shape: tuple[int, ...], corner: tuple[int, int]
 ) -> Float[np.ndarray, "H W"]:
     """How far each pixel of a region is from a fish's expected shape, px."""
-    sea = np.ones(shape, np.uint8)
-    x, y = np.round(fish.corner - corner).astype(int).tolist()
-    h, w = fish.shape.shape
-    top, left = max(0, y), max(0, x)
-    inside = fish.shape[top - y : shape[0] - y, left - x : shape[1] - x]
-    if inside.size == 0 or h + y <= 0 or w + x <= 0:
-        return np.full(shape, np.inf)
-    sea[top : top + inside.shape[0], left : left + inside.shape[1]] = ~inside
-    if sea.all():
-        return np.full(shape, np.inf)
+    sea = (~_placed(fish, shape, corner)).astype(np.uint8)
     return cv2.distanceTransform(sea, cv2.DIST_L2, cv2.DIST_MASK_3).astype(np.float64)
+
+
+def _placed(
+    fish: Expected, shape: tuple[int, ...], corner: tuple[int, int]
+) -> Bool[np.ndarray, "H W"]:
+    """The expected shape in the pixels of a region."""
+    placed = np.zeros(shape, bool)
+    x, y = np.round(fish.corner - corner).astype(int).tolist()
+    top, left = max(0, y), max(0, x)
+    inside = fish.shape[max(-y, 0) : max(shape[0] - y, 0), max(-x, 0) : max(shape[1] - x, 0)]
+    placed[top : top + inside.shape[0], left : left + inside.shape[1]] = inside
+    return placed
 
 
 def _opened(mask: Bool[np.ndarray, "H W"], diameter: int) -> UInt8[np.ndarray, "H W"]:

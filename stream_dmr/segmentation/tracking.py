@@ -266,7 +266,13 @@ class _Track:
         corner = self._whole.box[:2] + self._way
         if shape is None:
             return None
-        return Expected(shape=shape, corner=corner, length_px=self.length, area_px=self.area)
+        return Expected(
+            shape=shape,
+            corner=corner,
+            length_px=self.length,
+            area_px=self.area,
+            is_whole=self.was_alone,
+        )
 
     @property
     def _way(self) -> Float[np.ndarray, "2"]:
