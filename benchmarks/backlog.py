@@ -27,6 +27,7 @@ def engine_of(name: str, workers: int) -> Iterator[Engine]:
     if name == "local":
         yield LocalEngine(workers)
         return
+    os.environ.setdefault("RAY_worker_niceness", "0")  # else Ray's workers wait for all others
     from ray.cluster_utils import Cluster
 
     from stream_dmr.batch.ray_engine import RayEngine

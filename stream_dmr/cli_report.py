@@ -8,6 +8,15 @@ import typer
 
 from stream_dmr.cli_support import stop_on_signals, warn
 
+_Source = Annotated[
+    str | None,
+    typer.Option(
+        help="The recorded clip, for pictures of the fish.",
+        show_default="the one that the recorded command names",
+    ),
+]
+_Config = Annotated[Path | None, typer.Option(help="Its [fisheries] instead of the run's.")]
+
 
 def verify(
     folder: Annotated[Path, typer.Argument(help="The --out of runs or of exports.", metavar="DIR")],
@@ -28,16 +37,8 @@ def report(
         Path, typer.Argument(help="The --out of a run, or a recording.", metavar="DIR|REC")
     ],
     out: Annotated[Path, typer.Option(help="The page to write.")] = Path("report.html"),
-    source: Annotated[
-        str | None,
-        typer.Option(
-            help="The recorded clip, for pictures of the fish.",
-            show_default="the one that the recorded command names",
-        ),
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="Its [fisheries] instead of the run's.")
-    ] = None,
+    source: _Source = None,
+    config: _Config = None,
 ) -> None:
     """Write results as one page that opens offline: plots, a table of fish, their best frames."""
     from stream_dmr.report.report import open_report, write_report
@@ -54,16 +55,8 @@ def review(
         str, typer.Option(help="Your name, for the verdicts.", show_default="who is logged in")
     ] = "",
     port: Annotated[int, typer.Option(help="On this machine; 0: any free one.")] = 0,
-    source: Annotated[
-        str | None,
-        typer.Option(
-            help="The recorded clip, for pictures of the fish.",
-            show_default="the one that the recorded command names",
-        ),
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="Its [fisheries] instead of the run's.")
-    ] = None,
+    source: _Source = None,
+    config: _Config = None,
 ) -> None:
     """Serve the page of `report` on this machine and take verdicts into lengths.db.
 

@@ -35,6 +35,8 @@ def kill_one(out: Path, killed: list[int]) -> None:
 def main() -> None:
     """Print the number of nodes, of workers killed, and of videos done."""
     manifest, config, template, out = (Path(word) for word in sys.argv[1:])
+    # Else its workers wait for all else on the machine.
+    os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112
     jobs = read_manifest(manifest, config=config, template=str(template))
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     cluster.add_node(num_cpus=1)
