@@ -16,6 +16,7 @@ from stream_dmr.cli_batch import batch
 from stream_dmr.cli_calibrate import calibrate
 from stream_dmr.cli_evaluate import evaluate
 from stream_dmr.cli_export import export
+from stream_dmr.cli_learn import learn_template
 from stream_dmr.cli_recover import recover
 from stream_dmr.cli_replay import replay
 from stream_dmr.cli_report import report, review, verify
@@ -33,7 +34,7 @@ app = typer.Typer(
 )
 for command in (
     *(calibrate, replay, recover, view, convert, export),
-    *(report, review, verify, batch, evaluate, train),
+    *(report, review, verify, batch, evaluate, train, learn_template),
 ):
     app.command()(command)
 

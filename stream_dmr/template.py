@@ -1,5 +1,6 @@
 """The species' template: a closed mesh with joints, keypoints and a midline, in canonical form."""
 
+import json
 import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
-from stream_dmr.errors import TemplateError
+from stream_dmr.errors import OutputError, TemplateError
 from stream_dmr.geometry import arc_lengths
 
 BUNDLED = Path(__file__).parent / "templates"
@@ -57,6 +58,36 @@ def load_template(path: str | Path) -> Template:
     template = make_template(mesh, _points_of(table, toml), name=mesh_path.stem)
     tail_gives, total_per_fork = _length_of(table, toml)
     return replace(template, tail_gives=tail_gives, total_per_fork=total_per_fork)
+
+
+def save_template(template: Template, path: Path, *, comment: str) -> None:
+    """Write a template's mesh, and its TOML beside it, as `load_template` reads them.
+
+    Raises OutputError where they can't be written.
+    """
+    head, center, tail = template.keypoints.tolist()
+    lines = [
+        f"# {comment}",
+        f"name = {json.dumps(template.name)}",
+        f"joints = {template.joints.tolist()}",
+        "[keypoints]",
+        f"head = {head}",
+        f"center = {center}",
+        f"tail = {tail}",
+    ]
+    if template.tail_gives is not None:
+        lines += ["[length]", f'tail = "{template.tail_gives}"']
+        if template.total_per_fork is not None:
+            lines.append(f"total_per_fork = {template.total_per_fork}")
+    mesh = trimesh.Trimesh(template.rest_vertices, template.faces, process=False)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        mesh.export(path)
+        path.with_suffix(".toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(
+            f"{path}: can't be written: {error.strerror}; give another --out"
+        ) from error
 
 
 def bundled_names() -> list[str]:
