@@ -20,6 +20,7 @@ NO_CALIBRATION = "no calibration"
 TOUCHES_BORDER = "touches border"
 MOSTLY_HIDDEN = "mostly hidden"
 POOR_FIT = "poor fit"
+UNSURE_MASK = "unsure mask"
 UNCERTAIN = "uncertain"
 TURNED_AWAY = "turned away"
 PLANE_BEHIND = "plane behind camera"  # or parallel to the center's ray
@@ -42,6 +43,9 @@ class LocalizeSettings(Settings):
     )
     min_visible_fraction: float = Field(
         default=0.7, ge=0, le=1, description="least visible part of a fish that counts, 0 to 1"
+    )
+    min_mask_confidence: float = Field(
+        default=0.7, ge=0, le=1, description="least certain mask that counts, where it was found"
     )
     max_length_std_ratio: float = Field(
         default=0.2, gt=0, description="least certain fit that counts, std of length over length"
@@ -216,6 +220,8 @@ def quality_refusal(shape: FittedShape, quality: CropQuality, settings: Localize
     checks = {
         TOUCHES_BORDER: settings.refuse_border and quality.touches_border,
         MOSTLY_HIDDEN: not quality.visible_fraction >= settings.min_visible_fraction,
+        UNSURE_MASK: quality.mask_confidence is not None
+        and not quality.mask_confidence >= settings.min_mask_confidence,
         POOR_FIT: not shape.iou >= settings.min_iou,
         UNCERTAIN: not 0 <= shape.length_std_ratio <= settings.max_length_std_ratio,
     }

@@ -1,4 +1,4 @@
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
@@ -16,12 +16,12 @@ from shapes import (
 )
 
 from nodes.fit_mesh import FitMesh
-from stream_dmr.camera import frame_from_crop
+from stream_dmr.camera import crop_from_frame, frame_from_crop
 from stream_dmr.fitting.fit import Fitter
 from stream_dmr.fitting.objective import Objective
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
-from stream_dmr.messages import SolverReport
+from stream_dmr.messages import FishEnds, SolverReport
 from stream_dmr.skinning import DEFORMATIONS, Rig, deform
 from stream_dmr.template import load_template
 
@@ -118,6 +118,28 @@ class TestFinds:
         fitted = fitter.fit(crop, near(flat, seed=seed)).mesh
         assert_found(fitted, flat, RIG, crop)
         assert not fitted.report.cold_start
+
+    def test_a_fish_from_cold_heads_where_the_segmenter_says(self):
+        """Also where it is wrong: it has seen the fish, the fit only its outline."""
+        flat = true_pose(3)
+        crop = crop_of(flat, RIG)
+        head, _, tail = true_keypoints_px(flat, RIG, crop)
+        in_crop = crop_from_frame(
+            np.stack([head, tail]), crop_camera=crop.crop_camera, frame_camera=FRAME_CAMERA
+        )
+        for (snout, fork), confidence, is_told in (
+            (in_crop, 0.99, False),
+            (in_crop[::-1], 0.99, True),
+            (in_crop[::-1], 0.6, False),
+        ):
+            ends = FishEnds(head_px=snout, tail_px=fork, confidence=confidence)
+            found = (
+                Fitter(TEMPLATE, FitMeshSettings())
+                .fit(replace(crop, ends=ends), None)
+                .mesh.shape.keypoints_px
+            )
+            is_turned = np.linalg.norm(found[0] - head) > np.linalg.norm(found[0] - tail)
+            assert is_turned == is_told
 
     def test_a_fish_from_cold_where_head_and_tail_were_taken_for_each_other(self):
         fitter = Fitter(TEMPLATE, FitMeshSettings(cold_below_iou=1.0))

@@ -7,7 +7,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.body import JOINT, ROOT, rest_vector
+from stream_dmr.camera import Camera
 from stream_dmr.fitting.target import Target
+from stream_dmr.messages import FishEnds
 from stream_dmr.template import Template
 
 # Total bends about the axis toward the camera, rad: straight, and both ways.
@@ -15,6 +17,7 @@ _BENDS_RAD = (-1.2, 0.0, 1.2)
 # Turns about the body's own axis, rad: the broad side, its mirror image, and a slant either way.
 _ROLLS_RAD = (0.0, np.pi, 0.9, -0.9)
 _FLIPS_RAD = (0.0, np.pi)  # which end is the head?
+_SURE_OF_HEAD = 0.9
 
 
 def cold_starts(target: Target, template: Template) -> Float[np.ndarray, "B P"]:
@@ -40,6 +43,17 @@ def cold_starts(target: Target, template: Template) -> Float[np.ndarray, "B P"]:
     joints = starts[:, ROOT:].reshape(len(bends), num_joints, JOINT)
     joints[:, :, :3] = np.linspace(-0.5, 0.5, num_joints)[:, None] * axis[:, None]
     return starts
+
+
+def agreeing(
+    starts: Float[np.ndarray, "B P"], ends: FishEnds | None, crop_camera: Camera
+) -> Float[np.ndarray, "A P"]:
+    """Those starts whose head is where a segmenter surely sees it; all of them where it doesn't."""
+    if ends is None or ends.confidence < _SURE_OF_HEAD:
+        return starts
+    head, tail = crop_camera.back_project(np.stack([ends.head_px, ends.tail_px]))[:, :2]
+    forward = Rotation.from_rotvec(starts[:, :3]).apply([-1.0, 0.0, 0.0])[:, :2]
+    return starts[forward @ (head - tail) > 0]
 
 
 def _moments(mask: Float[np.ndarray, "S S"]) -> tuple[Float[np.ndarray, "2"], float, float]:

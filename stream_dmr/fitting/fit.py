@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from stream_dmr.body import Body
 from stream_dmr.camera import frame_from_crop
-from stream_dmr.fitting.cold_start import cold_starts
+from stream_dmr.fitting.cold_start import agreeing, cold_starts
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.outline import project
@@ -64,6 +64,10 @@ class Fitter:
         self._solver = _make_solver(template, self._body, settings)
         self._scanner = SizeScanner(self._body, settings)
 
+    def target(self, crop: FishCrop) -> Target:
+        """What is fitted to of a crop."""
+        return Target.from_crop(crop, plane_normal=self._plane_normal)
+
     def fit(self, crop: FishCrop, warm: Float[np.ndarray, "P"] | None) -> Fit:
         """Fit the template to a crop's mask, starting from `best` of the frame before.
 
@@ -73,8 +77,8 @@ class Fitter:
         if refusal:
             return Fit(_message(crop, None, None, refusal), None)
         began = time.perf_counter_ns()
-        target = Target.from_crop(crop, plane_normal=self._plane_normal)
-        solution, is_cold = self._solve(target, warm)
+        target = self.target(crop)
+        solution, is_cold = self._solve(crop, target, warm)
         return self._answer(crop, target, solution, is_cold=is_cold, since_ns=began)
 
     def fit_many(
@@ -96,7 +100,7 @@ class Fitter:
         ]
 
         def answer(index: int, one: "Fitted") -> Fit:
-            target = Target.from_crop(crops[index], plane_normal=self._plane_normal)
+            target = self.target(crops[index])
             return self._answer(
                 crops[index], target, one.solution, is_cold=one.is_cold, since_ns=began
             )
@@ -157,7 +161,9 @@ class Fitter:
             return "mask fills the crop"  # it has no edge to fit to
         return "mask too small" if area < self._settings.min_mask_px else ""
 
-    def _solve(self, target: Target, warm: Float[np.ndarray, "P"] | None) -> tuple[Solution, bool]:
+    def _solve(
+        self, crop: FishCrop, target: Target, warm: Float[np.ndarray, "P"] | None
+    ) -> tuple[Solution, bool]:
         """The warm fit if it is good, else a cold one where that is clearly better."""
         solution = None
         if warm is not None:
@@ -165,7 +171,8 @@ class Fitter:
             solution = self._solver.refine(target, start)
             if solution.iou >= self._settings.cold_below_iou:
                 return solution, False
-        cold = self._solver.search(target, cold_starts(target, self._template))
+        starts = agreeing(cold_starts(target, self._template), crop.ends, crop.crop_camera)
+        cold = self._solver.search(target, starts)
         if solution is not None and solution.loss < cold.loss + _CLEAR_GAIN:
             return solution, False
         return cold, True

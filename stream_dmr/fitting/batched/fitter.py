@@ -13,7 +13,7 @@ from torch import Tensor
 from stream_dmr.fitting.batched.solver import BatchedSolver, Solutions
 from stream_dmr.fitting.batched.targets import Targets
 from stream_dmr.fitting.batched.warm_start import recentered
-from stream_dmr.fitting.cold_start import cold_starts
+from stream_dmr.fitting.cold_start import agreeing, cold_starts
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution
 from stream_dmr.fitting.target import Target
@@ -96,7 +96,9 @@ class BatchedFitter:
     def _cold_starts(self, crops: list[FishCrop]) -> Float[Tensor, "B S P"]:
         def starts(crop: FishCrop) -> Float[np.ndarray, "S P"]:
             target = Target.from_crop(crop, plane_normal=self._plane_normal)
-            return cold_starts(target, self._template)
+            found = cold_starts(target, self._template)
+            # As many for each: those that agree, again and again.
+            return np.resize(agreeing(found, crop.ends, crop.crop_camera), found.shape)
 
         with ThreadPoolExecutor() as pool:
             return self._solver.tensor(np.array(list(pool.map(starts, crops))))
