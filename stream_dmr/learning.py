@@ -91,7 +91,7 @@ def well_seen(
     for number, (crops, calibration) in enumerate(recordings):
         normal = None if calibration is None else calibration.plane.rotation[:, 2]
         fitter = Fitter(template, settings, plane_normal=normal)
-        warm: dict[int, Float[np.ndarray, P] | None] = {}
+        warm: dict[int, np.ndarray | None] = {}
         for crop in crops:
             mesh, warm[crop.track_id] = fitter.fit(crop, warm.get(crop.track_id))
             place = localize(mesh, settings=gates, calibration=calibration)

@@ -84,14 +84,26 @@ def _beside(calibration: Calibration) -> Calibration:
 def _sightings(
     left: Shot, right: Shot | None, first: Calibration, second: Calibration
 ) -> Iterator[Sighting]:
-    ours = dict(_crops(left, first, _CHAIN))
+    ours = dict(chain_crops(left, first))
     if right is None:
-        yield from (Sighting(crop, None) for crop in ours.values())
+        yield from (Sighting(_seen(crop), None) for crop in ours.values())
         return
     lefts, rights = dict(_crops(left, first, _STEREO)), dict(_crops(right, second, _STEREO))
     for track_id, crop in ours.items():
-        both = (lefts[track_id], rights[track_id]) if track_id in rights else None
-        yield Sighting(crop, both)
+        both = None
+        if track_id in rights:
+            both = _seen(lefts[track_id]), _seen(rights[track_id])
+        yield Sighting(_seen(crop), both)
+
+
+def _seen(crop: FishCrop) -> FishCrop:
+    """Without its picture, which no method looks at and which takes most of the memory."""
+    return replace(crop, image=None)
+
+
+def chain_crops(shot: Shot, calibration: Calibration) -> Iterator[tuple[int, FishCrop]]:
+    """Every fish of a frame by its track id, with its picture, as the chain cuts it out."""
+    yield from _crops(shot, calibration, _CHAIN)
 
 
 def _crops(
@@ -118,7 +130,7 @@ def _crops(
             settings=settings,
             segmenter=GrabCut(),  # not asked: the mask is given
         )
-        yield box.track_id, replace(crop, image=None)
+        yield box.track_id, crop
 
 
 def _corners(xywh_px: tuple[int, int, int, int]) -> Float[np.ndarray, "4"]:

@@ -68,18 +68,22 @@ def write(document: Path, text: str) -> None:
     document.write_text(f"{before}{BEGIN}\n\n{text}\n\n{END}{after}", encoding="utf-8")
 
 
+def worst_fish(rows: list[Fish], count: int) -> list[Fish]:
+    """Those that were measured worst."""
+    measured = [fish for fish in rows if fish.measured.length_mm is not None]
+    return sorted(measured, key=lambda fish: -abs(_error(fish)))[:count]
+
+
 def worst(rows: list[Fish], count: int = 5) -> list[str]:
-    """The fish that were measured worst, for who wants to look at them."""
-    errors = [
-        (fish.measured.length_mm / fish.truth_mm - 1, fish)
-        for fish in rows
-        if fish.measured.length_mm is not None
-    ]
-    errors.sort(key=lambda pair: -abs(pair[0]))
+    """The fish that were measured worst, for who wants to look at them: table1.worst."""
     return [
-        f"scene {fish.scene}, fish {fish.track_id}: {fish.truth_mm:.0f} mm, {100 * error:+.1f} %"
-        for error, fish in errors[:count]
+        f"scene {fish.scene}, fish {fish.track_id}: {fish.truth_mm:.0f} mm, {_error(fish):+.1%}"
+        for fish in worst_fish(rows, count)
     ]
+
+
+def _error(fish: Fish) -> float:
+    return (fish.measured.length_mm or 0.0) / fish.truth_mm - 1
 
 
 def plot(found: dict[str, Evaluation], folder: Path) -> None:

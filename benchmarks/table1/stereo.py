@@ -93,6 +93,7 @@ def _disparities(
     design = np.polynomial.legendre.legvander(2 * at - 1, len(_SHAPE_STDS))
     # A body as long as `arc` at depth 1 whose depth changes by a share of its length.
     precision = np.diag([0.0, *(middle * arc[-1] * np.array(_SHAPE_STDS)) ** -2.0])
+    solution = np.zeros(design.shape[1])
     for _ in range(_ROUNDS):
         informed = design.T * (weights / _MATCH_STD**2)
         solution = np.linalg.solve(informed @ design + precision, informed @ values)
