@@ -14,6 +14,7 @@ test: $(STAMP)  ## the tests of a few minutes
 
 test-slow: $(STAMP)  ## the long ones, and those on material outside the repository
 	$(BIN)/pytest -m "slow or scenes"
+	$(BIN)/pytest -n 2 --hypothesis-profile new
 
 bench: $(STAMP)  ## the fit beside other renderers, and the chain: docs/performance.md, six minutes
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[bench]' \

@@ -8,9 +8,11 @@ from jaxtyping import install_import_hook
 
 install_import_hook(["stream_dmr", "nodes"], "beartype.beartype")
 
-# Nothing is timed in tests: the first example pays for imports and compilers.
-settings.register_profile("untimed", deadline=None)
-settings.load_profile("untimed")
+# Nothing is timed in tests: the first example pays for imports and compilers. By default the same
+# examples come each time, so that a change is judged by itself; `make test-slow` draws new ones.
+settings.register_profile("same", deadline=None, derandomize=True)
+settings.register_profile("new", deadline=None)
+settings.load_profile("same")
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
