@@ -20,7 +20,13 @@ from stream_dmr.cli_learn import learn_template
 from stream_dmr.cli_recover import recover
 from stream_dmr.cli_replay import replay
 from stream_dmr.cli_report import report, review, verify
-from stream_dmr.cli_support import command_line, stop_on_signals, without_password
+from stream_dmr.cli_support import (
+    ConfigOption,
+    TemplateOption,
+    command_line,
+    stop_on_signals,
+    without_password,
+)
 from stream_dmr.cli_train import train
 from stream_dmr.cli_view import convert, view
 from stream_dmr.errors import UserError
@@ -103,12 +109,8 @@ def run_command(
         Path | None,
         typer.Option(help="Folder of %06d.png from 1; a pixel's value is the fish's id."),
     ] = None,
-    template: Annotated[
-        str, typer.Option(help="The species: halibut, cod, or a mesh with its TOML beside it.")
-    ] = "halibut",
-    config: Annotated[
-        Path | None, typer.Option(help="A config.toml; left-out settings keep their defaults.")
-    ] = None,
+    template: TemplateOption = "halibut",
+    config: ConfigOption = None,
     out: Annotated[
         Path | None,
         typer.Option(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from stream_dmr.cli_support import stop_on_signals
+from stream_dmr.cli_support import ConfigOption, TemplateOption, stop_on_signals
 
 if TYPE_CHECKING:
     from stream_dmr.batch.batch import Engine
@@ -48,12 +48,8 @@ def batch(
             min=0,
         ),
     ] = 20000,
-    template: Annotated[
-        str, typer.Option(help="The species: halibut, cod, or a mesh with its TOML beside it.")
-    ] = "halibut",
-    config: Annotated[
-        Path | None, typer.Option(help="A config.toml; left-out settings keep their defaults.")
-    ] = None,
+    template: TemplateOption = "halibut",
+    config: ConfigOption = None,
 ) -> None:
     """Measure every video of a manifest, each as `run` does; call it again to go on.
 

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +16,12 @@ import typer
 if TYPE_CHECKING:
     from stream_dmr.recording.part import Part
 
+TemplateOption = Annotated[
+    str, typer.Option(help="The species: halibut, cod, or a mesh with its TOML beside it.")
+]
+ConfigOption = Annotated[
+    Path | None, typer.Option(help="A config.toml; left-out settings keep their defaults.")
+]
 TimeOption = Annotated[
     str | None, typer.Option("--time", help="Only this time of capture, in s.", metavar="FROM:TO")
 ]

@@ -23,9 +23,8 @@ from stream_dmr.body import Body, rest_vector
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import TemplateError
 from stream_dmr.fitting.contour.deformation import KINDS
-from stream_dmr.fitting.contour.levenberg_marquardt import evaluate, minimise
+from stream_dmr.fitting.contour.levenberg_marquardt import NEAR, evaluate, minimise
 from stream_dmr.fitting.contour.normal_equations import prior_loss
-from stream_dmr.fitting.contour.size_scan import NEAR
 from stream_dmr.fitting.fit import Fitter
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
@@ -164,10 +163,9 @@ class _Crowd:
         self._kind = KINDS[settings.deformation]
         self._rest = rest_vector(len(template.joints))
         self._free = np.zeros(len(self._rest), np.bool_)
-        self._lambdas = settings.lambdas() * [1, 1, 1, 1, 0, 0]  # smoothness is of the mesh alone
+        self._lambdas = settings.rough_lambdas()
         self._priors = settings.priors()
-        # One nat of a frame in L_rec (see fitting.size_scanner); frames of a fish are much alike.
-        self._nat = settings.prior_weight * settings.edge_std_px**2 * _FRAMES_PER_FISH
+        self._nat = settings.nat * _FRAMES_PER_FISH  # frames of a fish are much alike
 
     def nats(self, vector: Float[np.ndarray, "W"]) -> float:
         """Negative log likelihood and prior of proportions; the poses follow."""

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from stream_dmr.body import Body, rest_vector
 from stream_dmr.fitting.contour.deformation import KINDS
-from stream_dmr.fitting.contour.levenberg_marquardt import minimise
-from stream_dmr.fitting.contour.size_scan import NEAR, SIZE, only_size, scan_sizes
+from stream_dmr.fitting.contour.levenberg_marquardt import NEAR, minimise
+from stream_dmr.fitting.contour.size_scan import SIZE, only_size, scan_sizes
 from stream_dmr.fitting.contour.solver import ContourSolver
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.size_scanner import SizeScanner, mean_and_std

@@ -238,7 +238,11 @@ def test_systemd_is_told_as_long_as_the_run_is_alive(
 def test_without_systemd_nothing_is_said(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     monkeypatch.delenv("WATCHDOG_USEC", raising=False)
-    Watchdog(lambda: True).close()
+    asked = []
+    watchdog = Watchdog(lambda: not asked.append(True))
+    watchdog._ended.wait(0.05)
+    watchdog.close()
+    assert not asked
 
 
 def test_the_log_is_json_and_says_nothing_too_often(

@@ -87,6 +87,19 @@ class FitMeshSettings(Settings):
             ]
         )
 
+    def rough_lambdas(self) -> Float[np.ndarray, "6"]:
+        """Those without the mesh's smoothness, which tells poses apart no better and is dear."""
+        return self.lambdas() * [1, 1, 1, 1, 0, 0]
+
+    @property
+    def nat(self) -> float:
+        """A nat of likelihood in L_rec.
+
+        With edges that are off by a pixel it is `prior_weight`, since the priors' halved squares
+        are nats by themselves. Rougher edges say less.
+        """
+        return self.prior_weight * self.edge_std_px**2
+
     def priors(self) -> Float[np.ndarray, "14"]:
         """Weights of the squares of the tilt, then of each joint's 13 parameters (stream_dmr.body).
 

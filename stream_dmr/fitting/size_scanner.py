@@ -12,8 +12,8 @@ from scipy.interpolate import PchipInterpolator
 
 from stream_dmr.body import Body, rest_vector
 from stream_dmr.fitting.contour.deformation import KINDS
-from stream_dmr.fitting.contour.levenberg_marquardt import EXHAUSTED, STOP_REASONS, minimise
-from stream_dmr.fitting.contour.size_scan import NEAR, SIZE, only_size, scan_sizes
+from stream_dmr.fitting.contour.levenberg_marquardt import EXHAUSTED, NEAR, STOP_REASONS, minimise
+from stream_dmr.fitting.contour.size_scan import SIZE, only_size, scan_sizes
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution
 from stream_dmr.fitting.target import Target
@@ -37,15 +37,10 @@ class SizeScanner:
         self._kind = KINDS[settings.deformation]
         self._rest = rest_vector(len(body.joints))
         self._lambdas, self._priors = settings.lambdas(), settings.priors()
-        # The mesh's smoothness tells sizes apart no better, and is dear.
-        self._rough_lambdas = self._lambdas * [1, 1, 1, 1, 0, 0]
+        self._rough_lambdas = settings.rough_lambdas()
 
     def expected(self, target: Target, best: Solution) -> tuple[Solution, float]:
-        """The fit at the expected size of the fish, and the std of the log of this size.
-
-        With edges that are off by a pixel, `prior_weight` in L_rec is one nat: the priors' halved
-        squares are nats by themselves. Rougher edges say less.
-        """
+        """The fit at the expected size of the fish, and the std of the log of this size."""
         fits, losses, rooms = scan_sizes(
             self._body,
             self._kind,
@@ -58,8 +53,7 @@ class SizeScanner:
             self._settings.scan_iterations,
             self._settings.tolerance,
         )
-        nat = self._settings.prior_weight * self._settings.edge_std_px**2
-        mean, std = mean_and_std(_OFFSETS, losses / nat + _ROOM * rooms)
+        mean, std = mean_and_std(_OFFSETS, losses / self._settings.nat + _ROOM * rooms)
         start = fits[np.argmin(np.abs(_OFFSETS - mean))]
         start[SIZE] = best.flat[SIZE] + mean
         return self._fit_of_this_size(target, start), std

@@ -5,7 +5,6 @@ at once and not in the middle of a run.
 """
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +16,7 @@ from stream_dmr.messages import Frame
 from stream_dmr.segmentation.detector import Candidate
 from stream_dmr.segmentation.letterbox import Letterbox
 from stream_dmr.segmentation.onnx_outputs import NUM_OUTPUTS, Layout, WrongShape, decode
+from stream_dmr.segmentation.onnx_session import open_session
 from stream_dmr.settings import Settings
 
 _SMALLEST_INPUT = 32
@@ -54,7 +54,7 @@ class OnnxDetector:
     def __init__(self, path: Path, settings: OnnxSettings) -> None:
         """Raises ModelError, with one line, for a file that is no usable detector."""
         self._path, self._settings = path, settings
-        self._session = _open(path)
+        self._session = open_session(path)
         self._input_name, self._input_size = self._read_input()
         if len(self._session.get_outputs()) != NUM_OUTPUTS[settings.onnx_layout]:
             raise self._refusal(
@@ -143,21 +143,3 @@ class OnnxDetector:
     def _refusal(self, expected: str, got: str, *, remedy: str = "") -> ModelError:
         remedy = remedy or "export it anew, or set [detect_fish] onnx_layout"
         return ModelError(f"{self._path}: expected {expected}, got {got}; {remedy}")
-
-
-def _open(path: Path) -> Any:
-    """The session of an ONNX file. Raises ModelError where there is none to be had."""
-    import onnxruntime  # 0.1 s that only those pay who have a model
-
-    if not path.is_file():
-        raise ModelError(f"{path}: expected a detector's ONNX file, found none; check the path")
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4  # our one line says it
-    options.intra_op_num_threads = 2  # the other stages want cores as well
-    try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's own are no subclasses of anything
-        reason = f"{error}".strip().splitlines()[0][:160]
-        raise ModelError(
-            f"{path}: expected an ONNX model, but it can't be loaded: {reason}"
-        ) from None

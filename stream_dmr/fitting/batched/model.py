@@ -76,9 +76,3 @@ class Model(NamedTuple):
     def joint_values(self, flat: Float[Tensor, "B P"]) -> Float[Tensor, "B J 13"]:
         """The parameters of the joints, of each joint a row."""
         return flat[:, ROOT:].unflatten(1, (-1, JOINT))
-
-    def double(self) -> "Model":
-        """In float64."""
-        parts = self._asdict().items()
-        real = {k: v.double() for k, v in parts if isinstance(v, Tensor) and v.is_floating_point()}
-        return self._replace(**real)

@@ -14,7 +14,8 @@ from stream_dmr.fitting.batched.model import Model
 from stream_dmr.fitting.batched.normal_equations import prior_loss
 from stream_dmr.fitting.batched.solutions import Solutions
 from stream_dmr.fitting.batched.targets import Targets
-from stream_dmr.fitting.contour.solver import _FAR, _NEAR, _NUM_FINISHED, _ROUNDS, mirror
+from stream_dmr.fitting.contour.levenberg_marquardt import FAR, NEAR
+from stream_dmr.fitting.contour.solver import _NUM_FINISHED, _ROUNDS, mirror
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution
 from stream_dmr.fitting.target import Target
@@ -42,7 +43,7 @@ class BatchedSolver:
         self.model = Model.from_body(body, settings, **self._kind)
         self._mirror = self.tensor(mirror(np.ones(len(self.model.rest))))
         # The mesh's smoothness tells starts apart no better.
-        self._rough_lambdas = self.model.lambdas * self.tensor([1, 1, 1, 1, 0, 0])
+        self._rough_lambdas = self.tensor(settings.rough_lambdas())
 
     @property
     def dtype(self) -> torch.dtype:
@@ -91,7 +92,7 @@ class BatchedSolver:
                 flats.flatten(0, 1),
                 self._rough_lambdas,
                 iterations=iterations,
-                damping=_FAR,
+                damping=FAR,
             )
             flats = _ordered(rough.flat.view_as(flats), rough.loss.view(flats.shape[:2]))
         for column in range(min(_NUM_FINISHED, flats.shape[1])):
@@ -112,7 +113,7 @@ class BatchedSolver:
     def _finished(self, targets: Targets, which: Tensor, starts: Tensor) -> Solutions:
         most = self._settings.contour_iterations
         return self._minimised(
-            targets, which, starts, self.model.lambdas, iterations=most, damping=_NEAR
+            targets, which, starts, self.model.lambdas, iterations=most, damping=NEAR
         )
 
     def _minimised(
@@ -141,14 +142,14 @@ class BatchedSolver:
 
     def _losses(self, targets: Targets, which: Tensor, flats: Tensor) -> Tensor:
         parts = []
-        for some in self.chunks(targets, len(flats)):
+        for some in self._chunks(targets, len(flats)):
             chosen = targets.select(which[some])
             found = evaluate(self.model, chosen, flats[some], self._rough_lambdas)
             rough = found.terms @ self._rough_lambdas
             parts.append(rough + prior_loss(self.model, chosen, flats[some]))
         return torch.cat(parts)
 
-    def chunks(self, targets: Targets, count: int) -> Iterator[slice]:
+    def _chunks(self, targets: Targets, count: int) -> Iterator[slice]:
         """As many fits at a time as memory allows."""
         step = self.room(targets)
         return (slice(first, first + step) for first in range(0, count, step))

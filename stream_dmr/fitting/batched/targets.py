@@ -94,10 +94,6 @@ class Targets(NamedTuple):
         """Some of them, in a new order."""
         return Targets(*(part[index] for part in self))
 
-    def double(self) -> "Targets":
-        """In float64."""
-        return Targets(*(part.double() for part in self))
-
 
 def _padded(contours: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> dict[str, np.ndarray]:
     most = max(len(points) for points, _, _ in contours)

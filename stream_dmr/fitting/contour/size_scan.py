@@ -4,6 +4,7 @@ import numpy as np
 
 from stream_dmr.fitting.compiled import compiled
 from stream_dmr.fitting.contour.levenberg_marquardt import (
+    NEAR,
     evaluate,
     factorise,
     hold,
@@ -12,7 +13,6 @@ from stream_dmr.fitting.contour.levenberg_marquardt import (
 from stream_dmr.fitting.contour.normal_equations import normal_equations
 
 SIZE = 5  # the root's log scale, of the parameters
-NEAR = 1e-2  # damping of a fit that begins near its answer
 # In L_rec: a fit that a neighbour's pose would better by so much has been left behind by it.
 _LEFT_BEHIND = 0.003
 
@@ -30,14 +30,15 @@ def scan_sizes(body, kind, target, lambdas, priors, start, rest, offsets, iterat
     held = only_size(len(start))
     fits, losses = np.empty((count, len(start))), np.empty(count)
     middle = np.argmin(np.abs(offsets))
+    pose = start
     for way in range(2):
-        pose = start
-        for n in range(middle, count) if way == 0 else range(middle, -1, -1):
+        for n in range(middle, count) if way == 0 else range(middle - 1, -1, -1):
             pose, losses[n] = _fit_at(
                 start[SIZE] + offsets[n],
                 body, kind, target, lambdas, priors, pose, rest, held, iterations, tolerance,
             )  # fmt: skip
             fits[n] = pose
+        pose = fits[middle]
     pose = fits[0]
     for n in range(1, count):
         other, loss = _fit_at(

@@ -6,6 +6,8 @@ from jaxtyping import Float
 from stream_dmr.body import JOINT, ROOT, Body, rest_vector
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import (
+    FAR,
+    NEAR,
     SETTLED,
     STOP_REASONS,
     STUCK,
@@ -20,8 +22,6 @@ from stream_dmr.fitting.target import Target
 # Of a search: iterations of a round, and how many starts go into it at the most.
 _ROUNDS = ((2, 24), (4, 12))
 _NUM_FINISHED = 2
-# Damping at the start: near the answer the model is trusted, far from it less.
-_NEAR, _FAR = 1e-2, 1e-1
 
 
 class ContourSolver:
@@ -33,8 +33,7 @@ class ContourSolver:
         self._kind = KINDS[settings.deformation]
         self._rest = rest_vector(len(body.joints))
         self._lambdas, self._priors = settings.lambdas(), settings.priors()
-        # The mesh's smoothness tells starts apart no better, and is dear.
-        self._rough_lambdas = self._lambdas * [1, 1, 1, 1, 0, 0]
+        self._rough_lambdas = settings.rough_lambdas()
 
     def refine(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
         """From one start near the answer, and from its mirror image where that is more likely."""
@@ -47,7 +46,7 @@ class ContourSolver:
 
     def _finish(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
         most = self._settings.contour_iterations
-        return self._minimise(target, start, self._lambdas, iterations=most, damping=_NEAR)
+        return self._minimise(target, start, self._lambdas, iterations=most, damping=NEAR)
 
     def _prior_loss(self, target: Target, flat: Float[np.ndarray, "P"]) -> float:
         return prior_loss(target, flat, self._rest, self._priors)
@@ -73,7 +72,7 @@ class ContourSolver:
 
     def _rough(self, target: Target, start: Float[np.ndarray, "P"], iterations: int) -> Solution:
         return self._minimise(
-            target, start, self._rough_lambdas, iterations=iterations, damping=_FAR
+            target, start, self._rough_lambdas, iterations=iterations, damping=FAR
         )
 
     def _minimise(
