@@ -7,6 +7,7 @@ import argparse
 import json
 import shutil
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -20,7 +21,6 @@ def main() -> None:
     for name, count in (("kills", 300), ("cuts", 300), ("losses", 200), ("mutants", 2000)):
         parser.add_argument(f"--{name}", type=int, default=count)
     parser.add_argument("--kill-minutes", type=float, default=1e9, help="as many as fit")
-    parser.add_argument("--scene", type=Path, default=ROOT / "recordings" / "demo")
     asked = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="faults-"))
     if asked.cuts:
@@ -42,10 +42,7 @@ def main() -> None:
     if asked.kills:
         from kills import kills
 
-        show(
-            "kill -9",
-            kills(folder / "kills", asked.scene, count=asked.kills, minutes=asked.kill_minutes),
-        )
+        show("kill -9", kills(folder / "kills", count=asked.kills, minutes=asked.kill_minutes))
     shutil.rmtree(folder)
 
 
@@ -57,7 +54,7 @@ def grey_pictures(folder: Path) -> Path:
     return folder
 
 
-def show(name: str, figures: dict[str, object]) -> None:
+def show(name: str, figures: Mapping[str, object]) -> None:
     """A line of JSON a test."""
     print(json.dumps({"test": name} | figures), flush=True)
 

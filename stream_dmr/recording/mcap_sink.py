@@ -52,9 +52,10 @@ Extras = Sequence[ExtraTopics]
 class McapSink:
     """Writes every record, with the capture time as its log time.
 
-    A flush comes with the first record that is `flush_s` of wall clock after the last flush. A
-    full disk ends the recording: the file keeps its whole chunks and is closed without an index,
-    which readers do without; where not even that has room, it stays behind as `.part`.
+    A flush comes with the first record that is `flush_s` of wall clock after the last flush; in a
+    segment also of capture time, of which more passes while a stall is made up for. A full disk
+    ends the recording: the file keeps its whole chunks and is closed without an index, which
+    readers do without; where not even that has room, it stays behind as `.part`.
     """
 
     def __init__(
@@ -75,6 +76,8 @@ class McapSink:
                 f"stream-dmr recover {path.parent}"
             )
         self._flush_ns = int(flush_s * 1e9)
+        self._is_segment = number is not None
+        self._last_ns = 0  # the latest capture time
         self._channels: dict[type, int] = {}
         self._carried_channel = 0
         self._extras, self._extra_channels = extras, dict[str, int]()
@@ -88,7 +91,7 @@ class McapSink:
         try:
             sync_path(path.parent)
             self._writer = _start(self._file, header, number)
-            self._register_topics(is_segment=number is not None)
+            self._register_topics()
             self._flush()
         except OSError as error:
             self._file.close()
@@ -112,7 +115,8 @@ class McapSink:
             for topic, drawn in chain.from_iterable(e.draw(record) for e in self._extras):
                 channel = self._extra_channels[topic]
                 self._add(channel, timestamp_ns, drawn.SerializeToString())
-            if time.monotonic_ns() >= self._flush_at_ns:
+            self._last_ns = max(self._last_ns, timestamp_ns)
+            if self._is_flush_due():
                 self._flush()
 
     def carry(self, records: Iterable[Record]) -> None:
@@ -156,21 +160,26 @@ class McapSink:
         first, last = self._spans.get(track_id, (timestamp_ns, timestamp_ns))
         self._spans[track_id] = min(first, timestamp_ns), max(last, timestamp_ns)
 
-    def _register_topics(self, *, is_segment: bool) -> None:
+    def _register_topics(self) -> None:
         for kind, row in TOPICS.items():
             schema = self._writer.register_schema(row.schema, "protobuf", schema_bytes())
             self._channels[kind] = self._writer.register_channel(row.topic, "protobuf", schema)
-            if is_segment and kind is LocalizedFish:
+            if self._is_segment and kind is LocalizedFish:
                 self._carried_channel = self._writer.register_channel(CARRIED, "protobuf", schema)
         for topic, kind in chain.from_iterable(e.topics.items() for e in self._extras):
             schema = register_schema(self._writer, kind)
             channel = self._writer.register_channel(topic, "protobuf", schema)
             self._extra_channels[topic] = channel
 
+    def _is_flush_due(self) -> bool:
+        is_late = self._is_segment and self._last_ns >= self._flush_at_capture_ns
+        return is_late or time.monotonic_ns() >= self._flush_at_ns
+
     def _flush(self) -> None:
         self._writer.flush()
         self._file.sync()
         self._flush_at_ns = time.monotonic_ns() + self._flush_ns
+        self._flush_at_capture_ns = self._last_ns + self._flush_ns
 
     def _end(self) -> None:
         self._file.sync()
