@@ -30,9 +30,12 @@ def main() -> None:
         figures = power_cuts_of_recordings(folder / "power-recording", count=asked.cuts)
         show("power cuts of recordings", figures)
     if asked.losses:
-        from losses import losses
+        from losses import losses, restarts
 
-        show("camera losses", losses(grey_pictures(folder / "grey"), count=asked.losses))
+        restarted = asked.losses // 6  # one of six kinds
+        show("timestamps back at 0", restarts(folder / "restarts", count=restarted))
+        figures = losses(grey_pictures(folder / "grey"), count=asked.losses - restarted)
+        show("camera losses", figures)
     if asked.mutants:
         from fuzz import fuzz
 
