@@ -43,8 +43,7 @@ def batch(
     piece_frames: Annotated[
         int,
         typer.Option(
-            help="Longer videos with boxes or masks are measured in pieces of so many frames; "
-            "0: never.",
+            help="Longer videos are measured in pieces of so many frames; 0: never.",
             min=0,
         ),
     ] = 20000,

@@ -27,8 +27,9 @@ from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.retention import Retention
 from stream_dmr.recording.segments import open_segments
 from stream_dmr.run_folder import RESULTS, SEGMENTED, consistent_csv, prepare_folder
-from stream_dmr.segmentation.fish_finder import open_finder
+from stream_dmr.segmentation.fish_finder import FishFinder, open_finder
 from stream_dmr.segmentation.only import Only, OnlyFish, OnlyFrames
+from stream_dmr.segmentation.sightings import SightedFish
 from stream_dmr.store import LengthStore, flagged_fish
 from stream_dmr.tally import Observer, Tally, run_facts
 from stream_dmr.template import Template, load_template
@@ -81,15 +82,9 @@ def run(
     config = load_config(request.config)
     template = load_template(request.template)
     calibration = None if request.calibration is None else load_calibration(request.calibration)
-    detections = open_finder(
-        boxes=request.boxes,
-        masks=request.masks,
-        detect=config.detect_fish,
-        track=config.track_fish,
-    )
+    detections = _finder(request, config)
     reader: ReadFrames | OnlyFrames = ReadFrames(request.source, config.read_frames)
     if request.only is not None:
-        detections = OnlyFish(detections, request.only)
         reader = OnlyFrames(reader, request.only)
     try:
         if calibration is not None:
@@ -189,6 +184,19 @@ def resume(nodes: Sequence[Node], left: Iterable[LocalizedFish]) -> None:
     """Let a chain's last node finish what an earlier recording left of fish in view."""
     for fish in left:
         nodes[-1].step(fish)
+
+
+def _finder(request: RunRequest, config: Config) -> FishFinder:
+    if request.only is not None and request.only.sightings is not None:
+        finder: FishFinder = SightedFish(request.only.sightings)
+    else:
+        finder = open_finder(
+            boxes=request.boxes,
+            masks=request.masks,
+            detect=config.detect_fish,
+            track=config.track_fish,
+        )
+    return finder if request.only is None else OnlyFish(finder, request.only)
 
 
 def _header(

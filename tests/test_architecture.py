@@ -21,6 +21,7 @@ NODES = [CropFish, FitMesh, Localize, SmoothLength]
 # Who assembles and shows a run; everything else is the library, and knows no nodes.
 ASSEMBLY = [
     "stream_dmr.run",
+    "stream_dmr.scout",
     "stream_dmr.display",
     "stream_dmr.cli",
     "stream_dmr.demo",
@@ -36,9 +37,11 @@ FLOORS = [
     ["nodes"],
     [f"stream_dmr.watch.{name}" for name in ("state", "metrics", "picture", "server", "watch")],
     ["stream_dmr.run", "stream_dmr.report.report"],
+    ["stream_dmr.scout"],
     ["stream_dmr.batch.dataset", "stream_dmr.batch.job"],
     [f"stream_dmr.batch.{name}" for name in ("worker", "local", "ray_engine")],
-    ["stream_dmr.batch.pieces"],
+    ["stream_dmr.batch.pieces", "stream_dmr.batch.stitch"],
+    ["stream_dmr.batch.video"],
     ["stream_dmr.batch.batch"],
     [f"stream_dmr.review.{name}" for name in ("corrected", "judge", "server")],
     ["stream_dmr.replay.replay"],

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -301,7 +302,7 @@ def test_pieces_make_the_tables_of_the_whole(tmp_path: Path, timeout_s: float, p
     run(request(clip, tmp_path / "alone"), stop=threading.Event())
     manifest = write_manifest(tmp_path / "manifest.csv", row())
     (job,) = read_manifest(manifest, config=config, template=str(clip / "tiny.ply"))
-    pieces = pieces_of(job, piece_frames)
+    pieces = pieces_of(job, piece_frames, tmp_path)
     assert len(pieces) >= 2
     assert sorted(i for piece in pieces for i in piece.tracks) == [1, 2, 3, 4]
     out = tmp_path / "out"
@@ -312,8 +313,56 @@ def test_pieces_make_the_tables_of_the_whole(tmp_path: Path, timeout_s: float, p
     assert_same_tables(folder, tmp_path / "alone")
     assert verify(folder)[0] == []
     assert [path.name for path in (out / "videos").iterdir()] == ["video"]
+    assert list((out / "pieces").iterdir()) == []
     fish = dataset.dataset(out / "dataset" / "fish", partitioning="hive").to_table()
     assert fish.num_rows == 4
+
+
+@pytest.fixture(scope="module")
+def unnamed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Job]:
+    """A clip whose boxes don't say which fish they are, and what `run` makes of it."""
+    folder = tmp_path_factory.mktemp("unnamed")
+    clip = folder / "clip"
+    write_clip(clip, fish=COMING_AND_GOING)
+    lines = [line.split(",") for line in (clip / "boxes.txt").read_text().splitlines()]
+    (clip / "boxes.txt").write_text("".join(f"{a},-1,{','.join(c)}\n" for a, _, *c in lines))
+    config = clip / "quick.toml"
+    text = config.read_text().replace("[crop_fish]", '[crop_fish]\nsegmenter = "grabcut"')
+    text += "\n[smooth_length]\ntrack_timeout_s = 0.25\nmax_std_ratio = 1e9\n"
+    config.write_text(text + "\n[track_fish]\nmin_track_frames = 2\nmin_mask_confidence = 0.0\n")
+    run(
+        request(clip, folder / "alone", masks=None, boxes=clip / "boxes.txt"),
+        stop=threading.Event(),
+    )
+    manifest = write_manifest(folder / "m.csv", row(masks="", boxes="clip/boxes.txt"))
+    (job,) = read_manifest(manifest, config=config, template=str(clip / "tiny.ply"))
+    return folder, job
+
+
+def test_fish_that_nobody_named_are_found_once_and_measured_in_pieces(
+    unnamed: tuple[Path, Job], tmp_path: Path
+):
+    folder, job = unnamed
+    assert len(rows(folder / "alone" / "lengths.csv")) >= 3
+    (scout,) = pieces_of(job, 5, tmp_path)
+    assert scout.piece == "scout"
+    assert do_job(scout, tmp_path).num_frames == len(COMING_AND_GOING)
+    pieces = pieces_of(job, 5, tmp_path)
+    assert len(pieces) >= 2
+    assert sum(piece.share for piece in [scout, *pieces]) == pytest.approx(1.0)
+    summary = batch([job], tmp_path, ThisProcess(), piece_frames=5, stop=threading.Event())
+    assert [one.status for one in summary.outcomes] == ["done"]
+    assert_same_tables(folder_of(job, tmp_path), folder / "alone")
+    assert list((tmp_path / "pieces").iterdir()) == []
+
+
+def test_what_the_scout_cannot_read_fails_alone(unnamed: tuple[Path, Job], tmp_path: Path):
+    """Scout and pieces in one batch, beside a video whose calibration is wrong."""
+    _, job = unnamed
+    broken = replace(job, name="broken", calibration=str(tmp_path / "none.yaml"))
+    summary = batch([broken, job], tmp_path, ThisProcess(), piece_frames=5, stop=threading.Event())
+    assert [one.status for one in summary.outcomes] == ["failed", "done"]
+    assert "none.yaml" in rows(tmp_path / "videos.csv")[0]["reason"]
 
 
 def test_pieces_that_are_done_are_kept(tmp_path: Path):
@@ -322,7 +371,7 @@ def test_pieces_that_are_done_are_kept(tmp_path: Path):
     manifest = write_manifest(tmp_path / "manifest.csv", row())
     (job,) = read_manifest(manifest, config=clip / "quick.toml", template=str(clip / "tiny.ply"))
     out = tmp_path / "out"
-    first = pieces_of(job, 9)[0]
+    first = pieces_of(job, 9, out)[0]
     do_job(first, out)
     before = (folder_of(first, out) / "recording.mcap").stat().st_ino
     summary = batch([job], out, ThisProcess(), piece_frames=9, stop=threading.Event())
@@ -331,9 +380,7 @@ def test_pieces_that_are_done_are_kept(tmp_path: Path):
 
 
 def test_what_says_not_which_fish_it_is_stays_whole(season: Path, tmp_path: Path):
-    (job,) = jobs_of(season, tmp_path, row(masks=""))
-    assert pieces_of(job, 2) == [job]
     (job,) = jobs_of(season, tmp_path, row(masks="none"))
-    assert pieces_of(job, 2) == [job]
+    assert pieces_of(job, 2, tmp_path) == [job]
     (job,) = jobs_of(season, tmp_path, row())
-    assert pieces_of(job, 100) == [job]
+    assert pieces_of(job, 100, tmp_path) == [job]

@@ -4,21 +4,22 @@ import csv
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from stream_dmr.batch.dataset import publish, withdraw_others
-from stream_dmr.batch.job import DONE, FAILED, Outcome, finish, folder_of, outcome_of
+from stream_dmr.batch.job import DONE, SCOUT, Outcome, finish, folder_of, outcome_of, part_of
 from stream_dmr.batch.manifest import Job
-from stream_dmr.batch.pieces import pieces_of, stitch
 from stream_dmr.batch.progress import Clock
+from stream_dmr.batch.video import Video
 from stream_dmr.errors import OutputError
-from stream_dmr.recording.whole_file import make_folder
+from stream_dmr.recording.whole_file import make_folder, writing_to
 from stream_dmr.store import require_free
 
+_ROUNDS = 2  # scouts and all that needs none, then what they make possible
 _DYING_S = 10.0  # how long a killed process may still hold its folder
 _TABLE = (
     *("name", "video", "vessel", "trip", "haul"),
@@ -63,75 +64,109 @@ def batch(
     make_folder(out / "videos")
     _drop_parts(out)
     began = time.perf_counter()
-    over = {job.name: outcome_of(job, out) for job in jobs}
-    outcomes = {name: one for name, one in over.items() if one and one.status == DONE}
-    num_before = len(outcomes)
-    for job in jobs:
-        if job.name in outcomes:
-            publish(folder_of(job, out), job, out)
-    todo = [job for job in jobs if job.name not in outcomes]
-    videos = [Video(job, out, piece_frames) for job in todo]
-    clock = Clock([piece for video in videos for piece in video.pieces], say)
-    owners = {piece.name: video for video in videos for piece in video.pieces}
-    for video in videos:
-        for name in video.done:
-            clock.over(name)
-    waiting = [piece for video in videos for piece in video.missing]
-    over = chain(
-        [piece for video in videos for piece in video.done.values()],
-        engine.outcomes(waiting, out, stop=stop, clock=clock),
-    )
-    for piece in over:
-        clock.over(piece.name)
-        outcome = owners[piece.name].take(piece)
-        if outcome is None:
-            continue
-        job = owners[piece.name].job
-        outcomes[job.name] = outcome
-        if outcome.status == DONE:
-            publish(folder_of(job, out), job, out)
-        else:
-            _keep_failure(job, out, outcome)
-            say(f"{outcome.name}: failed: {outcome.reason}")
-        _write_outcomes(jobs, outcomes, out)
-    done = [job for job in jobs if job.name in outcomes and outcomes[job.name].status == DONE]
-    withdraw_others(done, out)
-    _write_outcomes(jobs, outcomes, out)
+    ledger = _Ledger(jobs, out, say)
+    num_before = len(ledger.outcomes)
+    videos = {
+        job.name: Video(job, out, piece_frames) for job in jobs if job.name not in ledger.outcomes
+    }
+    clock = Clock([video.job for video in videos.values()], say)
+    for video in videos.values():
+        _note(video, clock, ledger)
+        for piece in video.done():
+            clock.of(piece)(1.0)
+    clock.begin()
+    for _ in range(_ROUNDS):
+        for name, piece in _measured(videos.values(), engine, out, stop=stop, clock=clock):
+            videos[name].take(piece)
+            _note(videos[name], clock, ledger)
+    ledger.close()
     return BatchSummary(
-        outcomes=[outcomes[job.name] for job in jobs if job.name in outcomes],
+        outcomes=[ledger.outcomes[job.name] for job in jobs if job.name in ledger.outcomes],
         num_before=num_before,
         elapsed_s=time.perf_counter() - began,
     )
 
 
-class Video:
-    """A video on its way: in one piece, or in some."""
+def _measured(
+    videos: Iterable[Video],
+    engine: Engine,
+    out: Path,
+    *,
+    stop: threading.Event,
+    clock: Clock,
+) -> Iterator[tuple[str, Outcome]]:
+    """What became of the pieces that can be done now, with the names of their videos.
 
-    def __init__(self, job: Job, out: Path, piece_frames: int) -> None:
-        self.job = job
-        self._out = out
-        self.pieces = pieces_of(job, piece_frames) if piece_frames else [job]
-        self.done: dict[str, Outcome] = {}  # pieces of an earlier batch
-        for piece in self.pieces if len(self.pieces) > 1 else ():
-            outcome = outcome_of(piece, out)
-            if outcome is not None and outcome.status == DONE:
-                self.done[piece.name] = outcome
-        self.missing = [piece for piece in self.pieces if piece.name not in self.done]
-        self._left = {piece.name for piece in self.pieces}
+    Those come first that others wait for.
+    """
+    todo = [piece for video in videos for piece in video.todo()]
+    todo.sort(key=lambda piece: piece.piece != SCOUT)
+    names = {piece.label: piece.name for piece in todo}
+    if todo and not stop.is_set():
+        for outcome in engine.outcomes(todo, out, stop=stop, clock=clock):
+            yield names[outcome.name], outcome
 
-    def take(self, piece: Outcome) -> Outcome | None:
-        """What became of the video, once that is certain by what became of a piece."""
-        if len(self.pieces) == 1:
-            return replace(piece, name=self.job.name, key=self.job.key)
-        self._left.discard(piece.name)
-        if piece.status != DONE:
-            return Outcome(name=self.job.name, key=self.job.key, status=FAILED, reason=piece.reason)
-        return None if self._left else stitch(self.job, self.pieces, self._out)
+
+def _note(video: Video, clock: Clock, ledger: "_Ledger") -> None:
+    if video.outcome is not None:
+        clock.over(video.job.name)
+        ledger.write(video.job, video.outcome)
+
+
+class _Ledger:
+    """What is known of all videos: in videos.csv, and the data set of those that are done."""
+
+    def __init__(self, jobs: Sequence[Job], out: Path, say: Callable[[str], None]) -> None:
+        """Starts with what earlier batches have done."""
+        self._jobs, self._out, self._say = jobs, out, say
+        known = {job.name: outcome_of(job, out) for job in jobs}
+        self.outcomes = {name: one for name, one in known.items() if one and one.status == DONE}
+        for job in self._done():
+            publish(folder_of(job, out), job, out)
+        self._write()
+
+    def write(self, job: Job, outcome: Outcome) -> None:
+        """Take note of what became of a video."""
+        self.outcomes[job.name] = outcome
+        if outcome.status == DONE:
+            publish(folder_of(job, self._out), job, self._out)
+        else:
+            _keep_failure(job, self._out, outcome)
+            self._say(f"{outcome.name}: failed: {outcome.reason}")
+        self._write()
+
+    def close(self) -> None:
+        """Drop from the data set what is of no finished video."""
+        withdraw_others(self._done(), self._out)
+        self._write()
+
+    def _done(self) -> list[Job]:
+        outcomes = self.outcomes
+        return [j for j in self._jobs if j.name in outcomes and outcomes[j.name].status == DONE]
+
+    def _write(self) -> None:
+        """videos.csv: a row a video, in the order of the manifest."""
+        target = self._out / "videos.csv"
+        draft = target.with_suffix(".csv.part")
+        with writing_to(target):
+            with draft.open("w", newline="", encoding="utf-8") as file:
+                writer = csv.writer(file, lineterminator="\n")
+                writer.writerow(_TABLE)
+                for job in self._jobs:
+                    origin = (job.name, job.video, job.vessel, job.trip, job.haul)
+                    writer.writerow(origin + _result(self.outcomes.get(job.name)))
+            draft.replace(target)
+
+
+def _result(one: Outcome | None) -> tuple[object, ...]:
+    if one is None:
+        return ("waiting", "", "", "", "")
+    return (one.status, one.reason, one.num_frames, one.num_fish, one.elapsed_s)
 
 
 def _drop_parts(out: Path) -> None:
     """Remove what a kill left half done. OutputError where another batch is at it."""
-    for part in (out / "videos").glob("*.part"):
+    for part in chain(out.glob("videos/*.part"), out.glob("pieces/*/*.part")):
         until = time.monotonic() + _DYING_S
         while True:
             try:
@@ -146,29 +181,7 @@ def _drop_parts(out: Path) -> None:
 
 def _keep_failure(job: Job, out: Path, outcome: Outcome) -> None:
     """Also where the process that failed could write nothing."""
-    folder = folder_of(job, out)
     if outcome_of(job, out) is None:
-        part = folder.with_name(f"{folder.name}.part")
+        part = part_of(job, out)
         shutil.rmtree(part, ignore_errors=True)
-        finish(part, folder, outcome)
-
-
-def _write_outcomes(jobs: Sequence[Job], outcomes: dict[str, Outcome], out: Path) -> None:
-    """videos.csv: a row a video, in the order of the manifest."""
-    draft = out / "videos.csv.part"
-    try:
-        with draft.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(_TABLE)
-            for job in jobs:
-                one = outcomes.get(job.name)
-                origin = (job.name, job.video, job.vessel, job.trip, job.haul)
-                result = (
-                    ("waiting", "", "", "", "")
-                    if one is None
-                    else (one.status, one.reason, one.num_frames, one.num_fish, one.elapsed_s)
-                )
-                writer.writerow(origin + result)
-        draft.replace(out / "videos.csv")
-    except OSError as error:
-        raise OutputError(f"{out}: expected a folder to write to, got: {error.strerror}") from error
+        finish(part, folder_of(job, out), outcome)

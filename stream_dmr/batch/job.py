@@ -14,11 +14,13 @@ from stream_dmr.batch.progress import Progress
 from stream_dmr.errors import UserError
 from stream_dmr.recording.whole_file import rename_durably
 from stream_dmr.run import RunRequest, run
+from stream_dmr.scout import SIGHTINGS, scout
 from stream_dmr.segmentation.only import Only
 from stream_dmr.tally import Observer
 
 OUTCOME = "outcome.json"
 DONE, FAILED = "done", "failed"
+SCOUT = "scout"  # the piece of a raw video that finds out where its fish are
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +38,18 @@ class Outcome:
 
 def folder_of(job: Job, out: Path) -> Path:
     """Where the results of a job are, once it is over."""
-    return out / "videos" / job.name
+    return pieces_folder(job, out) / job.piece if job.piece else out / "videos" / job.name
+
+
+def pieces_folder(job: Job, out: Path) -> Path:
+    """Where the pieces of a video are until they are put together."""
+    return out / "pieces" / job.name
+
+
+def part_of(job: Job, out: Path) -> Path:
+    """Where they are until then."""
+    folder = folder_of(job, out)
+    return folder.with_name(f"{folder.name}.part")
 
 
 def outcome_of(job: Job, out: Path) -> Outcome | None:
@@ -50,34 +63,42 @@ def outcome_of(job: Job, out: Path) -> Outcome | None:
 
 
 def do_job(job: Job, out: Path, *, on_progress: Progress = lambda share: None) -> Outcome:
-    """Measure a video into its folder below `out`.
+    """Measure a video, or a piece of one, into its folder below `out`.
 
     All is done in a folder of another name, which gets its own only at the end: a job that is
     killed leaves nothing that looks done. What is wrong with the video is the outcome.
     """
-    folder = folder_of(job, out)
-    part = folder.with_name(f"{folder.name}.part")
+    folder, part = folder_of(job, out), part_of(job, out)
     began, key = time.perf_counter(), job.key
     part.parent.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(part, ignore_errors=True)
     try:
-        summary = run(
-            request_of(job, part), stop=threading.Event(), observer=_Ticker(job, on_progress)
-        )
-        write_tables(part, job)
+        num_frames, num_fish = _work(job, part, _Ticker(job, on_progress))
         outcome = Outcome(
-            name=job.name,
+            name=job.label,
             key=key,
             status=DONE,
-            num_frames=summary.num_frames,
-            num_fish=len(summary.fish),
+            num_frames=num_frames,
+            num_fish=num_fish,
             elapsed_s=round(time.perf_counter() - began, 3),
         )
     except UserError as error:
         shutil.rmtree(part, ignore_errors=True)
-        outcome = Outcome(name=job.name, key=key, status=FAILED, reason=str(error))
+        outcome = Outcome(name=job.label, key=key, status=FAILED, reason=str(error))
     finish(part, folder, outcome)
     return outcome
+
+
+def _work(job: Job, part: Path, observer: Observer) -> tuple[int, int]:
+    """Frames and fish of what was measured."""
+    request = request_of(job, part)
+    if job.piece == SCOUT:
+        part.mkdir()
+        return scout(request, part / SIGHTINGS, observer=observer), 0
+    summary = run(request, stop=threading.Event(), observer=observer)
+    if not job.piece:  # tables are for whole videos
+        write_tables(part, job)
+    return summary.num_frames, len(summary.fish)
 
 
 def finish(part: Path, folder: Path, outcome: Outcome) -> None:
@@ -109,7 +130,12 @@ def request_of(job: Job, out: Path) -> RunRequest:
         vessel=job.vessel,
         trip=job.trip,
         haul=job.haul,
-        only=Only(first=job.first_frame, last=job.last_frame, tracks=frozenset(job.tracks))
+        only=Only(
+            first=job.first_frame,
+            last=job.last_frame,
+            tracks=frozenset(job.tracks),
+            sightings=path(job.sightings),
+        )
         if job.tracks
         else None,
     )

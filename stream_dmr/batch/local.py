@@ -98,9 +98,11 @@ class _Worker:
                 break
             on_progress(float(line))
         if is_over:
-            return outcome_of(job, self._out)
+            return outcome_of(job, self._out) or _failed(job, "its files changed meanwhile")
         code = self._end()
-        return None if self._stop.is_set() else self._broken(job, code)
+        if self._stop.is_set():
+            return None
+        return _failed(job, f"its process ended ({code}): {self._last_words()}")
 
     def _start(self) -> subprocess.Popen[str]:
         self._errors.truncate(0)
@@ -123,9 +125,11 @@ class _Worker:
             pass
         return process.returncode
 
-    def _broken(self, job: Job, code: int) -> Outcome:
+    def _last_words(self) -> str:
         size = self._errors.seek(0, os.SEEK_END)
         self._errors.seek(max(0, size - _MOST_SAID))
-        said = " ".join(self._errors.read().decode(errors="replace").split())
-        reason = f"its process ended ({code}): {said}"
-        return Outcome(name=job.name, key=job.key, status=FAILED, reason=reason)
+        return " ".join(self._errors.read().decode(errors="replace").split())
+
+
+def _failed(job: Job, reason: str) -> Outcome:
+    return Outcome(name=job.label, key=job.key, status=FAILED, reason=reason)

@@ -8,11 +8,13 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 from stream_dmr import __version__
 from stream_dmr.errors import UserError
 
 COLUMNS = ("video", "calibration", "boxes", "masks", "vessel", "trip", "haul")
+_FILES = COLUMNS[:4]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,10 +31,17 @@ class Job:
     haul: str = ""
     config: str = ""
     template: str = "halibut"
-    tracks: Sequence[int] = ()  # of a piece of the video: the fish that are measured
+    piece: str = ""  # of the video, where this is one; see `pieces`
+    sightings: str = ""  # where the fish of a piece are, as its video's scout noted
+    tracks: Sequence[int] = ()  # the fish that a piece measures
     first_frame: int = 0
     last_frame: int = 0
     share: float = 1.0  # of the work that the whole video is
+
+    @property
+    def label(self) -> str:
+        """Unlike that of any other video, and of any other piece."""
+        return f"{self.name}/{self.piece}" if self.piece else self.name
 
     @property
     def key(self) -> str:
@@ -45,10 +54,10 @@ class Job:
         return sha256(json.dumps(made_of).encode()).hexdigest()
 
     @property
-    def num_bytes(self) -> float:
+    def num_bytes(self) -> int:
         """Of the video: by these the time left is estimated."""
         path = Path(self.video)
-        return self.share * path.stat().st_size if path.is_file() else 0.0
+        return path.stat().st_size if path.is_file() else 0
 
 
 def read_manifest(path: Path, *, config: Path | None, template: str) -> list[Job]:
@@ -57,53 +66,46 @@ def read_manifest(path: Path, *, config: Path | None, template: str) -> list[Job
     Raises UserError where it can't be read or lacks its columns. Files that it names are not
     looked at here: a missing one is the failure of its own row.
     """
+    rows = _rows(path)
+    names = _names([row["video"] or "" for row in rows])
+    mesh = template if not Path(template).is_file() else str(Path(template).resolve())
+    shared = {"config": "" if config is None else str(config.resolve()), "template": mesh}
+    jobs, home = [], path.resolve().parent
+    for number, (row, name) in enumerate(zip(rows, names, strict=True), start=2):
+        if not row["video"] or None in row:
+            raise UserError(f"{path}, line {number}: expected {len(COLUMNS)} cells with a video")
+        cells = {key: (row[key] or "").strip() for key in COLUMNS}
+        files = {key: str(home / cells[key]) for key in _FILES if cells[key]}
+        values: dict[str, Any] = cells | files | shared
+        jobs.append(Job(name=name, **values))
+    return jobs
+
+
+def _rows(path: Path) -> list[dict[str | None, str | None]]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
-            rows = list(reader)
-            columns = reader.fieldnames or []
+            rows, columns = list(reader), reader.fieldnames or []
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(f"{path}: expected a manifest as CSV in UTF-8, got: {error}") from error
-    missing = [name for name in COLUMNS if name not in columns]
-    unknown = [name for name in columns if name not in COLUMNS]
-    if missing or unknown:
+    if sorted(columns) != sorted(COLUMNS):
         raise UserError(
             f"{path}: expected the columns {','.join(COLUMNS)}, got {','.join(columns) or 'none'}"
         )
     if not rows:
         raise UserError(f"{path}: expected a row for each video, got none")
-    names = _names([row["video"] or "" for row in rows])
-    home = path.resolve().parent
-    mesh = template if not Path(template).is_file() else str(Path(template).resolve())
-    jobs = []
-    for number, (row, name) in enumerate(zip(rows, names, strict=True), start=2):
-        if not row["video"] or None in row:
-            raise UserError(f"{path}, line {number}: expected {len(COLUMNS)} cells with a video")
-        files = {key: str(home / row[key]) if row[key] else "" for key in COLUMNS[:4]}
-        origin = {key: (row[key] or "").strip() for key in COLUMNS[4:]}
-        jobs.append(
-            Job(
-                name=name,
-                video=files["video"],
-                calibration=files["calibration"],
-                boxes=files["boxes"],
-                masks=files["masks"],
-                vessel=origin["vessel"],
-                trip=origin["trip"],
-                haul=origin["haul"],
-                config="" if config is None else str(config.resolve()),
-                template=mesh,
-            )
-        )
-    return jobs
+    return rows
 
 
 def _names(videos: list[str]) -> list[str]:
-    """A folder's name for each: that of the video, and a number where it comes again."""
+    """A folder's name for each: that of the video, and a number where it comes again.
+
+    None ends like the folder of a video that is being measured.
+    """
     stems = [re.sub(r"[^A-Za-z0-9._-]+", "-", Path(v).stem).strip("-.") or "video" for v in videos]
     seen, names, taken = Counter[str](), list[str](), set[str]()
     for stem in stems:
-        name = stem
+        name = stem = stem.removesuffix(".part") or "video"
         while name in taken:
             seen[stem] += 1
             name = f"{stem}-{seen[stem] + 1}"

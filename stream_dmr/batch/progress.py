@@ -1,34 +1,42 @@
 """How far a batch is, and how long it will take."""
 
 import time
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 
 from stream_dmr.batch.manifest import Job
 
 _SAY_S = 5.0  # between two lines of progress
-Progress = Callable[[float], None]  # gets the share of one video that is done, 0 to 1
+Progress = Callable[[float], None]  # gets the share of one job that is done, 0 to 1
 
 
 class Clock:
     """Progress over all videos by their bytes, with an estimate of the time left."""
 
-    def __init__(self, jobs: Sequence[Job], say: Callable[[str], None]) -> None:
-        self._weights = {job.name: max(1.0, job.num_bytes) for job in jobs}
-        self._shares = dict.fromkeys(self._weights, 0.0)
+    def __init__(self, videos: Sequence[Job], say: Callable[[str], None]) -> None:
+        self._bytes = {job.name: max(1, job.num_bytes) for job in videos}
+        self._shares = {name: defaultdict[str, float](float) for name in self._bytes}  # by piece
+        self._over = set[str]()
         self._say = say
-        self._began = self._said = time.monotonic()
+        self._began = time.monotonic()
+        self._said = self._began
+        self._before = 0.0  # share that was done when it began
 
     def of(self, job: Job) -> Progress:
-        """What takes the shares of one job."""
+        """What takes the shares of one job, which may be a piece of a video."""
 
         def take(share: float) -> None:
-            self._shares[job.name] = share
+            self._shares[job.name][job.piece] = job.share * share
 
         return take
 
+    def begin(self) -> None:
+        """All that is over so far was over before; the pace is that of what comes now."""
+        self._before, self._began = self._share(), time.monotonic()
+
     def over(self, name: str) -> None:
-        """One is over, well or not."""
-        self._shares[name] = 1.0
+        """A video is over, well or not."""
+        self._over.add(name)
         self._said = -_SAY_S
 
     def pause(self) -> None:
@@ -40,11 +48,18 @@ class Clock:
 
     def line(self, elapsed_s: float) -> str:
         """Videos over, the share of all bytes, and the time left at this pace."""
-        total = sum(self._weights.values())
-        share = sum(self._weights[name] * done for name, done in self._shares.items()) / total
-        over = sum(done == 1.0 for done in self._shares.values())
-        left = duration(elapsed_s * (1 - share) / share) if share > 0 else "unknown"
-        return f"{over} of {len(self._shares)} videos, {100 * share:.0f} %, time left: {left}"
+        share = self._share()
+        made = share - self._before
+        left = duration(elapsed_s * (1 - share) / made) if made > 0 else "unknown"
+        over = len(self._over)
+        return f"{over} of {len(self._bytes)} videos, {100 * share:.0f} %, time left: {left}"
+
+    def _share(self) -> float:
+        done = (
+            size * (1.0 if name in self._over else sum(list(self._shares[name].values())))
+            for name, size in self._bytes.items()
+        )
+        return sum(done) / sum(self._bytes.values())
 
 
 def duration(seconds: float) -> str:

@@ -68,7 +68,7 @@ class RayEngine:
             return Outcome(**self._ray.get(task))
         except self._ray.exceptions.RayError as error:
             last = str(error).strip().splitlines()[-1]
-            return Outcome(name=job.name, key=job.key, status=FAILED, reason=f"on Ray: {last}")
+            return Outcome(name=job.label, key=job.key, status=FAILED, reason=f"on Ray: {last}")
 
 
 def measure(job: dict[str, Any], out: str) -> dict[str, Any]:

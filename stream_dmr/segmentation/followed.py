@@ -34,6 +34,10 @@ class FollowedFish:
             for sighting in self._tracker.step(frame, self._detector.find(frame))
         ]
 
+    def fish(self, number: int) -> int | None:
+        """The id of the fish that a track is; None while it doesn't count as one."""
+        return self._counter.counted(number)
+
     def admit(self, crops: Iterable[FishCrop]) -> list[FishCrop]:
         """The crops of those tracks that count as fish by now, by the fish's ids."""
         known = [(self._counter.track_id(crop), crop) for crop in crops]

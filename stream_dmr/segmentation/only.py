@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from stream_dmr.messages import FishCrop, Frame
@@ -17,6 +18,7 @@ class Only:
     first: int  # frame
     last: int  # frame, included
     tracks: frozenset[int]
+    sightings: Path | None = None  # of a scout, where no files say where the fish are
 
 
 @runtime_checkable
