@@ -9,7 +9,8 @@ from stream_dmr.messages import LengthEstimate
 from stream_dmr.recording.codec import decode
 from stream_dmr.recording.opened import open_recordings
 from stream_dmr.recording.recover import recover
-from stream_dmr.store import NAME, LengthStore, read_estimates, require_free
+from stream_dmr.store import NAME, LengthStore, require_free
+from stream_dmr.store_rows import read_estimates
 from stream_dmr.store_schema import open_database
 from stream_dmr.tables import write_lengths
 from stream_dmr.tally import run_facts

@@ -12,7 +12,8 @@ from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.recording.opened import Recording, messages
 from stream_dmr.recording.part import WHOLE, Part
-from stream_dmr.store import NAME, RunFacts, read_estimates
+from stream_dmr.store import NAME, RunFacts
+from stream_dmr.store_rows import read_estimates
 from stream_dmr.store_schema import open_database
 from stream_dmr.tally import run_facts
 from stream_dmr.verdicts import NOTHING_SAID, Review, read_verdicts, reviews

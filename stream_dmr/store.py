@@ -5,22 +5,20 @@ FULL. It also holds what a restart must not use again: track ids, frame numbers 
 """
 
 import fcntl
-import json
 import os
 import sqlite3
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from threading import RLock
 from uuid import uuid4
 
-import numpy as np
-
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate
-from stream_dmr.store_schema import FISH_COLUMNS, MARK_EVERY_NS, open_database
+from stream_dmr.store_rows import fish_row, read_estimates
+from stream_dmr.store_schema import MARK_EVERY_NS, DiskRefusal, copy_in_memory, open_database
 
 NAME = "lengths.db"
 _BALLAST = "lengths.reserve"  # room that is given up when the disk is full, so that lengths fit
@@ -53,6 +51,7 @@ class Marks:
     track_id: int = 0
     frame_index: int = 0
     timestamp_ns: int = 0
+    written: int = 0  # statements, by which a commit that failed tells whether it did
 
 
 class LengthStore:
@@ -62,8 +61,11 @@ class LengthStore:
     `trouble` says so meanwhile, and `close` raises OutputError if it never got there.
     """
 
-    def __init__(self, out_dir: Path, facts: RunFacts) -> None:
-        """Raises OutputError where another run writes there or the file can't be used."""
+    def __init__(self, out_dir: Path, facts: RunFacts, *, waits: bool = False) -> None:
+        """Raises OutputError where another run writes there or the file can't be used.
+
+        With `waits` not where the disk refuses it: then all waits in memory from the start.
+        """
         self.path = out_dir / NAME
         self.run_id = uuid4().hex
         self.trouble = ""  # why the last row could not be written; "" when all are
@@ -74,13 +76,13 @@ class LengthStore:
         self._clip: tuple[str, int] | None = None  # in work, and its frames done
         self._folder = _lock_folder(out_dir)
         try:
-            self._database = open_database(self.path)
-            self.before = Marks(**dict(self._database.execute("SELECT name, value FROM marks")))
-            self._begin_run()
+            self._database, self._is_reached = self._open(waits=waits)
+            self._is_stand_in = not self._is_reached
+            self.before = self._handed_out = _marks(self._database)
+            self._begin_run(waits=waits)
         except BaseException:
             os.close(self._folder)
             raise
-        self._handed_out = self.before
         self._marked_at_ns = time.monotonic_ns()
         _set_aside(self._ballast)
 
@@ -156,7 +158,7 @@ class LengthStore:
 
     def estimates(self) -> list[LengthEstimate]:
         """All finished fish of this folder, in the order in which their tracks ended."""
-        with self._lock:
+        with self._lock, _refusing(self.path):
             return list(read_estimates(self._database))
 
     def close(self) -> None:
@@ -176,19 +178,37 @@ class LengthStore:
                 f"{self.trouble}; the recording has them: make room and run stream-dmr recover"
             )
 
-    def _begin_run(self) -> None:
+    def _open(self, *, waits: bool) -> tuple[sqlite3.Connection, bool]:
+        """The file, or with `waits` a copy of it in memory, and which."""
+        try:
+            return open_database(self.path), True
+        except DiskRefusal as error:
+            if not waits:
+                raise
+            self.trouble = str(error)
+        self._give_up_ballast()
+        with suppress(DiskRefusal):
+            return open_database(self.path), True
+        return copy_in_memory(self.path), False
+
+    def _begin_run(self, *, waits: bool) -> None:
         values = {"run_id": self.run_id, "started_ns": time.time_ns()}
         values |= {field.name: getattr(self._facts, field.name) for field in fields(self._facts)}
         marks = ", ".join("?" for _ in values)
-        with _refusing(self.path):
-            self._database.execute(
-                f"INSERT INTO runs ({', '.join(values)}) VALUES ({marks})", tuple(values.values())
-            )
+        statement = f"INSERT INTO runs ({', '.join(values)}) VALUES ({marks})"
+        self._pending.append((statement, tuple(values.values())))
+        if self._is_reached:
+            self._write_pending()
+            if self.trouble and not waits:
+                raise OutputError(
+                    f"{self.path}: expected a database of lengths to write to, got: "
+                    f"{self.trouble}; make room, or choose another --out"
+                )
 
     def _mark(self, **marks: int) -> None:
         with self._lock:
-            now = {field.name: getattr(self._handed_out, field.name) for field in fields(Marks)}
-            self._handed_out = Marks(**{n: max(v, marks.get(n, v)) for n, v in now.items()})
+            higher = {n: max(v, getattr(self._handed_out, n)) for n, v in marks.items()}
+            self._handed_out = replace(self._handed_out, **higher)
             self._write_pending()
 
     def _write(self, statement: str, *values: object) -> None:
@@ -200,63 +220,50 @@ class LengthStore:
         """Commit all that waits; where that fails, give up the ballast and try once more."""
         for is_last in (False, True):
             try:
-                with _transaction(self._database):
-                    for statement, values in self._pending:
-                        self._database.execute(statement, values)
-                    if self._clip is not None:
-                        self._database.execute(_CLIP, (*self._clip, 0))
-                    for field in fields(Marks):
-                        mark = field.name, getattr(self._handed_out, field.name)
-                        self._database.execute(_MARK, mark)
-                self._pending.clear()
-                self.trouble = ""
+                self._reach_file()
+                self._commit()
                 return
             except sqlite3.IntegrityError:  # a fish that is there already: our own mistake
                 raise
-            except sqlite3.Error as error:
+            except (sqlite3.Error, OutputError) as error:
                 self.trouble = str(error)
+            self._is_reached = False
             if not is_last:
-                self._make_room()
+                self._give_up_ballast()
 
-    def _make_room(self) -> None:
+    def _commit(self) -> None:
+        marks = replace(self._handed_out, written=self._handed_out.written + len(self._pending))
+        with _transaction(self._database):
+            for statement, values in self._pending:
+                self._database.execute(statement, values)
+            if self._clip is not None:
+                self._database.execute(_CLIP, (*self._clip, 0))
+            for field in fields(marks):
+                self._database.execute(_MARK, (field.name, getattr(marks, field.name)))
+        self._handed_out = marks
+        self._pending.clear()
+        self.trouble = ""
+
+    def _reach_file(self) -> None:
+        """Open the file anew after trouble; what was committed in spite of it waits no more."""
+        if self._is_reached:
+            return
+        if not self._is_stand_in:
+            self._database.close()  # SQLite may hold on to a state of the file that never was
+        fresh = open_database(self.path)
+        self._database.close()
+        self._database, self._is_reached, self._is_stand_in = fresh, True, False
+        written = _marks(fresh).written
+        del self._pending[: max(0, written - self._handed_out.written)]
+        self._handed_out = replace(self._handed_out, written=written)
+
+    def _give_up_ballast(self) -> None:
         with suppress(OSError):
             self._ballast.unlink(missing_ok=True)
-        # After an I/O error SQLite may hold on to a state of the file that never was.
-        with suppress(sqlite3.Error, OutputError):
-            self._database.close()
-            self._database = open_database(self.path)
 
 
-def fish_row(estimate: LengthEstimate, flags: Sequence[str]) -> dict[str, object]:
-    """The columns of a final estimate."""
-    low, high = (None, None) if estimate.ci95_mm is None else estimate.ci95_mm.tolist()
-    row = {name: getattr(estimate, name) for name in FISH_COLUMNS}
-    return row | {
-        "ci95_low_mm": low,
-        "ci95_high_mm": high,
-        "refused": json.dumps(dict(estimate.refused)),
-        "flags": json.dumps(list(flags)),
-    }
-
-
-def read_estimates(database: sqlite3.Connection) -> Iterator[LengthEstimate]:
-    """The finished fish as they were, but for the smoothed series, which the recordings have."""
-    names = [*FISH_COLUMNS, "ci95_low_mm", "ci95_high_mm", "refused"]
-    for values in database.execute(f"SELECT {', '.join(names)} FROM fish ORDER BY number"):
-        row = dict(zip(names, values, strict=True))
-        ends = row.pop("ci95_low_mm"), row.pop("ci95_high_mm")
-        yield LengthEstimate(
-            **row | {"refused": json.loads(row["refused"])},
-            ci95_mm=None if ends[0] is None else np.array(ends),
-            timestamp_ns=row["last_timestamp_ns"],
-            frame_index=row["last_frame"],
-            is_final=True,
-            is_frame_used=False,
-            frame_reason="",
-            smoothed_frames=np.zeros(0, np.int64),
-            smoothed_mm=np.zeros(0),
-            smoothed_std_mm=np.zeros(0),
-        )
+def _marks(database: sqlite3.Connection) -> Marks:
+    return Marks(**dict(database.execute("SELECT name, value FROM marks")))
 
 
 @contextmanager
@@ -287,7 +294,11 @@ def flagged_fish(out_dir: Path) -> set[int]:
     path = out_dir / NAME
     if not path.exists():
         return set()
-    with _refusing(path), closing(open_database(path, read_only=True)) as database:
+    try:
+        database = open_database(path, read_only=True)
+    except DiskRefusal:  # a full disk has no room for SQLite's own files
+        database = copy_in_memory(path)
+    with _refusing(path), closing(database):
         rows = database.execute("SELECT track_id FROM fish WHERE flags != '[]'")
         return {track_id for (track_id,) in rows}
 

@@ -1,6 +1,7 @@
 """The tables of lengths.db, and how a file of them is opened."""
 
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 from stream_dmr.errors import OutputError
@@ -9,6 +10,9 @@ VERSION = 1  # PRAGMA user_version
 APPLICATION_ID = 0x646D726C  # "dmrl": what `file` and other programs may know it by
 MARK_EVERY_NS = 5_000_000_000  # how much of the capture times a crash may leave unmarked
 _PATIENCE_S = 5.0  # for a reader that holds the file
+_DISK_ERRORS = {
+    *(sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
+}
 
 FISH_COLUMNS = [
     *("track_id", "length_mm", "length_std_mm", "frames_seen", "frames_used", "first_frame"),
@@ -61,10 +65,15 @@ CREATE TABLE events (
 """
 
 
+class DiskRefusal(OutputError):
+    """The disk doesn't let a database be used now; nothing says that it is damaged."""
+
+
 def open_database(path: Path, *, read_only: bool = False) -> sqlite3.Connection:
     """Open a lengths.db, making its tables where there are none; usable from any one thread.
 
-    Raises OutputError where the file is no such database, damaged, or of a newer version.
+    Raises OutputError where the file is no such database, damaged, or of a newer version, and
+    DiskRefusal where it is the disk that refuses.
     """
     mode = "ro" if read_only else "rwc"
     try:
@@ -83,11 +92,39 @@ def open_database(path: Path, *, read_only: bool = False) -> sqlite3.Connection:
             database.close()
             raise
     except sqlite3.Error as error:
-        raise OutputError(
-            f"{path}: expected a database of lengths, got: {error}; move it away to begin a new "
-            "one, or choose another --out"
-        ) from error
+        raise _refusal(path, error) from error
     return database
+
+
+def copy_in_memory(path: Path) -> sqlite3.Connection:
+    """What a lengths.db holds, for reading, where the disk has no room for SQLite's own files.
+
+    Nobody else may have it open. Raises OutputError where it can't be read or is damaged.
+    """
+    memory = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
+    try:
+        if path.exists() and path.stat().st_size > 0:
+            address = f"{path.absolute().as_uri()}?mode=rw"
+            with closing(sqlite3.connect(address, uri=True, isolation_level=None)) as file:
+                file.execute("PRAGMA locking_mode = EXCLUSIVE")  # the log's index, in memory
+                file.backup(memory)
+            _check(memory, path)
+        _prepare(memory)
+    except BaseException as error:
+        memory.close()
+        if isinstance(error, (OSError, sqlite3.Error)):
+            raise _refusal(path, error) from error
+        raise
+    return memory
+
+
+def _refusal(path: Path, error: sqlite3.Error | OSError) -> OutputError:
+    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_IOERR) & 0xFF  # the rest says more
+    kind = DiskRefusal if code in _DISK_ERRORS else OutputError
+    return kind(
+        f"{path}: expected a database of lengths, got: {error}; move it away to begin a new one, "
+        "or choose another --out"
+    )
 
 
 def _check(database: sqlite3.Connection, path: Path) -> None:

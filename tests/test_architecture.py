@@ -69,7 +69,7 @@ WHO_KNOWS = {
     ],
     "prometheus_client": ["stream_dmr.watch"],
     "sqlite3": [
-        *("stream_dmr.store", "stream_dmr.store_schema"),
+        *("stream_dmr.store", "stream_dmr.store_rows", "stream_dmr.store_schema"),
         *("stream_dmr.results", "stream_dmr.verdicts"),
     ],
     "filterpy": ["stream_dmr.length_filter", "stream_dmr.segmentation"],

@@ -16,7 +16,7 @@ from tiny_clip import draw_mask, draw_picture, write_clip
 from stream_dmr.config import load_config, to_toml
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish
 from stream_dmr.run import RESULTS, Observer, RunRequest, run
-from stream_dmr.store import read_estimates
+from stream_dmr.store_rows import read_estimates
 from stream_dmr.store_schema import open_database
 from stream_dmr.tables import lengths_row
 

@@ -25,11 +25,11 @@ def write_small_scene(folder: Path) -> Path:
     return folder
 
 
-def write_crossing_fish(path: Path, *, num_frames: int = NUM_FRAMES) -> None:
+def write_crossing_fish(path: Path, *, num_frames: int = NUM_FRAMES, fps: int = 15) -> None:
     """The video alone; a name that ends in .ts makes it an MPEG transport stream."""
     grains = np.random.default_rng(0).integers(120, 220, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     ground = cv2.GaussianBlur(grains, (5, 5), 0)
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 15, (WIDTH, HEIGHT))
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (WIDTH, HEIGHT))
     for k in range(num_frames):
         picture = ground.copy()
         if k % _PERIOD < _CROSSING:

@@ -1,0 +1,114 @@
+"""One run over a folder of clips whose writes fail as a case says, and what is left of it."""
+
+import csv
+import ctypes
+import shutil
+import sqlite3
+import threading
+from pathlib import Path
+
+import cv2
+from failing_writes import FAILING_FRAMES, Case
+from kills import messages, unreadable_ones
+from measured import QUICK
+from small_scene import write_crossing_fish, write_small_scene
+
+from stream_dmr.errors import OutputError
+from stream_dmr.messages import Frame
+from stream_dmr.recording.recover import recover
+from stream_dmr.run import RunRequest, run
+from stream_dmr.tally import Observer
+
+_FPS = 5  # of capture time: a new segment is tried again 5 s after one that failed
+_CONFIG = QUICK.replace("[watch]\nport = {port}\n", "[read_frames]\nclips_wait_s = 0.1\n")
+_FOLDER = Path()
+_LIBRARY = ctypes.CDLL(None)
+_LIBRARY.disturb_writes.argtypes = [ctypes.c_char_p, ctypes.c_long, ctypes.c_long, ctypes.c_int]
+
+
+def prepare(folder: Path) -> None:
+    """Write the clip and what belongs to it."""
+    global _FOLDER  # what the forks share
+    _FOLDER = folder
+    cv2.setNumThreads(1)  # a pool of threads would not live on in a fork
+    write_small_scene(folder / "scene")
+    (folder / "clips").mkdir()
+    write_crossing_fish(folder / "clips" / "1.mp4", num_frames=80, fps=_FPS)
+    config = _CONFIG.replace("track_timeout_s = 0.8", "track_timeout_s = 2.4")
+    (folder / "config.toml").write_text(config)
+
+
+class Healing(Observer):
+    """Lets writes work again after some frames."""
+
+    def __init__(self, case: Case) -> None:
+        self.lines: list[str] = []
+        self._frames_left = FAILING_FRAMES if case.mode == "for a while" else -1
+
+    def warn(self, line: str) -> None:  # noqa: D102
+        self.lines.append(line)
+
+    def frame_done(self) -> None:  # noqa: D102
+        self._frames_left -= 1
+        if self._frames_left == 0:
+            _LIBRARY.disturb_writes(bytes(_FOLDER / "out"), 1, 0, 0)
+
+
+def measure(case: Case) -> dict:
+    """Run it, with these writes failing; what came of it."""
+    out, scene = _FOLDER / "out", _FOLDER / "scene"
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir()
+    request = RunRequest(
+        source=str(_FOLDER / "clips"),
+        out=out,
+        calibration=scene / "calibration.yaml",
+        template=str(scene / "species.ply"),
+        config=_FOLDER / "config.toml",
+    )
+    count = {"once": 1}.get(case.mode, 1 << 40) if case.at else 0
+    observer, refused, num_frames = Healing(case), "", 0
+    _LIBRARY.disturb_writes(bytes(out), case.at, count, case.error)
+    try:
+        num_frames = run(request, stop=threading.Event(), observer=observer).num_frames
+    except OutputError as error:
+        refused = str(error)
+    writes = _LIBRARY.disturb_seen()
+    _LIBRARY.disturb_writes(bytes(out), 1, 0, 0)
+    parts = [path.name for path in out.glob("*.part*")]
+    list(recover(out))
+    return {
+        "writes": writes,
+        "refused": refused,
+        "num_frames": num_frames,
+        "fish": stored(out),
+        "rows": exported(out),
+        "parts": parts,
+        "unreadable": unreadable_ones(out, set()),
+        "recorded": max((frame.frame_index for frame in messages(out, Frame)), default=0),
+        "said": "; ".join([refused, *dict.fromkeys(observer.lines), *parts])[:900],
+    }
+
+
+def stored(out: Path) -> list[list[object]]:
+    """Ids and lengths in lengths.db."""
+    database = sqlite3.connect(out / "lengths.db")
+    try:
+        rows = database.execute("SELECT track_id, round(length_mm, 3) FROM fish ORDER BY number")
+        return [[*row] for row in rows]
+    except sqlite3.Error:  # nothing could ever be written
+        return []
+    finally:
+        database.close()
+
+
+def exported(out: Path) -> list[list[object]]:
+    """The same by lengths.csv."""
+    path = out / "lengths.csv"
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return [
+            [int(row["track_id"]), round(float(row["length_mm"]), 3)]
+            for row in csv.DictReader(file)
+        ]
