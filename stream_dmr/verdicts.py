@@ -7,9 +7,9 @@ decision, the last species, and the last correction; `withdraw` takes back all b
 import os
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 from stream_dmr.errors import OutputError, UserError
@@ -17,6 +17,7 @@ from stream_dmr.store_schema import open_database
 
 KINDS = ("accept", "reject", "duplicate", "species", "correct", "withdraw")
 DECISIONS = KINDS[:3]
+Ends = tuple[tuple[float, float], tuple[float, float]]  # head and tail, frame pixels
 _TABLE = """
 CREATE TABLE IF NOT EXISTS verdicts (
     number INTEGER PRIMARY KEY,
@@ -53,6 +54,16 @@ class Verdict:
     length_std_mm: float | None = None
     written_ns: int = 0
 
+    @property
+    def moved(self) -> dict[int, Ends]:
+        """The points of a correction, by their frame."""
+        head_u, head_v, tail_u, tail_v = self.head_u, self.head_v, self.tail_u, self.tail_v
+        if self.frame_index is None or head_u is None or head_v is None:
+            return {}
+        if tail_u is None or tail_v is None:
+            return {}
+        return {self.frame_index: ((head_u, head_v), (tail_u, tail_v))}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Review:
@@ -64,6 +75,7 @@ class Review:
     species: str = ""
     length_mm: float | None = None  # as corrected
     length_std_mm: float | None = None
+    moved: Mapping[int, Ends] = field(default_factory=dict)  # by frame: where it was corrected
     reviewer: str = ""  # the last one
     written_ns: int = 0
 
@@ -77,7 +89,8 @@ class Review:
                 return replace(self, species=verdict.species, **signed)
             case "correct":
                 lengths = {"length_mm": verdict.length_mm, "length_std_mm": verdict.length_std_mm}
-                return replace(self, **lengths, **signed)
+                moved = {**self.moved, **verdict.moved}
+                return replace(self, **lengths, moved=moved, **signed)
             case _:
                 said = {"reason": verdict.reason, "duplicate_of": verdict.duplicate_of}
                 return replace(self, decision=verdict.kind, **said, **signed)
@@ -125,17 +138,6 @@ def read_verdicts(path: Path) -> list[Verdict]:
         names = [field.name for field in fields(Verdict)]
         rows = database.execute(f"SELECT {', '.join(names)} FROM verdicts ORDER BY number")
         return [Verdict(**dict(zip(names, row, strict=True))) for row in rows]
-
-
-def corrections(verdicts: list[Verdict], track_id: int) -> dict[int, Verdict]:
-    """The corrections of a fish that hold: the last one of each frame, since it was taken back."""
-    held: dict[int, Verdict] = {}
-    for verdict in verdicts:
-        if verdict.track_id == track_id and verdict.kind == "withdraw":
-            held.clear()
-        elif verdict.track_id == track_id and verdict.frame_index is not None:
-            held[verdict.frame_index] = verdict
-    return held
 
 
 def reviews(verdicts: list[Verdict]) -> dict[int, Review]:

@@ -1,10 +1,15 @@
 """A page opened in headless Chromium, with a script run in it."""
 
+import base64
+import fcntl
 import html
 import json
+import os
 import re
+import select
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -58,3 +63,95 @@ def dump(address: str) -> str:
     command = [chromium(), *FLAGS, "--window-size=1400,1000", "--virtual-time-budget=20000"]
     command += ["--dump-dom", address]
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+
+
+# Chromium reads from file descriptor 3 and writes to 4.
+_ON_3_AND_4 = """
+import os, sys
+os.dup2(int(sys.argv[1]), 3)
+os.dup2(int(sys.argv[2]), 4)
+os.execv(sys.argv[3], sys.argv[3:])
+"""
+
+
+class Tab:
+    """A page of headless Chromium, driven from outside as by a hand: real mouse, real fingers.
+
+    It speaks the DevTools protocol through a pipe: JSON each way, ended by a zero byte.
+    """
+
+    def __init__(self, address: str, *, width: int = 1400, height: int = 1000) -> None:
+        """Opens the address and waits until it has loaded."""
+        reads, self._ours = os.pipe()
+        self._answers, writes = os.pipe()
+        theirs = [fcntl.fcntl(fd, fcntl.F_DUPFD, 10) for fd in (reads, writes)]  # not 3 or 4
+        command = [chromium(), *FLAGS, "--remote-debugging-pipe", "about:blank"]
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", _ON_3_AND_4, *map(str, theirs), *command],
+            pass_fds=theirs,
+            stderr=subprocess.DEVNULL,
+        )
+        for fd in (reads, writes, *theirs):
+            os.close(fd)
+        self._text, self._count, self._session = b"", 0, ""
+        target = self.send("Target.createTarget", url="about:blank")["targetId"]
+        attached = self.send("Target.attachToTarget", targetId=target, flatten=True)
+        self._session = attached["sessionId"]
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.send("Emulation.setDeviceMetricsOverride", **size)
+        self.send("Page.enable")
+        self.send("Page.navigate", url=address)
+        while self._hear().get("method") != "Page.loadEventFired":
+            pass
+
+    def close(self) -> None:
+        """End the browser."""
+        self._process.kill()
+        self._process.wait()
+        os.close(self._ours)
+        os.close(self._answers)
+
+    def send(self, method: str, **params: Any) -> dict[str, Any]:
+        """A command of the protocol; its result."""
+        self._count += 1
+        said = {"id": self._count, "method": method, "params": params}
+        if self._session:
+            said["sessionId"] = self._session
+        os.write(self._ours, json.dumps(said).encode() + b"\0")
+        while (answer := self._hear()).get("id") != self._count:
+            pass
+        assert "error" not in answer, answer
+        return answer["result"]
+
+    def run(self, script: str) -> Any:
+        """Run the body of an async function in the page; what it returns, by JSON."""
+        expression = f"(async () => {{ {script} }})()"
+        answer = self.send(
+            "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
+        )
+        assert "exceptionDetails" not in answer, answer["exceptionDetails"]
+        return answer["result"].get("value")
+
+    def mouse(self, kind: str, x: float, y: float, *, is_down: bool = True) -> None:
+        """`kind`: mousePressed, mouseMoved or mouseReleased, in CSS pixels of the window."""
+        held = {"button": "left", "buttons": 1, "clickCount": 1} if is_down else {}
+        self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **held)
+
+    def touch(self, kind: str, *places: tuple[float, float]) -> None:
+        """`kind`: touchStart, touchMove or touchEnd; no places where no finger is left."""
+        fingers = [{"x": x, "y": y} for x, y in places]
+        self.send("Input.dispatchTouchEvent", type=kind, touchPoints=fingers)
+
+    def picture(self, path: Path) -> None:
+        """A screenshot, as PNG."""
+        data = self.send("Page.captureScreenshot")["data"]
+        path.write_bytes(base64.b64decode(data))
+
+    def _hear(self) -> dict[str, Any]:
+        while b"\0" not in self._text:
+            assert select.select([self._answers], [], [], 120)[0], "the browser says nothing"
+            data = os.read(self._answers, 1 << 20)
+            assert data, "the browser has ended"
+            self._text += data
+        text, _, self._text = self._text.partition(b"\0")
+        return json.loads(text)

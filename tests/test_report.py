@@ -61,7 +61,7 @@ def test_outlines_lie_on_the_mask_and_on_the_mesh(out: Path):
     }
     for track_id, shots in album.items():
         for shot in shots:
-            size, frame = shot.crop_size, shot.view.row.fish.frame_index
+            size, frame = shot.crop_camera.width, shot.view.row.fish.frame_index
             drawn = [np.zeros((size, size), np.uint8) for _ in range(2)]
             for image, lines in zip(drawn, (shot.outlines.mask, shot.outlines.mesh), strict=True):
                 for line in lines:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import dump, in_page, result_of
+from browser import Tab
 from command import rows
 from fish_run import measure
 
@@ -197,67 +197,94 @@ def test_a_port_in_use_is_refused(server: ReviewServer, report: Report):
         ReviewServer(report, reviewer="Ada", port=port)
 
 
-CLICKS = """
+HELPERS = """
 let open = 0;
 const fetched = window.fetch;
 window.fetch = (...what) => { open += 1; return fetched(...what).finally(() => { open -= 1; }); };
-const settle = async () => {
+window.press = async (id) => {
+  document.getElementById(id).click();
   do await new Promise((done) => setTimeout(done, 100)); while (open);
-  await new Promise((done) => setTimeout(done, 100));
+  await new Promise((done) => setTimeout(done, 100));  // for what is done with the answer
 };
-const press = async (id) => { document.getElementById(id).click(); await settle(); };
-const fill = (id, value) => { document.getElementById(id).value = value; };
-choose(1);
-await press('do-reject');
-const refusal = document.getElementById('said').textContent;
-fill('reason', 'a <b>glove</b>');
-await press('do-reject');
-fill('species-name', 'Gadus morhua');
-await press('do-species');
-const box = document.querySelector('.shots svg');
-const tail = box.querySelector('[data-name="tail"]');
-const at = tail.getBoundingClientRect();
-const x = at.x + at.width / 2, y = at.y + at.height / 2;
-tail.setPointerCapture = () => {};
-tail.hasPointerCapture = () => true;
-const send = (kind, dx, dy) => tail.dispatchEvent(new PointerEvent(kind, {
-  pointerId: 1, clientX: x + dx, clientY: y + dy }));
-const from = Number(tail.getAttribute('cy'));
-send('pointerdown', 0, 0);
-send('pointermove', 0, 12);
-const to = Number(tail.getAttribute('cy'));
-await press('do-correct');
-choose(2);
-fill('duplicate-of', '1');
-await press('do-duplicate');
-return { refusal, moved: to - from, row: document.querySelector('[data-id="1"]').innerText };
+window.fill = (id, value) => { document.getElementById(id).value = value; };
+window.where = (name) => {
+  const point = document.querySelector(`.shots svg [data-name="${name}"]`);
+  const { x, y, width, height } = point.getBoundingClientRect();
+  return [x + width / 2, y + height / 2, point.cx.baseVal.value, point.cy.baseVal.value];
+};
 """
 
 
-def test_a_reviewer_clicks_through_it(report: Report, out: Path, tmp_path: Path):
-    script = in_page(CLICKS)
-    page = report.html(reviewer="Ada <Byron>")
-    before, _, after = page.rpartition("</body>")
-    server = ReviewServer(report, reviewer="Ada <Byron>")
-    server._server.page = (before + script + after).encode()
-    try:
-        shown = dump(server.address)
-    finally:
-        server.close()
-    result = result_of(shown)
-    assert "reason" in result["refusal"]
-    assert result["moved"] > 1
-    assert "a <b>glove</b>" in result["row"]
+@pytest.fixture
+def tab(server: ReviewServer) -> Iterator[Tab]:
+    opened = Tab(server.address)
+    opened.run(HELPERS)
+    yield opened
+    opened.close()
+
+
+def test_a_reviewer_clicks_through_it(tab: Tab, out: Path):
+    shown = tab.run(
+        """
+        choose(1);
+        await press('do-reject');
+        const refusal = document.getElementById('said').textContent;
+        fill('reason', 'a <b>glove</b>');
+        await press('do-reject');
+        fill('species-name', 'Gadus morhua');
+        await press('do-species');
+        choose(2);
+        fill('duplicate-of', '1');
+        await press('do-duplicate');
+        return { refusal, row: document.querySelector('[data-id="1"]').innerText };
+        """
+    )
+    assert "reason" in shown["refusal"]
+    assert "a <b>glove</b>" in shown["row"]
     verdicts = read_verdicts(out / "lengths.db")
-    assert [(v.track_id, v.kind) for v in verdicts] == [
-        (1, "reject"),
-        (1, "species"),
-        (1, "correct"),
-        (2, "duplicate"),
+    said = [(verdict.track_id, verdict.kind) for verdict in verdicts]
+    assert said == [(1, "reject"), (1, "species"), (2, "duplicate")]
+    assert {verdict.reviewer for verdict in verdicts} == {"Ada <Byron>"}
+
+
+@pytest.mark.parametrize("by_finger", [False, True])
+def test_points_are_dragged_and_stay_where_they_were_put(tab: Tab, out: Path, by_finger: bool):
+    tab.run("choose(1); return 0")
+    x, y, *_ = tab.run("return where('tail')")
+    # A finger comes down beside the point, and the point keeps that distance.
+    path = [(x + 5 * by_finger, y + step + 5 * by_finger) for step in (0, 4, 9, 12)]
+    if by_finger:
+        tab.send("Emulation.setTouchEmulationEnabled", enabled=True)
+        tab.touch("touchStart", path[0])
+        for place in path[1:]:
+            tab.touch("touchMove", place)
+        tab.touch("touchEnd")
+    else:
+        tab.mouse("mousePressed", *path[0])
+        for place in path[1:]:
+            tab.mouse("mouseMoved", *place)
+        tab.mouse("mouseReleased", *path[-1])
+        tab.mouse("mouseMoved", x + 50, y + 50, is_down=False)
+    after = tab.run("return where('tail')")
+    assert after[:2] == pytest.approx([x, y + 12], abs=0.5)
+    assert tab.run("await press('do-correct'); return where('tail')") == pytest.approx(after, abs=1)
+    (verdict,) = read_verdicts(out / "lengths.db")
+    (measured, *_) = read_stored(out / "lengths.db")
+    assert measured.estimate.length_mm is not None
+    assert measured.length_mm == verdict.length_mm
+    assert verdict.length_mm is not None
+    assert abs(verdict.length_mm / measured.estimate.length_mm - 1) > 0.02
+
+
+def test_moved_points_are_in_the_report(judge: Judge, report: Report, out: Path):
+    frame_index, _, (head, tail) = ends(report, 1)
+    further = (np.array(tail) + 0.1 * (np.array(tail) - np.array(head))).tolist()
+    row = say(judge, track_id=1, kind="correct", frame_index=frame_index, head=head, tail=further)
+    assert row["moved"][frame_index] == [
+        pytest.approx(head, abs=0.01),
+        pytest.approx(further, abs=0.01),
     ]
-    assert {v.reviewer for v in verdicts} == {"Ada <Byron>"}
-    measured_mm = read_stored(out / "lengths.db")[0].estimate.length_mm
-    corrected_mm = verdicts[2].length_mm
-    assert measured_mm is not None
-    assert corrected_mm is not None
-    assert corrected_mm != pytest.approx(measured_mm, rel=1e-3)
+    page = open_report(out).html()
+    moved = json.dumps(row["moved"], separators=(",", ":"))
+    assert f'"moved":{moved}' in page
+    assert say(judge, track_id=1, kind="withdraw")["moved"] == {}

@@ -1,6 +1,9 @@
 // What a row opens: the best frames, every frame's length, the mesh. Parsed when it is opened.
 
 const SVG = "http://www.w3.org/2000/svg";
+// One plot of each kind for all fish, since a new one takes longer than new data in an old one.
+const FRAMES = element("div", { className: "plot" });
+const SOLID = element("div", { className: "solid" });
 const POINTS = [["head", "#ff3c3c"], ["center", "#ffffff"], ["tail", "#3ca0ff"]];
 
 function svg(tag, attributes, ...children) {
@@ -12,14 +15,19 @@ function svg(tag, attributes, ...children) {
 
 function shotOf(shot, index, fish) {
   const s = shot.size;
+  const moved = fish.moved[shot.frame];
+  const [, center] = shot.keypoints;
+  const keypoints = moved ? [moved[0], center, moved[1]] : shot.keypoints;
   const box = svg("svg", { viewBox: `-0.5 -0.5 ${s} ${s}`, "data-frame": shot.frame },
     svg("image", { href: shot.uri, x: -0.5, y: -0.5, width: s, height: s, preserveAspectRatio: "none" }),
     ...shot.mask.map((points) => svg("polygon", { points, class: "mask" })),
     ...shot.mesh.map((points) => svg("polygon", { points, class: "mesh" })),
-    ...POINTS.map(([name, fill], k) => svg("circle", { cx: shot.keypoints[k][0], cy: shot.keypoints[k][1], r: s / 55, fill, class: "point", "data-name": name }, svg("title", {}, name))));
+    ...POINTS.map(([name, fill], k) => svg("circle", { cx: keypoints[k][0], cy: keypoints[k][1], r: s / 55, fill, class: "point", "data-name": name }, svg("title", {}, name))));
   const row = fish.detail.frames.find((frame) => frame[0] === shot.frame);
-  const caption = row ? `frame ${shot.frame}, ${cm(row[2])} cm, IoU ${row[6] ?? "-"}${row[4] ? "" : `, refused: ${row[5]}`}` : `frame ${shot.frame}`;
-  return element("figure", {}, box, element("figcaption", {}, element("small", { textContent: caption })));
+  const caption = row ? `frame ${shot.frame}, ${cm(row[2])} cm, IoU ${row[6] ?? "-"}${row[4] ? "" : `, refused: ${row[5]}`}${moved ? ", points moved" : ""}` : `frame ${shot.frame}`;
+  const figure = element("figure", {}, box, element("figcaption", {}, element("small", { textContent: caption }),
+    element("button", { type: "button", textContent: "larger", onclick: () => figure.classList.toggle("large") })));
+  return figure;
 }
 
 function facts(fish) {
@@ -45,19 +53,16 @@ function facts(fish) {
 
 function drawDetail(fish) {
   const panel = document.getElementById("detail");
-  for (const plot of panel.querySelectorAll(".js-plotly-plot")) Plotly.purge(plot);
   fish.detail = JSON.parse(document.getElementById(`fish-${fish.track_id}`).textContent);
   const shots = element("div", { className: "shots" }, ...fish.detail.shots.map((shot, k) => shotOf(shot, k, fish)));
   const overlay = element("input", { type: "checkbox", checked: true, onchange: () => shots.classList.toggle("plain", !overlay.checked) });
-  const frames = element("div", { className: "plot" });
-  const solid = element("div", { className: "solid" });
   panel.replaceChildren(
     element("h2", { textContent: `Fish ${fish.track_id}: ${cm(lengthOf(fish))} cm` }),
     element("label", {}, overlay, " mask (yellow), mesh (green), head (red), center, tail (blue)"),
-    shots, ...reviewTools(fish, shots), element("div", { className: "pair" }, frames, solid), facts(fish));
+    shots, ...reviewTools(fish, shots), element("div", { className: "pair" }, FRAMES, SOLID), facts(fish));
   panel.scrollTop = 0;
-  drawFrames(frames, fish.detail.frames);
-  setTimeout(() => solid.isConnected && drawMesh(solid, fish.detail.mesh));  // the slow part, last
+  drawFrames(FRAMES, fish.detail.frames);
+  setTimeout(() => state.chosen === fish.track_id && drawMesh(SOLID, fish.detail.mesh));  // the slow part, last
 }
 
 function drawFrames(place, rows) {
@@ -74,7 +79,7 @@ function drawFrames(place, rows) {
   const [low, high] = [Math.min(...heights) / 10, Math.max(...heights) / 10];
   const drawn = layout("Frames (x: refused), estimate, 95 %", "frame", "cm");
   if (heights.length) drawn.yaxis.range = [low - 0.1 * (high - low) - 0.5, high + 0.1 * (high - low) + 0.5];
-  Plotly.newPlot(place, [
+  Plotly.react(place, [
     { type: "scatter", mode: "lines", x: [...x, ...[...x].reverse()], y: [...running.map((row) => row[9] / 10), ...running.map((row) => row[8] / 10).reverse()], fill: "toself", fillcolor: "rgba(22,104,168,.15)", line: { width: 0 }, hoverinfo: "skip" },
     { type: "scatter", mode: "lines", x, y: running.map((row) => row[7] / 10), line: { color: BLUE, width: 2 }, hovertemplate: "after frame %{x}: %{y:.1f} cm<extra></extra>" },
     marks(true, { color: BLUE, size: 6 }), marks(false, { color: ORANGE, size: 7, symbol: "x" }),
@@ -87,13 +92,13 @@ function unpacked(text, kind) {
 }
 
 function drawMesh(place, mesh) {
-  if (!mesh) return;
+  if (!mesh) return Plotly.purge(place);
   const points = unpacked(mesh.points, Int16Array);
   const axis = (k, from, to) => Array.from({ length: to - from }, (_, n) => points[3 * (from + n) + k] * mesh.step);
   const corner = (k) => Array.from(FACES.filter((_, n) => n % 3 === k));
   const [n, all] = [mesh.vertices, points.length / 3];
   const scene = { aspectmode: "data", camera: { up: { x: 0, y: -1, z: 0 }, eye: { x: 0.4, y: -0.6, z: -2.5 } }, xaxis: { title: { text: "x mm" } }, yaxis: { title: { text: "y mm" } }, zaxis: { title: { text: "depth mm" } } };
-  Plotly.newPlot(place, [
+  Plotly.react(place, [
     { type: "mesh3d", x: axis(0, 0, n), y: axis(1, 0, n), z: axis(2, 0, n), i: corner(0), j: corner(1), k: corner(2), color: "#7fb2d6", flatshading: false, opacity: 0.75, lighting: { ambient: 0.5, diffuse: 0.8 }, hoverinfo: "skip" },
     { type: "scatter3d", mode: "lines", x: axis(0, n, all), y: axis(1, n, all), z: axis(2, n, all), line: { color: ORANGE, width: 6 }, hoverinfo: "skip" },
   ], { margin: { l: 0, r: 0, t: 24, b: 0 }, scene, showlegend: false, title: { text: "Mesh of the best frame", font: { size: 13 }, x: 0.02 } }, QUIET);

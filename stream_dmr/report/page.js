@@ -1,7 +1,7 @@
 // The page as a whole: filters, choice, keys.
 
 const DATA = JSON.parse(document.getElementById("data").textContent);
-const FACES = unpacked(DATA.faces, Uint16Array);
+const FACES = unpacked(DATA.faces, Uint32Array);
 const FILTERS = ["search", "status", "verdict", "shortest", "longest", "frames"];
 
 function wanted() {
@@ -9,13 +9,18 @@ function wanted() {
 }
 
 function show() {
-  state.shown = sorted(filtered(DATA.fish, wanted()));
+  state.shown = filtered(DATA.fish, wanted());
   document.getElementById("count").textContent = `${state.shown.length} of ${DATA.fish.length} fish`;
-  drawHead(show);
-  drawRows(choose);
+  drawTable();
   drawSummary(state.shown);
   drawHistogram(state.shown);
   drawTime(state.shown, choose);
+}
+
+function drawTable() {
+  state.shown = sorted(state.shown);
+  drawHead(drawTable);
+  drawRows(choose);
 }
 
 function choose(id) {

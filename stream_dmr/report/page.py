@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr import __version__
+from stream_dmr.camera import crop_from_frame
 from stream_dmr.fish_table import fish_record
 from stream_dmr.fisheries import FisheriesSettings
 from stream_dmr.recording.header import RunHeader
@@ -38,7 +39,7 @@ def page(
         "title": title,
         "software": __version__,
         "template": header.template.name,
-        "faces": _packed(header.template.faces.astype("<u2")),
+        "faces": _packed(header.template.faces.astype("<u4")),
         "fisheries": settings.model_dump(),
         "runs": {one.run_id: asdict(one.facts) for one in fish},
         "notes": list(notes),
@@ -80,6 +81,22 @@ def summary(
         "refused": dict(fish.estimate.refused),
         "flags": list(fish.flags),
         "thumb": _uri(shots[0].thumb) if shots else "",
+        "moved": _moved(fish, shots),
+    }
+
+
+def _moved(fish: FishResult, shots: Sequence[Shot]) -> dict[int, Any]:
+    """The head and tail points that a reviewer has set, by frame, in pixels of the crop."""
+    by_frame = {shot.view.row.fish.frame_index: shot for shot in shots}
+    return {
+        frame_index: np.round(
+            crop_from_frame(
+                np.array(points), crop_camera=shot.crop_camera, frame_camera=shot.frame_camera
+            ),
+            2,
+        ).tolist()
+        for frame_index, points in fish.review.moved.items()
+        if (shot := by_frame.get(frame_index)) is not None
     }
 
 
@@ -116,7 +133,7 @@ def _shot(shot: Shot) -> dict[str, Any]:
     fish = shot.view.row.fish
     return {
         "frame": fish.frame_index,
-        "size": shot.crop_size,
+        "size": shot.crop_camera.width,
         "uri": _uri(shot.picture),
         "mask": [_points(line) for line in shot.outlines.mask],
         "mesh": [_points(line) for line in shot.outlines.mesh],
@@ -152,5 +169,5 @@ def _packed(array: np.ndarray) -> str:
     return b64encode(np.ascontiguousarray(array).tobytes()).decode()
 
 
-def _uri(jpeg: bytes) -> str:
-    return f"data:image/jpeg;base64,{b64encode(jpeg).decode()}"
+def _uri(webp: bytes) -> str:
+    return f"data:image/webp;base64,{b64encode(webp).decode()}"

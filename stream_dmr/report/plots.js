@@ -63,6 +63,7 @@ function drawHistogram(fish) {
     traces.push({ type: "scatter", mode: "lines", x: at, y: density(lengths, at).map((d) => d * lengths.length * width), line: { color: BLUE, width: 2 }, hoverinfo: "skip" });
   }
   const drawn = layout("Length frequency (bars) and kernel density (line)", "cm", "fish");
+  if (Math.max(...counts) < 6) drawn.yaxis.dtick = 1;
   const limit = DATA.fisheries.legal_cm;
   if (fish.some((f) => f.is_legal_size !== null)) drawn.shapes = [{ type: "line", x0: limit, x1: limit, yref: "paper", y0: 0, y1: 1, line: { color: ORANGE, dash: "dot" } }];
   Plotly.react("histogram", traces, drawn, QUIET);

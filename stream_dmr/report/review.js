@@ -24,22 +24,35 @@ function reviewTools(fish, shots) {
     element("small", { textContent: `as ${DATA.reviewer}; head and tail points can be dragged` }), said)];
 }
 
+const REACH_PX = 24;  // on the screen: a finger is no needle
+
 // Head and tail can be dragged; what was dragged last is what is saved, in pixels of its crop.
 function movable(shots) {
   let last = null;
   for (const box of shots.querySelectorAll("svg")) {
-    for (const point of box.querySelectorAll('[data-name="head"], [data-name="tail"]')) {
-      point.classList.add("moves");
-      point.onpointerdown = (event) => point.setPointerCapture(event.pointerId);
-      point.onpointermove = (event) => {
-        if (!point.hasPointerCapture(event.pointerId)) return;
-        const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(box.getScreenCTM().inverse());
-        point.setAttribute("cx", at.x);
-        point.setAttribute("cy", at.y);
-        last = box;
-      };
-    }
+    const ends = [...box.querySelectorAll('[data-name="head"], [data-name="tail"]')];
+    const place = (end) => ({ x: end.cx.baseVal.value, y: end.cy.baseVal.value });
+    const at = (event) => new DOMPoint(event.clientX, event.clientY).matrixTransform(box.getScreenCTM().inverse());
+    const away = (end, p) => Math.hypot(place(end).x - p.x, place(end).y - p.y) * box.getScreenCTM().a;
+    let held = null, from = null;  // the point, and where it was gripped
+    box.classList.add("moves");
+    box.onpointerdown = (event) => {
+      const p = at(event);
+      const nearest = ends.reduce((one, other) => (away(one, p) <= away(other, p) ? one : other));
+      if (away(nearest, p) > REACH_PX) return;
+      held = nearest;
+      from = { x: place(held).x - p.x, y: place(held).y - p.y };
+      box.setPointerCapture(event.pointerId);
+    };
+    box.onpointermove = (event) => {
+      if (!held) return;
+      const p = at(event);
+      held.setAttribute("cx", p.x + from.x);
+      held.setAttribute("cy", p.y + from.y);
+      last = box;
+    };
+    box.onpointerup = box.onpointercancel = () => { held = null; };
   }
-  const at = (name) => { const p = last.querySelector(`[data-name="${name}"]`); return [Number(p.getAttribute("cx")), Number(p.getAttribute("cy"))]; };
+  const at = (name) => { const p = last.querySelector(`[data-name="${name}"]`); return [p.cx.baseVal.value, p.cy.baseVal.value]; };
   return { moved: () => last && { frame_index: Number(last.dataset.frame), head: at("head"), tail: at("tail") } };
 }

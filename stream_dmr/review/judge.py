@@ -1,5 +1,6 @@
 """Takes verdicts on the fish of one folder, checks them and writes them down."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
@@ -10,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.errors import UserError
-from stream_dmr.messages import FishCrop, FittedMesh
+from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate
 from stream_dmr.recording.codec import decode
 from stream_dmr.report.gather import View
 from stream_dmr.report.page import summary
@@ -19,10 +20,11 @@ from stream_dmr.results import FishResult, database_of
 from stream_dmr.review.corrected import corrected_fish, corrected_length
 from stream_dmr.verdicts import (
     NOTHING_SAID,
+    Ends,
+    Review,
     Verdict,
     add_verdict,
     check,
-    corrections,
     read_verdicts,
     reviews,
 )
@@ -89,10 +91,12 @@ class Judge:
         return [self._row(one) for track_id, one in self._fish.items() if track_id in held]
 
     def _row(self, fish: FishResult) -> dict[str, Any]:
-        held = reviews(read_verdicts(self._database))
-        now = replace(fish, review=held.get(fish.estimate.track_id, NOTHING_SAID))
+        now = replace(fish, review=self._review(fish.estimate.track_id))
         report = self._report
         return summary(now, report.recording.header, report.settings, report.album)
+
+    def _review(self, track_id: int) -> Review:
+        return reviews(read_verdicts(self._database)).get(track_id, NOTHING_SAID)
 
     def _corrected(self, verdict: Verdict, said: Said) -> Verdict:
         """The verdict with its points in frame pixels and the length that follows."""
@@ -112,23 +116,21 @@ class Judge:
             tail_u=tail[0],
             tail_v=tail[1],
         )
-        held = corrections(read_verdicts(self._database), said.track_id)
-        held[said.frame_index] = verdict
-        length = self._length(held)
+        moved = {**self._review(said.track_id).moved, **verdict.moved}
+        length = self._length(said.track_id, moved)
         return replace(verdict, length_mm=length.length_mm, length_std_mm=length.length_std_mm)
 
-    def _length(self, held: dict[int, Verdict]) -> Any:
+    def _length(self, track_id: int, moved: Mapping[int, Ends]) -> LengthEstimate:
         report = self._report
-        frames = {}
-        for frame_index, verdict in held.items():
-            view = self._view(verdict.track_id, frame_index)
-            points = [[verdict.head_u, verdict.head_v], [verdict.tail_u, verdict.tail_v]]
-            frames[frame_index] = corrected_fish(
-                decode(FittedMesh, view.fit),
+        frames = {
+            frame_index: corrected_fish(
+                decode(FittedMesh, self._view(track_id, frame_index).fit),
                 np.array(points, float),
                 config=report.config,
                 calibration=report.recording.header.calibration,
             )
+            for frame_index, points in moved.items()
+        }
         return corrected_length(frames, report.config)
 
     def _view(self, track_id: int, frame_index: int) -> View:
