@@ -157,7 +157,7 @@ def fit_parts(setup: Setup, pair: Pair) -> dict[str, Callable[[], object]]:
     target, start = setup.start(pair)
     solver = ContourSolver(body, settings)
     flat = solver.refine(target, start).flat
-    _, _, points, pixels, rim, covered = evaluate(body, SPINE, target, flat)
+    _, _, points, pixels, rim, covered = evaluate(body, SPINE, target, flat, True)
     mask, fitter = pair.now.mask, setup.fitter(pair)
     outline_of = {"points": points, "pixels": pixels, "rim": rim, "covered": covered}
     return {
@@ -165,7 +165,7 @@ def fit_parts(setup: Setup, pair: Pair) -> dict[str, Callable[[], object]]:
         "contour of the mask": lambda: mask_contour(mask),
         "start moved onto the mask": lambda: recentered(body, SPINE, target, before),
         "solver": lambda: solver.refine(target, start),
-        "terms of the result": lambda: evaluate(body, SPINE, target, flat),
+        "terms of the result": lambda: evaluate(body, SPINE, target, flat, True),
         "covariance": lambda: covariance(body, target, settings, flat, **outline_of),
         "all of `Fitter.fit`": lambda: fitter.fit(pair.now, before),
     }
@@ -177,7 +177,7 @@ def iteration_parts(setup: Setup, pair: Pair) -> dict[str, Callable[[], object]]
     lambdas, priors = setup.settings.lambdas(), setup.settings.priors()
     rest = rest_vector(len(body.joints))
     target, flat = setup.start(pair)
-    _, _, points, pixels, rim, covered = evaluate(body, SPINE, target, flat)
+    _, _, points, pixels, rim, covered = evaluate(body, SPINE, target, flat, True)
     visible, _, _ = normal_equations.visible_rim(pixels, rim, covered)
     chosen, vertices = np.unique(visible), points[: body.num_vertices]
     rows = np.random.default_rng(0).normal(size=(len(visible) + len(target.contour), len(flat)))
@@ -186,7 +186,7 @@ def iteration_parts(setup: Setup, pair: Pair) -> dict[str, Callable[[], object]]
     H, g = normal_equations.normal_equations(*problem)
     mesh = (body.faces, body.edges, body.edge_faces)
     return {
-        "evaluate": lambda: evaluate(body, SPINE, target, flat),
+        "evaluate": lambda: evaluate(body, SPINE, target, flat, True),
         "- deform": lambda: deform(body, SPINE, flat),
         "- project": lambda: project(vertices, target.anchor, target.K),
         "- rim": lambda: out.rim_edges(pixels, *mesh),

@@ -202,7 +202,7 @@ class _Crowd:
     def _nats_as_posed(self, vector: Float[np.ndarray, "W"]) -> float:
         body, total = self._body(vector), 0.0
         for sample in self._samples:
-            terms, *_ = evaluate(body, self._kind, sample.target, sample.pose)
+            terms, *_ = evaluate(body, self._kind, sample.target, sample.pose, False)
             total += float(terms @ self._lambdas)
             total += prior_loss(sample.target, sample.pose, self._rest, self._priors)
         return total / self._nat + _unlikeliness(vector)

@@ -25,7 +25,7 @@ def test_known_targets_can_be_matched(seed):
     body = Body.from_template(TEMPLATE)
     known = draw_known(body, size=128, seed=seed, most_bend_rad=2.0)
     target = Target.from_crop(known.crop, plane_normal=TOWARD_CAMERA)
-    assert evaluate(body, 0, target, known.flat)[1] > 0.99
+    assert evaluate(body, 0, target, known.flat, True)[1] > 0.99
 
 
 def test_pairs_are_whole_and_differ():

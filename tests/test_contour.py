@@ -151,7 +151,9 @@ class TestDeformation:
     def test_slopes_of_the_rim_s_pixels_are_autograd_s(self, name, kind, seed):
         flat = motion(name, seed, size=0.2)
         target = target_of(fish_pose(0), "2 joints")
-        _, _, points, pixels, rim, _ = evaluate(BODIES[name], KINDS[kind], target, flat[0].numpy())
+        _, _, points, pixels, rim, _ = evaluate(
+            BODIES[name], KINDS[kind], target, flat[0].numpy(), True
+        )
         rim = rim[:: max(1, len(rim) // 6)]
         index, slopes = normal_equations.rim_slopes(
             BODIES[name], KINDS[kind], target, flat[0].numpy(), points, rim
@@ -259,7 +261,7 @@ def test_terms_and_iou_are_those_of_the_torch_objective(name, kind, seed):
     flat = motion(name, seed)
     objective = Objective(RIGS[name], target, FitMeshSettings(deformation=kind))
     expected = objective.terms(flat)
-    found, hard, *_ = evaluate(BODIES[name], KINDS[kind], target, flat[0].numpy())
+    found, hard, *_ = evaluate(BODIES[name], KINDS[kind], target, flat[0].numpy(), True)
     np.testing.assert_allclose(found, expected.terms[0], rtol=1e-9, atol=1e-9)
     assert hard == pytest.approx(expected.iou.item(), abs=1e-12)
 
@@ -268,7 +270,7 @@ class TestVisibleRim:
     def visible(self, flat, *, size=96):
         target = target_of(flat, "halibut", size=size)
         _, _, _, pixels, rim, covered = evaluate(
-            BODIES["halibut"], KINDS["spine"], target, flat[0].numpy()
+            BODIES["halibut"], KINDS["spine"], target, flat[0].numpy(), True
         )
         inside = distance_transform_edt(covered >= 0.5)
         outside = distance_transform_edt(covered < 0.5)

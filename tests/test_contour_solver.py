@@ -79,7 +79,7 @@ def target_of(flat, *, plane_normal=TOWARD_CAMERA):
 
 def energy(target, flat, *, kind=SPINE):
     """What `minimise` lowers: L_rec and the priors."""
-    terms = evaluate(BODY, kind, target, flat)[0]
+    terms = evaluate(BODY, kind, target, flat, True)[0]
     return terms @ LAMBDAS + prior_loss(target, flat, REST, PRIORS)
 
 
@@ -169,7 +169,7 @@ class TestNormalEquations:
         flat = hooked(seed)
         target = target_of(flat)
         near = moved(flat, np.random.default_rng(seed))
-        _, hard, points, pixels, rim, covered = evaluate(BODY, SPINE, target, near)
+        _, hard, points, pixels, rim, covered = evaluate(BODY, SPINE, target, near, True)
         assert hard < 0.92
         _, g = normal_equations(
             BODY, SPINE, target, LAMBDAS, PRIORS, near, REST, points, pixels, rim, covered
@@ -191,7 +191,7 @@ class TestDescent:
         best, loss, hard, used, _ = descend(target, start, kind=KINDS[kind])
         assert loss <= energy(target, start, kind=KINDS[kind]) + 1e-12
         assert loss == pytest.approx(energy(target, best, kind=KINDS[kind]), rel=1e-9, abs=1e-12)
-        assert hard == evaluate(BODY, KINDS[kind], target, best)[1]
+        assert hard == evaluate(BODY, KINDS[kind], target, best, True)[1]
         assert 1 <= used <= 30
 
     def test_the_start_is_left_alone(self):

@@ -182,7 +182,9 @@ class Fitter:
     ) -> FittedShape:
         """`size_std` of the log size, where it is known better than by the covariance."""
         flat, v = solution.flat, self._body.num_vertices
-        terms, iou, points, pixels, rim, covered = evaluate(self._body, self._kind, target, flat)
+        terms, iou, points, pixels, rim, covered = evaluate(
+            self._body, self._kind, target, flat, True
+        )
         spread, length_std = covariance(
             self._body,
             target,

@@ -42,7 +42,7 @@ class FitMeshSettings(Settings):
         default=30, ge=1, description="most iterations of a contour fit"
     )
     scan_iterations: int = Field(
-        default=3,
+        default=2,
         ge=0,
         description="of a fit at each size that a fish might have; 0: the best fit's own size",
     )

@@ -24,6 +24,8 @@ _OFFSETS = np.array([-0.2, -0.1, -0.04, 0.0, 0.04, 0.1, 0.2])
 # them, 0 the profile likelihood. A flat pose has more room by its curvature than it has in truth,
 # since what it would see of its slant is of second order. Between them, by our simulated scenes.
 _ROOM = 0.5
+# Sizes that are unlikelier by so many nats than the best fit's end a scan.
+_HOPELESS = 8.0
 _STEP = 0.002  # of the integration over log sizes
 _BEYOND = 0.15  # how far it goes past the sizes tried
 _STEEPEST_END = 10.0  # nats per unit of log size: past the ends sizes get at least so unlikely
@@ -36,25 +38,30 @@ class SizeScanner:
         self._body, self._settings = body, settings
         self._kind = KINDS[settings.deformation]
         self._rest = rest_vector(len(body.joints))
-        self._lambdas, self._priors = settings.lambdas(), settings.priors()
-        self._rough_lambdas = settings.rough_lambdas()
+        # The mesh's smoothness tells sizes apart no better, and is dear.
+        self._lambdas, self._priors = settings.rough_lambdas(), settings.priors()
 
     def expected(self, target: Target, best: Solution) -> tuple[Solution, float]:
         """The fit at the expected size of the fish, and the std of the log of this size."""
-        fits, losses, rooms = scan_sizes(
+        fits, losses, rooms, leads = scan_sizes(
             self._body,
             self._kind,
             target.coarse(),
-            self._rough_lambdas,
+            self._lambdas,
             self._priors,
             best.flat,
             self._rest,
             _OFFSETS,
+            _HOPELESS * self._settings.nat,
             self._settings.scan_iterations,
             self._settings.tolerance,
         )
-        mean, std = mean_and_std(_OFFSETS, losses / self._settings.nat + _ROOM * rooms)
-        start = fits[np.argmin(np.abs(_OFFSETS - mean))]
+        tried = np.isfinite(losses)
+        mean, std = mean_and_std(
+            _OFFSETS[tried], losses[tried] / self._settings.nat + _ROOM * rooms[tried]
+        )
+        nearest = np.argmin(np.where(tried, np.abs(_OFFSETS - mean), np.inf))
+        start = fits[nearest] + (mean - _OFFSETS[nearest]) * leads[nearest]
         start[SIZE] = best.flat[SIZE] + mean
         return self._fit_of_this_size(target, start), std
 
@@ -68,7 +75,7 @@ class SizeScanner:
             start,
             self._rest,
             only_size(len(start)),
-            self._settings.contour_iterations,
+            self._settings.scan_iterations,
             self._settings.tolerance,
             NEAR,
         )

@@ -20,14 +20,19 @@ _MOST_REFUSED = 3  # steps in a row, each ten times shorter: what is left to gai
 
 
 @compiled
-def evaluate(body, kind, target, flat):
-    """The six terms of eq. (3) and the hard IoU, with what the normal equations need again."""
+def evaluate(body, kind, target, flat, is_smooth):
+    """The six terms of eq. (3) and the hard IoU, with what the normal equations need again.
+
+    Without `is_smooth` the last two, L_normal and L_lap, are left at 0: they take a third of it.
+    """
     points = deform(body, kind, flat)
     pixels = project(points[: body.num_vertices], target.anchor, target.K)
     rim = rim_edges(pixels, body.faces, body.edges, body.edge_faces)
     covered = coverage(pixels, rim, len(target.mask))
     iou, boundary, hard = overlap(covered, target.mask, target.distance, target.mask_area)
-    normal, laplacian = smoothness(body, points, np.exp(flat[5]))
+    normal, laplacian = 0.0, 0.0
+    if is_smooth:
+        normal, laplacian = smoothness(body, points, np.exp(flat[5]))
     scale, translation = 0.0, 0.0
     for j in range(len(body.joints)):
         base = ROOT + JOINT * j
@@ -44,7 +49,8 @@ def minimise(
 ):
     """Best parameters, their L_rec and hard IoU, the iterations used and why it stopped."""
     flat = start.copy()
-    terms, hard, points, pixels, rim, covered = evaluate(body, kind, target, flat)
+    is_smooth = lambdas[4] > 0 or lambdas[5] > 0
+    terms, hard, points, pixels, rim, covered = evaluate(body, kind, target, flat, is_smooth)
     loss = np.sum(terms * lambdas) + prior_loss(target, flat, rest, priors)
     H, g = normal_equations(
         body, kind, target, lambdas, priors, flat, rest, points, pixels, rim, covered
@@ -56,7 +62,7 @@ def minimise(
         if 0.5 * dot(g, step) < tolerance:
             return flat, loss, hard, iteration - 1, SETTLED
         trial = flat - step
-        found = evaluate(body, kind, target, trial)
+        found = evaluate(body, kind, target, trial, is_smooth)
         gain = loss - np.sum(found[0] * lambdas) - prior_loss(target, trial, rest, priors)
         if gain > 0:
             flat = trial
@@ -108,7 +114,12 @@ def factorise(H, damping):
 @compiled
 def _solve(H, g, damping):
     """(H + damping diag H)^-1 g."""
-    L = factorise(H, damping)
+    return solve_factorised(factorise(H, damping), g)
+
+
+@compiled
+def solve_factorised(L, g):
+    """(L L^T)^-1 g."""
     x = g.copy()
     count = len(g)
     for p in range(count):

@@ -9,51 +9,40 @@ from stream_dmr.fitting.contour.levenberg_marquardt import (
     factorise,
     hold,
     minimise,
+    solve_factorised,
 )
 from stream_dmr.fitting.contour.normal_equations import normal_equations
 
 SIZE = 5  # the root's log scale, of the parameters
-# In L_rec: a fit that a neighbour's pose would better by so much has been left behind by it.
-_LEFT_BEHIND = 0.003
 
 
 @compiled
-def scan_sizes(body, kind, target, lambdas, priors, start, rest, offsets, iterations, tolerance):
+def scan_sizes(
+    body, kind, target, lambdas, priors, start, rest, offsets, hopeless, iterations, tolerance
+):
     """Fit anew at each log size `start[SIZE] + offsets` (ascending, 0 among them).
 
-    Returns the fits (G, P), their losses (G,), and half the log determinant of the curvature of
-    the loss in everything but the size (G,). From the start outwards, each size from its neighbour;
-    then once more from the smallest to the largest, since a pose that is not found from above,
-    with a fish too bent or too slanting, is found from below, where it must be flat.
+    From the start outwards, each size from where its neighbour's fit is headed, and no further than
+    sizes whose loss is worse than the start's by `hopeless`. Returns the fits (G, P), their losses
+    (G,), infinite where not tried, half the log determinants of the loss's curvature in all but the
+    size (G,), and the slopes of the fits to the log size (G, P).
     """
-    count = len(offsets)
-    held = only_size(len(start))
-    fits, losses = np.empty((count, len(start))), np.empty(count)
-    middle = np.argmin(np.abs(offsets))
-    pose = start
-    for way in range(2):
-        for n in range(middle, count) if way == 0 else range(middle - 1, -1, -1):
-            pose, losses[n] = _fit_at(
-                start[SIZE] + offsets[n],
-                body, kind, target, lambdas, priors, pose, rest, held, iterations, tolerance,
-            )  # fmt: skip
-            fits[n] = pose
-        pose = fits[middle]
-    pose = fits[0]
-    for n in range(1, count):
-        other, loss = _fit_at(
-            start[SIZE] + offsets[n],
-            body, kind, target, lambdas, priors, pose, rest, held, iterations, tolerance,
-        )  # fmt: skip
-        if loss < losses[n]:
-            fits[n], losses[n] = other, loss
-        pose = fits[n] if loss > losses[n] + _LEFT_BEHIND else other
-    curvatures = np.empty(count)
-    for n in range(count):
-        curvatures[n] = _half_log_determinant(
-            body, kind, target, lambdas, priors, fits[n], rest, held
-        )
-    return fits, losses, curvatures
+    count, middle = len(offsets), np.argmin(np.abs(offsets))
+    fits, leads = np.zeros((count, len(start))), np.zeros((count, len(start)))
+    losses, rooms = np.full(count, np.inf), np.zeros(count)
+    fits[middle], losses[middle], rooms[middle], leads[middle] = _fit_of_this_size(
+        body, kind, target, lambdas, priors, start, rest, iterations, tolerance
+    )
+    for way in (1, -1):
+        n = middle + way
+        while 0 <= n < count and losses[n - way] < losses[middle] + hopeless:
+            guess = fits[n - way] + (offsets[n] - offsets[n - way]) * leads[n - way]
+            guess[SIZE] = start[SIZE] + offsets[n]
+            fits[n], losses[n], rooms[n], leads[n] = _fit_of_this_size(
+                body, kind, target, lambdas, priors, guess, rest, iterations, tolerance
+            )
+            n += way
+    return fits, losses, rooms, leads
 
 
 @compiled
@@ -65,26 +54,20 @@ def only_size(num_parameters):
 
 
 @compiled
-def _fit_at(log_size, body, kind, target, lambdas, priors, pose, rest, held, iterations, tolerance):
-    """The best fit of one size from a pose, and its loss."""
-    start = pose.copy()
-    start[SIZE] = log_size
+def _fit_of_this_size(body, kind, target, lambdas, priors, start, rest, iterations, tolerance):
+    """The best fit (P,) of the start's size, its loss, half log determinant and slope (P,)."""
+    held = only_size(len(start))
     flat, loss, _, _, _ = minimise(
         body, kind, target, lambdas, priors, start, rest, held, iterations, tolerance, NEAR
     )
-    return flat, loss
-
-
-@compiled
-def _half_log_determinant(body, kind, target, lambdas, priors, flat, rest, held):
-    """Of the curvature in the parameters that aren't held."""
-    _, _, points, pixels, rim, covered = evaluate(body, kind, target, flat)
+    _, _, points, pixels, rim, covered = evaluate(body, kind, target, flat, False)
     H, g = normal_equations(
         body, kind, target, lambdas, priors, flat, rest, points, pixels, rim, covered
     )
+    pull = H[SIZE].copy()  # on the others, when the size grows
+    pull[SIZE] = 0.0
     hold(held, H, g)
     L = factorise(H, 0.0)
-    total = 0.0
-    for p in range(len(flat)):
-        total += np.log(L[p, p])
-    return total
+    lead = -solve_factorised(L, pull)
+    lead[SIZE] = 1.0
+    return flat, loss, np.sum(np.log(np.diag(L))), lead

@@ -67,7 +67,7 @@ class ContourSolver:
         return min(found, key=lambda solution: solution.loss)
 
     def _loss(self, target: Target, flat: Float[np.ndarray, "P"]) -> float:
-        terms, *_ = evaluate(self._body, self._kind, target, flat)
+        terms, *_ = evaluate(self._body, self._kind, target, flat, True)
         return float(terms @ self._rough_lambdas) + self._prior_loss(target, flat)
 
     def _rough(self, target: Target, start: Float[np.ndarray, "P"], iterations: int) -> Solution:
