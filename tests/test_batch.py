@@ -140,6 +140,36 @@ def test_the_data_set_holds_every_fish_and_every_frame(season: Path, tmp_path: P
             assert one["run_id"] == found[0]["run_id"]
 
 
+@pytest.fixture(scope="module")
+def finished(season: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A batch of two videos; one came without a trip, one shows no fish."""
+    folder = tmp_path_factory.mktemp("finished")
+    write_clip(season / "sea", fish=[[]] * 3)
+    (season / "sea" / "masks" / "000001.png").rename(season / "sea" / "masks" / "000009.png")
+    measure(jobs_of(season, folder, row(), row("sea", trip=""), row(trip="")), folder)
+    return folder
+
+
+def test_duckdb_opens_the_data_set(finished: Path):
+    duckdb = pytest.importorskip("duckdb", reason="needs DuckDB: pip install duckdb")
+    query = "SELECT vessel, trip, count(*) FROM read_parquet('{}', hive_partitioning = true) "
+    query += "GROUP BY ALL ORDER BY trip"
+    fish = duckdb.sql(query.format(finished / "dataset/fish/**/*.parquet")).fetchall()
+    assert fish == [("Sea/Bird", "", 2), ("Sea/Bird", "7", 2)]
+    frames = duckdb.sql(query.format(finished / "dataset/frames/**/*.parquet")).fetchall()
+    assert frames == [("Sea/Bird", "", 10), ("Sea/Bird", "7", 10)]
+
+
+def test_pandas_opens_the_data_set(finished: Path):
+    pandas = pytest.importorskip("pandas", reason="needs pandas: pip install pandas")
+    fish = pandas.read_parquet(finished / "dataset/fish")
+    assert set(fish["vessel"]) == {"Sea/Bird"}
+    assert sorted(fish["trip"]) == ["", "", "7", "7"]
+    lengths = rows(finished / "videos" / "video" / "lengths.csv")
+    of_first = fish[fish["video"] == "video"]["length_mm"]
+    assert list(of_first.round(6)) == [float(line["length_mm"]) for line in lengths]
+
+
 def test_what_is_done_is_not_done_again(season: Path, tmp_path: Path):
     jobs = jobs_of(season, tmp_path, row(), row("other"), row(video="broken/video.mp4"))
     measure(jobs, tmp_path)

@@ -23,7 +23,6 @@ from stream_dmr.tables import FRAMES_COLUMNS
 
 KINDS = ("fish", "frames")
 _PARTITIONS = ("vessel", "trip")
-_NONE = "__HIVE_DEFAULT_PARTITION__"
 _WHOLE_NUMBERS = ("frame_index", "timestamp_ns", "track_id")
 _MADE_BY = ("run_id", "software_version", "config_sha256")
 _OF_VIDEO = {"video": str, "haul": str}
@@ -81,7 +80,8 @@ def withdraw_others(jobs: Iterable[Job], out: Path) -> None:
 
 
 def _target(out: Path, kind: str, job: Job) -> Path:
-    parts = [f"{name}={quote(getattr(job, name), safe='') or _NONE}" for name in _PARTITIONS]
+    # Without a name it is that of no letters: pandas can't join others to what Hive has for none.
+    parts = [f"{name}={quote(getattr(job, name), safe='')}" for name in _PARTITIONS]
     return (out / "dataset" / kind).joinpath(*parts, f"{job.name}.parquet")
 
 
