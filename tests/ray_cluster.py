@@ -23,7 +23,7 @@ def kill_one(out: Path, killed: list[int]) -> None:
     """Kill the first worker that measures."""
     until = time.monotonic() + 300
     while time.monotonic() < until and not killed:
-        if any((out / "videos").glob("*.part/recording.mcap.part")):
+        if any(out.rglob("*.part/recording.mcap.part")):
             for folder in Path("/proc").glob("[0-9]*"):
                 name = (folder / "cmdline").read_bytes() if folder.exists() else b""
                 if name.startswith(b"ray::measure") and not killed:
@@ -46,7 +46,7 @@ def main() -> None:
         with closing(RayEngine(address=cluster.address)) as engine:
             cluster.wait_for_nodes()
             killer.start()
-            summary = batch(jobs, out, engine, stop=threading.Event(), say=print)
+            summary = batch(jobs, out, engine, piece_frames=1, stop=threading.Event(), say=print)
             killer.join()
     finally:
         cluster.shutdown()

@@ -298,6 +298,25 @@ def test_a_stop_ends_it_soon_and_leaves_nothing_half_done(season: Path, tmp_path
     assert [line["status"] for line in rows(tmp_path / "videos.csv")] == ["waiting"] * 2
 
 
+@pytest.mark.slow  # a dozen starts and more
+@pytest.mark.parametrize("seed", [1, 2])
+def test_killed_at_random_moments_it_gets_there(tmp_path: Path, seed: int):
+    clip = tmp_path / "clip"
+    write_clip(clip, fish=COMING_AND_GOING)
+    write_clip(tmp_path / "other", fish=[[1], [1], [1]])
+    run(request(clip, tmp_path / "alone"), stop=threading.Event())
+    manifest = write_manifest(tmp_path / "m.csv", row(), row("other"))
+    script = Path(__file__).with_name("killed_batch.py")
+    command = [sys.executable, str(script), str(manifest), str(clip / "quick.toml")]
+    command += [str(clip / "tiny.ply"), str(tmp_path / "out"), str(seed)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert int(ended.stdout.split()[0]) > 2
+    assert_same_tables(tmp_path / "out" / "videos" / "video", tmp_path / "alone")
+    assert verify(tmp_path / "out")[0] == []
+    assert [line["status"] for line in rows(tmp_path / "out" / "videos.csv")] == ["done"] * 2
+
+
 @pytest.mark.slow  # a cluster takes a minute to start
 def test_ray_on_two_nodes_loses_a_worker_and_nothing_else(season: Path, tmp_path: Path):
     pytest.importorskip("ray", reason="needs Ray: pip install 'stream-dmr[ray]'")
