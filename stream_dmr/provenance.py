@@ -49,7 +49,7 @@ def seal_run(folder: Path, *, with_recordings: bool) -> None:
     Reviewers go on writing to the database, so of it the fish of each run are summed up.
     """
     database = folder / DATABASE
-    kinds = ("*.csv", "*.mcap", "*.rrd") if with_recordings else ("*.csv",)
+    kinds = ("*.csv", "*.mcap", "*.rrd") if with_recordings else ("lengths.csv", "frames.csv")
     files = [path for kind in kinds for path in folder.glob(kind)]
     write_provenance(
         folder,

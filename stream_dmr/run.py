@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Iterable, Sequence
-from contextlib import closing, nullcontext
+from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -100,14 +100,22 @@ def run(
             marked=partial(flagged_fish, request.out),
             on_notice=observer.warn,
         )
-        retention.make_room()
-        repairs = prepare_folder(request.out, overwrite=request.overwrite, resume=goes_on)
+        with suppress(OSError, OutputError):  # a disk that is not well is tried again
+            retention.make_room()
+        repairs = prepare_folder(
+            request.out, overwrite=request.overwrite, resume=goes_on, waits=is_endless
+        )
         header = _header(request, reader.source.name, config, template, calibration)
         facts = run_facts(header, vessel=request.vessel, trip=request.trip, haul=request.haul)
         with (
             sealed(request.out, with_recordings=not is_endless, on_notice=observer.warn),
-            closing(LengthStore(request.out, facts)) as store,
-            consistent_csv(request.out / "lengths.csv", store, resume=goes_on),
+            closing(LengthStore(request.out, facts, waits=is_endless)) as store,
+            consistent_csv(
+                request.out / "lengths.csv",
+                store,
+                resume=goes_on,
+                on_refusal=observer.warn if is_endless else None,
+            ),
             closing(
                 Watch(
                     observer,

@@ -2,7 +2,7 @@
 
 import itertools
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,12 +20,14 @@ RESULTS = (
 SEGMENTED = ("lengths.db", "lengths.csv", "frames.csv", f"{STEM}-*")  # of a source without an end
 
 
-def prepare_folder(out: Path, *, overwrite: bool, resume: bool = False) -> list[Repair]:
+def prepare_folder(
+    out: Path, *, overwrite: bool, resume: bool = False, waits: bool = False
+) -> list[Repair]:
     """Make sure that results can be written to `out`, and that none are lost by it.
 
     Raises OutputError where it is no folder, can't be written to, has no room, or holds the
-    results of an earlier run; `overwrite` removes those instead, `resume` keeps them. Returns what
-    was done about recordings that a crash left unfinished.
+    results of an earlier run; `overwrite` removes those instead, `resume` keeps them. With `waits`
+    there may be room later. Returns what was done about recordings that a crash left unfinished.
     """
     earlier = [out / name for name in RESULTS if (out / name).exists()]
     earlier += sorted(out.glob(f"{STEM}-*"))
@@ -45,8 +47,9 @@ def prepare_folder(out: Path, *, overwrite: bool, resume: bool = False) -> list[
         for path in (out / f"{STEM}.mcap", out / f"{STEM}.rrd"):
             if path.exists():
                 _set_aside(path)
-        with tempfile.TemporaryFile(dir=out) as probe:
-            probe.write(bytes(1 << 16))
+        if not waits:
+            with tempfile.TemporaryFile(dir=out) as probe:
+                probe.write(bytes(1 << 16))
     except OSError as error:
         raise OutputError(
             f"{out}: expected a folder to write to, got: {error.strerror}; choose another --out"
@@ -64,11 +67,30 @@ def _set_aside(recording: Path) -> None:
 
 
 @contextmanager
-def consistent_csv(path: Path, store: LengthStore, *, resume: bool) -> Iterator[None]:
-    """Begin and end with what the store holds: a crash between the two loses a row of neither."""
+def consistent_csv(
+    path: Path,
+    store: LengthStore,
+    *,
+    resume: bool,
+    on_refusal: Callable[[str], None] | None = None,
+) -> Iterator[None]:
+    """Begin and end with what the store holds: a crash between the two loses a row of neither.
+
+    With `on_refusal`, that is told what the disk refuses, instead of an exception: the store has
+    the lengths, and the next run writes the table.
+    """
+
+    def write() -> None:
+        try:
+            write_lengths(path, store.estimates())
+        except OutputError as error:
+            if on_refusal is None:
+                raise
+            on_refusal(str(error))
+
     if resume:
-        write_lengths(path, store.estimates())
+        write()
     try:
         yield
     finally:
-        write_lengths(path, store.estimates())
+        write()

@@ -3,10 +3,8 @@
 Values are rounded to six decimals, far below what is measured; blank means there is none.
 """
 
-import csv
-import io
-import os
 from collections.abc import Iterable
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +13,8 @@ from jaxtyping import Float
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate, LocalizedFish
 from stream_dmr.recording.record import Record
-from stream_dmr.recording.whole_file import WholeFile, rename_durably
+from stream_dmr.recording.whole_file import rename_durably, writing_to
+from stream_dmr.table_file import TableFile
 
 LENGTHS_COLUMNS = [
     *("track_id", "length_mm", "length_std_mm", "ci95_low_mm", "ci95_high_mm"),
@@ -30,7 +29,7 @@ FRAMES_COLUMNS = [
     *("tail_x_mm", "tail_y_mm", "tail_z_mm"),
     *("bending_ratio", "length_mm", "length_std_mm", "iou", "accepted", "reason"),
 ]
-_BLOCK_BYTES = 1 << 16
+_LARGEST_BYTES = 64 << 20  # of frames.csv, before it is set aside: some hours of two fish
 
 
 class Tables:
@@ -40,10 +39,23 @@ class Tables:
     that says whether the frame was used; a row of lengths.csv comes with the final estimate.
     """
 
-    def __init__(self, out_dir: Path, *, resume: bool = False) -> None:
-        """With `resume`, the rows of an earlier run stay, but for one that a crash left in part."""
-        self._lengths = _Table(out_dir / "lengths.csv", LENGTHS_COLUMNS, resume=resume)
-        self._frames = _Table(out_dir / "frames.csv", FRAMES_COLUMNS, resume=resume)
+    def __init__(self, out_dir: Path, *, resume: bool = False, is_endless: bool = False) -> None:
+        """With `resume`, the rows of an earlier run stay, but for one that a crash left in part.
+
+        Of a run without an end, frames.csv becomes frames-000001.csv and so on where it is large,
+        and what the disk refuses is tried again: a file with every row, a row of lengths.csv with
+        the next one. A row of frames.csv that it refuses is left out.
+        """
+        again = {"resume": resume, "waits": is_endless}
+        self._lengths = TableFile(out_dir / "lengths.csv", LENGTHS_COLUMNS, **again)
+        self._lengths_refused: list[list[str]] = []
+        self._is_endless = is_endless
+        self._frames = TableFile(
+            out_dir / "frames.csv",
+            FRAMES_COLUMNS,
+            **again,
+            most_bytes=_LARGEST_BYTES if is_endless else None,
+        )
         self._waiting: dict[tuple[int, int], LocalizedFish] = {}
 
     def write(self, record: Record) -> None:
@@ -56,7 +68,18 @@ class Tables:
             if fish is not None:
                 self._frames.add(frames_row(fish, message.is_frame_used, message.frame_reason))
             if message.is_final:
-                self._lengths.add(lengths_row(message))
+                self._add_length(lengths_row(message))
+
+    def _add_length(self, row: list[str]) -> None:
+        self._lengths_refused.append(row)
+        try:
+            while self._lengths_refused:
+                self._lengths.add(self._lengths_refused[0])
+                del self._lengths_refused[0]
+        except OutputError:
+            if not self._is_endless:
+                self._lengths_refused.clear()
+            raise
 
     def close(self) -> None:
         """Write the rows that no estimate followed, with their own verdict. Idempotent."""
@@ -75,17 +98,16 @@ def write_lengths(path: Path, estimates: Iterable[LengthEstimate]) -> None:
     Raises OutputError where the disk refuses it.
     """
     draft = path.with_suffix(".csv.part")
-    table = _Table(draft, LENGTHS_COLUMNS)
     try:
-        for estimate in estimates:
-            table.add(lengths_row(estimate))
-        table.sync()
-        rename_durably(draft, path)
+        with closing(TableFile(draft, LENGTHS_COLUMNS)) as table, writing_to(path):
+            for estimate in estimates:
+                table.add(lengths_row(estimate))
+            table.sync()
+            rename_durably(draft, path)
     except BaseException:
-        draft.unlink(missing_ok=True)
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)
         raise
-    finally:
-        table.close()
 
 
 def lengths_row(estimate: LengthEstimate) -> list[str]:
@@ -135,51 +157,3 @@ def _number(value: float | None) -> str:
 
 def _numbers(values: Float[np.ndarray, "..."] | None, count: int) -> list[str]:
     return [""] * count if values is None else [_number(float(value)) for value in values.flat]
-
-
-def _whole_lines(path: Path) -> int:
-    """The bytes of a file up to the end of its last whole line."""
-    with path.open("rb") as file:
-        end = file.seek(0, os.SEEK_END)
-        while end > 0:
-            start = max(0, end - _BLOCK_BYTES)
-            file.seek(start)
-            newline = file.read(end - start).rfind(b"\n")
-            if newline >= 0:
-                return start + newline + 1
-            end = start
-    return 0
-
-
-class _Table:
-    """A CSV file with its header from the start, in which every row is whole."""
-
-    def __init__(self, path: Path, columns: list[str], *, resume: bool = False) -> None:
-        self._path = path
-        try:
-            keep = _whole_lines(path) if resume and path.exists() else 0
-            self._file = WholeFile(path, keep=keep)
-        except OSError as error:
-            raise self._refusal(error) from error
-        if keep == 0:
-            self.add(columns)
-
-    def add(self, row: list[str]) -> None:
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerow(row)
-        try:
-            self._file.write(text.getvalue().encode("utf-8", "backslashreplace"))
-        except OSError as error:
-            raise self._refusal(error) from error
-
-    def sync(self) -> None:
-        self._file.sync()
-
-    def close(self) -> None:
-        self._file.close()
-
-    def _refusal(self, error: OSError) -> OutputError:
-        return OutputError(
-            f"{self._path}: expected a file to write to, got: {error.strerror}; "
-            "make room or choose another --out"
-        )

@@ -28,6 +28,13 @@ class Sink(Protocol):
         ...
 
 
+@runtime_checkable
+class FileSink(Sink, Protocol):
+    """A sink that writes one file."""
+
+    path: Path  # of the file when it is closed
+
+
 OpenSinks = Callable[[Path, RunHeader, RecordingSettings], Sequence[Sink]]
 """Opens what records a run in this folder. Raises as `open_files` does."""
 
@@ -39,12 +46,12 @@ def open_files(
     *,
     stem: str = STEM,
     number: int | None = None,
-) -> list[Sink]:
+) -> list[FileSink]:
     """The sinks that the settings ask for, in this order; `number` is that of a segment.
 
     Raises OutputError where the disk refuses one, ConfigError where a package is missing.
     """
-    files: list[Sink] = []
+    files: list[FileSink] = []
     with ExitStack() as undo:
         if settings.mcap:
             path, extras = out_dir / f"{stem}.mcap", list(_extras(header, settings))

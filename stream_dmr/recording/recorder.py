@@ -60,7 +60,8 @@ class Recorder:
         make_folder(out_dir)
         with ExitStack() as undo:
             undo.callback(self._close_sinks)
-            self._sinks.append(Tables(out_dir, resume=resume))
+            is_endless = on_refusal is not None
+            self._sinks.append(Tables(out_dir, resume=resume, is_endless=is_endless))
             self._sinks += files(out_dir, header, settings)
             if live:
                 self._sinks.append(view := LiveView(header, settings))
@@ -155,4 +156,12 @@ class Recorder:
     def _close_sinks(self) -> None:
         with ExitStack() as stack:
             for sink in self._sinks:
-                stack.callback(sink.close)
+                stack.callback(self._close_one, sink)
+
+    def _close_one(self, sink: Sink) -> None:
+        try:
+            sink.close()
+        except OutputError as error:
+            if self._on_refusal is None:
+                raise
+            self._on_refusal(str(error))

@@ -1,7 +1,8 @@
 """Repairs what a crash or a power cut left of recordings."""
 
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from typing import NamedTuple
@@ -33,24 +34,38 @@ def recover(folder: Path) -> Iterator[Repair]:
     crash in the middle of it does no harm.
     """
     for leftover in folder.glob(f"{STEM}*{REWRITTEN}"):
-        leftover.unlink()
-    for part in sorted(folder.glob(f"{STEM}*.mcap{PART}")):
-        yield _attempt(part, _repair_mcap)
-    for rrd in sorted(folder.glob(f"{STEM}*.rrd")):
-        if not is_closed(rrd):
-            yield _attempt(rrd, _repair_rrd)
+        with suppress(OSError):
+            leftover.unlink()
+    unfinished = [*sorted(folder.glob(f"{STEM}*.mcap{PART}")), *sorted(folder.glob(f"{STEM}*.rrd"))]
+    for path in unfinished:
+        if is_unfinished(path):
+            yield repair(path)
 
 
-def _attempt(path: Path, repair: Callable[[Path], tuple[Path, str]]) -> Repair:
+def is_unfinished(path: Path) -> bool:
+    """Whether this is a file of a recording that was not closed; nothing may be writing it."""
+    is_view = path.suffix == ".rrd"
+    return path.exists() and (not is_closed(path) if is_view else path.suffix == PART)
+
+
+def repair(path: Path, *, left_by: str = "a crash") -> Repair:
+    """Make one file of a recording whole; where the disk refuses that, it stays as it is."""
     try:
-        found, done = repair(path)
+        found, done = _repair_rrd(path) if path.suffix == ".rrd" else _repair_mcap(path)
     except RecordingError:
-        found = path.with_name(path.name + _DAMAGED)
-        path.replace(found)
-        done = f"nothing in it is whole, it is kept as {found.name}"
+        found, done = _set_aside(path)
     except OSError as error:
         found, done = path, f"it can't be repaired: {error.strerror}; it stays as it is"
-    return Repair(found, f"{path.name}: left unfinished by a crash; {done}")
+    return Repair(found, f"{path.name}: left unfinished by {left_by}; {done}")
+
+
+def _set_aside(path: Path) -> tuple[Path, str]:
+    aside = path.with_name(path.name + _DAMAGED)
+    try:
+        path.replace(aside)
+    except OSError as error:
+        return path, f"nothing in it is whole, and it stays as it is: {error.strerror}"
+    return aside, f"nothing in it is whole, it is kept as {aside.name}"
 
 
 def _repair_mcap(part: Path) -> tuple[Path, str]:

@@ -85,6 +85,7 @@ class RerunSink:
             self._rec.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except RuntimeError as error:
             self._closed = True
+            self._rec.disconnect()
             raise self._refusal(error) from error
         self._flush_at_ns = time.monotonic_ns() + self._flush_ns
 

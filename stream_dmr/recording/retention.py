@@ -17,6 +17,7 @@ from stream_dmr.recording.rewrite import rewrite
 from stream_dmr.recording.rrd_file import is_closed
 from stream_dmr.recording.topics import FOXGLOVE_TOPICS, THINNED, TOPICS, VIDEO
 from stream_dmr.recording.whole_file import free_bytes, rename_durably
+from stream_dmr.table_file import set_aside
 
 _LEFT_OUT = {TOPICS[FishCrop].topic, VIDEO, *FOXGLOVE_TOPICS}
 _PERIOD_S = 5.0
@@ -25,8 +26,9 @@ _PERIOD_S = 5.0
 class Retention:
     """Makes room in the folder of a run whenever less is free than is to be kept free.
 
-    First the views and then the pictures and masks of the oldest segments go, then whole segments;
-    those with a fish of `marked()` after all others. What is being written is left alone.
+    First go old tables of frames, whose rows the segments have, then the views, and pictures and
+    masks, of the oldest segments, then whole segments; those with a fish of `marked()` after all
+    others. What is being written is left alone.
     """
 
     def __init__(
@@ -81,6 +83,8 @@ class Retention:
 
     def _steps(self) -> Iterator[str]:
         """Do what makes room, one at a time, and name it."""
+        for table in set_aside(self._folder / "frames.csv"):
+            yield from self._remove(table, "the table of frames")
         stems, marked = self._finished(), set(self._marked())
         is_marked = {stem: bool(marked & set(self._facts(stem)[0])) for stem in stems}
         for wanted in (False, True):

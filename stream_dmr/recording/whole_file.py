@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from stream_dmr.errors import OutputError
@@ -17,16 +17,27 @@ class WholeFile:
     def __init__(self, path: Path, *, keep: int = 0) -> None:
         """Of a file that is there, the first `keep` bytes stay."""
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT, 0o666)
-        self.truncate(keep)
+        try:
+            self.truncate(keep)
+        except OSError:
+            self.close()
+            raise
 
     def write(self, data: bytes) -> int:
-        """Append `data`; where that fails, OSError, with the file as it was."""
+        """Append `data`; where that fails, OSError, with the file as it was.
+
+        Where not even that can be had, the next write begins with it.
+        """
         rest = memoryview(data)
         try:
+            if self._is_torn:
+                self.truncate(self._size)
             while rest:
                 rest = rest[os.write(self._fd, rest) :]
         except OSError:
-            self.truncate(self._size)
+            self._is_torn = True
+            with suppress(OSError):
+                self.truncate(self._size)
             raise
         self._size += len(data)
         return len(data)
@@ -35,6 +46,7 @@ class WholeFile:
         """Cut back to `size` bytes; the next write continues there."""
         os.ftruncate(self._fd, size)
         self._size = os.lseek(self._fd, size, os.SEEK_SET)
+        self._is_torn = False
 
     def tell(self) -> int:
         """Bytes written so far."""
