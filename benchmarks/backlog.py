@@ -1,7 +1,7 @@
 """Throughput of `stream-dmr batch`: `python benchmarks/backlog.py --videos 4 --engines local ray`.
 
-Copies of the embedded scene, measured with one worker and with two; `--rounds 3` gives medians. The first video of each worker
-also pays for its start; `docs/scale.md` has the figures.
+Copies of the embedded scene, measured with one worker and with two; `--rounds 3` gives medians. The
+first video of each worker also pays for its start; `docs/scale.md` has the figures.
 """
 
 import argparse
