@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stream_dmr.messages import Frame
+from stream_dmr.segmentation.background import Background
 from stream_dmr.segmentation.camera_motion import CameraMotion, compose
 from stream_dmr.segmentation.detector import Candidate
 from stream_dmr.segmentation.motion import MotionDetector, MotionSettings
@@ -65,6 +66,32 @@ def pan(seed: int, step: tuple[float, float], frames: int) -> list[np.ndarray]:
 
 def grey(image: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+
+
+@given(st.integers(0, 99))
+@settings(max_examples=5)
+def test_the_background_is_judged_and_learnt_as_its_formulas_say(seed: int):
+    """The compiled arithmetic against the same in plain arrays."""
+    rng = np.random.default_rng(seed)
+    first, second, third = (rng.uniform(0, 255, (3, 24, 32)).astype(np.float32) for _ in range(3))
+    background = Background(first, memory_frames=5.0)
+    background.learn(second, background.distance(second), np.ones((24, 32), np.float32))
+    away = third - background.mean - background._shift
+    bb, gg, rr, bg, br, gr = background._inverse
+    inverse = np.array([[bb, bg, br], [bg, gg, gr], [br, gr, rr]])
+    expected = np.einsum("ihw,ijhw,jhw->hw", away, inverse, away) / background._habit
+    distance = background.distance(third)
+    np.testing.assert_allclose(distance, expected, rtol=2e-3)
+    rate = rng.choice([0.0, 0.5, 1.0], (24, 32)).astype(np.float32)
+    speed = rate * np.maximum(1 / (background._age + 1), 1 / 5)
+    excess = np.clip(distance * background._habit / 3, 1, 8)
+    habit = background._habit + speed * (excess - background._habit)
+    mean = background.mean + speed * (third - background.mean)
+    age = background._age + (rate > 0)
+    background.learn(third, distance, rate)
+    for found, wanted in ((background.mean, mean), (background._habit, habit)):
+        np.testing.assert_allclose(found, wanted, rtol=1e-4)
+    np.testing.assert_array_equal(background._age, age)
 
 
 @given(st.integers(0, 99), st.floats(-6, 6), st.floats(-6, 6))

@@ -14,7 +14,7 @@ from stream_dmr.messages import Frame
 from stream_dmr.segmentation.crop import CropFishSettings, crop_fish
 from stream_dmr.segmentation.detector import Candidate
 from stream_dmr.segmentation.followed import FollowedFish, TrackFishSettings
-from stream_dmr.segmentation.segmenter import Segmented
+from stream_dmr.segmentation.segmenter import Segmented, Segmenter
 
 WIDTH, HEIGHT = 640, 480
 SEA = 60
@@ -70,6 +70,7 @@ def follow(
     *,
     only: Sequence[int] | None = None,
     confidence: float = 1.0,
+    segmenter: Segmenter | None = None,
     **knobs: object,
 ) -> dict[int, list[Found]]:
     """The fish of each frame; `only`: frames that arrive, as a live source drops some."""
@@ -85,7 +86,7 @@ def follow(
                 detection,
                 frame_camera=camera,
                 settings=CropFishSettings(crop_size_px=32),
-                segmenter=WholeBox(confidence),
+                segmenter=segmenter or WholeBox(confidence),
             )
             for detection in fish.detect(frame)
         ]
@@ -211,3 +212,23 @@ def test_ids_go_to_fish_in_the_order_in_which_they_count():
 def test_a_zone_without_an_inside_is_refused(zone: list[float]):
     with pytest.raises(ValidationError):
         TrackFishSettings(zone=zone)
+
+
+@pytest.mark.parametrize(("confidence", "beyond"), [(1.0, 10.0), (0.8, 0.0)])
+def test_a_box_follows_the_edges_of_the_last_sure_mask_by_a_tenth_at_most(
+    confidence: float, beyond: float
+):
+    class Longer:
+        """Sees the fish reach on below every box, by half the box's height."""
+
+        def segment(self, image: np.ndarray, bbox_xyxy_px: np.ndarray) -> Segmented:
+            probability = np.zeros(image.shape[:2], np.float32)
+            x0, y0, x1, y1 = bbox_xyxy_px.round().astype(int)
+            probability[max(y0, 0) : y1 + (y1 - y0) // 2, max(x0, 0) : x1] = confidence
+            return Segmented(probability=probability, ends=None)
+
+    found = follow([[climb(i)] for i in range(10)], segmenter=Longer())
+    for i in range(2, 11):
+        x, y, w, h, _ = climb(i - 1)
+        edges = [x - w / 2, y - h / 2, x + w / 2, y + h / 2 + beyond]
+        np.testing.assert_allclose(found[i][0].bbox_xyxy_px, edges, atol=0.5)

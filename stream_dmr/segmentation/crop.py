@@ -8,17 +8,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from pydantic import Field
 
-from stream_dmr.camera import Camera, crop_from_frame
+from stream_dmr.camera import Camera, crop_from_frame, frame_from_crop
 from stream_dmr.messages import CropQuality, FishCrop, FishEnds, Frame
 from stream_dmr.segmentation.detections import Detection
+from stream_dmr.segmentation.quality import glare, sharpness, touches_border
 from stream_dmr.segmentation.segmenter import Segmenter
 from stream_dmr.settings import Settings
 
 _SMALLEST_PART = 0.05  # of the largest part's area: the tail behind a gaff stays, specks go
 _LARGEST_HOLE = 0.01  # of the mask's area: pinholes are noise, larger ones something in front
 _SAME_BOX = 0.85  # IoU of the mask's box and the one given, from which on they are one
-_BLOWN = 250  # grey level of every channel: no skin is so bright
-_BORDER_PX = 1  # a mask this near to the frame's edge touches it
 _MOST_SAMPLES = 4  # per crop pixel and axis; more cost time and change nothing that we measured
 
 
@@ -94,12 +93,12 @@ def crop_fish(
         crop_camera=fish.crop_camera,
         frame_camera=frame_camera,
         quality=CropQuality(
-            touches_border=_touches_border(fish.extent, shape=frame.image.shape[:2]),
+            touches_border=touches_border(fish.extent, shape=frame.image.shape[:2]),
             visible_fraction=detection.visible_fraction,
-            sharpness=_sharpness(fish.image, fish.mask),
+            sharpness=sharpness(fish.image, fish.mask),
             mask_area_px=fish.area_px,
             mask_confidence=fish.confidence,
-            glare=_glare(fish.image, fish.mask),
+            glare=glare(fish.image, fish.mask),
         ),
         ends=fish.ends,
     )
@@ -180,11 +179,16 @@ def _box_in_crop(
     bbox_xyxy_px: Float[np.ndarray, "4"], cameras: tuple[Camera, Camera]
 ) -> Float[np.ndarray, "4"]:
     """The box, half-open, in the crop's pixels: by the middles of its edges."""
-    x0, y0, x1, y1 = bbox_xyxy_px - 0.5  # half-open counts from pixel edges, cameras from centres
-    x, y = (x0 + x1) / 2, (y0 + y1) / 2
-    middles = np.array([[x0, y], [x, y0], [x1, y], [x, y1]])
+    middles = _middles(bbox_xyxy_px)
     pixels = crop_from_frame(middles, crop_camera=cameras[0], frame_camera=cameras[1])
     return pixels[np.arange(4), [0, 1, 0, 1]] + 0.5
+
+
+def _middles(bbox_xyxy_px: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4 2"]:
+    """The middles of a box's edges, left, top, right, bottom, as pixels."""
+    x0, y0, x1, y1 = bbox_xyxy_px - 0.5  # half-open counts from pixel edges, cameras from centres
+    x, y = (x0 + x1) / 2, (y0 + y1) / 2
+    return np.array([[x0, y], [x, y0], [x1, y], [x, y1]])
 
 
 def clean_mask(mask: Bool[np.ndarray, "H W"], *, min_area_px: int) -> Bool[np.ndarray, "H W"]:
@@ -224,6 +228,19 @@ def _extent(mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "4"] | None:
     """The box around a mask, half-open; None for an empty one."""
     x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
     return np.array([x, y, x + width, y + height], np.float64) if width else None
+
+
+def mask_extent(crop: FishCrop) -> Float[np.ndarray, "4"] | None:
+    """The box around a crop's mask, half-open in frame pixels; None for an empty mask.
+
+    By the middles of its edges, which is right to a pixel through any lens of use.
+    """
+    extent = _extent(crop.mask)
+    if extent is None:
+        return None
+    cameras = {"crop_camera": crop.crop_camera, "frame_camera": crop.frame_camera}
+    pixels = frame_from_crop(_middles(extent), **cameras)
+    return pixels[np.arange(4), [0, 1, 0, 1]] + 0.5
 
 
 def _union(
@@ -312,25 +329,3 @@ def frame_from_crop_map(
         frame_camera.K, frame_camera.distortion, np.eye(3), K, size, cv2.CV_32FC1
     )
     return x, y
-
-
-def _touches_border(extent: Float[np.ndarray, "4"] | None, *, shape: tuple[int, ...]) -> bool:
-    if extent is None:
-        return False
-    height, width = shape
-    x0, y0, x1, y1 = extent
-    return bool(min(x0, y0, width - x1, height - y1) <= _BORDER_PX)
-
-
-def _glare(image: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]) -> float:
-    """The share of the mask where the sensor saw nothing but light; 0 for an empty one."""
-    is_blown = cv2.inRange(image, np.full(3, _BLOWN), np.full(3, 255)) > 0
-    return float(np.count_nonzero(is_blown & mask) / max(np.count_nonzero(mask), 1))
-
-
-def _sharpness(image: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]) -> float:
-    """Variance of the Laplacian inside the mask (Pech-Pacheco et al., ICPR 2000)."""
-    if not mask.any():
-        return 0.0
-    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    return float(cv2.Laplacian(grey, cv2.CV_64F)[mask].var())

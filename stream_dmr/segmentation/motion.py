@@ -69,7 +69,7 @@ class MotionDetector:
     def _moving(self, small: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
         """Where the picture is foreign to its background and moves."""
         background, shown = self._follow(small)
-        picture = shown.astype(np.float32)
+        picture = _planes(shown)
         background.meet(picture)
         distance = background.distance(picture)
         foreign = _foreign(distance, self._settings.motion_min_distance)
@@ -90,7 +90,7 @@ class MotionDetector:
         if self._background is None or self._is_foreign is None or self._before is None:
             self._camera.step(grey, is_background=np.ones(grey.shape, bool))
             self._background = Background(
-                small.astype(np.float32), memory_frames=self._settings.motion_memory_frames
+                _planes(small), memory_frames=self._settings.motion_memory_frames
             )
             self._before = small
             return self._background, small
@@ -116,7 +116,8 @@ class MotionDetector:
         self._before = warp(before, shift)
         self._place = compose(shift, self._place)
         # Small errors would add up from picture to picture; the background itself mends them.
-        mean = cv2.cvtColor(background.mean.clip(0, 255).astype(np.uint8), cv2.COLOR_BGR2GRAY)
+        mean = cv2.merge(list(background.mean.clip(0, 255).astype(np.uint8)))
+        mean = cv2.cvtColor(mean, cv2.COLOR_BGR2GRAY)
         shown = warp(grey, self._place)
         mended = similarity(shown, mean, is_background=np.ones(grey.shape, bool))
         if mended is not None:
@@ -165,7 +166,13 @@ def _still(
     in_shape = np.bincount(labels[changed], minlength=count)
     is_still = in_shape < _STILL * stats[:, cv2.CC_STAT_AREA]
     is_still[0] = False
+    if not is_still.any():  # mostly so, and ten times as fast
+        return np.zeros(foreign.shape, bool)
     return np.asarray(is_still)[np.asarray(labels, np.intp)]
+
+
+def _planes(picture: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "3 h w"]:
+    return np.array(cv2.split(picture), np.float32)
 
 
 def _shrink(image: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
