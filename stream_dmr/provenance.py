@@ -85,6 +85,25 @@ def write_provenance(
             path.relative_to(folder).as_posix(): sha256_of(path) for path in sorted(set(files))
         },
     }
+    return _write(folder, made)
+
+
+def add_files(folder: Path, files: Iterable[Path]) -> None:
+    """Say in addition of `files` what they are, be they new or made anew. OutputError.
+
+    What it says of others stays, whatever has become of them. One that is missing or damaged stays
+    so: it is for `verify` to find.
+    """
+    try:
+        made = read_provenance(folder)
+    except ValueError:
+        return
+    if made is not None:
+        added = {path.relative_to(folder).as_posix(): sha256_of(path) for path in files}
+        _write(folder, made | {"files": made["files"] | added})
+
+
+def _write(folder: Path, made: dict[str, Any]) -> Path:
     target, draft = folder / NAME, folder / f"{NAME}.part"
     with writing_to(target):
         draft.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")

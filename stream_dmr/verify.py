@@ -51,10 +51,22 @@ def verify(folder: Path) -> tuple[list[Change], int]:
         )
     changes, num_files = list[Change](), 0
     for place in sorted(places):
-        found = list(_changes(place))
+        changes += dict.fromkeys(_changes(place))
         num_files += sum(1 for path in place.iterdir() if path.is_file())
-        changes += dict.fromkeys(found)
+    for copy in sorted(folder.glob("**/dataset/*/*/*/*.parquet")):
+        changes += _copy(copy)
+        num_files += 1
     return changes, num_files
+
+
+def _copy(path: Path) -> Iterator[Change]:
+    """A file of a batch's data set against that of its video, dataset/KIND/*/*/VIDEO.parquet."""
+    kind, batch = path.parents[2].name, path.parents[4]
+    origin = batch / "videos" / path.stem / f"{kind}.parquet"
+    if not origin.is_file():
+        yield Change(path, f"is of no video that is done: there is no {origin.relative_to(batch)}")
+    elif sha256_of(path) != sha256_of(origin):
+        yield Change(path, f"is not what {origin.relative_to(batch)} is")
 
 
 def _changes(folder: Path) -> Iterator[Change]:
@@ -69,12 +81,16 @@ def _changes(folder: Path) -> Iterator[Change]:
         yield Change(database, f"damaged: {error}")
         return
     lengths = [(str(f.estimate.track_id), lengths_row(f.estimate)) for f in fish.values()]
-    yield from _csv(folder / "lengths.csv", LENGTHS_COLUMNS, dict(lengths), whole=True)
+    yield from _csv(
+        folder / "lengths.csv", LENGTHS_COLUMNS, dict(lengths), witness=DATABASE, whole=True
+    )
     frames: dict[str, list[str]] = {}
     for recording in sorted([*folder.glob("*.mcap"), *folder.glob("*.mcap.part")]):
         yield from _recording(recording, runs, fish, frames)
     if frames:
-        yield from _csv(folder / "frames.csv", FRAMES_COLUMNS, frames, whole=False)
+        yield from _csv(
+            folder / "frames.csv", FRAMES_COLUMNS, frames, witness="the recording", whole=False
+        )
 
 
 def _against_provenance(folder: Path) -> Iterator[Change]:
@@ -84,6 +100,7 @@ def _against_provenance(folder: Path) -> Iterator[Change]:
         yield Change(folder / PROVENANCE, f"damaged: {error}")
         return
     if made is None:
+        yield Change(folder / PROVENANCE, "is missing; files were compared with each other alone")
         return
     for name, expected in made["files"].items():
         path = folder / name
@@ -138,7 +155,7 @@ def _recording(
         for line in recording.warnings:
             yield Change(path, line)
     except RecordingError as error:
-        yield Change(path, f"damaged: {error}")
+        yield Change(path, f"damaged: {str(error).removeprefix(f'{path}: ')}")
 
 
 def _estimate(path: Path, recorded: LengthEstimate, fish: FishResult | None) -> Iterator[Change]:
@@ -154,29 +171,39 @@ def _estimate(path: Path, recorded: LengthEstimate, fish: FishResult | None) -> 
 
 
 def _csv(
-    path: Path, columns: Sequence[str], expected: dict[str, list[str]], *, whole: bool
+    path: Path,
+    columns: Sequence[str],
+    expected: dict[str, list[str]],
+    *,
+    witness: str,
+    whole: bool,
 ) -> Iterator[Change]:
-    """Compare a table with the rows it should have; without `whole`, it may have others too."""
+    """Compare a table with the rows that a witness has; it may have others, but not if `whole`."""
     if not path.is_file():
         yield Change(path, "is missing")
         return
-    text = path.read_text(encoding="utf-8", errors="replace")
-    rows = list(csv.reader(io.StringIO(text)))
-    if not rows or rows[0] != list(columns):
+    found = _rows(path, columns)
+    if found is None:
         yield Change(path, "its columns are not those of stream-dmr")
         return
-    key = columns.index("track_id")
-    found: dict[str, list[str]] = {}
-    for row in rows[1:]:
-        if len(row) == len(columns):
-            found[row[0] if key == 0 else f"{row[0]},{row[key]}"] = row
     for name, row in expected.items():
-        label = f"fish {name}" if key == 0 else "frame {}, fish {}".format(*name.split(","))
+        label = "frame {}, fish {}".format(*name.split(",")) if "," in name else f"fish {name}"
         if name not in found:
-            yield Change(path, f"{label} is missing")
+            yield Change(path, f"{label} is missing; {witness} has it")
             continue
         for column, now, was in zip(columns, found[name], row, strict=True):
             if now != was:
-                yield Change(path, f"{label}: {column} is {now or 'blank'}, was {was or 'blank'}")
-    for name in found.keys() - expected.keys() if whole else ():
-        yield Change(path, f"fish {name} is no fish of {DATABASE}")
+                cell = f"{column} is {now or 'blank'}, {witness} says {was or 'blank'}"
+                yield Change(path, f"{label}: {cell}")
+    for name in sorted(found.keys() - expected.keys()) if whole else ():
+        yield Change(path, f"fish {name} is no fish of {witness}")
+
+
+def _rows(path: Path, columns: Sequence[str]) -> dict[str, list[str]] | None:
+    """Rows by their fish, or by frame and fish; None where the columns are others."""
+    rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8", errors="replace"))))
+    if not rows or rows[0] != list(columns):
+        return None
+    fish = columns.index("track_id")
+    whole = [row for row in rows[1:] if len(row) == len(columns)]
+    return {f"{row[0]},{row[fish]}" if fish else row[0]: row for row in whole}

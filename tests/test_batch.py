@@ -26,6 +26,7 @@ from stream_dmr.batch.pieces import pieces_of
 from stream_dmr.batch.progress import Clock, duration
 from stream_dmr.errors import UserError
 from stream_dmr.run import run
+from stream_dmr.verdicts import Verdict, add_verdict
 from stream_dmr.verify import verify
 
 TABLES = ("lengths.csv", "frames.csv")
@@ -168,6 +169,30 @@ def test_pandas_opens_the_data_set(finished: Path):
     lengths = rows(finished / "videos" / "video" / "lengths.csv")
     of_first = fish[fish["video"] == "video"]["length_mm"]
     assert list(of_first.round(6)) == [float(line["length_mm"]) for line in lengths]
+
+
+def test_a_changed_data_set_is_found(season: Path, tmp_path: Path):
+    (job,) = jobs_of(season, tmp_path, row())
+    measure([job], tmp_path)
+    assert verify(tmp_path)[0] == []
+    (copy,) = (tmp_path / "dataset" / "fish").rglob("*.parquet")
+    copy.write_bytes(copy.read_bytes() + b"x")
+    (change,) = verify(tmp_path)[0]
+    assert change.path == copy
+    assert "is not what videos/video/fish.parquet is" in change.what
+    copy.rename(copy.with_name("other.parquet"))
+    assert "no video that is done" in verify(tmp_path)[0][0].what
+
+
+def test_verdicts_come_into_the_data_set_with_the_next_batch(season: Path, tmp_path: Path):
+    (job,) = jobs_of(season, tmp_path, row())
+    measure([job], tmp_path)
+    database = folder_of(job, tmp_path) / "lengths.db"
+    add_verdict(database, Verdict(track_id=2, kind="reject", reason="a glove", reviewer="Ada"))
+    measure([job], tmp_path)
+    fish = dataset.dataset(tmp_path / "dataset" / "fish").to_table().to_pylist()
+    assert [one["verdict"] for one in fish] == [None, "reject"]
+    assert verify(tmp_path)[0] == []
 
 
 def test_what_is_done_is_not_done_again(season: Path, tmp_path: Path):

@@ -75,7 +75,11 @@ def test_a_changed_cell_is_named(out: Path, name: str, is_resealed: bool):
         made = json.loads((out / NAME).read_text())
         del made["files"][name]
         (out / NAME).write_text(json.dumps(made))
-    found = [line for line in changed(out) if f"length_mm is 1234.000000, was {before}" in line]
+    found = [
+        line
+        for line in changed(out)
+        if "length_mm is 1234.000000, " in line and f"says {before}" in line
+    ]
     assert len(found) == 1
     assert found[0].startswith(name)
 
@@ -114,6 +118,11 @@ def test_a_changed_export(out: Path):
     (out / "exp" / NAME).write_text("{}")
     (line,) = changed(out)
     assert line.startswith(f"{NAME}: damaged")
+
+
+def test_a_missing_provenance_is_said(out: Path):
+    (out / NAME).unlink()
+    assert changed(out) == [f"{NAME}: is missing; files were compared with each other alone"]
 
 
 def test_nothing_to_check_is_refused(tmp_path: Path):

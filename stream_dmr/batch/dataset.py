@@ -6,7 +6,7 @@ files of hive partitions, `vessel=.../trip=.../VIDEO.parquet`, one of each video
 
 import csv
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,14 @@ from pyarrow import Table, parquet
 
 from stream_dmr.batch.manifest import Job
 from stream_dmr.config import parse_config
+from stream_dmr.errors import OutputError
 from stream_dmr.fish_table import FISH_TABLE, arrow_schema, fish_record
+from stream_dmr.provenance import add_files
 from stream_dmr.recording.opened import open_recordings
-from stream_dmr.results import read_fish
+from stream_dmr.results import FishResult, read_fish
+from stream_dmr.store import NAME as DATABASE
 from stream_dmr.tables import FRAMES_COLUMNS
+from stream_dmr.verdicts import read_verdicts
 
 KINDS = ("fish", "frames")
 _PARTITIONS = ("vessel", "trip")
@@ -27,7 +31,7 @@ _WHOLE_NUMBERS = ("frame_index", "timestamp_ns", "track_id")
 _MADE_BY = ("run_id", "software_version", "config_sha256")
 _OF_VIDEO = {"video": str, "haul": str}
 FISH_SCHEMA = _OF_VIDEO | {k: v for k, v in FISH_TABLE.items() if k not in _PARTITIONS}
-FRAMES_SCHEMA: dict[str, type] = {
+_FRAMES: dict[str, type] = {
     **_OF_VIDEO,
     **dict.fromkeys(FRAMES_COLUMNS, float),
     **dict.fromkeys(_WHOLE_NUMBERS, int),
@@ -45,20 +49,31 @@ def write_tables(folder: Path, job: Job) -> None:
     fish = read_fish(folder, recording)
     of_video = {"video": job.name, "haul": job.haul}
     records = [fish_record(one, header.template, settings) | of_video for one in fish]
-    _write(folder / "fish.parquet", records, FISH_SCHEMA)
-    made = {one.estimate.track_id: one for one in fish}
+    tables = {"fish": (records, FISH_SCHEMA), "frames": (_frames(folder, fish, of_video), _FRAMES)}
+    for kind, (rows, schema) in tables.items():
+        _write(folder / f"{kind}.parquet", rows, schema)
+    add_files(folder, [folder / f"{kind}.parquet" for kind in KINDS])
+
+
+def _frames(
+    folder: Path, fish: Sequence[FishResult], of_video: dict[str, str]
+) -> list[dict[str, Any]]:
+    made = {one.estimate.track_id: {"run_id": one.run_id} | asdict(one.facts) for one in fish}
     frames = list[dict[str, Any]]()
     with (folder / "frames.csv").open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
-            record = {name: _value(row[name], FRAMES_SCHEMA[name]) for name in FRAMES_COLUMNS}
-            one = made.get(record["track_id"])
-            facts = {"run_id": one.run_id} | asdict(one.facts) if one else {}
-            frames.append(record | of_video | facts)
-    _write(folder / "frames.parquet", frames, FRAMES_SCHEMA)
+            record = {name: _value(row[name], _FRAMES[name]) for name in FRAMES_COLUMNS}
+            frames.append(record | of_video | made.get(record["track_id"], {}))
+    return frames
 
 
 def publish(folder: Path, job: Job, out: Path) -> None:
-    """Make the tables of a finished video a part of the data set. Idempotent."""
+    """Make the tables of a finished video a part of the data set. Idempotent.
+
+    What reviewers have said since they were written comes in as well.
+    """
+    if _last_said(folder) > _time(folder, "fish"):
+        write_tables(folder, job)
     for kind in KINDS:
         target = _target(out, kind, job)
         if target.exists() and target.stat().st_mtime_ns >= _time(folder, kind):
@@ -87,6 +102,15 @@ def _target(out: Path, kind: str, job: Job) -> Path:
 
 def _time(folder: Path, kind: str) -> int:
     return (folder / f"{kind}.parquet").stat().st_mtime_ns
+
+
+def _last_said(folder: Path) -> int:
+    """When a reviewer last said something, ns since 1970; 0 for never."""
+    try:
+        said = read_verdicts(folder / DATABASE)
+    except OutputError:  # `verify` says what is wrong with it
+        return 0
+    return said[-1].written_ns if said else 0
 
 
 def _write(path: Path, records: list[dict[str, Any]], schema: dict[str, type]) -> None:

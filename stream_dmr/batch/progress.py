@@ -59,7 +59,7 @@ class Clock:
             size * (1.0 if name in self._over else sum(list(self._shares[name].values())))
             for name, size in self._bytes.items()
         )
-        return sum(done) / sum(self._bytes.values())
+        return sum(done) / max(1, sum(self._bytes.values()))
 
 
 def duration(seconds: float) -> str:
