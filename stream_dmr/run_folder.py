@@ -77,12 +77,13 @@ def consistent_csv(
     """Begin and end with what the store holds: a crash between the two loses a row of neither.
 
     With `on_refusal`, that is told what the disk refuses, instead of an exception: the store has
-    the lengths, and the next run writes the table.
+    the lengths, and the next run writes the table, as it does where the store has trouble itself.
     """
 
     def write() -> None:
         try:
-            write_lengths(path, store.estimates())
+            if not store.trouble:
+                write_lengths(path, store.estimates())
         except OutputError as error:
             if on_refusal is None:
                 raise

@@ -185,7 +185,7 @@ class LengthStore:
         except DiskRefusal as error:
             if not waits:
                 raise
-            self.trouble = str(error)
+            self.trouble = str(error.__cause__)
         self._give_up_ballast()
         with suppress(DiskRefusal):
             return open_database(self.path), True
@@ -226,7 +226,7 @@ class LengthStore:
             except sqlite3.IntegrityError:  # a fish that is there already: our own mistake
                 raise
             except (sqlite3.Error, OutputError) as error:
-                self.trouble = str(error)
+                self.trouble = str(error.__cause__ or error)
             self._is_reached = False
             if not is_last:
                 self._give_up_ballast()
@@ -250,7 +250,12 @@ class LengthStore:
             return
         if not self._is_stand_in:
             self._database.close()  # SQLite may hold on to a state of the file that never was
-        fresh = open_database(self.path)
+        try:
+            fresh = open_database(self.path)
+        except DiskRefusal:
+            if not self._is_stand_in:
+                self._database, self._is_stand_in = copy_in_memory(self.path), True
+            raise
         self._database.close()
         self._database, self._is_reached, self._is_stand_in = fresh, True, False
         written = _marks(fresh).written

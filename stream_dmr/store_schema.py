@@ -103,8 +103,9 @@ def copy_in_memory(path: Path) -> sqlite3.Connection:
     """
     memory = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
     try:
-        if path.exists() and path.stat().st_size > 0:
-            address = f"{path.absolute().as_uri()}?mode=rw"
+        if _size(path) and not _size(path, "-journal"):  # which it has only while it is made
+            how = "mode=rw" if _size(path, "-wal") else "mode=ro&immutable=1"
+            address = f"{path.absolute().as_uri()}?{how}"
             with closing(sqlite3.connect(address, uri=True, isolation_level=None)) as file:
                 file.execute("PRAGMA locking_mode = EXCLUSIVE")  # the log's index, in memory
                 file.backup(memory)
@@ -116,6 +117,14 @@ def copy_in_memory(path: Path) -> sqlite3.Connection:
             raise _refusal(path, error) from error
         raise
     return memory
+
+
+def _size(path: Path, more: str = "") -> int:
+    """Bytes of a file beside the database; 0 where there is none."""
+    try:
+        return path.with_name(path.name + more).stat().st_size
+    except FileNotFoundError:
+        return 0
 
 
 def _refusal(path: Path, error: sqlite3.Error | OSError) -> OutputError:

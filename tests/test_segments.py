@@ -160,6 +160,14 @@ def test_any_beginning_of_a_recording_is_made_whole_or_set_aside(
         assert names(folder) == ["recording-000001.mcap.part.damaged"]
 
 
+@pytest.mark.parametrize("size", [0, 7, 8, 9, 16, 40])
+def test_a_recording_that_was_only_begun_is_set_aside(torn: Path, tmp_path: Path, size: int):
+    part = tmp_path / "recording-000001.mcap.part"
+    part.write_bytes((torn / part.name).read_bytes()[:size])
+    list(recover(tmp_path))
+    assert names(tmp_path) == ["recording-000001.mcap.part.damaged"]
+
+
 def test_a_repair_replaces_no_recording(torn: Path, tmp_path: Path):
     folder = Path(shutil.copytree(torn, tmp_path / "out"))
     (folder / "recording-000001.mcap").write_bytes(b"precious")

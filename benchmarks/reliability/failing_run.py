@@ -43,12 +43,14 @@ class Healing(Observer):
 
     def __init__(self, case: Case) -> None:
         self.lines: list[str] = []
+        self.num_frames = 0
         self._frames_left = FAILING_FRAMES if case.mode == "for a while" else -1
 
     def warn(self, line: str) -> None:  # noqa: D102
         self.lines.append(line)
 
     def frame_done(self) -> None:  # noqa: D102
+        self.num_frames += 1
         self._frames_left -= 1
         if self._frames_left == 0:
             _LIBRARY.disturb_writes(bytes(_FOLDER / "out"), 1, 0, 0)
@@ -67,10 +69,10 @@ def measure(case: Case) -> dict:
         config=_FOLDER / "config.toml",
     )
     count = {"once": 1}.get(case.mode, 1 << 40) if case.at else 0
-    observer, refused, num_frames = Healing(case), "", 0
+    observer, refused = Healing(case), ""
     _LIBRARY.disturb_writes(bytes(out), case.at, count, case.error)
     try:
-        num_frames = run(request, stop=threading.Event(), observer=observer).num_frames
+        run(request, stop=threading.Event(), observer=observer)
     except OutputError as error:
         refused = str(error)
     writes = _LIBRARY.disturb_seen()
@@ -80,7 +82,7 @@ def measure(case: Case) -> dict:
     return {
         "writes": writes,
         "refused": refused,
-        "num_frames": num_frames,
+        "num_frames": observer.num_frames,
         "fish": stored(out),
         "rows": exported(out),
         "parts": parts,

@@ -183,7 +183,8 @@ def _is_torn(stream: IO[bytes]) -> bool:
     stream.seek(max(size - len(MCAP0_MAGIC), 0))
     end = stream.read()
     stream.seek(0)
-    return end != MCAP0_MAGIC
+    is_only_begun = size < 2 * len(MCAP0_MAGIC)  # it begins with the same magic
+    return is_only_begun or end != MCAP0_MAGIC
 
 
 def whole_records(path: Path) -> Iterator[object]:
