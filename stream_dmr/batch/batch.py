@@ -5,6 +5,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -138,6 +139,8 @@ class _Ledger:
     def close(self) -> None:
         """Drop from the data set what is of no finished video."""
         withdraw_others(self._done(), self._out)
+        with suppress(OSError):  # it is not empty, or not there
+            (self._out / "pieces").rmdir()
         self._write()
 
     def _done(self) -> list[Job]:

@@ -6,6 +6,7 @@ import shutil
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 from stream_dmr.batch.dataset import write_tables
@@ -34,7 +35,9 @@ def stitch(job: Job, pieces: Sequence[Job], out: Path) -> Outcome:
     for number, place in enumerate(places, start=1):
         for path in place.glob("recording.*"):
             os.link(path, part / f"recording-{number}{path.suffix}")
-    num_fish = _join_fish(places, part, load_config(Path(job.config) if job.config else None))
+    stamps = sorted({stamp for place in places for stamp in _stamps(place)})
+    config = load_config(Path(job.config) if job.config else None)
+    num_fish = _join_fish(places, part, stamps, config)
     _join_frames(places, part / "frames.csv")
     seal_run(part, with_recordings=True)
     write_tables(part, job)
@@ -43,7 +46,7 @@ def stitch(job: Job, pieces: Sequence[Job], out: Path) -> Outcome:
         name=job.label,
         key=job.key,
         status=DONE,
-        num_frames=sum(one.num_frames for one in parts),
+        num_frames=len(stamps),
         num_fish=num_fish,
         elapsed_s=round(sum(one.elapsed_s for one in parts), 3),
     )
@@ -51,9 +54,10 @@ def stitch(job: Job, pieces: Sequence[Job], out: Path) -> Outcome:
     return outcome
 
 
-def _join_fish(places: Sequence[Path], part: Path, config: Config) -> int:
+def _join_fish(places: Sequence[Path], part: Path, stamps: list[int], config: Config) -> int:
     """Write lengths.db and lengths.csv; returns the number of fish."""
-    fish = _by_end(places, config)
+    fish = [one for place in places for one in read_stored(place / DATABASE)]
+    fish.sort(key=partial(_end, stamps=stamps, config=config))
     facts = next(iter(read_runs(places[0] / DATABASE).values()))
     with closing(LengthStore(part, facts)) as store:
         for one in fish:
@@ -62,18 +66,13 @@ def _join_fish(places: Sequence[Path], part: Path, config: Config) -> int:
     return len(fish)
 
 
-def _by_end(places: Sequence[Path], config: Config) -> list[FishResult]:
-    """All fish in the order in which a run of the whole video finishes them."""
-    stamps = sorted({stamp for place in places for stamp in _stamps(place)})
+def _end(fish: FishResult, *, stamps: list[int], config: Config) -> tuple[int, int, int]:
+    """When a run of the whole video finishes a fish, to sort by; of frames at these times."""
+    estimate = fish.estimate
     timeout_ns = round(config.smooth_length.track_timeout_s * 1e9)
-
-    def end(fish: FishResult) -> tuple[int, int, int]:
-        estimate = fish.estimate
-        tick = bisect_right(stamps, estimate.last_timestamp_ns + timeout_ns)
-        when = stamps[tick] if tick < len(stamps) else _AT_THE_END
-        return when, estimate.first_frame, estimate.track_id
-
-    return sorted((one for place in places for one in read_stored(place / DATABASE)), key=end)
+    tick = bisect_right(stamps, estimate.last_timestamp_ns + timeout_ns)
+    when = stamps[tick] if tick < len(stamps) else _AT_THE_END
+    return when, estimate.first_frame, estimate.track_id
 
 
 def _stamps(place: Path) -> Iterable[int]:
