@@ -120,21 +120,21 @@ def test_what_the_browser_shows_is_what_was_measured(out: Path, page: Path):
         const cells = () => [...document.querySelectorAll('.row')].map((row) => row.innerText);
         const before = cells();
         choose(2);
-        await new Promise((done) => setTimeout(done, 3000));
         const panel = document.getElementById('detail');
+        const solid = panel.querySelector('.solid');
+        while (!solid.data) await new Promise((done) => setTimeout(done, 50));
         const text = panel.innerText;
         const number = (query) => panel.querySelectorAll(query).length;
         const shapes = ['.shots svg', '.shots .mask', '.shots .mesh', '.shots .point'].map(number);
         const plots = panel.querySelectorAll('.js-plotly-plot').length;
         const frames = panel.querySelector('.plot').data;
-        const solid = panel.querySelector('.solid').data ?? [];
         const histogram = document.getElementById('histogram').data;
         document.getElementById('longest').value = 0;
         show();
         return { before, text, shapes, plots, none: state.shown.length,
           points: frames[2].x.length + frames[3].x.length,
-          faces: solid.length ? solid[0].i.length : -1,
-          corners: solid.length ? solid[0].x.length : -1,
+          faces: solid.data[0].i.length,
+          corners: solid.data[0].x.length,
           bars: histogram[0].y.reduce((sum, n) => sum + n, 0) };
         """,
     )
