@@ -16,8 +16,6 @@ sys.path.insert(0, str(ROOT / "tests"))
 from camera import Camera, free_port, require_server  # noqa: E402, F401
 
 CONFIG = """
-[crop_fish]
-segmenter = "grabcut"
 [smooth_length]
 track_timeout_s = 3.0
 [recording]
