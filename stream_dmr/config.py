@@ -105,10 +105,10 @@ def parse_config(text: str, *, where: str) -> Config:
     """Read the text of a config.toml; `where` names it in errors, which are `load_config`'s."""
     try:
         return Config.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{where}: expected TOML, got a mistake in it: {error}") from error
     except ValidationError as error:
         raise ConfigError(f"{where}{_explain(error.errors()[0])}") from error
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{where}: expected TOML, got a mistake in it: {error}") from error
 
 
 def to_toml(config: Config) -> str:

@@ -165,8 +165,8 @@ def _load_table(path: Path) -> dict[str, Any]:
             f"template: expected {path} beside the mesh, with joints and [keypoints]; it is missing"
         )
     try:
-        return tomllib.loads(path.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:  # ValueError: what TOML is not, or text
         raise TemplateError(f"template {path}: expected TOML, got: {error}") from error
 
 
@@ -204,7 +204,7 @@ def _points_of(table: dict[str, Any], path: Path) -> dict[str, Float[np.ndarray,
 def _points(values: Any, path: Path, name: str) -> Float[np.ndarray, "N 3"]:
     try:
         points = np.array(values, dtype=np.float64) if len(values) else np.empty((0, 3))
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         points = np.empty((0, 0))
     if points.ndim != 2 or points.shape[1] != 3:
         raise TemplateError(f"template {path}: expected {name} as [x, y, z], got {values}")

@@ -19,6 +19,8 @@ from stream_dmr.segmentation.cvat import load_cvat
 
 _COLUMNS = "frame,id,x,y,w,h,conf,class,visibility"
 _MASK_NAME = re.compile(r"\d{6,}\.png")
+# Pillow's ways to call a PNG broken.
+_BROKEN = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 _LABEL_MODES = {"1", "L", "P", "I", "I;16", "I;16B"}  # one channel; "P": palette indices
 
 
@@ -130,7 +132,7 @@ class Masks:
                 labels = np.asarray(picture)
         except FileNotFoundError:
             return None
-        except (OSError, SyntaxError):  # Pillow's two ways to call a PNG broken
+        except _BROKEN:
             raise AnnotationError(f"{path}: expected a PNG mask, but it can't be decoded") from None
         return labels.astype(np.uint8) if labels.dtype == bool else labels
 

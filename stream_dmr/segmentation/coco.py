@@ -15,6 +15,7 @@ from stream_dmr.pictures import natural_order
 from stream_dmr.segmentation.boxes import UNKNOWN_ID, Box, by_frame, corners
 
 _ID_NAMES = ("track_id", "instance_id")
+_TOO_MUCH = (OverflowError, RecursionError)  # a number without an end; brackets without number
 
 
 def load_coco(text: str, path: Path) -> dict[int, list[Box]]:
@@ -23,7 +24,7 @@ def load_coco(text: str, path: Path) -> dict[int, list[Box]]:
         table = json.loads(text)
         names = {int(image["id"]): str(image["file_name"]) for image in table["images"]}
         annotations = list(table["annotations"])
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, *_TOO_MUCH) as error:
         raise AnnotationError(
             f'{path}: expected COCO\'s JSON with "images" (id, file_name) and "annotations", '
             f"got: {type(error).__name__} {error}"
@@ -43,7 +44,7 @@ def _boxes(
             x, y, width, height = (float(value) for value in annotation["bbox"])
             track_id = _track_id(annotation)
             score = float(annotation.get("score", 1.0))
-        except (ValueError, KeyError, TypeError, AttributeError):
+        except (ValueError, KeyError, TypeError, AttributeError, *_TOO_MUCH):
             raise AnnotationError(
                 f"{where}: expected the image_id of one of the images and a bbox of x, y, width, "
                 f"height, got {str(annotation)[:80]}"

@@ -1,0 +1,96 @@
+"""A camera three times too fast: how late the measurement is, what it drops, and its lengths."""
+
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+
+from measured import CONFIG, Camera, free_port, write_pictures
+from soak import metrics_of
+
+from stream_dmr.messages import LengthEstimate, LocalizedFish, Message
+from stream_dmr.run import RunRequest, RunSummary, run
+from stream_dmr.tally import Observer
+
+_TIMES = 3
+_LEAST_USED = 8  # frames of a fish that are enough
+
+
+@dataclass
+class Late(Observer):
+    """How long after its capture each fish of a frame was localized, s."""
+
+    late_s: list[float] = field(default_factory=list)
+
+    def take(self, message: Message) -> None:  # noqa: D102
+        if isinstance(message, LocalizedFish):
+            self.late_s.append((time.time_ns() - message.timestamp_ns) / 1e9)
+
+
+def overload(folder: Path, scene: Path, *, seconds: float) -> dict[str, object]:
+    """Measure the scene's video for its pace and lengths, then a camera of three times that."""
+    folder.mkdir(parents=True)
+    port = free_port()
+    (folder / "config.toml").write_text(CONFIG.format(port=port))
+    whole = measured(scene, str(scene / "video.mp4"), folder, "whole", Observer())
+    again = measured(scene, str(scene / "video.mp4"), folder, "again", Observer())  # compiled
+    pace = again.num_frames / again.elapsed_s
+    (folder / "pictures").mkdir()
+    write_pictures(scene / "video.mp4", folder / "pictures")
+    fps = max(1, round(_TIMES * pace))
+    camera = Camera("--jpegs", str(folder / "pictures"), "--fps", str(fps))
+    camera.start()
+    stop, late, camera_frames = threading.Event(), Late(), dict[str, float]()
+
+    def end() -> None:
+        camera_frames.update(metrics_of(port))
+        stop.set()
+
+    timer = threading.Timer(seconds, end)
+    timer.start()
+    live = measured(scene, camera.address, folder, "live", late, stop=stop)
+    timer.join()
+    camera.lose()
+    counts = {
+        name: round(camera_frames[f"stream_dmr_camera_frames_total {name}"])
+        for name in ("received", "passed_on", "dropped", "failed")
+    }
+    lengths = [fish.length_mm for fish in whole.fish if fish.length_mm is not None]
+    enough = [fish for fish in live.fish if fish.frames_used >= _LEAST_USED and fish.length_mm]
+    return {
+        "frames/s it has time for": round(pace, 1),
+        "frames/s of the camera": fps,
+        "frames": counts,
+        "late, s, median": round(median(late.late_s), 2),
+        "late, s, most": round(max(late.late_s[len(late.late_s) // 10 :]), 2),
+        "fish seen in enough frames": len(enough),
+        "others": len(live.fish) - len(enough),
+        "off from the whole video, %, most": round(max(off(fish, lengths) for fish in enough), 1),
+    }
+
+
+def measured(
+    scene: Path,
+    source: str,
+    folder: Path,
+    name: str,
+    observer: Observer,
+    *,
+    stop: threading.Event | None = None,
+) -> RunSummary:
+    """A run over a source, into a folder of its own."""
+    request = RunRequest(
+        source=source,
+        out=folder / name,
+        calibration=scene / "calibration.yaml",
+        template=str(scene / "species.ply"),
+        config=folder / "config.toml",
+    )
+    return run(request, stop=stop or threading.Event(), observer=observer)
+
+
+def off(fish: LengthEstimate, lengths: list[float]) -> float:
+    """How far a length is from the nearest of those of the whole video, %."""
+    assert fish.length_mm is not None
+    return min(abs(fish.length_mm / length - 1) for length in lengths) * 100
