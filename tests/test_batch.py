@@ -394,12 +394,16 @@ def test_pieces_make_the_tables_of_the_whole(tmp_path: Path, timeout_s: float, p
 
 @pytest.fixture(scope="module")
 def unnamed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Job]:
-    """A clip whose boxes don't say which fish they are, and what `run` makes of it."""
+    """A clip whose boxes don't say which fish they are, and what `run` makes of it.
+
+    They lie too high, so that each follows the edges of the fish's last mask.
+    """
     folder = tmp_path_factory.mktemp("unnamed")
     clip = folder / "clip"
     write_clip(clip, fish=COMING_AND_GOING)
     lines = [line.split(",") for line in (clip / "boxes.txt").read_text().splitlines()]
-    (clip / "boxes.txt").write_text("".join(f"{a},-1,{','.join(c)}\n" for a, _, *c in lines))
+    moved = [f"{i},-1,{x},{int(y) - 5},{','.join(rest)}\n" for i, _, x, y, *rest in lines]
+    (clip / "boxes.txt").write_text("".join(moved))
     config = clip / "quick.toml"
     text = config.read_text().replace("[crop_fish]", '[crop_fish]\nsegmenter = "grabcut"')
     text += "\n[smooth_length]\ntrack_timeout_s = 0.25\nmax_std_ratio = 1e9\n"

@@ -4,17 +4,13 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.counting import CounterSettings, FishCounter
-from stream_dmr.segmentation.crop import mask_extent
 from stream_dmr.segmentation.detections import Detection
 from stream_dmr.segmentation.detector import Detector
+from stream_dmr.segmentation.edges import LastEdges
 from stream_dmr.segmentation.tracking import Tracker, TrackerSettings
-
-_SURE = 0.9  # mask_confidence of a mask that tells where its fish ends
-_LEAST, _FARTHEST = 0.03, 0.1  # of the box's longer side, that a mask's edge is away from its
 
 
 class TrackFishSettings(TrackerSettings, CounterSettings):
@@ -28,22 +24,20 @@ class FollowedFish:
         self._detector = detector
         self._tracker = Tracker(settings)
         self._counter = FishCounter(settings)
-        self._boxes: dict[int, np.ndarray] = {}  # of this frame, by track
-        self._beyond: dict[int, np.ndarray] = {}  # of the masks in the frame before, by track
+        self._edges = LastEdges()
+        self.boxes: dict[int, np.ndarray] = {}  # of this frame, as the detector gave them, by track
+        self.beyond: dict[int, np.ndarray] = {}  # and how far they were moved, likewise
 
     def detect(self, frame: Frame) -> list[Detection]:
         """What may be fish in one frame, by the numbers of their tracks. Frames come in order."""
         sightings = self._tracker.step(frame, self._detector.find(frame))
-        self._boxes = {one.number: one.candidate.bbox_xyxy_px for one in sightings}
-        height, width = frame.image.shape[:2]
+        self.boxes = {one.number: one.candidate.bbox_xyxy_px for one in sightings}
+        self.beyond = self._edges.beyond
+        mended = self._edges.mend(self.boxes, frame)
         return [
             Detection(
                 track_id=one.number,
-                bbox_xyxy_px=np.clip(
-                    self._boxes[one.number] + self._beyond.get(one.number, 0.0),
-                    0.0,
-                    [width, height, width, height],
-                ),
+                bbox_xyxy_px=mended[one.number],
                 mask=None,
                 visible_fraction=one.visible_fraction,
             )
@@ -57,11 +51,7 @@ class FollowedFish:
     def admit(self, crops: Iterable[FishCrop]) -> list[FishCrop]:
         """The crops of those tracks that count as fish by now, by the fish's ids."""
         crops = list(crops)
-        self._beyond = {
-            crop.track_id: _beyond(self._boxes[crop.track_id], mask_extent(crop))
-            for crop in crops
-            if (crop.quality.mask_confidence or 0.0) > _SURE
-        }
+        self._edges.learn(crops)
         known = [(self._counter.track_id(crop), crop) for crop in crops]
         fish = [replace(crop, track_id=i) for i, crop in known if i is not None]
         return sorted(fish, key=lambda crop: crop.track_id)
@@ -70,18 +60,3 @@ class FollowedFish:
     def warnings(self) -> list[str]:
         """What the user should know at the end, a line each."""
         return []
-
-
-def _beyond(
-    box: Float[np.ndarray, "4"], extent: Float[np.ndarray, "4"] | None
-) -> Float[np.ndarray, "4"]:
-    """How far the edges of a mask lie from those of the box that moved, px; 0 where they hardly do.
-
-    A shape that moves lacks the tail, or holds a piece of line, and mostly will in the next frame.
-    Never by much: what a mask has lost it would never get back.
-    """
-    if extent is None:
-        return np.zeros(4)
-    size = max(box[2:] - box[:2])
-    away = np.clip(extent - box, -_FARTHEST * size, _FARTHEST * size)
-    return np.where(abs(away) > _LEAST * size, away, 0.0)

@@ -16,19 +16,34 @@ from jaxtyping import Float
 
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.detections import Detection
+from stream_dmr.segmentation.edges import LastEdges
 from stream_dmr.segmentation.followed import FollowedFish
 
 
 class Sighting(NamedTuple):
-    """A fish in a frame, as `Detection` has it."""
+    """A fish in a frame, as the detector saw it; boxes are half-open, in frame pixels."""
 
     frame_index: int
     track_id: int
-    left: float  # of the box, half-open, frame pixels
+    visible_fraction: float
+    left: float
     top: float
     right: float
     bottom: float
-    visible_fraction: float
+    beyond_left: float  # how far the edges were moved, see `LastEdges`; in a fish's first frame
+    beyond_top: float
+    beyond_right: float
+    beyond_bottom: float
+
+    @property
+    def box(self) -> Float[np.ndarray, "4"]:
+        """As the detector gave it."""
+        return np.array(self[3:7])
+
+    @property
+    def beyond(self) -> Float[np.ndarray, "4"]:
+        """What was added to it."""
+        return np.array(self[7:])
 
 
 class Scout:
@@ -36,6 +51,7 @@ class Scout:
 
     def __init__(self, finder: FollowedFish) -> None:
         self._finder = finder
+        self._doubtful: list[Detection] = []  # of this frame
         self.sightings: list[Sighting] = []
 
     @property
@@ -45,30 +61,28 @@ class Scout:
 
     def detect(self, frame: Frame) -> list[Detection]:
         """See `FishFinder`: only those of which it is not known yet whether they are fish."""
-        doubtful = []
-        for one in self._finder.detect(frame):
-            fish = self._finder.fish(one.track_id)
-            if fish is None:
-                doubtful.append(one)
-            else:
-                self._note(frame.frame_index, fish, one.bbox_xyxy_px, one.visible_fraction)
-        return doubtful
+        found = self._finder.detect(frame)
+        self._doubtful = [one for one in found if self._finder.fish(one.track_id) is None]
+        self._note(frame.frame_index, found)
+        return self._doubtful
 
     def admit(self, crops: Iterable[FishCrop]) -> list[FishCrop]:
         """See `FishFinder`."""
         admitted = self._finder.admit(crops)
-        for crop in admitted:
-            seen = crop.quality.visible_fraction
-            self._note(crop.frame_index, crop.track_id, crop.bbox_xyxy_px, seen)
+        for crop in admitted[:1]:
+            self._note(crop.frame_index, self._doubtful)
         return admitted
 
-    def _note(
-        self, frame_index: int, track_id: int, bbox_xyxy_px: Float[np.ndarray, "4"], visible: float
-    ) -> None:
-        left, top, right, bottom = bbox_xyxy_px.tolist()
-        self.sightings.append(
-            Sighting(frame_index, track_id, left, top, right, bottom, visible_fraction=visible)
-        )
+    def _note(self, frame_index: int, found: Iterable[Detection]) -> None:
+        """Those that count by now, by the fish's ids."""
+        finder = self._finder
+        for one in found:
+            fish = finder.fish(one.track_id)
+            if fish is not None:
+                box, beyond = finder.boxes[one.track_id], finder.beyond.get(one.track_id)
+                moved = [0.0] * 4 if beyond is None else beyond.tolist()
+                where = (frame_index, fish, one.visible_fraction)
+                self.sightings.append(Sighting(*where, *box.tolist(), *moved))
 
 
 class SightedFish:
@@ -77,24 +91,34 @@ class SightedFish:
     def __init__(self, path: Path) -> None:
         self.warnings: list[str] = []  # a scout has said them
         self._frames: defaultdict[int, list[Sighting]] = defaultdict(list)
+        self._edges = LastEdges()
+        self._known = set[int]()
         for one in read_sightings(path):
             self._frames[one.frame_index].append(one)
 
     def detect(self, frame: Frame) -> list[Detection]:
         """See `FishFinder`."""
+        seen = self._frames.get(frame.frame_index, [])
+        for one in seen:
+            if one.track_id not in self._known:  # its masks so far are those of the scout
+                self._known.add(one.track_id)
+                self._edges.beyond[one.track_id] = one.beyond
+        boxes = self._edges.mend({one.track_id: one.box for one in seen}, frame)
         return [
             Detection(
                 track_id=one.track_id,
-                bbox_xyxy_px=np.array([one.left, one.top, one.right, one.bottom]),
+                bbox_xyxy_px=boxes[one.track_id],
                 mask=None,
                 visible_fraction=one.visible_fraction,
             )
-            for one in self._frames.get(frame.frame_index, ())
+            for one in seen
         ]
 
     def admit(self, crops: Iterable[FishCrop]) -> list[FishCrop]:
         """See `FishFinder`: what was noted is fish."""
-        return sorted(crops, key=lambda crop: crop.track_id)
+        crops = sorted(crops, key=lambda crop: crop.track_id)
+        self._edges.learn(crops)
+        return crops
 
 
 def write_sightings(path: Path, sightings: Iterable[Sighting]) -> None:
