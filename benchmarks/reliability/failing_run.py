@@ -20,7 +20,9 @@ from stream_dmr.run import RunRequest, run
 from stream_dmr.tally import Observer
 
 _FPS = 5  # of capture time: a new segment is tried again 5 s after one that failed
-_CONFIG = QUICK.replace("[watch]\nport = {port}\n", "[read_frames]\nclips_wait_s = 0.1\n")
+_CONFIG = QUICK.replace("[watch]\nport = {port}\n", "").replace(
+    "connect_s = 20.0", "clips_wait_s = 0.1"
+)
 _FOLDER = Path()
 _LIBRARY = ctypes.CDLL(None)
 _LIBRARY.disturb_writes.argtypes = [ctypes.c_char_p, ctypes.c_long, ctypes.c_long, ctypes.c_int]

@@ -28,7 +28,7 @@ _SHARES = {_STARTING: 1, _RUNNING: 2, _CUTTING: 1}
 
 
 def kills(
-    folder: Path, *, count: int, minutes: float = 1e9, side_by_side: int = 3, seed: int = 0
+    folder: Path, *, count: int, minutes: float = 1e9, side_by_side: int = 2, seed: int = 0
 ) -> dict[str, float]:
     """Kill `count` times; figures. Every second measurement draws the view as well."""
     scene = write_small_scene(folder / "scene")

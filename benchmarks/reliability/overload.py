@@ -21,7 +21,11 @@ _LEAST_USED = 8  # frames of a fish that are enough
 class Late(Observer):
     """How long after its capture each fish of a frame was localized, s."""
 
+    timer: threading.Timer  # of the end, from the first frame on
     late_s: list[float] = field(default_factory=list)
+
+    def begin(self, num_frames: int | None) -> None:  # noqa: D102
+        self.timer.start()
 
     def take(self, message: Message) -> None:  # noqa: D102
         if isinstance(message, LocalizedFish):
@@ -41,16 +45,15 @@ def overload(folder: Path, scene: Path, *, seconds: float) -> dict[str, object]:
     fps = max(1, round(_TIMES * pace))
     camera = Camera("--jpegs", str(folder / "pictures"), "--fps", str(fps))
     camera.start()
-    stop, late, camera_frames = threading.Event(), Late(), dict[str, float]()
+    stop, camera_frames = threading.Event(), dict[str, float]()
 
     def end() -> None:
         camera_frames.update(metrics_of(port))
         stop.set()
 
-    timer = threading.Timer(seconds, end)
-    timer.start()
+    late = Late(threading.Timer(seconds, end))
     live = measured(scene, camera.address, folder, "live", late, stop=stop)
-    timer.join()
+    late.timer.join()
     camera.lose()
     counts = {
         name: round(camera_frames[f"stream_dmr_camera_frames_total {name}"])

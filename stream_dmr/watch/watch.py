@@ -51,6 +51,7 @@ class Watch(Observer):
 
     def take(self, message: Message) -> None:  # noqa: D102
         self.state.take(message)
+        self._observer.take(message)
 
     def warn(self, line: str) -> None:  # noqa: D102
         self.state.warn(line)
