@@ -21,6 +21,7 @@ NODES = [CropFish, FitMesh, Localize, SmoothLength]
 # Who assembles and shows a run; everything else is the library, and knows no nodes.
 ASSEMBLY = [
     "stream_dmr.run",
+    "stream_dmr.run_inputs",
     "stream_dmr.scout",
     "stream_dmr.display",
     "stream_dmr.cli",
@@ -36,6 +37,8 @@ FLOORS = [
     ["stream_dmr.config", "stream_dmr.pipeline"],
     ["nodes"],
     [f"stream_dmr.watch.{name}" for name in ("state", "metrics", "picture", "server", "watch")],
+    ["stream_dmr.run_inputs"],
+    ["stream_dmr.run_outputs"],
     ["stream_dmr.run", "stream_dmr.report.report"],
     ["stream_dmr.scout"],
     ["stream_dmr.batch.dataset", "stream_dmr.batch.job"],
