@@ -10,7 +10,7 @@ import io
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from stream_dmr.errors import OutputError, RecordingError, UserError
 from stream_dmr.messages import LengthEstimate, LocalizedFish
@@ -109,8 +109,12 @@ def _against_provenance(folder: Path) -> Iterator[Change]:
         elif sha256_of(path) != expected:
             yield Change(path, f"was changed: its SHA-256 is not that in {PROVENANCE}")
     database = database_of(folder)
-    if database is None:
-        return
+    if database is not None:
+        yield from _database(database, made)
+
+
+def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
+    """The fish and the runs against what provenance.json says of them."""
     try:
         stored, runs = fish_by_run(database), read_runs(database)
     except OutputError:

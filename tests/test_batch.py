@@ -434,6 +434,19 @@ def test_fish_that_nobody_named_are_found_once_and_measured_in_pieces(
     assert not (tmp_path / "pieces").exists()
 
 
+def test_a_video_fails_once_however_many_of_its_pieces_do(tmp_path: Path):
+    clip = tmp_path / "clip"
+    write_clip(clip, fish=COMING_AND_GOING)
+    (clip / "calibration.yaml").write_text("no calibration")
+    manifest = write_manifest(tmp_path / "manifest.csv", row())
+    (job,) = read_manifest(manifest, config=clip / "quick.toml", template=str(clip / "tiny.ply"))
+    said = list[str]()
+    stop, out = threading.Event(), tmp_path / "out"
+    summary = batch([job], out, ThisProcess(), piece_frames=4, stop=stop, say=said.append)
+    assert [one.status for one in summary.outcomes] == ["failed"]
+    assert len(said) == 1
+
+
 def test_what_the_scout_cannot_read_fails_alone(unnamed: tuple[Path, Job], tmp_path: Path):
     """Scout and pieces in one batch, beside a video whose calibration is wrong."""
     _, job = unnamed

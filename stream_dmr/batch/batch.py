@@ -4,7 +4,7 @@ import csv
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
@@ -70,22 +70,31 @@ def batch(
     videos = {
         job.name: Video(job, out, piece_frames) for job in jobs if job.name not in ledger.outcomes
     }
-    clock = Clock([video.job for video in videos.values()], say)
-    for video in videos.values():
-        _note(video, clock, ledger)
-        for piece in video.done():
-            clock.of(piece)(1.0)
-    clock.begin()
+    clock = _started(videos.values(), ledger, say)
     for _ in range(_ROUNDS):
-        for name, piece in _measured(videos.values(), engine, out, stop=stop, clock=clock):
-            videos[name].take(piece)
-            _note(videos[name], clock, ledger)
+        for piece, outcome in _measured(videos.values(), engine, out, stop=stop, clock=clock):
+            clock.of(piece)(1.0)
+            video = videos[piece.name]
+            if video.outcome is None:  # else another piece of it has failed
+                video.take(outcome)
+                _note(video, clock, ledger)
     ledger.close()
     return BatchSummary(
         outcomes=[ledger.outcomes[job.name] for job in jobs if job.name in ledger.outcomes],
         num_before=num_before,
         elapsed_s=time.perf_counter() - began,
     )
+
+
+def _started(videos: Collection[Video], ledger: "_Ledger", say: Callable[[str], None]) -> Clock:
+    """A clock that knows what is done already; some of it makes a whole video."""
+    clock = Clock([video.job for video in videos], say)
+    for video in videos:
+        _note(video, clock, ledger)
+        for piece in video.done():
+            clock.of(piece)(1.0)
+    clock.begin()
+    return clock
 
 
 def _measured(
@@ -95,17 +104,14 @@ def _measured(
     *,
     stop: threading.Event,
     clock: Clock,
-) -> Iterator[tuple[str, Outcome]]:
-    """What became of the pieces that can be done now, with the names of their videos.
-
-    Those come first that others wait for.
-    """
+) -> Iterator[tuple[Job, Outcome]]:
+    """The pieces that can be done now, as they end; those come first that others wait for."""
     todo = [piece for video in videos for piece in video.todo()]
     todo.sort(key=lambda piece: piece.piece != SCOUT)
-    names = {piece.label: piece.name for piece in todo}
+    by_label = {piece.label: piece for piece in todo}
     if todo and not stop.is_set():
         for outcome in engine.outcomes(todo, out, stop=stop, clock=clock):
-            yield names[outcome.name], outcome
+            yield by_label[outcome.name], outcome
 
 
 def _note(video: Video, clock: Clock, ledger: "_Ledger") -> None:

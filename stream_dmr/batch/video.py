@@ -31,9 +31,7 @@ class Video:
         return [one for one in self.pieces if one.label in self._done]
 
     def take(self, piece: Outcome) -> None:
-        """Take note of what became of a piece."""
-        if self.outcome:  # another piece failed
-            return
+        """Take note of what became of a piece, while nothing is certain of the video."""
         if piece.status != DONE:
             self._end(replace(piece, name=self.job.label, key=self.job.key, status=FAILED))
         elif self.pieces == [self.job]:
