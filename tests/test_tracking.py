@@ -105,14 +105,61 @@ def climb(i: int, *, x: float = 300.0, speed: float = 12.0) -> Spot:
     return (x, 420 - speed * i, 40, 100, 200)
 
 
-def test_a_fish_keeps_its_id_through_a_short_gap_and_gets_a_new_one_after_a_long_one():
-    gaps = {"short": 7, "long": 8}
-    for name, gap in gaps.items():
-        frames = [[climb(i, speed=6)] for i in range(8)] + [[]] * gap
-        frames += [[climb(i, speed=6)] for i in range(8 + gap, 20 + gap)]
-        found = ids(follow(frames))
-        assert found[:8] == [[1]] * 8
-        assert found[8 + gap :] == [[1 if name == "short" else 2]] * 12
+@pytest.mark.parametrize(
+    ("gap", "hidden", "after"), [(7, 0, 1), (8, 0, 2), (8, 30, 1), (30, 30, 1), (31, 30, 2)]
+)
+def test_a_fish_keeps_its_id_through_a_gap_and_gets_a_new_one_after_a_longer_one(
+    gap: int, hidden: int, after: int
+):
+    frames = [[climb(i, speed=3)] for i in range(8)] + [[]] * gap
+    frames += [[climb(i, speed=3)] for i in range(8 + gap, 20 + gap)]
+    found = ids(follow(frames, max_hidden_frames=hidden))
+    assert found[:8] == [[1]] * 8
+    assert found[8 + gap :] == [[after]] * 12
+
+
+@given(
+    change=st.sampled_from(["nothing", "colour", "length", "place"]),
+    gap=st.integers(8, 25),
+    speed=st.floats(0, 4),
+)
+@settings(max_examples=20, deadline=None)
+def test_what_comes_back_is_the_same_fish_only_where_it_looks_like_it(
+    change: str, gap: int, speed: float
+):
+    def later(i: int) -> Spot:
+        x, y, w, h, level = climb(i, speed=speed)
+        other = {
+            "nothing": (x, y, w, h, level),
+            "colour": (x, y, w, h, 90),
+            "length": (x, y, w, 30, level),
+            "place": (x + 1.7 * h, y, w, h, level),
+        }
+        return other[change]
+
+    frames = [[climb(i, speed=speed)] for i in range(10)] + [[]] * gap
+    frames += [[later(i)] for i in range(10 + gap, 16 + gap)]
+    after = ids(follow(frames))[10 + gap :]
+    assert after == [[1 if change == "nothing" else 2]] * 6
+
+
+@given(numbers, numbers, st.integers(2, 8))
+@settings(max_examples=15, deadline=None)
+def test_fish_that_were_one_shape_are_told_apart_by_where_they_were_going(
+    a: float, b: float, late: int
+):
+    """The shape falls apart at last into one that is followed already and one that seems new."""
+    left, right = -(6 + a), 6 + b
+    frames = [
+        [(400 + left * i, 240, 40, 100, 200), (260 + right * i, 245, 40, 100, 200)]
+        for i in range(10)
+    ]
+    frames += [[(330, 242, 56, 105, 200)]] * (4 + late)
+    places = [(400 + left * i, 260 + right * i) for i in range(14 + late, 26 + late)]
+    frames += [[(x, 240, 40, 100, 200), (y, 245, 40, 100, 200)] for x, y in places]
+    last = follow(frames)[len(frames)]
+    middles = {one.track_id: one.bbox_xyxy_px[[0, 2]].mean() for one in last}
+    assert middles == pytest.approx({1: places[-1][0], 2: places[-1][1]})
 
 
 def test_frames_that_a_live_source_dropped_are_a_gap_like_any_other():
