@@ -23,12 +23,14 @@ from stream_dmr.tally import Observer, Tally
 from stream_dmr.template import Template
 from stream_dmr.video import LiveStream
 
+_MOST_LAST_FISH = 100  # that a source without an end is summed up by; the store has them all
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunSummary:
     """How a run went."""
 
-    fish: Sequence[LengthEstimate]  # the final ones, by track id
+    fish: Sequence[LengthEstimate]  # final, by track id; of an endless source the last ones
     num_frames: int  # that went through the whole chain
     elapsed_s: float
     counters: Sequence[StageCounters]
@@ -113,6 +115,7 @@ def _run_chain(
         store,
         watch,
         numbers_frames_on=inputs.is_endless and has_no_ids,
+        keeps=_MOST_LAST_FISH if inputs.is_endless else None,
         clips=go_on(inputs.source, store, on_notice=watch.warn),
         left=outputs.left,
         drift=DriftWatch(store, inputs.config.drift, on_notice=watch.warn)

@@ -56,15 +56,18 @@ class Tally:
         observer: Observer,
         *,
         numbers_frames_on: bool,
+        keeps: int | None = None,
         clips: Mapping[str, int] | None = None,
         left: Sequence[LocalizedFish] = (),
         drift: DriftWatch | None = None,
     ) -> None:
-        """`clips`: the source is a folder of clips, of which so many frames were done before.
+        """`keeps`: of the finished fish, so many of the last ones; of weeks at sea not all.
+
+        `clips`: the source is a folder of clips, of which so many frames were done before.
 
         `left`: frames of fish that a crash interrupted, and that this run finishes.
         """
-        self.final: list[LengthEstimate] = []
+        self.final: deque[LengthEstimate] = deque(maxlen=keeps)
         self.num_frames = 0
         self._drift = drift
         self._ious: defaultdict[int, list[float]] = defaultdict(list)  # of the open tracks

@@ -260,3 +260,27 @@ def test_a_run_stopped_at_any_frame_leaves_valid_results(tmp_path: Path, num_fra
     if num_frames:
         assert [fish.track_id for fish in summary.fish] == [1, 2]
         assert all(fish.is_final for fish in summary.fish)
+
+
+def test_of_a_source_without_an_end_only_the_last_fish_stay_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Weeks of fish are in the store, and in the tables; the summary of a run has room for some."""
+    monkeypatch.setattr("stream_dmr.run._MOST_LAST_FISH", 1)
+    clip, clips, out = tmp_path / "clip", tmp_path / "clips", tmp_path / "out"
+    write_clip(clip, fish=[[1, 2]] * 6)
+    config = clip / "quick.toml"
+    config.write_text(config.read_text() + "\n[read_frames]\nclips_wait_s = 0.0\n")
+    clips.mkdir()
+    (clip / "video.mp4").rename(clips / "1.mp4")
+    request = RunRequest(
+        source=str(clips),
+        masks=clip / "masks",
+        calibration=clip / "calibration.yaml",
+        template=str(clip / "tiny.ply"),
+        config=config,
+        out=out,
+    )
+    summary = run(request, stop=threading.Event())
+    assert len(summary.fish) == 1
+    assert len((out / "lengths.csv").read_text().splitlines()) == 1 + 2
