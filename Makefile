@@ -25,7 +25,7 @@ table1: $(STAMP)  ## Table 1 of the paper on simulated fish: docs/accuracy.md; F
 	cd benchmarks && ../$(BIN)/python -m table1 $(if $(FISH),--fish $(FISH)) \
 		$(if $(ROWS),--rows $(ROWS)) $(if $(AGAIN),--again)
 
-faults: $(STAMP)  ## kills, power cuts, lost cameras, mutated inputs: docs/reliability.md, an hour or two
+faults: $(STAMP)  ## all that goes wrong at sea: docs/reliability.md, two hours; FAULTS="--only clock"
 	$(BIN)/python benchmarks/reliability/faults.py $(FAULTS)
 
 soak: $(STAMP)  ## an hour of a looped live stream; SOAK="--minutes 5" for less

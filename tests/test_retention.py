@@ -138,6 +138,21 @@ def test_a_disk_without_room_to_write_the_rest_anew_loses_a_whole_segment(
     assert state(out) == ["pr", "", "pr"]
 
 
+def test_old_tables_of_frames_go_before_anything_else(recorded: Path, disk: Path):
+    out = Path(shutil.copytree(recorded, disk / "out"))
+    tables = [out / "frames-000001.csv", out / "frames-000002.csv"]
+    for table in tables:
+        table.write_bytes(bytes(10_000))
+    before = (out / "frames.csv").read_bytes()
+    (notice,) = make_room(out, free=free_bytes(disk) + 1, marked=set())
+    assert "the table of frames of 1" in notice
+    assert [table.exists() for table in tables] == [False, True]
+    make_room(out, free=free_bytes(disk) + 20_000, marked=set())
+    assert not tables[1].exists()
+    assert (out / "frames.csv").read_bytes() == before
+    assert state(out)[1:] == ["vpr", "vpr"]
+
+
 def test_what_is_being_written_stays(recorded: Path, disk: Path):
     out = Path(shutil.copytree(recorded, disk / "out"))
     last = out / f"recording-{NUM_SEGMENTS:06d}.mcap"

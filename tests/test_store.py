@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_disk import fill, small_disk
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate
@@ -222,6 +223,58 @@ def test_a_full_disk_keeps_fish_in_memory_until_there_is_room(tmp_path: Path):
     store.add(fish(60))
     assert not store.trouble
     assert [estimate.track_id for estimate in store.estimates()] == list(range(1, 61))
+    store.close()
+
+
+def test_a_disk_that_is_full_at_the_start_is_waited_for_and_no_id_is_used_twice(tmp_path: Path):
+    with small_disk(tmp_path / "disk", kilobytes=600) as disk:
+        store = LengthStore(disk, FACTS)
+        store.reserve_track(7)
+        store.add(fish(7))
+        store.close()
+        ballast = fill(disk)
+        with pytest.raises(OutputError, match="expected a database of lengths"):
+            LengthStore(disk, FACTS)
+        store = LengthStore(disk, FACTS, waits=True)
+        assert store.trouble
+        assert store.before.track_id == 7
+        assert [estimate.track_id for estimate in store.estimates()] == [7]
+        for number in (8, 9):
+            store.reserve_track(number)
+            store.add(fish(number))
+        assert store.trouble
+        ballast.unlink()
+        store.add(fish(10))
+        assert not store.trouble
+        assert [estimate.track_id for estimate in store.estimates()] == [7, 8, 9, 10]
+        store.close()
+
+
+def test_a_disk_that_is_full_from_the_very_first_start_is_waited_for(tmp_path: Path):
+    with small_disk(tmp_path / "disk", kilobytes=600) as disk:
+        ballast = fill(disk)
+        store = LengthStore(disk, FACTS, waits=True)
+        store.add(fish(1))
+        assert store.trouble
+        ballast.unlink()
+        store.add(fish(2))
+        store.close()
+        store = LengthStore(disk, FACTS)
+        assert [estimate.track_id for estimate in store.estimates()] == [1, 2]
+        store.close()
+
+
+def test_a_commit_that_failed_and_yet_came_to_be_is_not_written_twice(tmp_path: Path):
+    store = LengthStore(tmp_path, FACTS)
+    store.add(fish(1))
+    before, pending = store._handed_out, ("INSERT INTO events VALUES (5, ?, '', '', 0, 0)",)
+    store._pending.append((*pending, (store.run_id,)))
+    store._commit()
+    store._handed_out, store._is_reached = before, False  # as an error of its fsync leaves it
+    store._pending.append((*pending, (store.run_id,)))
+    store.add(fish(2))
+    assert not store.trouble
+    assert [estimate.track_id for estimate in store.estimates()] == [1, 2]
     store.close()
 
 

@@ -1,13 +1,13 @@
-"""`make faults`: kills, power cuts, lost cameras and mutated inputs; prints what came of each.
+"""`make faults`: all that goes wrong at sea, and what comes of it; prints a line of JSON each.
 
-python benchmarks/reliability/faults.py --kills 300 --cuts 300 --losses 200 --mutants 10000
+python benchmarks/reliability/faults.py --only losses clock       # these two; all where left out
 """
 
 import argparse
 import json
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import cv2
@@ -16,36 +16,83 @@ from measured import ROOT
 
 
 def main() -> None:
-    """Run those that have a count."""
+    """Run those that are asked for."""
     parser = argparse.ArgumentParser()
-    for name, count in (("kills", 300), ("cuts", 300), ("losses", 200), ("mutants", 10_000)):
+    parser.add_argument("--only", nargs="+", choices=sorted(FAULTS), default=[*FAULTS])
+    for name, count in COUNTS.items():
         parser.add_argument(f"--{name}", type=int, default=count)
     parser.add_argument("--kill-minutes", type=float, default=1e9, help="as many as fit")
     asked = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="faults-"))
-    if asked.cuts:
-        from power import power_cuts, power_cuts_of_recordings
-
-        show("power cuts", power_cuts(folder / "power", count=asked.cuts))
-        figures = power_cuts_of_recordings(folder / "power-recording", count=asked.cuts)
-        show("power cuts of recordings", figures)
-    if asked.losses:
-        from losses import losses, restarts
-
-        restarted = asked.losses // 6  # one of six kinds
-        show("timestamps back at 0", restarts(folder / "restarts", count=restarted))
-        figures = losses(grey_pictures(folder / "grey"), count=asked.losses - restarted)
-        show("camera losses", figures)
-    if asked.mutants:
-        from fuzz import fuzz
-
-        for row in fuzz(folder / "fuzz", ROOT, count=asked.mutants):
-            show("mutants", row)
-    if asked.kills:
-        from kills import kills
-
-        show("kill -9", kills(folder / "kills", count=asked.kills, minutes=asked.kill_minutes))
+    for name in asked.only:
+        for test, figures in FAULTS[name](folder / name, asked):
+            print(json.dumps({"test": test} | dict(figures)), flush=True)
     shutil.rmtree(folder)
+
+
+Found = Iterator[tuple[str, Mapping[str, object]]]
+
+
+def cuts(folder: Path, asked: argparse.Namespace) -> Found:
+    """Power cuts."""
+    from power import power_cuts, power_cuts_of_recordings
+
+    yield "power cuts", power_cuts(folder / "store", count=asked.cuts)
+    yield "power cuts of recordings", power_cuts_of_recordings(folder / "out", count=asked.cuts)
+
+
+def losses(folder: Path, asked: argparse.Namespace) -> Found:
+    """Lost cameras, and streams that count from 0 again."""
+    from losses import losses, restarts
+
+    restarted = asked.losses // 6  # one of six kinds
+    yield "timestamps back at 0", restarts(folder / "restarts", count=restarted)
+    pictures = grey_pictures(folder / "grey")
+    yield "camera losses", losses(pictures, count=asked.losses - restarted)
+
+
+def clock(folder: Path, _: argparse.Namespace) -> Found:
+    """A wall clock that is set."""
+    from clock_steps import clock_steps
+
+    yield "clock steps", clock_steps(folder)
+
+
+def writes(folder: Path, asked: argparse.Namespace) -> Found:
+    """A disk that refuses."""
+    from failing_writes import failing_writes
+
+    yield "failing writes", failing_writes(folder, cases=asked.writes)
+
+
+def overload(folder: Path, asked: argparse.Namespace) -> Found:
+    """A camera that is too fast."""
+    from overload import overload
+
+    yield "overload", overload(folder, seconds=asked.overload_s)
+
+
+def mutants(folder: Path, asked: argparse.Namespace) -> Found:
+    """Inputs that are wrong."""
+    from fuzz import fuzz
+
+    for row in fuzz(folder, ROOT, count=asked.mutants):
+        yield "mutants", row
+
+
+def kills(folder: Path, asked: argparse.Namespace) -> Found:
+    """Kills, at any moment."""
+    from kills import kills
+
+    yield "kill -9", kills(folder, count=asked.kills, minutes=asked.kill_minutes)
+
+
+FAULTS: dict[str, Callable[[Path, argparse.Namespace], Found]] = {
+    function.__name__: function
+    for function in (cuts, clock, writes, overload, losses, mutants, kills)
+}
+COUNTS = {"kills": 300, "cuts": 300, "losses": 200, "mutants": 10_000, "writes": 300}
+COUNTS |= {"overload-s": 60}
 
 
 def grey_pictures(folder: Path) -> Path:
@@ -54,11 +101,6 @@ def grey_pictures(folder: Path) -> Path:
     for k in range(32):
         cv2.imwrite(str(folder / f"{k:03d}.jpg"), np.full((48, 64, 3), 8 * k, np.uint8))
     return folder
-
-
-def show(name: str, figures: Mapping[str, object]) -> None:
-    """A line of JSON a test."""
-    print(json.dumps({"test": name} | figures), flush=True)
 
 
 if __name__ == "__main__":
