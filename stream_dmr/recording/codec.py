@@ -44,6 +44,7 @@ _DATACLASSES: dict[str, type] = {
         *(Camera, ReferencePlane, Calibration),
     )
 }
+_MOST_PX = 1 << 28  # of a picture; damaged bytes must not ask for all memory
 _SCALARS = {
     FieldDescriptor.TYPE_BOOL: bool,
     FieldDescriptor.TYPE_DOUBLE: float,
@@ -138,7 +139,12 @@ def _set(proto: Proto, field: Any, item: Any) -> None:
 
 
 def _build(kind: type[T], proto: Proto) -> T:
-    return kind(**{field.name: _get(proto, field) for field in _fields(kind)})
+    built = kind(**{field.name: _get(proto, field) for field in _fields(kind)})
+    if isinstance(built, Camera) and not 0 < built.width * built.height <= _MOST_PX:
+        raise RecordingError(
+            f"the recording has pictures of {built.width}x{built.height} px: it is damaged"
+        )
+    return built
 
 
 @cache
