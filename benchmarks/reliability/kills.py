@@ -52,12 +52,11 @@ def kills(
     for one in series:
         for name, figure in one.figures.items():
             figures[name] = figures.get(name, 0) + figure
-    return figures | {
-        "recording ends before the kill, s, median": round(median(behind), 2),
-        "recording ends before the kill, s, most": round(max(behind), 2),
-        "recording ends before frames.csv, s, median": round(median(behind_csv), 2),
-        "recording ends before frames.csv, s, most": round(max(behind_csv), 2),
-    }
+    for name, seconds in (("the kill", behind), ("frames.csv", behind_csv)):
+        if seconds:
+            figures[f"recording ends before {name}, s, median"] = round(median(seconds), 2)
+            figures[f"recording ends before {name}, s, most"] = round(max(seconds), 2)
+    return figures
 
 
 class Series:
