@@ -20,6 +20,7 @@ _LOG_LENGTH_STD = 0.3  # fish turn and bend
 _LOG_AREA_STD = 0.7
 _COLOUR_STD = 25.0  # grey levels
 _MOST_COST = 12.0  # a sum of five squares, each about 1
+_MOST_COST_OF_NEW = 5.0  # likewise, of a shape that nobody followed before
 _STAYING = 0.5  # what a shape is cheaper for the fish that has it already
 _SLOWER = 0.95  # speed, from frame to frame, of what is hidden by nothing that is seen
 _NEVER = 1e6
@@ -47,6 +48,7 @@ class Memory:
     area: float
     length: float
     colour: Float[np.ndarray, "3"]
+    is_covered: bool = False  # by something that is seen
 
     def move(self, F: Float[np.ndarray, "4 4"], Q: Float[np.ndarray, "4 4"]) -> None:
         """Move on as a Kalman filter that sees nothing."""
@@ -56,6 +58,7 @@ class Memory:
     def stay_inside_one_of(self, boxes: Iterable[Float[np.ndarray, "4"]]) -> None:
         """Stay in the box that this is in, however it moves; elsewhere move ever more slowly."""
         box = next((box for box in boxes if self.is_inside(box)), None)
+        self.is_covered = box is not None
         if box is None:
             self.x[2:] *= _SLOWER
             return
@@ -86,6 +89,7 @@ def who_is_who(
     Looks begin with those that were given away already: the first to memory `owned[0]`, and so on.
     """
     costs = np.array([[memory.cost(look) for look in looks] for memory in memories])
+    costs[:, len(owned) :][costs[:, len(owned) :] > _MOST_COST_OF_NEW] = _NEVER
     for column, row in enumerate(owned):
         costs[row, column] = min(costs[row, column], _MOST_COST) - _STAYING
     rows, columns = linear_sum_assignment(costs)

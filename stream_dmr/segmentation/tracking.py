@@ -24,6 +24,7 @@ from stream_dmr.settings import Settings
 _SWALLOWED = 0.55  # of a fish's expected box inside a candidate
 _SWOLLEN = 1.3  # times the larger of two fish: a candidate that is both
 _BESIDE = 0.3  # of a candidate inside a followed fish's box: a part of it, no new fish
+_COVERED_FRAMES = 30  # that another fish may hide one
 _KNOWN = 8  # frames after which a fish is known well enough to be known again
 
 
@@ -34,10 +35,10 @@ class TrackerSettings(Settings):
         default=7, ge=0, description="a fish unseen for more frames in a row is gone"
     )
     max_hidden_frames: int = Field(
-        default=30,
+        default=0,
         ge=0,
-        description="a fish lost amid the picture is known again, by place, size and colour, "
-        "within so many frames",
+        description="a fish lost in the open is known again within so many frames; 0 at a rail, "
+        "where the next fish soon hangs in its place",
     )
     min_score: float = Field(
         default=0.3, ge=0, le=1, description="least score of a detector's candidate that counts"
@@ -127,10 +128,14 @@ class Tracker:
         self._hidden = [
             track
             for track in (*self._hidden, *gone)
-            if track.lost_frames - 1 <= self._settings.max_hidden_frames  # it may be seen yet
+            if track.lost_frames - 1 <= self._most_hidden_frames(track)  # it may be seen yet
             and track.frames_seen >= _KNOWN
             and not track.look.touches_border
         ]
+
+    def _most_hidden_frames(self, track: Track) -> int:
+        is_covered = track.memory is not None and track.memory.is_covered
+        return max(self._settings.max_hidden_frames, _COVERED_FRAMES if is_covered else 0)
 
     def _recognise(self, free: Sequence[Look]) -> list[Look]:
         """Say who is who among fish that were one, or were lost; the looks of others remain."""
