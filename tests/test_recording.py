@@ -7,6 +7,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from threading import Thread
 
@@ -33,10 +34,12 @@ from stream_dmr.messages import (
     Message,
 )
 from stream_dmr.recording.codec import CODEC_VERSION, decode, reference
+from stream_dmr.recording.files import OpenSinks, open_files
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.mcap_sink import McapSink
 from stream_dmr.recording.pictures import checksum
 from stream_dmr.recording.recorder import Recorder
+from stream_dmr.recording.segments import open_segments
 from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.recording.topics import FOXGLOVE_TOPICS, TOPICS, topics_table
 from stream_dmr.recording.view_geometry import place
@@ -152,13 +155,33 @@ def test_a_flush_leaves_all_messages_so_far_readable_in_the_part(
     recorder = Recorder(tmp_path, header(), EXACT.model_copy(update={"flush_s": 1e-9}))
     write_all(recorder, messages)
     wait_for(recorder)
-    with (tmp_path / "recording.mcap.part").open("rb") as stream:
-        reader, found = NonSeekingReader(stream, validate_crcs=True), []
-        with suppress(McapError):  # it has no end yet
-            for _, _, item in reader.iter_messages(log_time_order=False):
-                found.append(item.log_time)
+    found = log_times_in_part(tmp_path)
     recorder.close()
     assert found == [message.timestamp_ns for message in messages]
+
+
+@pytest.mark.parametrize("files", [open_files, partial(open_segments, on_notice=print)])
+def test_what_nothing_follows_is_flushed_all_the_same(
+    tmp_path: Path, messages: list[Message], files: OpenSinks
+):
+    """A camera may stall, and the power fail meanwhile."""
+    settings = EXACT.model_copy(update={"flush_s": 0.3})
+    with Recorder(tmp_path, header(), settings, files=files) as recorder:
+        write_all(recorder, messages)
+        until = time.monotonic() + 30
+        while len(log_times_in_part(tmp_path)) < len(messages) and time.monotonic() < until:
+            time.sleep(0.05)
+        assert log_times_in_part(tmp_path) == [message.timestamp_ns for message in messages]
+
+
+def log_times_in_part(folder: Path) -> list[int]:
+    (part,) = folder.glob("*.mcap.part")
+    found = []
+    with part.open("rb") as stream, suppress(McapError):  # it has no end yet
+        reader = NonSeekingReader(stream, validate_crcs=True)
+        for _, _, item in reader.iter_messages(log_time_order=False):
+            found.append(item.log_time)
+    return found
 
 
 def test_a_part_left_by_a_crash_is_not_written_over(tmp_path: Path):

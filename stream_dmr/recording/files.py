@@ -29,6 +29,15 @@ class Sink(Protocol):
 
 
 @runtime_checkable
+class Flushing(Protocol):
+    """A sink that keeps records for a moment and writes them together."""
+
+    def flush_due(self) -> None:
+        """Write what was kept long enough; OutputError where the disk refuses it."""
+        ...
+
+
+@runtime_checkable
 class FileSink(Sink, Protocol):
     """A sink that writes one file."""
 

@@ -52,8 +52,9 @@ Extras = Sequence[ExtraTopics]
 class McapSink:
     """Writes every record, with the capture time as its log time.
 
-    A flush comes with the first record that is `flush_s` of wall clock after the last flush; in a
-    segment also of capture time, of which more passes while a stall is made up for. A full disk
+    A flush comes with the first record that is `flush_s` of wall clock after the last flush, or
+    with `flush_due`; in a segment also after `flush_s` of capture time, of which more passes while
+    a stall is made up for. A full disk
     ends the recording: the file keeps its whole chunks and is closed without an index, which
     readers do without; where not even that has room, it stays behind as `.part`.
     """
@@ -120,6 +121,12 @@ class McapSink:
             if self._is_flush_due():
                 self._flush()
 
+    def flush_due(self) -> None:
+        """Flush what has waited for `flush_s` though no record came; OutputError as above."""
+        if self._waits and not self._closed and time.monotonic_ns() >= self._flush_at_ns:
+            with self._refusing():
+                self._flush()
+
     def carry(self, records: Iterable[Record]) -> None:
         """Append, durably, what is taken over from before, in a topic of its own."""
         with self._refusing():
@@ -152,6 +159,7 @@ class McapSink:
             raise self._refusal(error) from error
 
     def _add(self, channel: int, timestamp_ns: int, data: bytes) -> None:
+        self._waits = True
         self._sequences[channel] += 1
         self._writer.add_message(
             channel, timestamp_ns, data, timestamp_ns, self._sequences[channel]
@@ -179,6 +187,7 @@ class McapSink:
     def _flush(self) -> None:
         self._writer.flush()
         self._file.sync()
+        self._waits = False
         self._flush_at_ns = time.monotonic_ns() + self._flush_ns
         self._flush_at_capture_ns = self._last_ns + self._flush_ns
 

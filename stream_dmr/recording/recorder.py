@@ -2,14 +2,15 @@
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
-from queue import Queue
+from queue import Empty, Queue
 from threading import Lock, Thread
 from types import TracebackType
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import Message
-from stream_dmr.recording.files import OpenSinks, Sink, open_files
+from stream_dmr.recording.files import Flushing, OpenSinks, Sink, open_files
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.live import LiveView
 from stream_dmr.recording.record import Record, make_record
@@ -18,6 +19,7 @@ from stream_dmr.recording.whole_file import make_folder
 from stream_dmr.tables import Tables
 
 _QUEUE_MESSAGES = 64  # some 6 frames; where the disk can't keep up, the run waits: nothing is lost
+_SHORTEST_PAUSE_S = 0.05
 
 
 class Recorder:
@@ -116,23 +118,34 @@ class Recorder:
         self.close()
 
     def _write_all(self) -> None:
-        while (record := self._queue.get()) is not None:
+        """What is kept for a moment is written then, also where nothing follows it."""
+        pause_s = max(self._settings.flush_s, _SHORTEST_PAUSE_S)
+        while True:
+            try:
+                record = self._queue.get(timeout=pause_s)
+            except Empty:
+                for sink in self._sinks:
+                    if isinstance(sink, Flushing):
+                        self._try(sink, sink.flush_due)
+                continue
+            if record is None:
+                return
             self._write_to_all(record)
             self._queue.task_done()
 
     def _write_to_all(self, record: Record) -> None:
         for sink in self._sinks:
-            self._write_to(sink, record)
+            self._try(sink, partial(sink.write, record))
 
-    def _write_to(self, sink: Sink, record: Record) -> None:
-        """Write to one sink; once it has failed, never again.
+    def _try(self, sink: Sink, write: Callable[[], None]) -> None:
+        """Let one sink write; once it has failed, never again.
 
         The others go on: where the pictures no longer have room, the lengths still may.
         """
         if sink in self._refused:
             return
         try:
-            sink.write(record)
+            write()
         except OutputError as error:
             if self._on_refusal is not None:
                 self._on_refusal(str(error))

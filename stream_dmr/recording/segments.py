@@ -9,7 +9,7 @@ from threading import Thread
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish
 from stream_dmr.recording.carried import Carried, carried_record
-from stream_dmr.recording.files import STEM, FileSink, Sink, open_files
+from stream_dmr.recording.files import STEM, FileSink, Flushing, Sink, open_files
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.mcap_sink import McapSink
 from stream_dmr.recording.record import Record
@@ -77,6 +77,11 @@ class Segments:
             self._carried.take(record)
         sinks = self._next if is_after else self._open
         self._each(sinks, lambda sink: sink.write(record))
+
+    def flush_due(self) -> None:
+        """Write what was kept long enough; never raises OutputError."""
+        for sinks in (self._open, self._next):
+            self._each(sinks, lambda sink: sink.flush_due() if isinstance(sink, Flushing) else None)
 
     def close(self) -> None:
         """Close what is open. Idempotent."""
