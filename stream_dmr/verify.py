@@ -21,6 +21,7 @@ from stream_dmr.recording.part import WHOLE
 from stream_dmr.results import FishResult, database_of, fish_by_run, read_runs, read_stored
 from stream_dmr.store import NAME as DATABASE
 from stream_dmr.store import RunFacts
+from stream_dmr.table_file import set_aside
 from stream_dmr.tables import FRAMES_COLUMNS, LENGTHS_COLUMNS, frames_row, lengths_row
 from stream_dmr.tally import run_facts
 
@@ -186,11 +187,18 @@ def _csv(
     if not path.is_file():
         yield Change(path, "is missing")
         return
-    found = _rows(path, columns)
-    if found is None:
-        yield Change(path, "its columns are not those of stream-dmr")
-        return
+    found: dict[str, list[str]] = {}
+    for table in (older := set_aside(path)) + [path]:
+        rows = _rows(table, columns)
+        if rows is None:
+            yield Change(table, "its columns are not those of stream-dmr")
+            return
+        found |= rows
+    # Where room was short the oldest tables went, maybe with some rows of the first frame left.
+    first = min((int(row[0]) for row in found.values()), default=0) if older else 0
     for name, row in expected.items():
+        if older and int(row[0]) <= first:
+            continue
         label = "frame {}, fish {}".format(*name.split(",")) if "," in name else f"fish {name}"
         if name not in found:
             yield Change(path, f"{label} is missing; {witness} has it")

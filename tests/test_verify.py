@@ -130,3 +130,22 @@ def test_nothing_to_check_is_refused(tmp_path: Path):
         verify(tmp_path)
     outcome = invoke("verify", {str(tmp_path): None})
     assert outcome.code == 2
+
+
+def test_tables_of_frames_that_were_set_aside_are_read_too(out: Path):
+    """As a run of weeks leaves them; the oldest went where room was short."""
+    path = out / "frames.csv"
+    columns, *rows = path.read_text().splitlines(keepends=True)
+    parts = [rows[:4], rows[4:8], rows[8:]]
+    tables = [path.with_name("frames-000001.csv"), path.with_name("frames-000002.csv"), path]
+    for table, part in zip(tables, parts, strict=True):
+        table.write_text(columns + "".join(part))
+    assert not rows_changed(out)
+    tables[0].unlink()
+    assert not rows_changed(out)
+    tables[1].write_text(columns + "".join(parts[1][:2] + parts[1][3:]))
+    assert [line for line in rows_changed(out) if "is missing" in line]
+
+
+def rows_changed(out: Path) -> list[str]:
+    return [line for line in changed(out) if line.startswith("frames.csv: frame ")]
