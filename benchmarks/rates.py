@@ -147,7 +147,7 @@ def losses(setup: Setup, pair: Pair) -> Losses:
         AdamSolver(setup.template, patient).refine(target, start),
     )
     lambdas = setup.settings.lambdas()
-    values = [evaluate(setup.body, SPINE, target, end.flat)[0] @ lambdas for end in ends]
+    values = [evaluate(setup.body, SPINE, target, end.flat, True)[0] @ lambdas for end in ends]
     return Losses(*map(float, values))
 
 
