@@ -236,6 +236,13 @@ def test_outputs_that_cannot_be_are_refused_before_the_first_frame(
     assert expected in refusal(model, onnx_layout=layout)
 
 
+def test_classes_that_the_model_does_not_have_are_refused(tmp_path):
+    model = yolo_model(tmp_path / "model.onnx", np.ones((1, 4)))
+    assert "with class 80, which onnx_classes names" in refusal(model, onnx_classes=[0, 80])
+    with pytest.raises(ValueError, match="greater than or equal to 0"):
+        OnnxSettings(onnx_classes=[-1])
+
+
 def test_a_name_that_is_no_detector_is_refused():
     with pytest.raises(
         ModelError, match=r'"unet" or a path that ends in \.pt or \.onnx, got "yolo"'

@@ -167,9 +167,18 @@ def test_files_that_are_no_weights_are_refused(tmp_path):
     (tmp_path / "empty.pt").write_bytes(b"")
     torch.save({"format": "of another project"}, tmp_path / "other.pt")
     torch.save([1, 2, 3], tmp_path / "list.pt")
-    for name in ("text.pt", "empty.pt", "other.pt", "list.pt", "missing.pt"):
-        with pytest.raises(ModelError, match=name):
-            load_weights(tmp_path / name)
+    save_weights(random_network(), tmp_path / "sound.pt")
+    sound = torch.load(tmp_path / "sound.pt")
+    spoilt = {name: value * float("nan") for name, value in sound["state"].items()}
+    wider = {name: torch.zeros(9, *value.shape) for name, value in sound["state"].items()}
+    fewer = dict(list(sound["state"].items())[1:])
+    for name, state in (("nan", spoilt), ("wide", wider), ("few", fewer), ("number", 7)):
+        torch.save({**sound, "state": state}, tmp_path / f"{name}.pt")
+    torch.save({"format": sound["format"]}, tmp_path / "stateless.pt")
+    for path in (*sorted(tmp_path.glob("[!s]*.pt")), tmp_path / "stateless.pt", tmp_path / "no.pt"):
+        with pytest.raises(ModelError, match=path.name) as caught:
+            load_weights(path)
+        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("size", [32, 64, 128, 200])

@@ -5,6 +5,7 @@ at once and not in the middle of a run.
 """
 
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -40,7 +41,7 @@ class OnnxSettings(Settings):
     onnx_imagenet: bool = Field(
         default=False, description="input by ImageNet's mean and std, as DETR wants; else 0 to 1"
     )
-    onnx_classes: list[int] = Field(
+    onnx_classes: list[Annotated[int, Field(ge=0)]] = Field(
         default=[], description="the model's classes that are fish, from 0; empty: all"
     )
     onnx_overlap: float = Field(
@@ -115,9 +116,18 @@ class OnnxDetector:
         blob = np.ascontiguousarray(values.transpose(2, 0, 1)[None])
         outputs = self._session.run(None, {self._input_name: blob})
         boxes, scores = decode(outputs, self._settings.onnx_layout, input_size=self._input_size)
-        fish = [c for c in self._settings.onnx_classes if c < scores.shape[1]]
-        scores = scores[:, fish] if self._settings.onnx_classes else scores
-        return boxes, scores.max(axis=1, initial=0.0)
+        return boxes, self._of_fish(scores).max(axis=1, initial=0.0)
+
+    def _of_fish(self, scores: Float[np.ndarray, "N C"]) -> Float[np.ndarray, "N F"]:
+        """The scores of those classes that are fish."""
+        classes = self._settings.onnx_classes
+        if not classes:
+            return scores
+        if self._settings.onnx_layout == "yolo-nms":  # has as many as were seen
+            classes = [c for c in classes if c < scores.shape[1]]
+        elif max(classes) >= scores.shape[1]:
+            raise WrongShape(f"with class {max(classes)}, which onnx_classes names")
+        return scores[:, classes]
 
     def _try(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
         """Raise ModelError where a picture makes the model fail or say what can't be."""

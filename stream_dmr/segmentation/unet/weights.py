@@ -40,10 +40,16 @@ def load_weights(path: Path) -> UNet:
             f"{path}: expected weights in the format '{_FORMAT}', got others; train them anew"
         )
     network = UNet()
-    network.load_state_dict(
-        {
+    try:
+        state = {
             name: value.float() if value.is_floating_point() else value
             for name, value in content["state"].items()
         }
-    )
+        network.load_state_dict(state)
+    except Exception as error:  # keys or shapes of another network, or no tensors at all
+        raise ModelError(
+            f"{path}: expected the layers of this version's network, got others; train them anew"
+        ) from error
+    if not all(bool(value.isfinite().all()) for value in state.values()):
+        raise ModelError(f"{path}: expected finite weights, got NaN or infinity; train them anew")
     return network.eval()
