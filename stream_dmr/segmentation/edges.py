@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.crop import mask_extent
+from stream_dmr.segmentation.detections import Detection
 
 _SURE = 0.9  # mask_confidence of a mask that tells where its fish ends
 _LEAST, _FARTHEST = 0.03, 0.1  # of the box's longer side, that a mask's edge is away from its
@@ -24,12 +25,25 @@ class LastEdges:
         self.beyond: dict[int, np.ndarray] = {}  # px, by track
         self._boxes: Mapping[int, np.ndarray] = {}  # of this frame, as they came
 
-    def mend(self, boxes: Mapping[int, np.ndarray], frame: Frame) -> dict[int, np.ndarray]:
-        """The boxes of a frame, by track, with the edges that the last masks had."""
+    def mended(
+        self, boxes: Mapping[int, np.ndarray], visible: Mapping[int, float], frame: Frame
+    ) -> list[Detection]:
+        """The boxes of a frame with the edges that the last masks had, and visible fractions.
+
+        Both by track. Their masks are for a segmenter to find.
+        """
         self._boxes = boxes
         height, width = frame.image.shape[:2]
         limits = [width, height, width, height]
-        return {i: np.clip(box + self.beyond.get(i, 0.0), 0.0, limits) for i, box in boxes.items()}
+        return [
+            Detection(
+                track_id=track,
+                bbox_xyxy_px=np.clip(box + self.beyond.get(track, 0.0), 0.0, limits),
+                mask=None,
+                visible_fraction=visible[track],
+            )
+            for track, box in boxes.items()
+        ]
 
     def learn(self, crops: Iterable[FishCrop]) -> None:
         """Take note of the masks of the same frame; of tracks without a sure one, nothing."""

@@ -33,16 +33,8 @@ class FollowedFish:
         sightings = self._tracker.step(frame, self._detector.find(frame))
         self.boxes = {one.number: one.candidate.bbox_xyxy_px for one in sightings}
         self.beyond = self._edges.beyond
-        mended = self._edges.mend(self.boxes, frame)
-        return [
-            Detection(
-                track_id=one.number,
-                bbox_xyxy_px=mended[one.number],
-                mask=None,
-                visible_fraction=one.visible_fraction,
-            )
-            for one in sightings
-        ]
+        visible = {one.number: one.visible_fraction for one in sightings}
+        return self._edges.mended(self.boxes, visible, frame)
 
     def fish(self, number: int) -> int | None:
         """The id of the fish that a track is; None while it doesn't count as one."""

@@ -20,8 +20,8 @@ from stream_dmr.segmentation.edges import LastEdges
 from stream_dmr.segmentation.followed import FollowedFish
 
 
-class Sighting(NamedTuple):
-    """A fish in a frame, as the detector saw it; boxes are half-open, in frame pixels."""
+class Noted(NamedTuple):
+    """What a scout notes of a fish in a frame, as the detector saw it. Boxes: half-open, px."""
 
     frame_index: int
     track_id: int
@@ -52,7 +52,7 @@ class Scout:
     def __init__(self, finder: FollowedFish) -> None:
         self._finder = finder
         self._doubtful: list[Detection] = []  # of this frame
-        self.sightings: list[Sighting] = []
+        self.sightings: list[Noted] = []
 
     @property
     def warnings(self) -> list[str]:
@@ -82,7 +82,7 @@ class Scout:
                 box, beyond = finder.boxes[one.track_id], finder.beyond.get(one.track_id)
                 moved = [0.0] * 4 if beyond is None else beyond.tolist()
                 where = (frame_index, fish, one.visible_fraction)
-                self.sightings.append(Sighting(*where, *box.tolist(), *moved))
+                self.sightings.append(Noted(*where, *box.tolist(), *moved))
 
 
 class SightedFish:
@@ -90,7 +90,7 @@ class SightedFish:
 
     def __init__(self, path: Path) -> None:
         self.warnings: list[str] = []  # a scout has said them
-        self._frames: defaultdict[int, list[Sighting]] = defaultdict(list)
+        self._frames: defaultdict[int, list[Noted]] = defaultdict(list)
         self._edges = LastEdges()
         self._known = set[int]()
         for one in read_sightings(path):
@@ -103,16 +103,8 @@ class SightedFish:
             if one.track_id not in self._known:  # its masks so far are those of the scout
                 self._known.add(one.track_id)
                 self._edges.beyond[one.track_id] = one.beyond
-        boxes = self._edges.mend({one.track_id: one.box for one in seen}, frame)
-        return [
-            Detection(
-                track_id=one.track_id,
-                bbox_xyxy_px=boxes[one.track_id],
-                mask=None,
-                visible_fraction=one.visible_fraction,
-            )
-            for one in seen
-        ]
+        visible = {one.track_id: one.visible_fraction for one in seen}
+        return self._edges.mended({one.track_id: one.box for one in seen}, visible, frame)
 
     def admit(self, crops: Iterable[FishCrop]) -> list[FishCrop]:
         """See `FishFinder`: what was noted is fish."""
@@ -121,18 +113,18 @@ class SightedFish:
         return crops
 
 
-def write_sightings(path: Path, sightings: Iterable[Sighting]) -> None:
+def write_sightings(path: Path, sightings: Iterable[Noted]) -> None:
     """As CSV; numbers as Python writes them, so that they are read to the last bit."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(Sighting._fields)
+        writer.writerow(Noted._fields)
         writer.writerows(sightings)
 
 
-def read_sightings(path: Path) -> Iterator[Sighting]:
+def read_sightings(path: Path) -> Iterator[Noted]:
     """What `write_sightings` wrote."""
     with path.open(newline="", encoding="utf-8") as file:
         lines = csv.reader(file)
         next(lines)
         for frame_index, track_id, *numbers in lines:
-            yield Sighting(int(frame_index), int(track_id), *map(float, numbers))
+            yield Noted(int(frame_index), int(track_id), *map(float, numbers))
