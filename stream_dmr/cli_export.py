@@ -47,6 +47,7 @@ def export(
     from stream_dmr.export import Export
 
     exported = Export(recording, parse_part(time, track))
+    exported.claim(out)
     if meshes:
         print(f"{out / 'meshes'}: {exported.meshes(out / 'meshes', format=meshes)} meshes")
     if masks:

@@ -11,10 +11,11 @@ import trimesh
 from jaxtyping import Bool
 
 from stream_dmr.camera import crop_from_frame, frame_from_crop
+from stream_dmr.errors import OutputError
 from stream_dmr.fish_table import fish_record, write_csv, write_parquet
 from stream_dmr.fisheries import FisheriesSettings
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
-from stream_dmr.provenance import write_provenance
+from stream_dmr.provenance import read_origin, seal_files
 from stream_dmr.recording.codec import reference
 from stream_dmr.recording.meshes import Meshes
 from stream_dmr.recording.opened import messages, open_recordings
@@ -116,11 +117,20 @@ class Export:
         self._written.append(path)
         return path
 
+    def claim(self, out: Path) -> None:
+        """Raise OutputError where `out` has what was made from something else."""
+        origin = read_origin(out)
+        if origin is not None and origin.resolve() != self._path.resolve():
+            raise OutputError(
+                f"{out}: expected a folder for what comes from {self._path}, found what came from "
+                f"{origin}; choose another --out"
+            )
+
     def provenance(self, out: Path) -> Path:
         """Write beside all that was written into `out` what made it, and its checksums."""
         database = database_of(self._path)
         runs = {"": run_facts(self._recording.header)} if database is None else read_runs(database)
-        return write_provenance(out, self._written, runs=runs, origin=str(self._path))
+        return seal_files(out, self._written, runs=runs, origin=str(self._path))
 
     def _messages(self, *kinds: type[Message]) -> Iterator[Message]:
         for message, _ in messages(self._recording, kinds, self._part):

@@ -1,7 +1,8 @@
 """provenance.json: what made the files of a folder, and their SHA-256."""
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from hashlib import file_digest, sha256
@@ -14,6 +15,7 @@ from stream_dmr.recording.whole_file import rename_durably, writing_to
 from stream_dmr.results import database_of, fish_by_run, read_runs
 from stream_dmr.store import NAME as DATABASE
 from stream_dmr.store import RunFacts
+from stream_dmr.verdicts import Verdict, read_verdicts
 
 NAME = "provenance.json"
 
@@ -46,46 +48,48 @@ def sealed(
 def seal_run(folder: Path, *, with_recordings: bool) -> None:
     """Write the provenance of a run's own results. OutputError.
 
-    Reviewers go on writing to the database, so of it the fish of each run are summed up.
+    Reviewers go on writing to the database, so of it the fish of each run and the verdicts are
+    summed up.
     """
     database = folder / DATABASE
     kinds = ("*.csv", "*.mcap", "*.rrd") if with_recordings else ("lengths.csv", "frames.csv")
     files = [path for kind in kinds for path in folder.glob(kind)]
-    write_provenance(
+    fish = {run_id: lines_sha256(lines) for run_id, lines in fish_by_run(database).items()}
+    _write(
         folder,
-        files,
-        runs=read_runs(database),
-        fish={run_id: fish_sha256(lines) for run_id, lines in fish_by_run(database).items()},
+        _new(read_runs(database))
+        | {"fish_sha256": fish, "files": _sums(folder, files)}
+        | {"verdicts": verdicts_sum(read_verdicts(database))},
     )
 
 
-def fish_sha256(lines: Iterable[str]) -> str:
-    """Of all that is stored of the fish of one run."""
+def lines_sha256(lines: Iterable[str]) -> str:
+    """Of what a database holds, a line a row."""
     return sha256("\n".join(lines).encode()).hexdigest()
 
 
-def write_provenance(
-    folder: Path,
-    files: Iterable[Path],
-    *,
-    runs: dict[str, RunFacts],
-    fish: dict[str, str] | None = None,
-    origin: str = "",
-) -> Path:
-    """Say of `files` in `folder` what they are and what made them. Raises OutputError.
+def verdicts_sum(verdicts: Sequence[Verdict]) -> dict[str, Any]:
+    """How many there are, and their SHA-256."""
+    lines = (json.dumps(asdict(verdict)) for verdict in verdicts)
+    return {"count": len(verdicts), "sha256": lines_sha256(lines)}
 
-    `origin` is the folder or recording that they were exported from.
+
+def seal_files(
+    folder: Path, files: Iterable[Path], *, runs: Mapping[str, RunFacts], origin: str = ""
+) -> Path:
+    """Say of `files` what they are and what made them, beside what is said of others.
+
+    `origin` is the folder or recording that they were exported from. OutputError, also where what
+    is said of others is damaged.
     """
-    made = {
-        "software_version": __version__,
-        "origin": origin,
-        "runs": {run_id: asdict(facts) for run_id, facts in runs.items()},
-        "fish_sha256": fish or {},
-        "files": {
-            path.relative_to(folder).as_posix(): sha256_of(path) for path in sorted(set(files))
-        },
-    }
-    return _write(folder, made)
+    try:
+        made = read_provenance(folder) or _new(runs, origin)
+    except ValueError as error:
+        raise OutputError(
+            f"{folder / NAME}: expected what made the files beside it, got: {error}; write to "
+            "another folder"
+        ) from error
+    return _write(folder, made | {"files": made["files"] | _sums(folder, files)})
 
 
 def add_files(folder: Path, files: Iterable[Path]) -> None:
@@ -94,25 +98,57 @@ def add_files(folder: Path, files: Iterable[Path]) -> None:
     What it says of others stays, whatever has become of them. One that is missing or damaged stays
     so: it is for `verify` to find.
     """
+    _add(folder, lambda made: {"files": made["files"] | _sums(folder, files)})
+
+
+def seal_verdicts(folder: Path) -> None:
+    """Say how many verdicts there are by now, and their SHA-256. As `add_files`."""
+    _add(folder, lambda made: {"verdicts": verdicts_sum(read_verdicts(folder / DATABASE))})
+
+
+def _add(folder: Path, more: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
     try:
         made = read_provenance(folder)
     except ValueError:
         return
     if made is not None:
-        added = {path.relative_to(folder).as_posix(): sha256_of(path) for path in files}
-        _write(folder, made | {"files": made["files"] | added})
+        _write(folder, made | more(made))
+
+
+def _new(runs: Mapping[str, RunFacts], origin: str = "") -> dict[str, Any]:
+    return {
+        "software_version": __version__,
+        "origin": origin,
+        "runs": {run_id: asdict(facts) for run_id, facts in runs.items()},
+        "fish_sha256": {},
+        "files": {},
+    }
+
+
+def _sums(folder: Path, files: Iterable[Path]) -> dict[str, str]:
+    return {path.relative_to(folder).as_posix(): sha256_of(path) for path in sorted(set(files))}
 
 
 def _write(folder: Path, made: dict[str, Any]) -> Path:
-    target, draft = folder / NAME, folder / f"{NAME}.part"
+    # Two reviewers may be at it.
+    target, draft = folder / NAME, folder / f"{NAME}.{os.getpid()}.part"
     with writing_to(target):
         draft.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
         rename_durably(draft, target)
     return target
 
 
+def read_origin(folder: Path) -> Path | None:
+    """What the files of a folder were made from: itself where it is a run's; None where unknown."""
+    try:
+        made = read_provenance(folder)
+    except ValueError:
+        return None
+    return None if made is None else Path(made.get("origin") or folder)
+
+
 def read_provenance(folder: Path) -> dict[str, Any] | None:
-    """What `write_provenance` wrote; None where nothing was. ValueError where it is damaged."""
+    """What was written; None where nothing was. ValueError where it is damaged."""
     path = folder / NAME
     if not path.is_file():
         return None

@@ -12,10 +12,12 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from stream_dmr.batch.check import check_batch
+from stream_dmr.batch.places import VIDEOS
 from stream_dmr.errors import OutputError, RecordingError, UserError
 from stream_dmr.messages import LengthEstimate, LocalizedFish
 from stream_dmr.provenance import NAME as PROVENANCE
-from stream_dmr.provenance import fish_sha256, read_provenance, sha256_of
+from stream_dmr.provenance import lines_sha256, read_provenance, sha256_of, verdicts_sum
 from stream_dmr.recording.opened import messages, open_recordings
 from stream_dmr.recording.part import WHOLE
 from stream_dmr.results import FishResult, database_of, fish_by_run, read_runs, read_stored
@@ -24,6 +26,7 @@ from stream_dmr.store import RunFacts
 from stream_dmr.table_file import set_aside
 from stream_dmr.tables import FRAMES_COLUMNS, LENGTHS_COLUMNS, frames_row, lengths_row
 from stream_dmr.tally import run_facts
+from stream_dmr.verdicts import Verdict, read_verdicts
 
 _MADE_BY = ("config_sha256", "calibration_sha256", "template_sha256")
 _COMPARED = (
@@ -44,7 +47,8 @@ def verify(folder: Path) -> tuple[list[Change], int]:
 
     Raises UserError where there is nothing to check.
     """
-    places = {path.parent for name in (DATABASE, PROVENANCE) for path in folder.rglob(name)}
+    marks = (DATABASE, PROVENANCE, VIDEOS)
+    places = {path.parent for name in marks for path in folder.rglob(name)}
     if not places:
         raise UserError(
             f"{folder}: expected a folder with {DATABASE} or {PROVENANCE}, found neither; give the "
@@ -54,24 +58,14 @@ def verify(folder: Path) -> tuple[list[Change], int]:
     for place in sorted(places):
         changes += dict.fromkeys(_changes(place))
         num_files += sum(1 for path in place.iterdir() if path.is_file())
-    for copy in sorted(folder.glob("**/dataset/*/*/*/*.parquet")):
-        changes += _copy(copy)
-        num_files += 1
+        num_files += sum(1 for _ in place.glob("dataset/*/*/*/*.parquet"))
     return changes, num_files
-
-
-def _copy(path: Path) -> Iterator[Change]:
-    """A file of a batch's data set against that of its video, dataset/KIND/*/*/VIDEO.parquet."""
-    kind, batch = path.parents[2].name, path.parents[4]
-    origin = batch / "videos" / path.stem / f"{kind}.parquet"
-    if not origin.is_file():
-        yield Change(path, f"is of no video that is done: there is no {origin.relative_to(batch)}")
-    elif sha256_of(path) != sha256_of(origin):
-        yield Change(path, f"is not what {origin.relative_to(batch)} is")
 
 
 def _changes(folder: Path) -> Iterator[Change]:
     yield from _against_provenance(folder)
+    if (folder / VIDEOS).is_file():
+        yield from (Change(*finding) for finding in check_batch(folder))
     database = database_of(folder)
     if database is None:
         return
@@ -118,10 +112,11 @@ def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
     """The fish and the runs against what provenance.json says of them."""
     try:
         stored, runs = fish_by_run(database), read_runs(database)
+        said = read_verdicts(database)
     except OutputError:
         return  # `_changes` says so
     for run_id, expected in made["fish_sha256"].items():
-        if fish_sha256(stored.get(run_id, [])) != expected:
+        if lines_sha256(stored.get(run_id, [])) != expected:
             yield Change(database, f"the fish of run {run_id} are not those that were measured")
     for run_id, facts in made["runs"].items():
         for field in fields(RunFacts):
@@ -129,6 +124,16 @@ def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
             if now != facts.get(field.name):
                 was = facts.get(field.name)
                 yield Change(database, f"run {run_id}: {field.name} is {now!r}, was {was!r}")
+    yield from _verdicts(database, said, made.get("verdicts", {}))
+
+
+def _verdicts(database: Path, said: Sequence[Verdict], known: dict[str, Any]) -> Iterator[Change]:
+    """What reviewers said, against what provenance.json says of it: rows are only added."""
+    count = known.get("count", 0)
+    if verdicts_sum(said[:count]) != (known or verdicts_sum([])):
+        yield Change(database, "the verdicts are not those that reviewers gave")
+    elif len(said) > count:
+        yield Change(database, f"verdicts that no `review` took: {len(said) - count}")
 
 
 def _recording(

@@ -25,6 +25,7 @@ from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
 from stream_dmr.batch.pieces import pieces_of
 from stream_dmr.batch.progress import Clock, duration
 from stream_dmr.errors import UserError
+from stream_dmr.provenance import seal_verdicts
 from stream_dmr.run import run
 from stream_dmr.verdicts import Verdict, add_verdict
 from stream_dmr.verify import verify
@@ -180,8 +181,39 @@ def test_a_changed_data_set_is_found(season: Path, tmp_path: Path):
     (change,) = verify(tmp_path)[0]
     assert change.path == copy
     assert "is not what videos/video/fish.parquet is" in change.what
-    copy.rename(copy.with_name("other.parquet"))
-    assert "no video that is done" in verify(tmp_path)[0][0].what
+    shutil.copy(tmp_path / "videos" / "video" / "fish.parquet", copy)
+    elsewhere = copy.parents[1] / "trip=9" / copy.name
+    elsewhere.parent.mkdir()
+    copy.rename(elsewhere)  # which makes it another trip's
+    assert [(change.path, change.what) for change in verify(tmp_path)[0]] == [
+        (copy, "is missing"),
+        (elsewhere, "is of no video that is done, by videos.csv"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "expected"),
+    [
+        (",done,", ",failed,", "video: status is failed, outcome.json says done"),
+        ("no such file", "is fine", "broken: reason is "),
+        ("Sea Bird", "Other", "is missing"),  # where the data set has that vessel's fish
+    ],
+)
+def test_a_changed_table_of_videos(
+    season: Path, tmp_path: Path, before: str, after: str, expected: str
+):
+    jobs = jobs_of(season, tmp_path, row(vessel="Sea Bird"), row(video="no/broken.mp4"))
+    measure(jobs, tmp_path)
+    assert verify(tmp_path)[0] == []
+    table = tmp_path / "videos.csv"
+    text = table.read_text()
+    assert before in text
+    table.write_text(text.replace(before, after, 1))
+    found = [change.what for change in verify(tmp_path)[0]]
+    assert "was changed: its SHA-256 is not that in provenance.json" in found
+    assert any(what.startswith(expected) for what in found), found
+    measure(jobs, tmp_path)
+    assert verify(tmp_path)[0] == []
 
 
 def test_verdicts_come_into_the_data_set_with_the_next_batch(season: Path, tmp_path: Path):
@@ -189,6 +221,7 @@ def test_verdicts_come_into_the_data_set_with_the_next_batch(season: Path, tmp_p
     measure([job], tmp_path)
     database = folder_of(job, tmp_path) / "lengths.db"
     add_verdict(database, Verdict(track_id=2, kind="reject", reason="a glove", reviewer="Ada"))
+    seal_verdicts(database.parent)
     measure([job], tmp_path)
     fish = dataset.dataset(tmp_path / "dataset" / "fish").to_table().to_pylist()
     assert [one["verdict"] for one in fish] == [None, "reject"]

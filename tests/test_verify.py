@@ -11,7 +11,7 @@ from command import invoke
 from fish_run import measure
 
 from stream_dmr.errors import UserError
-from stream_dmr.provenance import NAME
+from stream_dmr.provenance import NAME, seal_verdicts
 from stream_dmr.verdicts import Verdict, add_verdict
 from stream_dmr.verify import verify
 
@@ -42,8 +42,37 @@ def test_sound_results_and_exports_are_found_sound(out: Path):
     outcome = invoke("verify", {str(out): None})
     assert outcome.code == 0, outcome.out
     assert "nothing was changed" in outcome.out
-    add_verdict(out / "lengths.db", Verdict(track_id=1, kind="accept", reviewer="Ada"))
+    say(out, Verdict(track_id=1, kind="accept", reviewer="Ada"))
     assert changed(out) == []  # a verdict changes no measurement
+
+
+def say(out: Path, verdict: Verdict) -> None:
+    """As a review does."""
+    add_verdict(out / "lengths.db", verdict)
+    seal_verdicts(out)
+
+
+@pytest.mark.parametrize(
+    ("statement", "expected"),
+    [
+        ("UPDATE verdicts SET kind = 'accept' WHERE number = 1", "are not those that reviewers"),
+        ("DELETE FROM verdicts WHERE number = 2", "are not those that reviewers gave"),
+        ("DELETE FROM verdicts", "are not those that reviewers gave"),
+        ("DROP TABLE verdicts", "are not those that reviewers gave"),
+        (
+            "INSERT INTO verdicts (track_id, kind, reason, species, reviewer, written_ns) "
+            "VALUES (1, 'accept', '', '', 'Ada', 5)",
+            "verdicts that no `review` took: 1",
+        ),
+    ],
+)
+def test_changed_verdicts(out: Path, statement: str, expected: str):
+    say(out, Verdict(track_id=1, kind="reject", reason="a glove", reviewer="Ada"))
+    say(out, Verdict(track_id=2, kind="accept", reviewer="Bob"))
+    assert changed(out) == []
+    sql(out, statement)
+    (line,) = changed(out)
+    assert expected in line
 
 
 @pytest.mark.parametrize(
@@ -118,6 +147,47 @@ def test_a_changed_export(out: Path):
     (out / "exp" / NAME).write_text("{}")
     (line,) = changed(out)
     assert line.startswith(f"{NAME}: damaged")
+
+
+def test_exports_of_one_run_stand_beside_each_other(out: Path, tmp_path: Path):
+    exp = tmp_path / "exp"
+    for what in ({"--fish": "csv"}, {"--tables": "csv"}, {"--masks": None}):
+        outcome = invoke("export", {"--out": str(exp), str(out): None} | what)
+        assert outcome.code == 0, outcome.err
+    assert verify(exp)[0] == []
+    for name in ("fish.csv", "lengths.csv", "masks.json"):
+        with (exp / name).open("a") as file:
+            file.write(" ")
+    assert [change.path.name for change in verify(exp)[0]] == [
+        *("fish.csv", "lengths.csv", "masks.json")
+    ]
+
+
+def test_an_export_beside_its_run_takes_nothing_from_it(out: Path):
+    assert invoke("export", {"--out": str(out), "--fish": "csv", str(out): None}).code == 0
+    assert changed(out) == []
+    sql(out, "UPDATE fish SET iou = 1.0 WHERE track_id = 1")
+    (out / "fish.csv").write_text("")
+    assert {line.split(":")[0] for line in changed(out)} == {"fish.csv", "lengths.db"}
+
+
+def test_exports_of_another_run_are_refused(out: Path, tmp_path: Path):
+    exp = tmp_path / "exp"
+    assert invoke("export", {"--out": str(exp), "--fish": "csv", str(out): None}).code == 0
+    other = Path(shutil.copytree(out, tmp_path / "other"))
+    for target in (exp, out):
+        outcome = invoke("export", {"--out": str(target), "--fish": "csv", str(other): None})
+        assert outcome.code == 2
+        assert f"found what came from {out}" in outcome.error
+    assert verify(exp)[0] == []
+
+
+def test_a_report_beside_its_run_is_checked(out: Path):
+    page = out / "report.html"
+    assert invoke("report", {str(out): None, "--out": str(page)}).code == 0
+    assert changed(out) == []
+    page.write_text(page.read_text().replace("stream-dmr", "other"))
+    assert changed(out) == ["report.html: was changed: its SHA-256 is not that in provenance.json"]
 
 
 def test_a_missing_provenance_is_said(out: Path):

@@ -12,20 +12,19 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from stream_dmr.batch.dataset import publish, withdraw_others
-from stream_dmr.batch.job import DONE, SCOUT, Outcome, finish, folder_of, outcome_of, part_of
+from stream_dmr.batch.job import SCOUT, Outcome, finish, folder_of, outcome_of, part_of
 from stream_dmr.batch.manifest import Job
+from stream_dmr.batch.places import DONE, RESULT_COLUMNS, VIDEO_FOLDERS, VIDEOS, WAITING
 from stream_dmr.batch.progress import Clock
 from stream_dmr.batch.video import Video
 from stream_dmr.errors import OutputError
+from stream_dmr.provenance import seal_files
 from stream_dmr.recording.whole_file import make_folder, writing_to
 from stream_dmr.store import require_free
 
 _ROUNDS = 2  # scouts and all that needs none, then what they make possible
 _DYING_S = 10.0  # how long a killed process may still hold its folder
-_TABLE = (
-    *("name", "video", "vessel", "trip", "haul"),
-    *("status", "reason", "frames", "fish", "elapsed_s"),
-)
+_TABLE = ("name", "video", "vessel", "trip", "haul", *RESULT_COLUMNS)
 
 
 @runtime_checkable
@@ -62,7 +61,7 @@ def batch(
     Failed ones are tried again by the next batch; videos of more than `piece_frames` (0: none) are
     measured in pieces. Setting `stop` ends it soon.
     """
-    make_folder(out / "videos")
+    make_folder(out / VIDEO_FOLDERS)
     _drop_parts(out)
     began = time.perf_counter()
     ledger = _Ledger(jobs, out, say)
@@ -155,7 +154,7 @@ class _Ledger:
 
     def _write(self) -> None:
         """videos.csv: a row a video, in the order of the manifest."""
-        target = self._out / "videos.csv"
+        target = self._out / VIDEOS
         draft = target.with_suffix(".csv.part")
         with writing_to(target):
             with draft.open("w", newline="", encoding="utf-8") as file:
@@ -165,17 +164,18 @@ class _Ledger:
                     origin = (job.name, job.video, job.vessel, job.trip, job.haul)
                     writer.writerow(origin + _result(self.outcomes.get(job.name)))
             draft.replace(target)
+        seal_files(self._out, [target], runs={})
 
 
 def _result(one: Outcome | None) -> tuple[object, ...]:
     if one is None:
-        return ("waiting", "", "", "", "")
+        return (WAITING, "", "", "", "")
     return (one.status, one.reason, one.num_frames, one.num_fish, one.elapsed_s)
 
 
 def _drop_parts(out: Path) -> None:
     """Remove what a kill left half done. OutputError where another batch is at it."""
-    for part in chain(out.glob("videos/*.part"), out.glob("pieces/*/*.part")):
+    for part in chain(out.glob(f"{VIDEO_FOLDERS}/*.part"), out.glob("pieces/*/*.part")):
         until = time.monotonic() + _DYING_S
         while True:
             try:

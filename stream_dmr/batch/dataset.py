@@ -10,11 +10,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from pyarrow import Table, parquet
 
 from stream_dmr.batch.manifest import Job
+from stream_dmr.batch.places import KINDS, in_dataset
 from stream_dmr.config import parse_config
 from stream_dmr.errors import OutputError
 from stream_dmr.fish_table import FISH_TABLE, arrow_schema, fish_record
@@ -25,7 +25,6 @@ from stream_dmr.store import NAME as DATABASE
 from stream_dmr.tables import FRAMES_COLUMNS
 from stream_dmr.verdicts import read_verdicts
 
-KINDS = ("fish", "frames")
 _PARTITIONS = ("vessel", "trip")
 _WHOLE_NUMBERS = ("frame_index", "timestamp_ns", "track_id")
 _MADE_BY = ("run_id", "software_version", "config_sha256")
@@ -95,9 +94,7 @@ def withdraw_others(jobs: Iterable[Job], out: Path) -> None:
 
 
 def _target(out: Path, kind: str, job: Job) -> Path:
-    # Without a name it is that of no letters: pandas can't join others to what Hive has for none.
-    parts = [f"{name}={quote(getattr(job, name), safe='')}" for name in _PARTITIONS]
-    return (out / "dataset" / kind).joinpath(*parts, f"{job.name}.parquet")
+    return in_dataset(out, kind, vessel=job.vessel, trip=job.trip, name=job.name)
 
 
 def _time(folder: Path, kind: str) -> int:

@@ -10,16 +10,16 @@ from pathlib import Path
 
 from stream_dmr.batch.dataset import write_tables
 from stream_dmr.batch.manifest import Job
+from stream_dmr.batch.places import DONE, FAILED, OUTCOME, VIDEO_FOLDERS
 from stream_dmr.batch.progress import Progress
 from stream_dmr.errors import UserError
+from stream_dmr.provenance import add_files
 from stream_dmr.recording.whole_file import rename_durably
 from stream_dmr.run import RunRequest, run
 from stream_dmr.scout import SIGHTINGS, scout
 from stream_dmr.segmentation.only import Only
 from stream_dmr.tally import Observer
 
-OUTCOME = "outcome.json"
-DONE, FAILED = "done", "failed"
 SCOUT = "scout"  # the piece of a raw video that finds out where its fish are
 
 
@@ -38,7 +38,7 @@ class Outcome:
 
 def folder_of(job: Job, out: Path) -> Path:
     """Where the results of a job are, once it is over."""
-    return pieces_folder(job, out) / job.piece if job.piece else out / "videos" / job.name
+    return pieces_folder(job, out) / job.piece if job.piece else out / VIDEO_FOLDERS / job.name
 
 
 def pieces_folder(job: Job, out: Path) -> Path:
@@ -105,6 +105,7 @@ def finish(part: Path, folder: Path, outcome: Outcome) -> None:
     """Write the outcome and give the folder its name, in place of an earlier one."""
     part.mkdir(exist_ok=True)
     (part / OUTCOME).write_text(json.dumps(asdict(outcome)) + "\n", encoding="utf-8")
+    add_files(part, [part / OUTCOME])
     shutil.rmtree(folder, ignore_errors=True)
     rename_durably(part, folder)
 

@@ -13,8 +13,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import IO
 
-from stream_dmr.batch.job import FAILED, Outcome, outcome_of
+from stream_dmr.batch.job import Outcome, outcome_of
 from stream_dmr.batch.manifest import Job
+from stream_dmr.batch.places import FAILED
 from stream_dmr.batch.progress import Clock, Progress
 
 _MOST_SAID = 300  # bytes of what a broken process said last

@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from stream_dmr.batch.job import DONE, SCOUT, folder_of, outcome_of
+from stream_dmr.batch.job import SCOUT, folder_of, outcome_of
 from stream_dmr.batch.manifest import Job
+from stream_dmr.batch.places import DONE
 from stream_dmr.config import load_config
 from stream_dmr.errors import UserError
 from stream_dmr.scout import SIGHTINGS

@@ -8,8 +8,9 @@ from importlib import import_module  # an extra: nothing here needs it to be ins
 from pathlib import Path
 from typing import Any
 
-from stream_dmr.batch.job import FAILED, Outcome, do_job
+from stream_dmr.batch.job import Outcome, do_job
 from stream_dmr.batch.manifest import Job
+from stream_dmr.batch.places import FAILED
 from stream_dmr.batch.progress import Clock
 from stream_dmr.errors import ConfigError, UserError
 

@@ -10,8 +10,9 @@ from functools import partial
 from pathlib import Path
 
 from stream_dmr.batch.dataset import write_tables
-from stream_dmr.batch.job import DONE, Outcome, finish, folder_of, outcome_of, part_of
+from stream_dmr.batch.job import Outcome, finish, folder_of, outcome_of, part_of
 from stream_dmr.batch.manifest import Job
+from stream_dmr.batch.places import DONE
 from stream_dmr.config import Config, load_config
 from stream_dmr.messages import Frame
 from stream_dmr.provenance import seal_run

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from stream_dmr.batch.job import DONE, FAILED, SCOUT, Outcome, outcome_of, pieces_folder
+from stream_dmr.batch.job import SCOUT, Outcome, outcome_of, pieces_folder
 from stream_dmr.batch.manifest import Job
 from stream_dmr.batch.pieces import pieces_of
+from stream_dmr.batch.places import DONE, FAILED
 from stream_dmr.batch.stitch import stitch
 from stream_dmr.errors import UserError
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from stream_dmr.config import Config, load_config, parse_config
 from stream_dmr.fisheries import FisheriesSettings
+from stream_dmr.provenance import add_files
 from stream_dmr.recording.opened import Recording, open_recordings
 from stream_dmr.recording.whole_file import make_folder, writing_to
 from stream_dmr.report.album import Album, make_album
@@ -66,7 +67,9 @@ def open_report(path: Path, *, source: str | None = None, config: Path | None = 
 
 
 def write_report(report: Report, out: Path) -> int:
-    """Write the page; returns its bytes."""
+    """Write the page; returns its bytes. Beside results it is one of their files to `verify`."""
     make_folder(out.parent)
     with writing_to(out):
-        return out.write_text(report.html(), encoding="utf-8")
+        out.write_text(report.html(), encoding="utf-8")
+    add_files(out.parent, [out])
+    return out.stat().st_size

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.errors import UserError
 from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate
+from stream_dmr.provenance import seal_verdicts
 from stream_dmr.recording.codec import decode
 from stream_dmr.report.gather import View
 from stream_dmr.report.page import summary
@@ -83,6 +84,7 @@ class Judge:
             if said.kind == "correct":
                 verdict = self._corrected(verdict, said)
             add_verdict(self._database, verdict)
+            seal_verdicts(self._database.parent)
             return self._row(self._fish[said.track_id])
 
     def judged(self) -> list[dict[str, Any]]:
