@@ -9,7 +9,8 @@ from pathlib import Path
 
 import typer
 
-from stream_dmr.cli import exit_codes, run_command
+from stream_dmr.cli import exit_codes
+from stream_dmr.cli_run import run
 
 SCENE = Path(__file__).resolve().parents[1] / "recordings" / "demo"
 OUT = Path("runs") / "demo"
@@ -20,7 +21,7 @@ def measure_scene(scene: Path, *, out: Path, config: Path | None = None) -> bool
 
     Results of an earlier run in `out` are replaced.
     """
-    run_command(
+    run(
         source=str(scene / "video.mp4"),
         boxes=scene / "boxes.txt",
         masks=scene / "masks",

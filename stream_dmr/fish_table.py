@@ -11,6 +11,7 @@ from stream_dmr.recording.whole_file import writing_to
 from stream_dmr.results import FishResult
 from stream_dmr.tables import seconds
 from stream_dmr.template import Template
+from stream_dmr.verdicts import Review
 
 # Name -> type of its values, as in Parquet; every value may be missing.
 FISH_TABLE: dict[str, type] = {
@@ -43,16 +44,25 @@ def fish_record(
     fish: FishResult, template: Template, settings: FisheriesSettings
 ) -> dict[str, Any]:
     """The values of FISH_TABLE; None where there is none."""
-    estimate, review, facts = fish.estimate, fish.review, fish.facts
-    low, high = (None, None) if estimate.ci95_mm is None else estimate.ci95_mm.tolist()
     derived = derive(fish.length_mm, template, settings)
-    corrected = review.length_mm is not None
-    values: dict[str, Any] = {name: getattr(facts, name, None) for name in FISH_TABLE}
-    values |= {n: getattr(estimate, n) for n in FISH_TABLE if hasattr(estimate, n)}
+    values: dict[str, Any] = {name: getattr(fish.facts, name, None) for name in FISH_TABLE}
+    values |= {n: getattr(fish.estimate, n) for n in FISH_TABLE if hasattr(fish.estimate, n)}
     values |= {n: getattr(derived, n) for n in FISH_TABLE if hasattr(derived, n)}
     return values | {
+        **_measured(fish),
+        **_said(fish.review),
         "template": template.name,
-        "species": review.species or template.name,
+        "species": fish.review.species or template.name,
+        "weight_source": None if derived.weight_kg is None else settings.weight_source,
+        "legal_source": None if derived.is_legal_size is None else settings.legal_source,
+        "run_id": fish.run_id,
+    }
+
+
+def _measured(fish: FishResult) -> dict[str, Any]:
+    estimate, corrected = fish.estimate, fish.review.length_mm is not None
+    low, high = (None, None) if estimate.ci95_mm is None else estimate.ci95_mm.tolist()
+    return {
         "ci95_low_mm": low,
         "ci95_high_mm": high,
         "length_from": None if fish.length_mm is None else "review" if corrected else "measurement",
@@ -61,6 +71,11 @@ def fish_record(
         "refused": json.dumps(dict(estimate.refused)),
         "iou": fish.iou,
         "flags": json.dumps(list(fish.flags)),
+    }
+
+
+def _said(review: Review) -> dict[str, Any]:
+    return {
         "verdict": review.decision or None,
         "verdict_reason": review.reason or None,
         "duplicate_of": review.duplicate_of,
@@ -68,9 +83,6 @@ def fish_record(
         "corrected_length_std_mm": review.length_std_mm,
         "reviewer": review.reviewer or None,
         "reviewed_ns": review.written_ns or None,
-        "weight_source": None if derived.weight_kg is None else settings.weight_source,
-        "legal_source": None if derived.is_legal_size is None else settings.legal_source,
-        "run_id": fish.run_id,
     }
 
 

@@ -163,7 +163,7 @@ def _recording(
                 if message.is_final:
                     yield from _estimate(path, message, fish.get(message.track_id))
         for line in recording.warnings:
-            yield Change(path, line)
+            yield Change(path, line.removeprefix(f"{path}: "))
     except RecordingError as error:
         yield Change(path, f"damaged: {str(error).removeprefix(f'{path}: ')}")
 

@@ -51,7 +51,7 @@ FLOORS = [
     ["stream_dmr.display"],
     [
         f"stream_dmr.cli_{name}"
-        for name in ("replay", "evaluate", "train", "learn", "export", "report", "batch")
+        for name in ("run", "replay", "evaluate", "train", "learn", "export", "report", "batch")
     ],
     ["stream_dmr.cli"],
     ["stream_dmr.demo"],
@@ -84,7 +84,7 @@ WHO_KNOWS = {
         *("stream_dmr.cli_evaluate", "stream_dmr.cli_support", "stream_dmr.cli_train"),
         *("stream_dmr.cli_replay", "stream_dmr.cli_view", "stream_dmr.demo"),
         *("stream_dmr.cli_recover", "stream_dmr.cli_learn"),
-        *("stream_dmr.cli_report", "stream_dmr.cli_batch"),
+        *("stream_dmr.cli_report", "stream_dmr.cli_batch", "stream_dmr.cli_run"),
     ],
 }
 

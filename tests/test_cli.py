@@ -8,7 +8,8 @@ import pytest
 from command import invoke, rows
 
 from stream_dmr import __version__
-from stream_dmr.cli import default_out, one_line
+from stream_dmr.cli import one_line
+from stream_dmr.cli_run import default_out
 from stream_dmr.errors import UserError
 
 HEAVY = ["cv2", "torch", "rerun", "mcap", "numpy", "scipy", "trimesh", "numba", "pydantic"]

@@ -20,6 +20,7 @@ from stream_dmr.report.gather import FrameRow, Track
 from stream_dmr.results import FishResult
 
 _PER_RUN = ("source", "command")  # of the facts; the rest stand in the exports too
+_CODE = ("table.js", "plots.js", "detail.js", "review.js", "page.js")
 _FINEST = 32000  # int16 for the largest coordinate of a mesh
 
 
@@ -35,7 +36,7 @@ def page(
     reviewer: str | None = None,
 ) -> str:
     """The whole page; with a `reviewer`, it asks for verdicts and sends them to its server."""
-    data = {
+    about = {
         "title": title,
         "software": __version__,
         "template": header.template.name,
@@ -44,21 +45,21 @@ def page(
         "runs": {one.run_id: asdict(one.facts) for one in fish},
         "notes": list(notes),
         "reviewer": reviewer,
-        "fish": [summary(one, header, settings, album) for one in fish],
     }
-    details = "".join(
-        _script(f"fish-{one.estimate.track_id}", detail(one, tracks, album)) for one in fish
-    )
+    rows = [summary(one, header, settings, album) for one in fish]
+    details = (_script(f"fish-{one.estimate.track_id}", detail(one, tracks, album)) for one in fish)
+    return _filled(title, _script("data", about | {"fish": rows}) + "".join(details))
+
+
+def _filled(title: str, data: str) -> str:
+    """page.html with all that it asks for."""
     room = files("stream_dmr.report")
     parts = {
         "TITLE": title.replace("&", "&amp;").replace("<", "&lt;"),
         "STYLE": room.joinpath("page.css").read_text(encoding="utf-8"),
         "PLOTLY": files("plotly").joinpath("package_data/plotly.min.js").read_text("utf-8"),
-        "DATA": _script("data", data) + details,
-        "CODE": "".join(
-            room.joinpath(name).read_text(encoding="utf-8")
-            for name in ("table.js", "plots.js", "detail.js", "review.js", "page.js")
-        ),
+        "DATA": data,
+        "CODE": "".join(room.joinpath(name).read_text(encoding="utf-8") for name in _CODE),
     }
     text = room.joinpath("page.html").read_text(encoding="utf-8")
     pieces = text.split("@@")  # text, name, text, name, ..., text
