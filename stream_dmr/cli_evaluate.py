@@ -6,6 +6,14 @@ from typing import Annotated
 
 import typer
 
+from stream_dmr.cli_support import warn
+
+_NOT_THE_SAME_IDS = (
+    "the run found its fish in the video and numbered them as they came; where the truth numbers "
+    "them otherwise, other fish are compared: run with the truth's --boxes or --masks, or believe "
+    "the distributions alone"
+)
+
 
 def evaluate(
     lengths: Annotated[Path, typer.Option(help="lengths.csv of a run.")],
@@ -34,8 +42,11 @@ def evaluate(
     from stream_dmr.evaluation import evaluate, evaluate_histogram
     from stream_dmr.evaluation_files import is_histogram
     from stream_dmr.histogram_plot import plot_histograms
+    from stream_dmr.results import numbers_its_own
 
     settings = load_config(config).evaluate
+    if not is_histogram(truth) and numbers_its_own(lengths.parent):
+        warn([_NOT_THE_SAME_IDS])
     if is_histogram(truth):
         distributions = evaluate_histogram(lengths, truth, settings=settings)
         print_distributions(distributions)

@@ -105,6 +105,11 @@ def print_check(summary: ReplaySummary) -> None:
         )
     if len(found) > _MOST_SHOWN:
         print(f"... and {len(found) - _MOST_SHOWN} more")
+    if summary.num_left_out:
+        print(
+            f"{summary.num_left_out} messages not compared, of fish that were in view before this "
+            "recording began: their fits start from fits in the ones before it; give these, too"
+        )
     if summary.num_beyond:
         print(f"{summary.num_beyond} messages more than were recorded: it was cut off before them")
     kinds = ", ".join(sorted({item.kind for item in found}))

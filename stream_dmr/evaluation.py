@@ -3,7 +3,7 @@
 Fish are paired by track_id; the two distributions are compared without pairing, as in the paper.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -82,8 +82,22 @@ _DEFAULTS = EvaluateSettings()
 def evaluate(
     lengths_csv: Path, truth_csv: Path, *, settings: EvaluateSettings = _DEFAULTS
 ) -> Evaluation:
-    """Compare fish by fish. Raises UserError, in one line, for whatever can't be read."""
-    return compare(read_lengths(lengths_csv), read_truth(truth_csv), settings=settings)
+    """Compare fish by fish. Raises UserError, in one line, for whatever can't be read.
+
+    Also where no fish has the track_id of another: then nothing says which are the same.
+    """
+    lengths, truth = read_lengths(lengths_csv), read_truth(truth_csv)
+    if lengths and not lengths.keys() & truth.keys():
+        raise UserError(
+            f"{lengths_csv}: expected fish by the track_ids of {truth_csv} ({_some(truth)}), got "
+            f"others ({_some(lengths)}); number them alike, or give a histogram as the truth"
+        )
+    return compare(lengths, truth, settings=settings)
+
+
+def _some(ids: Iterable[int], most: int = 5) -> str:
+    first = [str(i) for i in ids]
+    return ", ".join(first[:most]) + (", ..." if len(first) > most else "")
 
 
 def evaluate_histogram(

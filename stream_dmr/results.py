@@ -76,6 +76,14 @@ def read_runs(database: Path) -> dict[str, RunFacts]:
         return dict(_runs(connection))
 
 
+def numbers_its_own(folder: Path) -> bool:
+    """Whether a run in a folder was given no files that say which fish is which. OutputError."""
+    database = database_of(folder)
+    runs = {} if database is None else read_runs(database)
+    commands = (one.command for one in runs.values() if " run " in one.command)
+    return any("--boxes" not in one and "--masks" not in one for one in commands)
+
+
 def fish_by_run(database: Path) -> dict[str, list[str]]:
     """Every stored value of the fish of each run, as JSON, a line each: for checksums."""
     lines: dict[str, list[str]] = {}

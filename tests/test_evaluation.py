@@ -1,10 +1,13 @@
 """`evaluate`: tables in, figures and a picture out; what can't be read is refused in one line."""
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import invoke
+from fish_run import measure
 
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.evaluation import distribution_rows, evaluate, evaluate_histogram, summary_rows
@@ -42,6 +45,24 @@ def test_evaluation_pairs_by_track_and_names_the_rest(tmp_path):
     assert rows["truth within the 95 % interval"] == "50 %"
     assert rows["its mean width"] == "3.4 % of the length"
     assert rows["NEES (1 is right)"] == f"{(0.7**2 + 3.6**2) / 2:.2f}"
+
+
+def test_fish_of_other_numbers_are_refused(tmp_path):
+    truth = write(tmp_path, "b.csv", "track_id,length_mm\n101,700\n102,800\n")
+    with pytest.raises(UserError, match=r"\(101, 102\), got others \(1, 2, 4, 9\); number them"):
+        evaluate(write(tmp_path, "a.csv", LENGTHS), truth)
+
+
+def test_numbers_that_a_run_gave_itself_are_warned_of(tmp_path):
+    out = measure(tmp_path)
+    truth = write(tmp_path, "b.csv", TRUTH)
+    for command, is_warned in (("", True), (" --masks clip/masks", False)):
+        with closing(sqlite3.connect(out / "lengths.db")) as database:
+            database.execute(f"UPDATE runs SET command = 'stream-dmr run --source x{command}'")
+            database.commit()
+        outcome = invoke("evaluate", {"--lengths": str(out / "lengths.csv"), "--truth": str(truth)})
+        assert outcome.code == 0
+        assert ("numbered them as they came" in outcome.err) == is_warned
 
 
 def test_nothing_measured_is_no_error(tmp_path):

@@ -39,6 +39,7 @@ class Judge:
         self._expected = {kind: _Peek(self._running(tape, kind)) for kind in kinds}
         self._ends_early = tape.ends_early
         self.num_compared = 0
+        self.num_left_out = 0
         self.num_beyond = 0  # computed, and not recorded where the recording was cut off
         self._longer: set[int] = set()  # the tracks of those
         self.mismatches: list[Mismatch] = []
@@ -46,6 +47,7 @@ class Judge:
     def compare(self, computed: Message) -> None:
         """Compare with the one of its kind, frame and fish."""
         if _track_of(computed) in self._leave_out:
+            self.num_left_out += 1
             return
         self.num_compared += 1
         if isinstance(computed, LengthEstimate) and computed.is_final:

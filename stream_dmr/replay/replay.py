@@ -71,6 +71,7 @@ class ReplaySummary:
     recorded_s: float  # of capture time, from the first frame to the last
     counters: Sequence[StageCounters]
     num_compared: int
+    num_left_out: int  # of fish that were in view before the recording began, see docs/replay.md
     num_beyond: int  # computed anew where the recording was cut off before them
     mismatches: Sequence[Mismatch]
 
@@ -129,6 +130,7 @@ def replay(
         recorded_s=scribe.recorded_s,
         counters=counters,
         num_compared=judge.num_compared if judge else 0,
+        num_left_out=judge.num_left_out if judge else 0,
         num_beyond=judge.num_beyond if judge else 0,
         mismatches=judge.mismatches if judge else [],
     )
