@@ -1,6 +1,10 @@
-"""What the benchmark compares must be comparable: its targets and its peer. No timings here."""
+"""What the benchmark compares must be comparable: its targets and its peer. No timings here.
+
+And whatever it calls of the library must still be there: nobody runs `make bench` every day.
+"""
 
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -8,14 +12,22 @@ import pytest
 import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+sys.path.insert(1, str(Path(__file__).parents[1] / "benchmarks" / "reliability"))
+import backlog
+import race
+import rates
+from chain import Rate
+from report import Results, markdown
 from targets import draw_known, draw_pair, species_template
 
+from stream_dmr.batch.manifest import read_manifest
 from stream_dmr.body import Body
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.target import Target
 from stream_dmr.silhouette import project, silhouette
 from stream_dmr.skinning import Rig, deform, spine
 
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 TEMPLATE = species_template()
 TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
 
@@ -33,6 +45,64 @@ def test_pairs_are_whole_and_differ():
     for crop in (pair.before, pair.now):
         assert not crop.quality.touches_border
     assert (pair.before.mask != pair.now.mask).any()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [path.stem for path in sorted(BENCHMARKS.rglob("*.py")) if path.parent.name != "table1"],
+)
+def test_every_script_finds_what_it_imports(name):
+    if name == "deodr_solver":
+        pytest.importorskip("deodr", reason="needs the extra bench")
+    if name == "failing_run":
+        pytest.skip("needs the library that failing_writes builds and loads before it")
+    import_module(name)
+
+
+def test_whatever_bench_measures_can_be_measured_and_printed(monkeypatch):
+    for module, name in ((rates, "ADAM_ITERATIONS"), (race, "CAP"), (race, "_DEODR_TRIES")):
+        monkeypatch.setattr(module, name, 2)
+    setup, size = rates.Setup(TEMPLATE), 48
+    pair = draw_pair(size=size, seed=0)
+    known = draw_known(setup.body, size=size, seed=0, most_bend_rad=0.5)
+    losses = rates.losses(setup, pair)
+    assert np.isfinite(losses).all()
+    assert losses.contour_without_priors < losses.adam  # which had two iterations
+    warm, cold = rates.warm(setup, pair), rates.cold(setup, known)
+    assert min(warm.iou, cold.iou) > 0.8
+    parts = [
+        rates.parts_ms(of(setup, pair), repeats=1)
+        for of in (rates.fit_parts, rates.iteration_parts)
+    ]
+    text = markdown(
+        Results(
+            load=(1.0, 1.0),
+            laps=[lap._replace(size=s) for lap in race_laps(setup, pair) for s in (128, 256)],
+            warm={128: [warm], 256: [warm]},
+            cold=[cold],
+            fits_per_second={
+                n: rates.fits_per_second(setup, [pair], threads=n, seconds=0.0) for n in (1, 2)
+            },
+            losses=[losses],
+            first_calls=([1.0, 2.0, 0.1], [1.0, 0.2, 0.1]),
+            chain=dict.fromkeys(("both recordings (default)",), Rate(1.0, 1, 1.0, {"fit": 1.0})),
+            fit_parts=dict.fromkeys((128, 256), parts[0]),
+            iteration_parts=dict.fromkeys((128, 256), parts[1]),
+            remarks=[],
+        )
+    )
+    assert "nan" not in text
+
+
+def race_laps(setup, pair):
+    return list(race.Race(setup.template).run(pair, size=48, index=0))
+
+
+def test_the_backlog_is_a_manifest(tmp_path):
+    backlog.write_manifest(tmp_path / "m.csv", 2)
+    first, second = read_manifest(tmp_path / "m.csv", config=None, template="halibut")
+    assert Path(first.video).is_file()
+    assert (first.trip, second.trip) == ("0", "1")
 
 
 def test_deodr_draws_our_silhouette_half_a_pixel_wider():
