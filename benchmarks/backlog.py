@@ -1,7 +1,8 @@
 """Throughput of `stream-dmr batch`: `python benchmarks/backlog.py --videos 4 --engines local ray`.
 
-Copies of the embedded scene, measured with one worker and with two; `--rounds 3` gives medians. The
-first video of each worker also pays for its start; `docs/scale.md` has the figures.
+Copies of the embedded scene with their masks, and all of them in one raw video, in pieces of a
+scene's length: with one worker and with two; `--rounds 3` gives medians. The first video of each
+worker also pays for its start; `docs/scale.md` has the figures.
 """
 
 import argparse
@@ -12,17 +13,29 @@ import tempfile
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from itertools import product
 from pathlib import Path
 from statistics import median
+from typing import NamedTuple
+
+import cv2
+import numpy as np
 
 from stream_dmr.batch.batch import Engine, batch
 from stream_dmr.batch.local import LocalEngine
 from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
 
 DEMO = Path(__file__).resolve().parents[1] / "recordings" / "demo"
+
+
+class Backlog(NamedTuple):
+    """What there is to do."""
+
+    name: str
+    jobs: list[Job]
+    piece_frames: int
 
 
 @contextmanager
@@ -43,28 +56,57 @@ def engine_of(name: str, workers: int) -> Iterator[Engine]:
     cluster.shutdown()
 
 
-def write_manifest(path: Path, videos: int) -> None:
-    row = {"video": DEMO / "video.mp4", "calibration": DEMO / "calibration.yaml"}
-    row |= {"boxes": DEMO / "boxes.txt", "masks": DEMO / "masks"}
-    with path.open("w", newline="") as file:
+def backlogs(folder: Path, videos: int) -> Iterator[Backlog]:
+    """So many videos with masks; one raw video as long as all of them, in pieces and whole."""
+    masks = {"boxes": DEMO / "boxes.txt", "masks": DEMO / "masks"}
+    with_masks = [{"video": DEMO / "video.mp4"} | masks] * videos
+    yield Backlog("masks", jobs_of(folder / "masks.csv", with_masks), 0)
+    num_frames = write_repeated(folder / "long.mp4", DEMO / "video.mp4", times=videos)
+    raw = jobs_of(folder / "raw.csv", [{"video": folder / "long.mp4"}])
+    yield Backlog("raw, in pieces", raw, num_frames // videos)
+    yield Backlog("raw, whole", raw, 0)
+
+
+def jobs_of(manifest: Path, rows: Sequence[Mapping[str, object]]) -> list[Job]:
+    """The jobs of these videos of the embedded scene, by a manifest."""
+    with manifest.open("w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
-        writer.writerows([row | {"vessel": "demo", "trip": n} for n in range(videos)])
+        for number, row in enumerate(rows):
+            of_all = {"calibration": DEMO / "calibration.yaml", "vessel": "demo", "trip": number}
+            writer.writerow(row | of_all)
+    return read_manifest(manifest, config=None, template=str(DEMO / "species.ply"))
 
 
-def measure(name: str, workers: int, jobs: list[Job], out: Path) -> float:
+def write_repeated(path: Path, video: Path, *, times: int) -> int:
+    """A video so many times in a row; returns the number of frames."""
+    source = cv2.VideoCapture(str(video))
+    frames = list[np.ndarray]()
+    while (read := source.read())[0]:
+        frames.append(read[1])
+    height, width = frames[0].shape[:2]
+    fps, codec = source.get(cv2.CAP_PROP_FPS), cv2.VideoWriter.fourcc(*"mp4v")
+    target = cv2.VideoWriter(str(path), codec, fps, (width, height))
+    for frame in frames * times:
+        target.write(frame)
+    target.release()
+    return len(frames) * times
+
+
+def measure(name: str, workers: int, work: Backlog, out: Path) -> float:
     """Print how it went; returns frames/s, the start of the engine left out."""
     load, began = os.getloadavg()[0], time.perf_counter()
     with engine_of(name, workers) as engine:
         ready_s = time.perf_counter() - began
-        summary = batch(jobs, out, engine, stop=threading.Event())
+        stop = threading.Event()
+        summary = batch(work.jobs, out, engine, piece_frames=work.piece_frames, stop=stop)
     frames = sum(one.num_frames for one in summary.outcomes)
     fish = sum(one.num_fish for one in summary.outcomes)
     in_work = sum(one.elapsed_s for one in summary.outcomes)
     print(
-        f"{name}, {workers} workers: {frames} frames, {fish} fish in {summary.elapsed_s:.1f} s, "
-        f"{frames / summary.elapsed_s:.2f} frames/s; {in_work:.1f} s in videos; engine ready in "
-        f"{ready_s:.1f} s; load {load:.1f}",
+        f"{work.name}, {name}, {workers} workers: {frames} frames, {fish} fish in "
+        f"{summary.elapsed_s:.1f} s, {frames / summary.elapsed_s:.2f} frames/s; "
+        f"{in_work:.1f} s in videos; engine ready in {ready_s:.1f} s; load {load:.1f}",
         flush=True,
     )
     return frames / summary.elapsed_s
@@ -77,17 +119,17 @@ def main() -> None:
     parser.add_argument("--workers", nargs="+", type=int, default=[1, 2])
     parser.add_argument("--rounds", type=int, default=1, help="of all, in turn; then medians")
     arguments = parser.parse_args()
-    rates = defaultdict[tuple[str, int], list[float]](list)
+    rates = defaultdict[tuple[str, str, int], list[float]](list)
     with tempfile.TemporaryDirectory() as folder:
-        manifest = Path(folder) / "manifest.csv"
-        write_manifest(manifest, arguments.videos)
-        jobs = read_manifest(manifest, config=None, template=str(DEMO / "species.ply"))
-        kinds = list(product(arguments.engines, arguments.workers))
-        for number, (name, workers) in product(range(arguments.rounds), kinds):
-            out = Path(folder) / f"{name}-{workers}-{number}"
-            rates[name, workers].append(measure(name, workers, jobs, out))
-    for (name, workers), found in rates.items():
-        print(f"{name}, {workers} workers: median {median(found):.2f} frames/s")
+        works = list(backlogs(Path(folder), arguments.videos))
+        kinds = list(product(works, arguments.engines, arguments.workers))
+        for number, (work, name, workers) in product(range(arguments.rounds), kinds):
+            if work.name == "raw, whole" and (name, workers) != ("local", 1):
+                continue  # one video keeps one worker busy, wherever
+            out = Path(folder) / f"{work.name}-{name}-{workers}-{number}"
+            rates[work.name, name, workers].append(measure(name, workers, work, out))
+    for (what, name, workers), found in rates.items():
+        print(f"{what}, {name}, {workers} workers: median {median(found):.2f} frames/s")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -20,7 +21,6 @@ from chain import Rate
 from report import Results, markdown
 from targets import draw_known, draw_pair, species_template
 
-from stream_dmr.batch.manifest import read_manifest
 from stream_dmr.body import Body
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.target import Target
@@ -98,11 +98,14 @@ def race_laps(setup, pair):
     return list(race.Race(setup.template).run(pair, size=48, index=0))
 
 
-def test_the_backlog_is_a_manifest(tmp_path):
-    backlog.write_manifest(tmp_path / "m.csv", 2)
-    first, second = read_manifest(tmp_path / "m.csv", config=None, template="halibut")
-    assert Path(first.video).is_file()
-    assert (first.trip, second.trip) == ("0", "1")
+def test_the_backlog_is_as_long_raw_as_with_masks(tmp_path):
+    with_masks, in_pieces, whole = backlog.backlogs(tmp_path, videos=2)
+    assert [job.trip for job in with_masks.jobs] == ["0", "1"]
+    lengths = [cv2.VideoCapture(job.video).get(cv2.CAP_PROP_FRAME_COUNT) for job in with_masks.jobs]
+    (raw,) = in_pieces.jobs
+    assert cv2.VideoCapture(raw.video).get(cv2.CAP_PROP_FRAME_COUNT) == sum(lengths)
+    assert in_pieces.piece_frames == lengths[0]
+    assert whole.jobs == [raw]
 
 
 def test_deodr_draws_our_silhouette_half_a_pixel_wider():
