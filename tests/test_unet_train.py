@@ -9,7 +9,7 @@ from stream_dmr.cli import app
 from stream_dmr.errors import ModelError, OutputError
 from stream_dmr.segmentation.unet.settings import TrainSettings
 from stream_dmr.segmentation.unet.train import TrainObserver, TrainRequest, train
-from stream_dmr.segmentation.unet.weights import load_weights
+from stream_dmr.segmentation.unet.weights import SHIPPED, load_weights
 
 TINY = TrainSettings(
     epochs=2,
@@ -79,6 +79,20 @@ def test_training_ends_where_nothing_improves(trained, tmp_path):
     merits = [epoch["iou"] for epoch in history(tmp_path)]
     assert len(merits) < 9
     assert merits[-1] <= max(merits[:-1])
+
+
+def test_fine_tuning_never_ends_with_worse_weights_than_it_began_with(tmp_path):
+    wild = TINY.model_copy(update={"learning_rate": 0.1, "epochs": 1})
+    best = train(request(tmp_path, settings=wild, init=SHIPPED), stop=never())
+    start, spoilt = history(tmp_path)
+    assert best.epoch == start["epoch"] == 0
+    assert start["loss"] is None
+    assert spoilt["iou"] < start["iou"]
+    one, other = (load_weights(path).state_dict() for path in (SHIPPED, tmp_path / "unet.pt"))
+    for name, value in one.items():
+        np.testing.assert_array_equal(value.numpy(), other[name].numpy())
+    train(request(tmp_path, settings=wild, resume=True, init=SHIPPED), stop=never())
+    assert len(history(tmp_path)) == 2  # it was over
 
 
 def test_what_cannot_be_is_refused_before_anything_is_learnt(trained, tmp_path):

@@ -49,8 +49,9 @@ class TrainDisplay(TrainObserver):
         self._progress.update(self._epoch, advance=num_crops)
 
     def checked(self, scores: Scores, *, is_best: bool) -> None:  # noqa: D102
+        loss = "to begin with" if scores.loss is None else f"loss {scores.loss:.3f}"
         self._console.print(
-            f"epoch {scores.epoch}/{self._settings.epochs}: loss {scores.loss:.3f}, "
+            f"epoch {scores.epoch}/{self._settings.epochs}: {loss}, "
             f"IoU {scores.iou:.3f}, heads right {scores.ends_right:.2f}{', best' * is_best}"
         )
         self._progress.reset(self._epoch, description=f"epoch {scores.epoch + 1}")

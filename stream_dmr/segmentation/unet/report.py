@@ -25,12 +25,13 @@ def draw_curve(history: Sequence[Scores], path: Path) -> None:
         left, right = _place(0.0, tenth / 10), _place(1.0, tenth / 10)
         cv2.line(canvas, left, right, _GRID, 1)
         _write(canvas, f"{tenth / 10:.1f}", (8, left[1] + 4), _INK)
-    highest = max(scores.loss for scores in history)
+    losses = [np.nan if scores.loss is None else scores.loss for scores in history]
+    highest = max(losses, key=np.nan_to_num)
     curves = {
         "mean IoU": ([s.iou for s in history], (180, 90, 0)),
         "10th percentile of IoU": ([s.iou_p10 for s in history], (220, 170, 90)),
         "heads found at the head": ([s.ends_right for s in history], (60, 140, 30)),
-        f"loss / {highest:.2f}": ([s.loss / highest for s in history], (90, 90, 200)),
+        f"loss / {highest:.2f}": ([loss / highest for loss in losses], (90, 90, 200)),
     }
     for index, (name, (values, colour)) in enumerate(curves.items()):
         steps = max(len(values) - 1, 1)

@@ -59,6 +59,8 @@ def train(
 ) -> Scores | None:
     """Teach the U-Net; returns the best scores, None where `stop` came before any.
 
+    Fine-tuning counts the weights that it begins with as epoch 0: it never ends with worse ones.
+
     Writes `unet.pt` (the best weights), `last.pt` (to resume from), `scores.json`, `curve.png` and
     `worst.png` into `request.out`, after every epoch. Raises a UserError where an input is wrong,
     before anything is learnt.
@@ -70,6 +72,8 @@ def train(
         check, size=request.settings.validation_crops, seed=(request.settings.seed, 0)
     )
     began = time.monotonic()
+    if training.is_fine_tuning and not training.history:
+        observer.checked(training.check_start(validation), is_best=True)
     while not training.is_over and not stop.is_set():
         scores = training.run_epoch(draw, validation, stop=stop, progress=observer.learning)
         if scores is None:

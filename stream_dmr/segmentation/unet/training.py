@@ -30,8 +30,8 @@ _FINE_TUNING = 0.3  # of the learning rate, where training starts from weights
 class Scores:
     """How well the network does on the validation pictures after an epoch."""
 
-    epoch: int
-    loss: float  # of the training pictures, mean over the epoch
+    epoch: int  # 0: of the weights that fine-tuning began with
+    loss: float | None  # of the training pictures, mean over the epoch; None for epoch 0
     iou: float  # mean over the pictures
     iou_p10: float  # one picture in ten is below
     ends_right: float  # share of the fish whose head is found at the head
@@ -87,12 +87,21 @@ class Training:
     @property
     def is_over(self) -> bool:
         """Whether all epochs have gone by, or too many without anything better."""
-        if len(self.history) >= self.settings.epochs:
+        if self._epoch >= self.settings.epochs:
             return True
         merits = [scores.merit for scores in self.history]
         return (
             bool(merits) and len(merits) - 1 - merits.index(max(merits)) >= self.settings.patience
         )
+
+    @property
+    def _epoch(self) -> int:
+        """The last one."""
+        return self.history[-1].epoch if self.history else 0
+
+    def check_start(self, validation: Pictures) -> Scores:
+        """Score the weights that fine-tuning begins with: none that are worse are kept."""
+        return self._check_and_keep(validation, epoch=0, loss=None)
 
     def run_epoch(
         self,
@@ -103,7 +112,7 @@ class Training:
         progress: Callable[[int], None],
     ) -> Scores | None:
         """Teach for one epoch and check; None where `stop` broke in, and then nothing is kept."""
-        settings, epoch = self.settings, len(self.history) + 1
+        settings, epoch = self.settings, self._epoch + 1
         pictures = Pictures(draw, size=settings.crops_per_epoch, seed=(settings.seed, epoch))
         losses = []
         batches = load(pictures, batch_size=settings.batch_size, workers=settings.workers)
@@ -113,10 +122,13 @@ class Training:
             self._set_rate((epoch - 1 + step / len(batches)) / settings.epochs)
             losses.append(self._step(batch))
             progress(len(batch[0]))
+        return self._check_and_keep(validation, epoch=epoch, loss=sum(losses) / len(losses))
+
+    def _check_and_keep(self, validation: Pictures, *, epoch: int, loss: float | None) -> Scores:
         self.ious, right = self.check(validation)
         scores = Scores(
             epoch=epoch,
-            loss=sum(losses) / len(losses),
+            loss=loss,
             iou=float(self.ious.mean()),
             iou_p10=float(self.ious.quantile(0.1)),
             ends_right=right,
