@@ -34,19 +34,27 @@ def verify(
 
 def report(
     path: Annotated[
-        Path, typer.Argument(help="The --out of a run, or a recording.", metavar="DIR|REC")
+        Path,
+        typer.Argument(help="The --out of a run or of a batch, or a recording.", metavar="DIR|REC"),
     ],
     out: Annotated[Path, typer.Option(help="The page to write.")] = Path("report.html"),
     source: _Source = None,
     config: _Config = None,
 ) -> None:
     """Write results as one page that opens offline: plots, a table of fish, their best frames."""
-    from stream_dmr.report.report import open_report, write_report
+    from stream_dmr.errors import UserError
+    from stream_dmr.report.report import is_batch, open_batch, open_report, write_report
 
-    opened = open_report(path, source=source, config=config)
-    size = write_report(opened, out)
-    warn(opened.recording.warnings)
-    print(f"{out}: {len(opened.fish)} fish, {size / 1e6:.1f} MB")
+    failed = list[str]()
+    if is_batch(path):
+        if source is not None:
+            raise UserError(f"--source: {path} is of a batch, whose videos have their own")
+        reports, failed = open_batch(path, config=config)
+    else:
+        reports = [open_report(path, source=source, config=config)]
+    size = write_report(reports, out, title=path.resolve().name, notes=failed)
+    warn(line for report in reports for line in report.recording.warnings)
+    print(f"{out}: {sum(len(report.fish) for report in reports)} fish, {size / 1e6:.1f} MB")
 
 
 def review(
@@ -65,9 +73,15 @@ def review(
     with stop_on_signals() as stop:
         from getpass import getuser
 
-        from stream_dmr.report.report import open_report
+        from stream_dmr.errors import UserError
+        from stream_dmr.report.report import is_batch, open_report
         from stream_dmr.review.server import ReviewServer
 
+        if is_batch(folder):
+            raise UserError(
+                f"{folder}: expected the --out of a run, got that of a batch; review its videos "
+                f"one by one: {folder / 'videos'}/NAME"
+            )
         opened = open_report(folder, source=source, config=config)
         warn(opened.recording.warnings)
         with closing(ReviewServer(opened, reviewer=reviewer or getuser(), port=port)) as server:

@@ -39,7 +39,7 @@ FLOORS = [
     [f"stream_dmr.watch.{name}" for name in ("state", "metrics", "picture", "server", "watch")],
     ["stream_dmr.run_inputs"],
     ["stream_dmr.run_outputs"],
-    ["stream_dmr.run", "stream_dmr.report.report"],
+    ["stream_dmr.run", *(f"stream_dmr.report.{name}" for name in ("gathered", "page", "report"))],
     ["stream_dmr.scout"],
     ["stream_dmr.batch.dataset", "stream_dmr.batch.job"],
     [f"stream_dmr.batch.{name}" for name in ("worker", "local", "ray_engine")],

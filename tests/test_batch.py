@@ -1,7 +1,9 @@
 """`stream-dmr batch`: the same as `run` on each video, whatever is killed in between."""
 
 import csv
+import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -214,6 +216,32 @@ def test_a_changed_table_of_videos(
     assert any(what.startswith(expected) for what in found), found
     measure(jobs, tmp_path)
     assert verify(tmp_path)[0] == []
+
+
+def test_one_report_of_all_videos(season: Path, tmp_path: Path):
+    jobs = jobs_of(season, tmp_path, row(), row("other"), row(video="no/broken.mp4"))
+    measure(jobs, tmp_path)
+    target = tmp_path / "report.html"
+    outcome = invoke("report", {str(tmp_path): None, "--out": str(target)})
+    assert outcome.code == 0, outcome.err
+    text = target.read_text()
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text)
+    assert found is not None
+    shown = json.loads(found[1])
+    fish = shown["fish"]
+    assert [(one["id"], one["video"], one["track_id"]) for one in fish] == [
+        *((1, "video", 1), (2, "video", 2), (3, "video-2", 1), (4, "video-2", 3))
+    ]
+    assert all(f'id="fish-{one["id"]}"' in text for one in fish)
+    assert fish[1]["time_s"] < fish[2]["time_s"]  # the second clip's clock begins anew
+    assert [line.split(":")[0] for line in shown["notes"]] == ["broken"]
+    assert verify(tmp_path)[0] == []  # the report is known there
+    measure(jobs, tmp_path)
+    target.write_text(text + " ")
+    assert [change.path for change in verify(tmp_path)[0]] == [target]
+    refusal = invoke("review", {str(tmp_path): None})
+    assert refusal.code == 2
+    assert "review its videos one by one" in refusal.error
 
 
 def test_verdicts_come_into_the_data_set_with_the_next_batch(season: Path, tmp_path: Path):

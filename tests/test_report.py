@@ -163,7 +163,7 @@ def test_filters_sorting_and_verdicts(out: Path, tmp_path: Path):
     ):
         add_verdict(copied / "lengths.db", verdict)
     target = tmp_path / "report.html"
-    write_report(open_report(copied), target)
+    write_report([open_report(copied)], target, title="copied")
     shown = evaluate(
         target,
         """
@@ -199,7 +199,7 @@ def test_thousands_of_fish_are_few_rows(page: Path):
         page,
         """
         const one = DATA.fish[0];
-        const fish = (_, k) => ({ ...one, track_id: k + 1, length_mm: 500 + k });
+        const fish = (_, k) => ({ ...one, id: k + 1, length_mm: 500 + k });
         DATA.fish = Array.from({ length: 2000 }, fish);
         show();
         const most = document.querySelectorAll('.row').length;

@@ -18,7 +18,9 @@ from stream_dmr.camera import crop_from_frame
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.recording.codec import decode
-from stream_dmr.report.report import Report, open_report
+from stream_dmr.report.gathered import Report
+from stream_dmr.report.page import page
+from stream_dmr.report.report import open_report
 from stream_dmr.results import read_stored
 from stream_dmr.review.corrected import corrected_fish, corrected_length
 from stream_dmr.review.judge import Judge
@@ -284,7 +286,7 @@ def test_moved_points_are_in_the_report(judge: Judge, report: Report, out: Path)
         pytest.approx(head, abs=0.01),
         pytest.approx(further, abs=0.01),
     ]
-    page = open_report(out).html()
+    text = page([open_report(out)], title="out")
     moved = json.dumps(row["moved"], separators=(",", ":"))
-    assert f'"moved":{moved}' in page
+    assert f'"moved":{moved}' in text
     assert say(judge, track_id=1, kind="withdraw")["moved"] == {}

@@ -14,7 +14,7 @@ from typing import Protocol, runtime_checkable
 from stream_dmr.batch.dataset import publish, withdraw_others
 from stream_dmr.batch.job import SCOUT, Outcome, finish, folder_of, outcome_of, part_of
 from stream_dmr.batch.manifest import Job
-from stream_dmr.batch.places import DONE, RESULT_COLUMNS, VIDEO_FOLDERS, VIDEOS, WAITING
+from stream_dmr.batch.places import DONE, VIDEO_COLUMNS, VIDEO_FOLDERS, VIDEOS, WAITING
 from stream_dmr.batch.progress import Clock
 from stream_dmr.batch.video import Video
 from stream_dmr.errors import OutputError
@@ -24,7 +24,6 @@ from stream_dmr.store import require_free
 
 _ROUNDS = 2  # scouts and all that needs none, then what they make possible
 _DYING_S = 10.0  # how long a killed process may still hold its folder
-_TABLE = ("name", "video", "vessel", "trip", "haul", *RESULT_COLUMNS)
 
 
 @runtime_checkable
@@ -159,7 +158,7 @@ class _Ledger:
         with writing_to(target):
             with draft.open("w", newline="", encoding="utf-8") as file:
                 writer = csv.writer(file, lineterminator="\n")
-                writer.writerow(_TABLE)
+                writer.writerow(VIDEO_COLUMNS)
                 for job in self._jobs:
                     origin = (job.name, job.video, job.vessel, job.trip, job.haul)
                     writer.writerow(origin + _result(self.outcomes.get(job.name)))

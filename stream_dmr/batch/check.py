@@ -1,6 +1,5 @@
 """Whether what a batch says of all its videos is still what it says of each."""
 
-import csv
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,7 +13,9 @@ from stream_dmr.batch.places import (
     VIDEOS,
     WAITING,
     in_dataset,
+    read_videos,
 )
+from stream_dmr.errors import OutputError
 from stream_dmr.provenance import sha256_of
 
 Finding = tuple[Path, str]  # a file, and what is wrong with it
@@ -24,14 +25,13 @@ _OF_OUTCOME = ("status", "reason", "num_frames", "num_fish", "elapsed_s")
 def check_batch(out: Path) -> Iterator[Finding]:
     """videos.csv against the outcome of each video, the data set against its tables."""
     try:
-        with (out / VIDEOS).open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-        known = {path for row in rows if row["status"] == DONE for path in _tables(out, row)}
-        findings = [finding for row in rows for finding in _row(out, row)]
-    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        yield out / VIDEOS, f"damaged: {error!r}"
+        rows = read_videos(out)
+    except OutputError as error:
+        yield out / VIDEOS, f"damaged: {error}"
         return
-    yield from findings
+    for row in rows:
+        yield from _row(out, row)
+    known = {path for row in rows if row["status"] == DONE for path in _tables(out, row)}
     for path in sorted((out / "dataset").rglob("*.parquet")):
         if path not in known:
             yield path, f"is of no video that is done, by {VIDEOS}"
@@ -43,11 +43,11 @@ def _row(out: Path, row: Mapping[str, str]) -> Iterator[Finding]:
     folder = out / VIDEO_FOLDERS / row["name"]
     try:
         outcome = json.loads((folder / OUTCOME).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        yield folder / OUTCOME, f"damaged: {error}"
+        outcomes = [str(outcome[name]) for name in _OF_OUTCOME]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        yield folder / OUTCOME, f"damaged: {error!r}"
         return
-    for column, name in zip(RESULT_COLUMNS, _OF_OUTCOME, strict=True):
-        was = str(outcome.get(name))
+    for column, was in zip(RESULT_COLUMNS, outcomes, strict=True):
         if row[column] != was:
             what = f"{row['name']}: {column} is {row[column] or 'blank'}, {OUTCOME} says {was}"
             yield out / VIDEOS, what

@@ -53,16 +53,16 @@ function facts(fish) {
 
 function drawDetail(fish) {
   const panel = document.getElementById("detail");
-  fish.detail = JSON.parse(document.getElementById(`fish-${fish.track_id}`).textContent);
+  fish.detail = JSON.parse(document.getElementById(`fish-${fish.id}`).textContent);
   const shots = element("div", { className: "shots" }, ...fish.detail.shots.map((shot, k) => shotOf(shot, k, fish)));
   const overlay = element("input", { type: "checkbox", checked: true, onchange: () => shots.classList.toggle("plain", !overlay.checked) });
   panel.replaceChildren(
-    element("h2", { textContent: `Fish ${fish.track_id}: ${cm(lengthOf(fish))} cm` }),
+    element("h2", { textContent: `Fish ${fish.track_id}${fish.video && ` of ${fish.video}`}: ${cm(lengthOf(fish))} cm` }),
     element("label", {}, overlay, " mask (yellow), mesh (green), head (red), center, tail (blue)"),
     shots, ...reviewTools(fish, shots), element("div", { className: "pair" }, FRAMES, SOLID), facts(fish));
   panel.scrollTop = 0;
   drawFrames(FRAMES, fish.detail.frames);
-  setTimeout(() => state.chosen === fish.track_id && drawMesh(SOLID, fish.detail.mesh));  // the slow part, last
+  setTimeout(() => state.chosen === fish.id && drawMesh(SOLID, fish.detail.mesh));  // the slow part, last
 }
 
 function drawFrames(place, rows) {

@@ -24,7 +24,7 @@ function drawTable() {
 }
 
 function choose(id) {
-  const fish = DATA.fish.find((one) => one.track_id === id);
+  const fish = DATA.fish.find((one) => one.id === id);
   if (!fish) return;
   state.chosen = id;
   drawRows(choose);
@@ -32,26 +32,26 @@ function choose(id) {
 }
 
 function replaceFish(fish) {
-  DATA.fish[DATA.fish.findIndex((one) => one.track_id === fish.track_id)] = fish;
+  DATA.fish[DATA.fish.findIndex((one) => one.id === fish.id)] = fish;
   show();
-  choose(fish.track_id);
+  choose(fish.id);
 }
 
 // What was said of fish since the page was made.
 async function refresh() {
   const answer = await fetch("judged.json");
-  for (const fish of await answer.json()) DATA.fish[DATA.fish.findIndex((one) => one.track_id === fish.track_id)] = fish;
+  for (const fish of await answer.json()) DATA.fish[DATA.fish.findIndex((one) => one.id === fish.id)] = fish;
   show();
 }
 
 function step(by) {
-  const at = state.shown.findIndex((one) => one.track_id === state.chosen) + by;
+  const at = state.shown.findIndex((one) => one.id === state.chosen) + by;
   const fish = state.shown[Math.max(0, Math.min(state.shown.length - 1, at))];
   if (!fish) return;
   const table = document.getElementById("table");
   const top = state.shown.indexOf(fish) * ROW_PX;
   if (top < table.scrollTop || top + ROW_PX > table.scrollTop + table.clientHeight) table.scrollTop = top;
-  choose(fish.track_id);
+  choose(fish.id);
 }
 
 let waiting = 0;

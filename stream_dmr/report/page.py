@@ -1,8 +1,9 @@
 """The page of a report: data as JSON, pictures as data URIs, plotly, all in one file."""
 
 import json
+import math
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from importlib.resources import files
 from typing import Any
@@ -13,10 +14,9 @@ from jaxtyping import Float
 from stream_dmr import __version__
 from stream_dmr.camera import crop_from_frame
 from stream_dmr.fish_table import fish_record
-from stream_dmr.fisheries import FisheriesSettings
-from stream_dmr.recording.header import RunHeader
 from stream_dmr.report.album import Album, Shot
 from stream_dmr.report.gather import FrameRow, Track
+from stream_dmr.report.gathered import Report
 from stream_dmr.results import FishResult
 
 _PER_RUN = ("source", "command")  # of the facts; the rest stand in the exports too
@@ -25,30 +25,50 @@ _FINEST = 32000  # int16 for the largest coordinate of a mesh
 
 
 def page(
+    reports: Sequence[Report],
     *,
     title: str,
-    header: RunHeader,
-    fish: Sequence[FishResult],
-    tracks: Mapping[int, Track],
-    album: Album,
-    settings: FisheriesSettings,
     notes: Sequence[str] = (),
     reviewer: str | None = None,
 ) -> str:
-    """The whole page; with a `reviewer`, it asks for verdicts and sends them to its server."""
+    """The whole page, of one report, or of those of one batch, all with the same template.
+
+    With a `reviewer`, it asks for verdicts and sends them to its server.
+    """
+    template = reports[0].recording.header.template
     about = {
         "title": title,
         "software": __version__,
-        "template": header.template.name,
-        "faces": _packed(header.template.faces.astype("<u4")),
-        "fisheries": settings.model_dump(),
-        "runs": {one.run_id: asdict(one.facts) for one in fish},
-        "notes": list(notes),
+        "template": template.name,
+        "faces": _packed(template.faces.astype("<u4")),
+        "fisheries": reports[0].settings.model_dump(),
+        "runs": {one.run_id: asdict(one.facts) for report in reports for one in report.fish},
+        "notes": [*notes, *(line for report in reports for line in report.recording.warnings)],
         "reviewer": reviewer,
     }
-    rows = [summary(one, header, settings, album) for one in fish]
-    details = (_script(f"fish-{one.estimate.track_id}", detail(one, tracks, album)) for one in fish)
+    rows, details = list[dict[str, Any]](), list[str]()
+    for row, fish, report in _rows(reports):
+        rows.append(row)
+        details.append(_script(f"fish-{row['id']}", detail(fish, report.tracks, report.album)))
     return _filled(title, _script("data", about | {"fish": rows}) + "".join(details))
+
+
+def _rows(reports: Sequence[Report]) -> Iterator[tuple[dict[str, Any], FishResult, Report]]:
+    """The row of each fish. Those of several videos are numbered anew.
+
+    Videos whose clocks begin anew follow each other.
+    """
+    number, end_s = 0, -math.inf
+    for report in reports:
+        first_s, last_s = report.span_s
+        later_s = max(0.0, end_s - first_s)
+        end_s = last_s + later_s
+        for fish in report.fish:
+            row = summary(fish, report)
+            number += 1
+            if len(reports) > 1:
+                row |= {"id": number, "video": report.title, "time_s": row["time_s"] + later_s}
+            yield row, fish, report
 
 
 def _filled(title: str, data: str) -> str:
@@ -66,15 +86,15 @@ def _filled(title: str, data: str) -> str:
     return "".join(parts[piece] if k % 2 else piece for k, piece in enumerate(pieces))
 
 
-def summary(
-    fish: FishResult, header: RunHeader, settings: FisheriesSettings, album: Album
-) -> dict[str, Any]:
+def summary(fish: FishResult, report: Report) -> dict[str, Any]:
     """The row of a fish in the table: that of fish.csv, and its best view, small."""
-    record = fish_record(fish, header.template, settings)
+    record = fish_record(fish, report.recording.header.template, report.settings)
     of_run = asdict(fish.facts)
     row = {name: value for name, value in record.items() if name not in of_run}
-    shots = album.get(fish.estimate.track_id, [])
+    shots = report.album.get(fish.estimate.track_id, [])
     return row | {
+        "id": fish.estimate.track_id,  # in the page
+        "video": "",
         "vessel": fish.facts.vessel,
         "trip": fish.facts.trip,
         "haul": fish.facts.haul,

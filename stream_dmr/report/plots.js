@@ -84,8 +84,8 @@ function drawTime(fish, onChoose) {
   const counts = new Set(counted(fish));
   const traces = [
     { type: "scatter", mode: "lines", ...bars, line: { color: "#c4d4e1", width: 1 }, hoverinfo: "skip" },
-    { type: "scatter", mode: "markers", x: measured.map(at), y: measured.map((f) => lengthOf(f) / 10), customdata: measured.map((f) => f.track_id),
-      marker: { color: measured.map((f) => (counts.has(f) ? BLUE : "#c0c0c0")), size: 6 }, hovertemplate: "fish %{customdata}<br>%{y:.1f} cm<extra></extra>" },
+    { type: "scatter", mode: "markers", x: measured.map(at), y: measured.map((f) => lengthOf(f) / 10), customdata: measured.map((f) => f.id), text: measured.map((f) => `${f.track_id} ${f.video && `of ${f.video}`}`),
+      marker: { color: measured.map((f) => (counts.has(f) ? BLUE : "#c0c0c0")), size: 6 }, hovertemplate: "fish %{text}<br>%{y:.1f} cm<extra></extra>" },
   ];
   Plotly.react("time", traces, layout("Fish over time, with 95 % intervals", unit, "cm"), QUIET).then((plot) => {
     plot.removeAllListeners("plotly_click");

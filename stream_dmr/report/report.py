@@ -1,49 +1,19 @@
 """`stream-dmr report`: results as one file that a reviewer can believe or refute."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
-from stream_dmr.config import Config, load_config, parse_config
-from stream_dmr.fisheries import FisheriesSettings
+from stream_dmr.batch.places import DONE, FAILED, VIDEO_FOLDERS, VIDEOS, read_videos
+from stream_dmr.config import load_config, parse_config
+from stream_dmr.errors import UserError
 from stream_dmr.provenance import add_files
-from stream_dmr.recording.opened import Recording, open_recordings
+from stream_dmr.recording.opened import open_recordings
 from stream_dmr.recording.whole_file import make_folder, writing_to
-from stream_dmr.report.album import Album, make_album
-from stream_dmr.report.gather import Track, gather
+from stream_dmr.report.album import make_album
+from stream_dmr.report.gather import gather
+from stream_dmr.report.gathered import Report
 from stream_dmr.report.page import page
-from stream_dmr.results import FishResult, read_fish
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Report:
-    """Everything that the page shows, gathered once."""
-
-    path: Path
-    recording: Recording
-    fish: Sequence[FishResult]
-    tracks: Mapping[int, Track]
-    album: Album
-    config: Config  # of the run
-    settings: FisheriesSettings
-
-    @property
-    def title(self) -> str:
-        """The results' name."""
-        return self.path.resolve().name
-
-    def html(self, *, reviewer: str | None = None) -> str:
-        """The page."""
-        return page(
-            title=self.title,
-            header=self.recording.header,
-            fish=self.fish,
-            tracks=self.tracks,
-            album=self.album,
-            settings=self.settings,
-            notes=self.recording.warnings,
-            reviewer=reviewer,
-        )
+from stream_dmr.results import read_fish
 
 
 def open_report(path: Path, *, source: str | None = None, config: Path | None = None) -> Report:
@@ -66,10 +36,33 @@ def open_report(path: Path, *, source: str | None = None, config: Path | None = 
     )
 
 
-def write_report(report: Report, out: Path) -> int:
+def is_batch(path: Path) -> bool:
+    """Whether a path is the --out of a batch."""
+    return (path / VIDEOS).is_file()
+
+
+def open_batch(out: Path, *, config: Path | None = None) -> tuple[list[Report], list[str]]:
+    """A report of each video that is done, and a line for each that failed. Raises UserError."""
+    rows = read_videos(out)
+    done = [row["name"] for row in rows if row["status"] == DONE]
+    failed = [f"{row['name']}: {row['reason']}" for row in rows if row["status"] == FAILED]
+    if not done:
+        raise UserError(f"{out / VIDEOS}: expected videos that are done, got none")
+    reports = [open_report(out / VIDEO_FOLDERS / name, config=config) for name in done]
+    if len({report.recording.header.template.name for report in reports}) > 1:
+        raise UserError(
+            f"{out}: expected videos of one template, got several; report them one by one: "
+            f"{out / VIDEO_FOLDERS / done[0]}, ..."
+        )
+    return reports, failed
+
+
+def write_report(
+    reports: Sequence[Report], out: Path, *, title: str, notes: Sequence[str] = ()
+) -> int:
     """Write the page; returns its bytes. Beside results it is one of their files to `verify`."""
     make_folder(out.parent)
     with writing_to(out):
-        out.write_text(report.html(), encoding="utf-8")
+        out.write_text(page(reports, title=title, notes=notes), encoding="utf-8")
     add_files(out.parent, [out])
     return out.stat().st_size

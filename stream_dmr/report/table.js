@@ -4,7 +4,7 @@
 const ROW_PX = 76;
 const COLUMNS = [
   { title: "", key: null },
-  { title: "Fish", key: (f) => f.track_id },
+  { title: "Fish", key: (f) => f.id },
   { title: "Length", key: (f) => lengthOf(f) ?? -1 },
   { title: "Frames", key: (f) => f.frames_used },
   { title: "Refused", key: (f) => f.frames_seen - f.frames_used },
@@ -36,7 +36,7 @@ function filtered(all, wanted) {
   const words = wanted.search.toLowerCase().split(/\s+/).filter(Boolean);
   return all.filter((f) => {
     const length = lengthOf(f);
-    const text = `${f.track_id} ${f.haul} ${f.trip} ${f.vessel} ${f.species} ${f.status} ${f.verdict ?? ""} ${f.verdict_reason ?? ""} ${f.flags.join(" ")} ${Object.keys(f.refused).join(" ")}`.toLowerCase();
+    const text = `${f.track_id} ${f.video} ${f.haul} ${f.trip} ${f.vessel} ${f.species} ${f.status} ${f.verdict ?? ""} ${f.verdict_reason ?? ""} ${f.flags.join(" ")} ${Object.keys(f.refused).join(" ")}`.toLowerCase();
     return words.every((word) => (/^\d+$/.test(word) ? String(f.track_id) === word || text.includes(word) : text.includes(word)))
       && (wanted.status !== "measured" || length !== null)
       && (wanted.status !== "not" || length === null)
@@ -56,7 +56,7 @@ function sorted(fish) {
   const key = COLUMNS[state.column].key;
   const sign = state.down ? -1 : 1;
   const compare = (a, b) => (a < b ? -1 : a > b ? 1 : 0);
-  return [...fish].sort((a, b) => sign * compare(key(a), key(b)) || a.track_id - b.track_id);
+  return [...fish].sort((a, b) => sign * compare(key(a), key(b)) || a.id - b.id);
 }
 
 function drawHead(onSort) {
@@ -81,7 +81,7 @@ function drawRows(onChoose) {
   rows.replaceChildren(...state.shown.slice(first, last).map((fish, k) => {
     const row = rowOf(fish);
     row.style.top = `${(first + k) * ROW_PX}px`;
-    row.onclick = () => onChoose(fish.track_id);
+    row.onclick = () => onChoose(fish.id);
     return row;
   }));
 }
@@ -95,9 +95,9 @@ function rowOf(fish) {
   const size = fish.is_legal_size === false ? element("small", { className: "bad", textContent: "below legal size" }) : "";
   return element(
     "div",
-    { className: fish.track_id === state.chosen ? "row chosen" : "row", role: "row", "data-id": fish.track_id },
+    { className: fish.id === state.chosen ? "row chosen" : "row", role: "row", "data-id": fish.id },
     fish.thumb ? element("img", { src: fish.thumb, alt: "", loading: "lazy" }) : element("span"),
-    element("b", { textContent: fish.track_id }),
+    element("span", {}, element("b", { textContent: fish.track_id }), element("small", { textContent: fish.video })),
     element("span", {}, element("b", { textContent: `${cm(lengthOf(fish))} cm` }), ...corrected, element("small", { textContent: interval }), size),
     element("span", { textContent: `${fish.frames_used} of ${fish.frames_seen}` }),
     element("small", { textContent: reasons, title: reasons }),

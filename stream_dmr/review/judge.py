@@ -15,8 +15,8 @@ from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate
 from stream_dmr.provenance import seal_verdicts
 from stream_dmr.recording.codec import decode
 from stream_dmr.report.gather import View
+from stream_dmr.report.gathered import Report
 from stream_dmr.report.page import summary
-from stream_dmr.report.report import Report
 from stream_dmr.results import FishResult, database_of
 from stream_dmr.review.corrected import corrected_fish, corrected_length
 from stream_dmr.verdicts import (
@@ -94,8 +94,7 @@ class Judge:
 
     def _row(self, fish: FishResult) -> dict[str, Any]:
         now = replace(fish, review=self._review(fish.estimate.track_id))
-        report = self._report
-        return summary(now, report.recording.header, report.settings, report.album)
+        return summary(now, self._report)
 
     def _review(self, track_id: int) -> Review:
         return reviews(read_verdicts(self._database)).get(track_id, NOTHING_SAID)

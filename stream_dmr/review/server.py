@@ -5,7 +5,8 @@ import threading
 from http import HTTPStatus
 
 from stream_dmr.errors import OutputError, UserError
-from stream_dmr.report.report import Report
+from stream_dmr.report.gathered import Report
+from stream_dmr.report.page import page
 from stream_dmr.review.judge import Judge
 from stream_dmr.token_server import TokenHandler, TokenServer
 
@@ -19,9 +20,9 @@ class ReviewServer:
     def __init__(self, report: Report, *, reviewer: str, port: int = 0) -> None:
         """UserError without a database, OutputError where the port can't be had."""
         judge = Judge(report, reviewer)
-        page = report.html(reviewer=reviewer).encode()
+        content = page([report], title=report.title, reviewer=reviewer).encode()
         try:
-            self._server = _Server(page, judge, port)
+            self._server = _Server(content, judge, port)
         except OSError as error:
             raise OutputError(
                 f"{_HOST}:{port}: expected a free port, got: {error.strerror}; choose another "
