@@ -90,6 +90,24 @@ def save_template(template: Template, path: Path, *, comment: str) -> None:
         ) from error
 
 
+def simplified(template: Template, *, max_faces: int) -> Template:
+    """The same body with at most so many faces (Garland and Heckbert, SIGGRAPH 1997).
+
+    The template itself where it has no more, or where fewer would leave its surface open.
+    """
+    if len(template.faces) <= max_faces:
+        return template
+    mesh = trimesh.Trimesh(template.rest_vertices, template.faces, process=False)
+    fewer = mesh.simplify_quadric_decimation(face_count=max_faces)
+    if not (fewer.is_watertight and fewer.is_winding_consistent):
+        return template
+    return replace(
+        template,
+        rest_vertices=np.asarray(fewer.vertices, np.float64),
+        faces=np.asarray(fewer.faces, np.int64),
+    )
+
+
 def bundled_names() -> list[str]:
     """Names of the templates that come with the package."""
     return sorted(file.stem for file in BUNDLED.glob("*.ply"))

@@ -20,6 +20,7 @@ from stream_dmr.fitting.batched.fitter import BatchedFitter
 from stream_dmr.fitting.batched.levenberg_marquardt import minimise
 from stream_dmr.fitting.batched.solver import BatchedSolver
 from stream_dmr.fitting.batched.targets import Targets
+from stream_dmr.fitting.bodies import coarse_body
 from stream_dmr.fitting.cold_start import cold_starts
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.solver import ContourSolver
@@ -28,10 +29,12 @@ from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solver
 
 BODY, HALIBUT = BODIES["halibut"], TEMPLATES["halibut"]
+COARSE = coarse_body(HALIBUT)
 
 
 def solver_on(device, *, dtype=torch.float64, **settings):
-    return BatchedSolver(BODY, FitMeshSettings(device=device, **settings), dtype=dtype)
+    settings = FitMeshSettings(device=device, **settings)
+    return BatchedSolver(BODY, settings, coarse=COARSE, dtype=dtype)
 
 
 def warm_fits(seed, *, batch=6, size=1.0):
@@ -126,7 +129,7 @@ def test_search_ends_where_the_compiled_one_does(device):
     crops, _ = crops_of_poses("halibut", 7, batch=3)
     targets, _ = targets_of(crops, "cpu")
     starts = np.stack([cold_starts(target, HALIBUT) for target in targets])
-    solver, compiled = solver_on(device), ContourSolver(BODY, FitMeshSettings())
+    solver, compiled = solver_on(device), ContourSolver(BODY, FitMeshSettings(), coarse=COARSE)
     stacked = Targets.stack(targets, device=device, dtype=solver.dtype)
     together = solver.search_many(stacked, solver.tensor(starts)).to_list()
     for found, target, some in zip(together, targets, starts, strict=True):

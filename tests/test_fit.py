@@ -21,6 +21,7 @@ from stream_dmr.fitting.fit import Fitter
 from stream_dmr.fitting.objective import Objective
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
+from stream_dmr.geometry import arc_length
 from stream_dmr.messages import FishEnds, SolverReport
 from stream_dmr.skinning import DEFORMATIONS, Rig, deform
 from stream_dmr.template import load_template
@@ -118,6 +119,21 @@ class TestFinds:
         fitted = fitter.fit(crop, near(flat, seed=seed)).mesh
         assert_found(fitted, flat, RIG, crop)
         assert not fitted.report.cold_start
+
+    @pytest.mark.parametrize("seed", [3, 4])
+    def test_the_same_fish_with_a_simplified_mesh(self, seed):
+        """A finer one costs time and tells nothing more; the mesh that is recorded keeps it."""
+        fine = fish_template(subdivisions=4, points=STRAIGHT)
+        crop = crop_of(true_pose(seed), Rig.from_template(fine), size=96)
+        whole, fewer = (
+            Fitter(fine, FitMeshSettings(max_faces=n)).fit(crop, near(true_pose(seed))).mesh.shape
+            for n in (10_000, 1000)
+        )
+        assert len(fewer.vertices) == len(whole.vertices) == len(fine.rest_vertices)
+        lengths = [arc_length(shape.midline) for shape in (whole, fewer)]
+        assert abs(np.log(lengths[1] / lengths[0])) < whole.length_std_ratio / 2
+        gap = np.linalg.norm(whole.keypoints_px - fewer.keypoints_px, axis=1)
+        assert gap.max() < 0.02 * np.linalg.norm(np.diff(whole.keypoints_px[[0, 2]], axis=0))
 
     def test_a_fish_from_cold_heads_where_the_segmenter_says(self):
         """Also where it is wrong: it has seen the fish, the fit only its outline."""

@@ -5,11 +5,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from shapes import POINTS, fish_mesh, seeds
+from shapes import POINTS, fish_mesh, fish_template, seeds
+from trimesh.proximity import closest_point_naive
 
 from stream_dmr.errors import TemplateError
 from stream_dmr.geometry import arc_length
-from stream_dmr.template import BUNDLED, bundled_names, load_template, make_template
+from stream_dmr.template import (
+    BUNDLED,
+    bundled_names,
+    load_template,
+    make_template,
+    simplified,
+)
 from stream_dmr.templates import make
 
 
@@ -150,6 +157,25 @@ class TestCanonicalForm:
         textures = [f"vt 0.{k} 0.5" for k in range(1, 241)]
         path.write_text("\n".join(textures + lines))
         assert len(load_template(path).rest_vertices) == len(fish_mesh().vertices)
+
+
+class TestSimplified:
+    def test_is_the_same_body_of_fewer_faces(self):
+        template = fish_template(subdivisions=3)  # 1,280 faces
+        fewer = simplified(template, max_faces=400)
+        assert len(fewer.faces) <= 400
+        before, after = body_of(template), body_of(fewer)
+        assert after.is_watertight
+        assert after.volume == pytest.approx(before.volume, rel=0.02)
+        _, gap, _ = closest_point_naive(before, after.vertices)
+        assert gap.max() < 0.005, "body lengths: vertices stay on the surface"
+        np.testing.assert_allclose(after.bounds, before.bounds, atol=0.005)
+        for field in ("keypoints", "joints", "midline"):
+            np.testing.assert_array_equal(getattr(fewer, field), getattr(template, field))
+
+    def test_leaves_a_coarse_body_as_it_is(self):
+        template = fish_template(subdivisions=2)
+        assert simplified(template, max_faces=len(template.faces)) is template
 
 
 def canonical_faces(faces):

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from stream_dmr.body import Body
 from stream_dmr.camera import frame_from_crop
+from stream_dmr.fitting.bodies import coarse_body, fine_body
 from stream_dmr.fitting.cold_start import agreeing, cold_starts
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
 # Without a calibration, fish are taken to hang square to the camera.
 _TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
-
 
 # In L_rec: by so much must a cold fit be better to give up the pose of the frame before, and which
 # end is the head.
@@ -60,9 +60,18 @@ class Fitter:
         self._template = template
         self._settings = settings
         self._body = Body.from_template(template)
+        self._fine_body = fine_body(template, max_faces=settings.max_faces)
+        self._coarse_body = coarse_body(template)
         self._kind = KINDS[settings.deformation]
-        self._solver = _make_solver(template, self._body, settings)
-        self._scanner = SizeScanner(self._body, settings)
+        self._solver = self._make_solver()
+        self._scanner = SizeScanner(self._fine_body, settings, coarse=self._coarse_body)
+
+    def _make_solver(self) -> Solver:
+        if self._settings.solver == "contour":
+            return ContourSolver(self._fine_body, self._settings, coarse=self._coarse_body)
+        from stream_dmr.fitting.adam import AdamSolver  # torch takes a second to import
+
+        return AdamSolver(self._template, self._settings)
 
     def target(self, crop: FishCrop) -> Target:
         """What is fitted to of a crop."""
@@ -136,7 +145,7 @@ class Fitter:
 
         return BatchedFitter(
             self._template,
-            BatchedSolver(self._body, self._settings),
+            BatchedSolver(self._fine_body, self._settings, coarse=self._coarse_body),
             self._settings,
             plane_normal=self._plane_normal,
             clear_gain=_CLEAR_GAIN,
@@ -167,7 +176,7 @@ class Fitter:
         """The warm fit if it is good, else a cold one where that is clearly better."""
         solution = None
         if warm is not None:
-            start = recentered(self._body, self._kind, target, warm)
+            start = recentered(self._fine_body, self._kind, target, warm)
             solution = self._solver.refine(target, start)
             if solution.iou >= self._settings.cold_below_iou:
                 return solution, False
@@ -214,14 +223,6 @@ class Fitter:
 
 def _is_finite(solution: Solution) -> bool:
     return bool(np.isfinite(solution.flat).all() and np.isfinite(solution.loss))
-
-
-def _make_solver(template: Template, body: Body, settings: FitMeshSettings) -> Solver:
-    if settings.solver == "contour":
-        return ContourSolver(body, settings)
-    from stream_dmr.fitting.adam import AdamSolver  # torch takes a second to import
-
-    return AdamSolver(template, settings)
 
 
 def _message(

@@ -46,6 +46,11 @@ class FitMeshSettings(Settings):
         ge=0,
         description="of a fit at each size that a fish might have; 0: the best fit's own size",
     )
+    max_faces: int = Field(
+        default=3000,
+        ge=600,
+        description="templates of more faces are simplified to so many for the contour fit",
+    )
     adam_iterations: int = Field(default=150, ge=1, description="most iterations of an adam fit")
     tolerance: float = Field(
         default=2e-4, gt=0, description="a fit has settled when L_rec falls by less than this"

@@ -34,8 +34,11 @@ _STEEPEST_END = 10.0  # nats per unit of log size: past the ends sizes get at le
 class SizeScanner:
     """Tries the sizes of one template."""
 
-    def __init__(self, body: Body, settings: FitMeshSettings) -> None:
-        self._body, self._settings = body, settings
+    def __init__(
+        self, body: Body, settings: FitMeshSettings, *, coarse: Body | None = None
+    ) -> None:
+        """`coarse` is the same body of fewer faces, to compare sizes with; or `body` itself."""
+        self._body, self._coarse, self._settings = body, coarse or body, settings
         self._kind = KINDS[settings.deformation]
         self._rest = rest_vector(len(body.joints))
         # The mesh's smoothness tells sizes apart no better, and is dear.
@@ -44,7 +47,7 @@ class SizeScanner:
     def expected(self, target: Target, best: Solution) -> tuple[Solution, float]:
         """The fit at the expected size of the fish, and the std of the log of this size."""
         fits, losses, rooms, leads = scan_sizes(
-            self._body,
+            self._coarse,
             self._kind,
             target.coarse(),
             self._lambdas,

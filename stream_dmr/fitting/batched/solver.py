@@ -30,9 +30,17 @@ class BatchedSolver:
     """`ContourSolver` for batches; the search of a cold fit is one batch as well."""
 
     def __init__(
-        self, body: Body, settings: FitMeshSettings, *, dtype: torch.dtype = torch.float32
+        self,
+        body: Body,
+        settings: FitMeshSettings,
+        *,
+        coarse: Body | None = None,
+        dtype: torch.dtype = torch.float32,
     ) -> None:
-        """Raises ConfigError where the settings name a device that is not there."""
+        """`coarse` is `ContourSolver`'s.
+
+        Raises ConfigError where the settings name a device that is not there.
+        """
         if settings.device == "cuda" and not torch.cuda.is_available():
             raise ConfigError(
                 "[fit_mesh]: expected a CUDA device and a CUDA build of torch for "
@@ -41,6 +49,7 @@ class BatchedSolver:
         self._settings = settings
         self._kind = {"device": settings.device, "dtype": dtype}
         self.model = Model.from_body(body, settings, **self._kind)
+        self._coarse = Model.from_body(coarse or body, settings, **self._kind)
         self._mirror = self.tensor(mirror(np.ones(len(self.model.rest))))
         # The mesh's smoothness tells starts apart no better.
         self._rough_lambdas = self.tensor(settings.rough_lambdas())
@@ -72,7 +81,7 @@ class BatchedSolver:
 
     @torch.no_grad()
     def refine_many(self, targets: Targets, starts: Float[Tensor, "B P"]) -> Solutions:
-        """From one start of each target, and from its mirror image where that is more likely."""
+        """From one start of each target, near its answer; see `ContourSolver.refine`."""
         return self._refined(targets, torch.arange(len(starts), device=starts.device), starts)
 
     @torch.no_grad()
@@ -80,13 +89,14 @@ class BatchedSolver:
         """From many starts of each target; see `ContourSolver.search`."""
         coarse, every = targets.coarse(), torch.arange(len(starts), device=starts.device)
         which = every[:, None].expand(starts.shape[:2])
-        losses = self._losses(coarse, which.flatten(), starts.flatten(0, 1)).view_as(which)
+        losses = self._rough_losses(coarse, which.flatten(), starts.flatten(0, 1)).view_as(which)
         flats = _ordered(starts, losses)
-        best = self._refined(targets, every, flats[:, 0])
+        best = self._refined_both_sides(targets, every, flats[:, 0])
         flats = flats[:, 1:]
         for iterations, most in _ROUNDS:
             flats = flats[:, :most]
             rough = self._minimised(
+                self._coarse,
                 coarse,
                 which[:, : flats.shape[1]].flatten(),
                 flats.flatten(0, 1),
@@ -96,28 +106,30 @@ class BatchedSolver:
             )
             flats = _ordered(rough.flat.view_as(flats), rough.loss.view(flats.shape[:2]))
         for column in range(min(_NUM_FINISHED, flats.shape[1])):
-            best = best.lower(self._refined(targets, every, flats[:, column]))
+            best = best.lower(self._refined_both_sides(targets, every, flats[:, column]))
         return best
 
     def _refined(self, targets: Targets, which: Tensor, starts: Tensor) -> Solutions:
-        found = self._finished(targets, which, starts)
+        most = self._settings.contour_iterations
+        lambdas = self.model.lambdas
+        return self._minimised(
+            self.model, targets, which, starts, lambdas, iterations=most, damping=NEAR
+        )
+
+    def _refined_both_sides(self, targets: Targets, which: Tensor, starts: Tensor) -> Solutions:
+        found = self._refined(targets, which, starts)
         mirrored = found.flat * self._mirror
         chosen = targets.select(which)
         gain = prior_loss(self.model, chosen, found.flat) - prior_loss(self.model, chosen, mirrored)
         index = torch.nonzero(gain >= self._settings.tolerance)[:, 0]
         if len(index) == 0:
             return found
-        other = self._finished(targets, which[index], mirrored[index])
+        other = self._refined(targets, which[index], mirrored[index])
         return found.replaced(index, found.select(index).lower(other))
-
-    def _finished(self, targets: Targets, which: Tensor, starts: Tensor) -> Solutions:
-        most = self._settings.contour_iterations
-        return self._minimised(
-            targets, which, starts, self.model.lambdas, iterations=most, damping=NEAR
-        )
 
     def _minimised(
         self,
+        model: Model,
         targets: Targets,
         which: Tensor,
         starts: Tensor,
@@ -128,7 +140,7 @@ class BatchedSolver:
     ) -> Solutions:
         """From starts, each with the index of its target."""
         state = minimise(
-            self.model,
+            model,
             targets,
             which,
             starts,
@@ -140,11 +152,11 @@ class BatchedSolver:
         )
         return Solutions(state.flat, state.loss, state.iou, state.iterations, state.stop)
 
-    def _losses(self, targets: Targets, which: Tensor, flats: Tensor) -> Tensor:
+    def _rough_losses(self, targets: Targets, which: Tensor, flats: Tensor) -> Tensor:
         parts = []
         for some in self._chunks(targets, len(flats)):
             chosen = targets.select(which[some])
-            found = evaluate(self.model, chosen, flats[some], self._rough_lambdas)
+            found = evaluate(self._coarse, chosen, flats[some], self._rough_lambdas)
             rough = found.terms @ self._rough_lambdas
             parts.append(rough + prior_loss(self.model, chosen, flats[some]))
         return torch.cat(parts)

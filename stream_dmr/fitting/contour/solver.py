@@ -27,8 +27,11 @@ _NUM_FINISHED = 2
 class ContourSolver:
     """Levenberg-Marquardt on contour residuals, judged by the paper's L_rec."""
 
-    def __init__(self, body: Body, settings: FitMeshSettings) -> None:
-        self._body = body
+    def __init__(
+        self, body: Body, settings: FitMeshSettings, *, coarse: Body | None = None
+    ) -> None:
+        """`coarse` is the same body of fewer faces, to look around with; or `body` itself."""
+        self._body, self._coarse = body, coarse or body
         self._settings = settings
         self._kind = KINDS[settings.deformation]
         self._rest = rest_vector(len(body.joints))
@@ -36,47 +39,52 @@ class ContourSolver:
         self._rough_lambdas = settings.rough_lambdas()
 
     def refine(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
-        """From one start near the answer, and from its mirror image where that is more likely."""
-        found = self._finish(target, start)
+        """From one start near the answer, whose side in depth it keeps."""
+        most = self._settings.contour_iterations
+        return self._minimise(
+            self._body, target, start, self._lambdas, iterations=most, damping=NEAR
+        )
+
+    def _refine_both_sides(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
+        """From one start, and from its mirror image in depth where that is more likely."""
+        found = self.refine(target, start)
         mirrored = mirror(found.flat)
         gain = self._prior_loss(target, found.flat) - self._prior_loss(target, mirrored)
         if gain < self._settings.tolerance:
             return found
-        return min(found, self._finish(target, mirrored), key=lambda solution: solution.loss)
-
-    def _finish(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
-        most = self._settings.contour_iterations
-        return self._minimise(target, start, self._lambdas, iterations=most, damping=NEAR)
+        return min(found, self.refine(target, mirrored), key=lambda solution: solution.loss)
 
     def _prior_loss(self, target: Target, flat: Float[np.ndarray, "P"]) -> float:
         return prior_loss(target, flat, self._rest, self._priors)
 
     def search(self, target: Target, starts: Float[np.ndarray, "B P"]) -> Solution:
-        """The likeliest start to its end; of the others the best after rounds on a coarse picture.
+        """The likeliest start to its end; of the others the best after coarse rounds.
 
         The likeliest leads to the answer by itself most of the time, but not always.
         """
         coarse = target.coarse()
-        flats = sorted(starts, key=lambda flat: self._loss(coarse, flat))
-        found = [self.refine(target, flats.pop(0))]
+        flats = sorted(starts, key=lambda flat: self._rough_loss(coarse, flat))
+        found = [self._refine_both_sides(target, flats.pop(0))]
         for iterations, most in _ROUNDS:
             rough = [self._rough(coarse, flat, iterations) for flat in flats[:most]]
             rough.sort(key=lambda solution: solution.loss)
             flats = [solution.flat for solution in rough]
-        found += [self.refine(target, flat) for flat in flats[:_NUM_FINISHED]]
+        found += [self._refine_both_sides(target, flat) for flat in flats[:_NUM_FINISHED]]
         return min(found, key=lambda solution: solution.loss)
 
-    def _loss(self, target: Target, flat: Float[np.ndarray, "P"]) -> float:
-        terms, *_ = evaluate(self._body, self._kind, target, flat, True)
+    def _rough_loss(self, target: Target, flat: Float[np.ndarray, "P"]) -> float:
+        terms, *_ = evaluate(self._coarse, self._kind, target, flat, False)
         return float(terms @ self._rough_lambdas) + self._prior_loss(target, flat)
 
     def _rough(self, target: Target, start: Float[np.ndarray, "P"], iterations: int) -> Solution:
+        lambdas = self._rough_lambdas
         return self._minimise(
-            target, start, self._rough_lambdas, iterations=iterations, damping=FAR
+            self._coarse, target, start, lambdas, iterations=iterations, damping=FAR
         )
 
     def _minimise(
         self,
+        body: Body,
         target: Target,
         start: Float[np.ndarray, "P"],
         lambdas: Float[np.ndarray, "6"],
@@ -85,7 +93,7 @@ class ContourSolver:
         damping: float,
     ) -> Solution:
         flat, loss, iou, used, stop = minimise(
-            self._body,
+            body,
             self._kind,
             target,
             lambdas,
