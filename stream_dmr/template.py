@@ -97,7 +97,8 @@ def simplified(template: Template, *, max_faces: int) -> Template:
     """
     if len(template.faces) <= max_faces:
         return template
-    mesh = trimesh.Trimesh(template.rest_vertices, template.faces, process=False)
+    # Copied: the library refuses arrays that may not be written to, as those of a message.
+    mesh = trimesh.Trimesh(template.rest_vertices.copy(), template.faces.copy(), process=False)
     fewer = mesh.simplify_quadric_decimation(face_count=max_faces)
     if not (fewer.is_watertight and fewer.is_winding_consistent):
         return template
