@@ -93,6 +93,7 @@ def test_fine_tuning_never_ends_with_worse_weights_than_it_began_with(tmp_path):
         np.testing.assert_array_equal(value.numpy(), other[name].numpy())
     train(request(tmp_path, settings=wild, resume=True, init=SHIPPED), stop=never())
     assert len(history(tmp_path)) == 2  # it was over
+    assert (tmp_path / "worst.png").exists()
 
 
 def test_what_cannot_be_is_refused_before_anything_is_learnt(trained, tmp_path):

@@ -50,8 +50,9 @@ class TrainDisplay(TrainObserver):
 
     def checked(self, scores: Scores, *, is_best: bool) -> None:  # noqa: D102
         loss = "to begin with" if scores.loss is None else f"loss {scores.loss:.3f}"
+        heads = "" if scores.ends_right is None else f", heads right {scores.ends_right:.2f}"
         self._console.print(
-            f"epoch {scores.epoch}/{self._settings.epochs}: {loss}, "
-            f"IoU {scores.iou:.3f}, heads right {scores.ends_right:.2f}{', best' * is_best}"
+            f"epoch {scores.epoch}/{self._settings.epochs}: {loss}, IoU {scores.iou:.3f}"
+            f"{heads}{', best' * is_best}"
         )
         self._progress.reset(self._epoch, description=f"epoch {scores.epoch + 1}")

@@ -1,6 +1,7 @@
 """Pictures of a training: how loss and scores went, and the masks that came out worst."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -25,20 +26,23 @@ def draw_curve(history: Sequence[Scores], path: Path) -> None:
         left, right = _place(0.0, tenth / 10), _place(1.0, tenth / 10)
         cv2.line(canvas, left, right, _GRID, 1)
         _write(canvas, f"{tenth / 10:.1f}", (8, left[1] + 4), _INK)
-    losses = [np.nan if scores.loss is None else scores.loss for scores in history]
-    highest = max(losses, key=np.nan_to_num)
+    highest = max((scores.loss for scores in history if scores.loss is not None), default=1.0)
     curves = {
         "mean IoU": ([s.iou for s in history], (180, 90, 0)),
         "10th percentile of IoU": ([s.iou_p10 for s in history], (220, 170, 90)),
         "heads found at the head": ([s.ends_right for s in history], (60, 140, 30)),
-        f"loss / {highest:.2f}": ([loss / highest for loss in losses], (90, 90, 200)),
+        f"loss / {highest:.2f}": (
+            [None if s.loss is None else s.loss / highest for s in history],
+            (90, 90, 200),
+        ),
     }
     for index, (name, (values, colour)) in enumerate(curves.items()):
         steps = max(len(values) - 1, 1)
-        points = [_place(k / steps, v) for k, v in enumerate(values) if np.isfinite(v)]
-        cv2.polylines(canvas, [np.array(points, np.int32).reshape(-1, 1, 2)], False, colour, 2)
+        points = [_place(k / steps, v) for k, v in enumerate(values) if v is not None]
+        for one, other in pairwise(points):
+            cv2.line(canvas, one, other, colour, 2)
         _write(canvas, name, (_EDGE + 170 * index, 18), colour)
-    _write(canvas, f"{len(history)} epochs", (_WIDTH - 110, _HEIGHT - 12), _INK)
+    _write(canvas, f"{history[-1].epoch} epochs", (_WIDTH - 110, _HEIGHT - 12), _INK)
     cv2.imwrite(str(path), canvas)
 
 

@@ -74,6 +74,7 @@ def train(
     began = time.monotonic()
     if training.is_fine_tuning and not training.history:
         observer.checked(training.check_start(validation), is_best=True)
+        _write_report(request, training, validation, elapsed_s=time.monotonic() - began)
     while not training.is_over and not stop.is_set():
         scores = training.run_epoch(draw, validation, stop=stop, progress=observer.learning)
         if scores is None:

@@ -34,7 +34,8 @@ class Scores:
     loss: float | None  # of the training pictures, mean over the epoch; None for epoch 0
     iou: float  # mean over the pictures
     iou_p10: float  # one picture in ten is below
-    ends_right: float  # share of the fish whose head is found at the head
+    # Share of the fish whose head is found at the head; None where nobody said where it is.
+    ends_right: float | None
 
     @property
     def merit(self) -> float:
@@ -137,7 +138,7 @@ class Training:
         return scores
 
     @torch.no_grad()
-    def check(self, validation: Pictures) -> tuple[Tensor, float]:
+    def check(self, validation: Pictures) -> tuple[Tensor, float | None]:
         """IoU of each validation picture, and the share of heads found at the head."""
         self.averaged.eval()
         ious, right, asked = [], 0, 0
@@ -146,7 +147,7 @@ class Training:
             ious.append(mask_iou(mask_logits, masks).cpu())
             is_right, is_asked = ends_are_right(ends_logits, ends_px)
             right, asked = right + int((is_right & is_asked).sum()), asked + int(is_asked.sum())
-        return torch.cat(ious), right / asked if asked else math.nan
+        return torch.cat(ious), right / asked if asked else None
 
     @torch.no_grad()
     def predict(self, samples: list[Sample]) -> Bool[np.ndarray, "B S S"]:
