@@ -36,6 +36,7 @@ class Backlog(NamedTuple):
     name: str
     jobs: list[Job]
     piece_frames: int
+    num_frames: int  # of all videos; what a piece skips before its first fish is work, too
 
 
 @contextmanager
@@ -60,11 +61,11 @@ def backlogs(folder: Path, videos: int) -> Iterator[Backlog]:
     """So many videos with masks; one raw video as long as all of them, in pieces and whole."""
     masks = {"boxes": DEMO / "boxes.txt", "masks": DEMO / "masks"}
     with_masks = [{"video": DEMO / "video.mp4"} | masks] * videos
-    yield Backlog("masks", jobs_of(folder / "masks.csv", with_masks), 0)
     num_frames = write_repeated(folder / "long.mp4", DEMO / "video.mp4", times=videos)
+    yield Backlog("masks", jobs_of(folder / "masks.csv", with_masks), 0, num_frames)
     raw = jobs_of(folder / "raw.csv", [{"video": folder / "long.mp4"}])
-    yield Backlog("raw, in pieces", raw, num_frames // videos)
-    yield Backlog("raw, whole", raw, 0)
+    yield Backlog("raw, in pieces", raw, num_frames // videos, num_frames)
+    yield Backlog("raw, whole", raw, 0, num_frames)
 
 
 def jobs_of(manifest: Path, rows: Sequence[Mapping[str, object]]) -> list[Job]:
@@ -100,7 +101,7 @@ def measure(name: str, workers: int, work: Backlog, out: Path) -> float:
         ready_s = time.perf_counter() - began
         stop = threading.Event()
         summary = batch(work.jobs, out, engine, piece_frames=work.piece_frames, stop=stop)
-    frames = sum(one.num_frames for one in summary.outcomes)
+    frames = work.num_frames
     fish = sum(one.num_fish for one in summary.outcomes)
     in_work = sum(one.elapsed_s for one in summary.outcomes)
     print(

@@ -44,7 +44,7 @@ def fish_record(
     fish: FishResult, template: Template, settings: FisheriesSettings
 ) -> dict[str, Any]:
     """The values of FISH_TABLE; None where there is none."""
-    derived = derive(fish.length_mm, template, settings)
+    derived = derive(fish.length_mm, template, settings, species=fish.review.species)
     values: dict[str, Any] = {name: getattr(fish.facts, name, None) for name in FISH_TABLE}
     values |= {n: getattr(fish.estimate, n) for n in FISH_TABLE if hasattr(fish.estimate, n)}
     values |= {n: getattr(derived, n) for n in FISH_TABLE if hasattr(derived, n)}

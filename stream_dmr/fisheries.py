@@ -57,17 +57,24 @@ class Derived:
     is_legal_size: bool | None = None
 
 
-def derive(length_mm: float | None, template: Template, settings: FisheriesSettings) -> Derived:
+def derive(
+    length_mm: float | None,
+    template: Template,
+    settings: FisheriesSettings,
+    *,
+    species: str | None = None,
+) -> Derived:
     """All that follows from the length from snout to tail keypoint, in mm.
 
     The template says which length its tail keypoint ends, and total over fork length; without the
     one neither is known, without the other only the first. Whole centimetres are those of the
-    length as it is measured. Weight and legal size are for the settings' species alone.
+    length as it is measured. Weight and legal size are for the settings' species alone; `species`:
+    the fish's, where it is not the template's.
     """
     if length_mm is None:
         return Derived()
     lengths = _both_lengths(length_mm, template)
-    is_species = template.name == settings.species
+    is_species = (species or template.name) == settings.species
     weighed, legal = lengths[settings.weight_length], lengths[settings.legal_length]
     has_weight = is_species and settings.weight_a > 0 and weighed is not None
     has_legal = is_species and settings.legal_cm > 0 and legal is not None

@@ -158,6 +158,8 @@ def test_verdicts_stand_beside_the_measurement(finished: Path, tmp_path: Path):
     one, two = exported(tmp_path / "out", tmp_path / "after", species="tiny")
     assert (one["verdict"], one["verdict_reason"], one["reviewer"]) == ("reject", "a glove", "Bo")
     assert one["species"] == "Gadus morhua"
+    assert (one["weight_kg"], one["is_legal_size"]) == ("", "")  # they are of the species "tiny"
+    assert two["weight_kg"] != ""
     assert (two["verdict"], two["duplicate_of"]) == ("duplicate", "1")
     assert (two["length_mm"], two["length_from"]) == (before[1]["length_mm"], "review")
     assert (two["corrected_length_mm"], two["fork_length_mm"]) == ("900.000000", "900.000000")

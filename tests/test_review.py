@@ -278,6 +278,38 @@ def test_points_are_dragged_and_stay_where_they_were_put(tab: Tab, out: Path, by
     assert abs(verdict.length_mm / measured.estimate.length_mm - 1) > 0.02
 
 
+def test_another_reviewers_verdicts_come_in(tab: Tab, report: Report, server: ReviewServer):
+    other = ReviewServer(report, reviewer="Bob")
+    try:
+        assert post(other, b'{"track_id": 2, "kind": "reject", "reason": "a glove"}') == 200
+        assert post(other, b'{"track_id": 2, "kind": "species", "species": "Gadus morhua"}') == 200
+    finally:
+        other.close()
+    row = tab.run(
+        """await refresh();
+        return document.querySelector('[data-id="2"]').innerText"""
+    )
+    assert "a glove" in row
+    assert "Gadus morhua" in row
+
+
+def test_a_verdict_that_nobody_takes_is_said_to_be_lost(tab: Tab, server: ReviewServer, out: Path):
+    tab.run("choose(1); return 0")
+    server.close()
+    said = "return document.getElementById('said').textContent"
+    assert "Not saved" in tab.run(f"await press('do-accept'); {said}")
+    assert read_verdicts(out / "lengths.db") == []
+
+
+def test_a_corrected_length_has_its_own_interval(tab: Tab, judge: Judge, report: Report):
+    frame_index, _, (head, tail) = ends(report, 1)
+    further = (np.array(tail) + 0.2 * (np.array(tail) - np.array(head))).tolist()
+    row = say(judge, track_id=1, kind="correct", frame_index=frame_index, head=head, tail=further)
+    mm, std = row["corrected_length_mm"], row["corrected_length_std_mm"]
+    shown = tab.run("await refresh(); return document.querySelector('[data-id=\"1\"]').innerText")
+    assert f"{(mm - 1.96 * std) / 10:.1f} to {(mm + 1.96 * std) / 10:.1f}" in shown
+
+
 def test_moved_points_are_in_the_report(judge: Judge, report: Report, out: Path):
     frame_index, _, (head, tail) = ends(report, 1)
     further = (np.array(tail) + 0.1 * (np.array(tail) - np.array(head))).tolist()

@@ -37,10 +37,13 @@ function replaceFish(fish) {
   choose(fish.id);
 }
 
-// What was said of fish since the page was made.
+// What was said of fish since the page was made, by others, too. What is open stays as it is.
+let heard = "";
 async function refresh() {
-  const answer = await fetch("judged.json");
-  for (const fish of await answer.json()) DATA.fish[DATA.fish.findIndex((one) => one.id === fish.id)] = fish;
+  const text = await fetch("judged.json").then((answer) => (answer.ok ? answer.text() : heard), () => heard);
+  if (text === heard) return;
+  heard = text;
+  for (const fish of JSON.parse(text)) DATA.fish[DATA.fish.findIndex((one) => one.id === fish.id)] = fish;
   show();
 }
 
@@ -68,5 +71,8 @@ document.getElementById("table").onkeydown = (event) => {
 document.getElementById("made").textContent = `stream-dmr ${DATA.software}, template ${DATA.template}`;
 document.getElementById("notes").replaceChildren(...DATA.notes.map((note) => element("li", { textContent: note })));
 show();
-if (DATA.reviewer !== null) refresh();
+if (DATA.reviewer !== null) {
+  refresh();
+  setInterval(refresh, 5000);
+}
 if (location.hash.startsWith("#fish-")) choose(Number(location.hash.slice(6)));

@@ -77,9 +77,10 @@ function drawTime(fish, onChoose) {
   const at = (f) => (f.time_s - start) / seconds;
   const bars = { x: [], y: [] };
   for (const f of measured) {
-    if (f.ci95_low_mm === null) continue;
+    const interval = intervalOf(f);
+    if (interval === null) continue;
     bars.x.push(at(f), at(f), null);
-    bars.y.push(f.ci95_low_mm / 10, f.ci95_high_mm / 10, null);
+    bars.y.push(interval[0] / 10, interval[1] / 10, null);
   }
   const counts = new Set(counted(fish));
   const traces = [

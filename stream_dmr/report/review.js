@@ -4,10 +4,15 @@ function reviewTools(fish, shots) {
   if (DATA.reviewer === null) return [];
   const said = element("p", { id: "said", textContent: "" });
   const send = async (verdict) => {
-    const answer = await fetch("verdict", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ track_id: fish.track_id, ...verdict }) });
-    const content = await answer.json();
-    if (answer.ok) replaceFish(content);
-    else { said.className = "bad"; said.textContent = content.error; }
+    const refuse = (why) => { said.className = "bad"; said.textContent = why; };
+    try {
+      const answer = await fetch("verdict", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ track_id: fish.track_id, ...verdict }) });
+      const content = await answer.json();
+      if (answer.ok) replaceFish(content);
+      else refuse(content.error);
+    } catch {
+      refuse("Not saved: stream-dmr review has ended. Start it again, and open its new address.");
+    }
   };
   const text = (id, placeholder, kind, name, label) => {
     const input = element("input", { id, placeholder, size: 14 });

@@ -18,6 +18,13 @@ function lengthOf(fish) {
   return fish.corrected_length_mm ?? fish.length_mm;
 }
 
+// Low and high end of the 95 % interval, mm: of the correction where there is one; null without any.
+function intervalOf(fish) {
+  const [mm, std] = [fish.corrected_length_mm, fish.corrected_length_std_mm];
+  if (mm !== null) return std === null ? null : [mm - 1.96 * std, mm + 1.96 * std];
+  return fish.ci95_low_mm === null ? null : [fish.ci95_low_mm, fish.ci95_high_mm];
+}
+
 function cm(mm, digits = 1) {
   return mm === null || mm === undefined ? "-" : (mm / 10).toFixed(digits);
 }
@@ -88,9 +95,11 @@ function drawRows(onChoose) {
 
 function rowOf(fish) {
   const reasons = Object.entries(fish.refused).map(([reason, count]) => `${count} ${reason}`).join(", ");
-  const interval = fish.ci95_low_mm === null ? fish.status : `${cm(fish.ci95_low_mm)} to ${cm(fish.ci95_high_mm)}`;
+  const interval = intervalOf(fish)?.map((mm) => cm(mm)).join(" to ") ?? fish.status;
   const corrected = fish.corrected_length_mm === null ? [] : [element("small", { textContent: `measured ${cm(fish.length_mm)} cm` })];
-  const verdict = element("span", { textContent: fish.verdict ?? "" }, element("small", { textContent: fish.verdict_reason ?? fish.duplicate_of ?? "" }));
+  const because = fish.verdict_reason ?? (fish.duplicate_of === null ? "" : `of ${fish.duplicate_of}`);
+  const species = fish.species === DATA.template ? "" : fish.species;
+  const verdict = element("span", { textContent: fish.verdict ?? "" }, element("small", { textContent: because }), element("small", { textContent: species }));
   if (fish.verdict) verdict.className = fish.verdict === "accept" ? "good" : "bad";
   const size = fish.is_legal_size === false ? element("small", { className: "bad", textContent: "below legal size" }) : "";
   return element(
