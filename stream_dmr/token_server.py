@@ -41,7 +41,11 @@ class TokenHandler(BaseHTTPRequestHandler):
     server_version = "stream-dmr"
     sys_version = ""
     timeout = _PATIENCE_S
-    cookie = "stream_dmr_token"
+
+    @property
+    def cookie(self) -> str:
+        """The name of the cookie: a browser has those of all ports of a machine in common."""
+        return f"stream_dmr_{self.server.server_address[1]}"
 
     def serve(self, path: str) -> None:
         """Answer a GET of someone who may."""

@@ -5,8 +5,11 @@ import shutil
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from contextlib import closing
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -186,6 +189,27 @@ def test_only_who_has_the_token_may_judge(server: ReviewServer, out: Path):
     assert read_verdicts(out / "lengths.db") == []
     assert post(server, good) == 200
     assert len(read_verdicts(out / "lengths.db")) == 1
+
+
+def test_two_reviews_in_one_browser_keep_their_cookies(server: ReviewServer, report: Report):
+    other = ReviewServer(report, reviewer="Bob")
+    try:
+        cookies = [first_cookie(one.address) for one in (server, other)]
+        for one in (server, other):
+            address = one.address.split("?")[0] + "judged.json"
+            request = urllib.request.Request(address, headers={"Cookie": "; ".join(cookies)})
+            with urllib.request.urlopen(request, timeout=10) as answer:
+                assert answer.status == 200
+    finally:
+        other.close()
+
+
+def first_cookie(address: str) -> str:
+    url = urlsplit(address)
+    connection = HTTPConnection(url.netloc, timeout=10)
+    connection.request("GET", f"/?{url.query}")
+    with closing(connection):
+        return str(connection.getresponse().headers["Set-Cookie"]).split(";")[0]
 
 
 def test_a_recording_alone_takes_no_verdicts(out: Path):

@@ -52,7 +52,6 @@ class _Server(TokenServer):
 
 class _Handler(TokenHandler):
     server: _Server  # pyright: ignore[reportIncompatibleVariableOverride]
-    cookie = "stream_dmr_review"  # a run that is watched on this machine has another
 
     def serve(self, path: str) -> None:
         match path:
