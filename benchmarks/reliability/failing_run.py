@@ -79,7 +79,7 @@ def measure(case: Case) -> dict:
         refused = str(error)
     writes = _LIBRARY.disturb_seen()
     _LIBRARY.disturb_writes(bytes(out), 1, 0, 0)
-    parts = [path.name for path in out.glob("*.part*")]
+    parts = [path.name for path in out.glob("*.part*") if path.suffix != ".damaged"]
     list(recover(out))
     return {
         "writes": writes,
