@@ -80,12 +80,22 @@ def _changes(folder: Path) -> Iterator[Change]:
         folder / "lengths.csv", LENGTHS_COLUMNS, dict(lengths), witness=DATABASE, whole=True
     )
     frames: dict[str, list[str]] = {}
-    for recording in sorted([*folder.glob("*.mcap"), *folder.glob("*.mcap.part")]):
+    for recording in _recordings(folder):
         yield from _recording(recording, runs, fish, frames)
     if frames:
         yield from _csv(
             folder / "frames.csv", FRAMES_COLUMNS, frames, witness="the recording", whole=False
         )
+
+
+def _recordings(folder: Path) -> list[Path]:
+    """Those to be read: every .mcap, and an .rrd, which is slow to read, where nothing knows it."""
+    try:
+        known = (read_provenance(folder) or {"files": {}})["files"]
+    except ValueError:
+        known = {}
+    rrd = [path for path in folder.glob("*.rrd") if path.name not in known]
+    return sorted([*folder.glob("*.mcap"), *folder.glob("*.mcap.part"), *rrd])
 
 
 def _against_provenance(folder: Path) -> Iterator[Change]:

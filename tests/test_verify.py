@@ -131,6 +131,21 @@ def test_a_changed_recording(out: Path, name: str):
     assert any(line.startswith(name) for line in changed(out))
 
 
+def test_a_recording_that_nothing_sums_up_is_read(out: Path):
+    """As those of a run without an end."""
+    made = json.loads((out / NAME).read_text())
+    for name in ("recording.mcap", "recording.rrd"):
+        del made["files"][name]
+    (out / NAME).write_text(json.dumps(made))
+    assert changed(out) == []
+    sql(out, "UPDATE fish SET length_mm = 999.0 WHERE track_id = 2")
+    for name in ("recording.mcap", "recording.rrd"):
+        assert any(f"length_mm is 999.0, {name} says" in line for line in changed(out))
+    with (out / "recording.rrd").open("r+b") as file:
+        file.truncate(len((out / "recording.rrd").read_bytes()) // 2)
+    assert any(line.startswith("recording.rrd: ") for line in changed(out))
+
+
 def test_another_runs_recording(out: Path, tmp_path: Path):
     other = measure(tmp_path / "other", template="halibut")
     shutil.copy(other / "recording.mcap", out / "recording.mcap")
