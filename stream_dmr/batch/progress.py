@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from stream_dmr.batch.manifest import Job
 
 _SAY_S = 5.0  # between two lines of progress
+_LEAST = 0.01  # of the work that gives an estimate: first frames wait for what is loaded for them
 Progress = Callable[[float], None]  # gets the share of one job that is done, 0 to 1
 
 
@@ -50,7 +51,7 @@ class Clock:
         """Videos over, the share of all bytes, and the time left at this pace."""
         share = self._share()
         made = share - self._before
-        left = duration(elapsed_s * (1 - share) / made) if made > 0 else "unknown"
+        left = duration(elapsed_s * (1 - share) / made) if made >= _LEAST else "unknown"
         over = len(self._over)
         return f"{over} of {len(self._bytes)} videos, {100 * share:.0f} %, time left: {left}"
 
