@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 from ray.cluster_utils import Cluster
@@ -17,6 +17,7 @@ from ray.cluster_utils import Cluster
 from stream_dmr.batch.batch import batch
 from stream_dmr.batch.manifest import read_manifest
 from stream_dmr.batch.ray_engine import RayEngine
+from stream_dmr.errors import UserError
 
 
 def kill_one(out: Path, killed: list[int]) -> None:
@@ -38,11 +39,14 @@ def main() -> None:
     # Else its workers wait for all else on the machine.
     os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112
     jobs = read_manifest(manifest, config=config, template=str(template))
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
-    cluster.add_node(num_cpus=1)
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "num_gpus": 0})
+    cluster.add_node(num_cpus=1, num_gpus=0)
     killed: list[int] = []
     killer = threading.Thread(target=kill_one, args=(out, killed))
     try:
+        with suppress(UserError):
+            RayEngine(address=cluster.address, gpus=0.25)
+            raise AssertionError("there is no GPU")
         with closing(RayEngine(address=cluster.address)) as engine:
             cluster.wait_for_nodes()
             killer.start()

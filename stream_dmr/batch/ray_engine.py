@@ -24,7 +24,8 @@ class RayEngine:
     def __init__(self, *, address: str | None = None, gpus: float = 0.0) -> None:
         """`address` of a cluster, "auto" for the one that this machine belongs to, None: a new one.
 
-        ConfigError without the package, UserError where the cluster can't be reached.
+        ConfigError without the package, UserError where the cluster can't be reached, or has no
+        GPUs though it should.
         """
         try:
             ray: Any = import_module("ray")
@@ -41,6 +42,12 @@ class RayEngine:
                 f"--address {address}: expected a Ray cluster, got: {error}; start one with: "
                 "ray start --head"
             ) from error
+        if gpus and not ray.cluster_resources().get("GPU"):
+            ray.shutdown()
+            raise UserError(
+                f"--gpus {gpus:g}: expected a cluster with GPUs, found none; videos would wait for "
+                "ever: leave it out"
+            )
         self._measure: Any = ray.remote(
             num_cpus=1, num_gpus=gpus, max_retries=_MOST_RETRIES, max_calls=0
         )(measure)
