@@ -10,7 +10,6 @@ from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.template import Template
 
-
 # Of capture time: a pose that old says nothing of the next one, and runs of weeks see many fish.
 _FORGET_NS = 60_000_000_000
 
