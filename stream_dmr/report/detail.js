@@ -24,7 +24,7 @@ function shotOf(shot, index, fish) {
     ...shot.mesh.map((points) => svg("polygon", { points, class: "mesh" })),
     ...POINTS.map(([name, fill], k) => svg("circle", { cx: keypoints[k][0], cy: keypoints[k][1], r: s / 55, fill, class: "point", "data-name": name }, svg("title", {}, name))));
   const row = fish.detail.frames.find((frame) => frame[0] === shot.frame);
-  const caption = row ? `frame ${shot.frame}, ${cm(row[2])} cm, IoU ${row[6] ?? "-"}${row[4] ? "" : `, refused: ${row[5]}`}${moved ? ", points moved" : ""}` : `frame ${shot.frame}`;
+  const caption = row ? `frame ${shot.frame}, ${row[2] === null ? "" : `${cm(row[2])} cm, `}IoU ${row[6] ?? "-"}${row[4] ? "" : `, refused: ${row[5]}`}${moved ? ", points moved" : ""}` : `frame ${shot.frame}`;
   const figure = element("figure", {}, box, element("figcaption", {}, element("small", { textContent: caption }),
     element("button", { type: "button", textContent: "larger", onclick: () => figure.classList.toggle("large") })));
   return figure;
@@ -57,12 +57,12 @@ function drawDetail(fish) {
   const shots = element("div", { className: "shots" }, ...fish.detail.shots.map((shot, k) => shotOf(shot, k, fish)));
   const overlay = element("input", { type: "checkbox", checked: true, onchange: () => shots.classList.toggle("plain", !overlay.checked) });
   panel.replaceChildren(
-    element("h2", { textContent: `Fish ${fish.track_id}${fish.video && ` of ${fish.video}`}: ${cm(lengthOf(fish))} cm` }),
+    element("h2", { textContent: `Fish ${fish.track_id}${fish.video && ` of ${fish.video}`}: ${lengthText(fish)}` }),
     element("label", {}, overlay, " mask (yellow), mesh (green), head (red), center, tail (blue)"),
     shots, ...reviewTools(fish, shots), element("div", { className: "pair" }, FRAMES, SOLID), facts(fish));
   panel.scrollTop = 0;
   drawFrames(FRAMES, fish.detail.frames);
-  setTimeout(() => state.chosen === fish.id && drawMesh(SOLID, fish.detail.mesh));  // the slow part, last
+  setTimeout(() => state.chosen === fish.id && drawMesh(SOLID, fish.detail.mesh, fish.unit));  // the slow part, last
 }
 
 function drawFrames(place, rows) {
@@ -78,7 +78,8 @@ function drawFrames(place, rows) {
   const heights = [...known.map((row) => row[2]), ...running.flatMap((row) => row.slice(8))];
   const [low, high] = [Math.min(...heights) / 10, Math.max(...heights) / 10];
   const drawn = layout("Frames (x: refused), estimate, 95 %", "frame", "cm");
-  if (heights.length) drawn.yaxis.range = [low - 0.1 * (high - low) - 0.5, high + 0.1 * (high - low) + 0.5];
+  if (!heights.length) sayEmpty(drawn);
+  else drawn.yaxis.range = [low - 0.1 * (high - low) - 0.5, high + 0.1 * (high - low) + 0.5];
   Plotly.react(place, [
     { type: "scatter", mode: "lines", x: [...x, ...[...x].reverse()], y: [...running.map((row) => row[9] / 10), ...running.map((row) => row[8] / 10).reverse()], fill: "toself", fillcolor: "rgba(22,104,168,.15)", line: { width: 0 }, hoverinfo: "skip" },
     { type: "scatter", mode: "lines", x, y: running.map((row) => row[7] / 10), line: { color: BLUE, width: 2 }, hovertemplate: "after frame %{x}: %{y:.1f} cm<extra></extra>" },
@@ -91,13 +92,13 @@ function unpacked(text, kind) {
   return new kind(bytes.buffer);
 }
 
-function drawMesh(place, mesh) {
+function drawMesh(place, mesh, unit) {
   if (!mesh) return Plotly.purge(place);
   const points = unpacked(mesh.points, Int16Array);
   const axis = (k, from, to) => Array.from({ length: to - from }, (_, n) => points[3 * (from + n) + k] * mesh.step);
   const corner = (k) => Array.from(FACES.filter((_, n) => n % 3 === k));
   const [n, all] = [mesh.vertices, points.length / 3];
-  const scene = { aspectmode: "data", camera: { up: { x: 0, y: -1, z: 0 }, eye: { x: 0.4, y: -0.6, z: -2.5 } }, xaxis: { title: { text: "x mm" } }, yaxis: { title: { text: "y mm" } }, zaxis: { title: { text: "depth mm" } } };
+  const scene = { aspectmode: "data", camera: { up: { x: 0, y: -1, z: 0 }, eye: { x: 0.4, y: -0.6, z: -2.5 } }, ...Object.fromEntries(["x", "y", "depth"].map((name, k) => [["xaxis", "yaxis", "zaxis"][k], { title: { text: `${name} ${unit}` } }])) };
   Plotly.react(place, [
     { type: "mesh3d", x: axis(0, 0, n), y: axis(1, 0, n), z: axis(2, 0, n), i: corner(0), j: corner(1), k: corner(2), color: "#7fb2d6", flatshading: false, opacity: 0.75, lighting: { ambient: 0.5, diffuse: 0.8 }, hoverinfo: "skip" },
     { type: "scatter3d", mode: "lines", x: axis(0, n, all), y: axis(1, n, all), z: axis(2, n, all), line: { color: ORANGE, width: 6 }, hoverinfo: "skip" },

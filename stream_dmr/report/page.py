@@ -95,6 +95,7 @@ def summary(fish: FishResult, report: Report) -> dict[str, Any]:
     return row | {
         "id": fish.estimate.track_id,  # in the page
         "video": "",
+        "unit": "body lengths" if report.recording.header.calibration is None else "mm",
         "vessel": fish.facts.vessel,
         "trip": fish.facts.trip,
         "haul": fish.facts.haul,

@@ -50,6 +50,11 @@ function layout(title, x, y) {
   };
 }
 
+function sayEmpty(drawn) {
+  drawn.xaxis.visible = drawn.yaxis.visible = false;
+  drawn.annotations = [{ text: "no lengths", showarrow: false, xref: "paper", yref: "paper", x: 0.5, y: 0.5 }];
+}
+
 function drawHistogram(fish) {
   const lengths = counted(fish).map((f) => lengthOf(f) / 10).sort((a, b) => a - b);
   const low = lengths[0] ?? 0, high = lengths.at(-1) ?? 1;
@@ -64,6 +69,7 @@ function drawHistogram(fish) {
   }
   const drawn = layout("Length frequency (bars) and kernel density (line)", "cm", "fish");
   if (Math.max(...counts) < 6) drawn.yaxis.dtick = 1;
+  if (!lengths.length) sayEmpty(drawn);
   const limit = DATA.fisheries.legal_cm;
   if (fish.some((f) => f.is_legal_size !== null)) drawn.shapes = [{ type: "line", x0: limit, x1: limit, yref: "paper", y0: 0, y1: 1, line: { color: ORANGE, dash: "dot" } }];
   Plotly.react("histogram", traces, drawn, QUIET);
@@ -88,7 +94,9 @@ function drawTime(fish, onChoose) {
     { type: "scatter", mode: "markers", x: measured.map(at), y: measured.map((f) => lengthOf(f) / 10), customdata: measured.map((f) => f.id), text: measured.map((f) => `${f.track_id} ${f.video && `of ${f.video}`}`),
       marker: { color: measured.map((f) => (counts.has(f) ? BLUE : "#c0c0c0")), size: 6 }, hovertemplate: "fish %{text}<br>%{y:.1f} cm<extra></extra>" },
   ];
-  Plotly.react("time", traces, layout("Fish over time, with 95 % intervals", unit, "cm"), QUIET).then((plot) => {
+  const drawn = layout("Fish over time, with 95 % intervals", unit, "cm");
+  if (!measured.length) sayEmpty(drawn);
+  Plotly.react("time", traces, drawn, QUIET).then((plot) => {
     plot.removeAllListeners("plotly_click");
     plot.on("plotly_click", (event) => event.points[0].customdata && onChoose(event.points[0].customdata));
   });

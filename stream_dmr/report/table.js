@@ -29,6 +29,10 @@ function cm(mm, digits = 1) {
   return mm === null || mm === undefined ? "-" : (mm / 10).toFixed(digits);
 }
 
+function lengthText(fish) {
+  return lengthOf(fish) === null ? "no length" : `${cm(lengthOf(fish))} cm`;
+}
+
 function element(tag, attributes = {}, ...children) {
   const made = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
@@ -107,7 +111,7 @@ function rowOf(fish) {
     { className: fish.id === state.chosen ? "row chosen" : "row", role: "row", "data-id": fish.id },
     fish.thumb ? element("img", { src: fish.thumb, alt: "", loading: "lazy" }) : element("span"),
     element("span", {}, element("b", { textContent: fish.track_id }), element("small", { textContent: fish.video })),
-    element("span", {}, element("b", { textContent: `${cm(lengthOf(fish))} cm` }), ...corrected, element("small", { textContent: interval }), size),
+    element("span", {}, element("b", { textContent: lengthText(fish) }), ...corrected, element("small", { textContent: interval }), size),
     element("span", { textContent: `${fish.frames_used} of ${fish.frames_seen}` }),
     element("small", { textContent: reasons, title: reasons }),
     element("small", { className: "bad", textContent: fish.flags.join(", ") }),
