@@ -86,8 +86,8 @@ def seal_files(
         made = read_provenance(folder) or _new(runs, origin)
     except ValueError as error:
         raise OutputError(
-            f"{folder / NAME}: expected what made the files beside it, got: {error}; write to "
-            "another folder"
+            f"{folder / NAME}: expected what made the files beside it, got: {error}; remove it, or "
+            "write to another folder"
         ) from error
     return _write(folder, made | {"files": made["files"] | _sums(folder, files)})
 
@@ -102,8 +102,18 @@ def add_files(folder: Path, files: Iterable[Path]) -> None:
 
 
 def seal_verdicts(folder: Path) -> None:
-    """Say how many verdicts there are by now, and their SHA-256. As `add_files`."""
-    _add(folder, lambda made: {"verdicts": verdicts_sum(read_verdicts(folder / DATABASE))})
+    """Say how many verdicts there are by now, and their SHA-256. As `add_files`.
+
+    Where those that were known have been changed, it stays at them, for `verify` to find.
+    """
+    said = read_verdicts(folder / DATABASE)
+
+    def more(made: dict[str, Any]) -> dict[str, Any]:
+        known = made.get("verdicts") or verdicts_sum([])
+        is_sound = verdicts_sum(said[: known["count"]]) == known
+        return {"verdicts": verdicts_sum(said)} if is_sound else {}
+
+    _add(folder, more)
 
 
 def _add(folder: Path, more: Callable[[dict[str, Any]], dict[str, Any]]) -> None:

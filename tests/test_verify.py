@@ -73,6 +73,10 @@ def test_changed_verdicts(out: Path, statement: str, expected: str):
     sql(out, statement)
     (line,) = changed(out)
     assert expected in line
+    if "no `review`" not in expected:  # and the next verdict doesn't hide it
+        add_verdict(out / "lengths.db", Verdict(track_id=1, kind="accept", reviewer="Ada"))
+        seal_verdicts(out)
+        assert changed(out) == [line]
 
 
 @pytest.mark.parametrize(
