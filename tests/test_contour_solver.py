@@ -255,7 +255,7 @@ class TestMirror:
 
     @pytest.mark.parametrize("seed", range(4))
     @pytest.mark.parametrize("tilt", [-0.3, 0.3])
-    def test_search_takes_the_image_nearer_the_reference_plane(self, seed, tilt):
+    def test_refine_takes_the_image_nearer_the_reference_plane(self, seed, tilt):
         """Both have one silhouette but for perspective, so it must not matter which it starts from.
 
         The other image stands 2 tilt out of the plane, and 0.56 is its sine.
@@ -268,7 +268,7 @@ class TestMirror:
         target = target_of(flat, plane_normal=np.ascontiguousarray(normal))
         solver = ContourSolver(BODY, SETTINGS)
         for start in (flat[0].numpy(), mirror(flat[0].numpy())):
-            found = solver.search(target, start[None])
+            found = solver.refine(target, start)
             along = Rotation.from_rotvec(found.flat[:3]).as_matrix()[:, 0]
             assert found.iou > 0.97
             assert abs(along @ normal) < 0.25

@@ -56,9 +56,7 @@ def known():
     solver = ContourSolver(BODY, SETTINGS)
     targets = [Target.from_crop(crop, plane_normal=PLANE_NORMAL) for crop in crops]
     starts = moved(flats, 5)
-    return [
-        (t, solver.search(t, s[None]), f) for t, s, f in zip(targets, starts, flats, strict=True)
-    ]
+    return [(t, solver.refine(t, s), f) for t, s, f in zip(targets, starts, flats, strict=True)]
 
 
 def scanned(target, flat, *, hopeless=np.inf):

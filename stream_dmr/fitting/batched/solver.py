@@ -81,7 +81,7 @@ class BatchedSolver:
 
     @torch.no_grad()
     def refine_many(self, targets: Targets, starts: Float[Tensor, "B P"]) -> Solutions:
-        """From one start of each target, near its answer; see `ContourSolver.refine`."""
+        """From one start of each target, and from its mirror image where that is more likely."""
         return self._refined(targets, torch.arange(len(starts), device=starts.device), starts)
 
     @torch.no_grad()
@@ -91,7 +91,7 @@ class BatchedSolver:
         which = every[:, None].expand(starts.shape[:2])
         losses = self._rough_losses(coarse, which.flatten(), starts.flatten(0, 1)).view_as(which)
         flats = _ordered(starts, losses)
-        best = self._refined_both_sides(targets, every, flats[:, 0])
+        best = self._refined(targets, every, flats[:, 0])
         flats = flats[:, 1:]
         for iterations, most in _ROUNDS:
             flats = flats[:, :most]
@@ -106,26 +106,26 @@ class BatchedSolver:
             )
             flats = _ordered(rough.flat.view_as(flats), rough.loss.view(flats.shape[:2]))
         for column in range(min(_NUM_FINISHED, flats.shape[1])):
-            best = best.lower(self._refined_both_sides(targets, every, flats[:, column]))
+            best = best.lower(self._refined(targets, every, flats[:, column]))
         return best
 
     def _refined(self, targets: Targets, which: Tensor, starts: Tensor) -> Solutions:
-        most = self._settings.contour_iterations
-        lambdas = self.model.lambdas
-        return self._minimised(
-            self.model, targets, which, starts, lambdas, iterations=most, damping=NEAR
-        )
-
-    def _refined_both_sides(self, targets: Targets, which: Tensor, starts: Tensor) -> Solutions:
-        found = self._refined(targets, which, starts)
+        found = self._finished(targets, which, starts)
         mirrored = found.flat * self._mirror
         chosen = targets.select(which)
         gain = prior_loss(self.model, chosen, found.flat) - prior_loss(self.model, chosen, mirrored)
         index = torch.nonzero(gain >= self._settings.tolerance)[:, 0]
         if len(index) == 0:
             return found
-        other = self._refined(targets, which[index], mirrored[index])
+        other = self._finished(targets, which[index], mirrored[index])
         return found.replaced(index, found.select(index).lower(other))
+
+    def _finished(self, targets: Targets, which: Tensor, starts: Tensor) -> Solutions:
+        most = self._settings.contour_iterations
+        lambdas = self.model.lambdas
+        return self._minimised(
+            self.model, targets, which, starts, lambdas, iterations=most, damping=NEAR
+        )
 
     def _minimised(
         self,

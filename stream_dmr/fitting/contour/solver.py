@@ -39,20 +39,19 @@ class ContourSolver:
         self._rough_lambdas = settings.rough_lambdas()
 
     def refine(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
-        """From one start near the answer, whose side in depth it keeps."""
-        most = self._settings.contour_iterations
-        return self._minimise(
-            self._body, target, start, self._lambdas, iterations=most, damping=NEAR
-        )
-
-    def _refine_both_sides(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
-        """From one start, and from its mirror image in depth where that is more likely."""
-        found = self.refine(target, start)
+        """From one start near the answer, and from its mirror image where that is more likely."""
+        found = self._finish(target, start)
         mirrored = mirror(found.flat)
         gain = self._prior_loss(target, found.flat) - self._prior_loss(target, mirrored)
         if gain < self._settings.tolerance:
             return found
-        return min(found, self.refine(target, mirrored), key=lambda solution: solution.loss)
+        return min(found, self._finish(target, mirrored), key=lambda solution: solution.loss)
+
+    def _finish(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
+        most = self._settings.contour_iterations
+        return self._minimise(
+            self._body, target, start, self._lambdas, iterations=most, damping=NEAR
+        )
 
     def _prior_loss(self, target: Target, flat: Float[np.ndarray, "P"]) -> float:
         return prior_loss(target, flat, self._rest, self._priors)
@@ -64,12 +63,12 @@ class ContourSolver:
         """
         coarse = target.coarse()
         flats = sorted(starts, key=lambda flat: self._rough_loss(coarse, flat))
-        found = [self._refine_both_sides(target, flats.pop(0))]
+        found = [self.refine(target, flats.pop(0))]
         for iterations, most in _ROUNDS:
             rough = [self._rough(coarse, flat, iterations) for flat in flats[:most]]
             rough.sort(key=lambda solution: solution.loss)
             flats = [solution.flat for solution in rough]
-        found += [self._refine_both_sides(target, flat) for flat in flats[:_NUM_FINISHED]]
+        found += [self.refine(target, flat) for flat in flats[:_NUM_FINISHED]]
         return min(found, key=lambda solution: solution.loss)
 
     def _rough_loss(self, target: Target, flat: Float[np.ndarray, "P"]) -> float:
