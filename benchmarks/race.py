@@ -19,6 +19,7 @@ from targets import Pair
 from stream_dmr.body import Body
 from stream_dmr.fitting import adam
 from stream_dmr.fitting.adam import AdamSolver
+from stream_dmr.fitting.bodies import coarse_body
 from stream_dmr.fitting.cold_start import cold_starts
 from stream_dmr.fitting.contour.solver import ContourSolver
 from stream_dmr.fitting.fit import Fitter
@@ -54,7 +55,8 @@ class _Watched(ContourSolver):
 
     def _minimise(self, *arguments: Any, **options: Any) -> Solution:
         solution = super()._minimise(*arguments, **options)
-        if solution.iou >= GOAL:
+        is_whole = arguments[0] is self._body  # a coarse mesh only looks around
+        if is_whole and solution.iou >= GOAL:
             raise _Reached
         return solution
 
@@ -74,6 +76,7 @@ class Race:
     def __init__(self, template: Template) -> None:
         self._template = template
         self._body = Body.from_template(template)
+        self._coarse = coarse_body(template, self._body)
         patient = FitMeshSettings(solver="adam", adam_iterations=CAP, tolerance=1e-12)
         self._adam = AdamSolver(template, patient)
         self._deodr = None
@@ -130,7 +133,7 @@ class Race:
         def by_contour() -> None:
             target = _target(pair)
             starts = cold_starts(target, self._template)
-            _Watched(self._body, FitMeshSettings()).search(target, starts)
+            _Watched(self._body, FitMeshSettings(), coarse=self._coarse).search(target, starts)
 
         def by_adam() -> None:
             target = _target(pair)

@@ -29,7 +29,7 @@ from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solver
 
 BODY, HALIBUT = BODIES["halibut"], TEMPLATES["halibut"]
-COARSE = coarse_body(HALIBUT)
+COARSE = coarse_body(HALIBUT, BODY)
 
 
 def solver_on(device, *, dtype=torch.float64, **settings):

@@ -56,7 +56,7 @@ def test_every_script_finds_what_it_imports(name):
         pytest.importorskip("deodr", reason="needs the extra bench")
     if name == "failing_run":
         pytest.skip("needs the library that failing_writes builds and loads before it")
-    import_module(name)
+    assert import_module(name).__doc__, "says what it measures, and how it is called"
 
 
 def test_whatever_bench_measures_can_be_measured_and_printed(monkeypatch):

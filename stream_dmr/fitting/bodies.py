@@ -9,14 +9,14 @@ _COARSE_FACES = 600
 _PLACES_PER_SEGMENT = 4
 
 
-def fine_body(template: Template, *, max_faces: int) -> Body:
-    """What a fit ends with: the template's own mesh, where it has no more faces than this."""
+def fine_body(template: Template, body: Body, *, max_faces: int) -> Body:
+    """What a fit ends with: the template's own `body`, where it has no more faces than this."""
     fewer = simplified(template, max_faces=max_faces)
     if fewer is template:
-        return Body.from_template(template)
+        return body
     return Body.from_template(fewer, places_per_segment=_PLACES_PER_SEGMENT)
 
 
-def coarse_body(template: Template) -> Body:
+def coarse_body(template: Template, body: Body) -> Body:
     """What poses and sizes are compared with on half the resolution."""
-    return fine_body(template, max_faces=_COARSE_FACES)
+    return fine_body(template, body, max_faces=_COARSE_FACES)

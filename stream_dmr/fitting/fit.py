@@ -60,8 +60,8 @@ class Fitter:
         self._template = template
         self._settings = settings
         self._body = Body.from_template(template)
-        self._fine_body = fine_body(template, max_faces=settings.max_faces)
-        self._coarse_body = coarse_body(template)
+        self._fine_body = fine_body(template, self._body, max_faces=settings.max_faces)
+        self._coarse_body = coarse_body(template, self._body)
         self._kind = KINDS[settings.deformation]
         self._solver = self._make_solver()
         self._scanner = SizeScanner(self._fine_body, settings, coarse=self._coarse_body)
