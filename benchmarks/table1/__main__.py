@@ -3,8 +3,8 @@
     make table1 [FISH=60] [ROWS=dmr,bfs] [AGAIN=1]
 
 What has been measured is kept in benchmarks/table1/cache, scene by scene: a run that was broken
-off goes on, and ROWS with AGAIN measures only those rows anew. Half an hour on two idle cores for
-all 738 fish, half of it for Adam. With fewer fish the table is printed, not written to
+off goes on, and ROWS with AGAIN measures only those rows anew. An hour on two idle cores for all
+738 fish, half of it for Adam. With fewer fish the table is printed, not written to
 docs/accuracy.md.
 """
 
@@ -21,7 +21,7 @@ from pathlib import Path
 
 from table1 import report, results
 from table1.fish import FISH_PER_SCENE
-from table1.methods import METHODS, make_method, measure_scene, scenes_of
+from table1.methods import METHODS, make_method, measure_scene
 
 ALL_FISH = 738
 DOCS = Path(__file__).parents[2] / "docs"
@@ -46,7 +46,7 @@ def main() -> None:
     _measure_missing(scenes, wanted, arguments.processes, arguments.cache)
     rows: dict[str, list[results.Fish]] = {}
     for method in METHODS:
-        rows |= results.load(method, scenes_of(method, scenes), cache=arguments.cache)
+        rows |= results.load(method, scenes, cache=arguments.cache)
         print(
             f"{method}: measured up to {results.age_hours(method, cache=arguments.cache):.1f} h ago"
         )
@@ -65,12 +65,7 @@ def _measure_missing(scenes: range, wanted: list[str], processes: int, cache: Pa
     """Scene by scene, since filming is shared by all methods."""
     tasks = []
     for scene in scenes:
-        missing = [
-            method
-            for method in wanted
-            if scene in scenes_of(method, scenes)
-            and not results.is_saved(method, scene, cache=cache)
-        ]
+        missing = [method for method in wanted if not results.is_saved(method, scene, cache=cache)]
         if missing:
             tasks.append((scene, missing, cache))
     if any("bfs" in methods for _, methods, _ in tasks):

@@ -1,6 +1,6 @@
 """All methods by name, made when first needed, and the work of one process: one scene."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import cache as cached
 from pathlib import Path
 
@@ -17,14 +17,8 @@ from table1.silhouettes import open_database
 
 METHODS = ("stereo", "monopose", "bfs", "dmr", "paper")
 LOG2_DATABASE = 20  # a million entries
-_PAPER_EVERY = 4  # scenes: see table1.dmr
 
 Measure = Callable[[Haul], dict[str, dict[int, LengthRow]]]
-
-
-def scenes_of(method: str, scenes: Iterable[int]) -> list[int]:
-    """Those scenes that a method measures."""
-    return [scene for scene in scenes if method != "paper" or scene % _PAPER_EVERY == 0]
 
 
 def measure_scene(task: tuple[int, list[str], Path]) -> int:

@@ -43,7 +43,7 @@ def evaluations(rows: dict[str, list[Fish]]) -> dict[str, Evaluation]:
 
 
 def markdown(found: dict[str, Evaluation]) -> str:
-    """The table, what its last row says of its own errors, and how many fish Adam had."""
+    """The table, what its last row says of its own errors, and how many frames Adam had."""
     lines = [_HEADER, *(_line(TITLES[row], evaluation) for row, evaluation in found.items())]
     notes = []
     if "dmr" in found and (intervals := found["dmr"].intervals) is not None:
@@ -54,9 +54,8 @@ def markdown(found: dict[str, Evaluation]) -> str:
         )
     if "paper" in found:
         notes.append(
-            f"As the paper wrote it: {len(found['paper'].fish)} of the fish, {PAPER_FRAMES} random "
-            "frames of each, since Adam takes seconds a frame; its histograms are compared with "
-            "those of the same fish."
+            f"As the paper wrote it: the mean of {PAPER_FRAMES} random frames of each fish, since "
+            "Adam takes seconds a frame."
         )
     return "\n".join([*lines, *(f"\n{note}" for note in notes)])
 
