@@ -33,10 +33,11 @@ class ReadFramesSettings(Settings):
         description="the longest pause between two attempts to reach a lost camera, s",
     )
     live_queue: int = Field(
-        default=4,
+        default=15,
         ge=1,
         le=1000,
-        description="frames of a live source that may wait; where more come, the oldest is dropped",
+        description="frames of a live source that may wait, say a second's; where more come, the "
+        "oldest is dropped",
     )
     clips_wait_s: float = Field(
         default=30.0,

@@ -14,6 +14,8 @@ from stream_dmr.camera import Calibration
 from stream_dmr.config import Config
 from stream_dmr.endless import DriftWatch, Tolerance, go_on
 from stream_dmr.errors import OutputError, UserError
+from stream_dmr.fitting.fit import Fitter
+from stream_dmr.fitting.rehearsal import rehearse
 from stream_dmr.messages import LengthEstimate, LocalizedFish
 from stream_dmr.pipeline import Node, StageCounters, run_chain
 from stream_dmr.run_folder import RESULTS, SEGMENTED
@@ -50,6 +52,8 @@ def run(
     inputs = checked_inputs(request)
     try:
         nodes = _nodes(inputs)
+        if inputs.is_endless:  # no frame of a camera shall wait for a compiler
+            rehearse(Fitter(inputs.template, inputs.config.fit_mesh))
         with open_outputs(inputs, observer) as outputs:
             resume(nodes, outputs.left)
             _say_what_matters(inputs, outputs, observer)
