@@ -4,7 +4,9 @@
 
 Thirty fish and frames, spread over the video: the crop as it was seen, the same with the mask
 (yellow), the fitted mesh (green), head (red), center (white), tail (blue), and id and confidence of
-the mask. No calibration: shapes are relative.
+the mask. No calibration: shapes are relative. Printed: which fish were followed for how long, and
+how often the head of a fish changed ends from one frame to the next, by the network's cue and by
+the fit.
 """
 
 import argparse
@@ -68,8 +70,27 @@ def tile(pair: Pair, faces: np.ndarray) -> np.ndarray:
     return np.vstack([picture, found])
 
 
+def turns(pairs: list[Pair]) -> str:
+    """How often head and tail changed places between consecutive frames of a fish."""
+    last: dict[tuple[str, int], tuple[int, np.ndarray]] = {}
+    turned, seen = Counter(), Counter()
+    for crop, mesh in pairs:
+        forward = {}
+        if crop.ends is not None:
+            forward["cue"] = crop.ends.head_px - crop.ends.tail_px
+        if mesh.shape is not None:
+            forward["fit"] = mesh.shape.keypoints_px[0] - mesh.shape.keypoints_px[2]
+        for who, now in forward.items():
+            frame, before = last.get((who, crop.track_id), (-1, now))
+            if frame == crop.frame_index - 1:
+                seen[who] += 1
+                turned[who] += bool(now @ before < 0)
+            last[who, crop.track_id] = crop.frame_index, now
+    return ", ".join(f"{who} {turned[who]} of {seen[who]}" for who in seen)
+
+
 def main() -> None:
-    """Write the picture, and print which fish were followed for how long."""
+    """Write the picture, and print what can be counted."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("video")
     parser.add_argument("--template", default="halibut")
@@ -79,6 +100,7 @@ def main() -> None:
     pairs = watch(arguments.video, template=arguments.template, path=arguments.config)
     frames = Counter(crop.track_id for crop, _ in pairs)
     print(f"{len(pairs)} crops of {len(frames)} fish; frames of each: {dict(frames)}")
+    print(f"head and tail changed places: {turns(pairs)}")
     faces = load_template(arguments.template).faces
     chosen = np.linspace(0, len(pairs) - 1, min(_SHOWN, len(pairs))).round().astype(int)
     tiles = [tile(pairs[i], faces) for i in chosen]

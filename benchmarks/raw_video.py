@@ -187,6 +187,7 @@ def main() -> None:
     parser.add_argument("--config", type=Path)
     parser.add_argument("--template", default="", help="default: the scene's species.ply")
     parser.add_argument("--simulate", type=int, default=0, help="scenes of every preset")
+    parser.add_argument("--seed", type=int, default=900, help="of the first simulated scene")
     parser.add_argument("--sheet", type=Path, help="a picture of masks per scene, named after it")
     parser.add_argument("--speed", action="store_true")
     arguments = parser.parse_args()
@@ -203,7 +204,7 @@ def _simulated(folder: Path, arguments: argparse.Namespace) -> Iterable[Row]:
     """Scenes with exact masks; those that `simulate` writes are as ragged as people's."""
     for preset in PRESETS:
         PRESETS[preset] = replace(PRESETS[preset], ragged_px=0.0)
-        for seed in range(900, 900 + arguments.simulate):
+        for seed in range(arguments.seed, arguments.seed + arguments.simulate):
             scene = folder / f"{preset}-{seed}"
             simulate(scene, num_fish=5, num_frames=75, preset=preset, seed=seed)
             yield measure(scene, arguments)

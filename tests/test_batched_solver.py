@@ -25,8 +25,10 @@ from stream_dmr.fitting.cold_start import cold_starts
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.solver import ContourSolver
 from stream_dmr.fitting.fit import Fitter
+from stream_dmr.fitting.heading import is_turned
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solver
+from stream_dmr.messages import FishEnds
 
 BODY, HALIBUT = BODIES["halibut"], TEMPLATES["halibut"]
 COARSE = coarse_body(HALIBUT, BODY)
@@ -170,6 +172,28 @@ class TestFitter:
             expected = fitter.fit(crop, warm)
             assert expected.mesh.report.cold_start == one.is_cold
             self.check_alike(one, expected)
+
+    def test_obeys_a_segmenter_that_is_sure(self, device):
+        """Each head at the other end than where the outline has it."""
+        crops, _ = crops_of_poses("halibut", 9, batch=3)
+        fitter = Fitter(HALIBUT, FitMeshSettings(), plane_normal=PLANE_NORMAL)
+        backlog = BatchedFitter(
+            HALIBUT,
+            solver_on(device),
+            FitMeshSettings(),
+            plane_normal=PLANE_NORMAL,
+            clear_gain=0.01,
+        )
+        free = [fitter.fit(crop, None) for crop in crops]
+        told = [
+            replace(crop, ends=FishEnds(head_px=px[2], tail_px=px[0], confidence=0.99))
+            for crop, px in zip(crops, (one.mesh.shape.keypoints_px for one in free), strict=True)
+        ]
+        found = backlog.fit(told, [None, free[1].best, None])
+        assert all(one.is_cold for one in found)
+        for one, crop in zip(found, told, strict=True):
+            assert not is_turned(one.solution.flat, fitter.target(crop).heading)
+            assert -2 < one.solution.loss < 2  # without what was added for comparing
 
     @staticmethod
     def check_alike(found, expected):

@@ -9,7 +9,7 @@ from stream_dmr.body import JOINT, ROOT
 from stream_dmr.errors import ConfigError
 from stream_dmr.fitting.objective import Objective
 from stream_dmr.fitting.settings import FitMeshSettings
-from stream_dmr.fitting.solver import Solution
+from stream_dmr.fitting.solver import Solution, rank
 from stream_dmr.fitting.target import Target
 from stream_dmr.skinning import Rig
 from stream_dmr.template import Template
@@ -47,10 +47,10 @@ class AdamSolver:
     def search(self, target: Target, starts: Float[np.ndarray, "B P"]) -> Solution:
         """A few iterations from every start, the best ones to the end, the best of these."""
         rough = self._descend(target, starts, _SEARCH_ITERATIONS, _FAR)
-        rough.sort(key=lambda solution: solution.loss)
+        rough.sort(key=lambda solution: rank(target, solution))
         best = np.stack([solution.flat for solution in rough[:_NUM_FINISHED]])
         fine = self._descend(target, best, self._settings.adam_iterations, _NEAR)
-        return min(fine, key=lambda solution: solution.loss)
+        return min(fine, key=lambda solution: rank(target, solution))
 
     def _descend(
         self, target: Target, starts: Float[np.ndarray, "B P"], iterations: int, step: float

@@ -7,9 +7,8 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.body import JOINT, ROOT, rest_vector
-from stream_dmr.camera import Camera
+from stream_dmr.fitting.heading import is_turned
 from stream_dmr.fitting.target import Target
-from stream_dmr.messages import FishEnds
 from stream_dmr.template import Template
 
 # Total bends about the axis toward the camera, rad: straight, and both ways.
@@ -17,11 +16,14 @@ _BENDS_RAD = (-1.2, 0.0, 1.2)
 # Turns about the body's own axis, rad: the broad side, its mirror image, and a slant either way.
 _ROLLS_RAD = (0.0, np.pi, 0.9, -0.9)
 _FLIPS_RAD = (0.0, np.pi)  # which end is the head?
-_SURE_OF_HEAD = 0.9
+NUM_STARTS = len(_BENDS_RAD) * len(_ROLLS_RAD) * len(_FLIPS_RAD)
 
 
 def cold_starts(target: Target, template: Template) -> Float[np.ndarray, "B P"]:
-    """One start for each head end, roll and bend, placed and scaled by the mask's moments."""
+    """One start for each head end, roll and bend, placed and scaled by the mask's moments.
+
+    Where the target's heading is known, those alone whose head is there.
+    """
     center_px, angle, extent_px = _moments(target.mask)
     focal = target.K[[0, 1], [0, 1]]
     num_joints = len(template.joints)
@@ -42,18 +44,7 @@ def cold_starts(target: Target, template: Template) -> Float[np.ndarray, "B P"]:
     starts[:, 5] = np.log(length)
     joints = starts[:, ROOT:].reshape(len(bends), num_joints, JOINT)
     joints[:, :, :3] = np.linspace(-0.5, 0.5, num_joints)[:, None] * axis[:, None]
-    return starts
-
-
-def agreeing(
-    starts: Float[np.ndarray, "B P"], ends: FishEnds | None, crop_camera: Camera
-) -> Float[np.ndarray, "A P"]:
-    """Those starts whose head is where a segmenter surely sees it; all of them where it doesn't."""
-    if ends is None or ends.confidence < _SURE_OF_HEAD:
-        return starts
-    head, tail = crop_camera.back_project(np.stack([ends.head_px, ends.tail_px]))[:, :2]
-    forward = Rotation.from_rotvec(starts[:, :3]).apply([-1.0, 0.0, 0.0])[:, :2]
-    return starts[forward @ (head - tail) > 0]
+    return starts[~is_turned(starts, target.heading)]
 
 
 def _moments(mask: Float[np.ndarray, "S S"]) -> tuple[Float[np.ndarray, "2"], float, float]:

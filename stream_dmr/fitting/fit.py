@@ -12,11 +12,12 @@ from jaxtyping import Float
 from stream_dmr.body import Body
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.fitting.bodies import coarse_body, fine_body
-from stream_dmr.fitting.cold_start import agreeing, cold_starts
+from stream_dmr.fitting.cold_start import cold_starts
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.outline import project
 from stream_dmr.fitting.contour.solver import ContourSolver
+from stream_dmr.fitting.heading import is_turned
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.size_scanner import SizeScanner
 from stream_dmr.fitting.solver import Solution, Solver
@@ -87,7 +88,7 @@ class Fitter:
             return Fit(_message(crop, None, None, refusal), None)
         began = time.perf_counter_ns()
         target = self.target(crop)
-        solution, is_cold = self._solve(crop, target, warm)
+        solution, is_cold = self._solve(target, warm)
         return self._answer(crop, target, solution, is_cold=is_cold, since_ns=began)
 
     def fit_many(
@@ -170,18 +171,18 @@ class Fitter:
             return "mask fills the crop"  # it has no edge to fit to
         return "mask too small" if area < self._settings.min_mask_px else ""
 
-    def _solve(
-        self, crop: FishCrop, target: Target, warm: Float[np.ndarray, "P"] | None
-    ) -> tuple[Solution, bool]:
-        """The warm fit if it is good, else a cold one where that is clearly better."""
+    def _solve(self, target: Target, warm: Float[np.ndarray, "P"] | None) -> tuple[Solution, bool]:
+        """The warm fit if it is good, else a cold one where that is clearly better.
+
+        A warm start whose head is at the wrong end leads nowhere.
+        """
         solution = None
-        if warm is not None:
+        if warm is not None and not is_turned(warm, target.heading):
             start = recentered(self._fine_body, self._kind, target, warm)
             solution = self._solver.refine(target, start)
             if solution.iou >= self._settings.cold_below_iou:
                 return solution, False
-        starts = agreeing(cold_starts(target, self._template), crop.ends, crop.crop_camera)
-        cold = self._solver.search(target, starts)
+        cold = self._solver.search(target, cold_starts(target, self._template))
         if solution is not None and solution.loss < cold.loss + _CLEAR_GAIN:
             return solution, False
         return cold, True

@@ -5,6 +5,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from stream_dmr.fitting.heading import TURNED, is_turned
 from stream_dmr.fitting.target import Target
 
 
@@ -17,6 +18,11 @@ class Solution(NamedTuple):
     iterations: int
     converged: bool
     stop_reason: str
+
+
+def rank(target: Target, solution: Solution) -> float:
+    """L_rec as a search compares it: from afar a fit may turn round, whatever it began with."""
+    return solution.loss + TURNED * float(is_turned(solution.flat, target.heading))
 
 
 @runtime_checkable

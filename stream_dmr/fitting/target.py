@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 
 from stream_dmr.fitting.compiled import compiled
 from stream_dmr.fitting.distance_map import signed_distance
+from stream_dmr.fitting.heading import told
 from stream_dmr.messages import FishCrop
 
 _SMOOTHING_PX = 1.5  # of the staircase that pixels make of an edge; short beside any fin
@@ -23,6 +24,7 @@ class Target(NamedTuple):
     K: Float[np.ndarray, "3 3"]
     anchor: Float[np.ndarray, "3"]  # where the root rests: depth 1, in the middle of the crop
     plane_normal: Float[np.ndarray, "3"]  # of the plane that fish hang in, camera frame
+    heading: Float[np.ndarray, "2"]  # tail to head in the picture; 0: not known
     mask: Float[np.ndarray, "S S"]
     distance: Float[np.ndarray, "S S"]  # to the mask's edge, px, negative inside
     mask_area: float  # px
@@ -32,11 +34,12 @@ class Target(NamedTuple):
 
     @classmethod
     def from_crop(cls, crop: FishCrop, *, plane_normal: Float[np.ndarray, "3"]) -> "Target":
-        """Distance map, contour and camera of a crop with a mask."""
+        """Distance map, contour, heading and camera of a crop with a mask."""
         return cls(
             np.ascontiguousarray(crop.crop_camera.K),
             crop.crop_camera.middle_ray(),
             plane_normal,
+            told(crop.ends, crop.crop_camera),
             crop.mask.astype(np.float64),
             signed_distance(crop.mask),
             float(crop.mask.sum()),

@@ -13,7 +13,8 @@ from torch import Tensor
 from stream_dmr.fitting.batched.solver import BatchedSolver, Solutions
 from stream_dmr.fitting.batched.targets import Targets
 from stream_dmr.fitting.batched.warm_start import recentered
-from stream_dmr.fitting.cold_start import agreeing, cold_starts
+from stream_dmr.fitting.cold_start import NUM_STARTS, cold_starts
+from stream_dmr.fitting.heading import is_turned
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution
 from stream_dmr.fitting.target import Target
@@ -76,7 +77,12 @@ class BatchedFitter:
     ) -> tuple[Solutions, Tensor]:
         """The warm fits where they are good, else cold ones where these are clearly better."""
         found = Solutions.none(len(crops), like=self._solver.model.rest)
-        warm = [i for i, start in enumerate(warms) if start is not None]
+        headings = targets.heading.double().cpu().numpy()
+        warm = [
+            i
+            for i, (start, heading) in enumerate(zip(warms, headings, strict=True))
+            if start is not None and not is_turned(start, heading)
+        ]
         if warm:
             index = torch.tensor(warm, device=found.loss.device)
             some = targets.select(index)
@@ -97,8 +103,8 @@ class BatchedFitter:
         def starts(crop: FishCrop) -> Float[np.ndarray, "S P"]:
             target = Target.from_crop(crop, plane_normal=self._plane_normal)
             found = cold_starts(target, self._template)
-            # As many for each: those that agree, again and again.
-            return np.resize(agreeing(found, crop.ends, crop.crop_camera), found.shape)
+            # As many for each: where the heading is known, those that agree again and again.
+            return np.resize(found, (NUM_STARTS, found.shape[1]))
 
         with ThreadPoolExecutor() as pool:
             return self._solver.tensor(np.array(list(pool.map(starts, crops))))

@@ -12,10 +12,12 @@ from stream_dmr.errors import ConfigError
 from stream_dmr.fitting.batched.levenberg_marquardt import evaluate, minimise
 from stream_dmr.fitting.batched.model import Model
 from stream_dmr.fitting.batched.normal_equations import prior_loss
+from stream_dmr.fitting.batched.rotation import rotation
 from stream_dmr.fitting.batched.solutions import Solutions
 from stream_dmr.fitting.batched.targets import Targets
 from stream_dmr.fitting.contour.levenberg_marquardt import FAR, NEAR
 from stream_dmr.fitting.contour.solver import _NUM_FINISHED, _ROUNDS, mirror
+from stream_dmr.fitting.heading import TURNED
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution
 from stream_dmr.fitting.target import Target
@@ -104,10 +106,21 @@ class BatchedSolver:
                 iterations=iterations,
                 damping=FAR,
             )
-            flats = _ordered(rough.flat.view_as(flats), rough.loss.view(flats.shape[:2]))
+            ranks = self._ranked(targets, which[:, : flats.shape[1]].flatten(), rough).loss
+            flats = _ordered(rough.flat.view_as(flats), ranks.view(flats.shape[:2]))
+        best = self._ranked(targets, every, best)
         for column in range(min(_NUM_FINISHED, flats.shape[1])):
-            best = best.lower(self._refined(targets, every, flats[:, column]))
-        return best
+            other = self._refined(targets, every, flats[:, column])
+            best = best.lower(self._ranked(targets, every, other))
+        return best._replace(loss=best.loss - self._handicap(targets, every, best.flat))
+
+    def _ranked(self, targets: Targets, which: Tensor, found: Solutions) -> Solutions:
+        """As they compare; see `contour.solver`."""
+        return found._replace(loss=found.loss + self._handicap(targets, which, found.flat))
+
+    def _handicap(self, targets: Targets, which: Tensor, flats: Tensor) -> Float[Tensor, "B"]:
+        forward = -rotation(flats[:, :3])[0][:, :2, 0]
+        return TURNED * ((forward * targets.heading[which]).sum(dim=1) < 0)
 
     def _refined(self, targets: Targets, which: Tensor, starts: Tensor) -> Solutions:
         found = self._finished(targets, which, starts)

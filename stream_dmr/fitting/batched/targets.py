@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from stream_dmr.fitting.batched.distance_map import signed_distance
+from stream_dmr.fitting.heading import told
 from stream_dmr.fitting.target import Target, mask_contour
 from stream_dmr.messages import FishCrop
 
@@ -21,6 +22,7 @@ class Targets(NamedTuple):
     middle: Float[Tensor, "B 2"]  # the principal point
     anchor: Float[Tensor, "B 3"]
     plane_normal: Float[Tensor, "B 3"]
+    heading: Float[Tensor, "B 2"]
     mask: Float[Tensor, "B S S"]
     distance: Float[Tensor, "B S S"]
     mask_area: Float[Tensor, "B"]
@@ -41,6 +43,7 @@ class Targets(NamedTuple):
             middle=real([t.K[:2, 2] for t in targets]),
             anchor=real([t.anchor for t in targets]),
             plane_normal=real([t.plane_normal for t in targets]),
+            heading=real([t.heading for t in targets]),
             mask=real([t.mask for t in targets]),
             distance=real([t.distance for t in targets]),
             mask_area=real([t.mask_area for t in targets]),
@@ -71,6 +74,7 @@ class Targets(NamedTuple):
             middle=real([k[:2, 2] for k in K]),
             anchor=real([crop.crop_camera.middle_ray() for crop in crops]),
             plane_normal=real([plane_normal] * len(crops)),
+            heading=real([told(crop.ends, crop.crop_camera) for crop in crops]),
             mask=masks.to(dtype),
             distance=distance,
             mask_area=masks.sum(dim=(1, 2)).to(dtype),

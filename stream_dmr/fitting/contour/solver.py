@@ -16,7 +16,7 @@ from stream_dmr.fitting.contour.levenberg_marquardt import (
 )
 from stream_dmr.fitting.contour.normal_equations import prior_loss
 from stream_dmr.fitting.settings import FitMeshSettings
-from stream_dmr.fitting.solver import Solution
+from stream_dmr.fitting.solver import Solution, rank
 from stream_dmr.fitting.target import Target
 
 # Of a search: iterations of a round, and how many starts go into it at the most.
@@ -66,10 +66,10 @@ class ContourSolver:
         found = [self.refine(target, flats.pop(0))]
         for iterations, most in _ROUNDS:
             rough = [self._rough(coarse, flat, iterations) for flat in flats[:most]]
-            rough.sort(key=lambda solution: solution.loss)
+            rough.sort(key=lambda solution: rank(target, solution))
             flats = [solution.flat for solution in rough]
         found += [self.refine(target, flat) for flat in flats[:_NUM_FINISHED]]
-        return min(found, key=lambda solution: solution.loss)
+        return min(found, key=lambda solution: rank(target, solution))
 
     def _rough_loss(self, target: Target, flat: Float[np.ndarray, "P"]) -> float:
         terms, *_ = evaluate(self._coarse, self._kind, target, flat, False)
