@@ -15,6 +15,7 @@ from stream_dmr.segmentation.crop import CropFishSettings, crop_fish
 from stream_dmr.segmentation.detections import Detection
 from stream_dmr.segmentation.grabcut import GrabCut
 from stream_dmr.simulation.body import HALIBUT, JOINT_ARCS, body_mesh, keypoints
+from stream_dmr.simulation.body import Body as SimulatedBody
 from stream_dmr.simulation.render import draw_mask
 from stream_dmr.simulation.scene import Scene, Visit, make_scene
 from stream_dmr.template import Template, make_template
@@ -39,8 +40,13 @@ class Known(NamedTuple):
 
 
 def species_template() -> Template:
-    """The simulated species' mean body, with 577 vertices: as fine as the bundled templates."""
-    mesh = body_mesh(HALIBUT, num_rings=36, num_sides=16)
+    """The simulated species' mean body."""
+    return body_template(HALIBUT)
+
+
+def body_template(simulated: SimulatedBody) -> Template:
+    """A simulated body with 577 vertices: as fine as the bundled templates."""
+    mesh = body_mesh(simulated, num_rings=36, num_sides=16)
     points = {"keypoints": keypoints(), "joints": keypoints(JOINT_ARCS)}
     body = trimesh.Trimesh(mesh.points, mesh.faces, process=False)
     return make_template(body, points, name="simulated halibut")

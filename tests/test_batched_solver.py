@@ -39,6 +39,16 @@ def solver_on(device, *, dtype=torch.float64, **settings):
     return BatchedSolver(BODY, settings, coarse=COARSE, dtype=dtype)
 
 
+def backlog_on(device):
+    return BatchedFitter(
+        HALIBUT,
+        solver_on(device),
+        FitMeshSettings(),
+        plane_normal=PLANE_NORMAL,
+        clear_gain=0.01,
+    )
+
+
 def warm_fits(seed, *, batch=6, size=1.0):
     """Targets as the CPU has them, and starts some pixels off."""
     crops, flats = crops_of_poses("halibut", seed, batch=batch)
@@ -161,12 +171,8 @@ class TestFitter:
         crops, starts = [*crops[:2], *larger, *crops[2:]], moved(np.insert(flats, 2, more, 0), 9)
         # One that is warm and good, one cold, one whose warm start leads nowhere.
         warms = [starts[0], None, starts[2], starts[3] + [*[0] * 5, 3.0, *[0] * 26], starts[4]]
-        settings = FitMeshSettings()
-        fitter = Fitter(HALIBUT, settings, plane_normal=PLANE_NORMAL)
-        backlog = BatchedFitter(
-            HALIBUT, solver_on(device), settings, plane_normal=PLANE_NORMAL, clear_gain=0.01
-        )
-        found = backlog.fit(crops, warms)
+        fitter = Fitter(HALIBUT, FitMeshSettings(), plane_normal=PLANE_NORMAL)
+        found = backlog_on(device).fit(crops, warms)
         assert [one.is_cold for one in found] == [False, True, False, True, False]
         for one, crop, warm in zip(found, crops, warms, strict=True):
             expected = fitter.fit(crop, warm)
@@ -177,19 +183,12 @@ class TestFitter:
         """Each head at the other end than where the outline has it."""
         crops, _ = crops_of_poses("halibut", 9, batch=3)
         fitter = Fitter(HALIBUT, FitMeshSettings(), plane_normal=PLANE_NORMAL)
-        backlog = BatchedFitter(
-            HALIBUT,
-            solver_on(device),
-            FitMeshSettings(),
-            plane_normal=PLANE_NORMAL,
-            clear_gain=0.01,
-        )
         free = [fitter.fit(crop, None) for crop in crops]
         told = [
             replace(crop, ends=FishEnds(head_px=px[2], tail_px=px[0], confidence=0.99))
             for crop, px in zip(crops, (one.mesh.shape.keypoints_px for one in free), strict=True)
         ]
-        found = backlog.fit(told, [None, free[1].best, None])
+        found = backlog_on(device).fit(told, [None, free[1].best, None])
         assert all(one.is_cold for one in found)
         for one, crop in zip(found, told, strict=True):
             assert not is_turned(one.solution.flat, fitter.target(crop).heading)
@@ -201,14 +200,7 @@ class TestFitter:
         np.testing.assert_allclose(found.solution.flat, expected.best, rtol=1e-2, atol=1e-3)
 
     def test_no_crops_give_no_fits(self, device):
-        backlog = BatchedFitter(
-            HALIBUT,
-            solver_on(device),
-            FitMeshSettings(),
-            plane_normal=PLANE_NORMAL,
-            clear_gain=0.01,
-        )
-        assert backlog.fit([], []) == []
+        assert backlog_on(device).fit([], []) == []
 
 
 @every_device

@@ -1,0 +1,104 @@
+"""What would help: the error of lengths, were something known that no mask tells.
+
+    .venv/bin/python benchmarks/oracles.py [--scenes 4]     of every preset; three minutes
+
+Scenes of our own, 18 fish each; masks as the simulator's film has them, ragged and cut by gaffs.
+"""
+
+import argparse
+import os
+
+# Before numpy and torch are imported: the processes are the threads.
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+import multiprocessing
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from table1.fish import FISH_PER_SCENE, FRAMES_PER_SCENE, Haul, watch
+from targets import body_template
+
+from stream_dmr.config import Config
+from stream_dmr.messages import FishCrop, LengthEstimate
+from stream_dmr.run import later_nodes
+from stream_dmr.simulation.body import HALIBUT, Body
+from stream_dmr.simulation.fish import pose_fish
+from stream_dmr.simulation.scene import Scene, make_scene
+from stream_dmr.template import Template
+
+FIRST_SEED = 5000
+PRESETS = ("clean", "realistic", "severe")
+BODIES: dict[str, Callable[[Body], Body]] = {
+    "nothing": lambda own: HALIBUT,
+    "each fish's own body": lambda own: own,
+    "only how broad it is": lambda own: replace(HALIBUT, half_width=own.half_width),
+    "all of its body but how broad it is": lambda own: replace(own, half_width=HALIBUT.half_width),
+}
+SLANT = "how far the fish of its scene hang out of the plane (std of the prior)"
+
+
+def errors_of(task: tuple[str, int]) -> dict[str, list[float]]:
+    """Relative errors of the fish of one scene, by what was known."""
+    preset, seed = task
+    scene = make_scene(
+        num_fish=FISH_PER_SCENE, num_frames=FRAMES_PER_SCENE, preset=preset, seed=seed
+    )
+    haul = watch(scene, with_second=False)
+    bodies = {visit.fish.track_id: visit.fish.body for visit in scene.visits}
+    found = {
+        known: _errors(haul, lambda i, of=of: body_template(of(bodies[i])), Config())
+        for known, of in BODIES.items()
+    }
+    tilted = Config.model_validate({"fit_mesh": {"tilt_std_rad": slant_std_rad(scene)}})
+    found[SLANT] = _errors(haul, lambda i: body_template(HALIBUT), tilted)
+    return found
+
+
+def slant_std_rad(scene: Scene) -> float:
+    """Root mean square over the fish of their mean angle with the reference plane."""
+    normal = scene.calibration.plane.rotation[:, 2]
+    slants = []
+    for visit in scene.visits:
+        posed = (pose_fish(visit.fish, p, calibration=scene.calibration) for p in visit.poses)
+        chords = [fish.keypoints[0] - fish.keypoints[2] for fish in posed]
+        slants.append(np.mean([np.arcsin(c @ normal / np.linalg.norm(c)) for c in chords]))
+    return float(np.sqrt(np.mean(np.square(slants))))
+
+
+def _errors(haul: Haul, template_of: Callable[[int], Template], config: Config) -> list[float]:
+    tracks: dict[int, list[FishCrop]] = {}
+    for sighting in (sighting for frame in haul.frames for sighting in frame):
+        tracks.setdefault(sighting.crop.track_id, []).append(sighting.crop)
+    errors = []
+    for track_id, crops in tracks.items():
+        fit, localize, smooth = later_nodes(
+            config, template=template_of(track_id), calibration=haul.calibration
+        )
+        for crop in crops:
+            for mesh in fit.step(crop):
+                for fish in localize.step(mesh):
+                    smooth.step(fish)
+        for estimate in smooth.close():
+            if isinstance(estimate, LengthEstimate) and estimate.length_mm is not None:
+                errors.append(estimate.length_mm / haul.truth_mm[track_id] - 1)
+    return errors
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scenes", type=int, default=4, help="of every preset")
+    parser.add_argument("--processes", type=int, default=2)
+    asked = parser.parse_args()
+    tasks = [(preset, FIRST_SEED + k) for k in range(asked.scenes) for preset in PRESETS]
+    with multiprocessing.get_context("spawn").Pool(asked.processes) as pool:
+        scenes = pool.map(errors_of, tasks, chunksize=1)
+    print("| if one knew | fish | mean error | bias |\n|---|---|---|---|")
+    for known in scenes[0]:
+        errors = 100 * np.concatenate([scene[known] for scene in scenes])
+        print(f"| {known} | {len(errors)} | {abs(errors).mean():.2f} % | {errors.mean():+.2f} % |")
+
+
+if __name__ == "__main__":
+    main()
