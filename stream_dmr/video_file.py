@@ -147,6 +147,7 @@ def _why_unreadable(path: Path, start: bytes) -> str:
 
 def _has_index(path: Path) -> bool:
     """Does an MP4 have its `moov` box? Walks the boxes at the top: size (4 bytes), name (4)."""
+    end = path.stat().st_size
     with path.open("rb") as file:
         while len(head := file.read(16)) >= 8:
             size, name = int.from_bytes(head[:4]), head[4:8]
@@ -154,7 +155,7 @@ def _has_index(path: Path) -> bool:
                 return True
             if size == 1:  # the true size follows in 8 bytes
                 size = int.from_bytes(head[8:16])
-            if size < 8:
+            if not 8 <= size <= end:  # damaged
                 return False
             file.seek(size - len(head), os.SEEK_CUR)
     return False

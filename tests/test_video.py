@@ -131,11 +131,13 @@ def test_refuses_what_is_no_video(tmp_path, capfd):
     with wave.open(str(tmp_path / "sound.wav"), "wb") as sound:
         sound.setparams((1, 2, 8000, 0, "NONE", ""))
         sound.writeframes(bytes(16000))
+    (tmp_path / "huge.mp4").write_bytes(b"\0\0\0\1ftyp" + 8 * b"\xff")  # says a box of its size
     write_video(tmp_path / "whole.mp4", codec="mp4v")
     assert "empty file" in refusal(tmp_path / "empty.mp4")
     assert "no picture in it can be decoded" in refusal(tmp_path / "noise.mp4")
     assert "text file" in refusal(tmp_path / "boxes.txt")
     assert "audio file" in refusal(tmp_path / "sound.wav")
+    assert "(moov)" in refusal(tmp_path / "huge.mp4")
     assert "(moov)" in refusal(cut(tmp_path / "whole.mp4"))
     assert "no such file" in refusal(tmp_path / "missing.mp4")
     assert capfd.readouterr() == ("", "")  # neither OpenCV nor FFmpeg speaks
