@@ -25,9 +25,9 @@ from stream_dmr.errors import TemplateError
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import NEAR, evaluate, minimise
 from stream_dmr.fitting.contour.normal_equations import prior_loss
-from stream_dmr.fitting.fit import Fitter
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
+from stream_dmr.fitting.tracks import TrackFitter
 from stream_dmr.localization import LocalizeSettings, localize
 from stream_dmr.messages import FishCrop
 from stream_dmr.proportions import NUM_KNOTS, Proportions
@@ -89,16 +89,15 @@ def well_seen(
     order = count()
     for number, (crops, calibration) in enumerate(recordings):
         normal = None if calibration is None else calibration.plane.rotation[:, 2]
-        fitter = Fitter(template, settings, plane_normal=normal)
-        warm: dict[int, np.ndarray | None] = {}
+        tracks = TrackFitter(template, settings, plane_normal=normal)
         for crop in crops:
-            mesh, warm[crop.track_id] = fitter.fit(crop, warm.get(crop.track_id))
+            mesh = tracks.fit(crop)
             place = localize(mesh, settings=gates, calibration=calibration)
             if mesh.shape is None or not place.accepted:
                 continue
             is_straight = place.bending_ratio is not None and place.bending_ratio <= _MOST_BENT
             if is_straight and mesh.shape.iou >= _LEAST_IOU:
-                target = fitter.target(crop)
+                target = tracks.fitter.target(crop)
                 key = number, crop.track_id
                 sample = Sample(key, mesh.shape.iou, target, mesh.shape.parameters.copy())
                 heapq.heappush(fish[key], (sample.iou, next(order), sample))

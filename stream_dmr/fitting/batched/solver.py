@@ -115,7 +115,7 @@ class BatchedSolver:
         return best._replace(loss=best.loss - self._handicap(targets, every, best.flat))
 
     def _ranked(self, targets: Targets, which: Tensor, found: Solutions) -> Solutions:
-        """As they compare; see `contour.solver`."""
+        """As they compare; see `fitting.solver.rank`."""
         return found._replace(loss=found.loss + self._handicap(targets, which, found.flat))
 
     def _handicap(self, targets: Targets, which: Tensor, flats: Tensor) -> Float[Tensor, "B"]:
