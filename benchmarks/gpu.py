@@ -69,7 +69,7 @@ def main() -> None:
     pairs = [pair._replace(plane_normal=pairs[0].plane_normal) for pair in pairs]
     befores = [setup.before(pair) for pair in pairs]
     settings = FitMeshSettings(device=arguments.device)
-    solver = BatchedSolver(setup.body, settings)
+    solver = BatchedSolver(setup.bodies, settings)
     peak = peak_of(arguments.device)
     if arguments.device == "cpu":
         torch.set_num_threads(1)
@@ -122,7 +122,7 @@ def measure(batch: Batch) -> None:
 
 def agreement(setup: Setup, pairs: Sequence[Pair], befores: list, batch: Batch) -> None:
     """How far from the compiled solver the batch ended."""
-    compiled = ContourSolver(setup.body, setup.settings)
+    compiled = ContourSolver(setup.bodies, setup.settings)
     gaps = []
     for index, pair in enumerate(pairs):
         target, start = setup.start(pair)

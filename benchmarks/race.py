@@ -16,10 +16,9 @@ from clock import Took, took, typical
 from jaxtyping import Float
 from targets import Pair
 
-from stream_dmr.body import Body
 from stream_dmr.fitting import adam
 from stream_dmr.fitting.adam import AdamSolver
-from stream_dmr.fitting.bodies import coarse_body
+from stream_dmr.fitting.bodies import Bodies
 from stream_dmr.fitting.cold_start import cold_starts
 from stream_dmr.fitting.contour.solver import ContourSolver
 from stream_dmr.fitting.fit import Fitter
@@ -75,8 +74,7 @@ class Race:
 
     def __init__(self, template: Template) -> None:
         self._template = template
-        self._body = Body.from_template(template)
-        self._coarse = coarse_body(template, self._body)
+        self._bodies = Bodies.of(template, max_faces=FitMeshSettings().max_faces)
         patient = FitMeshSettings(solver="adam", adam_iterations=CAP, tolerance=1e-12)
         self._adam = AdamSolver(template, patient)
         self._deodr = None
@@ -104,7 +102,7 @@ class Race:
     def _warm(
         self, pair: Pair, before: Float[np.ndarray, "P"]
     ) -> dict[str, Callable[[], Took | None]]:
-        return self._from(pair, lambda t: recentered(self._body, 0, t, before), near=True)
+        return self._from(pair, lambda t: recentered(self._bodies.fine, 0, t, before), near=True)
 
     def _from(
         self, pair: Pair, start: Callable[[Target], Float[np.ndarray, "P"]], *, near: bool
@@ -114,7 +112,7 @@ class Race:
 
         def by_contour(settings: FitMeshSettings) -> None:
             target = _target(pair)
-            _Watched(self._body, settings).refine(target, start(target))
+            _Watched(self._bodies, settings).refine(target, start(target))
 
         def by_adam() -> None:
             target = _target(pair)
@@ -133,7 +131,7 @@ class Race:
         def by_contour() -> None:
             target = _target(pair)
             starts = cold_starts(target, self._template)
-            _Watched(self._body, FitMeshSettings(), coarse=self._coarse).search(target, starts)
+            _Watched(self._bodies, FitMeshSettings()).search(target, starts)
 
         def by_adam() -> None:
             target = _target(pair)
@@ -166,7 +164,7 @@ class Race:
 
     def _known_start(self, target: Target) -> Float[np.ndarray, "P"] | None:
         """The first cold start that leads the contour solver to the goal."""
-        solver = _Watched(self._body, FitMeshSettings())
+        solver = _Watched(self._bodies, FitMeshSettings())
         for start in cold_starts(target, self._template):
             try:
                 solver.refine(target, start)

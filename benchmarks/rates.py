@@ -15,8 +15,9 @@ from clock import Took, took, typical
 from jaxtyping import Float
 from targets import Known, Pair
 
-from stream_dmr.body import Body, rest_vector
+from stream_dmr.body import rest_vector
 from stream_dmr.fitting.adam import AdamSolver
+from stream_dmr.fitting.bodies import Bodies
 from stream_dmr.fitting.contour import (
     deformation,
     levenberg_marquardt,
@@ -71,8 +72,9 @@ class Setup:
 
     def __init__(self, template: Template) -> None:
         self.template = template
-        self.body = Body.from_template(template)
         self.settings = FitMeshSettings()
+        self.bodies = Bodies.of(template, max_faces=self.settings.max_faces)
+        self.body = self.bodies.fine
 
     def fitter(self, pair: Pair) -> Fitter:
         """As the chain makes it, for the pair's reference plane."""
@@ -93,7 +95,7 @@ class Setup:
 def warm(setup: Setup, pair: Pair) -> Warm:
     """A fit that starts from the frame before."""
     fitter, before = setup.fitter(pair), setup.before(pair)
-    solver = ContourSolver(setup.body, setup.settings)
+    solver = ContourSolver(setup.bodies, setup.settings)
     target, start = setup.start(pair)
     found = solver.refine(target, start)
     return Warm(
@@ -142,8 +144,8 @@ def losses(setup: Setup, pair: Pair) -> Losses:
     bare = FitMeshSettings(prior_weight=0.0)
     patient = FitMeshSettings(solver="adam", adam_iterations=ADAM_ITERATIONS, tolerance=1e-12)
     ends = (
-        ContourSolver(setup.body, setup.settings).refine(target, start),
-        ContourSolver(setup.body, bare).refine(target, start),
+        ContourSolver(setup.bodies, setup.settings).refine(target, start),
+        ContourSolver(setup.bodies, bare).refine(target, start),
         AdamSolver(setup.template, patient).refine(target, start),
     )
     lambdas = setup.settings.lambdas()
@@ -155,7 +157,7 @@ def fit_parts(setup: Setup, pair: Pair) -> dict[str, Callable[[], object]]:
     """What a warm `Fitter.fit` does, each part to be timed by itself."""
     body, settings, before = setup.body, setup.settings, setup.before(pair)
     target, start = setup.start(pair)
-    solver = ContourSolver(body, settings)
+    solver = ContourSolver(setup.bodies, settings)
     flat = solver.refine(target, start).flat
     _, _, points, pixels, rim, covered = evaluate(body, SPINE, target, flat, True)
     mask, fitter = pair.now.mask, setup.fitter(pair)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from batches import (
-    BODIES,
     PLANE_NORMAL,
     TEMPLATES,
     crops_of_poses,
@@ -20,7 +19,7 @@ from stream_dmr.fitting.batched.fitter import BatchedFitter
 from stream_dmr.fitting.batched.levenberg_marquardt import minimise
 from stream_dmr.fitting.batched.solver import BatchedSolver
 from stream_dmr.fitting.batched.targets import Targets
-from stream_dmr.fitting.bodies import coarse_body
+from stream_dmr.fitting.bodies import Bodies
 from stream_dmr.fitting.cold_start import cold_starts
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.solver import ContourSolver
@@ -30,13 +29,13 @@ from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solver
 from stream_dmr.messages import FishEnds
 
-BODY, HALIBUT = BODIES["halibut"], TEMPLATES["halibut"]
-COARSE = coarse_body(HALIBUT, BODY)
+HALIBUT = TEMPLATES["halibut"]
+MESHES = Bodies.of(HALIBUT, max_faces=3000)
 
 
 def solver_on(device, *, dtype=torch.float64, **settings):
     settings = FitMeshSettings(device=device, **settings)
-    return BatchedSolver(BODY, settings, coarse=COARSE, dtype=dtype)
+    return BatchedSolver(MESHES, settings, dtype=dtype)
 
 
 def backlog_on(device):
@@ -67,7 +66,7 @@ class TestRefine:
     def test_goes_the_way_of_the_compiled_solver(self, device, kind, size):
         targets, starts = warm_fits(1, size=size)
         solver = solver_on(device, deformation=kind)
-        compiled = ContourSolver(BODY, FitMeshSettings(deformation=kind))
+        compiled = ContourSolver(MESHES, FitMeshSettings(deformation=kind))
         expected = [compiled.refine(*job) for job in zip(targets, starts, strict=True)]
         found = refined(solver, targets, starts)
         gaps = np.array([abs(a.loss - b.loss) for a, b in zip(found, expected, strict=True)])
@@ -141,7 +140,7 @@ def test_search_ends_where_the_compiled_one_does(device):
     crops, _ = crops_of_poses("halibut", 7, batch=3)
     targets, _ = targets_of(crops, "cpu")
     starts = np.stack([cold_starts(target, HALIBUT) for target in targets])
-    solver, compiled = solver_on(device), ContourSolver(BODY, FitMeshSettings(), coarse=COARSE)
+    solver, compiled = solver_on(device), ContourSolver(MESHES, FitMeshSettings())
     stacked = Targets.stack(targets, device=device, dtype=solver.dtype)
     together = solver.search_many(stacked, solver.tensor(starts)).to_list()
     for found, target, some in zip(together, targets, starts, strict=True):

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from shapes import STRAIGHT, crop_camera, crop_from_mask, crop_of, fish_template, picture, seeds
 
 from stream_dmr.body import JOINT, ROOT, Body, rest_vector
+from stream_dmr.fitting.bodies import Bodies
 from stream_dmr.fitting.contour import levenberg_marquardt
 from stream_dmr.fitting.contour.deformation import KINDS, deform
 from stream_dmr.fitting.contour.levenberg_marquardt import (
@@ -266,7 +267,7 @@ class TestMirror:
         flat = rest_parameters(2)
         flat[0, :3], flat[0, 5] = torch.as_tensor(root.as_rotvec()), np.log(0.25)
         target = target_of(flat, plane_normal=np.ascontiguousarray(normal))
-        solver = ContourSolver(BODY, SETTINGS)
+        solver = ContourSolver(Bodies(BODY, BODY, BODY), SETTINGS)
         for start in (flat[0].numpy(), mirror(flat[0].numpy())):
             found = solver.refine(target, start)
             along = Rotation.from_rotvec(found.flat[:3]).as_matrix()[:, 0]

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stream_dmr.body import Body, rest_vector
+from stream_dmr.fitting.bodies import Bodies
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import NEAR, evaluate, minimise
 from stream_dmr.fitting.contour.normal_equations import prior_loss
@@ -20,6 +21,7 @@ from stream_dmr.template import load_template
 OFFSETS = np.linspace(-0.3, 0.3, 13)
 FIVE = np.array([-0.1, -0.04, 0.0, 0.04, 0.1])
 BODY = Body.from_template(load_template("halibut"))
+BODIES = Bodies(BODY, BODY, BODY)
 SETTINGS = FitMeshSettings()
 LAMBDAS = SETTINGS.rough_lambdas()
 
@@ -53,7 +55,7 @@ def test_without_any_preference_nothing_is_known():
 def known():
     """Three targets, and the fits found from near the truth."""
     crops, flats = crops_of_poses("halibut", 5, batch=3)
-    solver = ContourSolver(BODY, SETTINGS)
+    solver = ContourSolver(BODIES, SETTINGS)
     targets = [Target.from_crop(crop, plane_normal=PLANE_NORMAL) for crop in crops]
     starts = moved(flats, 5)
     return [(t, solver.refine(t, s), f) for t, s, f in zip(targets, starts, flats, strict=True)]
@@ -116,7 +118,7 @@ def test_behind_a_hopeless_size_none_is_tried(known):
 
 def test_known_fish_have_the_size_to_be_expected(known):
     """To a few percent by one mask, and within what the std says."""
-    scanner = SizeScanner(BODY, SETTINGS)
+    scanner = SizeScanner(BODIES, SETTINGS)
     for target, best, flat in known:
         sized, std = scanner.expected(target, best)
         assert sized.flat[SIZE] == pytest.approx(flat[SIZE], abs=3 * std + 0.01)
@@ -127,7 +129,7 @@ def test_known_fish_have_the_size_to_be_expected(known):
 def test_rougher_edges_say_less(known):
     target, best, _ = known[0]
     stds = [
-        SizeScanner(BODY, FitMeshSettings(edge_std_px=px)).expected(target, best)[1]
+        SizeScanner(BODIES, FitMeshSettings(edge_std_px=px)).expected(target, best)[1]
         for px in (0.5, 1.0, 2.0)
     ]
     assert stds == sorted(stds)

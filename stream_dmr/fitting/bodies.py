@@ -1,5 +1,7 @@
 """The meshes that a fit works with: as fine as it takes, and no finer, since rims cost time."""
 
+from typing import NamedTuple
+
 from stream_dmr.body import Body
 from stream_dmr.template import Template, simplified
 
@@ -9,14 +11,22 @@ _COARSE_FACES = 600
 _PLACES_PER_SEGMENT = 4
 
 
-def fine_body(template: Template, body: Body, *, max_faces: int) -> Body:
-    """What a fit ends with: the template's own `body`, where it has no more faces than this."""
-    fewer = simplified(template, max_faces=max_faces)
-    if fewer is template:
-        return body
-    return Body.from_template(fewer, places_per_segment=_PLACES_PER_SEGMENT)
+class Bodies(NamedTuple):
+    """One template three times; those that need no simplifying are the same."""
 
+    whole: Body  # the template's own mesh, which is recorded
+    fine: Body  # what a fit ends with
+    coarse: Body  # what poses and sizes are compared with, on half the resolution
 
-def coarse_body(template: Template, body: Body) -> Body:
-    """What poses and sizes are compared with on half the resolution."""
-    return fine_body(template, body, max_faces=_COARSE_FACES)
+    @classmethod
+    def of(cls, template: Template, *, max_faces: int) -> "Bodies":
+        """`max_faces` of the fine one."""
+        whole = Body.from_template(template)
+
+        def reduced(faces: int) -> Body:
+            fewer = simplified(template, max_faces=faces)
+            if fewer is template:
+                return whole
+            return Body.from_template(fewer, places_per_segment=_PLACES_PER_SEGMENT)
+
+        return cls(whole, reduced(max_faces), reduced(_COARSE_FACES))

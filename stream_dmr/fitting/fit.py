@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from stream_dmr.body import Body
 from stream_dmr.camera import frame_from_crop
-from stream_dmr.fitting.bodies import coarse_body, fine_body
+from stream_dmr.fitting.bodies import Bodies
 from stream_dmr.fitting.cold_start import cold_starts
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
@@ -60,16 +59,14 @@ class Fitter:
         self._plane_normal = np.ascontiguousarray(normal)
         self._template = template
         self._settings = settings
-        self._body = Body.from_template(template)
-        self._fine_body = fine_body(template, self._body, max_faces=settings.max_faces)
-        self._coarse_body = coarse_body(template, self._body)
+        self._bodies = Bodies.of(template, max_faces=settings.max_faces)
         self._kind = KINDS[settings.deformation]
         self._solver = self._make_solver()
-        self._scanner = SizeScanner(self._fine_body, settings, coarse=self._coarse_body)
+        self._scanner = SizeScanner(self._bodies, settings)
 
     def _make_solver(self) -> Solver:
         if self._settings.solver == "contour":
-            return ContourSolver(self._fine_body, self._settings, coarse=self._coarse_body)
+            return ContourSolver(self._bodies, self._settings)
         from stream_dmr.fitting.adam import AdamSolver  # torch takes a second to import
 
         return AdamSolver(self._template, self._settings)
@@ -146,7 +143,7 @@ class Fitter:
 
         return BatchedFitter(
             self._template,
-            BatchedSolver(self._fine_body, self._settings, coarse=self._coarse_body),
+            BatchedSolver(self._bodies, self._settings),
             self._settings,
             plane_normal=self._plane_normal,
             clear_gain=_CLEAR_GAIN,
@@ -178,7 +175,7 @@ class Fitter:
         """
         solution = None
         if warm is not None and not is_turned(warm, target.heading):
-            start = recentered(self._fine_body, self._kind, target, warm)
+            start = recentered(self._bodies.fine, self._kind, target, warm)
             solution = self._solver.refine(target, start)
             if solution.iou >= self._settings.cold_below_iou:
                 return solution, False
@@ -191,12 +188,12 @@ class Fitter:
         self, target: Target, solution: Solution, crop: FishCrop, size_std: float | None
     ) -> FittedShape:
         """`size_std` of the log size, where it is known better than by the covariance."""
-        flat, v = solution.flat, self._body.num_vertices
+        flat, v = solution.flat, self._bodies.whole.num_vertices
         terms, iou, points, pixels, rim, covered = evaluate(
-            self._body, self._kind, target, flat, True
+            self._bodies.whole, self._kind, target, flat, True
         )
         spread, length_std = covariance(
-            self._body,
+            self._bodies.whole,
             target,
             self._settings,
             flat,

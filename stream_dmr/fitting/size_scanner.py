@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
-from stream_dmr.body import Body, rest_vector
+from stream_dmr.body import rest_vector
+from stream_dmr.fitting.bodies import Bodies
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import EXHAUSTED, NEAR, STOP_REASONS, minimise
 from stream_dmr.fitting.contour.size_scan import SIZE, only_size, scan_sizes
@@ -34,13 +35,10 @@ _STEEPEST_END = 10.0  # nats per unit of log size: past the ends sizes get at le
 class SizeScanner:
     """Tries the sizes of one template."""
 
-    def __init__(
-        self, body: Body, settings: FitMeshSettings, *, coarse: Body | None = None
-    ) -> None:
-        """`coarse` is the same body of fewer faces, to compare sizes with; or `body` itself."""
-        self._body, self._coarse, self._settings = body, coarse or body, settings
+    def __init__(self, bodies: Bodies, settings: FitMeshSettings) -> None:
+        self._body, self._coarse, self._settings = bodies.fine, bodies.coarse, settings
         self._kind = KINDS[settings.deformation]
-        self._rest = rest_vector(len(body.joints))
+        self._rest = rest_vector(len(bodies.fine.joints))
         # The mesh's smoothness tells sizes apart no better, and is dear.
         self._lambdas, self._priors = settings.rough_lambdas(), settings.priors()
 

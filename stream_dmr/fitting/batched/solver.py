@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stream_dmr.body import Body
 from stream_dmr.errors import ConfigError
 from stream_dmr.fitting.batched.levenberg_marquardt import evaluate, minimise
 from stream_dmr.fitting.batched.model import Model
@@ -15,6 +14,7 @@ from stream_dmr.fitting.batched.normal_equations import prior_loss
 from stream_dmr.fitting.batched.rotation import rotation
 from stream_dmr.fitting.batched.solutions import Solutions
 from stream_dmr.fitting.batched.targets import Targets
+from stream_dmr.fitting.bodies import Bodies
 from stream_dmr.fitting.contour.levenberg_marquardt import FAR, NEAR
 from stream_dmr.fitting.contour.solver import _NUM_FINISHED, _ROUNDS, mirror
 from stream_dmr.fitting.heading import TURNED
@@ -33,16 +33,12 @@ class BatchedSolver:
 
     def __init__(
         self,
-        body: Body,
+        bodies: Bodies,
         settings: FitMeshSettings,
         *,
-        coarse: Body | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        """`coarse` is `ContourSolver`'s.
-
-        Raises ConfigError where the settings name a device that is not there.
-        """
+        """Raises ConfigError where the settings name a device that is not there."""
         if settings.device == "cuda" and not torch.cuda.is_available():
             raise ConfigError(
                 "[fit_mesh]: expected a CUDA device and a CUDA build of torch for "
@@ -50,8 +46,8 @@ class BatchedSolver:
             )
         self._settings = settings
         self._kind = {"device": settings.device, "dtype": dtype}
-        self.model = Model.from_body(body, settings, **self._kind)
-        self._coarse = Model.from_body(coarse or body, settings, **self._kind)
+        self.model = Model.from_body(bodies.fine, settings, **self._kind)
+        self._coarse = Model.from_body(bodies.coarse, settings, **self._kind)
         self._mirror = self.tensor(mirror(np.ones(len(self.model.rest))))
         # The mesh's smoothness tells starts apart no better.
         self._rough_lambdas = self.tensor(settings.rough_lambdas())

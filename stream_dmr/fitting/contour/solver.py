@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.body import JOINT, ROOT, Body, rest_vector
+from stream_dmr.fitting.bodies import Bodies
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import (
     FAR,
@@ -27,14 +28,11 @@ _NUM_FINISHED = 2
 class ContourSolver:
     """Levenberg-Marquardt on contour residuals, judged by the paper's L_rec."""
 
-    def __init__(
-        self, body: Body, settings: FitMeshSettings, *, coarse: Body | None = None
-    ) -> None:
-        """`coarse` is the same body of fewer faces, to look around with; or `body` itself."""
-        self._body, self._coarse = body, coarse or body
+    def __init__(self, bodies: Bodies, settings: FitMeshSettings) -> None:
+        self._body, self._coarse = bodies.fine, bodies.coarse
         self._settings = settings
         self._kind = KINDS[settings.deformation]
-        self._rest = rest_vector(len(body.joints))
+        self._rest = rest_vector(len(bodies.fine.joints))
         self._lambdas, self._priors = settings.lambdas(), settings.priors()
         self._rough_lambdas = settings.rough_lambdas()
 
