@@ -58,15 +58,17 @@ class Body(NamedTuple):
         fractions = where - segments
         start, step = template.midline[:-1], np.diff(template.midline, axis=0)
         edges, edge_faces = _edges(template.faces)
+        # Copies, since those of a recording are read-only: for numba that is another type of array,
+        # for which it would make all machine code anew.
         return cls(
             points=points,
             places=start[segments] + fractions[:, None] * step[segments],
             place_of=place_of,
             segments=segments,
             fractions=fractions,
-            joints=template.joints,
-            midline=template.midline,
-            faces=template.faces,
+            joints=template.joints.copy(),
+            midline=template.midline.copy(),
+            faces=template.faces.copy(),
             edges=edges,
             edge_faces=edge_faces,
             num_neighbors=np.bincount(edges.ravel()),

@@ -1,4 +1,4 @@
-"""What is rehearsed before a camera's first frame is all that its frames will call."""
+"""What is rehearsed before a camera's first frame is all that its frames will call, and replays."""
 
 import subprocess
 import sys
@@ -6,6 +6,8 @@ from pathlib import Path
 
 CODE = """
 import gc
+import threading
+from pathlib import Path
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 from shapes import crop_of, pose
@@ -13,6 +15,7 @@ from nodes.fit_mesh import FitMesh
 from stream_dmr.fitting.fit import Fitter
 from stream_dmr.fitting.rehearsal import rehearse
 from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.replay.replay import ReplayRequest, replay
 from stream_dmr.skinning import Rig
 from stream_dmr.template import load_template
 
@@ -28,6 +31,9 @@ assert sum(rehearsed.values()) > 10, rehearsed
 node = FitMesh(FitMeshSettings(), template=template, calibration=None)
 for seed in (1, 1, 2):
     node.step(crop_of(pose(np.random.default_rng(seed), in_plane_rad=1.0), rig))
+assert compiled() == rehearsed, (compiled(), rehearsed)
+golden = Path("../recordings/golden/recording.mcap")
+replay(ReplayRequest(recordings=[golden], first="fit"), stop=threading.Event())
 assert compiled() == rehearsed, (compiled(), rehearsed)
 """
 

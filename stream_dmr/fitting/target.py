@@ -36,7 +36,7 @@ class Target(NamedTuple):
     def from_crop(cls, crop: FishCrop, *, plane_normal: Float[np.ndarray, "3"]) -> "Target":
         """Distance map, contour, heading and camera of a crop with a mask."""
         return cls(
-            np.ascontiguousarray(crop.crop_camera.K),
+            crop.crop_camera.K.copy(),  # see Body.from_template
             crop.crop_camera.middle_ray(),
             plane_normal,
             told(crop.ends, crop.crop_camera),
