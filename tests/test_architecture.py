@@ -3,6 +3,7 @@
 import ast
 import inspect
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import get_args, get_type_hints
 
@@ -93,8 +94,16 @@ def module_of(path: Path) -> str:
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
-def imports(path: Path, *, top_only: bool = False) -> Iterator[str]:
+MODULES = {module_of(path) for path in FILES}
+
+
+@cache
+def imports(path: Path, *, top_only: bool = False) -> list[str]:
     """The modules that a file imports; `from package import module` as the module."""
+    return list(_imports(path, top_only=top_only))
+
+
+def _imports(path: Path, *, top_only: bool) -> Iterator[str]:
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in tree.body if top_only else ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -102,8 +111,7 @@ def imports(path: Path, *, top_only: bool = False) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: imports are absolute here"
             names = {f"{node.module}.{alias.name}" for alias in node.names}
-            modules = names & {module_of(file) for file in FILES}
-            yield from modules or {str(node.module)}
+            yield from names & MODULES or {str(node.module)}
 
 
 def is_inside(module: str, rooms: list[str]) -> bool:
