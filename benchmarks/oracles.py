@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from table1.dmr import through_all
 from table1.fish import FISH_PER_SCENE, FRAMES_PER_SCENE, Haul, watch
 from targets import body_template
 
@@ -72,16 +73,12 @@ def _errors(haul: Haul, template_of: Callable[[int], Template], config: Config) 
         tracks.setdefault(sighting.crop.track_id, []).append(sighting.crop)
     errors = []
     for track_id, crops in tracks.items():
-        fit, localize, smooth = later_nodes(
-            config, template=template_of(track_id), calibration=haul.calibration
-        )
-        for crop in crops:
-            for mesh in fit.step(crop):
-                for fish in localize.step(mesh):
-                    smooth.step(fish)
-        for estimate in smooth.close():
-            if isinstance(estimate, LengthEstimate) and estimate.length_mm is not None:
-                errors.append(estimate.length_mm / haul.truth_mm[track_id] - 1)
+        nodes = later_nodes(config, template=template_of(track_id), calibration=haul.calibration)
+        final = [
+            m for m in through_all(crops, nodes) if isinstance(m, LengthEstimate) and m.is_final
+        ]
+        lengths_mm = [estimate.length_mm for estimate in final if estimate.length_mm is not None]
+        errors += [length_mm / haul.truth_mm[track_id] - 1 for length_mm in lengths_mm]
     return errors
 
 

@@ -213,21 +213,15 @@ import time
 began = time.perf_counter()
 import sys
 sys.path.insert(0, "benchmarks")
-import cv2, numpy as np
-from targets import crop_of_mask, species_template
-from stream_dmr.camera import Camera
-from stream_dmr.fitting.distance_map import signed_distance
+from targets import species_template
 from stream_dmr.fitting.fit import Fitter
+from stream_dmr.fitting.rehearsal import rehearse
 from stream_dmr.fitting.settings import FitMeshSettings
-mask = cv2.ellipse(np.zeros((128, 128), np.uint8), (64, 64), (45, 16), 20, 0, 360, 1, -1) > 0
-crop = crop_of_mask(mask, Camera.nominal(width=128, height=128))
 fitter = Fitter(species_template(), FitMeshSettings())
 ready = time.perf_counter()
-flat = fitter.fit(crop, None).best
-fitter.fit(crop, flat)
+rehearse(fitter)
 first = time.perf_counter()
-fitter.fit(crop, None)
-fitter.fit(crop, flat)
+rehearse(fitter)
 print(ready - began, first - ready, time.perf_counter() - first)
 """
 

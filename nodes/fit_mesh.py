@@ -22,8 +22,7 @@ class FitMesh:
         template: Template,
         calibration: Calibration | None,
     ) -> None:
-        normal = None if calibration is None else calibration.plane.rotation[:, 2]
-        self._tracks = TrackFitter(template, settings, plane_normal=normal)
+        self._tracks = TrackFitter(template, settings, calibration=calibration)
 
     def step(self, crop: FishCrop, /) -> list[FittedMesh]:
         """Fit one crop; what can't be fitted is passed on with its reason."""

@@ -88,8 +88,7 @@ def well_seen(
     settings = settings.model_copy(update={"scan_iterations": 0})
     order = count()
     for number, (crops, calibration) in enumerate(recordings):
-        normal = None if calibration is None else calibration.plane.rotation[:, 2]
-        tracks = TrackFitter(template, settings, plane_normal=normal)
+        tracks = TrackFitter(template, settings, calibration=calibration)
         for crop in crops:
             mesh = tracks.fit(crop)
             place = localize(mesh, settings=gates, calibration=calibration)

@@ -169,9 +169,7 @@ class TestDamage:
                 open_recordings([run[0]]).payloads(TOPICS, part)
             )
 
-    @settings(
-        max_examples=2, deadline=None
-    )  # a process of some seconds each; more in the slow test
+    @settings(max_examples=2, deadline=None)  # a process each; more in the slow test
     @given(seed=st.integers(0, 2**32))
     def test_a_flipped_byte_of_an_rrd_changes_no_message(self, run, tmp_path_factory, seed):
         _check_flip(run[0] / "recording.rrd", tmp_path_factory.mktemp("flip"), seed)
@@ -181,9 +179,7 @@ class TestDamage:
     def test_what_is_whole_of_a_torn_file_is_used(self, run, tmp_path_factory, share):
         _check_truncation(run[0] / "recording.mcap", tmp_path_factory.mktemp("torn"), share)
 
-    @settings(
-        max_examples=2, deadline=None
-    )  # a process of some seconds each; more in the slow test
+    @settings(max_examples=2, deadline=None)  # a process each; more in the slow test
     @given(share=st.floats(0.3, 0.95))
     def test_what_is_whole_of_a_torn_rrd_is_used(self, run, tmp_path_factory, share):
         _check_truncation(run[0] / "recording.rrd", tmp_path_factory.mktemp("torn"), share)

@@ -86,10 +86,11 @@ def _fit_once(
         for bending in (True, False)
     )
     meshes = _through(crops, bent[0])
-    return _through_all(meshes, bent[1:]), _through_all(meshes, flat[1:])
+    return through_all(meshes, bent[1:]), through_all(meshes, flat[1:])
 
 
-def _through_all(messages: Sequence[Message], nodes: Sequence[Node]) -> list[Message]:
+def through_all(messages: Sequence[Message], nodes: Sequence[Node]) -> list[Message]:
+    """What all of these nodes say, one after the other."""
     said: list[Message] = []
     for node in nodes:
         messages = _through(messages, node)

@@ -10,7 +10,7 @@ from stream_dmr.camera import Camera
 from stream_dmr.fitting.fit import Fitter
 from stream_dmr.messages import CropQuality, FishCrop
 
-_SIZE_PX = 64
+_SIZE_PX = 128
 
 
 def rehearse(fitter: Fitter) -> None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
+from stream_dmr.camera import Calibration
 from stream_dmr.fitting.fit import Fitter
 from stream_dmr.fitting.heading import HeadMemory
 from stream_dmr.fitting.settings import FitMeshSettings
@@ -29,10 +30,11 @@ class TrackFitter:
         template: Template,
         settings: FitMeshSettings,
         *,
-        plane_normal: Float[np.ndarray, "3"] | None,
+        calibration: Calibration | None,
     ) -> None:
-        """`plane_normal`, in the camera frame, is of the plane that fish hang in, if known."""
-        self.fitter = Fitter(template, settings, plane_normal=plane_normal)
+        """Fish hang in the plane of the calibration, if there is one."""
+        normal = None if calibration is None else calibration.plane.rotation[:, 2]
+        self.fitter = Fitter(template, settings, plane_normal=normal)
         self._least_iou = settings.cold_below_iou
         self._tracks: dict[int, _Track] = {}
 
