@@ -10,11 +10,11 @@ demo: $(STAMP)  ## the main job on the embedded scene, lengths beside the truth
 	$(BIN)/python -m stream_dmr.demo
 
 test: $(STAMP)  ## the tests of a few minutes
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist worksteal
 
 test-slow: $(STAMP)  ## the long ones, and those on material outside the repository
 	$(BIN)/pytest -m "slow or scenes"
-	$(BIN)/pytest -n 2 --hypothesis-profile new
+	$(BIN)/pytest -n 2 --dist worksteal --hypothesis-profile new
 
 bench: $(STAMP)  ## the fit beside other renderers, and the chain: docs/performance.md, six minutes
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[bench]' \

@@ -1,5 +1,6 @@
 """A page opened in headless Chromium, with scripts run in it."""
 
+import atexit
 import base64
 import fcntl
 import json
@@ -8,12 +9,21 @@ import select
 import shutil
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"]
+FLAGS = [
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--enable-unsafe-swiftshader",
+    "--disable-renderer-backgrounding",  # else tabs that nobody looks at wait for all others
+    "--disable-background-timer-throttling",
+    "--disable-backgrounding-occluded-windows",
+]
 
 
 def chromium() -> str:
@@ -45,54 +55,83 @@ os.execv(sys.argv[3], sys.argv[3:])
 """
 
 
-class Tab:
-    """A page of headless Chromium, driven from outside as by a hand: real mouse, real fingers.
+class _Browser:
+    """Headless Chromium, by the DevTools protocol: JSON both ways, each message ended by a 0."""
 
-    It speaks the DevTools protocol through a pipe: JSON each way, ended by a zero byte.
-    """
-
-    def __init__(self, address: str, *, width: int = 1400, height: int = 1000) -> None:
-        """Opens the address and waits until it has loaded."""
+    def __init__(self) -> None:
         reads, self._ours = os.pipe()
         self._answers, writes = os.pipe()
         theirs = [fcntl.fcntl(fd, fcntl.F_DUPFD, 10) for fd in (reads, writes)]  # not 3 or 4
         command = [chromium(), *FLAGS, "--remote-debugging-pipe", "about:blank"]
-        self._process = subprocess.Popen(
+        process = subprocess.Popen(
             [sys.executable, "-c", _ON_3_AND_4, *map(str, theirs), *command],
             pass_fds=theirs,
             stderr=subprocess.DEVNULL,
         )
+        atexit.register(process.kill)
         for fd in (reads, writes, *theirs):
             os.close(fd)
-        self._text, self._count, self._session = b"", 0, ""
-        target = self.send("Target.createTarget", url="about:blank")["targetId"]
-        attached = self.send("Target.attachToTarget", targetId=target, flatten=True)
+        self._text, self._count = b"", 0
+
+    def send(self, method: str, *, session: str | None = None, **params: Any) -> dict[str, Any]:
+        """A command of the protocol, to a tab or to the browser itself; its result."""
+        self._count += 1
+        said = {"id": self._count, "method": method, "params": params}
+        if session is not None:
+            said["sessionId"] = session
+        os.write(self._ours, json.dumps(said).encode() + b"\0")
+        while (answer := self.hear()).get("id") != self._count:
+            pass
+        assert "error" not in answer, answer
+        return answer["result"]
+
+    def hear(self) -> dict[str, Any]:
+        """What it says next."""
+        while b"\0" not in self._text:
+            assert select.select([self._answers], [], [], 120)[0], "the browser says nothing"
+            data = os.read(self._answers, 1 << 20)
+            assert data, "the browser has ended"
+            self._text += data
+        text, _, self._text = self._text.partition(b"\0")
+        return json.loads(text)
+
+
+@cache
+def _browser() -> _Browser:
+    """One for all tabs of this process, since it takes seconds to start."""
+    return _Browser()
+
+
+class Tab:
+    """A page of headless Chromium, driven from outside as by a hand: real mouse, real fingers.
+
+    Every tab has cookies and storage of its own.
+    """
+
+    def __init__(self, address: str, *, width: int = 1400, height: int = 1000) -> None:
+        """Opens the address and waits until it has loaded."""
+        browser = self._browser = _browser()
+        self._context = browser.send("Target.createBrowserContext")["browserContextId"]
+        target = browser.send(
+            "Target.createTarget", url="about:blank", browserContextId=self._context
+        )["targetId"]
+        attached = browser.send("Target.attachToTarget", targetId=target, flatten=True)
         self._session = attached["sessionId"]
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.send("Emulation.setDeviceMetricsOverride", **size)
         self.send("Page.enable")
         self.send("Page.navigate", url=address)
-        while self._hear().get("method") != "Page.loadEventFired":
+        loaded = ("Page.loadEventFired", self._session)
+        while ((said := browser.hear()).get("method"), said.get("sessionId")) != loaded:
             pass
 
     def close(self) -> None:
-        """End the browser."""
-        self._process.kill()
-        self._process.wait()
-        os.close(self._ours)
-        os.close(self._answers)
+        """With all that it keeps."""
+        self._browser.send("Target.disposeBrowserContext", browserContextId=self._context)
 
     def send(self, method: str, **params: Any) -> dict[str, Any]:
         """A command of the protocol; its result."""
-        self._count += 1
-        said = {"id": self._count, "method": method, "params": params}
-        if self._session:
-            said["sessionId"] = self._session
-        os.write(self._ours, json.dumps(said).encode() + b"\0")
-        while (answer := self._hear()).get("id") != self._count:
-            pass
-        assert "error" not in answer, answer
-        return answer["result"]
+        return self._browser.send(method, session=self._session, **params)
 
     def run(self, script: str) -> Any:
         """Run the body of an async function in the page; what it returns, by JSON."""
@@ -117,12 +156,3 @@ class Tab:
         """A screenshot, as PNG."""
         data = self.send("Page.captureScreenshot")["data"]
         path.write_bytes(base64.b64decode(data))
-
-    def _hear(self) -> dict[str, Any]:
-        while b"\0" not in self._text:
-            assert select.select([self._answers], [], [], 120)[0], "the browser says nothing"
-            data = os.read(self._answers, 1 << 20)
-            assert data, "the browser has ended"
-            self._text += data
-        text, _, self._text = self._text.partition(b"\0")
-        return json.loads(text)

@@ -466,9 +466,9 @@ def unnamed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Job]:
     moved = [f"{i},-1,{x},{int(y) - 5},{','.join(rest)}\n" for i, _, x, y, *rest in lines]
     (clip / "boxes.txt").write_text("".join(moved))
     config = clip / "quick.toml"
-    text = config.read_text().replace("[crop_fish]", '[crop_fish]\nsegmenter = "grabcut"')
-    text += "\n[smooth_length]\ntrack_timeout_s = 0.25\nmax_std_ratio = 1e9\n"
-    config.write_text(text + "\n[track_fish]\nmin_track_frames = 2\nmin_mask_confidence = 0.0\n")
+    with config.open("a") as file:
+        file.write("\n[smooth_length]\ntrack_timeout_s = 0.25\nmax_std_ratio = 1e9\n")
+        file.write("\n[track_fish]\nmin_track_frames = 2\nmin_mask_confidence = 0.0\n")
     run(
         request(clip, folder / "alone", masks=None, boxes=clip / "boxes.txt"),
         stop=threading.Event(),

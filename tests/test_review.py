@@ -226,7 +226,12 @@ def test_a_port_in_use_is_refused(server: ReviewServer, report: Report):
 HELPERS = """
 let open = 0;
 const fetched = window.fetch;
-window.fetch = (...what) => { open += 1; return fetched(...what).finally(() => { open -= 1; }); };
+const answered = async (...what) => {
+  const answer = await fetched(...what);
+  await answer.clone().text();
+  return answer;
+};
+window.fetch = (...what) => { open += 1; return answered(...what).finally(() => { open -= 1; }); };
 window.press = async (id) => {
   document.getElementById(id).click();
   do await new Promise((done) => setTimeout(done, 100)); while (open);

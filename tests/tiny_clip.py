@@ -11,10 +11,12 @@ from stream_dmr.calibration import save_calibration
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 
 WIDTH, HEIGHT = 160, 120
-# The fit is not what these tests are about: few pixels, and no frame refused for its quality.
+# The fit is not what these tests are about: few pixels, no frame refused for its quality, and no
+# network, which takes a process seconds to load.
 QUICK = """\
 [crop_fish]
 crop_size_px = 48
+segmenter = "grabcut"
 
 [fit_mesh]
 cold_below_iou = 0.0
