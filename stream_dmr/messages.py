@@ -48,7 +48,7 @@ class Frame:
 class CropQuality:
     """Facts about a crop that later stages gate by."""
 
-    touches_border: bool  # the mask reaches the edge of the frame: part of the fish is outside
+    touches_border: bool  # the mask reaches the edge of the frame or crop: part of it is outside
     visible_fraction: float  # of the fish, 0 to 1, as the annotations or the tracker say
     sharpness: float  # variance of the Laplacian inside the mask, grey levels squared
     mask_area_px: float  # of the mask, in frame pixels

@@ -360,6 +360,28 @@ def test_a_mask_found_in_the_crop_is_the_one_given_in_the_frame(camera, x, y, w,
     )
 
 
+@given(st.floats(0.7, 1.0), st.sampled_from([0, 1]), st.booleans())
+@settings(max_examples=30, deadline=None)
+def test_a_fish_that_goes_on_beyond_its_box_is_found_whole(share, axis, from_its_end):
+    strip = np.array([[180, 240], [60, 360]])
+    x, y = strip if axis else strip[::-1]
+    picture = np.zeros((420, 420), np.uint8)
+    picture[slice(*y), slice(*x)] = 255
+    box = np.array([x[0], y[0], x[1], y[1]], np.float64)
+    box[axis + 2 * (not from_its_end)] = 360 - share * 300 if from_its_end else 60 + share * 300
+    camera = Camera.nominal(width=420, height=420)
+    crop, _ = segmented(picture, box, camera)
+    assert not crop.quality.touches_border
+    assert crop.quality.mask_area_px == pytest.approx(60 * 300, rel=0.08)
+
+
+def test_a_fish_of_which_no_crop_shows_an_end_counts_as_cut():
+    picture = np.zeros((420, 420), np.uint8)
+    picture[20:400, 200:220] = 255
+    crop, _ = segmented(picture, [200, 190, 220, 230], Camera.nominal(width=420, height=420))
+    assert crop.quality.touches_border
+
+
 def test_a_doubtful_mask_is_trusted_less():
     camera = Camera.nominal(width=200, height=200)
     picture = np.zeros((200, 200), np.uint8)

@@ -266,12 +266,12 @@ def test_a_box_follows_the_edges_of_the_last_sure_mask_by_a_tenth_at_most(
     confidence: float, beyond: float
 ):
     class Longer:
-        """Sees the fish reach on below every box, by half the box's height."""
+        """Sees the fish reach on below every box, by an eighth of the box's height."""
 
         def segment(self, image: np.ndarray, bbox_xyxy_px: np.ndarray) -> Segmented:
             probability = np.zeros(image.shape[:2], np.float32)
             x0, y0, x1, y1 = bbox_xyxy_px.round().astype(int)
-            probability[max(y0, 0) : y1 + (y1 - y0) // 2, max(x0, 0) : x1] = confidence
+            probability[max(y0, 0) : y1 + (y1 - y0) // 8, max(x0, 0) : x1] = confidence
             return Segmented(probability=probability, ends=None)
 
     found = follow([[climb(i)] for i in range(10)], segmenter=Longer())

@@ -18,6 +18,7 @@ from stream_dmr.settings import Settings
 _SMALLEST_PART = 0.05  # of the largest part's area: the tail behind a gaff stays, specks go
 _LARGEST_HOLE = 0.01  # of the mask's area: pinholes are noise, larger ones something in front
 _SAME_BOX = 0.85  # IoU of the mask's box and the one given, from which on they are one
+_MOST_LOOKS = 3  # for a fish in its box
 _MOST_SAMPLES = 4  # per crop pixel and axis; more cost time and change nothing that we measured
 
 
@@ -62,6 +63,7 @@ class _Fish:
     mask: Bool[np.ndarray, "S S"]
     area_px: float  # in frame pixels
     extent: Float[np.ndarray, "4"] | None  # the mask's box in frame pixels; None: an empty mask
+    is_cut: bool  # the mask ends where the crop does, and the frame goes on
     confidence: float | None
     ends: FishEnds | None
 
@@ -93,7 +95,8 @@ def crop_fish(
         crop_camera=fish.crop_camera,
         frame_camera=frame_camera,
         quality=CropQuality(
-            touches_border=touches_border(fish.extent, shape=frame.image.shape[:2]),
+            touches_border=fish.is_cut
+            or touches_border(fish.extent, shape=frame.image.shape[:2]),
             visible_fraction=detection.visible_fraction,
             sharpness=sharpness(fish.image, fish.mask),
             mask_area_px=fish.area_px,
@@ -118,22 +121,24 @@ def _take(
         mask=mask,
         area_px=float(np.count_nonzero(given)),
         extent=_extent(given),
+        is_cut=False,
         confidence=None,
         ends=None,
     )
 
 
 def _find(view: _View, bbox_xyxy_px: Float[np.ndarray, "4"], segmenter: Segmenter) -> _Fish:
-    """The fish that a box means; where it fills another box than that, by a second look there.
+    """The fish that a box means; where it fills another box than that, by another look there.
 
     A moving shape may have lost the tail, or hold a piece of line as well.
     """
     box = _union(bbox_xyxy_px, None, view.image)
-    first = _segment(view, box, segmenter)
-    if first.extent is None or _overlap(first.extent, box) > _SAME_BOX:
-        return first
-    second = _segment(view, first.extent, segmenter)
-    return max(first, second, key=lambda fish: fish.confidence or 0.0)
+    looks = [_segment(view, box, segmenter)]
+    while (extent := looks[-1].extent) is not None and len(looks) < _MOST_LOOKS:
+        if not looks[-1].is_cut and (len(looks) > 1 or _overlap(extent, box) > _SAME_BOX):
+            break
+        looks.append(_segment(view, extent, segmenter))
+    return max(looks, key=lambda fish: (not fish.is_cut, fish.confidence or 0.0))
 
 
 def _segment(view: _View, bbox_xyxy_px: Float[np.ndarray, "4"], segmenter: Segmenter) -> _Fish:
@@ -160,6 +165,7 @@ def _segment(view: _View, bbox_xyxy_px: Float[np.ndarray, "4"], segmenter: Segme
         mask=mask,
         area_px=float(areas[mask].sum()),
         extent=extent,
+        is_cut=bool(mask[[0, -1]].any() or mask[:, [0, -1]].any()),
         confidence=expected_iou(probability, mask),
         ends=found.ends,
     )
