@@ -143,6 +143,17 @@ def test_losses_are_least_at_the_truth():
     assert not ends_are_right(logits.flip(1), ends)[0].any()
 
 
+def test_a_thin_tail_is_missed_more_than_as_much_of_the_body():
+    masks = torch.zeros(1, 32, 32)
+    masks[:, 10:22, 4:20] = 1.0
+    masks[:, 15:17, 20:28] = 1.0  # 16 pixels
+    logits = 20 * masks - 10
+    no_tail, no_flank = logits.clone(), logits.clone()
+    no_tail[:, 15:17, 20:28] = -10
+    no_flank[:, 10, 4:20] = -10
+    assert mask_loss(no_tail, masks) > 2 * mask_loss(no_flank, masks)
+
+
 def test_unknown_ends_teach_nothing():
     logits = torch.randn(3, 2, 16, 16, requires_grad=True)
     ends_px = torch.full((3, 2, 2), float("nan"))

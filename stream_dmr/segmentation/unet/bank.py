@@ -12,7 +12,7 @@ from jaxtyping import Float32, UInt8
 from stream_dmr.segmentation.unet.backgrounds import BACKGROUND_PX, draw_background
 from stream_dmr.segmentation.unet.patches import PATCH_PX, draw_fish_patch
 
-BANK_VERSION = 1
+BANK_VERSION = 2
 """Part of the file's name; raise it when fish or backgrounds are drawn otherwise."""
 
 

@@ -64,7 +64,7 @@ def pose_shape(rng: np.random.Generator, shape: Shape) -> Posed:
     spine = bend_spine(_draw_bends(rng, shape.is_flatfish), length_mm=1.0)
     middle = spine.frames[len(spine.frames) // 2]
     about_axis = rng.choice([0.0, np.pi]) + np.radians(rng.normal(0.0, 22.0))
-    if rng.random() < 0.2:
+    if rng.random() < 0.25:
         about_axis = rng.uniform(0.0, 2 * np.pi)  # edge on, or from above
     towards = np.radians(np.clip(rng.normal(0.0, 25.0), -65.0, 65.0))
     turn = Rotation.from_euler("YX", [towards, about_axis]).as_matrix() @ middle.T
@@ -155,8 +155,9 @@ def _draw_bends(rng: np.random.Generator, is_flatfish: bool) -> Float[np.ndarray
     in_broad_side = 0.45 if is_flatfish else 0.6
     sizes = np.array([0.0, 1.0, in_broad_side])[:, None] * _ORDER_SIZES
     bends = sizes * rng.standard_normal(sizes.shape)
-    bends *= np.radians(110.0) * rng.beta(1.0, 2.2) / max(total_bend_rad(bends), 1e-6)
-    bends[:, 0][0] = np.radians(rng.normal(0.0, 12.0)) * np.pi / 2  # twist
+    bends *= np.radians(120.0) * rng.beta(1.0, 2.0) / max(total_bend_rad(bends), 1e-6)
+    twist_deg = rng.normal(0.0, 80.0 if rng.random() < 0.35 else 12.0)  # 80: the tail edge on
+    bends[:, 0][0] = np.radians(twist_deg) * np.pi / 2
     return bends
 
 
