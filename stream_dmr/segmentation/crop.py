@@ -95,8 +95,7 @@ def crop_fish(
         crop_camera=fish.crop_camera,
         frame_camera=frame_camera,
         quality=CropQuality(
-            touches_border=fish.is_cut
-            or touches_border(fish.extent, shape=frame.image.shape[:2]),
+            touches_border=fish.is_cut or touches_border(fish.extent, shape=frame.image.shape[:2]),
             visible_fraction=detection.visible_fraction,
             sharpness=sharpness(fish.image, fish.mask),
             mask_area_px=fish.area_px,

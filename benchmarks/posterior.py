@@ -1,0 +1,162 @@
+"""Whether the scan of sizes loses anything: its slow twin, all poses by Metropolis' algorithm.
+
+    .venv/bin/python benchmarks/posterior.py [--scenes 2]     of every preset; four minutes a scene
+
+`SizeScanner` weighs seven sizes by their best fit and the room around it. Here the same likelihood
+and the same priors are sampled in all parameters instead (Metropolis et al., J. Chem. Phys. 21,
+1953), for a few frames of every fish, and the lengths are put together as ever.
+"""
+
+import argparse
+import os
+
+# Before numpy and torch are imported: the processes are the threads.
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numba import njit
+from oracles import FIRST_SEED, PRESETS
+from table1.fish import FISH_PER_SCENE, FRAMES_PER_SCENE, watch
+from targets import body_template
+
+from stream_dmr.body import rest_vector
+from stream_dmr.camera import Calibration
+from stream_dmr.config import Config
+from stream_dmr.fitting.bodies import Bodies
+from stream_dmr.fitting.contour.deformation import KINDS
+from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
+from stream_dmr.fitting.contour.normal_equations import normal_equations, prior_loss
+from stream_dmr.fitting.contour.size_scan import SIZE
+from stream_dmr.fitting.tracks import TrackFitter
+from stream_dmr.lengths import TrackLength
+from stream_dmr.localization import localize
+from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
+from stream_dmr.simulation.body import HALIBUT
+from stream_dmr.simulation.scene import make_scene
+
+_FRAMES_PER_FISH = 5
+_STEPS, _THIN, _BURN_IN = 24_000, 10, 0.2
+_STIFFEST = 10.0  # directions that the curvature leaves free are not walked further than this
+CONFIG = Config.model_validate({"smooth_length": {"min_frames": 1}})
+
+
+@njit
+def walk(body, kind, target, lambdas, priors, start, rest, spread, nat, steps, thin, rng):  # type: ignore[no-untyped-def]
+    """Parameters (steps / thin, P) as often as they are likely; `spread` (P, P) shapes steps."""
+    size = len(start)
+    here, kept = start.copy(), np.empty((steps // thin, size))
+    loss = np.inf
+    for step in range(steps):
+        length = 2.0 / np.sqrt(size) * np.exp(rng.uniform(-1.5, 0.7))
+        there = here + length * (spread @ rng.standard_normal(size)) * (step > 0)
+        terms = evaluate(body, kind, target, there, False)[0]
+        other = np.sum(terms * lambdas) + prior_loss(target, there, rest, priors)
+        if np.log(rng.random()) < (loss - other) / nat:
+            here, loss = there, other
+        if step % thin == thin - 1:
+            kept[step // thin] = here
+    return kept
+
+
+class Sampler:
+    """What `SizeScanner.expected` tells of the size, by sampling."""
+
+    def __init__(self, tracks: TrackFitter, bodies: Bodies, config: Config) -> None:
+        self._fitter, self._settings = tracks.fitter, config.fit_mesh
+        self._body, self._kind = bodies.coarse, KINDS[config.fit_mesh.deformation]
+        self._rest = rest_vector(len(bodies.coarse.joints))
+        self._rng = np.random.default_rng(1)
+        self._weights = config.fit_mesh.rough_lambdas(), config.fit_mesh.priors()
+
+    def log_size(self, crop: FishCrop, start: np.ndarray) -> tuple[float, float]:
+        """Mean and std."""
+        target, nat = self._fitter.target(crop).coarse(), self._settings.nat
+        problem = self._body, self._kind, target, *self._weights
+        _, _, *seen = evaluate(self._body, self._kind, target, start, False)
+        H, _ = normal_equations(*problem, start, self._rest, *seen)
+        values, vectors = np.linalg.eigh((H + H.T) / (2 * nat))
+        spread = vectors / np.sqrt(np.maximum(values, 1 / _STIFFEST))
+        kept = walk(*problem, start, self._rest, spread, nat, _STEPS, _THIN, self._rng)
+        sizes = kept[int(_BURN_IN * len(kept)) :, SIZE]
+        return float(sizes.mean()), float(sizes.std())
+
+
+def errors_of(task: tuple[str, int]) -> np.ndarray:
+    """Relative errors of the fish of a scene, by the scan and by sampling (F, 2)."""
+    preset, seed = task
+    scene = make_scene(
+        num_fish=FISH_PER_SCENE, num_frames=FRAMES_PER_SCENE, preset=preset, seed=seed
+    )
+    haul = watch(scene, with_second=False)
+    crops: dict[int, list[FishCrop]] = {}
+    for sighting in (sighting for frame in haul.frames for sighting in frame):
+        crops.setdefault(sighting.crop.track_id, []).append(sighting.crop)
+    template = body_template(HALIBUT)
+    tracks = TrackFitter(template, CONFIG.fit_mesh, calibration=haul.calibration)
+    sampler = Sampler(tracks, Bodies.of(template, max_faces=CONFIG.fit_mesh.max_faces), CONFIG)
+    errors = []
+    for track_id, track in crops.items():
+        fits = [(crop, tracks.fit(crop)) for crop in track]
+        pairs = list(_lengths(fits, sampler, haul.calibration))
+        if pairs:
+            lengths_mm = [_together(lengths) for lengths in zip(*pairs, strict=True)]
+            errors.append(np.array(lengths_mm, float) / haul.truth_mm[track_id] - 1)
+    return np.array(errors).reshape(-1, 2)
+
+
+def _lengths(
+    fits: Sequence[tuple[FishCrop, FittedMesh]], sampler: Sampler, calibration: Calibration
+) -> Iterator[tuple[LocalizedFish, LocalizedFish]]:
+    """Some frames of a fish that count, by the scan and by sampling."""
+    placed = [
+        (crop, mesh.shape, fish)
+        for crop, mesh in fits
+        if (fish := localize(mesh, settings=CONFIG.localize, calibration=calibration)).accepted
+    ]
+    some = np.linspace(0, len(placed) - 1, min(len(placed), _FRAMES_PER_FISH)).round().astype(int)
+    for crop, shape, fish in (placed[n] for n in some):
+        assert shape is not None
+        assert fish.length_mm is not None
+        assert fish.length_std_mm is not None
+        mean, std = sampler.log_size(crop, shape.parameters)
+        length_mm = fish.length_mm * np.exp(mean - shape.parameters[SIZE])
+        variance = (fish.length_std_mm / fish.length_mm) ** 2 - shape.length_std_ratio**2 + std**2
+        yield fish, replace(fish, length_mm=length_mm, length_std_mm=length_mm * variance**0.5)
+
+
+def _together(frames: Sequence[LocalizedFish]) -> float:
+    """The fish's length; NaN where its frames contradict each other."""
+    track = TrackLength(frames[0], CONFIG.smooth_length)
+    for fish in frames:
+        track.add(fish)
+    return track.finish().length_mm or float("nan")
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scenes", type=int, default=2, help="of every preset")
+    parser.add_argument("--processes", type=int, default=2)
+    asked = parser.parse_args()
+    tasks = [(preset, FIRST_SEED + k) for k in range(asked.scenes) for preset in PRESETS]
+    with multiprocessing.get_context("spawn").Pool(asked.processes) as pool:
+        scenes = pool.map(errors_of, tasks, chunksize=1)
+    print("| preset | fish | the scan: mean error, bias | all poses: mean error, bias |")
+    print("|---|---|---|---|")
+    for preset in (*PRESETS, "all"):
+        found = [
+            one for (name, _), one in zip(tasks, scenes, strict=True) if preset in (name, "all")
+        ]
+        errors = 100 * np.concatenate(found)
+        errors = errors[np.isfinite(errors).all(axis=1)]
+        means, biases = abs(errors).mean(axis=0), errors.mean(axis=0)
+        cells = [f"{mean:.2f} %, {bias:+.2f} %" for mean, bias in zip(means, biases, strict=True)]
+        print(f"| {preset} | {len(errors)} | {' | '.join(cells)} |")
+
+
+if __name__ == "__main__":
+    main()
