@@ -14,6 +14,7 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 import multiprocessing
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from table1.dmr import through_all
@@ -28,6 +29,7 @@ from stream_dmr.simulation.fish import pose_fish
 from stream_dmr.simulation.scene import Scene, make_scene
 from stream_dmr.template import Template
 
+T = TypeVar("T")
 FIRST_SEED = 5000
 PRESETS = ("clean", "realistic", "severe")
 BODIES: dict[str, Callable[[Body], Body]] = {
@@ -41,10 +43,7 @@ SLANT = "how far the fish of its scene hang out of the plane (std of the prior)"
 
 def errors_of(task: tuple[str, int]) -> dict[str, list[float]]:
     """Relative errors of the fish of one scene, by what was known."""
-    preset, seed = task
-    scene = make_scene(
-        num_fish=FISH_PER_SCENE, num_frames=FRAMES_PER_SCENE, preset=preset, seed=seed
-    )
+    scene = scene_of(task)
     haul = watch(scene, with_second=False)
     bodies = {visit.fish.track_id: visit.fish.body for visit in scene.visits}
     found = {
@@ -54,6 +53,22 @@ def errors_of(task: tuple[str, int]) -> dict[str, list[float]]:
     tilted = Config.model_validate({"fit_mesh": {"tilt_std_rad": slant_std_rad(scene)}})
     found[SLANT] = _errors(haul, lambda i: body_template(HALIBUT), tilted)
     return found
+
+
+def scene_of(task: tuple[str, int]) -> Scene:
+    """The scene of a preset and a seed."""
+    preset, seed = task
+    return make_scene(
+        num_fish=FISH_PER_SCENE, num_frames=FRAMES_PER_SCENE, preset=preset, seed=seed
+    )
+
+
+def tracks_of(haul: Haul) -> dict[int, list[FishCrop]]:
+    """The crops of each fish, in the order of their frames."""
+    tracks: dict[int, list[FishCrop]] = {}
+    for sighting in (sighting for frame in haul.frames for sighting in frame):
+        tracks.setdefault(sighting.crop.track_id, []).append(sighting.crop)
+    return tracks
 
 
 def slant_std_rad(scene: Scene) -> float:
@@ -68,11 +83,8 @@ def slant_std_rad(scene: Scene) -> float:
 
 
 def _errors(haul: Haul, template_of: Callable[[int], Template], config: Config) -> list[float]:
-    tracks: dict[int, list[FishCrop]] = {}
-    for sighting in (sighting for frame in haul.frames for sighting in frame):
-        tracks.setdefault(sighting.crop.track_id, []).append(sighting.crop)
     errors = []
-    for track_id, crops in tracks.items():
+    for track_id, crops in tracks_of(haul).items():
         nodes = later_nodes(config, template=template_of(track_id), calibration=haul.calibration)
         final = [
             m for m in through_all(crops, nodes) if isinstance(m, LengthEstimate) and m.is_final
@@ -82,15 +94,23 @@ def _errors(haul: Haul, template_of: Callable[[int], Template], config: Config) 
     return errors
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scenes", type=int, default=4, help="of every preset")
+def over_scenes(
+    work: Callable[[tuple[str, int]], T], *, about: str | None, scenes: int
+) -> list[tuple[str, T]]:
+    """What `work` makes of scenes of every preset, with the preset; `scenes` unless told."""
+    parser = argparse.ArgumentParser(description=about)
+    parser.add_argument("--scenes", type=int, default=scenes, help="of every preset")
     parser.add_argument("--processes", type=int, default=2)
     asked = parser.parse_args()
     tasks = [(preset, FIRST_SEED + k) for k in range(asked.scenes) for preset in PRESETS]
     with multiprocessing.get_context("spawn").Pool(asked.processes) as pool:
-        scenes = pool.map(errors_of, tasks, chunksize=1)
+        done = pool.map(work, tasks, chunksize=1)
+    return [(preset, one) for (preset, _), one in zip(tasks, done, strict=True)]
+
+
+def main() -> None:
+    """Print the table."""
+    scenes = [found for _, found in over_scenes(errors_of, about=__doc__, scenes=4)]
     print("| if one knew | fish | mean error | bias |\n|---|---|---|---|")
     for known in scenes[0]:
         errors = 100 * np.concatenate([scene[known] for scene in scenes])

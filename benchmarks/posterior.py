@@ -1,26 +1,24 @@
 """Whether the scan of sizes loses anything: its slow twin, all poses by Metropolis' algorithm.
 
-    .venv/bin/python benchmarks/posterior.py [--scenes 2]     of every preset; four minutes a scene
+    .venv/bin/python benchmarks/posterior.py [--scenes 2]     of every preset; two minutes a scene
 
 `SizeScanner` weighs seven sizes by their best fit and the room around it. Here the same likelihood
 and the same priors are sampled in all parameters instead (Metropolis et al., J. Chem. Phys. 21,
 1953), for a few frames of every fish, and the lengths are put together as ever.
 """
 
-import argparse
 import os
 
 # Before numpy and torch are imported: the processes are the threads.
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
-import multiprocessing
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numba import njit
-from oracles import FIRST_SEED, PRESETS
-from table1.fish import FISH_PER_SCENE, FRAMES_PER_SCENE, watch
+from oracles import PRESETS, over_scenes, scene_of, tracks_of
+from table1.fish import watch
 from targets import body_template
 
 from stream_dmr.body import rest_vector
@@ -36,7 +34,6 @@ from stream_dmr.lengths import TrackLength
 from stream_dmr.localization import localize
 from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
 from stream_dmr.simulation.body import HALIBUT
-from stream_dmr.simulation.scene import make_scene
 
 _FRAMES_PER_FISH = 5
 _STEPS, _THIN, _BURN_IN = 24_000, 10, 0.2
@@ -87,19 +84,12 @@ class Sampler:
 
 def errors_of(task: tuple[str, int]) -> np.ndarray:
     """Relative errors of the fish of a scene, by the scan and by sampling (F, 2)."""
-    preset, seed = task
-    scene = make_scene(
-        num_fish=FISH_PER_SCENE, num_frames=FRAMES_PER_SCENE, preset=preset, seed=seed
-    )
-    haul = watch(scene, with_second=False)
-    crops: dict[int, list[FishCrop]] = {}
-    for sighting in (sighting for frame in haul.frames for sighting in frame):
-        crops.setdefault(sighting.crop.track_id, []).append(sighting.crop)
+    haul = watch(scene_of(task), with_second=False)
     template = body_template(HALIBUT)
     tracks = TrackFitter(template, CONFIG.fit_mesh, calibration=haul.calibration)
     sampler = Sampler(tracks, Bodies.of(template, max_faces=CONFIG.fit_mesh.max_faces), CONFIG)
     errors = []
-    for track_id, track in crops.items():
+    for track_id, track in tracks_of(haul).items():
         fits = [(crop, tracks.fit(crop)) for crop in track]
         pairs = list(_lengths(fits, sampler, haul.calibration))
         if pairs:
@@ -138,24 +128,15 @@ def _together(frames: Sequence[LocalizedFish]) -> float:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scenes", type=int, default=2, help="of every preset")
-    parser.add_argument("--processes", type=int, default=2)
-    asked = parser.parse_args()
-    tasks = [(preset, FIRST_SEED + k) for k in range(asked.scenes) for preset in PRESETS]
-    with multiprocessing.get_context("spawn").Pool(asked.processes) as pool:
-        scenes = pool.map(errors_of, tasks, chunksize=1)
+    scenes = over_scenes(errors_of, about=__doc__, scenes=2)
     print("| preset | fish | the scan: mean error, bias | all poses: mean error, bias |")
     print("|---|---|---|---|")
-    for preset in (*PRESETS, "all"):
-        found = [
-            one for (name, _), one in zip(tasks, scenes, strict=True) if preset in (name, "all")
-        ]
-        errors = 100 * np.concatenate(found)
+    for shown in (*PRESETS, "all"):
+        errors = 100 * np.concatenate([one for preset, one in scenes if shown in (preset, "all")])
         errors = errors[np.isfinite(errors).all(axis=1)]
         means, biases = abs(errors).mean(axis=0), errors.mean(axis=0)
         cells = [f"{mean:.2f} %, {bias:+.2f} %" for mean, bias in zip(means, biases, strict=True)]
-        print(f"| {preset} | {len(errors)} | {' | '.join(cells)} |")
+        print(f"| {shown} | {len(errors)} | {' | '.join(cells)} |")
 
 
 if __name__ == "__main__":
