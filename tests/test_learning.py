@@ -90,7 +90,7 @@ class TestLearning:
         truth = 0.1 * np.cos(np.linspace(0, np.pi, NUM_KNOTS))
         vector[:NUM_KNOTS] = vector[NUM_KNOTS:-2] = truth
         stock = Proportions.from_vector(vector).apply(few_faces)
-        samples = samples_of(stock, num_fish=3)
+        samples = samples_of(stock, num_fish=4)
         learnt = learn(few_faces, samples, SETTINGS)
         middle = slice(2, NUM_KNOTS - 2)
         found = (learnt.proportions.left + learnt.proportions.right) / 2
