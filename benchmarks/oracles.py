@@ -26,12 +26,12 @@ from stream_dmr.messages import FishCrop, LengthEstimate
 from stream_dmr.run import later_nodes
 from stream_dmr.simulation.body import HALIBUT, Body
 from stream_dmr.simulation.fish import pose_fish
+from stream_dmr.simulation.presets import PRESETS
 from stream_dmr.simulation.scene import Scene, make_scene
 from stream_dmr.template import Template
 
 T = TypeVar("T")
 FIRST_SEED = 5000
-PRESETS = ("clean", "realistic", "severe")
 BODIES: dict[str, Callable[[Body], Body]] = {
     "nothing": lambda own: HALIBUT,
     "each fish's own body": lambda own: own,

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 from numba import njit
-from oracles import PRESETS, over_scenes, scene_of, tracks_of
+from oracles import over_scenes, scene_of, tracks_of
 from table1.fish import watch
 from targets import body_template
 
@@ -34,6 +34,7 @@ from stream_dmr.lengths import TrackLength
 from stream_dmr.localization import localize
 from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
 from stream_dmr.simulation.body import HALIBUT
+from stream_dmr.simulation.presets import PRESETS
 
 _FRAMES_PER_FISH = 5
 _STEPS, _THIN, _BURN_IN = 24_000, 10, 0.2

@@ -151,7 +151,7 @@ def _deform(rng: np.random.Generator, points: Float[np.ndarray, "N 3"]) -> Float
 
 
 def _draw_bends(rng: np.random.Generator, is_flatfish: bool) -> Float[np.ndarray, "3 K"]:
-    """Curvature of a body that turns by 0 to 110 degrees from head to tail, mostly by less."""
+    """Curvature of a body that turns by 0 to 120 degrees from head to tail, mostly by less."""
     in_broad_side = 0.45 if is_flatfish else 0.6
     sizes = np.array([0.0, 1.0, in_broad_side])[:, None] * _ORDER_SIZES
     bends = sizes * rng.standard_normal(sizes.shape)
