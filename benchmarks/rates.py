@@ -199,7 +199,7 @@ def iteration_parts(setup: Setup, pair: Pair) -> dict[str, Callable[[], object]]
         "- visible rim": lambda: normal_equations.visible_rim(pixels, rim, covered),
         "- jacobian": lambda: deformation.jacobian(body, SPINE, flat, chosen),
         "- sums of squares": lambda: normal_equations.weighted_squares(rows, weights, weights),
-        "solve": lambda: lm._solve(H, g, 1e-2),
+        "solve": lambda: lm.solve(H, g, 1e-2, np.zeros(len(g), np.bool_)),
     }
 
 

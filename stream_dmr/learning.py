@@ -207,7 +207,7 @@ class _Crowd:
 
     def _follow(self, body: Body, sample: Sample) -> float:
         """Fit a sample anew from where it was; its loss."""
-        sample.pose, loss, sample.iou, *_ = minimise(
+        found = minimise(
             body,
             self._kind,
             sample.target,
@@ -220,7 +220,8 @@ class _Crowd:
             _POSE_TOLERANCE,
             NEAR,
         )
-        return loss
+        sample.pose, sample.iou = found.flat, found.iou
+        return found.loss
 
 
 def _unlikeliness(vector: Float[np.ndarray, "W"]) -> float:

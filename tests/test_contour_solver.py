@@ -21,9 +21,9 @@ from stream_dmr.fitting.contour.levenberg_marquardt import (
     EXHAUSTED,
     SETTLED,
     STUCK,
-    _solve,
     evaluate,
     minimise,
+    solve,
 )
 from stream_dmr.fitting.contour.normal_equations import (
     _GAUGE,
@@ -115,7 +115,7 @@ class TestNormalEquations:
         rows = rng.normal(size=(rank, size)) * 10.0 ** rng.uniform(-spread, spread, size)
         H, g = rows.T @ rows, rng.normal(size=size)
         damped = H + np.diag(damping * np.diag(H) + 1e-12)
-        step = _solve(H, g, damping)
+        step = solve(H, g, damping, np.zeros(size, bool))
         # In the units in which the diagonal is 1, as both are only as good as the condition there.
         unit = np.sqrt(np.diag(damped))
         residual = (damped @ step - g) / unit
@@ -128,7 +128,20 @@ class TestNormalEquations:
 
     @pytest.mark.parametrize("H", [np.zeros((3, 3)), np.ones((3, 3)), -1e-15 * np.eye(3)])
     def test_steps_are_finite_even_where_nothing_holds_a_parameter(self, H):
-        assert np.isfinite(_solve(H, np.array([1.0, 0.0, -1.0]), 0.0)).all()
+        assert np.isfinite(solve(H, np.array([1.0, 0.0, -1.0]), 0.0, np.zeros(3, bool))).all()
+
+    @given(seed=seeds, size=st.integers(2, 12))
+    def test_what_is_held_stays_and_the_others_step_as_if_it_were_not_there(self, seed, size):
+        rng = np.random.default_rng(seed)
+        rows, held = rng.normal(size=(size + 5, size)), rng.random(size) < 0.5
+        H, g = rows.T @ rows, rng.normal(size=size)
+        kept_H, kept_g = H.copy(), g.copy()
+        step = solve(H, g, 0.01, held)
+        free = solve(np.ascontiguousarray(H[~held][:, ~held]), g[~held], 0.01, held[~held])
+        np.testing.assert_array_equal(step[held], 0.0)
+        np.testing.assert_allclose(step[~held], free, rtol=1e-9, atol=1e-12)
+        np.testing.assert_array_equal(H, kept_H)
+        np.testing.assert_array_equal(g, kept_g)
 
     @twenty
     @given(seed=seeds, num_joints=st.sampled_from([2, 3]))
@@ -189,11 +202,12 @@ class TestDescent:
         flat = hooked(seed)
         target = target_of(flat)
         start = moved(flat, np.random.default_rng(seed), size=size)
-        best, loss, hard, used, _ = descend(target, start, kind=KINDS[kind])
-        assert loss <= energy(target, start, kind=KINDS[kind]) + 1e-12
-        assert loss == pytest.approx(energy(target, best, kind=KINDS[kind]), rel=1e-9, abs=1e-12)
-        assert hard == evaluate(BODY, KINDS[kind], target, best, True)[1]
-        assert 1 <= used <= 30
+        found = descend(target, start, kind=KINDS[kind])
+        ends_at = energy(target, found.flat, kind=KINDS[kind])
+        assert found.loss <= energy(target, start, kind=KINDS[kind]) + 1e-12
+        assert found.loss == pytest.approx(ends_at, rel=1e-9, abs=1e-12)
+        assert found.iou == evaluate(BODY, KINDS[kind], target, found.flat, True)[1]
+        assert 1 <= found.iterations <= 30
 
     def test_the_start_is_left_alone(self):
         flat = hooked(0)
@@ -205,19 +219,31 @@ class TestDescent:
     def test_says_why_it_stopped(self):
         flat = hooked(0)
         target, start = target_of(flat), moved(flat, np.random.default_rng(0))
-        found, _, hard, used, stop = descend(target, start)
-        assert (stop, used < 30, hard > 0.97) == (SETTLED, True, True)
-        assert descend(target, start, iterations=2)[3:] == (2, EXHAUSTED)
+        found = descend(target, start)
+        assert (found.stop, found.iterations < 30, found.iou > 0.97) == (SETTLED, True, True)
+        short = descend(target, start, iterations=2)
+        assert (short.iterations, short.stop) == (2, EXHAUSTED)
         # Nothing is little enough to settle for, so it goes on until no step helps.
-        assert descend(target, found, iterations=1000, tolerance=0.0)[4] == STUCK
+        assert descend(target, found.flat, iterations=1000, tolerance=0.0).stop == STUCK
+
+    @pytest.mark.parametrize("iterations", [0, 1, 2])
+    def test_its_curvature_is_of_where_the_last_step_began(self, iterations):
+        flat = hooked(1)
+        target, start = target_of(flat), moved(flat, np.random.default_rng(1))
+        began = descend(target, start, iterations=max(iterations - 1, 0)).flat
+        _, _, *seen = evaluate(BODY, SPINE, target, began, True)
+        H, _ = normal_equations(BODY, SPINE, target, LAMBDAS, PRIORS, began, REST, *seen)
+        found = descend(target, start, iterations=iterations)
+        assert found.iterations == iterations
+        np.testing.assert_array_equal(found.H, H)
 
     def test_equal_inputs_give_equal_bits_in_any_thread(self):
         flats = [hooked(seed) for seed in range(6)]
         jobs = [(target_of(flat), moved(flat, np.random.default_rng(0))) for flat in flats] * 4
 
         def bits(job):
-            flat, *numbers = descend(*job)
-            return flat.tobytes(), *numbers
+            found = descend(*job)
+            return found.flat.tobytes(), found.loss, found.iou, found.iterations, found.stop
 
         alone = [bits(job) for job in jobs]
         assert len(set(alone)) == 6

@@ -5,6 +5,7 @@ import pytest
 from batches import PLANE_NORMAL, crops_of_poses, moved
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import PchipInterpolator
 
 from stream_dmr.body import Body, rest_vector
 from stream_dmr.fitting.bodies import Bodies
@@ -14,7 +15,8 @@ from stream_dmr.fitting.contour.normal_equations import prior_loss
 from stream_dmr.fitting.contour.size_scan import SIZE, only_size, scan_sizes
 from stream_dmr.fitting.contour.solver import ContourSolver
 from stream_dmr.fitting.settings import FitMeshSettings
-from stream_dmr.fitting.size_scanner import SizeScanner, mean_and_std
+from stream_dmr.fitting.size_density import mean_and_std
+from stream_dmr.fitting.size_scanner import SizeScanner
 from stream_dmr.fitting.target import Target
 from stream_dmr.template import load_template
 
@@ -49,6 +51,30 @@ def test_the_mean_leans_to_where_sizes_stay_likely():
 def test_without_any_preference_nothing_is_known():
     _, std = mean_and_std(OFFSETS, np.zeros(len(OFFSETS)))
     assert std > 0.15
+
+
+@settings(deadline=None)
+@given(
+    points=st.lists(
+        st.tuples(st.integers(-30, 30), st.floats(-50, 50)),
+        min_size=2,
+        max_size=9,
+        unique_by=lambda point: point[0],
+    )
+)
+def test_between_the_sizes_tried_the_curve_is_scipy_s(points):
+    """Slow twin: SciPy's interpolator and sums over a finer grid."""
+    hundredths, nats = map(np.array, zip(*sorted(points), strict=True))
+    offsets = hundredths / 100
+    x = np.arange(offsets[0] - 0.15, offsets[-1] + 0.15, 0.0005)
+    curve = PchipInterpolator(offsets, nats)(x.clip(offsets[0], offsets[-1]))
+    first, last = np.diff(nats)[[0, -1]] / np.diff(offsets)[[0, -1]]
+    curve += np.maximum(offsets[0] - x, 0) * max(-first, 10.0)
+    curve += np.maximum(x - offsets[-1], 0) * max(last, 10.0)
+    density = np.exp(curve.min() - curve)
+    mean = np.average(x, weights=density)
+    std = np.sqrt(np.average((x - mean) ** 2, weights=density))
+    assert mean_and_std(offsets, nats) == pytest.approx((mean, std), abs=0.003)
 
 
 @pytest.fixture(scope="module")

@@ -8,14 +8,15 @@ wherever its search has led it. So sizes near it are tried, with everything else
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import PchipInterpolator
 
 from stream_dmr.body import rest_vector
 from stream_dmr.fitting.bodies import Bodies
 from stream_dmr.fitting.contour.deformation import KINDS
-from stream_dmr.fitting.contour.levenberg_marquardt import EXHAUSTED, NEAR, STOP_REASONS, minimise
+from stream_dmr.fitting.contour.levenberg_marquardt import NEAR, minimise
 from stream_dmr.fitting.contour.size_scan import SIZE, only_size, scan_sizes
+from stream_dmr.fitting.contour.solver import solution_of
 from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.size_density import mean_and_std
 from stream_dmr.fitting.solver import Solution
 from stream_dmr.fitting.target import Target
 
@@ -27,9 +28,6 @@ _OFFSETS = np.array([-0.2, -0.1, -0.04, 0.0, 0.04, 0.1, 0.2])
 _ROOM = 0.5
 # Sizes that are unlikelier by so many nats than the best fit's end a scan.
 _HOPELESS = 8.0
-_STEP = 0.002  # of the integration over log sizes
-_BEYOND = 0.15  # how far it goes past the sizes tried
-_STEEPEST_END = 10.0  # nats per unit of log size: past the ends sizes get at least so unlikely
 
 
 class SizeScanner:
@@ -67,7 +65,7 @@ class SizeScanner:
         return self._fit_of_this_size(target, start), std
 
     def _fit_of_this_size(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
-        flat, loss, iou, used, stop = minimise(
+        found = minimise(
             self._body,
             self._kind,
             target,
@@ -80,19 +78,4 @@ class SizeScanner:
             self._settings.tolerance,
             NEAR,
         )
-        return Solution(flat, loss, iou, used, stop != EXHAUSTED, STOP_REASONS[stop])
-
-
-def mean_and_std(
-    offsets: Float[np.ndarray, "G"], nats: Float[np.ndarray, "G"]
-) -> tuple[float, float]:
-    """Of the density exp(-nats) over log sizes, which between those tried is a smooth curve."""
-    x = np.arange(offsets[0] - _BEYOND, offsets[-1] + _BEYOND, _STEP)
-    curve = PchipInterpolator(offsets, nats)(x.clip(offsets[0], offsets[-1]))
-    first, last = np.diff(nats)[[0, -1]] / np.diff(offsets)[[0, -1]]
-    curve += np.maximum(offsets[0] - x, 0) * max(-first, _STEEPEST_END)
-    curve += np.maximum(x - offsets[-1], 0) * max(last, _STEEPEST_END)
-    density = np.exp(curve.min() - curve)
-    density /= density.sum()
-    mean = float(density @ x)
-    return mean, float(np.sqrt(density @ (x - mean) ** 2))
+        return solution_of(found)

@@ -1,6 +1,9 @@
 """Damped Gauss-Newton on the contour, with the paper's L_rec deciding which iterate is best."""
 
+from typing import NamedTuple
+
 import numpy as np
+from jaxtyping import Float
 
 from stream_dmr.body import JOINT, ROOT
 from stream_dmr.fitting.compiled import compiled
@@ -17,6 +20,17 @@ STOP_REASONS = ("L_rec settled", "no step lowers L_rec", "iterations used up")
 NEAR, FAR = 1e-2, 1e-1
 _GROWTH, _SHRINK = 10.0, 0.3
 _MOST_REFUSED = 3  # steps in a row, each ten times shorter: what is left to gain is pixel noise
+
+
+class Minimum(NamedTuple):
+    """Where a search ended."""
+
+    flat: Float[np.ndarray, "P"]  # the best parameters
+    loss: float  # their L_rec with the priors
+    iou: float  # of the hard silhouette
+    iterations: int
+    stop: int  # why: index of STOP_REASONS
+    H: Float[np.ndarray, "P P"]  # curvature of the loss where the last step began, nothing held
 
 
 @compiled
@@ -47,7 +61,7 @@ def evaluate(body, kind, target, flat, is_smooth):
 def minimise(
     body, kind, target, lambdas, priors, start, rest, held, iterations, tolerance, damping
 ):
-    """Best parameters, their L_rec and hard IoU, the iterations used and why it stopped."""
+    """Down from the start, in `iterations` steps at the most; what is `held` (P,) stays."""
     flat = start.copy()
     is_smooth = lambdas[4] > 0 or lambdas[5] > 0
     terms, hard, points, pixels, rim, covered = evaluate(body, kind, target, flat, is_smooth)
@@ -57,10 +71,9 @@ def minimise(
     )
     calm, refused = 0, 0
     for iteration in range(1, iterations + 1):
-        hold(held, H, g)
-        step = _solve(H, g, damping)
+        step = solve(H, g, damping, held)
         if 0.5 * dot(g, step) < tolerance:
-            return flat, loss, hard, iteration - 1, SETTLED
+            return Minimum(flat, loss, hard, iteration - 1, SETTLED, H)
         trial = flat - step
         found = evaluate(body, kind, target, trial, is_smooth)
         gain = loss - np.sum(found[0] * lambdas) - prior_loss(target, trial, rest, priors)
@@ -72,7 +85,7 @@ def minimise(
             refused = 0
             calm = calm + 1 if gain < tolerance else 0
             if calm == 2:
-                return flat, loss, hard, iteration, SETTLED
+                return Minimum(flat, loss, hard, iteration, SETTLED, H)
             if iteration < iterations:
                 H, g = normal_equations(
                     body, kind, target, lambdas, priors, flat, rest, points, pixels, rim, covered
@@ -81,27 +94,29 @@ def minimise(
             damping *= _GROWTH
             refused += 1
             if refused == _MOST_REFUSED:
-                return flat, loss, hard, iteration, STUCK
-    return flat, loss, hard, iterations, EXHAUSTED
+                return Minimum(flat, loss, hard, iteration, STUCK, H)
+    return Minimum(flat, loss, hard, iterations, EXHAUSTED, H)
 
 
 @compiled
-def hold(held, H, g):
-    """Take parameters out of the problem: their step is 0."""
-    for p in range(len(g)):
-        if held[p]:
-            g[p] = 0.0
-            H[p] = 0.0
-            H[:, p] = 0.0
-            H[p, p] = 1.0
+def solve(H, g, damping, held):
+    """(H + damping diag H)^-1 g, with steps of 0 in the parameters that are held."""
+    return solve_factorised(factorise(H, damping, held), np.where(held, 0.0, g))
 
 
 @compiled
-def factorise(H, damping):
-    """Lower triangular L with L L^T = H + damping diag H: H is a sum of squares, so it exists."""
+def factorise(H, damping, held):
+    """Lower triangular L with L L^T = H + damping diag H: H is a sum of squares, so it exists.
+
+    Rows and columns of what is held are those of the unit matrix.
+    """
     L = H.copy()
     for p in range(len(H)):
         L[p, p] += damping * H[p, p] + 1e-12
+        if held[p]:
+            L[p] = 0.0
+            L[:, p] = 0.0
+            L[p, p] = 1.0
     for p in range(len(H)):
         for q in range(p + 1):
             total = L[p, q]
@@ -109,12 +124,6 @@ def factorise(H, damping):
                 total -= L[p, k] * L[q, k]
             L[p, q] = np.sqrt(max(total, 1e-30)) if p == q else total / L[q, q]
     return L
-
-
-@compiled
-def _solve(H, g, damping):
-    """(H + damping diag H)^-1 g."""
-    return solve_factorised(factorise(H, damping), g)
 
 
 @compiled

@@ -5,13 +5,10 @@ import numpy as np
 from stream_dmr.fitting.compiled import compiled
 from stream_dmr.fitting.contour.levenberg_marquardt import (
     NEAR,
-    evaluate,
     factorise,
-    hold,
     minimise,
     solve_factorised,
 )
-from stream_dmr.fitting.contour.normal_equations import normal_equations
 
 SIZE = 5  # the root's log scale, of the parameters
 
@@ -57,17 +54,10 @@ def only_size(num_parameters):
 def _fit_of_this_size(body, kind, target, lambdas, priors, start, rest, iterations, tolerance):
     """The best fit (P,) of the start's size, its loss, half log determinant and slope (P,)."""
     held = only_size(len(start))
-    flat, loss, _, _, _ = minimise(
+    found = minimise(
         body, kind, target, lambdas, priors, start, rest, held, iterations, tolerance, NEAR
     )
-    _, _, points, pixels, rim, covered = evaluate(body, kind, target, flat, False)
-    H, g = normal_equations(
-        body, kind, target, lambdas, priors, flat, rest, points, pixels, rim, covered
-    )
-    pull = H[SIZE].copy()  # on the others, when the size grows
-    pull[SIZE] = 0.0
-    hold(held, H, g)
-    L = factorise(H, 0.0)
-    lead = -solve_factorised(L, pull)
+    L = factorise(found.H, 0.0, held)
+    lead = solve_factorised(L, np.where(held, 0.0, -found.H[SIZE]))
     lead[SIZE] = 1.0
-    return flat, loss, np.sum(np.log(np.diag(L))), lead
+    return found.flat, found.loss, np.sum(np.log(np.diag(L))), lead

@@ -7,11 +7,11 @@ from stream_dmr.body import JOINT, ROOT, Body, rest_vector
 from stream_dmr.fitting.bodies import Bodies
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import (
+    EXHAUSTED,
     FAR,
     NEAR,
-    SETTLED,
     STOP_REASONS,
-    STUCK,
+    Minimum,
     evaluate,
     minimise,
 )
@@ -89,7 +89,7 @@ class ContourSolver:
         iterations: int,
         damping: float,
     ) -> Solution:
-        flat, loss, iou, used, stop = minimise(
+        found = minimise(
             body,
             self._kind,
             target,
@@ -102,7 +102,14 @@ class ContourSolver:
             self._settings.tolerance,
             damping,
         )
-        return Solution(flat, loss, iou, used, stop in (SETTLED, STUCK), STOP_REASONS[stop])
+        return solution_of(found)
+
+
+def solution_of(found: Minimum) -> Solution:
+    """In words."""
+    settled = found.stop != EXHAUSTED
+    reason = STOP_REASONS[found.stop]
+    return Solution(found.flat, found.loss, found.iou, found.iterations, settled, reason)
 
 
 def mirror(flat: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
