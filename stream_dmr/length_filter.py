@@ -3,6 +3,7 @@
 x = [length_mm], F = H = 1, Q the square of a small drift, R from the std of each frame's fit.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
@@ -41,7 +42,15 @@ class SmoothLengthSettings(Settings):
         default=0.005, gt=0, description="no frame counts as surer than this, std over length"
     )
     frame_correlation: float = Field(
-        default=0.1, ge=0, le=1, description="of the errors of one fish's frames, 0 to 1"
+        default=0.03,
+        ge=0,
+        le=1,
+        description="of the errors of one fish's frames, however far apart, 0 to 1",
+    )
+    correlation_time_s: float = Field(
+        default=0.06,
+        gt=0,
+        description="in which the rest of a frame's error is forgotten, s of capture time",
     )
     common_std_ratio: float = Field(
         default=0.01,
@@ -55,6 +64,7 @@ class Measurement:
     """The length of one good frame."""
 
     frame_index: int
+    timestamp_ns: int
     length_mm: float
     std_ratio: float  # std over length
 
@@ -105,11 +115,38 @@ def robust_start(measurements: Sequence[Measurement]) -> RobustStart:
     return RobustStart(length_mm=median, variance=float(variance), inflation=inflation)
 
 
+class _Likeness:
+    """How alike the errors of some frames are: c + (1 - c) exp(-t / tau) for two a time t apart.
+
+    A fish in one pose for a second is seen no better by sixty frames than by fifteen.
+    """
+
+    def __init__(self, lasting: float, correlation_time_s: float) -> None:
+        self._lasting, self._tau_ns = lasting, correlation_time_s * 1e9
+        self._count, self._last_ns = 0, 0
+        self._with_earlier = 0.0  # of the last frame: sum of exp(-t / tau) over all before it
+        self._pairs = 0.0  # the same over all pairs
+
+    def add(self, timestamp_ns: int) -> None:
+        """Take one frame more."""
+        fading = math.exp(-abs(timestamp_ns - self._last_ns) / self._tau_ns)
+        self._with_earlier = fading * (self._with_earlier + 1.0) if self._count else 0.0
+        self._pairs += self._with_earlier
+        self._count, self._last_ns = self._count + 1, timestamp_ns
+
+    @property
+    def design_effect(self) -> float:
+        """Variance of the frames' plain mean over that of as many independent ones (Kish)."""
+        passing = 1.0 + 2.0 * self._pairs / max(self._count, 1)
+        return self._lasting * self._count + (1.0 - self._lasting) * passing
+
+
 class ConstantLengthFilter:
     """The filter's way through one track: state and variance after each frame that it used."""
 
     def __init__(self, start: RobustStart, settings: SmoothLengthSettings) -> None:
         self.frames: list[int] = []
+        self._likeness = _Likeness(settings.frame_correlation, settings.correlation_time_s)
         self._x: list[np.ndarray] = []
         self._P: list[np.ndarray] = []
         self._start = start
@@ -123,8 +160,13 @@ class ConstantLengthFilter:
 
     @property
     def variance(self) -> float:
-        """After the last used frame, mm^2."""
+        """After the last used frame, mm^2, were the errors of frames independent."""
         return float(self._P[-1][0, 0])
+
+    @property
+    def design_effect(self) -> float:
+        """How many times larger the variance is, since frames of one fish err alike."""
+        return self._likeness.design_effect
 
     def offer(self, measurement: Measurement) -> bool:
         """Use one more frame, in the order of frames, unless its innovation is too large."""
@@ -142,6 +184,7 @@ class ConstantLengthFilter:
         # The start serves the gate only: the first frame used is the whole state (no prior).
         x, P = update(x, P, z, R, _ONE)[:2] if self.frames else (z, R)
         self.frames.append(measurement.frame_index)
+        self._likeness.add(measurement.timestamp_ns)
         self._x.append(x)
         self._P.append(P)
         return True

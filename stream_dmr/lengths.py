@@ -41,6 +41,7 @@ def measurement_of(fish: LocalizedFish, settings: SmoothLengthSettings) -> Measu
         )
     return Measurement(
         frame_index=fish.frame_index,
+        timestamp_ns=fish.timestamp_ns,
         length_mm=length_mm,
         std_ratio=max(std_mm / length_mm, settings.min_frame_std_ratio),
     )
@@ -149,16 +150,10 @@ class TrackLength:
     def _std_mm(
         self, length_mm: Float[np.ndarray, "N"], variance: Float[np.ndarray, "N"]
     ) -> Float[np.ndarray, "N"]:
-        """Std from the filter's variance and from what frames of one fish have in common.
-
-        Twenty frames of one pose are not twenty measurements: with a correlation rho between the
-        errors of n frames, the variance of their mean is P (1 - rho + rho n), where P is what the
-        filter takes for n independent ones.
-        """
+        """Std from the filter's variance and from what frames of one fish have in common."""
         assert self._filter is not None
-        rho, n = self._settings.frame_correlation, len(self._filter.frames)
         shared = (self._settings.common_std_ratio * length_mm) ** 2
-        return np.sqrt(variance * (1.0 - rho + rho * n) + shared)
+        return np.sqrt(variance * self._filter.design_effect + shared)
 
     def _status(self, num_used: int, *, is_measured: bool, is_final: bool) -> str:
         if NO_CALIBRATION in self._refused:

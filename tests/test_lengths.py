@@ -22,10 +22,14 @@ seeds = st.integers(0, 2**32 - 1)
 OPEN_GATE = 1 - 1e-15
 
 
-def frame(index, length_mm, *, std_mm=10.0, reason="", track_id=1):
+FRAME_NS = 40_000_000
+ALL_NEW = {"frame_correlation": 0.0, "correlation_time_s": 1e-9}  # no frame errs like another
+
+
+def frame(index, length_mm, *, std_mm=10.0, reason="", track_id=1, timestamp_ns=None):
     return LocalizedFish(
         frame_index=index,
-        timestamp_ns=index * 40_000_000,
+        timestamp_ns=index * FRAME_NS if timestamp_ns is None else timestamp_ns,
         track_id=track_id,
         keypoints_px=None,
         keypoints_mm=None,
@@ -50,7 +54,12 @@ def random_measurements(seed, *, count=12):
     indices = np.cumsum(rng.integers(1, 4, count))
     ratios = rng.uniform(0.01, 0.1, count)
     return [
-        Measurement(frame_index=int(i), length_mm=float(z), std_ratio=float(ratio))
+        Measurement(
+            frame_index=int(i),
+            timestamp_ns=int(i) * FRAME_NS,
+            length_mm=float(z),
+            std_ratio=float(ratio),
+        )
         for i, ratio, z in zip(
             indices, ratios, 700 * (1 + ratios * rng.normal(size=count)), strict=True
         )
@@ -115,7 +124,7 @@ def test_variance_falls_with_every_frame_when_nothing_drifts(seed):
 def test_short_readings_weigh_no_more_than_long_ones():
     """The same relative error above and below: the mean stays in the middle."""
     measurements = [
-        Measurement(frame_index=i, length_mm=length, std_ratio=0.1)
+        Measurement(frame_index=i, timestamp_ns=i * FRAME_NS, length_mm=length, std_ratio=0.1)
         for i, length in enumerate([700.0, 630.0, 770.0] * 5)
     ]
     track = run_filter(measurements, SmoothLengthSettings(process_std_mm=0.0))
@@ -151,22 +160,55 @@ def test_outlier_is_named_in_its_own_frame_and_the_next_one_is_used():
     assert (estimates[7].frames_seen, estimates[7].frames_used) == (8, 7)
 
 
-@pytest.mark.parametrize(("common", "rho"), [(0.0, 0.0), (0.02, 0.0), (0.01, 0.2)])
-def test_interval_covers_the_truth_as_often_as_it_says(common, rho):
+@pytest.mark.parametrize(
+    ("common", "lasting", "tau_s"),
+    [(0.0, 0.0, 1e-9), (0.02, 0.0, 1e-9), (0.01, 0.2, 1e-9), (0.01, 0.1, 0.1)],
+)
+def test_interval_covers_the_truth_as_often_as_it_says(common, lasting, tau_s):
     """150 fish of 15 frames, with and without errors that frames share."""
     rng = np.random.default_rng(1)
+    apart_s = np.abs(np.subtract.outer(np.arange(15), np.arange(15))) * FRAME_NS / 1e9
+    alike = np.linalg.cholesky(lasting + (1 - lasting) * np.exp(-apart_s / tau_s))
+    changes = {"frame_correlation": lasting, "correlation_time_s": tau_s}
     hits, nees = [], []
     for truth in rng.uniform(400, 1200, 150):
         std = truth * rng.uniform(0.02, 0.06, 15)
-        errors = np.sqrt(rho) * rng.normal() + np.sqrt(1 - rho) * rng.normal(size=15)
-        seen = truth * (1 + common * rng.normal()) + std * errors
+        seen = truth * (1 + common * rng.normal()) + std * (alike @ rng.normal(size=15))
         frames = [frame(i + 1, seen[i], std_mm=std[i]) for i in range(15)]
-        final = run(frames, common_std_ratio=common, frame_correlation=rho)[-1]
+        final = run(frames, common_std_ratio=common, **changes)[-1]
         low, high = final.ci95_mm
         hits.append(low <= truth <= high)
         nees.append(((final.length_mm - truth) / final.length_std_mm) ** 2)
-    assert 0.93 <= np.mean(hits) <= 0.98
+    assert 0.93 <= np.mean(hits) <= 0.99
     assert 0.75 <= np.mean(nees) <= 1.15  # 1 but for the inflation, which never shrinks an interval
+
+
+@given(
+    seed=seeds, lasting=st.sampled_from([0.0, 0.1, 1.0]), tau_s=st.sampled_from([1e-3, 0.1, 10.0])
+)
+def test_what_frames_have_in_common_is_the_sum_over_all_pairs(seed, lasting, tau_s):
+    """Slow twin: 1^T C 1 / n with the whole matrix of correlations."""
+    measurements = random_measurements(seed)
+    track = run_filter(
+        measurements,
+        SmoothLengthSettings(frame_correlation=lasting, correlation_time_s=tau_s),
+    )
+    times = [m.timestamp_ns / 1e9 for m in measurements if m.frame_index in track.frames]
+    apart_s = np.abs(np.subtract.outer(times, times))
+    alike = lasting + (1 - lasting) * np.exp(-apart_s / tau_s)
+    assert track.design_effect == pytest.approx(alike.sum() / len(times), rel=1e-9)
+
+
+def test_more_frames_of_the_same_second_tell_little_more():
+    """And those of a longer time do."""
+
+    def std_mm(count, seconds):
+        times = np.linspace(0, seconds * 1e9, count).astype(int)
+        frames = [frame(i, 700.0, timestamp_ns=int(t)) for i, t in enumerate(times, start=1)]
+        return run(frames, common_std_ratio=0.0, process_std_mm=0.0)[-1].length_std_mm
+
+    assert std_mm(120, 1.0) > 0.95 * std_mm(30, 1.0)
+    assert std_mm(120, 4.0) < 0.7 * std_mm(30, 1.0)
 
 
 def test_overconfident_fits_are_widened_by_their_own_scatter():
@@ -185,7 +227,7 @@ def test_overconfident_fits_are_widened_by_their_own_scatter():
 
 def test_common_error_does_not_average_out():
     frames = [frame(i, 700.0) for i in range(1, 400)]
-    final = run(frames, common_std_ratio=0.02, frame_correlation=0.0)[-1]
+    final = run(frames, common_std_ratio=0.02, **ALL_NEW)[-1]
     assert final.length_std_mm == pytest.approx(14.0, rel=0.01)
     np.testing.assert_allclose(final.ci95_mm, [700 - 27.5, 700 + 27.5], atol=0.3)
 
