@@ -29,6 +29,7 @@ from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.normal_equations import normal_equations, prior_loss
 from stream_dmr.fitting.contour.size_scan import SIZE
+from stream_dmr.fitting.size_scanner import SCATTER
 from stream_dmr.fitting.tracks import TrackFitter
 from stream_dmr.lengths import TrackLength
 from stream_dmr.localization import localize
@@ -115,7 +116,8 @@ def _lengths(
         assert fish.length_std_mm is not None
         mean, std = sampler.log_size(crop, shape.parameters)
         length_mm = fish.length_mm * np.exp(mean - shape.parameters[SIZE])
-        variance = (fish.length_std_mm / fish.length_mm) ** 2 - shape.length_std_ratio**2 + std**2
+        others = (fish.length_std_mm / fish.length_mm) ** 2 - shape.length_std_ratio**2
+        variance = others + (SCATTER * std) ** 2
         yield fish, replace(fish, length_mm=length_mm, length_std_mm=length_mm * variance**0.5)
 
 

@@ -24,7 +24,7 @@ class SmoothLengthSettings(Settings):
 
     min_frames: int = Field(default=3, ge=1, description="fewest good frames that give a length")
     max_std_ratio: float = Field(
-        default=0.15, gt=0, description="least certain length that is given, std over length"
+        default=0.2, gt=0, description="least certain length that is given, std over length"
     )
     max_frames: int = Field(
         default=2000, ge=1, description="good frames of one fish after which no more are used"
@@ -48,7 +48,7 @@ class SmoothLengthSettings(Settings):
         description="of the errors of one fish's frames, however far apart, 0 to 1",
     )
     correlation_time_s: float = Field(
-        default=0.06,
+        default=0.2,
         gt=0,
         description="in which the rest of a frame's error is forgotten, s of capture time",
     )

@@ -60,10 +60,10 @@ class LocalizeSettings(Settings):
         default=0.15, ge=0, description="std of what bending adds to a length, as a fraction of it"
     )
     slant_std_rad: float = Field(
-        default=0.15, ge=0, description="std of the angle at which the body is seen, rad"
+        default=0.1, ge=0, description="std of the angle at which the body is seen, rad"
     )
     misfit_std: float = Field(
-        default=0.12,
+        default=0.08,
         ge=0,
         description="std that the misfit of an IoU of 0.9 adds to a length, as a fraction of it",
     )

@@ -56,17 +56,17 @@ def test_without_any_preference_nothing_is_known():
 @settings(deadline=None)
 @given(
     points=st.lists(
-        st.tuples(st.integers(-30, 30), st.floats(-50, 50)),
+        st.tuples(st.integers(-30, 30), st.integers(-500, 500)),
         min_size=2,
         max_size=9,
         unique_by=lambda point: point[0],
     )
 )
 def test_between_the_sizes_tried_the_curve_is_scipy_s(points):
-    """Slow twin: SciPy's interpolator and sums over a finer grid."""
-    hundredths, nats = map(np.array, zip(*sorted(points), strict=True))
-    offsets = hundredths / 100
-    x = np.arange(offsets[0] - 0.15, offsets[-1] + 0.15, 0.0005)
+    """Slow twin: SciPy's interpolator, on the same grid."""
+    hundredths, tenths = map(np.array, zip(*sorted(points), strict=True))
+    offsets, nats = hundredths / 100, tenths / 10
+    x = np.arange(offsets[0] - 0.15, offsets[-1] + 0.15, 0.002)
     curve = PchipInterpolator(offsets, nats)(x.clip(offsets[0], offsets[-1]))
     first, last = np.diff(nats)[[0, -1]] / np.diff(offsets)[[0, -1]]
     curve += np.maximum(offsets[0] - x, 0) * max(-first, 10.0)
@@ -74,7 +74,7 @@ def test_between_the_sizes_tried_the_curve_is_scipy_s(points):
     density = np.exp(curve.min() - curve)
     mean = np.average(x, weights=density)
     std = np.sqrt(np.average((x - mean) ** 2, weights=density))
-    assert mean_and_std(offsets, nats) == pytest.approx((mean, std), abs=0.003)
+    assert mean_and_std(offsets, nats) == pytest.approx((mean, std), abs=0.002)
 
 
 @pytest.fixture(scope="module")
