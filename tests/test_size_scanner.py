@@ -48,6 +48,12 @@ def test_the_mean_leans_to_where_sizes_stay_likely():
     assert 0.03 < mean < std + 0.03
 
 
+def test_of_a_single_size_that_was_tried_it_is_the_mean():
+    mean, std = mean_and_std(np.array([0.03]), np.array([7.0]))
+    assert mean == pytest.approx(0.03, abs=0.002)
+    assert 0.03 < std < 0.15
+
+
 def test_without_any_preference_nothing_is_known():
     _, std = mean_and_std(OFFSETS, np.zeros(len(OFFSETS)))
     assert std > 0.15

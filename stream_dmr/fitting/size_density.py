@@ -13,21 +13,24 @@ _STEEPEST_END = 10.0  # nats per unit of log size: past the ends sizes get at le
 def mean_and_std(offsets, nats):
     """Of the density exp(-nats) over log sizes, which between those tried is a smooth curve.
 
-    `offsets` (G,) ascend, two at least. Past them the curve goes on straight, and steeply enough.
+    `offsets` (G,) ascend. Past them the curve goes on straight, and steeply enough.
     """
+    last = len(offsets) - 1
     slopes = pchip_slopes(offsets, nats)
-    falling = max(-(nats[1] - nats[0]) / (offsets[1] - offsets[0]), _STEEPEST_END)
-    rising = max((nats[-1] - nats[-2]) / (offsets[-1] - offsets[-2]), _STEEPEST_END)
-    count = int(np.ceil((offsets[-1] - offsets[0] + 2 * _BEYOND) / _STEP))
+    falling = rising = _STEEPEST_END
+    if last > 0:
+        falling = max(-(nats[1] - nats[0]) / (offsets[1] - offsets[0]), falling)
+        rising = max((nats[last] - nats[last - 1]) / (offsets[last] - offsets[last - 1]), rising)
+    count = int(np.ceil((offsets[last] - offsets[0] + 2 * _BEYOND) / _STEP))
     likeliest = np.min(nats)
     total = first = second = 0.0
     k = 0
     for n in range(count):
         x = offsets[0] - _BEYOND + n * _STEP
-        inside = min(max(x, offsets[0]), offsets[-1])
-        while k < len(offsets) - 2 and inside > offsets[k + 1]:
+        inside = min(max(x, offsets[0]), offsets[last])
+        while k < last - 1 and inside > offsets[k + 1]:
             k += 1
-        value = _hermite(offsets, nats, slopes, k, inside)
+        value = _hermite(offsets, nats, slopes, k, inside) if last > 0 else nats[0]
         value += (inside - x) * falling if x < inside else (x - inside) * rising
         density = np.exp(likeliest - value)
         total += density
@@ -48,6 +51,7 @@ def pchip_slopes(x, y):
     slopes = np.zeros(len(x))
     if last == 1:
         slopes[:] = (y[1] - y[0]) / (x[1] - x[0])
+    if last < 2:
         return slopes
     for k in range(1, last):
         h0, h1 = x[k] - x[k - 1], x[k + 1] - x[k]
@@ -55,17 +59,16 @@ def pchip_slopes(x, y):
         if d0 * d1 > 0:
             w0, w1 = 2 * h1 + h0, h1 + 2 * h0
             slopes[k] = (w0 + w1) / (w0 / d0 + w1 / d1)
-    slopes[0] = _end_slope(x[1] - x[0], x[2] - x[1], y[1] - y[0], y[2] - y[1])
-    slopes[last] = _end_slope(
-        x[last] - x[last - 1], x[last - 1] - x[last - 2], y[last] - y[last - 1],
-        y[last - 1] - y[last - 2],
-    )  # fmt: skip
+    slopes[0] = _end_slope(x, y, 0, 1)
+    slopes[last] = _end_slope(x, y, last, -1)
     return slopes
 
 
 @compiled
-def _end_slope(h0, h1, rise0, rise1):
-    d0, d1 = rise0 / h0, rise1 / h1
+def _end_slope(x, y, end, inwards):
+    near, far = end + inwards, end + 2 * inwards
+    h0, h1 = x[near] - x[end], x[far] - x[near]
+    d0, d1 = (y[near] - y[end]) / h0, (y[far] - y[near]) / h1
     slope = ((2 * h0 + h1) * d0 - h0 * d1) / (h0 + h1)
     if slope * d0 <= 0:
         return 0.0

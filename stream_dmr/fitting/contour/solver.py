@@ -106,7 +106,7 @@ class ContourSolver:
 
 
 def solution_of(found: Minimum) -> Solution:
-    """In words."""
+    """What a descent found, as every solver says it."""
     settled = found.stop != EXHAUSTED
     reason = STOP_REASONS[found.stop]
     return Solution(found.flat, found.loss, found.iou, found.iterations, settled, reason)
