@@ -20,6 +20,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from reading import read_header, read_messages, read_metadata
 from recorded_run import assert_same, header, run, template
 from rerun.chunk import RrdReader
+from vulkan import needs_vulkan
 
 from stream_dmr.errors import OutputError, RecordingError
 from stream_dmr.geometry import arc_length
@@ -422,6 +423,7 @@ def test_foxglove_topics_are_written_beside_the_messages(tmp_path: Path, message
 
 
 @pytest.mark.slow
+@needs_vulkan
 def test_the_view_opens_without_a_screen(tmp_path: Path, messages: list[Message]):
     from stream_dmr.recording.viewer import screenshot
 

@@ -17,6 +17,7 @@ from reading import read_header, read_messages
 from recorded_run import assert_same, header, run
 from rerun.chunk import RrdReader
 from tiny_clip import write_clip
+from vulkan import needs_vulkan
 
 from stream_dmr.errors import SourceError
 from stream_dmr.export import mask_in_frame, run_lengths
@@ -290,6 +291,7 @@ def test_without_a_screen_the_ways_to_do_without_are_named(
 
 
 @pytest.mark.slow
+@needs_vulkan
 def test_a_picture_of_the_view_needs_no_screen(clip: Path, tmp_path: Path):
     png = tmp_path / "view.png"
     options = {"--screenshot": str(png), "--frame": "2"}
