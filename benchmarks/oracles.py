@@ -12,7 +12,7 @@ import os
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 import multiprocessing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -21,8 +21,9 @@ from table1.dmr import through_all
 from table1.fish import FISH_PER_SCENE, FRAMES_PER_SCENE, Haul, watch
 from targets import body_template
 
+from nodes.smooth_length import SmoothLength
 from stream_dmr.config import Config
-from stream_dmr.messages import FishCrop, LengthEstimate
+from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish
 from stream_dmr.run import later_nodes
 from stream_dmr.simulation.body import HALIBUT, Body
 from stream_dmr.simulation.fish import pose_fish
@@ -55,12 +56,10 @@ def errors_of(task: tuple[str, int]) -> dict[str, list[float]]:
     return found
 
 
-def scene_of(task: tuple[str, int]) -> Scene:
+def scene_of(task: tuple[str, int], *, num_frames: int = FRAMES_PER_SCENE) -> Scene:
     """The scene of a preset and a seed."""
     preset, seed = task
-    return make_scene(
-        num_fish=FISH_PER_SCENE, num_frames=FRAMES_PER_SCENE, preset=preset, seed=seed
-    )
+    return make_scene(num_fish=FISH_PER_SCENE, num_frames=num_frames, preset=preset, seed=seed)
 
 
 def tracks_of(haul: Haul) -> dict[int, list[FishCrop]]:
@@ -69,6 +68,13 @@ def tracks_of(haul: Haul) -> dict[int, list[FishCrop]]:
     for sighting in (sighting for frame in haul.frames for sighting in frame):
         tracks.setdefault(sighting.crop.track_id, []).append(sighting.crop)
     return tracks
+
+
+def sum_up(frames: Sequence[LocalizedFish], config: Config) -> LengthEstimate:
+    """What all these frames of one fish say together."""
+    *_, final = through_all(frames, [SmoothLength(config.smooth_length)])
+    assert isinstance(final, LengthEstimate)
+    return final
 
 
 def slant_std_rad(scene: Scene) -> float:

@@ -17,9 +17,9 @@ from dataclasses import replace
 
 import numpy as np
 from numba import njit
-from oracles import over_scenes, scene_of, tracks_of
+from oracles import over_scenes, scene_of, sum_up, tracks_of
 from table1.fish import watch
-from targets import body_template
+from targets import species_template
 
 from stream_dmr.body import rest_vector
 from stream_dmr.camera import Calibration
@@ -31,10 +31,8 @@ from stream_dmr.fitting.contour.normal_equations import normal_equations, prior_
 from stream_dmr.fitting.contour.size_scan import SIZE
 from stream_dmr.fitting.size_scanner import SCATTER
 from stream_dmr.fitting.tracks import TrackFitter
-from stream_dmr.lengths import TrackLength
 from stream_dmr.localization import localize
 from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
-from stream_dmr.simulation.body import HALIBUT
 from stream_dmr.simulation.presets import PRESETS
 
 _FRAMES_PER_FISH = 5
@@ -87,7 +85,7 @@ class Sampler:
 def errors_of(task: tuple[str, int]) -> np.ndarray:
     """Relative errors of the fish of a scene, by the scan and by sampling (F, 2)."""
     haul = watch(scene_of(task), with_second=False)
-    template = body_template(HALIBUT)
+    template = species_template()
     tracks = TrackFitter(template, CONFIG.fit_mesh, calibration=haul.calibration)
     sampler = Sampler(tracks, Bodies.of(template, max_faces=CONFIG.fit_mesh.max_faces), CONFIG)
     errors = []
@@ -123,10 +121,7 @@ def _lengths(
 
 def _together(frames: Sequence[LocalizedFish]) -> float:
     """The fish's length; NaN where its frames contradict each other."""
-    track = TrackLength(frames[0], CONFIG.smooth_length)
-    for fish in frames:
-        track.add(fish)
-    return track.finish().length_mm or float("nan")
+    return sum_up(frames, CONFIG).length_mm or float("nan")
 
 
 def main() -> None:

@@ -6,18 +6,16 @@ Scenes of our own, 18 fish each, every fish in sight for some three seconds at 1
 """
 
 import numpy as np
-from oracles import over_scenes, tracks_of
+from oracles import over_scenes, scene_of, sum_up, tracks_of
 from table1.dmr import through_all
-from table1.fish import FISH_PER_SCENE, watch
+from table1.fish import watch
 from targets import species_template
 
-from nodes.smooth_length import SmoothLength
 from stream_dmr.config import Config
-from stream_dmr.messages import LengthEstimate, LocalizedFish
+from stream_dmr.messages import LocalizedFish
 from stream_dmr.run import later_nodes
 from stream_dmr.simulation.motion import FPS
 from stream_dmr.simulation.presets import PRESETS
-from stream_dmr.simulation.scene import make_scene
 
 _NUM_FRAMES = 600  # of a scene: some 48 of each fish
 CONFIG = Config()
@@ -31,18 +29,15 @@ VIEWS = {
 
 def errors_of(task: tuple[str, int]) -> dict[str, list[tuple[float, float]]]:
     """Relative errors and relative stds of the fish of one scene, by what was seen of them."""
-    preset, seed = task
-    scene = make_scene(num_fish=FISH_PER_SCENE, num_frames=_NUM_FRAMES, preset=preset, seed=seed)
-    haul = watch(scene, with_second=False)
+    haul = watch(scene_of(task, num_frames=_NUM_FRAMES), with_second=False)
+    fit, localize, _ = later_nodes(
+        CONFIG, template=species_template(), calibration=haul.calibration
+    )
     found: dict[str, list[tuple[float, float]]] = {view: [] for view in VIEWS}
     for track_id, crops in tracks_of(haul).items():
-        fit, localize, _ = later_nodes(
-            CONFIG, template=species_template(), calibration=haul.calibration
-        )
         placed = [m for m in through_all(crops, [fit, localize]) if isinstance(m, LocalizedFish)]
         for view, chosen in VIEWS.items():
-            *_, final = through_all(chosen(placed), [SmoothLength(CONFIG.smooth_length)])
-            assert isinstance(final, LengthEstimate)
+            final = sum_up(chosen(placed), CONFIG)
             if final.length_mm is not None and final.length_std_mm is not None:
                 truth_mm = haul.truth_mm[track_id]
                 found[view].append((final.length_mm / truth_mm - 1, final.length_std_mm / truth_mm))

@@ -165,13 +165,13 @@ def test_outlier_is_named_in_its_own_frame_and_the_next_one_is_used():
     [(0.0, 0.0, 1e-9), (0.02, 0.0, 1e-9), (0.01, 0.2, 1e-9), (0.01, 0.1, 0.1)],
 )
 def test_interval_covers_the_truth_as_often_as_it_says(common, lasting, tau_s):
-    """150 fish of 15 frames, with and without errors that frames share."""
+    """300 fish of 15 frames, with and without errors that frames share."""
     rng = np.random.default_rng(1)
     apart_s = np.abs(np.subtract.outer(np.arange(15), np.arange(15))) * FRAME_NS / 1e9
     alike = np.linalg.cholesky(lasting + (1 - lasting) * np.exp(-apart_s / tau_s))
     changes = {"frame_correlation": lasting, "correlation_time_s": tau_s}
     hits, nees = [], []
-    for truth in rng.uniform(400, 1200, 150):
+    for truth in rng.uniform(400, 1200, 300):
         std = truth * rng.uniform(0.02, 0.06, 15)
         seen = truth * (1 + common * rng.normal()) + std * (alike @ rng.normal(size=15))
         frames = [frame(i + 1, seen[i], std_mm=std[i]) for i in range(15)]
@@ -179,7 +179,7 @@ def test_interval_covers_the_truth_as_often_as_it_says(common, lasting, tau_s):
         low, high = final.ci95_mm
         hits.append(low <= truth <= high)
         nees.append(((final.length_mm - truth) / final.length_std_mm) ** 2)
-    assert 0.93 <= np.mean(hits) <= 0.99
+    assert 0.93 <= np.mean(hits) <= 0.98
     assert 0.75 <= np.mean(nees) <= 1.15  # 1 but for the inflation, which never shrinks an interval
 
 
