@@ -1,10 +1,7 @@
 """One crop in, one fitted mesh out: warm from the frame before, else cold; then sized."""
 
 import time
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -25,9 +22,6 @@ from stream_dmr.fitting.uncertainty import covariance
 from stream_dmr.fitting.warm_start import recentered
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms, SolverReport
 from stream_dmr.template import Template
-
-if TYPE_CHECKING:
-    from stream_dmr.fitting.batched.fitter import BatchedFitter, Fitted
 
 # Without a calibration, fish are taken to hang square to the camera.
 _TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
@@ -88,35 +82,6 @@ class Fitter:
         solution, is_cold = self._solve(target, warm)
         return self._answer(crop, target, solution, is_cold=is_cold, since_ns=began)
 
-    def fit_many(
-        self, crops: Sequence[FishCrop], warms: Sequence[Float[np.ndarray, "P"] | None]
-    ) -> list[Fit]:
-        """What `fit` says of each: a backlog, side by side on a GPU with `device = "cuda"`.
-
-        Its fits agree with those of `fit` to the solver's tolerance, not to the last bit, and each
-        reports the time of its whole batch. Raises ConfigError where there is no GPU.
-        """
-        if self._settings.device == "cpu" or self._settings.solver != "contour":
-            return [self.fit(crop, warm) for crop, warm in zip(crops, warms, strict=True)]
-        refusals = [self._refusal(crop) for crop in crops]
-        sound = [index for index, refusal in enumerate(refusals) if not refusal]
-        began = time.perf_counter_ns()
-        fitted = self._backlog.fit([crops[i] for i in sound], [warms[i] for i in sound])
-        answers = [
-            Fit(_message(c, None, None, r), None) for c, r in zip(crops, refusals, strict=True)
-        ]
-
-        def answer(index: int, one: "Fitted") -> Fit:
-            target = self.target(crops[index])
-            return self._answer(
-                crops[index], target, one.solution, is_cold=one.is_cold, since_ns=began
-            )
-
-        with ThreadPoolExecutor() as pool:
-            for index, found in zip(sound, pool.map(answer, sound, fitted), strict=True):
-                answers[index] = found
-        return answers
-
     def _answer(
         self,
         crop: FishCrop,
@@ -135,19 +100,6 @@ class Fitter:
         shape = self._shape(target, sized, crop, size_std)
         report = self._report(solution, is_cold=is_cold, since_ns=since_ns)
         return Fit(_message(crop, shape, report, ""), solution.flat)
-
-    @cached_property
-    def _backlog(self) -> "BatchedFitter":
-        from stream_dmr.fitting.batched.fitter import BatchedFitter  # imports torch: a second
-        from stream_dmr.fitting.batched.solver import BatchedSolver
-
-        return BatchedFitter(
-            self._template,
-            BatchedSolver(self._bodies, self._settings),
-            self._settings,
-            plane_normal=self._plane_normal,
-            clear_gain=_CLEAR_GAIN,
-        )
 
     def _report(self, solution: Solution, *, is_cold: bool, since_ns: int) -> SolverReport:
         return SolverReport(

@@ -20,8 +20,7 @@ class FitMeshSettings(Settings):
         default="contour", description='"contour" is second order and fast; "adam" is the paper\'s'
     )
     device: Literal["cpu", "cuda"] = Field(
-        default="cpu",
-        description="where adam and backlogs (fit_many) run; one contour fit: the CPU",
+        default="cpu", description="where adam runs; the contour solver: the CPU"
     )
     lambda_scale: float = Field(default=1.0, ge=0, description="weight of L_s, eq. (3)")
     lambda_translation: float = Field(default=10.0, ge=0, description="weight of L_t, eq. (3)")
