@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 .PHONY: demo test test-slow bench faults soak table1 check format golden config clean
 
 demo: $(STAMP)  ## the main job on the embedded scene, lengths beside the truth
-	$(BIN)/python -m stream_dmr.demo
+	$(BIN)/python -m stream_dmr.cli.demo
 
 test: $(STAMP)  ## the tests of a few minutes
 	$(BIN)/pytest -n 2 --dist worksteal
@@ -44,7 +44,7 @@ golden: $(STAMP)  ## recordings/golden anew, after saying what moved
 	$(BIN)/python recordings/make_golden.py
 
 config: $(STAMP)  ## config.toml anew from the settings classes
-	$(BIN)/python -m stream_dmr.config > config.toml.new
+	$(BIN)/python -m stream_dmr.running.config > config.toml.new
 	mv config.toml.new config.toml
 
 # The stamp comes last, so that an interrupted installation is taken up again.

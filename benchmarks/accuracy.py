@@ -12,9 +12,9 @@ import tempfile
 import threading
 from pathlib import Path
 
-from stream_dmr.config import Config, to_toml
-from stream_dmr.evaluation import Evaluation, evaluate
-from stream_dmr.run import RunRequest, run
+from stream_dmr.evaluation.compare import Evaluation, evaluate
+from stream_dmr.running.config import Config, to_toml
+from stream_dmr.running.run import RunRequest, run
 
 _QUIET = {"mcap": False, "rrd": False}
 _PAPER = {"deformation": "linear-blend", "solver": "adam"}

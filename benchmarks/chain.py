@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import cv2
 
-from stream_dmr.calibration import save_calibration
-from stream_dmr.config import Config, to_toml
-from stream_dmr.run import RunRequest, run
+from stream_dmr.calibration.file import save_calibration
+from stream_dmr.running.config import Config, to_toml
+from stream_dmr.running.run import RunRequest, run
 from stream_dmr.simulation.film import Shot, film
 from stream_dmr.simulation.scene import HEIGHT, WIDTH, make_scene
 from stream_dmr.simulation.writer import encode_mask, write_species

@@ -19,13 +19,13 @@ import numpy as np
 
 from nodes.crop_fish import CropFish
 from nodes.read_frames import ReadFrames
-from stream_dmr.config import load_config
 from stream_dmr.messages import FishCrop, FittedMesh, Message
-from stream_dmr.pipeline import run_chain
 from stream_dmr.report.pictures import drawn, outlines_of
-from stream_dmr.run import later_nodes
-from stream_dmr.segmentation.fish_finder import open_finder
-from stream_dmr.template import load_template
+from stream_dmr.running.config import load_config
+from stream_dmr.running.pipeline import run_chain
+from stream_dmr.running.run import later_nodes
+from stream_dmr.segmentation.tracking.fish_finder import open_finder
+from stream_dmr.template.template import load_template
 
 _SHOWN, _PER_ROW = 30, 10
 _TILE_PX = 160

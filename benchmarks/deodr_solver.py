@@ -15,14 +15,13 @@ from deodr.differentiable_renderer import Scene2D
 from jaxtyping import Float
 from torch import Tensor
 
-from stream_dmr import losses
-from stream_dmr.body import JOINT, ROOT
-from stream_dmr.fitting import adam
+from stream_dmr.fitting.body import JOINT, ROOT
+from stream_dmr.fitting.paper import adam, losses
+from stream_dmr.fitting.paper.silhouette import project
+from stream_dmr.fitting.paper.skinning import Parameters, Rig, deform, spine
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
-from stream_dmr.silhouette import project
-from stream_dmr.skinning import Parameters, Rig, deform, spine
-from stream_dmr.template import Template
+from stream_dmr.template.template import Template
 
 
 class DeodrSolver:

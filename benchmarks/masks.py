@@ -18,16 +18,16 @@ import torch
 from jaxtyping import Bool, UInt8
 
 from nodes.crop_fish import CropFish
-from stream_dmr.calibration import load_calibration
+from stream_dmr.calibration.file import load_calibration
 from stream_dmr.messages import FishCrop
-from stream_dmr.read_settings import ReadFramesSettings
-from stream_dmr.segmentation.annotations import Masks
-from stream_dmr.segmentation.crop import CropFishSettings, frame_from_crop_map
-from stream_dmr.segmentation.detections import open_annotations
-from stream_dmr.segmentation.unet.inference import UNetSegmenter
-from stream_dmr.segmentation.unet.network import SIZE_PX
-from stream_dmr.segmentation.unet.weights import SHIPPED
-from stream_dmr.video import open_source
+from stream_dmr.segmentation.annotations.detections import open_annotations
+from stream_dmr.segmentation.annotations.files import Masks
+from stream_dmr.segmentation.masks.crop import CropFishSettings, frame_from_crop_map
+from stream_dmr.segmentation.network.inference import UNetSegmenter
+from stream_dmr.segmentation.network.network import SIZE_PX
+from stream_dmr.segmentation.network.weights import SHIPPED
+from stream_dmr.sources.open_source import open_source
+from stream_dmr.sources.settings import ReadFramesSettings
 
 _LEAST_PX = 64  # of a true mask in its crop
 _SHOWN, _PER_ROW = 36, 12  # crops on the sheet: the worst third, the others at random

@@ -22,14 +22,14 @@ from table1.fish import FISH_PER_SCENE, FRAMES_PER_SCENE, Haul, watch
 from targets import body_template
 
 from nodes.smooth_length import SmoothLength
-from stream_dmr.config import Config
 from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish
-from stream_dmr.run import later_nodes
+from stream_dmr.running.config import Config
+from stream_dmr.running.run import later_nodes
 from stream_dmr.simulation.body import HALIBUT, Body
 from stream_dmr.simulation.fish import pose_fish
 from stream_dmr.simulation.presets import PRESETS
 from stream_dmr.simulation.scene import Scene, make_scene
-from stream_dmr.template import Template
+from stream_dmr.template.template import Template
 
 T = TypeVar("T")
 FIRST_SEED = 5000

@@ -11,10 +11,9 @@ import tempfile
 from pathlib import Path
 from statistics import median
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from browser import Tab
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from stream_dmr.report.report import open_report, write_report
+from tests.support.browser import Tab
 
 _REPEATS = 5
 # Until the frame after next: what was asked for is on the screen by then.

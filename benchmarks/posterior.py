@@ -21,18 +21,18 @@ from oracles import over_scenes, scene_of, sum_up, tracks_of
 from table1.fish import watch
 from targets import species_template
 
-from stream_dmr.body import rest_vector
 from stream_dmr.camera import Calibration
-from stream_dmr.config import Config
-from stream_dmr.fitting.bodies import Bodies
+from stream_dmr.fitting.body import rest_vector
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.normal_equations import normal_equations, prior_loss
-from stream_dmr.fitting.contour.size_scan import SIZE
-from stream_dmr.fitting.size_scanner import SCATTER
+from stream_dmr.fitting.mesh_levels import Bodies
+from stream_dmr.fitting.size.scan import SIZE
+from stream_dmr.fitting.size.scanner import SCATTER
 from stream_dmr.fitting.tracks import TrackFitter
-from stream_dmr.localization import localize
+from stream_dmr.localization.localize import localize
 from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
+from stream_dmr.running.config import Config
 from stream_dmr.simulation.presets import PRESETS
 
 _FRAMES_PER_FISH = 5

@@ -16,17 +16,17 @@ from clock import Took, took, typical
 from jaxtyping import Float
 from targets import Pair
 
-from stream_dmr.fitting import adam
-from stream_dmr.fitting.adam import AdamSolver
-from stream_dmr.fitting.bodies import Bodies
 from stream_dmr.fitting.cold_start import cold_starts
 from stream_dmr.fitting.contour.solver import ContourSolver
-from stream_dmr.fitting.fit import Fitter
+from stream_dmr.fitting.fitter import Fitter
+from stream_dmr.fitting.mesh_levels import Bodies
+from stream_dmr.fitting.paper import adam
+from stream_dmr.fitting.paper.adam import AdamSolver
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution
 from stream_dmr.fitting.target import Target
 from stream_dmr.fitting.warm_start import recentered
-from stream_dmr.template import Template
+from stream_dmr.template.template import Template
 
 GOAL = 0.97
 CAP = 300  # iterations of a gradient descent; then it counts as never there

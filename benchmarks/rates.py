@@ -15,9 +15,7 @@ from clock import Took, took, typical
 from jaxtyping import Float
 from targets import Known, Pair
 
-from stream_dmr.body import rest_vector
-from stream_dmr.fitting.adam import AdamSolver
-from stream_dmr.fitting.bodies import Bodies
+from stream_dmr.fitting.body import rest_vector
 from stream_dmr.fitting.contour import (
     deformation,
     levenberg_marquardt,
@@ -30,12 +28,14 @@ from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.outline import project
 from stream_dmr.fitting.contour.solver import ContourSolver
 from stream_dmr.fitting.distance_map import signed_distance
-from stream_dmr.fitting.fit import Fitter
+from stream_dmr.fitting.fitter import Fitter
+from stream_dmr.fitting.mesh_levels import Bodies
+from stream_dmr.fitting.paper.adam import AdamSolver
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target, mask_contour
 from stream_dmr.fitting.uncertainty import covariance
 from stream_dmr.fitting.warm_start import recentered
-from stream_dmr.template import Template
+from stream_dmr.template.template import Template
 
 SPINE = KINDS["spine"]
 ADAM_ITERATIONS = 300  # its steps have shrunk ten thousandfold by then
@@ -214,8 +214,8 @@ began = time.perf_counter()
 import sys
 sys.path.insert(0, "benchmarks")
 from targets import species_template
-from stream_dmr.fitting.fit import Fitter
-from stream_dmr.fitting.rehearsal import rehearse
+from stream_dmr.fitting.fitter import Fitter
+from stream_dmr.fitting.compile_kernels import rehearse
 from stream_dmr.fitting.settings import FitMeshSettings
 fitter = Fitter(species_template(), FitMeshSettings())
 ready = time.perf_counter()

@@ -26,18 +26,18 @@ from masks import iou, write_sheet
 
 from nodes.crop_fish import CropFish
 from nodes.read_frames import ReadFrames
-from stream_dmr.calibration import load_calibration
-from stream_dmr.config import load_config
-from stream_dmr.evaluation_files import read_truth
+from stream_dmr.calibration.file import load_calibration
+from stream_dmr.evaluation.files import read_truth
 from stream_dmr.messages import FishCrop, LengthEstimate, Message
-from stream_dmr.pipeline import StageCounters, run_chain
-from stream_dmr.run import later_nodes
-from stream_dmr.segmentation.annotations import Masks
-from stream_dmr.segmentation.crop import frame_from_crop_map
-from stream_dmr.segmentation.fish_finder import open_finder
+from stream_dmr.running.config import load_config
+from stream_dmr.running.pipeline import StageCounters, run_chain
+from stream_dmr.running.run import later_nodes
+from stream_dmr.segmentation.annotations.files import Masks
+from stream_dmr.segmentation.masks.crop import frame_from_crop_map
+from stream_dmr.segmentation.tracking.fish_finder import open_finder
 from stream_dmr.simulation.presets import PRESETS
 from stream_dmr.simulation.writer import simulate
-from stream_dmr.template import load_template
+from stream_dmr.template.template import load_template
 
 
 class Ran(NamedTuple):

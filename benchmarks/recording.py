@@ -17,13 +17,12 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from recorded_run import HEIGHT, WIDTH, header, run
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.messages import FishCrop, Frame, Message
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.settings import RecordingSettings
+from tests.support.recorded_run import HEIGHT, WIDTH, header, run
 
 NUM_FRAMES, RATE_HZ = 90, 30
 EXACT = {"crops": "png", "meshes": "vertices"}

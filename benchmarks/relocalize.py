@@ -20,13 +20,13 @@ from pathlib import Path
 
 import numpy as np
 
-from stream_dmr.calibration import save_calibration
+from stream_dmr.calibration.file import save_calibration
 from stream_dmr.messages import Frame, LengthEstimate, Message
-from stream_dmr.recording.codec import encode, reference
-from stream_dmr.recording.mcap_sink import McapSink
-from stream_dmr.recording.opened import Recording, messages, open_recordings
-from stream_dmr.recording.record import Record
-from stream_dmr.recording.topics import TOPICS
+from stream_dmr.recording.mcap.sink import McapSink
+from stream_dmr.recording.messages.codec import encode, reference
+from stream_dmr.recording.messages.record import Record
+from stream_dmr.recording.messages.topics import TOPICS
+from stream_dmr.recording.reading.reader import Recording, messages, open_recordings
 
 
 def main() -> None:
@@ -48,7 +48,7 @@ def main() -> None:
         )
         save_calibration(moved, replace(calibration, plane=plane))
         print(f"{long.stat().st_size / 1e6:.0f} MB")
-        command = [sys.executable, "-m", "stream_dmr.cli", "replay", str(long)]
+        command = [sys.executable, "-m", "stream_dmr.cli.main", "replay", str(long)]
         command += ["--from", "localize", "--calibration", str(moved), "--timings"]
         for more in ([], ["--out", str(Path(scratch) / "out")]):
             used_s = cpu_s()

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from stream_dmr.recording.opened import open_recordings
+from stream_dmr.recording.reading.reader import open_recordings
 
 STAGES = ("crop", "fit", "localize", "smooth")
 FORMATS = ("recording.mcap", "recording.rrd")
@@ -40,7 +40,7 @@ def main() -> None:
 
 def replayed(recording: Path, stage: str, processors: int) -> str:
     """The number of messages that are equal, or what the command says."""
-    command = [sys.executable, "-m", "stream_dmr.cli", "replay", str(recording)]
+    command = [sys.executable, "-m", "stream_dmr.cli.main", "replay", str(recording)]
     command += ["--check", "--from", stage]
     if stage == "crop":
         command += as_run(recording)

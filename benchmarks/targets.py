@@ -7,18 +7,18 @@ import trimesh
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.body import JOINT, ROOT, Body, rest_vector
 from stream_dmr.camera import Camera
+from stream_dmr.fitting.body import JOINT, ROOT, Body, rest_vector
 from stream_dmr.fitting.contour.deformation import KINDS, deform
 from stream_dmr.messages import CropQuality, FishCrop, Frame
-from stream_dmr.segmentation.crop import CropFishSettings, crop_fish
-from stream_dmr.segmentation.detections import Detection
-from stream_dmr.segmentation.grabcut import GrabCut
+from stream_dmr.segmentation.annotations.detections import Detection
+from stream_dmr.segmentation.masks.crop import CropFishSettings, crop_fish
+from stream_dmr.segmentation.masks.grabcut import GrabCut
 from stream_dmr.simulation.body import HALIBUT, JOINT_ARCS, body_mesh, keypoints
 from stream_dmr.simulation.body import Body as SimulatedBody
 from stream_dmr.simulation.render import draw_mask
 from stream_dmr.simulation.scene import Scene, Visit, make_scene
-from stream_dmr.template import Template, make_template
+from stream_dmr.template.template import Template, make_template
 
 _NUM_FRAMES = 60
 

@@ -16,9 +16,9 @@ from hota import score
 
 from nodes.crop_fish import CropFish
 from stream_dmr.messages import Frame
-from stream_dmr.segmentation.crop import CropFishSettings
-from stream_dmr.segmentation.detectors import DetectFishSettings, open_detector
-from stream_dmr.segmentation.followed import FollowedFish, TrackFishSettings
+from stream_dmr.segmentation.detection.detectors import DetectFishSettings, open_detector
+from stream_dmr.segmentation.masks.crop import CropFishSettings
+from stream_dmr.segmentation.tracking.tracked_fish import FollowedFish, TrackFishSettings
 from stream_dmr.simulation.film import film
 from stream_dmr.simulation.presets import PRESETS
 from stream_dmr.simulation.scene import Scene, Visit, make_scene

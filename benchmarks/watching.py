@@ -11,9 +11,9 @@ from table1.dmr import through_all
 from table1.fish import watch
 from targets import species_template
 
-from stream_dmr.config import Config
 from stream_dmr.messages import LocalizedFish
-from stream_dmr.run import later_nodes
+from stream_dmr.running.config import Config
+from stream_dmr.running.run import later_nodes
 from stream_dmr.simulation.motion import FPS
 from stream_dmr.simulation.presets import PRESETS
 

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 from stream_dmr.camera import Camera
 from stream_dmr.messages import FishCrop, Frame
-from stream_dmr.segmentation.crop import CropFishSettings, crop_fish
-from stream_dmr.segmentation.fish_finder import FishFinder
-from stream_dmr.segmentation.segmenters import open_segmenter
+from stream_dmr.segmentation.masks.crop import CropFishSettings, crop_fish
+from stream_dmr.segmentation.masks.segmenters import open_segmenter
+from stream_dmr.segmentation.tracking.fish_finder import FishFinder
 
 
 class CropFish:

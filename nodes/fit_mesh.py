@@ -6,7 +6,7 @@ from stream_dmr.camera import Calibration
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.tracks import TrackFitter
 from stream_dmr.messages import FishCrop, FittedMesh
-from stream_dmr.template import Template
+from stream_dmr.template.template import Template
 
 # Of capture time: a pose that old says nothing of the next one, and runs of weeks see many fish.
 _FORGET_NS = 60_000_000_000

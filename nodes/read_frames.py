@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 
 from stream_dmr.messages import Frame
-from stream_dmr.read_settings import ReadFramesSettings
-from stream_dmr.video import open_source
+from stream_dmr.sources.open_source import open_source
+from stream_dmr.sources.settings import ReadFramesSettings
 
 
 class ReadFrames:

@@ -6,8 +6,8 @@ and a final one when its track ends.
 
 from collections.abc import Sequence
 
-from stream_dmr.length_filter import SmoothLengthSettings
-from stream_dmr.lengths import TrackLength, late_estimate
+from stream_dmr.lengths.kalman import SmoothLengthSettings
+from stream_dmr.lengths.track_length import TrackLength, late_estimate
 from stream_dmr.messages import LengthEstimate, LocalizedFish
 
 

@@ -12,7 +12,7 @@ import threading
 from pathlib import Path
 
 from stream_dmr.replay.replay import ReplayRequest, replay
-from stream_dmr.run import RunRequest, run
+from stream_dmr.running.run import RunRequest, run
 
 HERE = Path(__file__).parent
 GOLDEN = HERE / "golden"

@@ -121,7 +121,7 @@ class FittedShape:
     their common scale is arbitrary.
     """
 
-    parameters: Float[np.ndarray, "P"]  # layout: stream_dmr.skinning.Parameters
+    parameters: Float[np.ndarray, "P"]  # layout: stream_dmr.fitting.paper.skinning.Parameters
     vertices: Float[np.ndarray, "V 3"] | None  # None: not recorded, `parameters` give them
     keypoints: Float[np.ndarray, "3 3"]  # head, center, tail
     keypoints_px: Float[np.ndarray, "3 2"]  # the same in frame pixels

@@ -21,11 +21,11 @@ from chain import Rate
 from report import Results, markdown
 from targets import draw_known, draw_pair, species_template
 
-from stream_dmr.body import Body
+from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
+from stream_dmr.fitting.paper.silhouette import project, silhouette
+from stream_dmr.fitting.paper.skinning import Rig, deform, spine
 from stream_dmr.fitting.target import Target
-from stream_dmr.silhouette import project, silhouette
-from stream_dmr.skinning import Rig, deform, spine
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 TEMPLATE = species_template()

@@ -6,7 +6,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from camera import require_server
+
+from tests.support.camera import require_server
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -15,9 +15,9 @@ from small_scene import write_crossing_fish, write_small_scene
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import Frame
-from stream_dmr.recording.recover import recover
-from stream_dmr.run import RunRequest, run
-from stream_dmr.tally import Observer
+from stream_dmr.recording.segments.recover import recover
+from stream_dmr.running.result_writer import Observer
+from stream_dmr.running.run import RunRequest, run
 
 _FPS = 5  # of capture time: a new segment is tried again 5 s after one that failed
 _CONFIG = QUICK.replace("[watch]\nport = {port}\n", "").replace(

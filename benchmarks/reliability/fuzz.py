@@ -16,18 +16,18 @@ from typing import get_args
 import numpy as np
 from mutants import Mutate, by_box, by_byte, by_chunk, by_line, by_node, by_record, of_header
 
-from stream_dmr.calibration import load_calibration
-from stream_dmr.config import load_config
+from stream_dmr.calibration.file import load_calibration
 from stream_dmr.errors import UserError
-from stream_dmr.export import Export
 from stream_dmr.messages import Frame, Message
-from stream_dmr.read_settings import ReadFramesSettings
-from stream_dmr.recording.codec import decode
-from stream_dmr.recording.convert import convert
-from stream_dmr.recording.opened import open_recordings
-from stream_dmr.segmentation.detections import open_annotations
-from stream_dmr.template import load_template
-from stream_dmr.video import open_source
+from stream_dmr.recording.messages.codec import decode
+from stream_dmr.recording.reading.convert import convert
+from stream_dmr.recording.reading.reader import open_recordings
+from stream_dmr.results.export import Export
+from stream_dmr.running.config import load_config
+from stream_dmr.segmentation.annotations.detections import open_annotations
+from stream_dmr.sources.open_source import open_source
+from stream_dmr.sources.settings import ReadFramesSettings
+from stream_dmr.template.template import load_template
 
 _SLOW_S = 10.0
 

@@ -18,9 +18,9 @@ from small_scene import write_small_scene
 
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import FishCrop, Frame, LengthEstimate, LocalizedFish
-from stream_dmr.recording.codec import decode
-from stream_dmr.recording.opened import open_recordings
-from stream_dmr.recording.recover import recover
+from stream_dmr.recording.messages.codec import decode
+from stream_dmr.recording.reading.reader import open_recordings
+from stream_dmr.recording.segments.recover import recover
 
 M = TypeVar("M", Frame, FishCrop, LocalizedFish, LengthEstimate)
 _STARTING, _RUNNING, _CUTTING = "while it starts", "while it measures", "while a segment ends"

@@ -14,9 +14,9 @@ from measured import Camera, resources
 from small_scene import write_crossing_fish
 
 from stream_dmr.errors import SourceError
-from stream_dmr.live import LiveStream
 from stream_dmr.messages import Frame
-from stream_dmr.read_settings import ReadFramesSettings
+from stream_dmr.sources.live import LiveStream
+from stream_dmr.sources.settings import ReadFramesSettings
 
 KINDS = ("refused", "reset", "silent", "frozen", "resized")
 _SETTINGS = ReadFramesSettings(silence_s=3.0)  # so that a frozen one needn't stay away for 20 s

@@ -11,9 +11,9 @@ from pathlib import Path
 import cv2
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path.insert(0, str(ROOT))
 
-from camera import Camera, free_port, require_server  # noqa: E402, F401
+from tests.support.camera import Camera, free_port, require_server  # noqa: E402, F401
 
 CONFIG = """
 [smooth_length]
@@ -66,7 +66,7 @@ class Measurement:
         """Start it, with these variables of the environment beside ours."""
         template = self.scene / "species.ply"
         template = template if template.exists() else self.scene.parent / "species.ply"
-        command = [sys.executable, "-m", "stream_dmr.cli", "run", "--log-json"]
+        command = [sys.executable, "-m", "stream_dmr.cli.main", "run", "--log-json"]
         command += ["--source", self.camera.address, "--out", str(self.out)]
         command += ["--calibration", str(self.scene / "calibration.yaml")]
         command += ["--template", str(template), "--config", str(self.folder / "config.toml")]

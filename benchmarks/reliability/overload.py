@@ -11,8 +11,8 @@ from small_scene import write_small_scene
 from soak import metrics_of
 
 from stream_dmr.messages import LocalizedFish, Message
-from stream_dmr.run import RunRequest, RunSummary, run
-from stream_dmr.tally import Observer
+from stream_dmr.running.result_writer import Observer
+from stream_dmr.running.run import RunRequest, RunSummary, run
 
 _TIMES = 3
 

@@ -7,15 +7,15 @@ from pathlib import Path
 
 from kills import unreadable_ones
 from measured import ROOT  # noqa: F401
-from recorded_run import header, run
-from test_store import FACTS, LengthStore, fish
 
-from stream_dmr.recording.mcap_sink import McapSink
-from stream_dmr.recording.opened import open_recordings
-from stream_dmr.recording.record import make_record
-from stream_dmr.recording.recover import recover
+from stream_dmr.recording.mcap.sink import McapSink
+from stream_dmr.recording.messages.record import make_record
+from stream_dmr.recording.messages.topics import TOPICS
+from stream_dmr.recording.reading.reader import open_recordings
+from stream_dmr.recording.segments.recover import recover
 from stream_dmr.recording.settings import RecordingSettings
-from stream_dmr.recording.topics import TOPICS
+from tests.results.test_store import FACTS, LengthStore, fish
+from tests.support.recorded_run import header, run
 
 _NAME = "recording-000001.mcap"
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from measured import ROOT  # noqa: F401
-from tiny_clip import HEIGHT, WIDTH, calibration, write_template
 
-from stream_dmr.calibration import save_calibration
+from stream_dmr.calibration.file import save_calibration
+from tests.support.tiny_clip import HEIGHT, WIDTH, calibration, write_template
 
 NUM_FRAMES = 160
 _PERIOD_PX = 320  # from one pair of fish to the next

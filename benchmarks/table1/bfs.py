@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float
 from numba import njit
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.evaluation_files import LengthRow
+from stream_dmr.evaluation.files import LengthRow
 from stream_dmr.messages import FishCrop, FittedMesh
-from stream_dmr.template import Template
+from stream_dmr.template.template import Template
 from table1.fish import Haul
 from table1.frames import fitted_mesh, measure_frames, unfitted
 from table1.silhouettes import DISTANCE, HEIGHT, PX_PER_STD, WIDTH, Database, pack, posed

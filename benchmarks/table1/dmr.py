@@ -4,13 +4,13 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from stream_dmr.config import Config
-from stream_dmr.evaluation_files import LengthRow
-from stream_dmr.localization import LocalizeSettings
+from stream_dmr.evaluation.files import LengthRow
+from stream_dmr.localization.localize import LocalizeSettings
 from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish, Message
-from stream_dmr.pipeline import Node
-from stream_dmr.run import later_nodes
-from stream_dmr.template import Template
+from stream_dmr.running.config import Config
+from stream_dmr.running.pipeline import Node
+from stream_dmr.running.run import later_nodes
+from stream_dmr.template.template import Template
 from table1.fish import Haul
 
 ROWS = ("dmr", "dmr-flat")

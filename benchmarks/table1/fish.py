@@ -15,9 +15,9 @@ from jaxtyping import Float
 
 from stream_dmr.camera import Calibration, ReferencePlane
 from stream_dmr.messages import FishCrop, Frame
-from stream_dmr.segmentation.crop import CropFishSettings, crop_fish
-from stream_dmr.segmentation.detections import Detection
-from stream_dmr.segmentation.grabcut import GrabCut
+from stream_dmr.segmentation.annotations.detections import Detection
+from stream_dmr.segmentation.masks.crop import CropFishSettings, crop_fish
+from stream_dmr.segmentation.masks.grabcut import GrabCut
 from stream_dmr.simulation.film import Shot, film
 from stream_dmr.simulation.motion import FPS
 from stream_dmr.simulation.scene import Scene, make_scene

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.camera import frame_from_crop
-from stream_dmr.evaluation_files import LengthRow
-from stream_dmr.length_filter import SmoothLengthSettings
-from stream_dmr.localization import LocalizeSettings, localize
+from stream_dmr.evaluation.files import LengthRow
+from stream_dmr.lengths.kalman import SmoothLengthSettings
+from stream_dmr.localization.localize import LocalizeSettings, localize
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms
 from table1.fish import Haul
 

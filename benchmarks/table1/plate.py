@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from numba import njit
 
 from stream_dmr.camera import Camera
-from stream_dmr.template import Template
+from stream_dmr.template.template import Template
 
 _PIXELS_A_LENGTH = 800  # of the species' mask, from which the plate is cut
 _NUM_OUTLINE = 120

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int, UInt64
 from numba import njit
 from scipy.stats import qmc
 
-from stream_dmr.template import Template
+from stream_dmr.template.template import Template
 
 # The box that is filled evenly, rad: C bend and S bend through the thickness, C bend across it, and
 # twist, from head to tail; then roll about the body, and tilt toward the camera.

@@ -11,9 +11,9 @@ it is.
 import numpy as np
 from jaxtyping import Float
 
-from stream_dmr.evaluation_files import LengthRow
+from stream_dmr.evaluation.files import LengthRow
 from stream_dmr.geometry import arc_length, arc_lengths
-from stream_dmr.localization import LocalizeSettings
+from stream_dmr.localization.localize import LocalizeSettings
 from stream_dmr.messages import FishCrop
 from table1.fish import BASELINE_MM, Haul
 from table1.frames import medians

@@ -18,9 +18,9 @@ from stream_dmr.batch.places import DONE, VIDEO_COLUMNS, VIDEO_FOLDERS, VIDEOS, 
 from stream_dmr.batch.progress import Clock
 from stream_dmr.batch.video import Video
 from stream_dmr.errors import OutputError
-from stream_dmr.provenance import seal_files
-from stream_dmr.recording.whole_file import make_folder, writing_to
-from stream_dmr.store import require_free
+from stream_dmr.files import make_folder, writing_to
+from stream_dmr.results.provenance import seal_files
+from stream_dmr.results.store import require_free
 
 _ROUNDS = 2  # scouts and all that needs none, then what they make possible
 _DYING_S = 10.0  # how long a killed process may still hold its folder

@@ -16,7 +16,7 @@ from stream_dmr.batch.places import (
     read_videos,
 )
 from stream_dmr.errors import OutputError
-from stream_dmr.provenance import sha256_of
+from stream_dmr.results.provenance import sha256_of
 
 Finding = tuple[Path, str]  # a file, and what is wrong with it
 _OF_OUTCOME = ("status", "reason", "num_frames", "num_fish", "elapsed_s")

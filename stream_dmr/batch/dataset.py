@@ -15,15 +15,15 @@ from pyarrow import Table, parquet
 
 from stream_dmr.batch.manifest import Job
 from stream_dmr.batch.places import KINDS, in_dataset
-from stream_dmr.config import parse_config
 from stream_dmr.errors import OutputError
-from stream_dmr.fish_table import FISH_TABLE, arrow_schema, fish_record
-from stream_dmr.provenance import add_files
-from stream_dmr.recording.opened import open_recordings
-from stream_dmr.results import FishResult, read_fish
-from stream_dmr.store import NAME as DATABASE
-from stream_dmr.tables import FRAMES_COLUMNS
-from stream_dmr.verdicts import read_verdicts
+from stream_dmr.recording.reading.reader import open_recordings
+from stream_dmr.results.finished_fish import FishResult, read_fish
+from stream_dmr.results.fish_table import FISH_TABLE, arrow_schema, fish_record
+from stream_dmr.results.provenance import add_files
+from stream_dmr.results.store import NAME as DATABASE
+from stream_dmr.results.tables import FRAMES_COLUMNS
+from stream_dmr.results.verdicts import read_verdicts
+from stream_dmr.running.config import parse_config
 
 _PARTITIONS = ("vessel", "trip")
 _WHOLE_NUMBERS = ("frame_index", "timestamp_ns", "track_id")

@@ -10,15 +10,15 @@ from pathlib import Path
 
 from stream_dmr.batch.dataset import write_tables
 from stream_dmr.batch.manifest import Job
+from stream_dmr.batch.only import Only
 from stream_dmr.batch.places import DONE, FAILED, OUTCOME, VIDEO_FOLDERS
 from stream_dmr.batch.progress import Progress
+from stream_dmr.batch.scout import SIGHTINGS, scout
 from stream_dmr.errors import UserError
-from stream_dmr.provenance import add_files
-from stream_dmr.recording.whole_file import rename_durably
-from stream_dmr.run import RunRequest, run
-from stream_dmr.scout import SIGHTINGS, scout
-from stream_dmr.segmentation.only import Only
-from stream_dmr.tally import Observer
+from stream_dmr.files import rename_durably
+from stream_dmr.results.provenance import add_files
+from stream_dmr.running.result_writer import Observer
+from stream_dmr.running.run import RunRequest, run
 
 SCOUT = "scout"  # the piece of a raw video that finds out where its fish are
 

@@ -20,13 +20,13 @@ from PIL import Image
 from stream_dmr.batch.job import SCOUT, folder_of, outcome_of
 from stream_dmr.batch.manifest import Job
 from stream_dmr.batch.places import DONE
-from stream_dmr.config import load_config
+from stream_dmr.batch.scout import SIGHTINGS
+from stream_dmr.batch.sightings import read_sightings
 from stream_dmr.errors import UserError
-from stream_dmr.scout import SIGHTINGS
-from stream_dmr.segmentation.annotations import load_boxes
-from stream_dmr.segmentation.boxes import UNKNOWN_ID
-from stream_dmr.segmentation.sightings import read_sightings
-from stream_dmr.video import open_source
+from stream_dmr.running.config import load_config
+from stream_dmr.segmentation.annotations.boxes import UNKNOWN_ID
+from stream_dmr.segmentation.annotations.files import load_boxes
+from stream_dmr.sources.open_source import open_source
 
 _SCOUTS_SHARE = 0.4  # of the work that a raw video is, measured: docs/scale.md
 Spans = dict[int, tuple[int, int]]  # id -> first and last frame

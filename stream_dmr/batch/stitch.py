@@ -13,14 +13,14 @@ from stream_dmr.batch.dataset import write_tables
 from stream_dmr.batch.job import Outcome, finish, folder_of, outcome_of, part_of
 from stream_dmr.batch.manifest import Job
 from stream_dmr.batch.places import DONE
-from stream_dmr.config import Config, load_config
 from stream_dmr.messages import Frame
-from stream_dmr.provenance import seal_run
-from stream_dmr.recording.opened import messages, open_recordings
-from stream_dmr.results import FishResult, read_runs, read_stored
-from stream_dmr.store import NAME as DATABASE
-from stream_dmr.store import LengthStore
-from stream_dmr.tables import FRAMES_COLUMNS, write_lengths
+from stream_dmr.recording.reading.reader import messages, open_recordings
+from stream_dmr.results.finished_fish import FishResult, read_runs, read_stored
+from stream_dmr.results.provenance import seal_run
+from stream_dmr.results.store import NAME as DATABASE
+from stream_dmr.results.store import LengthStore
+from stream_dmr.results.tables import FRAMES_COLUMNS, write_lengths
+from stream_dmr.running.config import Config, load_config
 
 _AT_THE_END = 1 << 63  # ns, later than all that ends before
 

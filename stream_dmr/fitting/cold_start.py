@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.body import JOINT, ROOT, rest_vector
+from stream_dmr.fitting.body import JOINT, ROOT, rest_vector
 from stream_dmr.fitting.heading import is_turned
 from stream_dmr.fitting.target import Target
-from stream_dmr.template import Template
+from stream_dmr.template.template import Template
 
 # Total bends about the axis toward the camera, rad: straight, and both ways.
 _BENDS_RAD = (-1.2, 0.0, 1.2)

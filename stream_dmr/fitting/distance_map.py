@@ -8,7 +8,7 @@ one sweep, since within a row nothing beyond the ends of a pixel's own run can b
 import numpy as np
 from jaxtyping import Bool, Float
 
-from stream_dmr.fitting.compiled import compiled
+from stream_dmr.compiled import compiled
 
 _NONE = 1 << 20  # no edge in this column; its square is still exact
 

@@ -105,9 +105,10 @@ class FitMeshSettings(Settings):
         return self.prior_weight * self.edge_std_px**2
 
     def priors(self) -> Float[np.ndarray, "14"]:
-        """Weights of the squares of the tilt, then of each joint's 13 parameters (stream_dmr.body).
+        """Weights of the squares of the tilt, then of each joint's 13 parameters.
 
-        The joints' translations and scales have L_t and L_s.
+        Their layout stands in `stream_dmr.fitting.body`. The joints' translations and scales have
+        L_t and L_s.
         """
         turns = [self.twist_std_rad, self.bend_std_rad, self.bend_std_rad]
         spread = [self.tilt_std_rad, *turns, *[np.inf] * 4, *[self.weight_std] * 6]

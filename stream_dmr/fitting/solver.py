@@ -12,7 +12,7 @@ from stream_dmr.fitting.target import Target
 class Solution(NamedTuple):
     """The best iterate by L_rec, and why the search ended."""
 
-    flat: Float[np.ndarray, "P"]  # layout: stream_dmr.body
+    flat: Float[np.ndarray, "P"]  # layout: stream_dmr.fitting.body
     loss: float  # L_rec of eq. (3)
     iou: float  # of the hard silhouette
     iterations: int

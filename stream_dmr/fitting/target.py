@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from stream_dmr.fitting.compiled import compiled
+from stream_dmr.compiled import compiled
 from stream_dmr.fitting.distance_map import signed_distance
 from stream_dmr.fitting.heading import told
 from stream_dmr.messages import FishCrop

@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.camera import Calibration
-from stream_dmr.fitting.fit import Fitter
+from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.heading import HeadMemory
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.messages import FishCrop, FittedMesh
-from stream_dmr.template import Template
+from stream_dmr.template.template import Template
 
 
 @dataclass(kw_only=True, slots=True)

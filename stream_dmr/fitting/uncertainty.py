@@ -10,8 +10,8 @@ variance; so does the length of a fish that may be turned away.
 import numpy as np
 from jaxtyping import Float
 
-from stream_dmr.body import JOINT, ROOT, Body
-from stream_dmr.fitting.compiled import compiled
+from stream_dmr.compiled import compiled
+from stream_dmr.fitting.body import JOINT, ROOT, Body
 from stream_dmr.fitting.contour.deformation import KINDS, jacobian
 from stream_dmr.fitting.contour.normal_equations import rim_slopes, visible_rim, weighted_squares
 from stream_dmr.fitting.contour.rotation import dot

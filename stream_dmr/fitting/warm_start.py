@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stream_dmr.fitting.compiled import compiled
+from stream_dmr.compiled import compiled
 from stream_dmr.fitting.contour.deformation import deform
 from stream_dmr.fitting.contour.outline import project
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from stream_dmr.errors import ConfigError
-from stream_dmr.recording.header import RunHeader
-from stream_dmr.recording.mcap_sink import ExtraTopics, McapSink
-from stream_dmr.recording.record import Record
-from stream_dmr.recording.rerun_sink import RerunSink
+from stream_dmr.recording.mcap.sink import ExtraTopics, McapSink
+from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.record import Record
+from stream_dmr.recording.rerun.sink import RerunSink
 from stream_dmr.recording.settings import RecordingSettings
 
 STEM = "recording"
@@ -77,11 +77,11 @@ def open_files(
 def _extras(header: RunHeader, settings: RecordingSettings) -> Iterator[ExtraTopics]:
     if settings.foxglove:
         with _needs("foxglove", "foxglove = true"):
-            from stream_dmr.recording.foxglove import FoxgloveView
+            from stream_dmr.recording.messages.foxglove import FoxgloveView
         yield FoxgloveView(header, settings)
     if settings.frames == "h264":
         with _needs("h264", 'frames = "h264"'):
-            from stream_dmr.recording.video import H264Topic
+            from stream_dmr.recording.mcap.video import H264Topic
         yield H264Topic(crf=settings.h264_crf)
 
 

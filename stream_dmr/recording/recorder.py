@@ -9,14 +9,14 @@ from threading import Lock, Thread
 from types import TracebackType
 
 from stream_dmr.errors import OutputError
+from stream_dmr.files import make_folder
 from stream_dmr.messages import Message
 from stream_dmr.recording.files import Flushing, OpenSinks, Sink, open_files
-from stream_dmr.recording.header import RunHeader
-from stream_dmr.recording.live import LiveView
-from stream_dmr.recording.record import Record, make_record
+from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.record import Record, make_record
+from stream_dmr.recording.rerun.live import LiveView
 from stream_dmr.recording.settings import RecordingSettings
-from stream_dmr.recording.whole_file import make_folder
-from stream_dmr.tables import Tables
+from stream_dmr.results.tables import Tables
 
 _QUEUE_MESSAGES = 64  # some 6 frames; where the disk can't keep up, the run waits: nothing is lost
 _SHORTEST_PAUSE_S = 0.05

@@ -9,30 +9,23 @@ from pathlib import Path
 
 from nodes.crop_fish import CropFish
 from nodes.read_frames import ReadFrames
-from stream_dmr.calibration import load_calibration
+from stream_dmr.calibration.file import load_calibration
 from stream_dmr.camera import Calibration
-from stream_dmr.config import Config, load_config, parse_config, to_toml
 from stream_dmr.errors import UserError
-from stream_dmr.messages import (
-    FishCrop,
-    FittedMesh,
-    Frame,
-    LengthEstimate,
-    LocalizedFish,
-    Message,
-)
-from stream_dmr.pipeline import Node, StageCounters, run_chain
-from stream_dmr.recording.header import RunHeader
-from stream_dmr.recording.opened import Recording, open_recordings
-from stream_dmr.recording.part import WHOLE, Part
+from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
+from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.reading.frame_images import SourcePictures
+from stream_dmr.recording.reading.reader import Recording, open_recordings
+from stream_dmr.recording.reading.selection import WHOLE, Part
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.recording.restored import SourcePictures
-from stream_dmr.replay.judge import Judge, Mismatch, Scribe
-from stream_dmr.replay.tape import Playback, Tape
-from stream_dmr.run import Observer, later_nodes, resume
-from stream_dmr.run_folder import prepare_folder
-from stream_dmr.segmentation.fish_finder import open_finder
-from stream_dmr.template import Template, load_template
+from stream_dmr.replay.comparator import Judge, Mismatch, Scribe
+from stream_dmr.replay.recorded_messages import Playback, Tape
+from stream_dmr.running.config import Config, load_config, parse_config, to_toml
+from stream_dmr.running.folder import prepare_folder
+from stream_dmr.running.pipeline import Node, StageCounters, run_chain
+from stream_dmr.running.run import Observer, later_nodes, resume
+from stream_dmr.segmentation.tracking.fish_finder import open_finder
+from stream_dmr.template.template import Template, load_template
 
 STAGES: dict[str, type[Message]] = {
     "crop": FishCrop,

@@ -11,9 +11,9 @@ from jaxtyping import Float, UInt8
 
 from stream_dmr.camera import Camera
 from stream_dmr.errors import SourceError
-from stream_dmr.recording.meshes import Meshes
-from stream_dmr.recording.opened import Recording
-from stream_dmr.recording.view_geometry import place
+from stream_dmr.recording.reading.reader import Recording
+from stream_dmr.recording.rerun.meshes import Meshes
+from stream_dmr.recording.rerun.view_geometry import place
 from stream_dmr.report.gather import Track, View
 from stream_dmr.report.pictures import (
     Outlines,

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate, LocalizedFish
-from stream_dmr.recording.codec import decode
-from stream_dmr.recording.meshes import Meshes
-from stream_dmr.recording.opened import Recording, messages
-from stream_dmr.recording.part import WHOLE, Part
+from stream_dmr.recording.messages.codec import decode
+from stream_dmr.recording.reading.reader import Recording, messages
+from stream_dmr.recording.reading.selection import WHOLE, Part
+from stream_dmr.recording.rerun.meshes import Meshes
 
 Key = tuple[int, int]  # frame index, track id
 

@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from stream_dmr.config import Config
-from stream_dmr.fisheries import FisheriesSettings
-from stream_dmr.recording.opened import Recording
+from stream_dmr.recording.reading.reader import Recording
 from stream_dmr.report.album import Album
 from stream_dmr.report.gather import Track
-from stream_dmr.results import FishResult
+from stream_dmr.results.finished_fish import FishResult
+from stream_dmr.results.fisheries import FisheriesSettings
+from stream_dmr.running.config import Config
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

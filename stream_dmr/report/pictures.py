@@ -13,12 +13,12 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from stream_dmr.camera import Camera, crop_from_frame
 from stream_dmr.messages import FishCrop, FittedShape, Frame
-from stream_dmr.read_settings import ReadFramesSettings
-from stream_dmr.recording.opened import Recording, messages
-from stream_dmr.recording.part import WHOLE
-from stream_dmr.recording.restored import RecordedPictures, SourcePictures
-from stream_dmr.segmentation.crop import frame_from_crop_map
-from stream_dmr.video import open_source
+from stream_dmr.recording.reading.frame_images import RecordedPictures, SourcePictures
+from stream_dmr.recording.reading.reader import Recording, messages
+from stream_dmr.recording.reading.selection import WHOLE
+from stream_dmr.segmentation.masks.crop import frame_from_crop_map
+from stream_dmr.sources.open_source import open_source
+from stream_dmr.sources.settings import ReadFramesSettings
 
 MASK, MESH, HEAD, CENTER, TAIL = (
     *((80, 220, 255), (90, 230, 90)),  # BGR

@@ -4,16 +4,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from stream_dmr.batch.places import DONE, FAILED, VIDEO_FOLDERS, VIDEOS, read_videos
-from stream_dmr.config import load_config, parse_config
 from stream_dmr.errors import UserError
-from stream_dmr.provenance import add_files
-from stream_dmr.recording.opened import open_recordings
-from stream_dmr.recording.whole_file import make_folder, writing_to
+from stream_dmr.files import make_folder, writing_to
+from stream_dmr.recording.reading.reader import open_recordings
 from stream_dmr.report.album import make_album
 from stream_dmr.report.gather import gather
 from stream_dmr.report.gathered import Report
 from stream_dmr.report.page import page
-from stream_dmr.results import read_fish
+from stream_dmr.results.finished_fish import read_fish
+from stream_dmr.results.provenance import add_files
+from stream_dmr.running.config import load_config, parse_config
 
 
 def open_report(path: Path, *, source: str | None = None, config: Path | None = None) -> Report:

@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.camera import Calibration
-from stream_dmr.config import Config
 from stream_dmr.errors import UserError
-from stream_dmr.lengths import TrackLength
-from stream_dmr.localization import localize
+from stream_dmr.lengths.track_length import TrackLength
+from stream_dmr.localization.localize import localize
 from stream_dmr.messages import FittedMesh, LengthEstimate, LocalizedFish
+from stream_dmr.running.config import Config
 
 
 def corrected_fish(

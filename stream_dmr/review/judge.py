@@ -12,14 +12,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.errors import UserError
 from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate
-from stream_dmr.provenance import seal_verdicts
-from stream_dmr.recording.codec import decode
+from stream_dmr.recording.messages.codec import decode
 from stream_dmr.report.gather import View
 from stream_dmr.report.gathered import Report
 from stream_dmr.report.page import summary
-from stream_dmr.results import FishResult, database_of
-from stream_dmr.review.corrected import corrected_fish, corrected_length
-from stream_dmr.verdicts import (
+from stream_dmr.results.finished_fish import FishResult, database_of
+from stream_dmr.results.provenance import seal_verdicts
+from stream_dmr.results.verdicts import (
     NOTHING_SAID,
     Ends,
     Review,
@@ -29,6 +28,7 @@ from stream_dmr.verdicts import (
     read_verdicts,
     reviews,
 )
+from stream_dmr.review.corrected import corrected_fish, corrected_length
 
 _Point = tuple[float, float]
 

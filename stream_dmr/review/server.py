@@ -8,7 +8,7 @@ from stream_dmr.errors import OutputError, UserError
 from stream_dmr.report.gathered import Report
 from stream_dmr.report.page import page
 from stream_dmr.review.judge import Judge
-from stream_dmr.token_server import TokenHandler, TokenServer
+from stream_dmr.web.token_server import TokenHandler, TokenServer
 
 _HOST = "127.0.0.1"
 _LARGEST = 1 << 16  # bytes of a verdict

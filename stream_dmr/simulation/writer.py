@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from jaxtyping import UInt16
 
-from stream_dmr.calibration import save_calibration
+from stream_dmr.calibration.file import save_calibration
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.simulation.body import HALIBUT, JOINT_ARCS, body_mesh, keypoints
 from stream_dmr.simulation.film import Box, film

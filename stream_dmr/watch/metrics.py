@@ -6,7 +6,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from stream_dmr.live import LiveStream
+from stream_dmr.sources.live import LiveStream
 from stream_dmr.watch.state import RunState
 
 

@@ -11,11 +11,11 @@ from typing import Any
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from stream_dmr.errors import ConfigError, OutputError
-from stream_dmr.token_server import TokenHandler, TokenServer
 from stream_dmr.watch.metrics import registry_of
 from stream_dmr.watch.picture import as_jpeg, draw
 from stream_dmr.watch.settings import WatchSettings
 from stream_dmr.watch.state import RunState
+from stream_dmr.web.token_server import TokenHandler, TokenServer
 
 _PICTURE_S = 0.5  # a picture serves all who ask for so long: watching must not slow the measuring
 

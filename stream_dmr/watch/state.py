@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from stream_dmr.live import LiveStream
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
-from stream_dmr.pipeline import Chain
-from stream_dmr.video import Source
+from stream_dmr.running.pipeline import Chain
+from stream_dmr.sources.live import LiveStream
+from stream_dmr.sources.open_source import Source
 
 _FRAMES_KEPT = 16  # more than are on their way through the chain, so that fish find their picture
 _FISH_KEPT = 20

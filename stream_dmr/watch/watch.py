@@ -3,10 +3,10 @@
 from pathlib import Path
 
 from stream_dmr.messages import LengthEstimate, Message
-from stream_dmr.pipeline import Chain
-from stream_dmr.store import LengthStore
-from stream_dmr.tally import Observer
-from stream_dmr.video import Source
+from stream_dmr.results.store import LengthStore
+from stream_dmr.running.pipeline import Chain
+from stream_dmr.running.result_writer import Observer
+from stream_dmr.sources.open_source import Source
 from stream_dmr.watch.server import WatchServer
 from stream_dmr.watch.service import Watchdog
 from stream_dmr.watch.settings import WatchSettings

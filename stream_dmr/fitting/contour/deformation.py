@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stream_dmr.fitting.compiled import compiled
+from stream_dmr.compiled import compiled
 from stream_dmr.fitting.contour.joints import factors
 from stream_dmr.fitting.contour.linear_blend import blend_jacobian, blend_points, move_and_scale
 from stream_dmr.fitting.contour.rotation import rotation

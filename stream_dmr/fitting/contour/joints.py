@@ -1,13 +1,13 @@
 """What both deformations share: the joints' weights, scales and blends, and the root.
 
 Skinning weights are a softmax of e_j, so that a blend X = sum_j W_j X_j has
-dX/de_j = W_j (X_j - X). The layout of the parameters stands in `stream_dmr.body`.
+dX/de_j = W_j (X_j - X). The layout of the parameters stands in `stream_dmr.fitting.body`.
 """
 
 import numpy as np
 
-from stream_dmr.body import JOINT, ROOT
-from stream_dmr.fitting.compiled import compiled
+from stream_dmr.compiled import compiled
+from stream_dmr.fitting.body import JOINT, ROOT
 from stream_dmr.fitting.contour.rotation import turn_slope
 
 

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from stream_dmr.body import JOINT, ROOT
-from stream_dmr.fitting.compiled import compiled
+from stream_dmr.compiled import compiled
+from stream_dmr.fitting.body import JOINT, ROOT
 from stream_dmr.fitting.contour.deformation import deform
 from stream_dmr.fitting.contour.mesh_terms import smoothness
 from stream_dmr.fitting.contour.normal_equations import normal_equations, prior_loss

@@ -6,7 +6,7 @@ than all the rest of an iteration, so the normal equations get their gradient al
 
 import numpy as np
 
-from stream_dmr.fitting.compiled import compiled
+from stream_dmr.compiled import compiled
 from stream_dmr.fitting.contour.pull_back import pull_back
 
 

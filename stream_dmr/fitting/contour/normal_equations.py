@@ -10,8 +10,8 @@ too many goes unseen.
 
 import numpy as np
 
-from stream_dmr.body import JOINT, ROOT
-from stream_dmr.fitting.compiled import compiled
+from stream_dmr.compiled import compiled
+from stream_dmr.fitting.body import JOINT, ROOT
 from stream_dmr.fitting.contour.deformation import jacobian
 from stream_dmr.fitting.contour.mesh_terms import smoothness_slope
 from stream_dmr.fitting.contour.rotation import rotation, turn_slope

@@ -6,7 +6,7 @@ them against.
 
 import numpy as np
 
-from stream_dmr.fitting.compiled import compiled
+from stream_dmr.compiled import compiled
 
 
 @compiled

@@ -6,8 +6,8 @@ points, each cross-section of the spine carries one push and one turn to its joi
 
 import numpy as np
 
-from stream_dmr.body import JOINT, ROOT
-from stream_dmr.fitting.compiled import compiled
+from stream_dmr.compiled import compiled
+from stream_dmr.fitting.body import JOINT, ROOT
 from stream_dmr.fitting.contour.deformation import SPINE, jacobian
 from stream_dmr.fitting.contour.joints import blend, factors, joint_scales, weights
 from stream_dmr.fitting.contour.rotation import dot, rotation, turn_and_slope

@@ -6,7 +6,7 @@ the rotation vector omega (Sola et al., "A micro Lie theory", 2018, eq. (143)).
 
 import numpy as np
 
-from stream_dmr.fitting.compiled import compiled
+from stream_dmr.compiled import compiled
 
 
 @compiled

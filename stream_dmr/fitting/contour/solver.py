@@ -3,8 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from stream_dmr.body import JOINT, ROOT, Body, rest_vector
-from stream_dmr.fitting.bodies import Bodies
+from stream_dmr.fitting.body import JOINT, ROOT, Body, rest_vector
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import (
     EXHAUSTED,
@@ -16,6 +15,7 @@ from stream_dmr.fitting.contour.levenberg_marquardt import (
     minimise,
 )
 from stream_dmr.fitting.contour.normal_equations import prior_loss
+from stream_dmr.fitting.mesh_levels import Bodies
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution, rank
 from stream_dmr.fitting.target import Target

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from stream_dmr.body import JOINT, ROOT
-from stream_dmr.fitting.compiled import compiled
+from stream_dmr.compiled import compiled
+from stream_dmr.fitting.body import JOINT, ROOT
 from stream_dmr.fitting.contour.joints import blend, factors, joint_scales, root_slope, weights
 from stream_dmr.fitting.contour.rotation import (
     apply,

@@ -1,0 +1,99 @@
+"""`stream-dmr batch`: a backlog of videos on one machine or many."""
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from stream_dmr.cli.support import ConfigOption, TemplateOption, stop_on_signals
+
+if TYPE_CHECKING:
+    from stream_dmr.batch.batch import Engine
+
+Engines = Literal["local", "ray"]
+
+
+def batch(
+    manifest: Annotated[
+        Path,
+        typer.Argument(
+            help="CSV with video,calibration,boxes,masks,vessel,trip,haul.",
+            metavar="MANIFEST.csv",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the results; a batch goes on there.")],
+    engine: Annotated[
+        Engines, typer.Option(help="Where: processes of this machine, or a cluster of many.")
+    ] = "local",
+    address: Annotated[
+        str | None,
+        typer.Option(help="Of a Ray cluster; auto: this machine's. Without it a new one starts."),
+    ] = None,
+    gpus: Annotated[
+        float, typer.Option(help="GPUs for each video on Ray, also a part of one.", min=0)
+    ] = 0.0,
+    workers: Annotated[
+        int, typer.Option(help="Videos at a time, with local.", show_default="one a core")
+    ] = 0,
+    piece_frames: Annotated[
+        int,
+        typer.Option(
+            help="Longer videos are measured in pieces of so many frames; 0: never.",
+            min=0,
+        ),
+    ] = 20000,
+    template: TemplateOption = "halibut",
+    config: ConfigOption = None,
+) -> None:
+    """Measure every video of a manifest, each as `run` does; call it again to go on.
+
+    Writes --out/videos/NAME (as `run` does), videos.csv (what became of each) and dataset (Parquet:
+    a row a fish, a row a fish and frame). A video that can't be measured fails alone.
+    """
+    with stop_on_signals() as stop:
+        from stream_dmr.batch.batch import batch as run_batch
+        from stream_dmr.batch.manifest import read_manifest
+        from stream_dmr.batch.progress import duration
+        from stream_dmr.running.config import load_config
+        from stream_dmr.template.template import load_template
+
+        load_config(config)
+        load_template(template)
+        jobs = read_manifest(manifest, config=config, template=template)
+        with _engine(engine, workers, address, gpus) as where:
+            summary = run_batch(
+                jobs,
+                out,
+                where,
+                piece_frames=piece_frames,
+                stop=stop,
+                say=lambda line: print(line, file=sys.stderr, flush=True),
+            )
+    failed = sum(outcome.status != "done" for outcome in summary.outcomes)
+    print(
+        f"{len(summary.outcomes) - failed} of {len(jobs)} videos are done, {summary.num_before} of "
+        f"them before, {failed} failed; {duration(summary.elapsed_s)}; results in {out}"
+    )
+    if stop.signal_number:
+        print(f"stopped by {signal.Signals(stop.signal_number).name}", file=sys.stderr)
+        raise typer.Exit(128 + stop.signal_number)
+    if failed:
+        raise typer.Exit(2)
+
+
+@contextmanager
+def _engine(name: str, workers: int, address: str | None, gpus: float) -> Iterator["Engine"]:
+    if name == "local":
+        from stream_dmr.batch.local import LocalEngine
+
+        yield LocalEngine(workers or os.cpu_count() or 1)
+        return
+    from stream_dmr.batch.ray_engine import RayEngine
+
+    with closing(RayEngine(address=address, gpus=gpus)) as engine:
+        yield engine

@@ -1,0 +1,192 @@
+"""What the terminal shows of a run: progress, warnings, and the table of fish at the end."""
+
+import sys
+import time
+from collections.abc import Sequence
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from stream_dmr.evaluation.compare import Distributions, Evaluation, distribution_rows, summary_rows
+from stream_dmr.messages import LengthEstimate
+from stream_dmr.replay.replay import ReplaySummary
+from stream_dmr.running.run import Observer, RunSummary
+
+_LINE_EVERY_S = 10.0  # where there is no terminal to draw a bar on
+_PLAIN_WIDTH = 120
+_MOST_SHOWN = 20  # differences of a replay
+
+
+class RunDisplay(Observer):
+    """A progress bar on a terminal, a plain line now and then elsewhere; all of it on stderr."""
+
+    def __init__(self) -> None:
+        self._console = Console(stderr=True, highlight=False, soft_wrap=True)
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]:.1f} frames/s, {task.fields[num_fish]} fish"),
+            TimeRemainingColumn(),
+            console=self._console,
+            disable=not self._console.is_terminal,
+        )
+        self._task = self._progress.add_task("measuring", total=None, rate=0.0, num_fish=0)
+        self._num_frames: int | None = None
+        self._num_done = self._num_fish = 0
+        self._warned: set[str] = set()
+        self._began = self._last_line = time.monotonic()
+
+    def __enter__(self) -> "RunDisplay":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._progress.stop()
+
+    def warn(self, line: str) -> None:  # noqa: D102
+        if line not in self._warned:
+            self._warned.add(line)
+            self._console.print(f"warning: {line}", markup=False)
+
+    def serving(self, address: str) -> None:  # noqa: D102
+        self._console.print(f"watch it with: {address}", markup=False)
+
+    def begin(self, num_frames: int | None) -> None:  # noqa: D102
+        self._num_frames = num_frames
+        self._began = self._last_line = time.monotonic()
+        self._progress.update(self._task, total=num_frames)
+        self._progress.start()
+
+    def frame_done(self) -> None:  # noqa: D102
+        self._num_done += 1
+        now = time.monotonic()
+        rate = self._num_done / max(now - self._began, 1e-9)
+        self._progress.update(self._task, advance=1, rate=rate)
+        if self._progress.disable and now - self._last_line >= _LINE_EVERY_S:
+            self._last_line = now
+            of = "" if self._num_frames is None else f" of {self._num_frames}"
+            print_line = f"frame {self._num_done}{of}, {rate:.1f} frames/s, {self._num_fish} fish"
+            self._console.print(print_line)
+
+    def fish_seen(self, num_fish: int) -> None:  # noqa: D102
+        self._num_fish = num_fish
+        self._progress.update(self._task, num_fish=num_fish)
+
+
+def print_fish(fish: Sequence[LengthEstimate]) -> None:
+    """Print the table of fish to stdout."""
+    table = _table("fish", "length mm", "95 % interval mm", "frames used/seen", "status")
+    for estimate in fish:
+        table.add_row(
+            str(estimate.track_id),
+            length_text(estimate),
+            interval_text(estimate),
+            f"{estimate.frames_used}/{estimate.frames_seen}",
+            status_text(estimate),
+        )
+    _stdout().print(table if fish else "no fish")
+
+
+def print_check(summary: ReplaySummary) -> None:
+    """Print what a replay computed otherwise than it was recorded, to stdout."""
+    found = summary.mismatches
+    for item in found[:_MOST_SHOWN]:
+        print(
+            f"frame {item.frame_index}, fish {item.track_id}, {item.kind}, "
+            f"{item.difference.field}: recorded {item.difference.logged}, "
+            f"now {item.difference.computed}"
+        )
+    if len(found) > _MOST_SHOWN:
+        print(f"... and {len(found) - _MOST_SHOWN} more")
+    if summary.num_left_out:
+        print(
+            f"{summary.num_left_out} messages not compared, of fish that were in view before this "
+            "recording began: their fits start from fits in the ones before it; give these, too"
+        )
+    if summary.num_beyond:
+        print(f"{summary.num_beyond} messages more than were recorded: it was cut off before them")
+    kinds = ", ".join(sorted({item.kind for item in found}))
+    print(
+        f"check: {len(found)} fields differ, in {kinds}"
+        if found
+        else f"check: {summary.num_compared} messages are the recorded ones to the last bit"
+    )
+
+
+def print_timings(summary: RunSummary | ReplaySummary) -> None:
+    """Print what each stage of the chain took, its part of the recording included, to stdout."""
+    table = _table("stage", "messages in", "out", "busy ms/frame", "CPU ms/frame", "busy %")
+    for counter in summary.counters:
+        table.add_row(
+            counter.stage,
+            str(counter.messages_in),
+            str(counter.messages_out),
+            f"{1e3 * counter.busy_s / max(summary.num_frames, 1):.2f}",
+            f"{1e3 * counter.cpu_s / max(summary.num_frames, 1):.2f}",
+            f"{100 * counter.busy_s / summary.elapsed_s:.0f}",
+        )
+    _stdout().print(table)
+
+
+def print_evaluation(evaluation: Evaluation) -> None:
+    """Print measured lengths beside the true ones, then the figures, to stdout."""
+    fish = _table("fish", "truth mm", "measured mm", "error mm", "error %")
+    for row in evaluation.fish:
+        measured = "-" if row.length_mm is None else f"{row.length_mm:.1f}"
+        error_mm = "-" if row.error_mm is None else f"{row.error_mm:+.1f}"
+        percent = "-" if row.error_mm is None else f"{100 * row.error_mm / row.truth_mm:+.2f}"
+        fish.add_row(str(row.track_id), f"{row.truth_mm:.1f}", measured, error_mm, percent)
+    _stdout().print(fish, "", _figures(summary_rows(evaluation)), sep="\n")
+
+
+def print_distributions(distributions: Distributions) -> None:
+    """Print the figures of two histograms to stdout."""
+    _stdout().print(_figures(distribution_rows(distributions)))
+
+
+def _figures(rows: list[tuple[str, str]]) -> Table:
+    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+    for name, value in rows:
+        table.add_row(name, value)
+    return table
+
+
+def _stdout() -> Console:
+    """A console as wide as the terminal; wide enough for any row where there is none."""
+    width = None if sys.stdout.isatty() else _PLAIN_WIDTH
+    return Console(highlight=False, width=width)
+
+
+def _table(*titles: str) -> Table:
+    return Table(*titles, box=None, padding=(0, 2, 0, 0))
+
+
+def length_text(estimate: LengthEstimate) -> str:
+    """Length ± std in mm, or a dash."""
+    if estimate.length_mm is None or estimate.length_std_mm is None:
+        return "-"
+    return f"{estimate.length_mm:.1f} ± {estimate.length_std_mm:.1f}"
+
+
+def interval_text(estimate: LengthEstimate) -> str:
+    """The 95 % interval in mm, or a dash."""
+    if estimate.ci95_mm is None:
+        return "-"
+    low, high = estimate.ci95_mm
+    return f"{low:.1f} to {high:.1f}"
+
+
+def status_text(estimate: LengthEstimate) -> str:
+    """The status; where there is no length, with the reasons why frames were refused."""
+    reasons = sorted(estimate.refused.items(), key=lambda item: -item[1])
+    shown = [f"{count} {reason}" for reason, count in reasons if reason != estimate.status]
+    if estimate.length_mm is not None or not shown:
+        return estimate.status
+    return f"{estimate.status}: {', '.join(shown)}"

@@ -1,0 +1,66 @@
+"""`stream-dmr export`: what a recording holds, for other programs."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from stream_dmr.cli.support import TimeOption, TrackOption, parse_part, warn
+
+Meshes = Literal["ply", "glb"]
+Tables = Literal["csv", "parquet"]
+
+
+def export(
+    recording: Annotated[
+        Path, typer.Argument(help="An .mcap or .rrd, or the folder of a run.", metavar="REC")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder to write to.")],
+    meshes: Annotated[
+        Meshes | None, typer.Option(help="A mesh per fish and frame, in mm, in the camera frame.")
+    ] = None,
+    masks: Annotated[
+        bool, typer.Option("--masks", help="masks.json: every mask as COCO run lengths.")
+    ] = False,
+    tables: Annotated[
+        Tables | None, typer.Option(help="lengths, and frames with the keypoints.")
+    ] = None,
+    fish: Annotated[
+        Tables | None,
+        typer.Option(help="What a fishery asks: total and fork length, cm, weight, legal size."),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="Its [fisheries] instead of the run's, for --fish.")
+    ] = None,
+    time: TimeOption = None,
+    track: TrackOption = None,
+) -> None:
+    """Write meshes, masks, keypoints and lengths of a recording for other programs.
+
+    provenance.json beside them says what made them; `stream-dmr verify` checks it.
+    """
+    if not (meshes or masks or tables or fish):
+        raise typer.BadParameter(
+            "say what to export: --fish csv, --meshes ply, --masks, --tables csv"
+        )
+    from stream_dmr.results.export import Export
+    from stream_dmr.running.config import load_config, parse_config
+
+    exported = Export(recording, parse_part(time, track))
+    exported.claim(out)
+    if meshes:
+        print(f"{out / 'meshes'}: {exported.meshes(out / 'meshes', format=meshes)} meshes")
+    if masks:
+        print(f"{out / 'masks.json'}: {exported.masks(out / 'masks.json')} masks")
+    if tables:
+        for path in exported.tables(out, format=tables):
+            print(path)
+    if fish:
+        settings = (
+            parse_config(exported.config_toml, where=f"{recording}: its config.toml")
+            if config is None
+            else load_config(config)
+        )
+        print(exported.fish(out, settings.fisheries, format=fish))
+    print(exported.provenance(out))
+    warn(exported.warnings)

@@ -1,0 +1,103 @@
+"""The command `stream-dmr`. What is heavy is imported inside the commands: --help must be quick."""
+
+import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stream_dmr import __version__
+from stream_dmr.cli.batch import batch
+from stream_dmr.cli.calibrate import calibrate
+from stream_dmr.cli.evaluate import evaluate
+from stream_dmr.cli.export import export
+from stream_dmr.cli.learn import learn_template
+from stream_dmr.cli.recover import recover
+from stream_dmr.cli.replay import replay
+from stream_dmr.cli.report import report, review, verify
+from stream_dmr.cli.run import run
+from stream_dmr.cli.train import train
+from stream_dmr.cli.view import convert, view
+from stream_dmr.errors import UserError
+
+app = typer.Typer(
+    name="stream-dmr",
+    help="Lengths of hooked, bent fish from one calibrated camera, with every stage recorded.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+for command in (
+    *(run, calibrate, replay, recover, view, convert, export),
+    *(report, review, verify, batch, evaluate, train, learn_template),
+):
+    app.command()(command)
+
+
+def main() -> None:
+    """The entry point of `stream-dmr`."""
+    with exit_codes():
+        app(prog_name="stream-dmr")
+
+
+@contextmanager
+def exit_codes() -> Iterator[None]:
+    """A user's mistake becomes one line and exit code 2, our own a traceback and exit code 1."""
+    try:
+        yield
+    except UserError as error:
+        print(f"error: {one_line(error)}", file=sys.stderr)
+        sys.exit(2)
+    except Exception as error:
+        traceback.print_exc()
+        print(
+            f"error: stream-dmr broke down ({type(error).__name__}); this is not your fault, "
+            "please report it with the lines above",
+            file=sys.stderr,
+        )
+        sys.exit(1)
+
+
+def one_line(error: UserError) -> str:
+    """The message of an error and its notes on one line."""
+    parts = [str(error), *getattr(error, "__notes__", [])]
+    return "; ".join(" ".join(part.splitlines()) for part in parts)
+
+
+def _print_version(is_asked: bool) -> bool:
+    if is_asked:
+        print(f"stream-dmr {__version__}")
+        raise typer.Exit
+    return is_asked
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version."),
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command("simulate")
+def simulate_command(
+    out: Annotated[Path, typer.Option(help="Folder for the scene.")],
+    fish: Annotated[int, typer.Option(help="Number of fish.")] = 3,
+    frames: Annotated[int, typer.Option(help="Number of frames.")] = 60,
+    preset: Annotated[str, typer.Option(help="clean, realistic or severe.")] = "realistic",
+    seed: Annotated[int, typer.Option(help="Equal seeds give equal scenes.")] = 0,
+) -> None:
+    """Make a scene of hooked fish with known lengths: video, boxes, masks, calibration, truth."""
+    from stream_dmr.simulation import simulate
+
+    simulate(out, num_fish=fish, num_frames=frames, preset=preset, seed=seed)
+    print(f"scene in {out}: video.mp4, boxes.txt, masks, calibration.yaml, truth.csv, species.ply")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,24 @@
+"""`stream-dmr recover`: what a crash or a power cut left, made whole."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def recover(
+    folder: Annotated[Path, typer.Argument(help="The folder of a run.", metavar="DIR")],
+) -> None:
+    """Make recordings that a crash or a power cut left unfinished whole, for any reader.
+
+    `run` does it by itself when it starts. Lengths that a full disk kept out of lengths.db are
+    taken over from the recordings.
+    """
+    from stream_dmr.running.recovery import recover_folder
+
+    count = 0
+    for line in recover_folder(folder):
+        print(line)
+        count += 1
+    if not count:
+        print(f"{folder}: nothing to repair")

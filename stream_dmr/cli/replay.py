@@ -1,0 +1,89 @@
+"""`stream-dmr replay`: a recording computed anew from one stage on."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from stream_dmr.cli.support import (
+    TimeOption,
+    TrackOption,
+    command_line,
+    parse_part,
+    stop_on_signals,
+)
+
+Stage = Literal["crop", "fit", "localize", "smooth"]
+
+
+def replay(
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Recordings (.mcap, .rrd, torn ones too), folders of runs or of segments.",
+            metavar="REC...",
+        ),
+    ],
+    first: Annotated[
+        Stage, typer.Option("--from", help="The first stage that is computed anew.")
+    ] = "fit",
+    check: Annotated[
+        bool, typer.Option("--check", help="Compare with what was recorded; exit 1 if it differs.")
+    ] = False,
+    config: Annotated[Path | None, typer.Option(help="Settings instead of the recorded.")] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="A calibration instead of the recorded one.")
+    ] = None,
+    template: Annotated[
+        str | None, typer.Option(help="A species instead of the recorded one.")
+    ] = None,
+    source: Annotated[str | None, typer.Option(help="The recorded clip, for --from crop.")] = None,
+    boxes: Annotated[Path | None, typer.Option(help="As in the run, for --from crop.")] = None,
+    masks: Annotated[Path | None, typer.Option(help="As in the run, for --from crop.")] = None,
+    time: TimeOption = None,
+    track: TrackOption = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for a new recording and new tables.")
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the results of an earlier run in --out.")
+    ] = False,
+    timings: Annotated[
+        bool, typer.Option("--timings", help="At the end, show the time that each stage took.")
+    ] = False,
+) -> None:
+    """Compute a recording anew from one stage on, with its own inputs or with others."""
+    from stream_dmr.cli.display import RunDisplay, print_check, print_fish, print_timings
+    from stream_dmr.replay.replay import ReplayRequest
+    from stream_dmr.replay.replay import replay as replay_recording
+
+    request = ReplayRequest(
+        recordings=recordings,
+        first=first,
+        config=config,
+        calibration=calibration,
+        template=template,
+        source=source,
+        boxes=boxes,
+        masks=masks,
+        part=parse_part(time, track),
+        out=out,
+        overwrite=overwrite,
+        check=check,
+        command=command_line(),
+    )
+    with stop_on_signals() as stop, RunDisplay() as display:
+        summary = replay_recording(request, stop=stop, observer=display)
+    print_fish(summary.fish)
+    if timings:
+        print_timings(summary)
+    speed = summary.recorded_s / summary.elapsed_s
+    print(f"{summary.num_frames} frames in {summary.elapsed_s:.1f} s, {speed:.0f} times real time")
+    if out is not None:
+        print(f"results in {out}")
+    if stop.signal_number:
+        raise typer.Exit(128 + stop.signal_number)
+    if check:
+        print_check(summary)
+        if summary.mismatches:
+            raise typer.Exit(1)

@@ -1,0 +1,89 @@
+"""`stream-dmr verify`, `report` and `review`: what a reviewer does with results."""
+
+from contextlib import closing
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stream_dmr.cli.support import stop_on_signals, warn
+
+_Source = Annotated[
+    str | None,
+    typer.Option(
+        help="The recorded clip, for pictures of the fish.",
+        show_default="the one that the recorded command names",
+    ),
+]
+_Config = Annotated[Path | None, typer.Option(help="Its [fisheries] instead of the run's.")]
+
+
+def verify(
+    folder: Annotated[Path, typer.Argument(help="The --out of runs or of exports.", metavar="DIR")],
+) -> None:
+    """Check that results are still what their run measured; exit 1 and say what was changed."""
+    from stream_dmr.results.verify import verify as verify_results
+
+    changes, num_files = verify_results(folder)
+    for change in changes:
+        print(f"{change.path}: {change.what}")
+    if changes:
+        raise typer.Exit(1)
+    print(f"{folder}: {num_files} files, nothing was changed")
+
+
+def report(
+    path: Annotated[
+        Path,
+        typer.Argument(help="The --out of a run or of a batch, or a recording.", metavar="DIR|REC"),
+    ],
+    out: Annotated[Path, typer.Option(help="The page to write.")] = Path("report.html"),
+    source: _Source = None,
+    config: _Config = None,
+) -> None:
+    """Write results as one page that opens offline: plots, a table of fish, their best frames."""
+    from stream_dmr.errors import UserError
+    from stream_dmr.report.report import is_batch, open_batch, open_report, write_report
+
+    failed = list[str]()
+    if is_batch(path):
+        if source is not None:
+            raise UserError(f"--source: {path} is of a batch, whose videos have their own")
+        reports, failed = open_batch(path, config=config)
+    else:
+        reports = [open_report(path, source=source, config=config)]
+    size = write_report(reports, out, title=path.resolve().name, notes=failed)
+    warn(line for report in reports for line in report.recording.warnings)
+    print(f"{out}: {sum(len(report.fish) for report in reports)} fish, {size / 1e6:.1f} MB")
+
+
+def review(
+    folder: Annotated[Path, typer.Argument(help="The --out of a run.", metavar="DIR")],
+    reviewer: Annotated[
+        str, typer.Option(help="Your name, for the verdicts.", show_default="who is logged in")
+    ] = "",
+    port: Annotated[int, typer.Option(help="On this machine; 0: any free one.")] = 0,
+    source: _Source = None,
+    config: _Config = None,
+) -> None:
+    """Serve the page of `report` on this machine and take verdicts into lengths.db.
+
+    Verdicts stand beside the measurements, which stay as they are; Ctrl-C ends it.
+    """
+    with stop_on_signals() as stop:
+        from getpass import getuser
+
+        from stream_dmr.errors import UserError
+        from stream_dmr.report.report import is_batch, open_report
+        from stream_dmr.review.server import ReviewServer
+
+        if is_batch(folder):
+            raise UserError(
+                f"{folder}: expected the --out of a run, got that of a batch; review its videos "
+                f"one by one: {folder / 'videos'}/NAME"
+            )
+        opened = open_report(folder, source=source, config=config)
+        warn(opened.recording.warnings)
+        with closing(ReviewServer(opened, reviewer=reviewer or getuser(), port=port)) as server:
+            print(f"open {server.address}\nCtrl-C ends it", flush=True)
+            stop.wait()

@@ -1,0 +1,122 @@
+"""`stream-dmr run`: the main job."""
+
+import re
+import signal
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stream_dmr.cli.support import (
+    ConfigOption,
+    TemplateOption,
+    command_line,
+    stop_on_signals,
+    without_password,
+)
+
+if TYPE_CHECKING:
+    from stream_dmr.running.run import RunSummary
+
+
+def run(
+    source: Annotated[
+        str,
+        typer.Option(help="A video, a folder of pictures, rtsp://... or a camera's index."),
+    ],
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="Calibration file. Without one: relative shapes, no millimetres."),
+    ] = None,
+    boxes: Annotated[
+        Path | None, typer.Option(help="Boxes as MOT Challenge text, frames from 1.")
+    ] = None,
+    masks: Annotated[
+        Path | None,
+        typer.Option(help="Folder of %06d.png from 1; a pixel's value is the fish's id."),
+    ] = None,
+    template: TemplateOption = "halibut",
+    config: ConfigOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for the results; one with results of an earlier run is refused.",
+            show_default="runs/<name of the source>",
+        ),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the results of an earlier run in --out.")
+    ] = False,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on after an earlier run in --out; a live source does."),
+    ] = False,
+    vessel: Annotated[str, typer.Option(help="Where the fish come from, for the exports.")] = "",
+    trip: Annotated[str, typer.Option(help="Of this vessel, for the exports.")] = "",
+    haul: Annotated[str, typer.Option(help="Of this trip, for the exports.")] = "",
+    live: Annotated[
+        bool, typer.Option("--live", help="Serve the view on this machine while measuring.")
+    ] = False,
+    log_json: Annotated[
+        bool, typer.Option("--log-json", help="Log lines of JSON to stderr, for a service.")
+    ] = False,
+    timings: Annotated[
+        bool, typer.Option("--timings", help="At the end, show the time that each stage took.")
+    ] = False,
+) -> None:
+    """Measure the fish of a clip.
+
+    Writes lengths.db, lengths.csv, frames.csv, recording.mcap and recording.rrd into --out. Ctrl-C
+    ends the run early and keeps what was done.
+    """
+    with stop_on_signals() as stop:
+        from stream_dmr.cli.display import RunDisplay
+        from stream_dmr.running.run import RunRequest
+        from stream_dmr.running.run import run as measure
+        from stream_dmr.watch.journal import Journal
+
+        request = RunRequest(
+            source=source,
+            out=out or default_out(source),
+            calibration=calibration,
+            boxes=boxes,
+            masks=masks,
+            template=template,
+            config=config,
+            overwrite=overwrite,
+            resume=resume,
+            live=live,
+            command=command_line(),
+            vessel=vessel,
+            trip=trip,
+            haul=haul,
+        )
+        with nullcontext(Journal()) if log_json else RunDisplay() as observer:
+            summary = measure(request, stop=stop, observer=observer)
+        _print_summary(summary, request.out, timings=timings)
+    if stop.signal_number:
+        print(f"stopped by {signal.Signals(stop.signal_number).name}", file=sys.stderr)
+        raise typer.Exit(128 + stop.signal_number)
+
+
+def _print_summary(summary: "RunSummary", out: Path, *, timings: bool) -> None:
+    from stream_dmr.cli.display import print_fish, print_timings
+
+    print_fish(summary.fish)
+    if timings:
+        print_timings(summary)
+    rate = summary.num_frames / summary.elapsed_s
+    print(f"{summary.num_frames} frames in {summary.elapsed_s:.1f} s, {rate:.1f} frames/s")
+    print(f"results in {out}: {', '.join(path.name for path in summary.files)}")
+
+
+def default_out(source: str) -> Path:
+    """runs/ and the name of the source, made fit for a folder's name."""
+    if source.isdecimal() and not Path(source).exists():
+        return Path("runs") / f"camera-{source}"
+    if "://" in source:
+        address = without_password(source).split("://", 1)[1]
+        return Path("runs") / re.sub(r"[^A-Za-z0-9._-]+", "-", address).strip("-")
+    return Path("runs") / Path(source).resolve().stem

@@ -1,0 +1,89 @@
+"""What several commands need: the command as typed, and signals that end a run gently."""
+
+import re
+import shlex
+import signal
+import sys
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from stream_dmr.recording.reading.selection import Part
+
+TemplateOption = Annotated[
+    str, typer.Option(help="The species: halibut, cod, or a mesh with its TOML beside it.")
+]
+ConfigOption = Annotated[
+    Path | None, typer.Option(help="A config.toml; left-out settings keep their defaults.")
+]
+TimeOption = Annotated[
+    str | None, typer.Option("--time", help="Only this time of capture, in s.", metavar="FROM:TO")
+]
+TrackOption = Annotated[
+    list[int] | None, typer.Option("--track", help="Only this fish; may be repeated.")
+]
+
+
+def without_password(text: str) -> str:
+    """An address without the password in it."""
+    return re.sub(r"(?<=://)[^/\s]*@", "", text)
+
+
+def command_line() -> str:
+    """The command as typed, for the recording; passwords are left out."""
+    return without_password(shlex.join(["stream-dmr", *sys.argv[1:]]))
+
+
+def warn(lines: Iterable[str]) -> None:
+    """Print what the user should know."""
+    for line in lines:
+        print(f"warning: {line}", file=sys.stderr)
+
+
+def parse_part(time: str | None, track: list[int] | None) -> "Part":
+    """The part of a recording that --time and --track ask for."""
+    from stream_dmr.recording.reading.selection import Part
+
+    time_s = None if time is None else _parse_time(time)
+    return Part.of_seconds(time_s, frozenset(track) if track else None)
+
+
+def _parse_time(text: str) -> tuple[float, float]:
+    try:
+        first, last = (float(part) for part in text.split(":"))
+    except ValueError:
+        first = last = 0.0
+    if not first < last:
+        raise typer.BadParameter(f"--time: expected FROM:TO in seconds, such as 60:90, got {text}")
+    return first, last
+
+
+class Stop(threading.Event):
+    """Set by a signal, which it remembers."""
+
+    signal_number = 0
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[Stop]:
+    """Ctrl-C and SIGTERM set the event instead of breaking in; repeated ones change nothing."""
+    stop = Stop()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        if not stop.is_set():
+            stop.signal_number = number
+            stop.set()
+
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, on_signal) for number in signals]
+    try:
+        yield stop
+    finally:
+        for number, handler in zip(signals, before, strict=True):
+            signal.signal(number, handler)

@@ -1,0 +1,70 @@
+"""`stream-dmr train`: weights of the U-Net that finds masks, also for one's own vessel."""
+
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from stream_dmr.cli.support import command_line, stop_on_signals
+
+Device = Literal["cpu", "cuda"]
+
+
+def train(
+    out: Annotated[Path, typer.Option(help="Folder for weights, scores and pictures.")] = Path(
+        "runs/train"
+    ),
+    images: Annotated[
+        Path | None,
+        typer.Option(help="Folder of your own images; without them all pictures are simulated."),
+    ] = None,
+    masks: Annotated[
+        Path | None,
+        typer.Option(help="Folder of a .png per image, values are fish ids; or a COCO .json."),
+    ] = None,
+    init: Annotated[
+        Path | None,
+        typer.Option(help="Weights to start from; with --images the shipped ones by themselves."),
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="A config.toml; [train] is read.")] = None,
+    device: Annotated[Device, typer.Option(help="Where to compute.")] = "cpu",
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on after the last epoch of the training in --out.")
+    ] = False,
+) -> None:
+    """Teach the network that finds masks, on simulated pictures or on your own as well.
+
+    Writes unet.pt, scores.json, curve.png and worst.png into --out after every epoch; use the
+    weights by [crop_fish] segmenter = "OUT/unet.pt". Ctrl-C ends it; --resume goes on.
+    """
+    if (images is None) != (masks is None):
+        raise typer.BadParameter("--images and --masks belong together: give both or neither")
+    with stop_on_signals() as stop:
+        from stream_dmr.running.config import load_config
+        from stream_dmr.segmentation.training.display import TrainDisplay
+        from stream_dmr.segmentation.training.train import TrainRequest
+        from stream_dmr.segmentation.training.train import train as train_network
+
+        settings = load_config(config).train
+        request = TrainRequest(
+            out=out,
+            settings=settings,
+            images=images,
+            masks=masks,
+            init=init,
+            device=device,
+            resume=resume,
+            command=command_line(),
+        )
+        with TrainDisplay(settings) as display:
+            best = train_network(request, stop=stop, observer=display)
+    if best is not None:
+        print(f"best: epoch {best.epoch}, mean IoU {best.iou:.3f}; {out / 'unet.pt'}")
+    if stop.signal_number:
+        print(
+            f"stopped by {signal.Signals(stop.signal_number).name}; --resume goes on",
+            file=sys.stderr,
+        )
+        raise typer.Exit(128 + stop.signal_number)

@@ -1,0 +1,115 @@
+"""`stream-dmr view` and `stream-dmr convert`: recordings in Rerun's viewer."""
+
+import signal
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stream_dmr.cli.support import TimeOption, TrackOption, parse_part, warn
+
+if TYPE_CHECKING:
+    from stream_dmr.recording.reading.selection import Part
+
+_Source = Annotated[
+    str | None,
+    typer.Option(help="The clip that was recorded, for pictures recorded by reference."),
+]
+
+
+def view(
+    recording: Annotated[
+        str,
+        typer.Argument(
+            help="An .rrd, an .mcap, the folder of a run, or the address of a run with --live.",
+            metavar="REC",
+        ),
+    ],
+    source: _Source = None,
+    time: TimeOption = None,
+    track: TrackOption = None,
+    web: Annotated[
+        bool, typer.Option("--web", help="For a browser on this machine, in bounded memory.")
+    ] = False,
+    port: Annotated[int, typer.Option(help="Of --web; 0 takes any that is free.")] = 0,
+    screenshot: Annotated[
+        Path | None, typer.Option(help="Save a picture (.png) instead; needs no screen.")
+    ] = None,
+    frame: Annotated[int, typer.Option(help="The frame of --screenshot.")] = 1,
+) -> None:
+    """Look at a recording, or a part of it: frame, 3D scene, lengths, IoU, timings and events."""
+    from stream_dmr.recording.rerun import viewer
+
+    for number in (signal.SIGINT, signal.SIGTERM):  # the viewer's process must end with us
+        signal.signal(number, lambda number, _: sys.exit(128 + number))
+    with _as_rrd(recording, source, parse_part(time, track)) as rrd:
+        if screenshot is not None:
+            viewer.screenshot(rrd, screenshot, frame_index=frame)
+            print(screenshot)
+        elif web:
+            viewer.serve(rrd, port=port)
+        else:
+            viewer.show(rrd)
+
+
+def convert(
+    recording: Annotated[
+        Path, typer.Argument(help="A recording, or the folder of a run.", metavar="REC")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="The .rrd to write.", show_default="REC with .rrd for .mcap"),
+    ] = None,
+    source: _Source = None,
+    time: TimeOption = None,
+    track: TrackOption = None,
+    full_size: Annotated[
+        bool, typer.Option("--full-size", help="Pictures as large as the source's.")
+    ] = False,
+) -> None:
+    """Make the .rrd of a recording, or of a part of it, again, with every frame drawn."""
+    rrd = out or (
+        recording / "recording.rrd" if recording.is_dir() else recording.with_suffix(".rrd")
+    )
+    _convert(recording, rrd, source, parse_part(time, track), full_size=full_size)
+    print(rrd)
+
+
+def _convert(
+    recording: Path, rrd: Path, source: str | None, part: "Part", *, full_size: bool = False
+) -> None:
+    from stream_dmr.errors import RecordingError
+    from stream_dmr.recording.reading.convert import EVERY_FRAME
+    from stream_dmr.recording.reading.convert import convert as convert_recording
+    from stream_dmr.sources.open_source import ReadFramesSettings, open_source
+
+    if recording.resolve() == rrd.resolve():
+        raise RecordingError(f"{rrd}: expected another file to write to; choose one with --out")
+    settings = EVERY_FRAME.model_copy(update={"view_px": 1 << 16} if full_size else {})
+    with ExitStack() as stack:
+        frames = None
+        if source is not None:
+            frames = stack.enter_context(closing(open_source(source, ReadFramesSettings())))
+        lost = convert_recording(recording, rrd, frames=frames, settings=settings, part=part)
+    warn(lost)
+
+
+@contextmanager
+def _as_rrd(recording: str, source: str | None, part: "Part") -> Iterator[str]:
+    """An .rrd or address as it is; an .mcap, a part, and with a source, drawn anew."""
+    if "://" in recording:
+        yield recording
+        return
+    path = Path(recording)
+    drawn = path / "recording.rrd" if path.is_dir() else path
+    if drawn.suffix == ".rrd" and drawn.is_file() and source is None and part.is_whole:
+        yield str(drawn.resolve())
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        rrd = Path(folder) / "recording.rrd"
+        _convert(path, rrd, source, part)
+        yield str(rrd)

@@ -1,0 +1,249 @@
+"""`stream-dmr evaluate`: lengths against the true ones, fish by fish, or against a histogram.
+
+Fish are paired by track_id; the two distributions are compared without pairing, as in the paper.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.errors import UserError
+from stream_dmr.evaluation.files import (
+    Interval,
+    LengthRow,
+    read_histogram,
+    read_lengths,
+    read_truth,
+)
+from stream_dmr.evaluation.metrics import (
+    DistributionErrors,
+    EvaluateSettings,
+    FishErrors,
+    Histogram,
+    IntervalFigures,
+    distribution_errors,
+    fish_errors,
+    interval_figures,
+    length_histogram,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FishComparison:
+    """One fish of the truth beside what was measured of it."""
+
+    track_id: int
+    truth_mm: float
+    length_mm: float | None  # None: not measured
+    std_mm: float | None
+    ci95_mm: Interval | None
+
+    @property
+    def error_mm(self) -> float | None:
+        """Measured minus true."""
+        return None if self.length_mm is None else self.length_mm - self.truth_mm
+
+
+@dataclass(frozen=True, kw_only=True)
+class Distributions:
+    """Two histograms of the same bins, and how they differ."""
+
+    predicted: Histogram
+    truth: Histogram
+    errors: DistributionErrors
+    num_outside: int  # measured fish outside of all bins
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """How a table of lengths compares with the truth."""
+
+    fish: tuple[FishComparison, ...]  # every fish of the truth, in its order
+    unmeasured: tuple[int, ...]  # ids with a row but no length
+    missing: tuple[int, ...]  # ids of the truth without a row
+    unknown: tuple[int, ...]  # ids with a row but no truth; only in `distributions`
+    fraction_measured: float  # of the fish of the truth
+    intervals: IntervalFigures | None  # None: no intervals
+    errors: FishErrors | None  # None: nothing measured
+    distributions: Distributions | None  # None: no fish within the bins
+
+    @property
+    def coverage(self) -> float | None:
+        """Fraction of the 95 % intervals that hold the truth; None: no intervals."""
+        return None if self.intervals is None else self.intervals.coverage
+
+
+_DEFAULTS = EvaluateSettings()
+
+
+def evaluate(
+    lengths_csv: Path, truth_csv: Path, *, settings: EvaluateSettings = _DEFAULTS
+) -> Evaluation:
+    """Compare fish by fish. Raises UserError, in one line, for whatever can't be read.
+
+    Also where no fish has the track_id of another: then nothing says which are the same.
+    """
+    lengths, truth = read_lengths(lengths_csv), read_truth(truth_csv)
+    if lengths and not lengths.keys() & truth.keys():
+        raise UserError(
+            f"{lengths_csv}: expected fish by the track_ids of {truth_csv} ({_some(truth)}), got "
+            f"others ({_some(lengths)}); number them alike, or give a histogram as the truth"
+        )
+    return compare(lengths, truth, settings=settings)
+
+
+def _some(ids: Iterable[int], most: int = 5) -> str:
+    first = [str(i) for i in ids]
+    return ", ".join(first[:most]) + (", ..." if len(first) > most else "")
+
+
+def evaluate_histogram(
+    lengths_csv: Path, histogram_csv: Path, *, settings: EvaluateSettings = _DEFAULTS
+) -> Distributions:
+    """Compare with a histogram, in its own bins. Raises UserError, also where no fish is in them.
+
+    Of the settings only the pseudo count is used. A histogram of shares stands for as many fish as
+    were measured.
+    """
+    known = read_histogram(histogram_csv)
+    lengths_mm = _measured_mm(read_lengths(lengths_csv))
+    predicted = length_histogram(lengths_mm, known.histogram.edges_mm)
+    if predicted is None:
+        low, high = known.histogram.edges_mm[[0, -1]]
+        raise UserError(f"{lengths_csv}: expected lengths from {low:g} to {high:g} mm, got none")
+    truth = known.histogram
+    if known.is_shares:
+        truth = Histogram(edges_mm=truth.edges_mm, counts=truth.shares * predicted.counts.sum())
+    return _distributions(lengths_mm, predicted, truth, settings)
+
+
+def compare(
+    lengths: Mapping[int, LengthRow], truth: Mapping[int, float], *, settings: EvaluateSettings
+) -> Evaluation:
+    """Compare lengths with known ones, both by track_id; there is at least one known one."""
+    nothing = LengthRow(length_mm=None)
+    fish = tuple(
+        FishComparison(
+            track_id=track_id,
+            truth_mm=truth_mm,
+            length_mm=lengths.get(track_id, nothing).length_mm,
+            std_mm=lengths.get(track_id, nothing).std_mm,
+            ci95_mm=lengths.get(track_id, nothing).ci95_mm,
+        )
+        for track_id, truth_mm in truth.items()
+    )
+    pairs = [(f.length_mm, f.truth_mm) for f in fish if f.length_mm is not None]
+    paired_mm, paired_truth_mm = np.array(pairs).reshape(-1, 2).T
+    return Evaluation(
+        fish=fish,
+        unmeasured=tuple(i for i in truth if i in lengths and lengths[i].length_mm is None),
+        missing=tuple(i for i in truth if i not in lengths),
+        unknown=tuple(i for i in lengths if i not in truth),
+        fraction_measured=len(pairs) / len(fish),
+        intervals=_intervals(fish),
+        errors=fish_errors(paired_mm, paired_truth_mm),
+        distributions=_compare_distributions(
+            _measured_mm(lengths), np.array(list(truth.values())), settings
+        ),
+    )
+
+
+def _measured_mm(lengths: Mapping[int, LengthRow]) -> Float[np.ndarray, "N"]:
+    return np.array([row.length_mm for row in lengths.values() if row.length_mm is not None])
+
+
+def _compare_distributions(
+    lengths_mm: Float[np.ndarray, "P"], truth_mm: Float[np.ndarray, "T"], settings: EvaluateSettings
+) -> Distributions | None:
+    edges_mm = settings.edges_mm()
+    predicted, truth = (length_histogram(mm, edges_mm) for mm in (lengths_mm, truth_mm))
+    if predicted is None or truth is None:
+        return None
+    return _distributions(lengths_mm, predicted, truth, settings)
+
+
+def _distributions(
+    lengths_mm: Float[np.ndarray, "P"],
+    predicted: Histogram,
+    truth: Histogram,
+    settings: EvaluateSettings,
+) -> Distributions:
+    return Distributions(
+        predicted=predicted,
+        truth=truth,
+        errors=distribution_errors(predicted, truth, settings),
+        num_outside=len(lengths_mm) - round(predicted.counts.sum()),
+    )
+
+
+def _intervals(fish: tuple[FishComparison, ...]) -> IntervalFigures | None:
+    """Over the fish that have an interval; NEES where all of these have a std, too."""
+    known = [f for f in fish if f.length_mm is not None and f.ci95_mm is not None]
+    stds_mm = [f.std_mm for f in known if f.std_mm is not None]
+    return interval_figures(
+        predicted_mm=np.array([f.length_mm for f in known], np.float64),
+        truth_mm=np.array([f.truth_mm for f in known]),
+        intervals_mm=np.array([f.ci95_mm for f in known]).reshape(-1, 2),
+        stds_mm=np.array(stds_mm) if len(stds_mm) == len(known) else None,
+    )
+
+
+def summary_rows(evaluation: Evaluation) -> list[tuple[str, str]]:
+    """Name and value of each figure, ready for a table of two columns."""
+    num_measured = sum(f.length_mm is not None for f in evaluation.fish)
+    rows = [("fish measured", f"{num_measured} of {len(evaluation.fish)}")]
+    for name, ids in (
+        ("not measured, track", evaluation.unmeasured),
+        ("not in the lengths, track", evaluation.missing),
+        ("not in the truth, track", evaluation.unknown),
+    ):
+        if ids:
+            rows.append((name, ", ".join(map(str, ids))))
+    if evaluation.errors is not None:
+        rows += _error_rows(evaluation.errors)
+    if evaluation.intervals is not None:
+        rows += _interval_rows(evaluation.intervals)
+    if evaluation.distributions is not None:
+        rows += distribution_rows(evaluation.distributions)
+    return rows
+
+
+def distribution_rows(distributions: Distributions) -> list[tuple[str, str]]:
+    """Name and value of each figure of Table 1."""
+    d = distributions.errors
+    rows = [
+        ("distribution: bias", f"{d.bias_mm:+.1f} mm"),
+        ("distribution: EMD", f"{d.emd_mm:.1f} mm"),
+        ("distribution: RMSD", f"{100 * d.rmsd:.1f} %"),
+        ("distribution: KL", f"{d.kl:.2f}"),
+    ]
+    if distributions.num_outside:
+        low, high = distributions.truth.edges_mm[[0, -1]]
+        outside = f"{distributions.num_outside} outside {low:g} to {high:g} mm"
+        rows.append(("distribution: left out", outside))
+    return rows
+
+
+def _error_rows(e: FishErrors) -> list[tuple[str, str]]:
+    return [
+        ("mean absolute error", f"{e.mean_absolute_mm:.1f} mm, {e.mean_absolute_percent:.2f} %"),
+        (
+            "median absolute error",
+            f"{e.median_absolute_mm:.1f} mm, {e.median_absolute_percent:.2f} %",
+        ),
+        ("90th percentile", f"{e.p90_absolute_mm:.1f} mm, {e.p90_absolute_percent:.2f} %"),
+        ("bias", f"{e.bias_mm:+.1f} mm, {e.bias_percent:+.2f} %"),
+    ]
+
+
+def _interval_rows(i: IntervalFigures) -> list[tuple[str, str]]:
+    rows = [
+        ("truth within the 95 % interval", f"{100 * i.coverage:.0f} %"),
+        ("its mean width", f"{100 * i.mean_width:.1f} % of the length"),
+    ]
+    if i.nees is not None:
+        rows.append(("NEES (1 is right)", f"{i.nees:.2f}"))
+    return rows

@@ -1,0 +1,107 @@
+"""A template prepared for deformation: points bound to the midline, edges paired with faces.
+
+Plain arrays, so that torch, numpy and compiled loops all work on one and the same binding; and the
+layout of the parameters that deform it.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from stream_dmr.template.template import Template
+
+# A deformation has ROOT + JOINT * J parameters: rotation vector (3, rad), x and y of the
+# translation (2, body lengths) and log scale (1) of the root; then of each joint rotation vector
+# (3, rad), translation (3, body lengths), log scale (1), and the Cholesky factor of the precision Q
+# of its weight (6: the logs of its diagonal, then the entries (1,0), (2,0), (2,1)).
+ROOT = 6
+JOINT = 13
+# Radius of a joint's Gaussian before it is learnt, in body lengths.
+_REST_RADIUS = 0.25
+
+
+class Body(NamedTuple):
+    """Points are the V vertices, the 3 keypoints and the M midline points, in this order.
+
+    The foot of a point is the nearest place on the midline. Points of one cross-section share it,
+    so what depends on the foot alone is worked out once for each of the U different `places`.
+    """
+
+    points: Float[np.ndarray, "N 3"]
+    places: Float[np.ndarray, "U 3"]  # the different feet
+    place_of: Int[np.ndarray, "N"]  # of each point
+    segments: Int[np.ndarray, "U"]  # midline segment of each place
+    fractions: Float[np.ndarray, "U"]  # where in its segment, 0 to 1
+    joints: Float[np.ndarray, "J 3"]
+    midline: Float[np.ndarray, "M 3"]
+    faces: Int[np.ndarray, "F 3"]
+    edges: Int[np.ndarray, "E 2"]  # each once, in the direction in which its first face runs
+    edge_faces: Int[np.ndarray, "E 2"]  # the faces that run along and against the edge
+    num_neighbors: Int[np.ndarray, "V"]  # of each vertex along the edges
+    num_vertices: int
+
+    @classmethod
+    def from_template(cls, template: Template, *, places_per_segment: int = 1000) -> "Body":
+        """Bind a template's points to its midline.
+
+        Those whose feet are nearer than one part of a segment share their mean. 1000 parts bring
+        together what differs in the last bits of a file, the rings of a mesh that is made of them;
+        fewer make a mesh without rings faster to deform.
+        """
+        points = np.concatenate([template.rest_vertices, template.keypoints, template.midline])
+        segments, fractions = bind_to_midline(points, template.midline)
+        where = segments + fractions
+        _, place_of = np.unique(np.round(where * places_per_segment), return_inverse=True)
+        where = np.bincount(place_of, where) / np.bincount(place_of)
+        segments = np.minimum(where.astype(int), len(template.midline) - 2)
+        fractions = where - segments
+        start, step = template.midline[:-1], np.diff(template.midline, axis=0)
+        edges, edge_faces = _edges(template.faces)
+        # Copies, since those of a recording are read-only: for numba that is another type of array,
+        # for which it would make all machine code anew.
+        return cls(
+            points=points,
+            places=start[segments] + fractions[:, None] * step[segments],
+            place_of=place_of,
+            segments=segments,
+            fractions=fractions,
+            joints=template.joints.copy(),
+            midline=template.midline.copy(),
+            faces=template.faces.copy(),
+            edges=edges,
+            edge_faces=edge_faces,
+            num_neighbors=np.bincount(edges.ravel()),
+            num_vertices=len(template.rest_vertices),
+        )
+
+
+def rest_vector(num_joints: int) -> Float[np.ndarray, "P"]:
+    """Parameters of the template at rest, one body length at depth 1."""
+    joint = np.zeros(JOINT)
+    joint[7:10] = -np.log(_REST_RADIUS)
+    return np.concatenate([np.zeros(ROOT), np.tile(joint, num_joints)])
+
+
+def bind_to_midline(
+    points: Float[np.ndarray, "N 3"], midline: Float[np.ndarray, "M 3"]
+) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+    """Nearest place of each point on a polyline: its segment, and the fraction in it.
+
+    Points past an end get that end.
+    """
+    start, step = midline[:-1], np.diff(midline, axis=0)
+    along = np.einsum("nmk,mk->nm", points[:, None] - start, step) / (step**2).sum(axis=1)
+    along = along.clip(0.0, 1.0)
+    feet = start + along[..., None] * step
+    segment = np.argmin(((points[:, None] - feet) ** 2).sum(axis=-1), axis=1)
+    return segment, along[np.arange(len(points)), segment]
+
+
+def _edges(faces: Int[np.ndarray, "F 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Each edge of a closed mesh once, with the faces that run along and against it."""
+    directed = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    face_of = {(a, b): i // 3 for i, (a, b) in enumerate(directed.tolist())}
+    edges = [(a, b) for a, b in face_of if a < b]
+    edge_faces = [(face_of[a, b], face_of[b, a]) for a, b in edges]
+    return np.array(edges, np.int64), np.array(edge_faces, np.int64)

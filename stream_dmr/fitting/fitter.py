@@ -1,0 +1,189 @@
+"""One crop in, one fitted mesh out: warm from the frame before, else cold; then sized."""
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.camera import frame_from_crop
+from stream_dmr.fitting.cold_start import cold_starts
+from stream_dmr.fitting.contour.deformation import KINDS
+from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
+from stream_dmr.fitting.contour.outline import project
+from stream_dmr.fitting.contour.solver import ContourSolver
+from stream_dmr.fitting.heading import is_turned
+from stream_dmr.fitting.mesh_levels import Bodies
+from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.size.scanner import SizeScanner
+from stream_dmr.fitting.solver import Solution, Solver
+from stream_dmr.fitting.target import Target
+from stream_dmr.fitting.uncertainty import covariance
+from stream_dmr.fitting.warm_start import recentered
+from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms, SolverReport
+from stream_dmr.template.template import Template
+
+# Without a calibration, fish are taken to hang square to the camera.
+_TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
+
+# In L_rec: by so much must a cold fit be better to give up the pose of the frame before, and which
+# end is the head.
+_CLEAR_GAIN = 0.01
+
+
+class Fit(NamedTuple):
+    """What came of one crop."""
+
+    mesh: FittedMesh
+    best: Float[np.ndarray, "P"] | None  # the likeliest parameters: where the next frame begins
+
+
+class Fitter:
+    """Fits one template to crops; holds nothing of any track."""
+
+    def __init__(
+        self,
+        template: Template,
+        settings: FitMeshSettings,
+        *,
+        plane_normal: Float[np.ndarray, "3"] | None = None,
+    ) -> None:
+        """`plane_normal`, in the camera frame, is of the plane that fish hang in, if known."""
+        normal = _TOWARD_CAMERA if plane_normal is None else plane_normal
+        self._plane_normal = np.ascontiguousarray(normal)
+        self._template = template
+        self._settings = settings
+        self._bodies = Bodies.of(template, max_faces=settings.max_faces)
+        self._kind = KINDS[settings.deformation]
+        self._solver = self._make_solver()
+        self._scanner = SizeScanner(self._bodies, settings)
+
+    def _make_solver(self) -> Solver:
+        if self._settings.solver == "contour":
+            return ContourSolver(self._bodies, self._settings)
+        from stream_dmr.fitting.paper.adam import AdamSolver  # torch takes a second to import
+
+        return AdamSolver(self._template, self._settings)
+
+    def target(self, crop: FishCrop) -> Target:
+        """What is fitted to of a crop."""
+        return Target.from_crop(crop, plane_normal=self._plane_normal)
+
+    def fit(self, crop: FishCrop, warm: Float[np.ndarray, "P"] | None) -> Fit:
+        """Fit the template to a crop's mask, starting from `best` of the frame before.
+
+        What can't be fitted comes back with its reason in `refusal`.
+        """
+        refusal = self._refusal(crop)
+        if refusal:
+            return Fit(_message(crop, None, None, refusal), None)
+        began = time.perf_counter_ns()
+        target = self.target(crop)
+        solution, is_cold = self._solve(target, warm)
+        return self._answer(crop, target, solution, is_cold=is_cold, since_ns=began)
+
+    def _answer(
+        self,
+        crop: FishCrop,
+        target: Target,
+        solution: Solution,
+        *,
+        is_cold: bool,
+        since_ns: int,
+    ) -> Fit:
+        """The message of a fit, at the size that is to be expected of it."""
+        sized, size_std = solution, None
+        if _is_finite(solution) and self._settings.scans_sizes:
+            sized, size_std = self._scanner.expected(target, solution)
+        if not _is_finite(sized):
+            return Fit(_message(crop, None, None, "fit diverged"), None)
+        shape = self._shape(target, sized, crop, size_std)
+        report = self._report(solution, is_cold=is_cold, since_ns=since_ns)
+        return Fit(_message(crop, shape, report, ""), solution.flat)
+
+    def _report(self, solution: Solution, *, is_cold: bool, since_ns: int) -> SolverReport:
+        return SolverReport(
+            solver=self._settings.solver,
+            deformation=self._settings.deformation,
+            iterations=solution.iterations,
+            converged=solution.converged,
+            stop_reason=solution.stop_reason,
+            cold_start=is_cold,
+            elapsed_ns=time.perf_counter_ns() - since_ns,
+        )
+
+    def _refusal(self, crop: FishCrop) -> str:
+        area = int(crop.mask.sum())
+        if area == 0:
+            return "no mask"
+        if crop.mask.all():
+            return "mask fills the crop"  # it has no edge to fit to
+        return "mask too small" if area < self._settings.min_mask_px else ""
+
+    def _solve(self, target: Target, warm: Float[np.ndarray, "P"] | None) -> tuple[Solution, bool]:
+        """The warm fit if it is good, else a cold one where that is clearly better.
+
+        A warm start whose head is at the wrong end leads nowhere.
+        """
+        solution = None
+        if warm is not None and not is_turned(warm, target.heading):
+            start = recentered(self._bodies.fine, self._kind, target, warm)
+            solution = self._solver.refine(target, start)
+            if solution.iou >= self._settings.cold_below_iou:
+                return solution, False
+        cold = self._solver.search(target, cold_starts(target, self._template))
+        if solution is not None and solution.loss < cold.loss + _CLEAR_GAIN:
+            return solution, False
+        return cold, True
+
+    def _shape(
+        self, target: Target, solution: Solution, crop: FishCrop, size_std: float | None
+    ) -> FittedShape:
+        """`size_std` of the log size, where it is known better than by the covariance."""
+        flat, v = solution.flat, self._bodies.whole.num_vertices
+        terms, iou, points, pixels, rim, covered = evaluate(
+            self._bodies.whole, self._kind, target, flat, True
+        )
+        spread, length_std = covariance(
+            self._bodies.whole,
+            target,
+            self._settings,
+            flat,
+            points=points,
+            pixels=pixels,
+            rim=rim,
+            covered=covered,
+        )
+        placed = points + target.anchor
+        keypoints_px = project(points[v : v + 3], target.anchor, target.K)
+        return FittedShape(
+            parameters=flat,
+            vertices=placed[:v],
+            keypoints=placed[v : v + 3],
+            keypoints_px=frame_from_crop(
+                keypoints_px, crop_camera=crop.crop_camera, frame_camera=crop.frame_camera
+            ),
+            midline=placed[v + 3 :],
+            iou=iou,
+            losses=LossTerms(**dict(zip(LossTerms.__slots__, terms.tolist(), strict=True))),
+            covariance=spread,
+            length_std_ratio=length_std if size_std is None else size_std,
+        )
+
+
+def _is_finite(solution: Solution) -> bool:
+    return bool(np.isfinite(solution.flat).all() and np.isfinite(solution.loss))
+
+
+def _message(
+    crop: FishCrop, shape: FittedShape | None, report: SolverReport | None, refusal: str
+) -> FittedMesh:
+    return FittedMesh(
+        frame_index=crop.frame_index,
+        timestamp_ns=crop.timestamp_ns,
+        track_id=crop.track_id,
+        shape=shape,
+        report=report,
+        quality=crop.quality,
+        refusal=refusal,
+    )

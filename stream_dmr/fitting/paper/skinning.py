@@ -1,0 +1,212 @@
+"""The deformation of the template (paper, Sec. 2.1): eq. (1)-(2), and the spine that keeps length.
+
+Both variants share their parameters: a root rotation, translation and scale, and for each joint a
+rotation, a translation, a scale and the precision Q of its Gaussian skinning weight.
+
+The root's translation has no depth: under a perspective camera depth and scale of one silhouette
+can't be told apart, so the root stays at depth 1 and the localization finds the millimetres.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from stream_dmr.fitting.body import JOINT, ROOT, Body, rest_vector
+from stream_dmr.template.template import Template
+
+
+class Parameters(NamedTuple):
+    """The parameters of a batch of B deformations with J joints, as views of one (B, P) tensor."""
+
+    root_rotation: Float[Tensor, "B 3"]  # rotation vector, rad
+    root_translation: Float[Tensor, "B 2"]  # x, y of the camera frame, body lengths
+    root_log_scale: Float[Tensor, "B"]  # log of the body length over the depth
+    joint_rotations: Float[Tensor, "B J 3"]  # rotation vectors, rad
+    joint_translations: Float[Tensor, "B J 3"]  # body lengths
+    joint_log_scales: Float[Tensor, "B J"]
+    joint_precisions: Float[Tensor, "B J 6"]  # Cholesky factor of Q, its diagonal as logs
+
+    @classmethod
+    def from_flat(cls, flat: Float[Tensor, "B P"]) -> "Parameters":
+        """Split P = ROOT + JOINT * J columns."""
+        root, joints = flat[:, :ROOT], flat[:, ROOT:].unflatten(1, (-1, JOINT))
+        return cls(
+            root_rotation=root[:, :3],
+            root_translation=root[:, 3:5],
+            root_log_scale=root[:, 5],
+            joint_rotations=joints[..., :3],
+            joint_translations=joints[..., 3:6],
+            joint_log_scales=joints[..., 6],
+            joint_precisions=joints[..., 7:],
+        )
+
+    def flat(self) -> Float[Tensor, "B P"]:
+        """The inverse of `from_flat`."""
+        root = torch.cat(
+            [self.root_rotation, self.root_translation, self.root_log_scale[:, None]], dim=1
+        )
+        joints = torch.cat(
+            [
+                self.joint_rotations,
+                self.joint_translations,
+                self.joint_log_scales[..., None],
+                self.joint_precisions,
+            ],
+            dim=2,
+        )
+        return torch.cat([root, joints.flatten(1)], dim=1)
+
+
+def rest_parameters(num_joints: int, *, batch: int = 1) -> Float[Tensor, "B P"]:
+    """A batch of parameters of the template at rest, one body length at depth 1."""
+    return torch.as_tensor(rest_vector(num_joints)).repeat(batch, 1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Rig:
+    """A `Body` as tensors, float64 throughout."""
+
+    points: Float[Tensor, "N 3"]
+    faces: Int[Tensor, "F 3"]
+    edges: Int[Tensor, "E 2"]
+    edge_faces: Int[Tensor, "E 2"]
+    num_neighbors: Float[Tensor, "V"]  # of each vertex along the edges
+    joints: Float[Tensor, "J 3"]
+    midline: Float[Tensor, "M 3"]
+    feet: Float[Tensor, "N 3"]  # of the points on the midline
+    foot_segments: Int[Tensor, "N"]  # midline segment of each foot
+    foot_fractions: Float[Tensor, "N"]  # place of the foot in its segment, 0 to 1
+    num_vertices: int
+
+    @classmethod
+    def from_template(cls, template: Template, *, device: str = "cpu") -> "Rig":
+        """Bind a template's points to its midline and move it to a device."""
+        body = Body.from_template(template)
+        arrays = {
+            "points": body.points,
+            "faces": body.faces,
+            "edges": body.edges,
+            "edge_faces": body.edge_faces,
+            "num_neighbors": body.num_neighbors.astype(float),
+            "joints": body.joints,
+            "midline": body.midline,
+            "feet": body.places[body.place_of],
+            "foot_segments": body.segments[body.place_of],
+            "foot_fractions": body.fractions[body.place_of],
+        }
+        tensors = {name: torch.as_tensor(array, device=device) for name, array in arrays.items()}
+        return cls(**tensors, num_vertices=body.num_vertices)
+
+
+class Deformed(NamedTuple):
+    """A batch of deformed templates, centered on the root, in units of the root's depth."""
+
+    vertices: Float[Tensor, "B V 3"]
+    keypoints: Float[Tensor, "B 3 3"]
+    midline: Float[Tensor, "B M 3"]
+
+
+Deformation = Callable[[Rig, Parameters], Float[Tensor, "B N 3"]]
+
+
+def linear_blend(rig: Rig, parameters: Parameters) -> Float[Tensor, "B N 3"]:
+    """Eq. (1) and (2) to the letter: the joints' rotation matrices are blended as matrices.
+
+    A blend of rotations is no rotation: it shrinks the middle of a bent body.
+    """
+    weights = skinning_weights(rig.points, rig.joints, parameters.joint_precisions)
+    rotations = rotation_matrices(parameters.joint_rotations)
+    root = rotation_matrices(parameters.root_rotation)
+    # Rotation: V <- R_0 (sum_j W_j R_j) V
+    blended = torch.einsum("bnj,bjkl->bnkl", weights, rotations)
+    points = torch.einsum("bkl,bnlm,nm->bnk", root, blended, rig.points)
+    # Translation: V <- T_0 + (sum_j W_j T_j) + V
+    points = points + weights @ parameters.joint_translations
+    points = points + _with_depth(parameters.root_translation)[:, None]
+    # Scaling: V <- S_0 (sum_j W_j S_j) V
+    scale = torch.einsum("bnj,bj->bn", weights, parameters.joint_log_scales.exp())
+    return points * scale[..., None] * parameters.root_log_scale.exp()[:, None, None]
+
+
+def spine(rig: Rig, parameters: Parameters) -> Float[Tensor, "B N 3"]:
+    """The length-keeping variant: rotations are blended as rotations, and the body is swept.
+
+    At each place s of the midline the joints give one rotation R(s) = exp(sum_j W_j(s) log R_j)
+    and one scale S(s). The bent midline is the integral of R(s) m'(s), so its length is the root's
+    scale alone; each cross-section moves with the frame at its foot, S(s) times as broad and thick.
+    """
+    nodes = rig.midline
+    middles = (nodes[1:] + nodes[:-1]) / 2
+    rotation, _, _ = _frames(rig, parameters, middles)
+    steps = torch.einsum("bmkl,ml->bmk", rotation, nodes[1:] - nodes[:-1])
+    bent = torch.cat([torch.zeros_like(steps[:, :1]), steps.cumsum(dim=1)], dim=1)
+    place = bent[:, rig.foot_segments] + rig.foot_fractions[:, None] * steps[:, rig.foot_segments]
+    center = place[:, rig.num_vertices + 1][:, None]  # the foot of the center keypoint is the root
+
+    rotation, scale, shift = _frames(rig, parameters, rig.feet)
+    offset = scale[..., None] * (rig.points - rig.feet) + shift
+    points = place - center + torch.einsum("bnkl,bnl->bnk", rotation, offset)
+    root = rotation_matrices(parameters.root_rotation)
+    points = points @ root.transpose(1, 2) + _with_depth(parameters.root_translation)[:, None]
+    return points * parameters.root_log_scale.exp()[:, None, None]
+
+
+DEFORMATIONS: dict[str, Deformation] = {"spine": spine, "linear-blend": linear_blend}
+
+
+def deform(rig: Rig, flat: Float[Tensor, "B P"], deformation: Deformation) -> Deformed:
+    """Deform vertices, keypoints and midline of the template together."""
+    points = deformation(rig, Parameters.from_flat(flat))
+    v = rig.num_vertices
+    return Deformed(points[:, :v], points[:, v : v + 3], points[:, v + 3 :])
+
+
+def skinning_weights(
+    points: Float[Tensor, "N 3"], joints: Float[Tensor, "J 3"], precisions: Float[Tensor, "B J 6"]
+) -> Float[Tensor, "B N J"]:
+    """W_ji = C exp(-1/2 (V_i - V_j)^T Q_j (V_i - V_j)), eq. (2); rows sum to 1.
+
+    Q = L L^T with a positive diagonal of L, so Q stays positive definite whatever is learnt.
+    """
+    L = _cholesky_factors(precisions)
+    difference = points[:, None] - joints
+    scaled = torch.einsum("bjkl,njk->bnjl", L, difference)
+    return torch.softmax(-0.5 * scaled.square().sum(dim=-1), dim=-1)
+
+
+def rotation_matrices(rotvec: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rodrigues' formula, smooth at the identity."""
+    x, y, z = rotvec.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    # The root of the sum is kept away from 0, where its derivative has no limit.
+    angle = (rotvec.square().sum(dim=-1) + 1e-30).sqrt()[..., None, None]
+    half = torch.sinc(angle / (2 * torch.pi))
+    identity = torch.eye(3, dtype=rotvec.dtype, device=rotvec.device)
+    return identity + torch.sinc(angle / torch.pi) * cross + 0.5 * half.square() * (cross @ cross)
+
+
+def _frames(
+    rig: Rig, parameters: Parameters, places: Float[Tensor, "N 3"]
+) -> tuple[Float[Tensor, "B N 3 3"], Float[Tensor, "B N"], Float[Tensor, "B N 3"]]:
+    """Blended rotation, scale and translation at places of the midline."""
+    weights = skinning_weights(places, rig.joints, parameters.joint_precisions)
+    rotation = rotation_matrices(weights @ parameters.joint_rotations)
+    scale = torch.einsum("bnj,bj->bn", weights, parameters.joint_log_scales.exp())
+    return rotation, scale, weights @ parameters.joint_translations
+
+
+def _with_depth(translation: Float[Tensor, "B 2"]) -> Float[Tensor, "B 3"]:
+    return torch.nn.functional.pad(translation, (0, 1))
+
+
+def _cholesky_factors(precisions: Float[Tensor, "B J 6"]) -> Float[Tensor, "B J 3 3"]:
+    """Lower triangular L from its logged diagonal and its entries (1,0), (2,0), (2,1)."""
+    a, b, c = precisions[..., :3].exp().unbind(-1)
+    d, e, f = precisions[..., 3:].unbind(-1)
+    zero = torch.zeros_like(a)
+    return torch.stack([a, zero, zero, d, b, zero, e, f, c], dim=-1).unflatten(-1, (3, 3))

@@ -1,0 +1,193 @@
+"""One length per fish from its frames: a running estimate, and a final one with its interval.
+
+Frames are weighted by the variance of their fit and gated by their innovation
+(`kalman.py`). The interval also holds what no averaging removes: the error that all frames
+of one fish share. Frames of one track are not independent measurements.
+"""
+
+from collections import Counter
+from statistics import NormalDist
+
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.lengths.kalman import (
+    ConstantLengthFilter,
+    Measurement,
+    SmoothLengthSettings,
+    run_filter,
+)
+from stream_dmr.localization.localize import NO_CALIBRATION
+from stream_dmr.messages import LengthEstimate, LocalizedFish
+
+OUTLIER = "outlier"
+LONG_ENOUGH = "measured long enough"
+TRACK_ENDED = "track has ended"
+
+MEASURED = "measured"
+UNCERTAIN = "too uncertain"  # its frames contradict each other, or none of them knows
+MEASURING = "measuring"
+
+_STD_PER_CI95 = NormalDist().inv_cdf(0.975)  # 1.96
+
+
+def measurement_of(fish: LocalizedFish, settings: SmoothLengthSettings) -> Measurement:
+    """Take the length of an accepted frame. Raises ValueError where it has no usable numbers."""
+    length_mm, std_mm = fish.length_mm, fish.length_std_mm
+    if length_mm is None or std_mm is None or not (0 < length_mm < np.inf and 0 <= std_mm < np.inf):
+        raise ValueError(
+            f"frame {fish.frame_index}, track {fish.track_id}: expected an accepted frame with a "
+            f"positive length and its std in mm, got {length_mm} and {std_mm}"
+        )
+    return Measurement(
+        frame_index=fish.frame_index,
+        timestamp_ns=fish.timestamp_ns,
+        length_mm=length_mm,
+        std_ratio=max(std_mm / length_mm, settings.min_frame_std_ratio),
+    )
+
+
+class TrackLength:
+    """One fish: takes its frames in order, gives the running estimate and the final one."""
+
+    def __init__(self, first: LocalizedFish, settings: SmoothLengthSettings) -> None:
+        self._settings = settings
+        self._first = self._last = first
+        self._seen = 0
+        self._measurements: list[Measurement] = []
+        self._filter: ConstantLengthFilter | None = None
+        self._filtered_whole = 0  # number of measurements when last filtered from the start
+        self._refused: Counter[str] = Counter()
+        self._refusal = ""  # of the last frame, before the filter saw it
+
+    @property
+    def last_timestamp_ns(self) -> int:
+        """Capture time of the last frame, good or not."""
+        return self._last.timestamp_ns
+
+    def add(self, fish: LocalizedFish) -> LengthEstimate:
+        """Take the next frame of this fish, the first one included; the running estimate."""
+        self._last = fish
+        self._seen += 1
+        self._refusal = fish.reason
+        if fish.accepted and len(self._measurements) >= self._settings.max_frames:
+            self._refusal = LONG_ENOUGH
+        if self._refusal:
+            self._refused[self._refusal] += 1
+        else:
+            self._measure(measurement_of(fish, self._settings))
+        return self._estimate(is_final=False)
+
+    def finish(self) -> LengthEstimate:
+        """Return the final estimate, with the smoothed series: the track has ended."""
+        if self._measurements:
+            self._filter = run_filter(self._measurements, self._settings)
+        return self._estimate(is_final=True)
+
+    def _measure(self, measurement: Measurement) -> None:
+        """Filter one more good frame.
+
+        A bad start must not shut out the good frames after it, so the whole track is filtered
+        anew, from the median of all frames so far: at each frame at first, then at growing
+        intervals (1/16 of the track), which keeps the mean work per frame bounded.
+        """
+        self._measurements.append(measurement)
+        count = len(self._measurements)
+        if self._filter is not None and count < self._filtered_whole + max(1, count // 16):
+            self._filter.offer(measurement)
+        else:
+            self._filter = run_filter(self._measurements, self._settings)
+            self._filtered_whole = count
+
+    def _estimate(self, *, is_final: bool) -> LengthEstimate:
+        used = self._filter.frames if self._filter else []
+        outliers = Counter({OUTLIER: len(self._measurements) - len(used)})
+        reason = self._refusal or ("" if used[-1:] == [self._last.frame_index] else OUTLIER)
+        length_mm, std_mm, ci95_mm = self._result(len(used))
+        smoothed_mm, smoothed_std_mm = self._smoothed() if is_final else (np.zeros(0),) * 2
+        return LengthEstimate(
+            frame_index=self._last.frame_index,
+            timestamp_ns=self._last.timestamp_ns,
+            track_id=self._last.track_id,
+            is_frame_used=reason == "",
+            frame_reason=reason,
+            length_mm=length_mm,
+            length_std_mm=std_mm,
+            ci95_mm=ci95_mm,
+            frames_seen=self._seen,
+            frames_used=len(used),
+            refused=dict(self._refused + outliers),  # the sum of counters drops zeros
+            first_frame=self._first.frame_index,
+            last_frame=self._last.frame_index,
+            first_timestamp_ns=self._first.timestamp_ns,
+            last_timestamp_ns=self._last.timestamp_ns,
+            status=self._status(len(used), is_measured=length_mm is not None, is_final=is_final),
+            is_final=is_final,
+            smoothed_frames=np.array(used if is_final else [], dtype=np.int64),
+            smoothed_mm=smoothed_mm,
+            smoothed_std_mm=smoothed_std_mm,
+        )
+
+    def _result(
+        self, num_used: int
+    ) -> tuple[float, float, Float[np.ndarray, "2"]] | tuple[None, None, None]:
+        """Length, std and 95 % interval in mm, once there are enough good frames that agree."""
+        if self._filter is None or num_used < self._settings.min_frames:
+            return None, None, None
+        length_mm = self._filter.length_mm
+        std_mm = float(self._std_mm(np.array([length_mm]), np.array([self._filter.variance]))[0])
+        if std_mm > self._settings.max_std_ratio * length_mm:
+            return None, None, None
+        return length_mm, std_mm, length_mm + _STD_PER_CI95 * std_mm * np.array([-1.0, 1.0])
+
+    def _smoothed(self) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+        """Length and std in mm at each used frame, given all of them."""
+        if self._filter is None:
+            return np.zeros(0), np.zeros(0)
+        smoothed_mm, variance = self._filter.smoothed()
+        return smoothed_mm, self._std_mm(smoothed_mm, variance)
+
+    def _std_mm(
+        self, length_mm: Float[np.ndarray, "N"], variance: Float[np.ndarray, "N"]
+    ) -> Float[np.ndarray, "N"]:
+        """Std from the filter's variance and from what frames of one fish have in common."""
+        assert self._filter is not None
+        shared = (self._settings.common_std_ratio * length_mm) ** 2
+        return np.sqrt(variance * self._filter.design_effect + shared)
+
+    def _status(self, num_used: int, *, is_measured: bool, is_final: bool) -> str:
+        if NO_CALIBRATION in self._refused:
+            return NO_CALIBRATION
+        if not is_final:
+            return MEASURING
+        if is_measured:
+            return MEASURED
+        if num_used >= self._settings.min_frames:
+            return UNCERTAIN
+        return f"too few good frames ({num_used} of {self._settings.min_frames})"
+
+
+def late_estimate(fish: LocalizedFish) -> LengthEstimate:
+    """Answer a frame whose track has ended: it counts for nothing, and is never final."""
+    return LengthEstimate(
+        frame_index=fish.frame_index,
+        timestamp_ns=fish.timestamp_ns,
+        track_id=fish.track_id,
+        is_frame_used=False,
+        frame_reason=TRACK_ENDED,
+        length_mm=None,
+        length_std_mm=None,
+        ci95_mm=None,
+        frames_seen=1,
+        frames_used=0,
+        refused={TRACK_ENDED: 1},
+        first_frame=fish.frame_index,
+        last_frame=fish.frame_index,
+        first_timestamp_ns=fish.timestamp_ns,
+        last_timestamp_ns=fish.timestamp_ns,
+        status=TRACK_ENDED,
+        is_final=False,
+        smoothed_frames=np.zeros(0, dtype=np.int64),
+        smoothed_mm=np.zeros(0),
+        smoothed_std_mm=np.zeros(0),
+    )

@@ -1,0 +1,255 @@
+"""Reads a .mcap from its start to its end, also where the end is missing.
+
+Every byte is under a checksum: chunks have their own, and the data section has one over all of it,
+which is why a whole read is made in file order. A read of a part goes by the index instead, and is
+guarded by the checksums of the index and of the chunks that are read.
+"""
+
+import json
+import struct
+import zlib
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO
+
+from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Attachment, Channel, Chunk, Footer, Metadata
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC
+from zstandard import ZstdError
+
+from stream_dmr.errors import RecordingError
+from stream_dmr.messages import LocalizedFish, Message
+from stream_dmr.recording.messages.codec import check_version, decode
+from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.topics import (
+    CARRIED,
+    RECOVERED,
+    RUN,
+    SEGMENT,
+    SPANS,
+    THINNED,
+    TOPICS,
+    VIDEO,
+)
+from stream_dmr.recording.reading.selection import WHOLE, Part, Spans
+
+# What the mcap library lets through on damaged bytes; its CRC error is a ValueError.
+_DAMAGE = (
+    *(McapError, ValueError, KeyError, IndexError, RuntimeError, struct.error, ZstdError),
+    *(OverflowError, MemoryError, AttributeError, TypeError),
+)
+_CUT_OFF = (EndOfFile, struct.error)
+_FOOTER_BYTES = 1 + 8 + 8 + 8 + 4
+_LARGEST_RECORD = 1 << 30  # bytes; a damaged length must not ask for all memory
+
+
+class McapFile:
+    """One .mcap."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises RecordingError where not even the header can be read."""
+        self.path = path
+        self.warnings: list[str] = []
+        self.metadata: dict[str, str] = {}
+        self.is_segment = self.is_thinned = self.ends_early = False
+        self.header = self._read_header()
+
+    def tracks(self) -> Collection[int]:
+        """The ids of its fish, by the index where it has one."""
+        with self._open() as stream:
+            if not _is_torn(stream) and _has_index(stream):
+                spans = _spans(stream, SeekingReader(stream, validate_crcs=True))
+                if spans:
+                    return spans.keys()
+        fish = (payload for _, payload in self.payloads([LocalizedFish]))
+        return {decode(LocalizedFish, payload).track_id for payload in fish}
+
+    def carried(self) -> Iterator[bytes]:
+        """See `opened.Recording`."""
+        for _, message in self._messages([CARRIED], WHOLE) if self.is_segment else ():
+            yield message.data
+
+    def payloads(
+        self, kinds: Collection[type[Message]], part: Part = WHOLE
+    ) -> Iterator[tuple[type[Message], bytes]]:
+        """See `opened.Recording`. A torn file gives what is whole, and a warning."""
+        topics = {TOPICS[kind].topic: kind for kind in kinds}
+        for topic, message in self._messages(topics, part):
+            yield topics[topic], message.data
+
+    def video(self, part: Part = WHOLE) -> Iterator[bytes]:
+        """See `opened.Recording`."""
+        for _, message in self._messages([VIDEO], part):
+            yield message.data
+
+    def _messages(self, topics: Collection[str], part: Part) -> Iterator[tuple[str, McapMessage]]:
+        with self._open() as stream:
+            if part.is_whole or _is_torn(stream) or not _has_index(stream):
+                yield from self._in_order(stream, topics, part)
+            else:
+                yield from _by_index(stream, topics, part)
+
+    def _in_order(
+        self, stream: IO[bytes], topics: Collection[str], part: Part
+    ) -> Iterator[tuple[str, McapMessage]]:
+        is_torn, count = _is_torn(stream), 0
+        wanted: dict[int, str] = {}  # topics by channel
+        try:
+            for record in _records(stream):
+                if isinstance(record, Channel) and record.topic in topics:
+                    wanted[record.id] = record.topic
+                elif isinstance(record, Footer):
+                    _check_index(stream, record)
+                elif isinstance(record, McapMessage):
+                    count += 1
+                    topic = wanted.get(record.channel_id)
+                    if topic and part.has_time(record.log_time):
+                        yield topic, record
+        except _CUT_OFF:
+            if not is_torn:
+                raise
+        if is_torn:
+            self._warn(f"{self.path}: torn; {count} messages are whole, what came after is lost")
+
+    def _warn(self, line: str) -> None:
+        if line not in self.warnings:
+            self.warnings.append(line)
+
+    def _read_header(self) -> RunHeader:
+        attachments: dict[str, bytes] = {}
+        with self._open() as stream:
+            self.ends_early = _is_torn(stream)
+            try:
+                for record in _records(stream, emit_chunks=True):
+                    if isinstance(record, Chunk):
+                        break
+                    if isinstance(record, Metadata):
+                        self._take(record)
+                    elif isinstance(record, Attachment) and record.name != SPANS:
+                        attachments[record.name] = record.data
+            except _CUT_OFF:
+                pass
+            try:
+                return RunHeader.from_parts(self.metadata, attachments)
+            except KeyError as error:
+                raise RecordingError(
+                    f"expected a recording of stream-dmr, but it lacks {error}; it ends too early "
+                    "or is of another program"
+                ) from error
+
+    def _take(self, record: Metadata) -> None:
+        if record.name == RUN:
+            self.metadata = record.metadata
+            check_version(int(self.metadata["codec_version"]))
+        elif record.name == RECOVERED:
+            self._warn(f"{self.path}: recovered after a crash; what came after that is lost")
+        self.is_segment |= record.name == SEGMENT
+        self.is_thinned |= record.name == THINNED
+        self.ends_early |= record.name in (SEGMENT, RECOVERED)
+
+    @contextmanager
+    def _open(self) -> Iterator[IO[bytes]]:
+        try:
+            with self.path.open("rb") as stream:
+                yield stream
+        except OSError as error:
+            raise RecordingError(
+                f"{self.path}: expected a recording (.mcap or .rrd), got: {error.strerror}; "
+                "check the path"
+            ) from error
+        except RecordingError as error:
+            raise RecordingError(f"{self.path}: {error}") from error
+        except _DAMAGE as error:
+            raise RecordingError(
+                f"{self.path}: expected a whole recording, got a damaged one ({error}); "
+                "what was read before the damage is sound"
+            ) from error
+
+
+def is_torn(path: Path) -> bool:
+    """Whether a file lacks its end."""
+    with path.open("rb") as stream:
+        return _is_torn(stream)
+
+
+def _is_torn(stream: IO[bytes]) -> bool:
+    """Whether a file lacks the magic that closes it; back to its start."""
+    size = stream.seek(0, 2)
+    stream.seek(max(size - len(MCAP0_MAGIC), 0))
+    end = stream.read()
+    stream.seek(0)
+    is_only_begun = size < 2 * len(MCAP0_MAGIC)  # it begins with the same magic
+    return is_only_begun or end != MCAP0_MAGIC
+
+
+def whole_records(path: Path) -> Iterator[object]:
+    """Every record before the end of a file, or before the first damage in it."""
+    with path.open("rb") as stream, suppress(*_DAMAGE, *_CUT_OFF):
+        yield from _records(stream)
+
+
+def _by_index(
+    stream: IO[bytes], topics: Collection[str], part: Part
+) -> Iterator[tuple[str, McapMessage]]:
+    stream.seek(-_FOOTER_BYTES - len(MCAP0_MAGIC), 2)
+    _check_index(stream, _footer(stream))
+    stream.seek(0)
+    reader = SeekingReader(stream, validate_crcs=True)
+    first, last = part.within(_spans(stream, reader)).bounds_ns
+    for _, channel, message in reader.iter_messages(
+        list(topics), starting_at=first, ending_before=last, log_time_order=False
+    ):
+        yield channel.topic, message
+
+
+def _spans(stream: IO[bytes], reader: SeekingReader) -> Spans:
+    """When each fish was seen."""
+    summary = reader.get_summary()
+    for index in summary.attachment_indexes if summary else ():
+        if index.name == SPANS:
+            stream.seek(index.offset)
+            record = stream.read(index.length)  # 9 bytes of head, content, CRC-32
+            if zlib.crc32(record[9:-4]) != int.from_bytes(record[-4:], "little"):
+                raise ValueError(f"the checksum of {SPANS} is wrong")
+            text = record[-4 - index.data_size : -4]
+            return {int(track_id): tuple(span) for track_id, span in json.loads(text).items()}
+    return {}
+
+
+def _has_index(stream: IO[bytes]) -> bool:
+    """Not where a full disk left no room for one."""
+    stream.seek(-_FOOTER_BYTES - len(MCAP0_MAGIC), 2)
+    footer = _footer(stream)
+    stream.seek(0)
+    return footer.summary_start > 0
+
+
+def _footer(stream: IO[bytes]) -> Footer:
+    """The footer that stands here."""
+    opcode, _, *fields = struct.unpack("<BQQQI", stream.read(_FOOTER_BYTES))
+    if opcode != Opcode.FOOTER:
+        raise ValueError("it has no footer")
+    return Footer(*fields)
+
+
+def _check_index(stream: IO[bytes], footer: Footer) -> None:
+    """The mcap library writes this checksum and never looks at it."""
+    if footer.summary_crc:
+        place = stream.tell()
+        stream.seek(footer.summary_start)
+        rest = stream.read()[: -len(MCAP0_MAGIC) - 4]
+        stream.seek(place)
+        if zlib.crc32(rest) != footer.summary_crc:
+            raise ValueError("the checksum of its index is wrong")
+
+
+def _records(stream: IO[bytes], *, emit_chunks: bool = False) -> Iterator[object]:
+    reader = StreamReader(
+        stream, emit_chunks=emit_chunks, validate_crcs=True, record_size_limit=_LARGEST_RECORD
+    )
+    return reader.records

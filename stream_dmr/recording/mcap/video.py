@@ -1,0 +1,118 @@
+"""H.264 for the eye: a tenth of the bytes of JPEGs, but not the pixels that the run saw.
+
+One `foxglove.CompressedVideo` a frame: an access unit in Annex B with no pictures out of order, a
+key frame at least every second of capture time. Pictures of odd size get one more row or column.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+from av.error import FFmpegError
+from av.video.codeccontext import VideoCodecContext
+from av.video.frame import PictureType
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
+from google.protobuf.message import DecodeError
+from jaxtyping import UInt8
+
+from stream_dmr.errors import RecordingError
+from stream_dmr.messages import Frame
+from stream_dmr.recording.messages.record import Record
+from stream_dmr.recording.messages.topics import KEY_FRAME_NS, VIDEO
+
+_PRESET = "superfast"  # half the time of "veryfast" for 10 % more bytes
+_BT601, _LIMITED = 5, 1  # FFmpeg's numbers of OpenCV's YUV, so that others show the right colours
+_SPS = 7  # NAL unit type; it comes before every key frame
+
+
+class H264Topic:
+    """Encodes the frames of one file, in their order: its first picture needs no other."""
+
+    topics = {VIDEO: CompressedVideo}  # noqa: RUF012
+
+    def __init__(self, *, crf: int) -> None:
+        """`crf` is x264's constant rate factor, 0 to 51."""
+        self._crf = crf
+        self._context: VideoCodecContext | None = None
+        self._key_at_ns = 0
+
+    def draw(self, record: Record) -> Iterator[tuple[str, Any]]:
+        """The video of a frame."""
+        frame = record.whole
+        if isinstance(frame, Frame):
+            video = CompressedVideo(data=self._encode(frame), format="h264", frame_id="camera")
+            video.timestamp.FromNanoseconds(frame.timestamp_ns)
+            yield VIDEO, video
+
+    def _encode(self, frame: Frame) -> bytes:
+        # OpenCV's conversion takes a sixth of FFmpeg's time and is nearer to the truth.
+        planes = cv2.cvtColor(_even(frame.image), cv2.COLOR_BGR2YUV_I420)
+        picture = av.VideoFrame.from_ndarray(planes.astype(np.uint8, copy=False), format="yuv420p")
+        if self._context is None:
+            self._context = _encoder(picture, self._crf)
+            self._key_at_ns = frame.timestamp_ns
+        picture.pts = None
+        if frame.timestamp_ns >= self._key_at_ns:
+            picture.pict_type = PictureType.I
+            self._key_at_ns = frame.timestamp_ns + KEY_FRAME_NS
+        return b"".join(bytes(packet) for packet in self._context.encode(picture))
+
+
+def decode_video(
+    samples: Iterable[bytes],
+) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
+    """Capture times and BGR pictures of CompressedVideo messages, from the first key frame on.
+
+    Raises RecordingError where one can't be decoded.
+    """
+    context = av.CodecContext.create("h264", "r")
+    context.thread_count = 1  # else pictures come some frames late
+    has_begun = False
+    for sample in samples:
+        try:
+            video = CompressedVideo.FromString(sample)
+            has_begun = has_begun or _is_key_frame(video.data)
+            if not has_begun:
+                continue
+            (picture,) = context.decode(av.Packet(video.data))  # type: ignore[arg-type]
+        except (DecodeError, FFmpegError, ValueError, IndexError) as error:
+            raise RecordingError(
+                f"expected an H.264 picture in the recording, found other bytes: {error}"
+            ) from error
+        yield video.timestamp.ToNanoseconds(), _bgr(picture.to_ndarray(format="yuv420p"))
+
+
+def _encoder(picture: av.VideoFrame, crf: int) -> VideoCodecContext:
+    context = av.CodecContext.create("libx264", "w")
+    context.width, context.height = picture.width, picture.height
+    context.pix_fmt = "yuv420p"
+    context.colorspace, context.color_range = _BT601, _LIMITED
+    context.framerate = 30  # type: ignore[assignment]
+    context.gop_size = 1 << 20  # key frames come by the clock of the capture, not by number
+    context.thread_count = 1
+    context.options = {
+        "preset": _PRESET,
+        "tune": "zerolatency",  # a picture in, its bytes out
+        "crf": str(crf),
+        "forced-idr": "1",
+        "x264-params": "scenecut=0:repeat-headers=1",
+    }
+    return context
+
+
+def _is_key_frame(access_unit: bytes) -> bool:
+    start = access_unit.find(b"\0\0\1")
+    return start >= 0 and access_unit[start + 3] & 0x1F == _SPS
+
+
+def _bgr(planes: np.ndarray) -> UInt8[np.ndarray, "H W 3"]:
+    return cv2.cvtColor(planes, cv2.COLOR_YUV2BGR_I420).astype(np.uint8, copy=False)
+
+
+def _even(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    height, width = image.shape[:2]
+    if height % 2 == width % 2 == 0:
+        return image
+    return cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)

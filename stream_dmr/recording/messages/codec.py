@@ -1,0 +1,187 @@
+"""Message <-> bytes: one typed, versioned encoding per message type, exact to the last bit.
+
+The schema is `messages.proto`; a dataclass and its protobuf message have the same field names.
+"""
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache
+from typing import Any, TypeVar
+
+import numpy as np
+from google.protobuf.descriptor import FieldDescriptor
+from google.protobuf.message import DecodeError
+from google.protobuf.message import Message as Proto
+
+from stream_dmr import messages
+from stream_dmr.camera import Calibration, Camera, ReferencePlane
+from stream_dmr.errors import RecordingError
+from stream_dmr.recording.messages.schema import proto_class
+from stream_dmr.recording.reading.pictures import (
+    Picture,
+    checksum,
+    compress,
+    compress_mask,
+    decompress,
+)
+
+CODEC_VERSION = 3
+"""Raised when a file written from now on would be read wrongly by an older reader.
+
+2: a crop may lack its picture, a fit its vertices and covariance.
+3: the JPEG of a frame may not be what the run saw.
+"""
+
+T = TypeVar("T")
+
+_DATACLASSES: dict[str, type] = {
+    kind.__name__: kind
+    for kind in (
+        *(messages.Frame, messages.FishCrop, messages.FittedMesh),
+        *(messages.LocalizedFish, messages.LengthEstimate),
+        *(messages.CropQuality, messages.FishEnds, messages.FittedShape),
+        *(messages.LossTerms, messages.SolverReport),
+        *(Camera, ReferencePlane, Calibration),
+    )
+}
+_MOST_PX = 1 << 28  # of a picture; damaged bytes must not ask for all memory
+_SCALARS = {
+    FieldDescriptor.TYPE_BOOL: bool,
+    FieldDescriptor.TYPE_DOUBLE: float,
+    FieldDescriptor.TYPE_INT64: int,
+    # A file name of undecodable bytes must not stop a run.
+    FieldDescriptor.TYPE_STRING: lambda text: text.encode("utf-8", "backslashreplace").decode(),
+}
+
+
+def encode(message: object, *, picture: Picture | None = None) -> bytes:
+    """The bytes of a message (or of any other dataclass in `messages.proto`).
+
+    `picture` replaces the message's `image`; without it the image is written as PNG, exact.
+    """
+    proto = proto_class(type(message).__name__)()
+    _fill(proto, message, picture)
+    return proto.SerializeToString(deterministic=True)
+
+
+def decode(kind: type[T], data: bytes) -> T:
+    """The message of type `kind` that `encode` wrote; RecordingError where the bytes are not one.
+
+    The image of a Frame recorded by reference has the shape (0, 0, 3).
+    """
+    proto = proto_class(kind.__name__)()
+    try:
+        proto.ParseFromString(data)
+    except DecodeError as error:
+        raise RecordingError(
+            f"expected a {kind.__name__} in the recording, found other bytes: it is damaged"
+        ) from error
+    return _build(kind, proto)
+
+
+def reference(frame: bytes) -> Picture:
+    """How the picture of an encoded Frame was recorded, for finding it again in the source."""
+    proto: Any = proto_class("Frame")()
+    proto.ParseFromString(frame)
+    return _picture(proto.image)
+
+
+def without_picture(frame: bytes) -> bytes:
+    """The same encoded Frame by reference: size and checksum stay, the pixels go."""
+    proto: Any = proto_class("Frame")()
+    proto.ParseFromString(frame)
+    picture = _picture(proto.image)
+    if picture.format == "reference":
+        return frame
+    crc32 = picture.crc32 or checksum(decompress(picture))
+    proto.image.format, proto.image.data, proto.image.crc32 = "reference", b"", crc32
+    return proto.SerializeToString(deterministic=True)
+
+
+def check_version(version: int) -> None:
+    """Raise RecordingError for a recording written by a newer codec than this one."""
+    if version > CODEC_VERSION:
+        raise RecordingError(
+            f"the recording has codec version {version}, newer than {CODEC_VERSION}, the newest "
+            "that this stream-dmr reads: upgrade stream-dmr"
+        )
+
+
+def _fill(proto: Proto, value: object, picture: Picture | None = None) -> None:
+    for field in proto.DESCRIPTOR.fields:
+        item = getattr(value, field.name)
+        if field.name == "image" and item is not None:
+            item = picture or compress(item, format="png")
+        if item is not None:
+            _set(proto, field, item)
+
+
+def _set(proto: Proto, field: Any, item: Any) -> None:
+    if field.message_type is None:
+        setattr(proto, field.name, _SCALARS[field.type](item))
+        return
+    inner = getattr(proto, field.name)
+    if isinstance(item, Mapping):
+        for name, count in item.items():
+            inner.add(name=_SCALARS[FieldDescriptor.TYPE_STRING](name), count=count)
+        return
+    inner.SetInParent()
+    if field.message_type.name == "Picture":
+        item = item if isinstance(item, Picture) else compress_mask(item)
+        for part in fields(Picture):
+            setattr(inner, part.name, getattr(item, part.name))
+    elif is_dataclass(item):
+        _fill(inner, item)
+    else:
+        little = item.astype(item.dtype.newbyteorder("<"), copy=False)
+        inner.dtype, inner.data = little.dtype.str, little.tobytes()
+        inner.shape.extend(item.shape)
+
+
+def _build(kind: type[T], proto: Proto) -> T:
+    built = kind(**{field.name: _get(proto, field) for field in _fields(kind)})
+    if isinstance(built, Camera) and not 0 < built.width * built.height <= _MOST_PX:
+        raise RecordingError(
+            f"the recording has pictures of {built.width}x{built.height} px: it is damaged"
+        )
+    return built
+
+
+@cache
+def _fields(kind: type) -> list[Any]:
+    """Those of its protobuf message, which has a field for each of the dataclass."""
+    by_name = proto_class(kind.__name__).DESCRIPTOR.fields_by_name
+    return [by_name[field.name] for field in fields(kind)]
+
+
+def _get(proto: Proto, field: Any) -> Any:
+    inner = getattr(proto, field.name)
+    if field.is_repeated:
+        return {count.name: count.count for count in inner}
+    if field.has_presence and not proto.HasField(field.name):
+        if field.containing_oneof is None:  # so the schema doesn't say `optional`
+            raise RecordingError(
+                f"{proto.DESCRIPTOR.name} lacks its {field.name}: the recording is damaged"
+            )
+        return None
+    if field.message_type is None:
+        return inner
+    name = field.message_type.name
+    if name == "Array":
+        return _array(inner)
+    if name == "Picture":
+        return decompress(_picture(inner))
+    return _build(_DATACLASSES[name], inner)
+
+
+def _picture(proto: Any) -> Picture:
+    return Picture(**{part.name: getattr(proto, part.name) for part in fields(Picture)})
+
+
+def _array(proto: Any) -> np.ndarray:
+    try:
+        dtype = np.dtype(proto.dtype)
+        array = np.frombuffer(proto.data, dtype).reshape(tuple(proto.shape))
+    except (TypeError, ValueError) as error:
+        raise RecordingError(f"the recording holds a damaged array: {error}") from error
+    return array.astype(dtype.newbyteorder("="), copy=False)

@@ -1,0 +1,101 @@
+"""What a recording needs beside its messages to be recomputed from."""
+
+import platform
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from stream_dmr import __version__
+from stream_dmr.camera import Calibration
+from stream_dmr.errors import RecordingError
+from stream_dmr.recording.messages.codec import CODEC_VERSION, decode, encode
+from stream_dmr.template.template import Template
+
+_LIBRARIES = ("numpy", "opencv-python-headless", "torch", "scipy", "numba", "mcap", "rerun-sdk")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunHeader:
+    """The inputs of a run that are not messages."""
+
+    source: str  # file name or address
+    command: str  # as typed
+    config_toml: str
+    template: Template
+    calibration: Calibration | None = None
+    calibration_file: bytes = b""  # the user's file as it was; empty where there is none
+
+    @cached_property
+    def checksum(self) -> int:
+        """Of the attachments: runs with the same one had the same inputs but for the source."""
+        return _checksum(self.attachments())
+
+    def metadata(self) -> dict[str, str]:
+        """The record `run`: who wrote this, from what, and with which versions."""
+        return {
+            "source": self.source,
+            "command": self.command,
+            "codec_version": str(CODEC_VERSION),
+            "attachments_crc32": str(self.checksum),
+            "stream_dmr": __version__,
+            "python": platform.python_version(),
+            "platform": f"{platform.system()} {platform.machine()} {' '.join(platform.libc_ver())}",
+            "cpu": _cpu(),
+            **{name: _version(name) for name in _LIBRARIES},
+        }
+
+    def attachments(self) -> dict[str, bytes]:
+        """Name -> content. The .pb ones are exact and for replay, the others are for people too."""
+        files = {"config.toml": self.config_toml.encode(), "template.pb": encode(self.template)}
+        if self.calibration is not None:
+            files["calibration.pb"] = encode(self.calibration)
+            files["calibration.yaml"] = self.calibration_file
+        return files
+
+    @classmethod
+    def from_parts(cls, metadata: dict[str, str], attachments: dict[str, bytes]) -> "RunHeader":
+        """The inverse of `metadata` and `attachments`, exact.
+
+        KeyError where a part is missing, RecordingError where one is damaged.
+        """
+        calibration = attachments.get("calibration.pb")
+        header = cls(
+            source=metadata["source"],
+            command=metadata["command"],
+            config_toml=attachments["config.toml"].decode(),
+            template=decode(Template, attachments["template.pb"]),
+            calibration=None if calibration is None else decode(Calibration, calibration),
+            calibration_file=attachments.get("calibration.yaml", b""),
+        )
+        recorded = metadata.get("attachments_crc32")  # the first recordings have none
+        if recorded is not None and recorded != str(_checksum(attachments)):
+            raise RecordingError("its config, template or calibration is damaged or missing")
+        return header
+
+
+def _checksum(attachments: Mapping[str, bytes]) -> int:
+    """To tell whether all are there and as they were: readers by index check nothing else."""
+    crc32 = 0
+    for name, data in sorted(attachments.items()):
+        crc32 = zlib.crc32(name.encode() + data, crc32)
+    return crc32
+
+
+def _cpu() -> str:
+    """The processor: another one may round the last bits of sines and sums otherwise."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or platform.machine()
+
+
+def _version(library: str) -> str:
+    try:
+        return version(library)
+    except PackageNotFoundError:
+        return "not installed"

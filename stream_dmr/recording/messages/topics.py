@@ -1,0 +1,87 @@
+"""The one table of what a message is called in each kind of recording."""
+
+from dataclasses import dataclass
+
+from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Topic:
+    """Where the messages of one type lie."""
+
+    message: type[Message]
+    topic: str  # in the .mcap
+    entities: tuple[str, ...]  # in the .rrd; {id} is the track's
+
+    @property
+    def schema(self) -> str:
+        """Name of the protobuf message, in `messages.proto`."""
+        return f"stream_dmr.{self.message.__name__}"
+
+    @property
+    def payload(self) -> str:
+        """Entity path of the encoded messages in the .rrd."""
+        return f"messages{self.topic}"
+
+
+FRAME, MASKS = "scene/camera/frame", "scene/camera/masks"
+BOX, OUTLINE = "scene/camera/fish/{id}/box", "scene/camera/fish/{id}/outline"
+MESH = "scene/fish/{id}/mesh"
+KEYPOINTS_2D = "scene/camera/fish/{id}/keypoints"
+KEYPOINTS_3D, MIDLINE = "scene/fish/{id}/keypoints", "scene/fish/{id}/midline"
+FRAME_LENGTH, LENGTH = "length/{id}/frame", "length/{id}/estimate"
+IOU, BENDING, FIT_MS = "iou/{id}", "bending/{id}", "fit_ms/{id}"
+LOG, REFUSALS, RESULTS = "log", "log/refusals", "log/lengths"
+CAMERA, PLANE = "scene/camera", "scene/plane"  # static, from the header
+END = "messages/end"  # the last row of a whole .rrd: how many messages each payload path has
+# Metadata records of an .mcap: of the run; of one of several files, with its `number`; of one that
+# a crash left unfinished; of one whose pictures and masks went to make room.
+RUN, SEGMENT, RECOVERED, THINNED = "run", "segment", "recovered", "thinned"
+SPANS = "tracks.json"  # attachment of a whole .mcap: each track's first and last capture time, ns
+KEY_FRAME_NS = 1_000_000_000  # of capture time, from one key frame of the video to the next
+VIDEO = "/video"  # in the .mcap with frames = "h264": foxglove.CompressedVideo
+FISH_ROOTS = ("scene/camera/fish", "scene/fish")  # what a new frame clears
+
+TOPICS: dict[type[Message], Topic] = {
+    row.message: row
+    for row in (
+        Topic(message=Frame, topic="/frame", entities=(FRAME,)),
+        Topic(message=FishCrop, topic="/crop", entities=(MASKS, OUTLINE)),
+        Topic(message=FittedMesh, topic="/fit", entities=(MESH, IOU, FIT_MS)),
+        Topic(
+            message=LocalizedFish,
+            topic="/localized",
+            entities=(BOX, KEYPOINTS_2D, KEYPOINTS_3D, MIDLINE, FRAME_LENGTH, BENDING),
+        ),
+        Topic(message=LengthEstimate, topic="/length", entities=(LENGTH, REFUSALS, RESULTS)),
+    )
+}
+
+
+CARRIED = "/carried/localized"
+"""In a segment: of the fish that were in view at its beginning, what was seen before."""
+
+FOXGLOVE_TOPICS = {
+    "/foxglove/picture": "foxglove.CompressedImage",
+    "/foxglove/camera": "foxglove.CameraCalibration",
+    "/foxglove/plane": "foxglove.FrameTransform",
+    "/foxglove/fish": "foxglove.SceneUpdate",
+    "/foxglove/outlines": "foxglove.ImageAnnotations",
+    "/foxglove/keypoints": "foxglove.ImageAnnotations",
+}
+"""In the .mcap, beside the messages, with `foxglove = true`: topic -> schema."""
+
+
+def topics_table() -> str:
+    """The tables in `docs/recording.md`, which `python -m` this module prints."""
+    lines = ["| message | topic (.mcap) | schema | entities (.rrd) |", "|---|---|---|---|"]
+    for row in TOPICS.values():
+        entities = ", ".join(f"`{path}`" for path in row.entities)
+        lines.append(f"| `{row.message.__name__}` | `{row.topic}` | `{row.schema}` | {entities} |")
+    lines += ["", "| topic with `foxglove = true` | schema |", "|---|---|"]
+    lines += [f"| `{topic}` | `{schema}` |" for topic, schema in FOXGLOVE_TOPICS.items()]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(topics_table())

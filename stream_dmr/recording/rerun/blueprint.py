@@ -1,0 +1,166 @@
+"""How a recording opens in Rerun: the layout of its views, the colours, and what never moves."""
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from jaxtyping import Float, Int
+
+from stream_dmr.camera import Calibration, Camera
+from stream_dmr.recording.messages import topics
+from stream_dmr.recording.messages.topics import CAMERA, LOG, PLANE
+from stream_dmr.recording.rerun.palette import color
+
+_GRID_MM = 100.0
+_GREY = (150, 160, 170, 90)
+_PICTURE_DEPTH = 0.25  # of the camera's picture in the scene, of the distance to the fish
+NOMINAL_DEPTH = 2.5  # of a fish without calibration, in body lengths: it fills half the picture
+RUN = "run"
+_THIN = rr.Radius.ui_points(1.2)
+_DOTS = rr.Radius.ui_points([5.5, 3.5, 3.5])  # head, center, tail: the large one is the head
+_WHITE = (255, 255, 255)
+# Where the 3D views are seen from: close enough to see how a fish is bent; and past the camera.
+# Without a calibration fish seem as far away as they are small.
+_NEAR = np.array([[0.42, -0.18, 0.5], [0.0, 0.0, 0.92]])
+_RELATIVE = np.array([[0.35, -0.2, 0.0], [0.0, 0.0, 1.0]])
+_FAR = np.array([[0.7, -0.4, -0.05], [0.0, -0.02, 0.85]])
+PICTURES = {
+    topics.FRAME: rr.EncodedImage.from_fields(media_type="image/jpeg"),
+    topics.MASKS: rr.EncodedImage.from_fields(media_type="image/png", opacity=0.35, draw_order=1.0),
+}
+_LOG_COLUMNS = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
+_SEE_THROUGH = 150  # opacity of a mesh, of 255: the midline shows
+
+
+def appearance(track_id: int, faces: Int[np.ndarray, "F 3"]) -> dict[str, rr.AsComponents]:
+    """What never changes of a fish, by entity path with `{id}` left open."""
+    tint, name = color(track_id), f"fish {track_id}"
+    lines = rr.SeriesLines(
+        names=[name, f"{name} low", f"{name} high"],
+        colors=[tint, (*tint, 110), (*tint, 110)],
+        widths=[2.5, 1.0, 1.0],
+    )
+    curve = rr.SeriesLines(names=name, colors=tint)
+    return {
+        topics.BOX: rr.Boxes2D.from_fields(colors=[tint], radii=rr.Radius.ui_points(0.6)),
+        topics.OUTLINE: rr.LineStrips2D.from_fields(colors=[tint], radii=_THIN),
+        topics.KEYPOINTS_2D: rr.Points2D.from_fields(colors=[_WHITE], radii=_DOTS),
+        topics.MESH: rr.Mesh3D.from_fields(
+            triangle_indices=faces, albedo_factor=(*tint, _SEE_THROUGH)
+        ),
+        topics.KEYPOINTS_3D: rr.Points3D.from_fields(colors=[_WHITE], radii=_DOTS),
+        topics.MIDLINE: rr.LineStrips3D.from_fields(colors=[_WHITE], radii=_THIN),
+        topics.LENGTH: lines,
+        topics.FRAME_LENGTH: rr.SeriesPoints(names=f"{name}, frame", colors=tint, marker_sizes=2.0),
+        **dict.fromkeys((topics.IOU, topics.BENDING, topics.FIT_MS), curve),
+    }
+
+
+def blueprint(calibration: Calibration | None) -> rrb.Blueprint:
+    """The frame and the 3D scene above; length, IoU and the log of events below.
+
+    Without a calibration there are no lengths, so the bending ratio takes their place.
+    """
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(
+                rrb.Spatial2DView(origin=CAMERA, name="Frame: masks, outlines, keypoints"),
+                rrb.Tabs(
+                    _scene_view(
+                        calibration, "Fish", eye=_RELATIVE if calibration is None else _NEAR
+                    ),
+                    _scene_view(calibration, "Whole scene", eye=_FAR),
+                ),
+            ),
+            rrb.Horizontal(
+                _series("bending", "Bending ratio")
+                if calibration is None
+                else _series("length", "Length, its 95 % band, and single frames, mm"),
+                rrb.Vertical(
+                    _series("iou", "Silhouette IoU", axis_y=rrb.ScalarAxis(range=(0.5, 1.0))),
+                    _series("fit_ms", "Time of a fit, ms", axis_y=rrb.ScalarAxis(range=(0, 100))),
+                ),
+                rrb.Tabs(
+                    rrb.TextLogView(origin=LOG, name="Refusals and lengths", columns=_LOG_COLUMNS),
+                    rrb.TextDocumentView(origin=RUN, name="Run"),
+                ),
+            ),
+            row_shares=[3, 2],
+        ),
+        rrb.TimePanel(timeline="frame", state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
+
+
+def _series(origin: str, name: str, *, axis_y: rrb.ScalarAxis | None = None) -> rrb.TimeSeriesView:
+    legend = rrb.PlotLegend(visible=False)  # it hides the lines; hovering names them
+    return rrb.TimeSeriesView(origin=origin, name=name, axis_y=axis_y, plot_legend=legend)
+
+
+def _scene_view(
+    calibration: Calibration | None,
+    name: str,
+    *,
+    eye: Float[np.ndarray, "2 3"],
+) -> rrb.Spatial3DView:
+    """`eye` is where it stands and where it looks, in units of the fish's distance."""
+    depth = NOMINAL_DEPTH if calibration is None else middle_mm(calibration)[2]
+    unit = "relative" if calibration is None else "mm"
+    return rrb.Spatial3DView(
+        origin="scene",
+        contents=["scene/**", "- scene/camera/fish/**", f"- {topics.MASKS}"],
+        name=f"{name} (camera frame, {unit})",
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(
+            position=depth * eye[0], look_target=depth * eye[1], eye_up=(0.0, -1.0, 0.0)
+        ),
+    )
+
+
+def log_camera(rec: rr.RecordingStream, camera: Camera, *, depth: float, factor: int) -> None:
+    """The camera, for all time, for fish that hang some `depth` away.
+
+    `factor` is the number of frame pixels per pixel of the picture that is shown.
+    """
+    # Rerun counts pixels from the corner of the top-left one, we from its centre.
+    shift = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    pinhole = rr.Pinhole(
+        image_from_camera=np.diag([1 / factor, 1 / factor, 1.0]) @ shift @ camera.K,
+        resolution=(camera.width / factor, camera.height / factor),
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=_PICTURE_DEPTH * depth,
+    )
+    rec.log(CAMERA, pinhole, static=True)
+
+
+def log_plane(rec: rr.RecordingStream, calibration: Calibration) -> None:
+    """The reference plane as a grid of 100 mm, for all time."""
+    middle, camera, plane = middle_mm(calibration), calibration.camera, calibration.plane
+    half = 0.6 * middle[2] * max(camera.width / camera.K[0, 0], camera.height / camera.K[1, 1])
+    lines = _grid(plane.rotation.T @ (middle - plane.translation_mm), half)
+    strips = lines @ plane.rotation.T + plane.translation_mm
+    rec.log(
+        PLANE, rr.LineStrips3D(strips, colors=[_GREY], radii=rr.Radius.ui_points(0.7)), static=True
+    )
+
+
+def middle_mm(calibration: Calibration) -> Float[np.ndarray, "3"]:
+    """Where the camera's axis meets the plane, or the plane's origin where it doesn't."""
+    ray = np.array([[0.0, 0.0, 1.0]])
+    depth = calibration.plane.depth_mm(ray)[0]
+    if np.isfinite(depth) and depth > 0:
+        return ray[0] * depth
+    return calibration.plane.translation_mm
+
+
+def _grid(middle: Float[np.ndarray, "3"], half: float) -> Float[np.ndarray, "L 2 3"]:
+    """Lines of a square grid in world Z = 0, on multiples of its spacing."""
+    spacing = _GRID_MM * max(1.0, np.ceil(half / _GRID_MM / 20))  # 40 lines each way at most
+    count = int(np.ceil(half / spacing))
+    center = np.round(middle[:2] / spacing) * spacing
+    offsets = np.arange(-count, count + 1) * spacing
+    ends = np.array([-count, count]) * spacing
+    along, across = np.meshgrid(offsets, ends, indexing="ij")
+    vertical = np.stack([along, across, np.zeros_like(along)], axis=-1)
+    lines = np.concatenate([vertical, vertical[..., [1, 0, 2]]])
+    return lines + np.array([*center, 0.0])

@@ -1,0 +1,184 @@
+"""Reads the messages back that an .rrd carries beside its view.
+
+An .rrd has no checksum of its own, so each message and each part of the header has a CRC-32 beside
+it, the messages of each kind are numbered, and a last row says how many there are.
+"""
+
+import json
+import subprocess
+import warnings
+import zlib
+from collections.abc import Collection, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from heapq import merge
+from multiprocessing import get_context
+from operator import itemgetter
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pyarrow as pa
+
+from stream_dmr.errors import RecordingError
+from stream_dmr.messages import Message
+from stream_dmr.recording.messages.codec import check_version
+from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.topics import END, TOPICS
+from stream_dmr.recording.reading.selection import WHOLE, Part
+from stream_dmr.recording.rerun.program import rerun_program
+
+_HEADER = "/messages/header/"
+_FOOTER_MAGIC = b"RRF2FOOT"  # in the last 16 bytes of a file that was closed
+_DAMAGE = (ValueError, RuntimeError, OSError, KeyError, TypeError, pa.ArrowException)
+
+# By entity: number, capture time, encoding.
+Rows = dict[str, list[tuple[int, int, bytes]]]
+
+
+class RrdFile:
+    """One .rrd with `rrd_messages`, in memory."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises RecordingError where it can't be read or holds no messages."""
+        self.path = path
+        self.warnings: list[str] = []
+        self._rows = _read_apart(path)
+        self._check_end()
+        self.header = self._read_header()
+
+    def payloads(
+        self, kinds: Collection[type[Message]], part: Part = WHOLE
+    ) -> Iterator[tuple[type[Message], bytes]]:
+        """See `opened.Recording`; the kinds are mixed by capture time."""
+
+        def wanted(kind: type[Message]) -> Iterator[tuple[int, type[Message], bytes]]:
+            for _, timestamp_ns, payload in self._rows.get(f"/{TOPICS[kind].payload}", ()):
+                if part.has_time(timestamp_ns):
+                    yield timestamp_ns, kind, payload
+
+        for _, kind, payload in merge(*map(wanted, kinds), key=itemgetter(0)):
+            yield kind, payload
+
+    def carried(self) -> Iterator[bytes]:
+        """None: it is in the .mcap."""
+        return iter(())
+
+    def video(self, part: Part = WHOLE) -> Iterator[bytes]:
+        """None: it is in the .mcap."""
+        return iter(())
+
+    def _check_end(self) -> None:
+        """Compare with the last row: without it the file is torn, with other counts damaged."""
+        end = self._rows.pop(f"/{END}", None)
+        counts = {entity: len(rows) for entity, rows in self._rows.items()}
+        self.ends_early = end is None
+        self.is_thinned = False
+        if end is None:
+            whole = sum(count for entity, count in counts.items() if _HEADER not in entity)
+            self.warnings.append(
+                f"{self.path}: torn; {whole} messages are whole, what came after is lost"
+            )
+        elif json.loads(end[0][2]) != counts:
+            raise RecordingError(f"{self.path}: damaged: parts of it are missing")
+
+    def _read_header(self) -> RunHeader:
+        parts = {
+            entity.removeprefix(_HEADER): rows[0][2]
+            for entity, rows in self._rows.items()
+            if entity.startswith(_HEADER)
+        }
+        if "run.json" not in parts:
+            raise RecordingError(
+                f"{self.path}: expected a recording that carries its messages, got only the view; "
+                "replay the .mcap, or record with rrd_messages = true"
+            )
+        self.metadata: dict[str, str] = json.loads(parts.pop("run.json"))
+        try:
+            check_version(int(self.metadata["codec_version"]))
+            return RunHeader.from_parts(self.metadata, parts)
+        except RecordingError as error:
+            raise RecordingError(f"{self.path}: {error}") from error
+        except KeyError as error:
+            raise RecordingError(f"{self.path}: lacks {error}, not a complete recording") from error
+
+
+def _read_apart(path: Path) -> Rows:
+    """Read in a process of its own: on some damaged files Rerun takes its process down."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        try:
+            return pool.submit(_read, path).result()
+        except BrokenProcessPool as error:
+            raise RecordingError(
+                f"{path}: damaged: Rerun's reader breaks down on it; replay the .mcap instead"
+            ) from error
+
+
+def _read(path: Path) -> Rows:
+    try:
+        return _rows_in(path)
+    except _DAMAGE as error:
+        if path.is_file() and not is_closed(path) and (rows := _salvaged(path)):
+            return rows
+        raise RecordingError(
+            f"{path}: expected a whole recording (.rrd), but it can't be read: {error}"
+        ) from error
+
+
+def _rows_in(path: Path) -> Rows:
+    from rerun.chunk import RrdReader  # in the other process only
+
+    rows: Rows = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that a torn file has no footer, we say ourselves
+        for chunk in RrdReader(str(path)).stream():
+            entity = str(chunk.entity_path)
+            if entity.startswith("/messages/"):
+                rows.setdefault(entity, []).extend(_rows_of(chunk.to_record_batch()))
+    for entity, found in rows.items():
+        found.sort()
+        if [number for number, _, _ in found] != list(range(len(found))):
+            raise ValueError(f"messages are missing in {entity}")
+    return rows
+
+
+def is_closed(path: Path) -> bool:
+    """Whether an .rrd has its footer."""
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - 16, 0))
+        return _FOOTER_MAGIC in file.read()
+
+
+def _salvaged(path: Path) -> Rows:
+    """The whole part of a file that was not closed, of which Rerun's reader wants nothing."""
+    with TemporaryDirectory() as folder:
+        whole = Path(folder) / "whole.rrd"
+        command = [
+            rerun_program(),
+            "rrd",
+            "filter",
+            "--continue-on-error",
+            str(path),
+            "-o",
+            str(whole),
+        ]
+        subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            return _rows_in(whole)
+        except _DAMAGE:
+            return {}
+
+
+def _rows_of(batch: pa.RecordBatch) -> Iterator[tuple[int, int, bytes]]:
+    """Numbers, times and encodings; those of the header, which is static, are 0."""
+    times, numbers = [0] * batch.num_rows, [0] * batch.num_rows
+    if "time" in batch.schema.names:
+        times = batch.column("time").cast(pa.int64()).to_pylist()
+    if "number" in batch.schema.names:
+        numbers = [values[0].as_py() for values in batch.column("number")]
+    columns = (numbers, times, batch.column("payload"), batch.column("crc32"))
+    for number, timestamp_ns, payload, crc32 in zip(*columns, strict=True):
+        data = np.asarray(payload.values).astype(np.uint8, copy=False).tobytes()
+        if zlib.crc32(data) != crc32.values[0].as_py():
+            raise ValueError("the checksum of a message is wrong")
+        yield number, timestamp_ns, data

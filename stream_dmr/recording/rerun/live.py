@@ -1,0 +1,78 @@
+"""The view of a run while it measures."""
+
+import socket
+import time
+from contextlib import suppress
+from queue import Empty, Full, Queue
+from threading import Event, Thread
+
+import rerun as rr
+
+from stream_dmr.errors import OutputError
+from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.record import Record
+from stream_dmr.recording.rerun.blueprint import blueprint
+from stream_dmr.recording.rerun.draw import Drawing
+from stream_dmr.recording.rerun.sink import log_run, new_stream
+from stream_dmr.recording.settings import RecordingSettings
+
+_PORT = 9876  # where Rerun's viewer looks first
+_MEMORY = "256MiB"  # of the server, for viewers that come late; what is older is dropped
+_QUEUE_MESSAGES = 128
+_SEND_S = 0.2
+_CLOSE_S = 2.0  # a viewer that hangs is left behind after this
+
+
+class LiveView:
+    """Serves the view at `address`, on this machine only.
+
+    It can neither slow nor stop the run: what it has no time for is not shown, and where it
+    breaks, it is silent from there on.
+    """
+
+    def __init__(self, header: RunHeader, settings: RecordingSettings) -> None:
+        self.num_dropped = 0
+        self._queue: Queue[Record] = Queue(_QUEUE_MESSAGES)
+        self._stop = Event()
+        port = _free_port()
+        self.address = f"rerun+http://127.0.0.1:{port}/proxy"
+        self._rec = new_stream()
+        sink = rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=_MEMORY)
+        self._rec.set_sinks(sink, default_blueprint=blueprint(header.calibration))
+        log_run(self._rec, header)
+        self._drawing = Drawing(self._rec, header, settings)
+        self._thread = Thread(target=self._draw_all, name="live", daemon=True)
+        self._thread.start()
+
+    def write(self, record: Record) -> None:
+        """Show a record, if there is time for it."""
+        try:
+            self._queue.put_nowait(record)
+        except Full:
+            self.num_dropped += 1
+
+    def close(self) -> None:
+        """Stop serving. Idempotent."""
+        self._stop.set()
+        self._thread.join(_CLOSE_S)
+
+    def _draw_all(self) -> None:
+        with suppress(Exception):
+            send_at = time.monotonic()
+            while not (self._stop.is_set() and self._queue.empty()):
+                with suppress(Empty):
+                    self._drawing.draw(self._queue.get(timeout=_SEND_S))
+                if time.monotonic() >= send_at:
+                    self._drawing.send()
+                    send_at = time.monotonic() + _SEND_S
+            self._drawing.send()
+        self._rec.disconnect()
+
+
+def _free_port() -> int:
+    """Rerun's own port, or any where that is taken."""
+    for port in (_PORT, 0):
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return probe.getsockname()[1]
+    raise OutputError("--live: expected a free port to serve the view at, found none")

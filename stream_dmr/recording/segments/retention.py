@@ -1,0 +1,141 @@
+"""Keeps room on the disk: old recordings go when it runs short, step by step, lengths never."""
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
+from pathlib import Path
+from threading import Event, Thread
+
+from stream_dmr.csv_file import set_aside
+from stream_dmr.errors import OutputError, RecordingError
+from stream_dmr.files import free_bytes, rename_durably
+from stream_dmr.messages import FishCrop, Frame
+from stream_dmr.recording.files import STEM
+from stream_dmr.recording.mcap.file import McapFile
+from stream_dmr.recording.mcap.sink import PART
+from stream_dmr.recording.messages.codec import without_picture
+from stream_dmr.recording.messages.topics import FOXGLOVE_TOPICS, THINNED, TOPICS, VIDEO
+from stream_dmr.recording.reading.rewrite import rewrite
+from stream_dmr.recording.rerun.file import is_closed
+from stream_dmr.sources.picture_folder import natural_order
+
+_LEFT_OUT = {TOPICS[FishCrop].topic, VIDEO, *FOXGLOVE_TOPICS}
+_PERIOD_S = 5.0
+
+
+class Retention:
+    """Makes room in the folder of a run whenever less is free than is to be kept free.
+
+    First go old tables of frames, whose rows the segments have, then the views, and pictures and
+    masks, of the oldest segments, then whole segments; those with a fish of `marked()` after all
+    others. What is being written is left alone.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        free_bytes: int,
+        marked: Callable[[], Collection[int]],
+        on_notice: Callable[[str], None],
+    ) -> None:
+        self._folder, self._free_bytes = folder, free_bytes
+        self._marked, self._on_notice = marked, on_notice
+        self._known: dict[str, tuple[Collection[int], bool]] = {}  # tracks, is it thinned
+        self._stop = Event()
+        self._thread = Thread(target=self._watch, name="retention", daemon=True)
+
+    def start(self) -> None:
+        """Make room from now on, in a thread of its own."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop. Idempotent."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def make_room(self) -> None:
+        """Take as many steps as are needed, or as there are.
+
+        Raises OSError or OutputError where the disk is not well.
+        """
+        if not self._free_bytes or not self._folder.is_dir():
+            return
+        done: Counter[str] = Counter()
+        steps = self._steps()
+        while self._is_short() and not self._stop.is_set() and (step := next(steps, None)):
+            done[step] += 1
+        if done:
+            what = ", ".join(f"{step} of {count}" for step, count in done.items())
+            gigabytes = self._free_bytes / 1e9
+            self._on_notice(
+                f"less than {gigabytes:g} GB were free, so the oldest recordings went: {what}"
+            )
+
+    def _watch(self) -> None:
+        while not self._stop.wait(_PERIOD_S):
+            with suppress(OSError, OutputError):  # measuring goes on
+                self.make_room()
+
+    def _is_short(self) -> bool:
+        return free_bytes(self._folder) < self._free_bytes
+
+    def _steps(self) -> Iterator[str]:
+        """Do what makes room, one at a time, and name it."""
+        for table in set_aside(self._folder / "frames.csv"):
+            yield from self._remove(table, "the table of frames")
+        stems, marked = self._finished(), set(self._marked())
+        is_marked = {stem: bool(marked & set(self._facts(stem)[0])) for stem in stems}
+        for wanted in (False, True):
+            group = [stem for stem in stems if is_marked[stem] is wanted]
+            for stem in group:
+                yield from self._remove(stem.with_suffix(".rrd"), "the view")
+                yield from self._thin(stem.with_suffix(".mcap"))
+            for stem in group:
+                yield from self._remove(stem.with_suffix(".mcap"), "all")
+
+    def _finished(self) -> list[Path]:
+        """What is not being written, the oldest first, without suffix."""
+        recordings = [*self._folder.glob(f"{STEM}-*.mcap"), *self._folder.glob(f"{STEM}-*.rrd")]
+        stems = {path.with_suffix("") for path in recordings}
+        return sorted((stem for stem in stems if not _is_open(stem)), key=natural_order)
+
+    def _facts(self, stem: Path) -> tuple[Collection[int], bool]:
+        """The fish of a segment, and whether its pictures and masks are gone."""
+        if stem.name not in self._known:
+            try:
+                file = McapFile(stem.with_suffix(".mcap"))
+                self._known[stem.name] = file.tracks(), file.is_thinned
+            except RecordingError:
+                self._known[stem.name] = (), True
+        return self._known[stem.name]
+
+    def _remove(self, path: Path, what: str) -> Iterator[str]:
+        if path.exists():
+            path.unlink()
+            yield what
+
+    def _thin(self, path: Path) -> Iterator[str]:
+        """Pictures and masks go; where there is no room to write the rest anew, nothing does."""
+        tracks, is_thinned = self._facts(path.with_suffix(""))
+        if is_thinned:
+            return
+        with suppress(OSError):
+            copy, _ = rewrite(path, note=THINNED, edit=_thinned)
+            rename_durably(copy, path)
+            self._known[path.stem] = tracks, True
+            yield "pictures and masks"
+
+
+def _is_open(stem: Path) -> bool:
+    rrd = stem.with_suffix(".rrd")
+    return stem.with_name(f"{stem.name}.mcap{PART}").exists() or (
+        rrd.exists() and not is_closed(rrd)
+    )
+
+
+def _thinned(topic: str, data: bytes) -> bytes | None:
+    if topic in _LEFT_OUT:
+        return None
+    return without_picture(data) if topic == TOPICS[Frame].topic else data

@@ -1,0 +1,228 @@
+"""Recordings of a bounded length, one after the other, for a source without an end."""
+
+import re
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+from threading import Thread
+
+from stream_dmr.errors import OutputError
+from stream_dmr.files import free_bytes
+from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish
+from stream_dmr.recording.files import STEM, FileSink, Flushing, Sink, open_files
+from stream_dmr.recording.mcap.sink import McapSink
+from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.record import Record
+from stream_dmr.recording.segments.open_tracks import Carried, carried_record
+from stream_dmr.recording.segments.recover import is_unfinished, repair
+from stream_dmr.recording.settings import RecordingSettings
+
+_NUMBERED = re.compile(rf"{STEM}-(\d+)\..*")
+_RETRY_NS = 5_000_000_000  # of capture time, after the disk refused a new segment
+_FLOOR = 0.05  # of `keep_free_gb`: with less than that free, nothing but lengths is written
+_NO_ROOM = "hardly any room is left on the disk; nothing is recorded but lengths"
+_MOST_IN_FLIGHT = 16  # frames between the source and the end of the chain: fewer, in fact
+
+
+class Segments:
+    """Writes recording-000001.mcap and .rrd, recording-000002.mcap and .rrd, ...
+
+    A cut comes between two frames. The stages are some frames apart, so for a moment two segments
+    are open: what belongs to frames from the cut on goes to the new one. A segment is complete
+    when the last stage has reached the cut; the fish in view are then carried over to the next.
+    What the disk refuses is told by `on_notice` and tried again with a new segment; what that
+    leaves unfinished is repaired once there is room for the next one.
+    """
+
+    def __init__(
+        self,
+        out_dir: Path,
+        header: RunHeader,
+        settings: RecordingSettings,
+        *,
+        left: Iterable[LocalizedFish] = (),
+        on_notice: Callable[[str], None],
+    ) -> None:
+        """`left`: of the fish that an earlier run left unfinished, which this one finishes."""
+        self._out_dir, self._header, self._settings = out_dir, header, settings
+        self._on_notice = on_notice
+        self._number = last_number(out_dir)
+        self._began_ns: int | None = None  # capture time of the first frame
+        self._cut_ns: int | None = None  # of the first frame of `_next`
+        self._retry_ns = 0
+        self._now_ns = self._refused_ns = 0  # capture times: the last frame; the last refusal
+        self._frames_since_cut = 0
+        self._carried, self._ahead = Carried(), list[Record]()
+        for fish in left:
+            self._carried.take(carried_record(fish))
+        self._torn: list[Path] = []
+        self._repairs = Thread(target=self._repair, name="repairs")
+        self._next: list[FileSink] = []
+        self._open: list[FileSink] = self._try_next(0)
+        self._carry_to(self._open)
+
+    def write(self, record: Record) -> None:
+        """Take one record; never raises OutputError."""
+        message = record.message
+        if isinstance(message, Frame):
+            self._see(message)
+        is_after = self._cut_ns is not None and message.timestamp_ns >= self._cut_ns
+        if isinstance(message, LengthEstimate):
+            if is_after and not message.is_final:
+                self._complete()
+            is_after = False  # a final one belongs where it was made, whenever its fish was seen
+        if is_after:
+            self._ahead.append(record)
+        else:
+            self._carried.take(record)
+        sinks = self._next if is_after else self._open
+        self._each(sinks, lambda sink: sink.write(record))
+
+    def flush_due(self) -> None:
+        """Write what was kept long enough; never raises OutputError."""
+        for sinks in (self._open, self._next):
+            self._each(sinks, lambda sink: sink.flush_due() if isinstance(sink, Flushing) else None)
+
+    def close(self) -> None:
+        """Close what is open. Idempotent."""
+        if self._cut_ns is not None:
+            self._complete()
+        self._close_all(self._open)
+        if self._repairs.is_alive():
+            self._repairs.join()
+        self._repair()
+
+    def _see(self, frame: Frame) -> None:
+        """Cut before this frame if it is time; complete the segment before an earlier cut."""
+        self._now_ns = frame.timestamp_ns
+        if self._open and self._lacks_room():
+            self._give_up(frame.timestamp_ns)
+        if self._cut_ns is not None:
+            self._frames_since_cut += 1
+            if self._frames_since_cut >= _MOST_IN_FLIGHT:
+                self._complete()
+        elif self._began_ns is None:
+            self._began_ns = frame.timestamp_ns
+        elif self._is_due(frame.timestamp_ns, self._began_ns):
+            self._cut(frame.timestamp_ns)
+
+    def _is_due(self, now_ns: int, began_ns: int) -> bool:
+        if now_ns < self._retry_ns:
+            return False
+        size = sum(sink.size for sink in self._open if isinstance(sink, McapSink))
+        is_long = now_ns - began_ns >= self._settings.segment_s * 1e9
+        lacks_file = len(self._open) < self._settings.mcap + self._settings.rrd
+        return is_long or size >= self._settings.segment_mb * 1e6 or lacks_file
+
+    def _cut(self, now_ns: int) -> None:
+        self._next = self._try_next(now_ns)
+        if self._next:
+            self._cut_ns, self._frames_since_cut = now_ns, 0
+
+    def _complete(self) -> None:
+        """The last stage has reached the cut: end the segment before it.
+
+        What is carried over is on the disk before that: one of the two always has a fish whole.
+        """
+        self._carry_to(self._next)
+        self._close_all(self._open)
+        self._open, self._next = self._next, []
+        self._began_ns, self._cut_ns = self._cut_ns, None
+        for record in self._ahead:
+            self._carried.take(record)
+        self._ahead.clear()
+
+    def _lacks_room(self) -> bool:
+        """Whether lengths need what room is left on the disk."""
+        return free_bytes(self._out_dir) < _FLOOR * self._settings.keep_free_gb * 1e9
+
+    def _give_up(self, now_ns: int) -> None:
+        """End what is open, while there is room to end it."""
+        if self._cut_ns is not None:
+            self._complete()
+        self._close_all(self._open)
+        self._retry_ns = now_ns + _RETRY_NS
+        self._on_notice(f"{self._out_dir}: {_NO_ROOM}")
+
+    def _try_next(self, now_ns: int) -> list[FileSink]:
+        """Open the next segment; none where the disk refuses it."""
+        if self._lacks_room():
+            self._retry_ns = now_ns + _RETRY_NS
+            self._on_notice(f"{self._out_dir}: {_NO_ROOM}")
+            return []
+        number = 1 + max(self._number, last_number(self._out_dir))  # a torn one keeps its own
+        stem = f"{STEM}-{number:06d}"
+        try:
+            files = open_files(
+                self._out_dir, self._header, self._settings, stem=stem, number=number
+            )
+        except OutputError as error:
+            self._retry_ns = now_ns + _RETRY_NS
+            self._torn += self._out_dir.glob(f"{stem}.*")
+            self._on_notice(f"{error}; tried again in some seconds")
+            return []
+        self._number = number
+        if self._torn and not self._repairs.is_alive():
+            self._repairs = Thread(target=self._repair, name="repairs")
+            self._repairs.start()
+        return files
+
+    def _repair(self) -> None:
+        """Make whole what a disk that was full left unfinished; it may take a while."""
+        torn, self._torn = self._torn, []
+        for path in filter(is_unfinished, torn):
+            repaired = repair(path, left_by="a disk that refused its end")
+            self._on_notice(repaired.line)
+            if repaired.path == path and is_unfinished(path):
+                self._torn.append(path)
+
+    def _carry_to(self, sinks: list[FileSink]) -> None:
+        def carry(sink: FileSink) -> None:
+            if isinstance(sink, McapSink):
+                sink.carry(self._carried.records())
+
+        self._each(sinks, carry)
+
+    def _each(self, sinks: list[FileSink], write: Callable[[FileSink], None]) -> None:
+        """Write to each; one that the disk refuses is over."""
+        for sink in [*sinks]:
+            try:
+                write(sink)
+            except OutputError as error:
+                sinks.remove(sink)
+                is_again = self._now_ns - self._refused_ns < _RETRY_NS
+                self._retry_ns = self._now_ns + _RETRY_NS * is_again
+                self._refused_ns = self._now_ns
+                self._on_notice(f"{error}; tried again with the next segment")
+                with suppress(OutputError):
+                    sink.close()
+                self._torn += self._out_dir.glob(f"{sink.path.name}*")
+
+    def _close_all(self, sinks: list[FileSink]) -> None:
+        for sink in sinks:
+            try:
+                sink.close()
+            except OutputError as error:
+                self._on_notice(str(error))
+                self._torn += self._out_dir.glob(f"{sink.path.name}*")
+        sinks.clear()
+
+
+def open_segments(
+    out_dir: Path,
+    header: RunHeader,
+    settings: RecordingSettings,
+    *,
+    left: Iterable[LocalizedFish] = (),
+    on_notice: Callable[[str], None],
+) -> list[Sink]:
+    """`Segments`, where anything is recorded."""
+    if not (settings.mcap or settings.rrd):
+        return []
+    return [Segments(out_dir, header, settings, left=left, on_notice=on_notice)]
+
+
+def last_number(out_dir: Path) -> int:
+    """Of the segments in a folder, whole or not; 0 where there are none."""
+    found = [_NUMBERED.fullmatch(path.name) for path in out_dir.iterdir()]
+    return max((int(match[1]) for match in found if match), default=0)

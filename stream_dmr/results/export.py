@@ -1,0 +1,224 @@
+"""Recordings in the formats of others: meshes, COCO masks, tables."""
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import trimesh
+from jaxtyping import Bool
+
+from stream_dmr.camera import crop_from_frame, frame_from_crop
+from stream_dmr.errors import OutputError
+from stream_dmr.files import make_folder, writing_to
+from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
+from stream_dmr.recording.messages.codec import reference
+from stream_dmr.recording.messages.record import make_record
+from stream_dmr.recording.reading.pictures import Picture
+from stream_dmr.recording.reading.reader import messages, open_recordings
+from stream_dmr.recording.reading.selection import WHOLE, Part
+from stream_dmr.recording.rerun.meshes import Meshes
+from stream_dmr.recording.rerun.view_geometry import place
+from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.results.finished_fish import database_of, read_fish, read_runs
+from stream_dmr.results.fish_table import fish_record, write_csv, write_parquet
+from stream_dmr.results.fisheries import FisheriesSettings
+from stream_dmr.results.provenance import read_origin, seal_files
+from stream_dmr.results.tables import Tables
+from stream_dmr.running.result_writer import run_facts
+
+MeshFormat = Literal["ply", "glb"]
+TableFormat = Literal["csv", "parquet"]
+
+
+class Export:
+    """A recording, or a part of it, for other programs. Raises RecordingError and OutputError."""
+
+    def __init__(self, recording: Path, part: Part = WHOLE) -> None:
+        self._path = recording
+        self._recording = open_recordings([recording])
+        self._part = part
+        self._written: list[Path] = []
+
+    @property
+    def config_toml(self) -> str:
+        """The settings of the run."""
+        return self._recording.header.config_toml
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """What of the recording is lost, a line each."""
+        return self._recording.warnings
+
+    def meshes(self, out: Path, *, format: MeshFormat) -> int:
+        """Write `fish-ID/FRAME.ply` (or .glb) into `out`; returns their number.
+
+        Vertices are in the camera frame, in mm; without a calibration a fish is one body length
+        long.
+        """
+        template = self._recording.header.template
+        restored, count = Meshes(template), 0
+        for fit, fish in _pairs(self._messages(FittedMesh, LocalizedFish)):
+            shape = restored.with_vertices(fit).shape
+            vertices = None if shape is None else place(shape, fish)[0]
+            if vertices is None:
+                continue
+            folder = make_folder(out / f"fish-{fit.track_id}")
+            mesh = trimesh.Trimesh(vertices, template.faces, process=False)
+            target = folder / f"{fit.frame_index:06d}.{format}"
+            with writing_to(folder):
+                mesh.export(target)
+            self._written.append(target)
+            count += 1
+        return count
+
+    def masks(self, path: Path) -> int:
+        """Write every mask as COCO JSON with run lengths; returns their number.
+
+        They are in the pixels of the frame, lens distortion included. Frames without fish are
+        listed too.
+        """
+        images, annotations = list[dict[str, Any]](), list[dict[str, Any]]()
+        for message, payload in messages(self._recording, (Frame, FishCrop), self._part):
+            if isinstance(message, Frame):
+                images.append(_image(message.frame_index, reference(payload)))
+            elif isinstance(message, FishCrop):
+                annotations.append(_annotation(message, number=len(annotations) + 1))
+        categories = [{"id": 1, "name": "fish"}]
+        coco = {"images": images, "annotations": annotations, "categories": categories}
+        make_folder(path.parent)
+        with writing_to(path):
+            path.write_text(json.dumps(coco))
+        self._written.append(path)
+        return len(annotations)
+
+    def tables(self, out: Path, *, format: TableFormat) -> list[Path]:
+        """Write lengths and frames (keypoints, one row a fish and frame) into `out`, as `run`."""
+        tables = Tables(make_folder(out))
+        for message in self._messages(LocalizedFish, LengthEstimate):
+            tables.write(make_record(message, RecordingSettings()))
+        tables.close()
+        paths = [out / "lengths.csv", out / "frames.csv"]
+        paths = paths if format == "csv" else [_as_parquet(path) for path in paths]
+        self._written += paths
+        return paths
+
+    def fish(self, out: Path, settings: FisheriesSettings, *, format: TableFormat) -> Path:
+        """Write fish.csv (or .parquet): what a fishery asks, what reviewers said, what made it."""
+        template = self._recording.header.template
+        records = [
+            fish_record(fish, template, settings)
+            for fish in read_fish(self._path, self._recording, self._part)
+        ]
+        write = write_csv if format == "csv" else write_parquet
+        path = write(make_folder(out) / "fish", records)
+        self._written.append(path)
+        return path
+
+    def claim(self, out: Path) -> None:
+        """Raise OutputError where `out` has what was made from something else."""
+        origin = read_origin(out)
+        if origin is not None and origin.resolve() != self._path.resolve():
+            raise OutputError(
+                f"{out}: expected a folder for what comes from {self._path}, found what came from "
+                f"{origin}; choose another --out"
+            )
+
+    def provenance(self, out: Path) -> Path:
+        """Write beside all that was written into `out` what made it, and its checksums."""
+        database = database_of(self._path)
+        runs = {"": run_facts(self._recording.header)} if database is None else read_runs(database)
+        return seal_files(out, self._written, runs=runs, origin=str(self._path))
+
+    def _messages(self, *kinds: type[Message]) -> Iterator[Message]:
+        for message, _ in messages(self._recording, kinds, self._part):
+            yield message
+
+
+def mask_in_frame(crop: FishCrop) -> Bool[np.ndarray, "H W"]:
+    """The mask of a crop in the pixels of its frame.
+
+    A frame pixel belongs to it where the crop's mask, interpolated, is above one half: a crop is
+    coarser than its frame, and its nearest pixel would leave steps along the outline.
+    """
+    frame = crop.frame_camera
+    mask = np.zeros((frame.height, frame.width), bool)
+    x0, y0, x1, y1 = _extent(crop)
+    if x1 <= x0 or y1 <= y0:
+        return mask
+    x, y = np.meshgrid(np.arange(x0, x1), np.arange(y0, y1))
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1).astype(float)
+    at = crop_from_frame(pixels, crop_camera=crop.crop_camera, frame_camera=frame)
+    u, v = at.reshape(*x.shape, 2).astype(np.float32).transpose(2, 0, 1)
+    share = cv2.remap(crop.mask.astype(np.float32), u, v, cv2.INTER_LINEAR)
+    mask[y0:y1, x0:x1] = share > 0.5
+    return mask
+
+
+def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
+    """COCO's counts: pixels off, on, off, ... column by column, beginning with those off."""
+    pixels = mask.ravel(order="F")
+    changes = np.flatnonzero(np.diff(pixels)) + 1
+    edges = np.concatenate([[0], changes, [len(pixels)]])
+    counts = np.diff(edges).tolist()
+    return [0, *counts] if pixels[0] else counts
+
+
+def _extent(crop: FishCrop) -> tuple[int, int, int, int]:
+    """A box of frame pixels that holds the crop's mask, half-open."""
+    contours, _ = cv2.findContours(
+        crop.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+    )
+    if not contours:
+        return 0, 0, 0, 0
+    outline = np.concatenate(contours)[:, 0].astype(float)
+    pixels = frame_from_crop(outline, crop_camera=crop.crop_camera, frame_camera=crop.frame_camera)
+    scale = float((crop.frame_camera.K[[0, 1], [0, 1]] / crop.crop_camera.K[[0, 1], [0, 1]]).max())
+    low, high = pixels.min(axis=0) - 2 * scale - 1, pixels.max(axis=0) + 2 * scale + 2
+    limits = [crop.frame_camera.width, crop.frame_camera.height]
+    x0, y0 = np.clip(low, 0, limits).astype(int)
+    x1, y1 = np.clip(high, 0, limits).astype(int)
+    return int(x0), int(y0), int(x1), int(y1)
+
+
+def _image(frame_index: int, picture: Picture) -> dict[str, Any]:
+    name, size = f"{frame_index:06d}.png", {"width": picture.width, "height": picture.height}
+    return {"id": frame_index, "file_name": name, **size}
+
+
+def _annotation(crop: FishCrop, *, number: int) -> dict[str, Any]:
+    mask = mask_in_frame(crop)
+    x0, y0, x1, y1 = crop.bbox_xyxy_px.tolist()
+    return {
+        "id": number,
+        "image_id": crop.frame_index,
+        "category_id": 1,
+        "track_id": crop.track_id,
+        "bbox": [x0, y0, x1 - x0, y1 - y0],
+        "area": int(mask.sum()),
+        "iscrowd": 0,
+        "segmentation": {"size": list(mask.shape), "counts": run_lengths(mask)},
+    }
+
+
+def _pairs(messages: Iterable[Message]) -> Iterator[tuple[FittedMesh, LocalizedFish]]:
+    """Each fit with where its fish hangs."""
+    waiting: dict[tuple[int, int], FittedMesh] = {}
+    for message in messages:
+        if isinstance(message, FittedMesh):
+            waiting[message.track_id, message.frame_index] = message
+        elif isinstance(message, LocalizedFish):
+            fit = waiting.pop((message.track_id, message.frame_index), None)
+            if fit is not None:
+                yield fit, message
+
+
+def _as_parquet(table: Path) -> Path:
+    from pyarrow import csv, parquet
+
+    path = table.with_suffix(".parquet")
+    parquet.write_table(csv.read_csv(table), path)
+    table.unlink()
+    return path

@@ -1,0 +1,126 @@
+"""fish.csv (or .parquet): one row a fish with all that a fishery and an auditor ask of it."""
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from stream_dmr.files import writing_to
+from stream_dmr.results.finished_fish import FishResult
+from stream_dmr.results.fisheries import FisheriesSettings, derive
+from stream_dmr.results.tables import seconds
+from stream_dmr.results.verdicts import Review
+from stream_dmr.template.template import Template
+
+# Name -> type of its values, as in Parquet; every value may be missing.
+FISH_TABLE: dict[str, type] = {
+    **dict.fromkeys(("vessel", "trip", "haul"), str),
+    "track_id": int,
+    **dict.fromkeys(("template", "species", "status"), str),
+    **dict.fromkeys(("length_mm", "length_std_mm", "ci95_low_mm", "ci95_high_mm"), float),
+    "length_from": str,  # "measurement" or "review": what the five columns after it follow from
+    **dict.fromkeys(("fork_length_mm", "total_length_mm"), float),
+    "length_cm": int,
+    "weight_kg": float,
+    "is_legal_size": bool,
+    **dict.fromkeys(("frames_seen", "frames_used", "first_frame", "last_frame"), int),
+    **dict.fromkeys(("first_time", "last_time"), str),
+    "refused": str,  # JSON: reason -> number of frames
+    "iou": float,
+    "flags": str,  # JSON
+    **dict.fromkeys(("verdict", "verdict_reason"), str),
+    "duplicate_of": int,
+    **dict.fromkeys(("corrected_length_mm", "corrected_length_std_mm"), float),
+    "reviewer": str,
+    "reviewed_ns": int,  # wall clock, since 1970
+    **dict.fromkeys(("weight_source", "legal_source", "source", "run_id"), str),
+    **dict.fromkeys(("software_version", "config_sha256", "calibration_sha256"), str),
+    "template_sha256": str,
+}
+
+
+def fish_record(
+    fish: FishResult, template: Template, settings: FisheriesSettings
+) -> dict[str, Any]:
+    """The values of FISH_TABLE; None where there is none."""
+    derived = derive(fish.length_mm, template, settings, species=fish.review.species)
+    values: dict[str, Any] = {name: getattr(fish.facts, name, None) for name in FISH_TABLE}
+    values |= {n: getattr(fish.estimate, n) for n in FISH_TABLE if hasattr(fish.estimate, n)}
+    values |= {n: getattr(derived, n) for n in FISH_TABLE if hasattr(derived, n)}
+    return values | {
+        **_measured(fish),
+        **_said(fish.review),
+        "template": template.name,
+        "species": fish.review.species or template.name,
+        "weight_source": None if derived.weight_kg is None else settings.weight_source,
+        "legal_source": None if derived.is_legal_size is None else settings.legal_source,
+        "run_id": fish.run_id,
+    }
+
+
+def _measured(fish: FishResult) -> dict[str, Any]:
+    estimate, corrected = fish.estimate, fish.review.length_mm is not None
+    low, high = (None, None) if estimate.ci95_mm is None else estimate.ci95_mm.tolist()
+    return {
+        "ci95_low_mm": low,
+        "ci95_high_mm": high,
+        "length_from": None if fish.length_mm is None else "review" if corrected else "measurement",
+        "first_time": seconds(estimate.first_timestamp_ns),
+        "last_time": seconds(estimate.last_timestamp_ns),
+        "refused": json.dumps(dict(estimate.refused)),
+        "iou": fish.iou,
+        "flags": json.dumps(list(fish.flags)),
+    }
+
+
+def _said(review: Review) -> dict[str, Any]:
+    return {
+        "verdict": review.decision or None,
+        "verdict_reason": review.reason or None,
+        "duplicate_of": review.duplicate_of,
+        "corrected_length_mm": review.length_mm,
+        "corrected_length_std_mm": review.length_std_mm,
+        "reviewer": review.reviewer or None,
+        "reviewed_ns": review.written_ns or None,
+    }
+
+
+def write_csv(path: Path, records: Sequence[dict[str, Any]]) -> Path:
+    """Write records of FISH_TABLE as `path`.csv; lengths are rounded as in lengths.csv."""
+    target = path.with_suffix(".csv")
+    with writing_to(target), target.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(FISH_TABLE)
+        writer.writerows([_text(record[name]) for name in FISH_TABLE] for record in records)
+    return target
+
+
+def write_parquet(path: Path, records: Sequence[dict[str, Any]]) -> Path:
+    """Write records of FISH_TABLE as `path`.parquet, exact."""
+    from pyarrow import Table, parquet
+
+    target = path.with_suffix(".parquet")
+    with writing_to(target):
+        parquet.write_table(Table.from_pylist(list(records), arrow_schema(FISH_TABLE)), target)
+    return target
+
+
+def arrow_schema(columns: dict[str, type]) -> Any:
+    """The schema of a table in Parquet."""
+    import pyarrow as pa
+
+    kinds = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
+    return pa.schema([(name, kinds[kind]) for name, kind in columns.items()])
+
+
+def _text(value: object) -> str:
+    match value:
+        case None:
+            return ""
+        case bool():
+            return str(value).lower()
+        case float():
+            return f"{value:.6f}"
+        case _:
+            return str(value)

@@ -1,0 +1,170 @@
+"""provenance.json: what made the files of a folder, and their SHA-256."""
+
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from hashlib import file_digest, sha256
+from pathlib import Path
+from typing import Any
+
+from stream_dmr import __version__
+from stream_dmr.errors import OutputError
+from stream_dmr.files import rename_durably, writing_to
+from stream_dmr.results.finished_fish import database_of, fish_by_run, read_runs
+from stream_dmr.results.store import NAME as DATABASE
+from stream_dmr.results.store import RunFacts
+from stream_dmr.results.verdicts import Verdict, read_verdicts
+
+NAME = "provenance.json"
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, in hex."""
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()
+
+
+@contextmanager
+def sealed(
+    folder: Path, *, with_recordings: bool, on_notice: Callable[[str], None]
+) -> Iterator[None]:
+    """Write the provenance of a run's results when it ends, however it does.
+
+    Recordings of months are left out: a run that is told to stop has no time to read them. What a
+    full disk refuses is a notice: the lengths are there.
+    """
+    try:
+        yield
+    finally:
+        if database_of(folder) is not None:
+            try:
+                seal_run(folder, with_recordings=with_recordings)
+            except OutputError as error:
+                on_notice(str(error))
+
+
+def seal_run(folder: Path, *, with_recordings: bool) -> None:
+    """Write the provenance of a run's own results. OutputError.
+
+    Reviewers go on writing to the database, so of it the fish of each run and the verdicts are
+    summed up.
+    """
+    database = folder / DATABASE
+    kinds = ("*.csv", "*.mcap", "*.rrd") if with_recordings else ("lengths.csv", "frames.csv")
+    files = [path for kind in kinds for path in folder.glob(kind)]
+    fish = {run_id: lines_sha256(lines) for run_id, lines in fish_by_run(database).items()}
+    _write(
+        folder,
+        _new(read_runs(database))
+        | {"fish_sha256": fish, "files": _sums(folder, files)}
+        | {"verdicts": verdicts_sum(read_verdicts(database))},
+    )
+
+
+def lines_sha256(lines: Iterable[str]) -> str:
+    """Of what a database holds, a line a row."""
+    return sha256("\n".join(lines).encode()).hexdigest()
+
+
+def verdicts_sum(verdicts: Sequence[Verdict]) -> dict[str, Any]:
+    """How many there are, and their SHA-256."""
+    lines = (json.dumps(asdict(verdict)) for verdict in verdicts)
+    return {"count": len(verdicts), "sha256": lines_sha256(lines)}
+
+
+def seal_files(
+    folder: Path, files: Iterable[Path], *, runs: Mapping[str, RunFacts], origin: str = ""
+) -> Path:
+    """Say of `files` what they are and what made them, beside what is said of others.
+
+    `origin` is the folder or recording that they were exported from. OutputError, also where what
+    is said of others is damaged.
+    """
+    try:
+        made = read_provenance(folder) or _new(runs, origin)
+    except ValueError as error:
+        raise OutputError(
+            f"{folder / NAME}: expected what made the files beside it, got: {error}; remove it, or "
+            "write to another folder"
+        ) from error
+    return _write(folder, made | {"files": made["files"] | _sums(folder, files)})
+
+
+def add_files(folder: Path, files: Iterable[Path]) -> None:
+    """Say in addition of `files` what they are, be they new or made anew. OutputError.
+
+    What it says of others stays, whatever has become of them. One that is missing or damaged stays
+    so: it is for `verify` to find.
+    """
+    _add(folder, lambda made: {"files": made["files"] | _sums(folder, files)})
+
+
+def seal_verdicts(folder: Path) -> None:
+    """Say how many verdicts there are by now, and their SHA-256. As `add_files`.
+
+    Where those that were known have been changed, it stays at them, for `verify` to find.
+    """
+    said = read_verdicts(folder / DATABASE)
+
+    def more(made: dict[str, Any]) -> dict[str, Any]:
+        known = made.get("verdicts") or verdicts_sum([])
+        is_sound = verdicts_sum(said[: known["count"]]) == known
+        return {"verdicts": verdicts_sum(said)} if is_sound else {}
+
+    _add(folder, more)
+
+
+def _add(folder: Path, more: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+    try:
+        made = read_provenance(folder)
+    except ValueError:
+        return
+    if made is not None:
+        _write(folder, made | more(made))
+
+
+def _new(runs: Mapping[str, RunFacts], origin: str = "") -> dict[str, Any]:
+    return {
+        "software_version": __version__,
+        "origin": origin,
+        "runs": {run_id: asdict(facts) for run_id, facts in runs.items()},
+        "fish_sha256": {},
+        "files": {},
+    }
+
+
+def _sums(folder: Path, files: Iterable[Path]) -> dict[str, str]:
+    return {path.relative_to(folder).as_posix(): sha256_of(path) for path in sorted(set(files))}
+
+
+def _write(folder: Path, made: dict[str, Any]) -> Path:
+    # Two reviewers may be at it.
+    target, draft = folder / NAME, folder / f"{NAME}.{os.getpid()}.part"
+    with writing_to(target):
+        draft.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
+        rename_durably(draft, target)
+    return target
+
+
+def read_origin(folder: Path) -> Path | None:
+    """What the files of a folder were made from: itself where it is a run's; None where unknown."""
+    try:
+        made = read_provenance(folder)
+    except ValueError:
+        return None
+    return None if made is None else Path(made.get("origin") or folder)
+
+
+def read_provenance(folder: Path) -> dict[str, Any] | None:
+    """What was written; None where nothing was. ValueError where it is damaged."""
+    path = folder / NAME
+    if not path.is_file():
+        return None
+    made = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(made, dict) or not all(
+        isinstance(made.get(key), dict) for key in ("runs", "fish_sha256", "files")
+    ):
+        raise ValueError("it is not as stream-dmr writes it")
+    return made

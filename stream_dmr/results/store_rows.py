@@ -1,0 +1,42 @@
+"""A finished fish as a row of lengths.db, and back."""
+
+import json
+import sqlite3
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from stream_dmr.messages import LengthEstimate
+from stream_dmr.results.store_schema import FISH_COLUMNS
+
+
+def fish_row(estimate: LengthEstimate, flags: Sequence[str]) -> dict[str, object]:
+    """The columns of a final estimate."""
+    low, high = (None, None) if estimate.ci95_mm is None else estimate.ci95_mm.tolist()
+    row = {name: getattr(estimate, name) for name in FISH_COLUMNS}
+    return row | {
+        "ci95_low_mm": low,
+        "ci95_high_mm": high,
+        "refused": json.dumps(dict(estimate.refused)),
+        "flags": json.dumps(list(flags)),
+    }
+
+
+def read_estimates(database: sqlite3.Connection) -> Iterator[LengthEstimate]:
+    """The finished fish as they were, but for the smoothed series, which the recordings have."""
+    names = [*FISH_COLUMNS, "ci95_low_mm", "ci95_high_mm", "refused"]
+    for values in database.execute(f"SELECT {', '.join(names)} FROM fish ORDER BY number"):
+        row = dict(zip(names, values, strict=True))
+        ends = row.pop("ci95_low_mm"), row.pop("ci95_high_mm")
+        yield LengthEstimate(
+            **row | {"refused": json.loads(row["refused"])},
+            ci95_mm=None if ends[0] is None else np.array(ends),
+            timestamp_ns=row["last_timestamp_ns"],
+            frame_index=row["last_frame"],
+            is_final=True,
+            is_frame_used=False,
+            frame_reason="",
+            smoothed_frames=np.zeros(0, np.int64),
+            smoothed_mm=np.zeros(0),
+            smoothed_std_mm=np.zeros(0),
+        )

@@ -1,0 +1,242 @@
+"""Whether results are still what their run measured: every file against what made it.
+
+The recording is the witness of the database, the database of lengths.csv, the recording of
+frames.csv, and provenance.json of them all. Who changes all of these alike can't be found here:
+keep a copy of provenance.json elsewhere.
+"""
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from stream_dmr.batch.check import check_batch
+from stream_dmr.batch.places import VIDEOS
+from stream_dmr.csv_file import set_aside
+from stream_dmr.errors import OutputError, RecordingError, UserError
+from stream_dmr.messages import LengthEstimate, LocalizedFish
+from stream_dmr.recording.reading.reader import messages, open_recordings
+from stream_dmr.recording.reading.selection import WHOLE
+from stream_dmr.results.finished_fish import (
+    FishResult,
+    database_of,
+    fish_by_run,
+    read_runs,
+    read_stored,
+)
+from stream_dmr.results.provenance import NAME as PROVENANCE
+from stream_dmr.results.provenance import lines_sha256, read_provenance, sha256_of, verdicts_sum
+from stream_dmr.results.store import NAME as DATABASE
+from stream_dmr.results.store import RunFacts
+from stream_dmr.results.tables import FRAMES_COLUMNS, LENGTHS_COLUMNS, frames_row, lengths_row
+from stream_dmr.results.verdicts import Verdict, read_verdicts
+from stream_dmr.running.result_writer import run_facts
+
+_MADE_BY = ("config_sha256", "calibration_sha256", "template_sha256")
+_COMPARED = (
+    *("length_mm", "length_std_mm", "frames_seen", "frames_used", "first_frame", "last_frame"),
+    *("first_timestamp_ns", "last_timestamp_ns", "status"),
+)
+
+
+class Change(NamedTuple):
+    """One thing that is not as it was made."""
+
+    path: Path
+    what: str
+
+
+def verify(folder: Path) -> tuple[list[Change], int]:
+    """Check a folder of results or exports and those in it; what was changed, and files checked.
+
+    Raises UserError where there is nothing to check.
+    """
+    marks = (DATABASE, PROVENANCE, VIDEOS)
+    places = {path.parent for name in marks for path in folder.rglob(name)}
+    if not places:
+        raise UserError(
+            f"{folder}: expected a folder with {DATABASE} or {PROVENANCE}, found neither; give the "
+            "--out of a run or of an export"
+        )
+    changes, num_files = list[Change](), 0
+    for place in sorted(places):
+        changes += dict.fromkeys(_changes(place))
+        num_files += sum(1 for path in place.iterdir() if path.is_file())
+        num_files += sum(1 for _ in place.glob("dataset/*/*/*/*.parquet"))
+    return changes, num_files
+
+
+def _changes(folder: Path) -> Iterator[Change]:
+    yield from _against_provenance(folder)
+    if (folder / VIDEOS).is_file():
+        yield from (Change(*finding) for finding in check_batch(folder))
+    database = database_of(folder)
+    if database is None:
+        return
+    try:
+        runs = read_runs(database)
+        fish = {one.estimate.track_id: one for one in read_stored(database)}
+    except OutputError as error:
+        yield Change(database, f"damaged: {error}")
+        return
+    lengths = [(str(f.estimate.track_id), lengths_row(f.estimate)) for f in fish.values()]
+    yield from _csv(
+        folder / "lengths.csv", LENGTHS_COLUMNS, dict(lengths), witness=DATABASE, whole=True
+    )
+    frames: dict[str, list[str]] = {}
+    for recording in _recordings(folder):
+        yield from _recording(recording, runs, fish, frames)
+    if frames:
+        yield from _csv(
+            folder / "frames.csv", FRAMES_COLUMNS, frames, witness="the recording", whole=False
+        )
+
+
+def _recordings(folder: Path) -> list[Path]:
+    """Those to be read: every .mcap, and an .rrd, which is slow to read, where nothing knows it."""
+    try:
+        known = (read_provenance(folder) or {"files": {}})["files"]
+    except ValueError:
+        known = {}
+    rrd = [path for path in folder.glob("*.rrd") if path.name not in known]
+    return sorted([*folder.glob("*.mcap"), *folder.glob("*.mcap.part"), *rrd])
+
+
+def _against_provenance(folder: Path) -> Iterator[Change]:
+    try:
+        made = read_provenance(folder)
+    except (ValueError, OSError) as error:
+        yield Change(folder / PROVENANCE, f"damaged: {error}")
+        return
+    if made is None:
+        yield Change(folder / PROVENANCE, "is missing; files were compared with each other alone")
+        return
+    for name, expected in made["files"].items():
+        path = folder / name
+        if not path.is_file():
+            yield Change(path, "is missing")
+        elif sha256_of(path) != expected:
+            yield Change(path, f"was changed: its SHA-256 is not that in {PROVENANCE}")
+    database = database_of(folder)
+    if database is not None:
+        yield from _database(database, made)
+
+
+def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
+    """The fish and the runs against what provenance.json says of them."""
+    try:
+        stored, runs = fish_by_run(database), read_runs(database)
+        said = read_verdicts(database)
+    except OutputError:
+        return  # `_changes` says so
+    for run_id, expected in made["fish_sha256"].items():
+        if lines_sha256(stored.get(run_id, [])) != expected:
+            yield Change(database, f"the fish of run {run_id} are not those that were measured")
+    for run_id, facts in made["runs"].items():
+        for field in fields(RunFacts):
+            now = getattr(runs.get(run_id), field.name, "missing")
+            if now != facts.get(field.name):
+                was = facts.get(field.name)
+                yield Change(database, f"run {run_id}: {field.name} is {now!r}, was {was!r}")
+    yield from _verdicts(database, said, made.get("verdicts", {}))
+
+
+def _verdicts(database: Path, said: Sequence[Verdict], known: dict[str, Any]) -> Iterator[Change]:
+    """What reviewers said, against what provenance.json says of it: rows are only added."""
+    count = known.get("count", 0)
+    if verdicts_sum(said[:count]) != (known or verdicts_sum([])):
+        yield Change(database, "the verdicts are not those that reviewers gave")
+    elif len(said) > count:
+        yield Change(database, f"verdicts that no `review` took: {len(said) - count}")
+
+
+def _recording(
+    path: Path,
+    runs: dict[str, RunFacts],
+    fish: dict[int, FishResult],
+    frames: dict[str, list[str]],
+) -> Iterator[Change]:
+    """Compare a recording with the database; its rows of frames.csv are added to `frames`."""
+    try:
+        recording = open_recordings([path])
+        made = run_facts(recording.header)
+        if not any(all(getattr(r, n) == getattr(made, n) for n in _MADE_BY) for r in runs.values()):
+            of_run = next(iter(runs.values()), None)
+            for name in _MADE_BY:
+                if getattr(of_run, name, None) != getattr(made, name):
+                    yield Change(path, f"{name} is {getattr(made, name)}, no run in {DATABASE} has")
+        waiting: dict[tuple[int, int], LocalizedFish] = {}
+        for message, _ in messages(recording, [LocalizedFish, LengthEstimate], WHOLE):
+            key = message.frame_index, getattr(message, "track_id", 0)
+            if isinstance(message, LocalizedFish):
+                waiting[key] = message
+            elif isinstance(message, LengthEstimate):
+                if (seen := waiting.pop(key, None)) is not None:
+                    row = frames_row(seen, message.is_frame_used, message.frame_reason)
+                    frames[f"{key[0]},{key[1]}"] = row
+                if message.is_final:
+                    yield from _estimate(path, message, fish.get(message.track_id))
+        for line in recording.warnings:
+            yield Change(path, line.removeprefix(f"{path}: "))
+    except RecordingError as error:
+        yield Change(path, f"damaged: {str(error).removeprefix(f'{path}: ')}")
+
+
+def _estimate(path: Path, recorded: LengthEstimate, fish: FishResult | None) -> Iterator[Change]:
+    database = path.parent / DATABASE
+    if fish is None:
+        yield Change(database, f"fish {recorded.track_id} is missing; {path.name} has it")
+        return
+    for name in _COMPARED:
+        stored, measured = getattr(fish.estimate, name), getattr(recorded, name)
+        if stored != measured:
+            what = f"fish {recorded.track_id}: {name} is {stored}, {path.name} says {measured}"
+            yield Change(database, what)
+
+
+def _csv(
+    path: Path,
+    columns: Sequence[str],
+    expected: dict[str, list[str]],
+    *,
+    witness: str,
+    whole: bool,
+) -> Iterator[Change]:
+    """Compare a table with the rows that a witness has; it may have others, but not if `whole`."""
+    if not path.is_file():
+        yield Change(path, "is missing")
+        return
+    found: dict[str, list[str]] = {}
+    for table in (older := set_aside(path)) + [path]:
+        rows = _rows(table, columns)
+        if rows is None:
+            yield Change(table, "its columns are not those of stream-dmr")
+            return
+        found |= rows
+    # Where room was short the oldest tables went, maybe with some rows of the first frame left.
+    first = min((int(row[0]) for row in found.values()), default=0) if older else 0
+    for name, row in expected.items():
+        if older and int(row[0]) <= first:
+            continue
+        label = "frame {}, fish {}".format(*name.split(",")) if "," in name else f"fish {name}"
+        if name not in found:
+            yield Change(path, f"{label} is missing; {witness} has it")
+            continue
+        for column, now, was in zip(columns, found[name], row, strict=True):
+            if now != was:
+                cell = f"{column} is {now or 'blank'}, {witness} says {was or 'blank'}"
+                yield Change(path, f"{label}: {cell}")
+    for name in sorted(found.keys() - expected.keys()) if whole else ():
+        yield Change(path, f"fish {name} is no fish of {witness}")
+
+
+def _rows(path: Path, columns: Sequence[str]) -> dict[str, list[str]] | None:
+    """Rows by their fish, or by frame and fish; None where the columns are others."""
+    rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8", errors="replace"))))
+    if not rows or rows[0] != list(columns):
+        return None
+    fish = columns.index("track_id")
+    whole = [row for row in rows[1:] if len(row) == len(columns)]
+    return {f"{row[0]},{row[fish]}" if fish else row[0]: row for row in whole}

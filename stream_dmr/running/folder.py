@@ -1,0 +1,97 @@
+"""The folder of a run: checked and made ready before it, consistent after it."""
+
+import itertools
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from stream_dmr.errors import OutputError
+from stream_dmr.recording.files import STEM
+from stream_dmr.recording.segments.recover import Repair, recover
+from stream_dmr.results.provenance import NAME as PROVENANCE
+from stream_dmr.results.store import LengthStore, require_free
+from stream_dmr.results.tables import write_lengths
+
+RESULTS = (
+    *("lengths.db", "lengths.csv", "frames.csv", "recording.mcap", "recording.rrd"),
+    PROVENANCE,
+)
+SEGMENTED = ("lengths.db", "lengths.csv", "frames.csv", f"{STEM}-*")  # of a source without an end
+
+
+def prepare_folder(
+    out: Path, *, overwrite: bool, resume: bool = False, waits: bool = False
+) -> list[Repair]:
+    """Make sure that results can be written to `out`, and that none are lost by it.
+
+    Raises OutputError where it is no folder, can't be written to, has no room, or holds the
+    results of an earlier run; `overwrite` removes those instead, `resume` keeps them. With `waits`
+    there may be room later. Returns what was done about recordings that a crash left unfinished.
+    """
+    earlier = [out / name for name in RESULTS if (out / name).exists()]
+    earlier += sorted(out.glob(f"{STEM}-*"))
+    if earlier and not overwrite and not resume:
+        raise OutputError(
+            f"{out}: expected a folder without results, found {earlier[0].name} of an earlier run; "
+            "choose another --out, or add --resume or --overwrite"
+        )
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        require_free(out)
+        if overwrite:
+            for path in (*earlier, *out.glob(f"{STEM}.*")):
+                for leftover in ("", "-wal", "-shm"):  # of a database after a crash
+                    path.with_name(path.name + leftover).unlink(missing_ok=True)
+        repairs = list(recover(out))
+        for path in (out / f"{STEM}.mcap", out / f"{STEM}.rrd"):
+            if path.exists():
+                _set_aside(path)
+        if not waits:
+            with tempfile.TemporaryFile(dir=out) as probe:
+                probe.write(bytes(1 << 16))
+    except OSError as error:
+        raise OutputError(
+            f"{out}: expected a folder to write to, got: {error.strerror}; choose another --out"
+        ) from error
+    return repairs
+
+
+def _set_aside(recording: Path) -> None:
+    """Give the recording of an earlier run a name of its own: recording-1.mcap, ..."""
+    for number in itertools.count(1):
+        aside = recording.with_stem(f"{recording.stem}-{number}")
+        if not aside.exists():
+            recording.rename(aside)
+            return
+
+
+@contextmanager
+def consistent_csv(
+    path: Path,
+    store: LengthStore,
+    *,
+    resume: bool,
+    on_refusal: Callable[[str], None] | None = None,
+) -> Iterator[None]:
+    """Begin and end with what the store holds: a crash between the two loses a row of neither.
+
+    With `on_refusal`, that is told what the disk refuses, instead of an exception: the store has
+    the lengths, and the next run writes the table, as it does where the store has trouble itself.
+    """
+
+    def write() -> None:
+        try:
+            if not store.trouble:
+                write_lengths(path, store.estimates())
+        except OutputError as error:
+            if on_refusal is None:
+                raise
+            on_refusal(str(error))
+
+    if resume:
+        write()
+    try:
+        yield
+    finally:
+        write()

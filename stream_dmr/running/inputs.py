@@ -1,0 +1,116 @@
+"""What a run is asked for, read and checked before the first frame."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from nodes.read_frames import ReadFrames
+from stream_dmr.batch.only import Only, OnlyFish, OnlyFrames
+from stream_dmr.batch.sightings import SightedFish
+from stream_dmr.calibration.file import load_calibration, require_size
+from stream_dmr.camera import Calibration
+from stream_dmr.errors import UserError
+from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.running.config import Config, load_config, to_toml
+from stream_dmr.segmentation.tracking.fish_finder import FishFinder, open_finder
+from stream_dmr.sources.open_source import Source
+from stream_dmr.template.template import Template, load_template
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunRequest:
+    """What the user asks for."""
+
+    source: str  # path, address or camera index
+    out: Path
+    calibration: Path | None = None
+    boxes: Path | None = None
+    masks: Path | None = None
+    template: str = "halibut"  # name of a bundled one, or a path
+    config: Path | None = None
+    overwrite: bool = False  # replace the results of an earlier run in `out`
+    resume: bool = False  # go on after them; a live source always does
+    live: bool = False  # serve the view while measuring
+    command: str = ""  # as typed, for the recording
+    vessel: str = ""  # where the fish come from, for the exports
+    trip: str = ""
+    haul: str = ""
+    only: Only | None = None  # a piece of the source
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """A request whose every file was read and found sound, and the open source."""
+
+    request: RunRequest
+    config: Config
+    template: Template
+    calibration: Calibration | None
+    detections: FishFinder
+    reader: ReadFrames | OnlyFrames
+
+    @property
+    def source(self) -> Source:
+        """Where frames come from."""
+        return self.reader.source
+
+    @property
+    def is_endless(self) -> bool:
+        """A camera, or a folder that grows."""
+        return self.source.is_endless
+
+    @property
+    def goes_on(self) -> bool:
+        """After the results that are in the folder already."""
+        return (self.request.resume or self.is_endless) and not self.request.overwrite
+
+    def header(self) -> RunHeader:
+        """What the recording says of this run."""
+        file = self.request.calibration
+        return RunHeader(
+            source=self.source.name,
+            command=self.request.command,
+            config_toml=to_toml(self.config),
+            template=self.template,
+            calibration=self.calibration,
+            calibration_file=b"" if file is None else file.read_bytes(),
+        )
+
+
+def checked_inputs(request: RunRequest) -> Inputs:
+    """Read what a run needs; the caller closes the reader.
+
+    Raises a UserError where anything of it is wrong.
+    """
+    config = load_config(request.config)
+    template = load_template(request.template)
+    calibration = None if request.calibration is None else load_calibration(request.calibration)
+    detections = _finder(request, config)
+    reader = ReadFrames(request.source, config.read_frames)
+    inputs = Inputs(
+        request=request,
+        config=config,
+        template=template,
+        calibration=calibration,
+        detections=detections,
+        reader=reader if request.only is None else OnlyFrames(reader, request.only),
+    )
+    if calibration is not None:
+        try:
+            require_size(calibration, width=inputs.source.width, height=inputs.source.height)
+        except UserError:
+            reader.close()
+            raise
+    return inputs
+
+
+def _finder(request: RunRequest, config: Config) -> FishFinder:
+    if request.only is not None and request.only.sightings is not None:
+        finder: FishFinder = SightedFish(request.only.sightings)
+    else:
+        finder = open_finder(
+            boxes=request.boxes,
+            masks=request.masks,
+            detect=config.detect_fish,
+            track=config.track_fish,
+        )
+    return finder if request.only is None else OnlyFish(finder, request.only)

@@ -1,0 +1,56 @@
+"""Makes the folder of a run whole after a crash, a power cut or a full disk."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+from stream_dmr.errors import OutputError, RecordingError
+from stream_dmr.messages import LengthEstimate
+from stream_dmr.recording.messages.codec import decode
+from stream_dmr.recording.reading.reader import open_recordings
+from stream_dmr.recording.segments.recover import recover
+from stream_dmr.results.store import NAME, LengthStore, require_free
+from stream_dmr.results.store_rows import read_estimates
+from stream_dmr.results.store_schema import open_database
+from stream_dmr.results.tables import write_lengths
+from stream_dmr.running.result_writer import run_facts
+
+FROM_RECORDING = "taken over from the recording"
+
+
+def recover_folder(folder: Path) -> Iterator[str]:
+    """Repair recordings and add lengths that only they hold; what was done, a line each.
+
+    Raises OutputError where that is no folder or another run is writing to it.
+    """
+    if not folder.is_dir():
+        raise OutputError(f"{folder}: expected the folder of a run, found none; check the path")
+    require_free(folder)
+    for repair in recover(folder):
+        yield repair.line
+    if (folder / NAME).exists():
+        for path in sorted(folder.glob("*.mcap")):
+            yield from _add_lengths(path, folder)
+
+
+def _add_lengths(path: Path, folder: Path) -> Iterator[str]:
+    try:
+        recording = open_recordings([path])
+        final = [
+            estimate
+            for _, payload in recording.payloads([LengthEstimate])
+            if (estimate := decode(LengthEstimate, payload)).is_final
+        ]
+    except RecordingError as error:
+        yield str(error)
+        return
+    with closing(open_database(folder / NAME, read_only=True)) as database:
+        stored = {estimate.track_id for estimate in read_estimates(database)}
+    missing = [estimate for estimate in final if estimate.track_id not in stored]
+    if not missing:
+        return
+    with closing(LengthStore(folder, run_facts(recording.header))) as store:
+        for estimate in missing:
+            store.add(estimate, flags=[FROM_RECORDING])
+            yield f"fish {estimate.track_id}: its length was only in {path.name}, now in {NAME}"
+        write_lengths(folder / "lengths.csv", store.estimates())

@@ -1,0 +1,51 @@
+"""Boxes from CVAT's XML, version 1.1 (docs.cvat.ai, "CVAT"), for videos and for pictures.
+
+CVAT counts frames, pictures and tracks from 0, we from 1. A video's tracks follow fish; boxes of
+pictures don't, so those are for the tracker to follow.
+"""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+
+from stream_dmr.errors import AnnotationError
+from stream_dmr.segmentation.annotations.boxes import UNKNOWN_ID, Box, by_frame, corners
+
+
+def load_cvat(text: str, path: Path) -> dict[int, list[Box]]:
+    """Boxes by frame, from a file's text. Raises AnnotationError with what is wrong, and where."""
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as error:
+        raise AnnotationError(f"{path}: expected CVAT's XML, got: {error}") from None
+    if root.tag != "annotations":
+        raise AnnotationError(f"{path}: expected CVAT's <annotations>, got <{root.tag}>")
+    return by_frame(_boxes(root, path))
+
+
+def _boxes(root: ET.Element, path: Path) -> Iterator[tuple[str, int, Box]]:
+    for track in root.iter("track"):
+        for box in track.iter("box"):
+            where = f"{path}, track {track.get('id')}, frame {box.get('frame')}"
+            if box.get("outside") != "1":
+                yield _box(box, box.get("frame"), track.get("id"), where)
+    for image in root.iter("image"):
+        where = f"{path}, image {image.get('id')}"
+        for box in image.iter("box"):
+            yield _box(box, image.get("id"), None, where)
+
+
+def _box(
+    element: ET.Element, frame: str | None, track: str | None, where: str
+) -> tuple[str, int, Box]:
+    try:
+        x0, y0, x1, y1 = (float(element.attrib[name]) for name in ("xtl", "ytl", "xbr", "ybr"))
+        frame_index = int(frame or "") + 1
+        track_id = UNKNOWN_ID if track is None else int(track) + 1
+    except (KeyError, ValueError):
+        raise AnnotationError(
+            f"{where}: expected a frame's number and a box with xtl, ytl, xbr, ybr, "
+            f"got {element.attrib}"
+        ) from None
+    box = corners(x0, y0, x1 - x0, y1 - y0, where=where)
+    return where, frame_index, Box(track_id=track_id, bbox_xyxy_px=box, visibility=1.0)

@@ -1,0 +1,83 @@
+"""Masks from boxes alone, with no trained weights: GrabCut on each frame by itself.
+
+Rother, Kolmogorov, Blake: "GrabCut: interactive foreground extraction using iterated graph cuts",
+SIGGRAPH 2004. A stand-in for real masks: it follows colour, so shadows and lines may stick.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from stream_dmr.segmentation.masks.segmenter import Segmented
+
+_CONTEXT = 0.2  # of the box's longer side: the ring around it that shows what is not fish
+_WORKING_PX = 256  # of the longer side: finer costs much time and moves the outline little
+_SMALLEST_PX = 12  # below, GrabCut's two mixtures of 5 Gaussians have too few pixels
+_ITERATIONS = 5
+
+
+class GrabCut:
+    """A `Segmenter` without weights; it looks for no ends."""
+
+    def segment(
+        self, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
+    ) -> Segmented:
+        """The fish in a box; its probability is 0 or 1, since GrabCut knows no doubt."""
+        mask = segment_box(image, bbox_xyxy_px)
+        return Segmented(probability=mask.astype(np.float32), ends=None)
+
+
+def segment_box(
+    image: UInt8[np.ndarray, "H W 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
+) -> Bool[np.ndarray, "H W"]:
+    """The fish in a box, as a mask of the whole picture; empty where the box is too small.
+
+    Deterministic, and independent of every other frame.
+    """
+    mask = np.zeros(image.shape[:2], bool)
+    x0, y0, x1, y1 = _context(bbox_xyxy_px, width=image.shape[1], height=image.shape[0])
+    region = image[y0:y1, x0:x1]
+    scale = min(1.0, _WORKING_PX / max(region.shape[0], region.shape[1], 1))
+    box = np.round((bbox_xyxy_px - [x0, y0, x0, y0]) * scale).astype(int)
+    if min(box[2] - box[0], box[3] - box[1], *region.shape[:2]) < _SMALLEST_PX:
+        return mask
+    small = cv2.resize(region, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    fish = _smooth(_grab_cut(small, box))
+    size = (region.shape[1], region.shape[0])
+    mask[y0:y1, x0:x1] = cv2.resize(fish * np.uint8(255), size) > 127
+    return mask
+
+
+def _context(
+    bbox_xyxy_px: Float[np.ndarray, "4"], *, width: int, height: int
+) -> tuple[int, int, int, int]:
+    """The box and its surroundings in whole pixels, half-open, inside the frame."""
+    ring = _CONTEXT * max(bbox_xyxy_px[2:] - bbox_xyxy_px[:2])
+    low = np.floor(bbox_xyxy_px[:2] - ring).astype(int).clip(0, [width, height])
+    high = np.ceil(bbox_xyxy_px[2:] + ring).astype(int).clip(0, [width, height])
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+def _grab_cut(image: UInt8[np.ndarray, "h w 3"], box: np.ndarray) -> UInt8[np.ndarray, "h w"]:
+    """1 where GrabCut says fish. Outside the box is sea; its corners probably are."""
+    height, width = image.shape[:2]
+    x0, y0, x1, y1 = (int(v) for v in np.clip(box, 0, [width, height, width, height]))
+    seeds = np.full((height, width), cv2.GC_BGD, np.uint8)
+    seeds[y0:y1, x0:x1] = cv2.GC_PR_BGD
+    centre = ((x0 + x1 - 1) / 2, (y0 + y1 - 1) / 2)
+    cv2.ellipse(seeds, (centre, (x1 - x0, y1 - y0), 0.0), cv2.GC_PR_FGD, cv2.FILLED)
+    cv2.setRNGSeed(0)  # its k-means starts at random
+    models = np.zeros((2, 1, 65))  # of sea and fish; OpenCV's workspace
+    unused = (0, 0, 0, 0)
+    cv2.grabCut(image, seeds, unused, models[0], models[1], _ITERATIONS, mode=cv2.GC_INIT_WITH_MASK)
+    return ((seeds == cv2.GC_FGD) | (seeds == cv2.GC_PR_FGD)).astype(np.uint8)
+
+
+def _smooth(fish: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """The largest connected piece, rid of threads and notches thinner than a few pixels."""
+    fish = cv2.medianBlur(fish, 5)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(fish, connectivity=4)
+    if count < 2:
+        return fish
+    largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    return (labels == largest).astype(np.uint8)

@@ -1,0 +1,55 @@
+"""The network's weights as a file: the ones that ship, and those that a user trains."""
+
+from pathlib import Path
+
+import torch
+
+from stream_dmr.errors import ModelError
+from stream_dmr.segmentation.network.network import UNet
+
+SHIPPED = Path(__file__).parent / "weights" / "unet.pt"
+_FORMAT = "stream-dmr unet 1"  # a new number where the network's layers change
+
+
+def save_weights(network: UNet, path: Path) -> None:
+    """Write the weights in half precision, whose error is far below what the mask feels."""
+    state = {
+        name: value.half() if value.is_floating_point() else value
+        for name, value in network.state_dict().items()
+    }
+    torch.save({"format": _FORMAT, "state": state}, path)
+
+
+def load_weights(path: Path) -> UNet:
+    """The network with these weights, in evaluation mode on the CPU.
+
+    Raises ModelError where the file can't be read or isn't one that `save_weights` wrote.
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise ModelError(
+            f"{path}: expected the weights of a U-Net, got: {error.strerror}"
+        ) from error
+    except Exception as error:  # torch raises many kinds for bytes that are not its own
+        raise ModelError(
+            f"{path}: expected weights written by `stream-dmr train`, got another kind of file"
+        ) from error
+    if not isinstance(content, dict) or content.get("format") != _FORMAT:
+        raise ModelError(
+            f"{path}: expected weights in the format '{_FORMAT}', got others; train them anew"
+        )
+    network = UNet()
+    try:
+        state = {
+            name: value.float() if value.is_floating_point() else value
+            for name, value in content["state"].items()
+        }
+        network.load_state_dict(state)
+    except Exception as error:  # keys or shapes of another network, or no tensors at all
+        raise ModelError(
+            f"{path}: expected the layers of this version's network, got others; train them anew"
+        ) from error
+    if not all(bool(value.isfinite().all()) for value in state.values()):
+        raise ModelError(f"{path}: expected finite weights, got NaN or infinity; train them anew")
+    return network.eval()

@@ -1,0 +1,58 @@
+"""What the terminal shows of a training."""
+
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from stream_dmr.segmentation.training.settings import TrainSettings
+from stream_dmr.segmentation.training.train import TrainObserver
+from stream_dmr.segmentation.training.training import Scores
+
+
+class TrainDisplay(TrainObserver):
+    """A bar per task on a terminal, a line per epoch everywhere; all of it on stderr."""
+
+    def __init__(self, settings: TrainSettings) -> None:
+        self._console = Console(stderr=True, highlight=False, soft_wrap=True)
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+            TimeRemainingColumn(),
+            console=self._console,
+            disable=not self._console.is_terminal,
+        )
+        self._settings = settings
+        self._drawing = self._progress.add_task("drawing fish", total=1, visible=False)
+        self._epoch = self._progress.add_task("epoch 1", total=settings.crops_per_epoch)
+
+    def __enter__(self) -> "TrainDisplay":
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._progress.stop()
+
+    def drawing(self, num_done: int, num_all: int) -> None:  # noqa: D102
+        is_under_way = num_done < num_all
+        self._progress.update(
+            self._drawing, completed=num_done, total=num_all, visible=is_under_way
+        )
+
+    def learning(self, num_crops: int) -> None:  # noqa: D102
+        self._progress.update(self._epoch, advance=num_crops)
+
+    def checked(self, scores: Scores, *, is_best: bool) -> None:  # noqa: D102
+        loss = "to begin with" if scores.loss is None else f"loss {scores.loss:.3f}"
+        heads = "" if scores.ends_right is None else f", heads right {scores.ends_right:.2f}"
+        self._console.print(
+            f"epoch {scores.epoch}/{self._settings.epochs}: {loss}, IoU {scores.iou:.3f}"
+            f"{heads}{', best' * is_best}"
+        )
+        self._progress.reset(self._epoch, description=f"epoch {scores.epoch + 1}")

@@ -1,0 +1,87 @@
+"""Random fish by themselves: small pictures with transparency, heads to the left."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from stream_dmr.segmentation.training.skins import ALONG_END, draw_skin_pair
+from stream_dmr.segmentation.training.species import Posed, Shape, draw_shape, pose_shape
+from stream_dmr.simulation.render import rasterize, vertex_normals
+from stream_dmr.simulation.skin import noise
+
+PATCH_PX = 160
+_FINE = 2  # samples per pixel and axis while drawing
+_RIM_PX = 4
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FishPatch:
+    """One fish by itself."""
+
+    bgra: UInt8[np.ndarray, "P P 4"]  # colour times coverage, and coverage
+    ends_px: Float[np.ndarray, "2 2"]  # snout, and the fork of the tail
+
+
+def draw_fish_patch(rng: np.random.Generator) -> FishPatch:
+    """A fish of random species, pose, skin and light that fills its patch."""
+    shape = draw_shape(rng)
+    posed = pose_shape(rng, shape)
+    pixels, ends = _fill_patch(posed)
+    coverage, colour = _draw(rng, shape, posed, pixels)
+    fine = np.dstack([colour, coverage])
+    small = cv2.resize(fine, (PATCH_PX, PATCH_PX), interpolation=cv2.INTER_AREA)
+    small = np.clip(np.round(small * [1, 1, 1, 255]), 0, 255)
+    return FishPatch(bgra=small.astype(np.uint8), ends_px=(ends + 0.5) / _FINE - 0.5)
+
+
+def _fill_patch(posed: Posed) -> tuple[Float[np.ndarray, "V 2"], Float[np.ndarray, "2 2"]]:
+    """Pixels of vertices and ends in the finely sampled patch."""
+    seen = posed.vertices[:, :2] / posed.vertices[:, 2:]
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    side = PATCH_PX * _FINE
+    scale = (side - 2 * _RIM_PX * _FINE) / (high - low).max()
+    shift = (side - 1) / 2 - scale * (low + high) / 2
+    ends = posed.ends[:, :2] / posed.ends[:, 2:]
+    return seen * scale + shift, ends * scale + shift
+
+
+def _draw(
+    rng: np.random.Generator, shape: Shape, posed: Posed, pixels: Float[np.ndarray, "V 2"]
+) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W 3"]]:
+    """Coverage (0 or 1), and colour where it is 1."""
+    normals = vertex_normals(posed.vertices, shape.faces)
+    shade, gloss = _draw_light(rng, normals)
+    shade = np.where(shape.is_fin, shade * rng.uniform(0.55, 1.25), shade)
+    attributes = np.column_stack([shape.texture, shade, gloss]).astype(np.float32)
+    side = PATCH_PX * _FINE
+    face, values = rasterize(
+        pixels, posed.vertices[:, 2], shape.faces, attributes, width=side, height=side
+    )
+    mask = face >= 0
+    skin = draw_skin_pair(rng, is_flatfish=shape.is_flatfish)
+    along = values[..., 0] * np.float32((skin.shape[1] - 1) / ALONG_END)
+    across = (values[..., 1] + 1) / 2 * np.float32(skin.shape[2] - 1)
+    sides = [cv2.remap(s, across, along, cv2.INTER_LINEAR) for s in skin]
+    is_first = (shape.points[shape.faces, 2].mean(axis=1) > 0)[face][..., None]
+    colour = np.where(is_first, *sides) * values[..., 2:3]
+    wet = np.clip(noise(rng, side, side, grain_px=(5.0, 5.0)) + 0.5, 0.0, 1.5)
+    colour += (255 * values[..., 3] * wet)[..., None]
+    return mask.astype(np.float32), np.clip(colour, 0, 255) * mask[..., None]
+
+
+def _draw_light(
+    rng: np.random.Generator, normals: Float[np.ndarray, "V 3"]
+) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:
+    """Diffuse shade and gloss (Blinn, SIGGRAPH 1977) under one lamp somewhere before the fish."""
+    lamp = rng.normal([0.0, -0.3, -1.0], [0.7, 0.7, 0.3])
+    lamp /= np.linalg.norm(lamp)
+    ambient = rng.uniform(0.3, 0.9)
+    facing = np.where(normals[:, 2] > 0, -1.0, 1.0)[:, None] * normals  # thin fins have two sides
+    shade = ambient + (1 - ambient) * np.maximum(facing @ lamp, 0.0)
+    halfway = lamp - np.array([0.0, 0.0, 1.0])
+    halfway /= np.linalg.norm(halfway)
+    sharpness = rng.uniform(6.0, 60.0)
+    strength = max(0.0, rng.uniform(-0.3, 0.7))
+    return shade, strength * np.maximum(facing @ halfway, 0.0) ** sharpness

@@ -1,0 +1,154 @@
+"""A folder of clips, to which a recorder on board may still be adding, as one source of frames."""
+
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Event
+
+from stream_dmr.errors import SourceError
+from stream_dmr.messages import Frame
+from stream_dmr.sources.picture_folder import natural_order
+from stream_dmr.sources.settings import ReadFramesSettings
+from stream_dmr.sources.video_file import VideoFile
+
+_SUFFIXES = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv"}
+_SETTLE_S = 5.0  # a clip that has not grown for so long is whole, or never will be
+_POLL_S = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Size:
+    num_bytes: int
+    modified_ns: int
+
+
+class ClipFolder:
+    """The clips of a folder in natural order of their names, all of one size, frames numbered on.
+
+    A clip is read once it has stopped growing or a later one is there. One that can't be read, or
+    has another size, is left out with a warning. Capture times: a clip ends when its file was
+    last modified, but never begins before the one before it ended.
+    """
+
+    is_endless = True
+    num_frames: int | None = None
+
+    def __init__(self, folder: Path, settings: ReadFramesSettings) -> None:
+        """Raises SourceError where no clip can be read."""
+        self.name = folder.resolve().name
+        self.warnings: list[str] = []
+        self._folder = folder
+        self._settings = settings
+        self._closing = Event()
+        self._begun: set[str] = set()
+        self._skip: Mapping[str, int] = {}
+        self._after_ns = 0
+        self._video: VideoFile | None = None
+        first = self._first_clip()
+        self.width, self.height, self.fps = first.width, first.height, first.fps
+        first.close()
+
+    def resume(self, *, done: Iterable[str], frames_done: Mapping[str, int], after_ns: int) -> None:
+        """Leave out whole clips, so many frames of others, and begin after this capture time."""
+        self._begun.update(done)
+        self._skip, self._after_ns = frames_done, after_ns
+
+    def __iter__(self) -> Iterator[Frame]:
+        frame_index, last_ns = 0, self._after_ns
+        while (path := self._next_clip()) is not None:
+            self._begun.add(path.name)
+            self._video = self._open(path)
+            if self._video is None:
+                continue
+            start_ns = max(_start_ns(path, self._video), last_ns + round(1e9 / self._video.fps))
+            for frame in self._video:
+                frame_index += 1
+                last_ns = start_ns + frame.timestamp_ns
+                if frame.frame_index > self._skip.get(path.name, 0):
+                    yield replace(frame, frame_index=frame_index, timestamp_ns=last_ns)
+            self.warnings += self._video.warnings
+
+    def close(self) -> None:
+        """Let go of the clip; iteration ends."""
+        self._closing.set()
+        if self._video is not None:
+            self._video.close()
+
+    def _first_clip(self) -> VideoFile:
+        problem = SourceError(f"{self._folder}: expected clips, found none")
+        for path in clips_in(self._folder):
+            try:
+                return VideoFile(path, self._settings)
+            except SourceError as error:
+                problem = error
+        raise problem
+
+    def _open(self, path: Path) -> VideoFile | None:
+        try:
+            video = VideoFile(path, self._settings)
+        except SourceError as error:
+            self.warnings.append(f"{error}; the clip was left out")
+            return None
+        if (video.width, video.height) != (self.width, self.height):
+            video.close()
+            self.warnings.append(
+                f"{path.name}: expected {self.width}x{self.height} px as the first clip has, got "
+                f"{video.width}x{video.height} px; the clip was left out"
+            )
+            return None
+        return video
+
+    def _next_clip(self) -> Path | None:
+        """Wait for a clip that is whole; None at the end, or when none came for too long."""
+        sizes: dict[str, _Size] = {}
+        since = waited_from = time.monotonic()
+        while not self._closing.is_set():
+            paths = [path for path in clips_in(self._folder) if path.name not in self._begun]
+            if len(paths) > 1:
+                return paths[0]
+            now = time.monotonic()
+            if paths:
+                size = _size_of(paths[0])
+                if size is None:
+                    continue
+                if size != sizes.get(paths[0].name):
+                    sizes[paths[0].name] = size
+                    since = waited_from = now
+                if now - since >= _SETTLE_S or _is_old(size):
+                    return paths[0]
+            elif now - waited_from >= self._settings.clips_wait_s:
+                return None
+            self._closing.wait(_POLL_S)
+        return None
+
+
+def clips_in(folder: Path) -> list[Path]:
+    """The videos of a folder, in natural order. Raises SourceError where it can't be read."""
+    try:
+        files = [path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES]
+        files = [path for path in files if path.is_file() and not path.name.startswith(".")]
+    except OSError as error:
+        raise SourceError(
+            f"{folder}: expected a folder of clips, but it can't be read: {error.strerror}"
+        ) from None
+    return sorted(files, key=natural_order)
+
+
+def _size_of(path: Path) -> _Size | None:
+    """None where it was removed since."""
+    try:
+        facts = path.stat()
+    except FileNotFoundError:
+        return None
+    return _Size(num_bytes=facts.st_size, modified_ns=facts.st_mtime_ns)
+
+
+def _is_old(size: _Size) -> bool:
+    """Last written before the time in which a clip settles, by the wall clock as files have it."""
+    return time.time_ns() - size.modified_ns > _SETTLE_S * 1e9
+
+
+def _start_ns(path: Path, video: VideoFile) -> int:
+    size, duration_s = _size_of(path), (video.num_frames or 0) / video.fps
+    return 0 if size is None else size.modified_ns - round(duration_s * 1e9)

@@ -1,0 +1,161 @@
+"""A video file as a source of frames."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from stream_dmr.errors import SourceError
+from stream_dmr.messages import Frame
+from stream_dmr.sources.decoder import Decoder, DecodingError, Picture, ResizedError
+from stream_dmr.sources.picture_folder import nominal_ns, size_error
+from stream_dmr.sources.settings import ReadFramesSettings
+
+_NONSENSE_MS = 1e12  # 31 years
+_LEAST_FPS, _MOST_FPS = 1e-3, 1e6
+_MOST_FRAMES = 1e12
+_TEXT = bytes(range(32, 127)) + b"\t\r\n"
+
+
+class VideoFile:
+    """A video file; a damaged one gives the frames that still decode, and a warning."""
+
+    is_endless = False
+
+    def __init__(self, path: Path, settings: ReadFramesSettings) -> None:
+        """Raises SourceError where not even a first frame can be read."""
+        self.name = path.name
+        self.warnings: list[str] = []
+        self._patience_s = settings.silence_s
+        self._is_closed = False
+        start = _start_of(path)
+        # Absolute, since FFmpeg takes what stands before a colon in a relative path for a protocol.
+        self._decoder = Decoder(str(path.resolve()))
+        try:
+            self._first = self._decoder.read(timeout_s=self._patience_s)
+        except DecodingError:
+            self._first = None
+        if self._first is None:
+            self._decoder.close()
+            raise SourceError(f"{path}: {_why_unreadable(path, start)}")
+        self.height, self.width = self._decoder.height, self._decoder.width
+        promised = self._decoder.promised
+        self.num_frames = int(promised) if 1 <= promised < _MOST_FRAMES else None
+        self.fps = usual_fps(self._decoder.fps, settings)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Raises SourceError at a frame of another size."""
+        frame_index, timestamp_ns = 0, -1
+        pending, self._first = self._first, None
+        while pending is not None:
+            frame_index += 1
+            timestamp_ns = container_ns(
+                pending.milliseconds,
+                frame_index=frame_index,
+                fps=self.fps,
+                previous_ns=timestamp_ns,
+            )
+            yield Frame(
+                frame_index=frame_index,
+                timestamp_ns=timestamp_ns,
+                image=pending.image,
+                source=self.name,
+            )
+            pending = self._read(after=frame_index)
+        self._compare_with_promise(frame_index)
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the file; iteration ends."""
+        self._is_closed = True
+        self._first = None
+        self._decoder.close()
+
+    def _read(self, *, after: int) -> Picture | None:
+        """The next picture; None at the end, and where the decoder breaks down for good."""
+        try:
+            return None if self._is_closed else self._decoder.read(timeout_s=self._patience_s)
+        except ResizedError as error:
+            raise size_error(
+                (error.width, error.height),
+                expected=(self.width, self.height),
+                where=f"{self.name}, frame {after + 1}",
+            ) from None
+        except DecodingError as error:
+            if not self._is_closed:
+                self.warnings.append(
+                    f"{self.name}: {error} after frame {after}; the file seems damaged there"
+                )
+            return None
+
+    def _compare_with_promise(self, num_read: int) -> None:
+        # Containers without a frame count promise duration x rate, which may be one too many.
+        if not self._is_closed and self.num_frames and num_read < self.num_frames - 1:
+            self.warnings.append(
+                f"{self.name}: the file promises {self.num_frames} frames, only {num_read} could "
+                "be read; it seems cut off or damaged"
+            )
+
+
+def container_ns(milliseconds: float, *, frame_index: int, fps: float, previous_ns: int) -> int:
+    """A container's timestamp as ns since the start of the stream, above `previous_ns`.
+
+    OpenCV hands them out as float milliseconds; rounded to whole ns they are exact, since a double
+    is off by some 0.01 ns after a day. (Matroska itself only keeps whole milliseconds.) Where the
+    container has none (OpenCV then says 0) or nonsense, the frame rate tells the time. One that
+    stands still or steps back is moved to 1 ns after the last, so that the right ones after it
+    stay as they are.
+    """
+    if milliseconds == 0 or not abs(milliseconds) < _NONSENSE_MS:
+        timestamp_ns = nominal_ns(frame_index, fps)
+    else:
+        timestamp_ns = round(milliseconds * 1e6)
+    return max(timestamp_ns, previous_ns + 1)
+
+
+def usual_fps(fps: float, settings: ReadFramesSettings) -> float:
+    """The container's frame rate, where it is one."""
+    return fps if _LEAST_FPS <= fps <= _MOST_FPS else settings.images_fps
+
+
+def _start_of(path: Path) -> bytes:
+    """The bytes that name a file's format. Raises SourceError where they can't be a video's."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(512)
+    except OSError as error:
+        raise SourceError(
+            f"{path}: expected a video, but it can't be read: {error.strerror}"
+        ) from None
+    if not start:
+        raise SourceError(f"{path}: expected a video, got an empty file; copy it again")
+    if not start.translate(None, delete=_TEXT):  # FFmpeg would film a terminal that prints it
+        raise SourceError(f"{path}: expected a video, got a text file")
+    return start
+
+
+def _why_unreadable(path: Path, start: bytes) -> str:
+    """What to tell about a file that gives no picture."""
+    if start[8:12] == b"WAVE" or start[:3] == b"ID3" or start[:4] in (b"fLaC", b"OggS"):
+        return "expected a video, got an audio file with no pictures in it"
+    if start[4:8] == b"ftyp" and not _has_index(path):
+        return "expected a whole video, but its index (moov) at the end is missing; copy it again"
+    return (
+        "expected a video, but no picture in it can be decoded; "
+        "it may hold sound only, be damaged, or not be a video at all"
+    )
+
+
+def _has_index(path: Path) -> bool:
+    """Does an MP4 have its `moov` box? Walks the boxes at the top: size (4 bytes), name (4)."""
+    end = path.stat().st_size
+    with path.open("rb") as file:
+        while len(head := file.read(16)) >= 8:
+            size, name = int.from_bytes(head[:4]), head[4:8]
+            if name == b"moov":
+                return True
+            if size == 1:  # the true size follows in 8 bytes
+                size = int.from_bytes(head[8:16])
+            if not 8 <= size <= end:  # damaged
+                return False
+            file.seek(size - len(head), os.SEEK_CUR)
+    return False

@@ -1,0 +1,539 @@
+"""`stream-dmr batch`: the same as `run` on each video, whatever is killed in between."""
+
+import csv
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from pyarrow import dataset
+
+from stream_dmr.batch.batch import batch
+from stream_dmr.batch.job import Outcome, do_job, folder_of, outcome_of
+from stream_dmr.batch.local import LocalEngine
+from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
+from stream_dmr.batch.pieces import pieces_of
+from stream_dmr.batch.progress import Clock, duration
+from stream_dmr.errors import UserError
+from stream_dmr.results.provenance import seal_verdicts
+from stream_dmr.results.verdicts import Verdict, add_verdict
+from stream_dmr.results.verify import verify
+from stream_dmr.running.run import run
+from tests.support.command import invoke, rows
+from tests.support.fish_run import FISH, request
+from tests.support.tiny_clip import write_clip
+
+SUPPORT = Path(__file__).resolve().parents[1] / "support"
+TABLES = ("lengths.csv", "frames.csv")
+
+
+def write_manifest(path: Path, *jobs: dict[str, str]) -> Path:
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(jobs)
+    return path
+
+
+def row(clip: str = "clip", **other: str) -> dict[str, str]:
+    files = {"video": f"{clip}/video.mp4", "calibration": f"{clip}/calibration.yaml"}
+    return (
+        files | {"masks": f"{clip}/masks", "vessel": "Sea/Bird", "trip": "7", "haul": "1"} | other
+    )
+
+
+@pytest.fixture(scope="module")
+def season(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two clips, and what `run` makes of the first."""
+    folder = tmp_path_factory.mktemp("season")
+    write_clip(folder / "clip", fish=FISH)
+    write_clip(folder / "other", fish=[[1], [1], [1], [1, 3], [3], [3]])
+    (folder / "broken").mkdir()
+    (folder / "broken" / "video.mp4").write_bytes(b"this is no video")
+    run(request(folder / "clip", folder / "alone"), stop=threading.Event())
+    return folder
+
+
+def jobs_of(season: Path, tmp_path: Path, *lines: dict[str, str]) -> list[Job]:
+    manifest = write_manifest(season / f"{tmp_path.name}.csv", *lines)
+    clip = season / "clip"
+    return read_manifest(manifest, config=clip / "quick.toml", template=str(clip / "tiny.ply"))
+
+
+class ThisProcess:
+    """An engine without processes, which take seconds to start."""
+
+    def outcomes(
+        self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, clock: Clock
+    ) -> Iterator[Outcome]:
+        for job in jobs:
+            yield do_job(job, out, on_progress=clock.of(job))
+
+
+def measure(jobs: list[Job], out: Path) -> dict[str, str]:
+    summary = batch(jobs, out, ThisProcess(), stop=threading.Event())
+    return {one.name: one.status for one in summary.outcomes}
+
+
+def assert_same_tables(folder: Path, other: Path) -> None:
+    for name in TABLES:
+        assert (folder / name).read_bytes() == (other / name).read_bytes()
+
+
+def test_a_job_is_what_run_makes(season: Path, tmp_path: Path):
+    (job,) = jobs_of(season, tmp_path, row())
+    shares = list[float]()
+    outcome = do_job(job, tmp_path, on_progress=shares.append)
+    folder = folder_of(job, tmp_path)
+    assert_same_tables(folder, season / "alone")
+    assert (outcome.num_frames, outcome.num_fish) == (len(FISH), 2)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    assert verify(folder)[0] == []
+    assert outcome_of(job, tmp_path) == outcome
+
+
+def test_videos_are_measured_and_a_bad_one_fails_alone(season: Path, tmp_path: Path):
+    lines = row(), row("other", trip="8"), row(video="broken/video.mp4"), row(masks="none")
+    jobs = jobs_of(season, tmp_path, *lines, row(video="missing.mp4", vessel=""))
+    assert [job.name for job in jobs] == ["video", "video-2", "video-3", "video-4", "missing"]
+    statuses = measure(jobs, tmp_path / "out")
+    assert list(statuses.values()) == ["done", "done", "failed", "failed", "failed"]
+    assert_same_tables(folder_of(jobs[0], tmp_path / "out"), season / "alone")
+    table = rows(tmp_path / "out" / "videos.csv")
+    assert [line["status"] for line in table] == list(statuses.values())
+    assert "broken" in table[2]["reason"]
+    assert "none" in table[3]["reason"]
+    assert "missing.mp4" in table[4]["reason"]
+    assert not list((tmp_path / "out" / "videos").glob("*.part"))
+
+
+def test_the_data_set_holds_every_fish_and_every_frame(season: Path, tmp_path: Path):
+    jobs = jobs_of(season, tmp_path, row(), row("other", trip="8", haul="2"))
+    measure(jobs, tmp_path)
+    fish = dataset.dataset(tmp_path / "dataset" / "fish", partitioning="hive").to_table()
+    frames = dataset.dataset(tmp_path / "dataset" / "frames", partitioning="hive").to_table()
+    for job in jobs:
+        folder = folder_of(job, tmp_path)
+        measured = rows(folder / "lengths.csv")
+        found = [one for one in fish.to_pylist() if one["video"] == job.name]
+        assert [one["track_id"] for one in found] == [int(one["track_id"]) for one in measured]
+        for one, line in zip(found, measured, strict=True):
+            assert f"{one['length_mm']:.6f}" == line["length_mm"]
+            assert (one["vessel"], str(one["trip"]), one["haul"]) == (
+                "Sea/Bird",
+                job.trip,
+                job.haul,
+            )
+            assert one["run_id"]
+            assert len(one["config_sha256"]) == 64
+        lines = rows(folder / "frames.csv")
+        seen = [one for one in frames.to_pylist() if one["video"] == job.name]
+        assert len(seen) == len(lines)
+        for one, line in zip(seen, lines, strict=True):
+            assert (one["frame_index"], one["reason"]) == (int(line["frame_index"]), line["reason"])
+            assert one["accepted"] is (line["accepted"] == "true")
+            assert one["run_id"] == found[0]["run_id"]
+
+
+@pytest.fixture(scope="module")
+def finished(season: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A batch of two videos; one came without a trip, one shows no fish."""
+    folder = tmp_path_factory.mktemp("finished")
+    write_clip(season / "sea", fish=[[]] * 3)
+    (season / "sea" / "masks" / "000001.png").rename(season / "sea" / "masks" / "000009.png")
+    measure(jobs_of(season, folder, row(), row("sea", trip=""), row(trip="")), folder)
+    return folder
+
+
+def test_duckdb_opens_the_data_set(finished: Path):
+    duckdb = pytest.importorskip("duckdb", reason="needs DuckDB: pip install duckdb")
+    query = "SELECT vessel, trip, count(*) FROM read_parquet('{}', hive_partitioning = true) "
+    query += "GROUP BY ALL ORDER BY trip"
+    fish = duckdb.sql(query.format(finished / "dataset/fish/**/*.parquet")).fetchall()
+    assert fish == [("Sea/Bird", "", 2), ("Sea/Bird", "7", 2)]
+    frames = duckdb.sql(query.format(finished / "dataset/frames/**/*.parquet")).fetchall()
+    assert frames == [("Sea/Bird", "", 10), ("Sea/Bird", "7", 10)]
+
+
+def test_pandas_opens_the_data_set(finished: Path):
+    pandas = pytest.importorskip("pandas", reason="needs pandas: pip install pandas")
+    fish = pandas.read_parquet(finished / "dataset/fish")
+    assert set(fish["vessel"]) == {"Sea/Bird"}
+    assert sorted(fish["trip"]) == ["", "", "7", "7"]
+    lengths = rows(finished / "videos" / "video" / "lengths.csv")
+    of_first = fish[fish["video"] == "video"]["length_mm"]
+    assert list(of_first.round(6)) == [float(line["length_mm"]) for line in lengths]
+
+
+def test_a_changed_data_set_is_found(season: Path, tmp_path: Path):
+    (job,) = jobs_of(season, tmp_path, row())
+    measure([job], tmp_path)
+    assert verify(tmp_path)[0] == []
+    (copy,) = (tmp_path / "dataset" / "fish").rglob("*.parquet")
+    copy.write_bytes(copy.read_bytes() + b"x")
+    (change,) = verify(tmp_path)[0]
+    assert change.path == copy
+    assert "is not what videos/video/fish.parquet is" in change.what
+    shutil.copy(tmp_path / "videos" / "video" / "fish.parquet", copy)
+    elsewhere = copy.parents[1] / "trip=9" / copy.name
+    elsewhere.parent.mkdir()
+    copy.rename(elsewhere)  # which makes it another trip's
+    assert [(change.path, change.what) for change in verify(tmp_path)[0]] == [
+        (copy, "is missing"),
+        (elsewhere, "is of no video that is done, by videos.csv"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "expected"),
+    [
+        (",done,", ",failed,", "video: status is failed, outcome.json says done"),
+        ("no such file", "is fine", "broken: reason is "),
+        ("Sea Bird", "Other", "is missing"),  # where the data set has that vessel's fish
+    ],
+)
+def test_a_changed_table_of_videos(
+    season: Path, tmp_path: Path, before: str, after: str, expected: str
+):
+    jobs = jobs_of(season, tmp_path, row(vessel="Sea Bird"), row(video="no/broken.mp4"))
+    measure(jobs, tmp_path)
+    assert verify(tmp_path)[0] == []
+    table = tmp_path / "videos.csv"
+    text = table.read_text()
+    assert before in text
+    table.write_text(text.replace(before, after, 1))
+    found = [change.what for change in verify(tmp_path)[0]]
+    assert "was changed: its SHA-256 is not that in provenance.json" in found
+    assert any(what.startswith(expected) for what in found), found
+    measure(jobs, tmp_path)
+    assert verify(tmp_path)[0] == []
+
+
+def test_one_report_of_all_videos(season: Path, tmp_path: Path):
+    jobs = jobs_of(season, tmp_path, row(), row("other"), row(video="no/broken.mp4"))
+    measure(jobs, tmp_path)
+    target = tmp_path / "report.html"
+    outcome = invoke("report", {str(tmp_path): None, "--out": str(target)})
+    assert outcome.code == 0, outcome.err
+    text = target.read_text()
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text)
+    assert found is not None
+    shown = json.loads(found[1])
+    fish = shown["fish"]
+    assert [(one["id"], one["video"], one["track_id"]) for one in fish] == [
+        *((1, "video", 1), (2, "video", 2), (3, "video-2", 1), (4, "video-2", 3))
+    ]
+    assert all(f'id="fish-{one["id"]}"' in text for one in fish)
+    assert fish[1]["time_s"] < fish[2]["time_s"]  # the second clip's clock begins anew
+    assert [line.split(":")[0] for line in shown["notes"]] == ["broken"]
+    assert verify(tmp_path)[0] == []  # the report is known there
+    measure(jobs, tmp_path)
+    target.write_text(text + " ")
+    assert [change.path for change in verify(tmp_path)[0]] == [target]
+    refusal = invoke("review", {str(tmp_path): None})
+    assert refusal.code == 2
+    assert "review its videos one by one" in refusal.error
+
+
+def test_verdicts_come_into_the_data_set_with_the_next_batch(season: Path, tmp_path: Path):
+    (job,) = jobs_of(season, tmp_path, row())
+    measure([job], tmp_path)
+    database = folder_of(job, tmp_path) / "lengths.db"
+    add_verdict(database, Verdict(track_id=2, kind="reject", reason="a glove", reviewer="Ada"))
+    seal_verdicts(database.parent)
+    measure([job], tmp_path)
+    fish = dataset.dataset(tmp_path / "dataset" / "fish").to_table().to_pylist()
+    assert [one["verdict"] for one in fish] == [None, "reject"]
+    assert verify(tmp_path)[0] == []
+
+
+def test_what_is_done_is_not_done_again(season: Path, tmp_path: Path):
+    jobs = jobs_of(season, tmp_path, row(), row("other"), row(video="broken/video.mp4"))
+    measure(jobs, tmp_path)
+    before = {p: p.stat().st_mtime_ns for p in tmp_path.glob("videos/*/recording.mcap")}
+    summary = batch(jobs, tmp_path, ThisProcess(), stop=threading.Event())
+    assert summary.num_before == 2
+    assert {p: p.stat().st_mtime_ns for p in tmp_path.glob("videos/*/recording.mcap")} == before
+    assert [one.status for one in summary.outcomes] == ["done", "done", "failed"]
+
+
+def test_another_trip_or_another_config_is_done_again(season: Path, tmp_path: Path):
+    measure(jobs_of(season, tmp_path, row()), tmp_path)
+    (job,) = jobs_of(season, tmp_path, row(trip="9"))
+    assert outcome_of(job, tmp_path) is None
+    measure([job], tmp_path)
+    files = list((tmp_path / "dataset" / "fish").rglob("*.parquet"))
+    assert [path.parent.name for path in files] == ["trip=9"]  # the old row is gone
+
+
+def test_without_results_there_is_no_outcome(season: Path, tmp_path: Path):
+    (job,) = jobs_of(season, tmp_path, row())
+    folder = folder_of(job, tmp_path)
+    for content in ("", "{", "{}", '{"name": "video"}'):
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "outcome.json").write_text(content)
+        assert outcome_of(job, tmp_path) is None
+
+
+def test_killed_at_any_moment_it_goes_on_where_it_was(season: Path, tmp_path: Path):
+    """First its worker is killed, which one video is charged with, then the batch itself."""
+    clip, out = season / "clip", tmp_path / "out"
+    manifest = write_manifest(season / f"{tmp_path.name}.csv", row(), row("other"), row("clip"))
+    command = [sys.executable, "-m", "stream_dmr.cli.main", "batch", str(manifest)]
+    command += ["--config", str(clip / "quick.toml"), "--template", str(clip / "tiny.ply")]
+    command += ["--workers", "1", "--out", str(out)]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        wait_for(lambda: (out / "videos" / "video.part" / "recording.mcap.part").exists())
+        os.kill(workers(out)[0], signal.SIGKILL)
+        wait_for(lambda: (out / "videos" / "video-3.part" / "recording.mcap.part").exists())
+        process.send_signal(signal.SIGKILL)
+    wait_for(lambda: not workers(out))  # nobody goes on unattended
+    lines = {line["name"]: line for line in rows(out / "videos.csv")}
+    assert "its process ended (-9)" in lines["video"]["reason"]
+    assert [line["status"] for line in lines.values()] == ["failed", "done", "waiting"]
+    done = out / "videos" / "video-2" / "recording.mcap"
+    before = done.stat().st_mtime_ns
+    assert not (out / "videos" / "video-3").exists()
+    jobs = jobs_of(season, tmp_path, row(), row("other"), row("clip"))
+    statuses = measure(jobs, out)
+    assert list(statuses.values()) == ["done"] * 3
+    assert done.stat().st_mtime_ns == before
+    for name in ("video", "video-3"):
+        assert_same_tables(out / "videos" / name, season / "alone")
+
+
+def workers(out: Path) -> list[int]:
+    """Processes that measure into `out`."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            words = (folder / "cmdline").read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if b"stream_dmr.batch.worker" in words and str(out).encode() in words:
+            found.append(int(folder.name))
+    return found
+
+
+def wait_for(condition, seconds: float = 300.0) -> None:  # type: ignore[no-untyped-def]
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+def test_the_command(season: Path, tmp_path: Path):
+    manifest = write_manifest(season / f"{tmp_path.name}.csv", row(), row(video="missing.mp4"))
+    clip = season / "clip"
+    outcome = invoke(
+        "batch",
+        {str(manifest): None, "--out": str(tmp_path), "--config": str(clip / "quick.toml")}
+        | {"--template": str(clip / "tiny.ply"), "--workers": "1"},
+    )
+    assert outcome.code == 2
+    assert "1 of 2 videos are done, 0 of them before, 1 failed" in outcome.out
+    assert "missing: failed: " in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("", "expected the columns"),
+        ("video,calibration\n", "expected the columns"),
+        (f"{','.join(COLUMNS)},more\n", "expected the columns"),
+        (f"{','.join(COLUMNS)}\n", "a row for each video"),
+        (f"{','.join(COLUMNS)}\n,,,,,,\n", "line 2: expected 7 cells"),
+        (f"{','.join(COLUMNS)}\na.mp4,,,,,,,,\n", "line 2: expected 7 cells"),
+    ],
+)
+def test_a_wrong_manifest_is_refused(tmp_path: Path, text: str, match: str):
+    (tmp_path / "m.csv").write_text(text)
+    with pytest.raises(UserError, match=match):
+        read_manifest(tmp_path / "m.csv", config=None, template="cod")
+    with pytest.raises(UserError, match="expected a manifest"):
+        read_manifest(tmp_path / "none.csv", config=None, template="cod")
+
+
+def test_the_time_left_is_by_bytes(season: Path, tmp_path: Path):
+    jobs = jobs_of(season, tmp_path, row(), row())
+    clock = Clock(jobs, print)
+    assert clock.line(10.0).endswith("time left: unknown")
+    clock.of(jobs[0])(0.5)
+    assert clock.line(10.0) == "0 of 2 videos, 25 %, time left: 30 s"
+    clock.over(jobs[0].name)
+    assert clock.line(10.0) == "1 of 2 videos, 50 %, time left: 10 s"
+    assert (duration(200.0), duration(7200.0)) == ("3 min", "2.0 h")
+
+
+def test_a_stop_ends_it_soon_and_leaves_nothing_half_done(season: Path, tmp_path: Path):
+    jobs = jobs_of(season, tmp_path, row(), row("other"))
+    stop = threading.Event()
+    stop.set()
+    summary = batch(jobs, tmp_path, LocalEngine(1), stop=stop)
+    assert summary.outcomes == []
+    assert shutil.disk_usage(tmp_path).free > 0
+    assert [line["status"] for line in rows(tmp_path / "videos.csv")] == ["waiting"] * 2
+
+
+@pytest.mark.slow  # a dozen starts and more
+@pytest.mark.parametrize("seed", [1, 2])
+def test_killed_at_random_moments_it_gets_there(tmp_path: Path, seed: int):
+    clip = tmp_path / "clip"
+    write_clip(clip, fish=COMING_AND_GOING)
+    write_clip(tmp_path / "other", fish=[[1], [1], [1]])
+    run(request(clip, tmp_path / "alone"), stop=threading.Event())
+    manifest = write_manifest(tmp_path / "m.csv", row(), row("other"))
+    script = SUPPORT / "killed_batch.py"
+    command = [sys.executable, str(script), str(manifest), str(clip / "quick.toml")]
+    command += [str(clip / "tiny.ply"), str(tmp_path / "out"), str(seed)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert int(ended.stdout.split()[0]) > 2
+    assert_same_tables(tmp_path / "out" / "videos" / "video", tmp_path / "alone")
+    assert verify(tmp_path / "out")[0] == []
+    assert [line["status"] for line in rows(tmp_path / "out" / "videos.csv")] == ["done"] * 2
+
+
+@pytest.mark.slow  # a cluster takes a minute to start
+def test_ray_on_two_nodes_loses_a_worker_and_nothing_else(season: Path, tmp_path: Path):
+    pytest.importorskip("ray", reason="needs Ray: pip install 'stream-dmr[ray]'")
+    clip, out = season / "clip", tmp_path / "out"
+    lines = row(), row("other"), row(video="broken/video.mp4"), row("clip")
+    manifest = write_manifest(season / f"{tmp_path.name}.csv", *lines)
+    script = SUPPORT / "ray_cluster.py"
+    command = [sys.executable, str(script), str(manifest), str(clip / "quick.toml")]
+    ended = subprocess.run(
+        [*command, str(clip / "tiny.ply"), str(out)], capture_output=True, text=True, check=False
+    )
+    assert "nodes 2, killed 1, done 3" in ended.stdout, ended.stdout + ended.stderr
+    statuses = [line["status"] for line in rows(out / "videos.csv")]
+    assert statuses == ["done", "done", "failed", "done"]
+    for name in ("video", "video-4"):
+        assert_same_tables(out / "videos" / name, season / "alone")
+
+
+COMING_AND_GOING = [
+    *([1, 2], [1, 2], [1, 2], [1, 2], [1], [1, 3], [1, 3], [3], [3], [3]),
+    *([], [4], [4], [4], [4], [4], [4], [4], [2, 4], [2]),
+]
+
+
+@pytest.mark.parametrize(("timeout_s", "piece_frames"), [(0.25, 4), (100.0, 9)])
+def test_pieces_make_the_tables_of_the_whole(tmp_path: Path, timeout_s: float, piece_frames: int):
+    clip = tmp_path / "clip"
+    write_clip(clip, fish=COMING_AND_GOING)  # fish cross every cut; 2 comes back at the end
+    config = clip / "quick.toml"
+    text = config.read_text() + f"\n[smooth_length]\ntrack_timeout_s = {timeout_s}\n"
+    config.write_text(text + "max_std_ratio = 1e9\n")
+    run(request(clip, tmp_path / "alone"), stop=threading.Event())
+    manifest = write_manifest(tmp_path / "manifest.csv", row())
+    (job,) = read_manifest(manifest, config=config, template=str(clip / "tiny.ply"))
+    pieces = pieces_of(job, piece_frames, tmp_path)
+    assert len(pieces) >= 2
+    assert sorted(i for piece in pieces for i in piece.tracks) == [1, 2, 3, 4]
+    out = tmp_path / "out"
+    summary = batch([job], out, ThisProcess(), piece_frames=piece_frames, stop=threading.Event())
+    assert [one.status for one in summary.outcomes] == ["done"]
+    assert summary.outcomes[0].num_fish == 4
+    folder = folder_of(job, out)
+    assert_same_tables(folder, tmp_path / "alone")
+    assert verify(folder)[0] == []
+    assert [path.name for path in (out / "videos").iterdir()] == ["video"]
+    assert not (out / "pieces").exists()
+    fish = dataset.dataset(out / "dataset" / "fish", partitioning="hive").to_table()
+    assert fish.num_rows == 4
+
+
+@pytest.fixture(scope="module")
+def unnamed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Job]:
+    """A clip whose boxes don't say which fish they are, and what `run` makes of it.
+
+    They lie too high, so that each follows the edges of the fish's last mask.
+    """
+    folder = tmp_path_factory.mktemp("unnamed")
+    clip = folder / "clip"
+    write_clip(clip, fish=COMING_AND_GOING)
+    lines = [line.split(",") for line in (clip / "boxes.txt").read_text().splitlines()]
+    moved = [f"{i},-1,{x},{int(y) - 5},{','.join(rest)}\n" for i, _, x, y, *rest in lines]
+    (clip / "boxes.txt").write_text("".join(moved))
+    config = clip / "quick.toml"
+    with config.open("a") as file:
+        file.write("\n[smooth_length]\ntrack_timeout_s = 0.25\nmax_std_ratio = 1e9\n")
+        file.write("\n[track_fish]\nmin_track_frames = 2\nmin_mask_confidence = 0.0\n")
+    run(
+        request(clip, folder / "alone", masks=None, boxes=clip / "boxes.txt"),
+        stop=threading.Event(),
+    )
+    manifest = write_manifest(folder / "m.csv", row(masks="", boxes="clip/boxes.txt"))
+    (job,) = read_manifest(manifest, config=config, template=str(clip / "tiny.ply"))
+    return folder, job
+
+
+def test_fish_that_nobody_named_are_found_once_and_measured_in_pieces(
+    unnamed: tuple[Path, Job], tmp_path: Path
+):
+    folder, job = unnamed
+    assert len(rows(folder / "alone" / "lengths.csv")) >= 3
+    (scout,) = pieces_of(job, 5, tmp_path)
+    assert scout.piece == "scout"
+    assert do_job(scout, tmp_path).num_frames == len(COMING_AND_GOING)
+    pieces = pieces_of(job, 5, tmp_path)
+    assert len(pieces) >= 2
+    assert sum(piece.share for piece in [scout, *pieces]) == pytest.approx(1.0)
+    summary = batch([job], tmp_path, ThisProcess(), piece_frames=5, stop=threading.Event())
+    assert [one.status for one in summary.outcomes] == ["done"]
+    assert_same_tables(folder_of(job, tmp_path), folder / "alone")
+    assert not (tmp_path / "pieces").exists()
+
+
+def test_a_video_fails_once_however_many_of_its_pieces_do(tmp_path: Path):
+    clip = tmp_path / "clip"
+    write_clip(clip, fish=COMING_AND_GOING)
+    (clip / "calibration.yaml").write_text("no calibration")
+    manifest = write_manifest(tmp_path / "manifest.csv", row())
+    (job,) = read_manifest(manifest, config=clip / "quick.toml", template=str(clip / "tiny.ply"))
+    said = list[str]()
+    stop, out = threading.Event(), tmp_path / "out"
+    summary = batch([job], out, ThisProcess(), piece_frames=4, stop=stop, say=said.append)
+    assert [one.status for one in summary.outcomes] == ["failed"]
+    assert len(said) == 1
+
+
+def test_what_the_scout_cannot_read_fails_alone(unnamed: tuple[Path, Job], tmp_path: Path):
+    """Scout and pieces in one batch, beside a video whose calibration is wrong."""
+    _, job = unnamed
+    broken = replace(job, name="broken", calibration=str(tmp_path / "none.yaml"))
+    summary = batch([broken, job], tmp_path, ThisProcess(), piece_frames=5, stop=threading.Event())
+    assert [one.status for one in summary.outcomes] == ["failed", "done"]
+    assert "none.yaml" in rows(tmp_path / "videos.csv")[0]["reason"]
+
+
+def test_pieces_that_are_done_are_kept(tmp_path: Path):
+    clip = tmp_path / "clip"
+    write_clip(clip, fish=COMING_AND_GOING)
+    manifest = write_manifest(tmp_path / "manifest.csv", row())
+    (job,) = read_manifest(manifest, config=clip / "quick.toml", template=str(clip / "tiny.ply"))
+    out = tmp_path / "out"
+    first = pieces_of(job, 9, out)[0]
+    do_job(first, out)
+    before = (folder_of(first, out) / "recording.mcap").stat().st_ino
+    summary = batch([job], out, ThisProcess(), piece_frames=9, stop=threading.Event())
+    assert [one.status for one in summary.outcomes] == ["done"]
+    assert (folder_of(job, out) / "recording-1.mcap").stat().st_ino == before
+
+
+def test_what_says_not_which_fish_it_is_stays_whole(season: Path, tmp_path: Path):
+    (job,) = jobs_of(season, tmp_path, row(masks="none"))
+    assert pieces_of(job, 2, tmp_path) == [job]
+    (job,) = jobs_of(season, tmp_path, row())
+    assert pieces_of(job, 100, tmp_path) == [job]

@@ -1,0 +1,112 @@
+"""The command itself: help, version, exit codes, and the commands beside `run`."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from stream_dmr import __version__
+from stream_dmr.cli.main import one_line
+from stream_dmr.cli.run import default_out
+from stream_dmr.errors import UserError
+from tests.support.command import invoke, rows
+
+HEAVY = ["cv2", "torch", "rerun", "mcap", "numpy", "scipy", "trimesh", "numba", "pydantic"]
+
+
+def test_help_imports_nothing_heavy():
+    """What makes `--help` answer at once, without timing it."""
+    code = (
+        "import sys; sys.argv = ['stream-dmr', '--help']\n"
+        "from stream_dmr.cli.main import main\n"
+        "try: main()\n"
+        f"finally: print([m for m in {HEAVY} if m in sys.modules], file=sys.stderr)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stderr.strip() == "[]"
+    for command in ("run", "simulate", "calibrate", "evaluate"):
+        assert command in result.stdout
+
+
+def test_version():
+    outcome = invoke("--version")
+    assert (outcome.code, outcome.out.strip()) == (0, f"stream-dmr {__version__}")
+
+
+@pytest.mark.parametrize("command", ["run", "simulate", "calibrate", "evaluate"])
+def test_every_command_has_help(command: str):
+    assert invoke(command, {"--help": None}).code == 0
+
+
+@pytest.mark.parametrize("command", ["fly", "run --speed 3", "simulate --fish many --out x"])
+def test_usage_errors_exit_with_2_and_no_traceback(command: str):
+    outcome = invoke(command)
+    assert outcome.code == 2
+    assert "Traceback" not in outcome.err
+
+
+def test_our_own_fault_exits_with_1_and_the_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path):
+    def broken(*args: object, **kwargs: object) -> None:
+        raise ZeroDivisionError("oops")
+
+    monkeypatch.setattr("stream_dmr.simulation.simulate", broken)
+    outcome = invoke("simulate", {"--out": str(tmp_path)})
+    assert outcome.code == 1
+    assert "Traceback" in outcome.err
+    assert "ZeroDivisionError" in outcome.err.splitlines()[-1]
+
+
+def test_an_error_and_its_notes_are_one_line():
+    error = UserError("mesh: broken\nat vertex 3")
+    error.add_note("the rest is kept")
+    assert one_line(error) == "mesh: broken at vertex 3; the rest is kept"
+
+
+@pytest.mark.parametrize(
+    ("source", "out"),
+    [
+        ("clips/haul 7.mp4", "runs/haul 7"),
+        ("clips/frames/", "runs/frames"),
+        ("3", "runs/camera-3"),
+        ("rtsp://user:secret@10.0.0.5:554/rail", "runs/10.0.0.5-554-rail"),
+    ],
+)
+def test_results_go_by_the_name_of_the_source(source: str, out: str):
+    assert default_out(source) == Path(out)
+
+
+def test_simulate_writes_a_scene(tmp_path: Path):
+    options = {"--fish": "1", "--frames": "2", "--preset": "clean", "--out": str(tmp_path / "s")}
+    outcome = invoke("simulate", options)
+    assert outcome.code == 0, outcome.err
+    for name in ("video.mp4", "boxes.txt", "masks", "calibration.yaml", "truth.csv"):
+        assert (tmp_path / "s" / name).exists()
+    assert len(rows(tmp_path / "s" / "truth.csv")) == 1
+
+
+def test_simulate_refuses_an_unknown_preset(tmp_path: Path):
+    outcome = invoke("simulate", {"--preset": "stormy", "--out": str(tmp_path / "s")})
+    assert outcome.code == 2
+    assert "stormy" in outcome.error
+
+
+def test_evaluate_prints_each_fish_and_the_figures(tmp_path: Path):
+    (tmp_path / "a.csv").write_text("track_id,length_mm\n1,102\n2,196\n")
+    (tmp_path / "b.csv").write_text("track_id,length_mm\n1,100\n2,200\n3,300\n")
+    options = {"--lengths": str(tmp_path / "a.csv"), "--truth": str(tmp_path / "b.csv")}
+    outcome = invoke("evaluate", options)
+    assert outcome.code == 0, outcome.err
+    assert "+2.00" in outcome.out
+    assert "2 of 3" in outcome.out
+    assert "3.0 mm, 2.00 %" in outcome.out
+
+
+def test_evaluate_refuses_a_missing_file(tmp_path: Path):
+    (tmp_path / "b.csv").write_text("track_id,length_mm\n1,100\n")
+    options = {"--lengths": str(tmp_path / "a.csv"), "--truth": str(tmp_path / "b.csv")}
+    outcome = invoke("evaluate", options)
+    assert outcome.code == 2
+    assert "a.csv" in outcome.error

@@ -1,0 +1,45 @@
+"""What is rehearsed before a camera's first frame is all that its frames will call, and replays."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+CODE = """
+import gc
+import threading
+from pathlib import Path
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+from tests.support.shapes import crop_of, pose
+from nodes.fit_mesh import FitMesh
+from stream_dmr.fitting.fitter import Fitter
+from stream_dmr.fitting.compile_kernels import rehearse
+from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.replay.replay import ReplayRequest, replay
+from stream_dmr.fitting.paper.skinning import Rig
+from stream_dmr.template.template import load_template
+
+def compiled():
+    loops = [one for one in gc.get_objects() if isinstance(one, Dispatcher)]
+    return {loop.py_func.__qualname__: len(loop.signatures) for loop in loops}
+
+template = load_template("cod")
+rig = Rig.from_template(template)
+rehearse(Fitter(load_template("halibut"), FitMeshSettings()))
+rehearsed = compiled()
+assert sum(rehearsed.values()) > 10, rehearsed
+node = FitMesh(FitMeshSettings(), template=template, calibration=None)
+for seed in (1, 1, 2):
+    node.step(crop_of(pose(np.random.default_rng(seed), in_plane_rad=1.0), rig))
+assert compiled() == rehearsed, (compiled(), rehearsed)
+golden = Path("recordings/golden/recording.mcap")
+replay(ReplayRequest(recordings=[golden], first="fit"), stop=threading.Event())
+assert compiled() == rehearsed, (compiled(), rehearsed)
+"""
+
+
+def test_after_it_nothing_is_compiled():
+    """In a process of its own, where no other test has called a loop."""
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run([sys.executable, "-c", CODE], cwd=root, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

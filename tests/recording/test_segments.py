@@ -1,0 +1,283 @@
+"""Recordings in segments, what a crash leaves of them, and how a run goes on after it."""
+
+import json
+import os
+import shutil
+import sqlite3
+from collections import Counter
+from dataclasses import replace
+from functools import partial
+from itertools import takewhile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+
+from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish, Message
+from stream_dmr.recording.messages.codec import decode
+from stream_dmr.recording.messages.topics import TOPICS
+from stream_dmr.recording.reading.reader import open_recordings
+from stream_dmr.recording.recorder import Recorder
+from stream_dmr.recording.segments.recover import recover
+from stream_dmr.recording.segments.segments import open_segments
+from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.running.result_writer import INTERRUPTED
+from tests.running.test_run_signals import start, wait_for_rows
+from tests.support.command import invoke, rows
+from tests.support.reading import read_messages
+from tests.support.recorded_run import assert_same, header, run
+from tests.support.tiny_clip import HEIGHT, QUICK, WIDTH, write_clip
+
+NUM_FRAMES, SLOWER = 24, 20  # 2 fish in 24 frames, 2/3 s from one to the next
+SEGMENT_S = 3.0  # 5 frames
+SETTINGS = RecordingSettings(rrd=False, flush_s=1e-9, segment_s=SEGMENT_S)
+
+
+@pytest.fixture(scope="module")
+def messages() -> list[Message]:
+    """As a chain gives them: each stage a frame behind the one before it."""
+    slow = [replace(m, timestamp_ns=m.timestamp_ns * SLOWER) for m in run(NUM_FRAMES)]
+    stages = {kind: number for number, kind in enumerate(TOPICS)}
+    return sorted(slow, key=lambda m: (is_final(m), m.frame_index + stages[type(m)]))
+
+
+def is_final(message: Message) -> bool:
+    return isinstance(message, LengthEstimate) and message.is_final
+
+
+def recorder(out: Path, settings: RecordingSettings = SETTINGS, **more) -> Recorder:
+    notices: list[str] = []
+    files = partial(open_segments, on_notice=notices.append)
+    return Recorder(out, header(), settings, files=files, **more)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, messages: list[Message]) -> Path:
+    """The segments of a run that ended well."""
+    out = tmp_path_factory.mktemp("whole")
+    with recorder(out) as segments:
+        for message in messages:
+            segments.write(message)
+    return out
+
+
+@pytest.fixture(scope="module")
+def torn(tmp_path_factory: pytest.TempPathFactory, messages: list[Message]) -> Path:
+    """What a crash leaves while the stages are on both sides of the first cut."""
+    out = tmp_path_factory.mktemp("torn")
+    live = recorder(tmp_path_factory.mktemp("live"))
+    with live:
+        for message in takewhile(lambda m: m.frame_index <= 8, messages):
+            live.write(message)
+        live._queue.join()
+        for path in (tmp_path_factory.getbasetemp()).glob("live*/recording*"):
+            shutil.copy(path, out)
+    return out
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.glob("recording*"))
+
+
+def read_by_others(path: Path) -> list[tuple[str, int]]:
+    """Topic and log time of every message, by the mcap library's own reader."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        return [(channel.topic, m.log_time) for _, channel, m in reader.iter_messages()]
+
+
+def test_segments_hold_every_message_once_and_are_cut_between_frames(
+    whole: Path, messages: list[Message]
+):
+    assert names(whole) == [f"recording-{n:06d}.mcap" for n in range(1, 6)]
+    for kind in TOPICS:
+        expected = [m for m in messages if isinstance(m, kind) and not isinstance(m, Frame)]
+        found = [m for m in read_messages(whole, [kind]) if not isinstance(m, Frame)]
+        for one, other in zip(
+            sorted(expected, key=is_final), sorted(found, key=is_final), strict=True
+        ):
+            assert (one.frame_index, one.track_id) == (other.frame_index, other.track_id)
+    cuts = []
+    for path in sorted(whole.glob("*.mcap")):
+        assert read_by_others(path)
+        found = list(read_messages(path))
+        indices = {m.frame_index for m in found if not is_final(m)}
+        assert indices == set(range(min(indices), max(indices) + 1))
+        assert {m.frame_index for m in found if isinstance(m, Frame)} == indices
+        cuts.append(min(indices))
+    assert cuts == [1, 6, 11, 16, 21]
+
+
+def test_a_segment_carries_the_fish_that_are_in_view(whole: Path, messages: list[Message]):
+    for path in sorted(whole.glob("*.mcap")):
+        first = min(m.frame_index for m in read_messages(path, [Frame]))
+        carried = [decode(LocalizedFish, data) for data in open_recordings([path]).carried()]
+        expected = [m for m in messages if isinstance(m, LocalizedFish) and m.frame_index < first]
+        expected.sort(key=lambda m: (m.track_id, m.frame_index))
+        assert len(carried) == len(expected)
+        for one, other in zip(expected, carried, strict=True):
+            assert_same(one, other)
+
+
+def test_what_a_crash_left_is_made_whole(torn: Path, tmp_path: Path, messages: list[Message]):
+    folder = Path(shutil.copytree(torn, tmp_path / "out"))
+    assert names(folder) == ["recording-000001.mcap.part", "recording-000002.mcap.part"]
+    before = [list(read_messages(path)) for path in sorted(folder.iterdir())]
+    repairs = list(recover(folder))
+    assert names(folder) == ["recording-000001.mcap", "recording-000002.mcap"]
+    assert all("left unfinished by a crash" in repair.line for repair in repairs)
+    for repair, expected in zip(repairs, before, strict=True):
+        found = list(read_messages(repair.path))
+        assert len(found) == len(expected) > 0
+        for one, other in zip(expected, found, strict=True):
+            assert_same(one, other)
+        assert len(read_by_others(repair.path)) >= len(found)
+    assert list(recover(folder)) == []
+
+
+@settings(max_examples=40)
+@given(share=st.floats(0, 1), rubbish=st.binary(max_size=40))
+def test_any_beginning_of_a_recording_is_made_whole_or_set_aside(
+    torn: Path, tmp_path_factory: pytest.TempPathFactory, share: float, rubbish: bytes
+):
+    folder = tmp_path_factory.mktemp("cut")
+    part = folder / "recording-000001.mcap.part"
+    data = (torn / part.name).read_bytes()
+    part.write_bytes(data[: round(share * len(data))] + rubbish)
+    (repair,) = recover(folder)
+    assert "left unfinished" in repair.line
+    if repair.path.suffix == ".mcap":
+        assert read_by_others(repair.path) is not None
+        kept = list(read_messages(repair.path))
+        whole = list(read_messages(torn / part.name))
+        for one, other in zip(whole[: len(kept)], kept, strict=True):
+            assert_same(one, other)
+    else:
+        assert names(folder) == ["recording-000001.mcap.part.damaged"]
+
+
+@pytest.mark.parametrize("size", [0, 7, 8, 9, 16, 40])
+def test_a_recording_that_was_only_begun_is_set_aside(torn: Path, tmp_path: Path, size: int):
+    part = tmp_path / "recording-000001.mcap.part"
+    part.write_bytes((torn / part.name).read_bytes()[:size])
+    list(recover(tmp_path))
+    assert names(tmp_path) == ["recording-000001.mcap.part.damaged"]
+
+
+def test_a_repair_replaces_no_recording(torn: Path, tmp_path: Path):
+    folder = Path(shutil.copytree(torn, tmp_path / "out"))
+    (folder / "recording-000001.mcap").write_bytes(b"precious")
+    repair = next(recover(folder))
+    assert repair.path.name == "recording-000001-1.mcap"
+    assert (folder / "recording-000001.mcap").read_bytes() == b"precious"
+
+
+def test_the_command_says_what_it_did(torn: Path, tmp_path: Path):
+    folder = Path(shutil.copytree(torn, tmp_path / "out"))
+    outcome = invoke(f"recover {folder}")
+    assert outcome.code == 0
+    assert len(outcome.out.splitlines()) == 2
+    assert "nothing to repair" in invoke(f"recover {folder}").out
+    assert "expected the folder of a run" in invoke(f"recover {folder / 'none'}").error
+
+
+def test_a_length_that_only_the_recording_has_is_taken_over(tmp_path: Path):
+    options = write_clip(tmp_path / "clip", fish=[[1, 2]] * 3)
+    out = Path(options["--out"])
+    assert invoke("run", options).code == 0
+    csv = (out / "lengths.csv").read_text()
+    with sqlite3.connect(out / "lengths.db") as database:
+        database.execute("DELETE FROM fish WHERE track_id = 2")
+    database.close()
+    assert "fish 2" in invoke(f"recover {out}").out
+    assert (out / "lengths.csv").read_text() == csv
+    assert "nothing to repair" in invoke(f"recover {out}").out
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A measurement of clips, killed in the middle of a fish and started again."""
+    options = write_clips(tmp_path_factory.mktemp("interrupted"), num_frames=110)
+    out = Path(options["--out"])
+    killed = start(options)
+    wait_for_rows(out / "frames.csv", 45, killed)
+    killed.kill()
+    killed.communicate()
+    assert any(name.endswith(".part") for name in names(out))
+    outcome = invoke("run", options)
+    assert outcome.code == 0, outcome.err
+    assert "left unfinished by a crash" in outcome.err
+    return out
+
+
+CLIPS = """
+[read_frames]
+clips_wait_s = 0.5
+[recording]
+rrd = false
+flush_s = 0.1
+segment_s = 4.0
+"""
+
+
+def write_clips(folder: Path, *, num_frames: int) -> dict[str, str]:
+    """A folder with a clip, a source without an end; return the options of `run`."""
+    options = write_clip(folder)
+    del options["--boxes"], options["--masks"]
+    Path(options["--config"]).write_text(CLIPS + QUICK)
+    (folder / "clips").mkdir()
+    write_swaying_fish(folder / "clips" / "1.avi", num_frames=num_frames)
+    return options | {"--source": str(folder / "clips")}
+
+
+def write_swaying_fish(path: Path, *, num_frames: int) -> None:
+    """A fish that motion finds, before a ground that GrabCut can tell from it."""
+    grains = np.random.default_rng(0).integers(120, 220, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    ground = cv2.GaussianBlur(grains, (5, 5), 0)
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (WIDTH, HEIGHT))
+    for k in range(num_frames):
+        center = round(80 + 40 * np.sin(k / 6)), 60 + k % 3
+        video.write(cv2.ellipse(ground.copy(), center, (14, 40), 0, 0, 360, (40, 40, 40), -1))
+    video.release()
+    os.utime(path, (1.7e9, 1.7e9))
+
+
+def test_fish_in_view_at_a_crash_are_finished_by_the_restart_and_say_so(interrupted: Path):
+    with sqlite3.connect(interrupted / "lengths.db") as database:
+        query = "SELECT track_id, frames_seen, flags FROM fish"
+        fish = {i: (seen, json.loads(flags)) for i, seen, flags in database.execute(query)}
+    database.close()
+    flagged = {track_id for track_id, (_, flags) in fish.items() if flags == [INTERRUPTED]}
+    assert flagged
+    assert max(fish) > max(flagged)  # it came into view again
+    recorded = Counter(m.track_id for m in localized(interrupted))
+    assert {track_id: seen for track_id, (seen, _) in fish.items()} == recorded
+    exported = {int(row["track_id"]) for row in rows(interrupted / "lengths.csv")}
+    assert exported == set(fish)
+
+
+def localized(path: Path) -> list[LocalizedFish]:
+    return [m for m in read_messages(path, [LocalizedFish]) if isinstance(m, LocalizedFish)]
+
+
+@pytest.mark.parametrize("first", ["fit", "localize", "smooth"])
+def test_all_segments_in_a_row_are_what_was_recorded_over_a_crash(interrupted: Path, first: str):
+    outcome = invoke(f"replay {interrupted}", {"--from": first, "--check": None})
+    assert outcome.code == 0, outcome.out + outcome.err
+    assert "recovered after a crash" in outcome.err
+
+
+@pytest.mark.parametrize("first", ["fit", "localize", "smooth"])
+def test_every_segment_alone_is_what_was_recorded(interrupted: Path, first: str):
+    paths = sorted(interrupted.glob("*.mcap"))
+    assert len(paths) > 3
+    left_out = list[bool]()
+    for path in paths[:4]:
+        outcome = invoke(f"replay {path}", {"--from": first, "--check": None})
+        assert outcome.code == 0, f"{path.name}: {outcome.out}{outcome.err}"
+        left_out.append("messages not compared" in outcome.out)
+    assert left_out[:2] == [False, first == "fit"]

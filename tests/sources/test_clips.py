@@ -1,0 +1,120 @@
+"""A folder of clips: growing, damaged, gone on with after a restart."""
+
+import itertools
+import os
+import shutil
+import threading
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from stream_dmr.errors import SourceError
+from stream_dmr.messages import Frame
+from stream_dmr.sources.clip_folder import ClipFolder
+from stream_dmr.sources.open_source import open_source
+from stream_dmr.sources.settings import ReadFramesSettings
+
+AT_ONCE = ReadFramesSettings(clips_wait_s=0.0)
+OLD_S = 1_700_000_000
+
+
+def clip(path: Path, *, first: int, num_frames: int = 4, size: tuple[int, int] = (64, 48)) -> Path:
+    """Grey pictures `first`, `first` + 1, ..., 25 a second; whole for long."""
+    draft = path.with_suffix(".draft.avi")
+    writer = cv2.VideoWriter(str(draft), cv2.VideoWriter_fourcc(*"FFV1"), 25.0, size)
+    for k in range(first, first + num_frames):
+        writer.write(np.full((size[1], size[0], 3), 8 * k, np.uint8))
+    writer.release()
+    os.utime(draft, (OLD_S + first, OLD_S + first))
+    return draft.rename(path)
+
+
+def numbers(frames: list[Frame]) -> list[int]:
+    return [round(float(frame.image.mean()) / 8) for frame in frames]
+
+
+def test_clips_follow_each_other_by_name(tmp_path: Path):
+    for number in (10, 9, 1):
+        clip(tmp_path / f"rail_{number}.avi", first=number)
+    folder = open_source(str(tmp_path), AT_ONCE)
+    assert isinstance(folder, ClipFolder)
+    frames = list(folder)
+    assert numbers(frames) == [1, 2, 3, 4, 9, 10, 11, 12, 10, 11, 12, 13]
+    assert [frame.frame_index for frame in frames] == list(range(1, 13))
+    assert [frame.source for frame in frames[::4]] == ["rail_1.avi", "rail_9.avi", "rail_10.avi"]
+    times = [frame.timestamp_ns for frame in frames]
+    assert all(a < b for a, b in itertools.pairwise(times))
+    # Each ends when it was last written, but the last, which would begin before that.
+    assert times[4] == (OLD_S + 9) * 10**9 - 160_000_000
+    assert times[8] - times[4] == 10**9
+    assert folder.warnings == []
+
+
+def test_clips_that_overlap_in_time_are_set_one_after_the_other(tmp_path: Path):
+    for name in ("a", "b"):
+        clip(tmp_path / f"{name}.avi", first=1)
+    times = [frame.timestamp_ns for frame in open_source(str(tmp_path), AT_ONCE)]
+    assert {b - a for a, b in itertools.pairwise(times)} == {40_000_000}
+
+
+def test_a_clip_that_can_not_be_used_is_left_out(tmp_path: Path):
+    clip(tmp_path / "1.avi", first=1)
+    (tmp_path / "2.avi").write_bytes(bytes(range(256)) * 40)
+    clip(tmp_path / "3.avi", first=3, size=(32, 48))
+    clip(tmp_path / "4.avi", first=5)
+    folder = open_source(str(tmp_path), AT_ONCE)
+    assert numbers(list(folder)) == [1, 2, 3, 4, 5, 6, 7, 8]
+    assert len(folder.warnings) == 2
+    assert "2.avi: expected a video" in folder.warnings[0]
+    assert "3.avi: expected 64x48 px as the first clip has, got 32x48 px" in folder.warnings[1]
+
+
+def test_a_restart_reads_what_was_not_read(tmp_path: Path):
+    for first in (1, 5, 9):
+        clip(tmp_path / f"{first}.avi", first=first)
+    folder = ClipFolder(tmp_path, AT_ONCE)
+    folder.resume(done=["1.avi"], frames_done={"5.avi": 3}, after_ns=2 * OLD_S * 10**9)
+    frames = list(folder)
+    assert numbers(frames) == [8, 9, 10, 11, 12]
+    assert frames[0].timestamp_ns > 2 * OLD_S * 10**9
+
+
+def test_a_clip_is_read_when_it_has_come_and_not_before(tmp_path: Path):
+    clip(tmp_path / "1.avi", first=1)
+    whole = clip(tmp_path / "whole", first=5)
+    folder = ClipFolder(tmp_path, ReadFramesSettings(clips_wait_s=8.0))
+
+    def copy_slowly() -> None:
+        data = whole.read_bytes()
+        with (tmp_path / "2.avi").open("wb") as file:
+            for part in (data[: len(data) // 3], data[len(data) // 3 :]):
+                file.write(part)
+                file.flush()
+                time.sleep(1.0)
+
+    thread = threading.Thread(target=copy_slowly)
+    thread.start()
+    frames = list(itertools.islice(folder, 8))
+    thread.join()
+    folder.close()
+    assert numbers(frames) == [1, 2, 3, 4, 5, 6, 7, 8]
+    assert folder.warnings == []
+
+
+def test_closing_ends_the_wait_for_a_clip(tmp_path: Path):
+    clip(tmp_path / "1.avi", first=1)
+    folder = ClipFolder(tmp_path, ReadFramesSettings(clips_wait_s=1e9))
+    threading.Timer(0.5, folder.close).start()
+    assert len(list(folder)) == 4
+
+
+def test_a_folder_without_a_readable_clip_is_refused(tmp_path: Path):
+    (tmp_path / "1.avi").write_bytes(bytes(range(256)) * 40)
+    with pytest.raises(SourceError, match=r"1\.avi: expected a video"):
+        open_source(str(tmp_path), AT_ONCE)
+    clip(tmp_path / "2.avi", first=1)
+    shutil.copy2(tmp_path / "2.avi", tmp_path / "3.avi")
+    assert len(list(open_source(str(tmp_path), AT_ONCE))) >= 4

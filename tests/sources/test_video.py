@@ -1,0 +1,271 @@
+import itertools
+import wave
+from fractions import Fraction
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nodes.read_frames import ReadFrames
+from stream_dmr.errors import SourceError
+from stream_dmr.sources.open_source import open_source
+from stream_dmr.sources.picture_folder import nominal_ns
+from stream_dmr.sources.settings import ReadFramesSettings
+from stream_dmr.sources.video_file import container_ns
+
+SETTINGS = ReadFramesSettings()
+SECOND_NS = 10**9
+
+
+def noise(seed, *, size=(64, 48), dtype=np.uint8, channels=3):
+    """Noise, so that no codec makes a video too small to be cut in the middle."""
+    shape = (size[1], size[0], channels) if channels > 1 else (size[1], size[0])
+    return np.random.default_rng(seed).integers(0, np.iinfo(dtype).max, shape, dtype, endpoint=True)
+
+
+def write_video(path, *, codec="MJPG", fps=25.0, num_frames=12, size=(64, 48)):
+    # OpenCV's own writer keeps odd sizes; its FFmpeg writer makes them even.
+    is_odd = size[0] % 2 or size[1] % 2
+    backend = cv2.CAP_OPENCV_MJPEG if is_odd else cv2.CAP_FFMPEG
+    writer = cv2.VideoWriter(str(path), backend, cv2.VideoWriter_fourcc(*codec), fps, size)
+    assert writer.isOpened()
+    for seed in range(num_frames):
+        writer.write(noise(seed, size=size))
+    writer.release()
+    return path
+
+
+def cut(path, fraction=0.5):
+    data = path.read_bytes()
+    short = path.with_stem(path.stem + "_cut")
+    short.write_bytes(data[: int(len(data) * fraction)])
+    return short
+
+
+def read(source):
+    opened = open_source(str(source), SETTINGS)
+    return opened, list(opened)
+
+
+def refusal(source):
+    with pytest.raises(SourceError) as caught:
+        read(source)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "fps"),
+    [
+        ("a.mp4", "mp4v", Fraction(30)),
+        ("b.mp4", "mp4v", Fraction(24)),
+        ("c.avi", "MJPG", Fraction(25, 2)),
+        ("d.avi", "FFV1", Fraction(15)),
+    ],
+)
+def test_timestamps_of_a_constant_rate_are_exact(tmp_path, name, codec, fps):
+    opened, frames = read(write_video(tmp_path / name, codec=codec, fps=float(fps)))
+    assert [f.frame_index for f in frames] == list(range(1, 13))
+    assert [f.timestamp_ns for f in frames] == [round(k * SECOND_NS / fps) for k in range(12)]
+    assert (opened.num_frames, opened.width, opened.height) == (12, 64, 48)
+    assert opened.fps == pytest.approx(float(fps), rel=1e-4)
+    assert opened.warnings == []
+
+
+def test_matroska_keeps_its_whole_milliseconds(tmp_path):
+    _, frames = read(write_video(tmp_path / "a.mkv", fps=30.0))
+    assert [f.timestamp_ns for f in frames[:4]] == [0, 33_000_000, 67_000_000, 100_000_000]
+
+
+def test_lossless_pictures_come_back_in_order(tmp_path):
+    _, frames = read(write_video(tmp_path / "a.avi", codec="FFV1"))
+    for seed, frame in enumerate(frames):  # FFV1 stores YUV here, so colours are rounded
+        difference = cv2.absdiff(frame.image.mean(axis=2), noise(seed).mean(axis=2))
+        assert difference.mean() < 12
+        assert frame.source == "a.avi"
+
+
+def test_odd_sizes(tmp_path):
+    opened, frames = read(write_video(tmp_path / "odd.avi", size=(641, 359), num_frames=3))
+    assert (opened.width, opened.height) == (641, 359)
+    assert {f.image.shape for f in frames} == {(359, 641, 3)}
+
+
+def test_a_colon_in_a_relative_path_is_no_protocol(tmp_path, monkeypatch):
+    write_video(tmp_path / "rail:1.avi", num_frames=2)
+    monkeypatch.chdir(tmp_path)
+    assert len(read("rail:1.avi")[1]) == 2
+
+
+@pytest.mark.parametrize("name", ["a.avi", "a.mkv"])
+def test_what_decodes_of_a_cut_video_is_read_and_the_rest_reported(tmp_path, name):
+    whole = read(write_video(tmp_path / name))[1]
+    opened, frames = read(cut(tmp_path / name))
+    assert 3 <= len(frames) < 12
+    assert opened.warnings == [
+        f"{Path(name).stem}_cut{Path(name).suffix}: the file promises 12 frames, only "
+        f"{len(frames)} could be read; it seems cut off or damaged"
+    ]
+    for frame, original in zip(frames[:-1], whole, strict=False):
+        np.testing.assert_array_equal(frame.image, original.image)
+
+
+def test_stopping_early_is_no_damage(tmp_path):
+    reader = ReadFrames(str(write_video(tmp_path / "a.avi")), SETTINGS)
+    frames = []
+    for frame in reader:
+        frames.append(frame)
+        if len(frames) == 4:
+            reader.close()
+    assert len(frames) == 4
+    assert reader.source.warnings == []
+
+
+def test_refuses_what_is_no_video(tmp_path, capfd):
+    (tmp_path / "empty.mp4").touch()
+    (tmp_path / "noise.mp4").write_bytes(bytes(range(256)) * 40)
+    (tmp_path / "boxes.txt").write_text("1,1,576.0,530.3,54.7,197.0,1,1,1.0\n" * 50)
+    with wave.open(str(tmp_path / "sound.wav"), "wb") as sound:
+        sound.setparams((1, 2, 8000, 0, "NONE", ""))
+        sound.writeframes(bytes(16000))
+    (tmp_path / "huge.mp4").write_bytes(b"\0\0\0\1ftyp" + 8 * b"\xff")  # says a box of its size
+    write_video(tmp_path / "whole.mp4", codec="mp4v")
+    assert "empty file" in refusal(tmp_path / "empty.mp4")
+    assert "no picture in it can be decoded" in refusal(tmp_path / "noise.mp4")
+    assert "text file" in refusal(tmp_path / "boxes.txt")
+    assert "audio file" in refusal(tmp_path / "sound.wav")
+    assert "(moov)" in refusal(tmp_path / "huge.mp4")
+    assert "(moov)" in refusal(cut(tmp_path / "whole.mp4"))
+    assert "no such file" in refusal(tmp_path / "missing.mp4")
+    assert capfd.readouterr() == ("", "")  # neither OpenCV nor FFmpeg speaks
+
+
+def test_refuses_a_camera_and_a_stream_that_are_not_there():
+    assert refusal("97").startswith("camera 97: expected")
+    message = refusal("rtsp://mate:secret@127.0.0.1:9/rail")
+    assert message.startswith("rtsp://127.0.0.1:9/rail: expected")
+
+
+def stamps(milliseconds):
+    times = []
+    for frame_index, ms in enumerate(milliseconds, start=1):
+        previous = times[-1] if times else -1
+        times.append(container_ns(ms, frame_index=frame_index, fps=25.0, previous_ns=previous))
+    return times
+
+
+@pytest.mark.parametrize("missing", [0.0, float("nan")])
+def test_missing_timestamps_follow_the_frame_rate(missing):
+    assert stamps([missing] * 4) == [0, 40_000_000, 80_000_000, 120_000_000]
+
+
+def test_timestamps_that_stand_still_or_step_back_are_pushed_on_without_drift():
+    ms = [0.0, 40.0, 40.0, 35.0, 120.0]
+    assert stamps(ms) == [0, 40_000_000, 40_000_001, 40_000_002, 120_000_000]
+
+
+@given(st.lists(st.floats(), max_size=20))
+def test_timestamps_strictly_increase_whatever_the_container_says(milliseconds):
+    times = stamps(milliseconds)
+    assert all(a < b for a, b in itertools.pairwise([-1, *times]))
+
+
+@given(st.integers(0, 24 * 3600 * 90_000), st.sampled_from([90_000, 30_000, 12_800, 600, 25]))
+def test_timestamps_are_exact_for_a_day(ticks, time_base):
+    milliseconds = 1000.0 * (ticks * (1.0 / time_base))  # as OpenCV computes it
+    if ticks and ticks / time_base <= 86_400:
+        exact = Fraction(ticks * SECOND_NS, time_base)
+        assert abs(stamps([milliseconds])[0] - exact) <= Fraction(52, 100)
+
+
+@given(st.fractions(min_value=1, max_value=240, max_denominator=1001), st.integers(1, 10**6))
+def test_nominal_times_are_whole_periods(fps, frame_index):
+    exact = (frame_index - 1) * SECOND_NS / fps
+    assert abs(nominal_ns(frame_index, float(fps)) - exact) <= 1
+
+
+def test_pictures_in_natural_order(tmp_path):
+    for number in (10, 9, 1, 2):
+        cv2.imwrite(str(tmp_path / f"fish_{number}.png"), noise(number))
+    (tmp_path / "notes.txt").write_text("not a picture")
+    (tmp_path / "._fish_1.png").write_bytes(b"left behind by another system")
+    settings = ReadFramesSettings(images_fps=12.5)
+    opened = open_source(str(tmp_path), settings)
+    frames = list(opened)
+    assert [f.source for f in frames] == [f"fish_{n}.png" for n in (1, 2, 9, 10)]
+    assert [f.timestamp_ns for f in frames] == [0, 80_000_000, 160_000_000, 240_000_000]
+    assert (opened.num_frames, opened.fps, opened.name) == (4, 12.5, tmp_path.name)
+    for frame, number in zip(frames, (1, 2, 9, 10), strict=True):
+        np.testing.assert_array_equal(frame.image, noise(number))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".JPG"])
+def test_grey_pictures_become_three_equal_channels(tmp_path, suffix):
+    grey = noise(1, channels=1, size=(33, 21)) // 8 + 100
+    cv2.imwrite(str(tmp_path / f"1{suffix}"), grey)
+    _, [frame] = read(tmp_path)
+    assert frame.image.shape == (21, 33, 3)
+    assert frame.image.dtype == np.uint8
+    tolerance = 24 if suffix == ".JPG" else 0
+    assert np.abs(frame.image.astype(int) - grey[..., None].astype(int)).max() <= tolerance
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("suffix", [".png", ".tiff"])
+def test_16_bit_pictures_keep_their_brightness(tmp_path, channels, suffix):
+    eight = noise(2, channels=channels)
+    cv2.imwrite(str(tmp_path / f"1{suffix}"), eight.astype(np.uint16) * 257)
+    _, [frame] = read(tmp_path)
+    np.testing.assert_array_equal(frame.image, eight if channels == 3 else np.dstack([eight] * 3))
+
+
+def test_12_bits_in_16_are_not_read_as_night(tmp_path):
+    cv2.imwrite(str(tmp_path / "1.png"), np.zeros((20, 30), np.uint16))  # the lens cap is on
+    cv2.imwrite(str(tmp_path / "2.png"), np.full((20, 30), 4095, np.uint16))
+    cv2.imwrite(str(tmp_path / "3.png"), np.full((20, 30), 2048, np.uint16))
+    _, frames = read(tmp_path)
+    assert [int(f.image.max()) for f in frames] == [0, 255, 128]
+
+
+def test_a_picture_that_cannot_be_decoded_keeps_its_index(tmp_path):
+    for number in (1, 3):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), noise(number))
+    (tmp_path / "2.png").touch()
+    opened, frames = read(tmp_path)
+    assert [f.frame_index for f in frames] == [1, 3]
+    assert opened.warnings == ["2.png: can't be decoded, so was left out"]
+
+
+def test_pictures_of_two_sizes_are_refused_after_those_before(tmp_path):
+    cv2.imwrite(str(tmp_path / "1.png"), noise(1))
+    cv2.imwrite(str(tmp_path / "2.png"), noise(2, size=(32, 48)))
+    opened = iter(open_source(str(tmp_path), SETTINGS))
+    assert next(opened).frame_index == 1
+    with pytest.raises(SourceError, match=r"2\.png: expected 64x48 px.* got 32x48 px"):
+        next(opened)
+
+
+def test_refuses_folders_without_pictures(tmp_path):
+    assert "found none" in refusal(tmp_path)
+    (tmp_path / "1.png").write_bytes(b"no picture")
+    assert "none of its 1 can be decoded" in refusal(tmp_path)
+    (tmp_path / "1.png").rename(tmp_path / "1.mp4")
+    assert "1.mp4: expected a video" in refusal(tmp_path)
+
+
+def test_frames_cannot_be_written_to(tmp_path):
+    cv2.imwrite(str(tmp_path / "1.png"), noise(1))
+    [frame] = ReadFrames(str(tmp_path), SETTINGS)
+    with pytest.raises(ValueError, match="read-only"):
+        frame.image[0, 0] = 0
+
+
+@pytest.mark.scenes
+def test_a_real_clip_is_read_whole(real):
+    opened, frames = read(real / "trout" / "fish.mp4")
+    assert len(frames) == opened.num_frames == 668
+    assert opened.warnings == []
+    assert all(a.timestamp_ns < b.timestamp_ns for a, b in itertools.pairwise(frames))

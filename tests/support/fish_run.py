@@ -1,0 +1,34 @@
+"""A finished run over a tiny clip: what exports, reports and reviews start from."""
+
+import threading
+from pathlib import Path
+
+from stream_dmr.running.run import RunRequest, run
+from tests.support.tiny_clip import write_clip
+
+FISH = [[1], [1, 2], [1, 2], [1, 2], [1, 2], [2]]
+
+
+def request(clip: Path, out: Path, **other: object) -> RunRequest:
+    given: dict[str, object] = {
+        "source": str(clip / "video.mp4"),
+        "out": out,
+        "calibration": clip / "calibration.yaml",
+        "masks": clip / "masks",
+        "template": str(clip / "tiny.ply"),
+        "config": clip / "quick.toml",
+        "command": f"stream-dmr run --source {clip / 'video.mp4'}",
+    }
+    return RunRequest(**given | other)  # type: ignore[arg-type]
+
+
+def measure(folder: Path, **other: object) -> Path:
+    """Write a clip of two fish into `folder`, measure it into `folder`/out."""
+    clip = folder / "clip"
+    write_clip(clip, fish=FISH)
+    toml = clip / "tiny.toml"
+    toml.write_text(toml.read_text() + '[length]\ntail = "fork"\ntotal_per_fork = 1.05\n')
+    config = clip / "quick.toml"
+    config.write_text(config.read_text() + "\n[smooth_length]\nmax_std_ratio = 1e9\n")
+    run(request(clip, folder / "out", **other), stop=threading.Event())
+    return folder / "out"

@@ -1,0 +1,72 @@
+"""Kills a batch again and again, at random moments, and lets it go on each time.
+
+`python killed_batch.py MANIFEST CONFIG TEMPLATE OUT SEED`. Prints the times after which it was
+killed. A process of its own, which forks: a batch that starts from nothing takes seconds until
+there is something to kill.
+"""
+
+import json
+import os
+import random
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import stream_dmr.fitting.fitter
+from stream_dmr.batch.batch import batch
+from stream_dmr.batch.job import Outcome, do_job
+from stream_dmr.batch.manifest import Job, read_manifest
+from stream_dmr.batch.progress import Clock
+
+assert stream_dmr.fitting.fitter  # loaded here, once
+
+
+class ThisProcess:
+    """Measures one after the other, where a kill hits all there is."""
+
+    def outcomes(
+        self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, clock: Clock
+    ) -> Iterator[Outcome]:
+        for job in jobs:
+            yield do_job(job, out)
+
+
+def check(out: Path) -> None:
+    """Whatever has its name is whole."""
+    for folder in [*out.glob("videos/*"), *out.glob("pieces/*/*")]:
+        if folder.suffix != ".part":
+            assert json.loads((folder / "outcome.json").read_text())["status"] == "done", folder
+
+
+def main() -> None:
+    """Kill at moments that come later and later, until it gets through."""
+    manifest, config, template, out = (Path(word) for word in sys.argv[1:5])
+    moments = random.Random(int(sys.argv[5]))
+    jobs = read_manifest(manifest, config=config, template=str(template))
+    killed = list[float]()
+    while True:
+        child = os.fork()
+        if child == 0:
+            batch(jobs, out, ThisProcess(), piece_frames=5, stop=threading.Event())
+            os._exit(0)
+        patience_s = moments.uniform(0.0, 1.0 + 1.0 * len(killed))
+        until = time.monotonic() + patience_s
+        while os.waitpid(child, os.WNOHANG) == (0, 0):
+            if time.monotonic() > until:
+                os.kill(child, signal.SIGKILL)
+                os.waitpid(child, 0)
+                killed.append(patience_s)
+                check(out)
+                break
+            time.sleep(0.001)
+        else:
+            break
+    check(out)
+    print(len(killed), "kills, after", " ".join(f"{one:.2f}" for one in killed), "s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,23 @@
+"""Recordings as tests read them."""
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+from stream_dmr.messages import Message
+from stream_dmr.recording.messages.codec import decode
+from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.topics import TOPICS
+from stream_dmr.recording.reading.reader import open_recordings
+
+
+def read_header(path: Path) -> RunHeader:
+    return open_recordings([path]).header
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    return open_recordings([path]).metadata
+
+
+def read_messages(path: Path, kinds: Collection[type[Message]] = TOPICS) -> Iterator[Message]:
+    for kind, payload in open_recordings([path]).payloads(kinds):
+        yield decode(kind, payload)
