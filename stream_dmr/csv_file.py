@@ -6,8 +6,7 @@ import os
 from pathlib import Path
 
 from stream_dmr.errors import OutputError
-from stream_dmr.files import WholeFile
-from stream_dmr.sources.picture_folder import natural_order
+from stream_dmr.files import WholeFile, natural_order
 
 _BLOCK_BYTES = 1 << 16
 

@@ -1,6 +1,7 @@
-"""A file in which every write happens completely or not at all."""
+"""Files: whole writes, names that survive a power loss, and the order of numbered ones."""
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -103,3 +104,9 @@ def make_folder(path: Path) -> Path:
     with writing_to(path):
         path.mkdir(parents=True, exist_ok=True)
     return path
+
+
+def natural_order(path: Path) -> tuple[list[str | int], str]:
+    """A sorting key by which `2.png` comes before `10.png`."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name

@@ -14,79 +14,92 @@ from nodes.fit_mesh import FitMesh
 from nodes.localize import Localize
 from nodes.read_frames import ReadFrames
 from nodes.smooth_length import SmoothLength
-from stream_dmr.pipeline import Node
+from stream_dmr.running.pipeline import Node
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted([*(ROOT / "stream_dmr").rglob("*.py"), *(ROOT / "nodes").rglob("*.py")])
 NODES = [CropFish, FitMesh, Localize, SmoothLength]
-# Who assembles and shows a run; everything else is the library, and knows no nodes.
-ASSEMBLY = [
-    "stream_dmr.run",
-    "stream_dmr.run_inputs",
-    "stream_dmr.scout",
-    "stream_dmr.display",
+# From the top down, as in the design: a module belongs to the room with the longest name that it
+# begins with, and imports from its own room and those below.
+ROOMS = [
     "stream_dmr.cli",
-    "stream_dmr.demo",
-    "stream_dmr.replay.replay",
+    "stream_dmr.review",
+    "stream_dmr.report",
+    "stream_dmr.batch",
+    "stream_dmr.replay",
+    "stream_dmr.watch",
+    "stream_dmr.web",
+    "stream_dmr.running",
+    "nodes",
+    "stream_dmr.results",
+    "stream_dmr.recording.recorder",
+    "stream_dmr.recording.segments",
+    "stream_dmr.recording.files",
+    "stream_dmr.recording.foxglove",
+    "stream_dmr.recording.reading",
+    "stream_dmr.recording.rerun",
+    "stream_dmr.recording.mcap",
+    "stream_dmr.recording.messages",
+    "stream_dmr.recording.settings",
+    "stream_dmr.recording",
+    "stream_dmr.lengths",
+    "stream_dmr.localization",
+    "stream_dmr.fitting.shape",
+    "stream_dmr.fitting.compile_kernels",
+    "stream_dmr.fitting.tracks",
+    "stream_dmr.fitting.fitter",
+    "stream_dmr.fitting.cold_start",
+    "stream_dmr.fitting.warm_start",
+    "stream_dmr.fitting.uncertainty",
+    "stream_dmr.fitting.size",
+    "stream_dmr.fitting.paper",
+    "stream_dmr.fitting.contour",
+    "stream_dmr.fitting.solver",
+    "stream_dmr.fitting.target",
+    "stream_dmr.fitting.distance_map",
+    "stream_dmr.fitting.heading",
+    "stream_dmr.fitting.settings",
+    "stream_dmr.fitting.mesh_levels",
+    "stream_dmr.fitting.body",
+    "stream_dmr.fitting",
+    "stream_dmr.segmentation.training",
+    "stream_dmr.segmentation.tracking",
+    "stream_dmr.segmentation.masks",
+    "stream_dmr.segmentation.annotations",
+    "stream_dmr.segmentation.detection",
+    "stream_dmr.segmentation.network",
+    "stream_dmr.segmentation.segmenter",
+    "stream_dmr.segmentation",
+    "stream_dmr.simulation",
+    "stream_dmr.evaluation",
+    "stream_dmr.template",
+    "stream_dmr.calibration",
+    "stream_dmr.sources",
+    "stream_dmr.csv_file",
+    "stream_dmr.files",
+    "stream_dmr.compiled",
+    "stream_dmr.messages",
+    "stream_dmr.camera",
+    "stream_dmr.geometry",
+    "stream_dmr.settings",
+    "stream_dmr.errors",
+    "stream_dmr",
 ]
-# From the ground floor up; a module imports from its own floor and those below.
-FLOORS = [
-    ["stream_dmr", "stream_dmr.errors", "stream_dmr.settings", "stream_dmr.geometry"],
-    ["stream_dmr.camera"],
-    ["stream_dmr.messages"],
-    ["*"],  # the rooms of the library
-    ["stream_dmr.config", "stream_dmr.pipeline"],
-    ["nodes"],
-    [f"stream_dmr.watch.{name}" for name in ("state", "metrics", "picture", "server", "watch")],
-    ["stream_dmr.run_inputs"],
-    ["stream_dmr.run_outputs"],
-    ["stream_dmr.run", *(f"stream_dmr.report.{name}" for name in ("gathered", "page", "report"))],
-    ["stream_dmr.scout"],
-    ["stream_dmr.batch.dataset", "stream_dmr.batch.job"],
-    [f"stream_dmr.batch.{name}" for name in ("worker", "local", "ray_engine")],
-    ["stream_dmr.batch.pieces", "stream_dmr.batch.stitch"],
-    ["stream_dmr.batch.video"],
-    ["stream_dmr.batch.batch"],
-    [f"stream_dmr.review.{name}" for name in ("corrected", "judge", "server")],
-    ["stream_dmr.replay.replay"],
-    ["stream_dmr.display"],
-    [
-        f"stream_dmr.cli_{name}"
-        for name in ("run", "replay", "evaluate", "train", "learn", "export", "report", "batch")
-    ],
-    ["stream_dmr.cli"],
-    ["stream_dmr.demo"],
-]
+WITHOUT_MODULES = ["stream_dmr.recording", "stream_dmr.fitting", "stream_dmr.segmentation"]
 WHO_KNOWS = {
     "av": ["stream_dmr.recording"],
     "mcap": ["stream_dmr.recording"],
     "rerun": ["stream_dmr.recording"],
     "foxglove": ["stream_dmr.recording"],
     "google": ["stream_dmr.recording"],  # protobuf
-    "torch": [
-        "stream_dmr.segmentation",
-        "stream_dmr.fitting",
-        *(
-            f"stream_dmr.{name}"
-            for name in ("template", "skinning", "silhouette", "losses", "body")
-        ),
-    ],
+    "torch": ["stream_dmr.segmentation", "stream_dmr.fitting.paper"],
     "prometheus_client": ["stream_dmr.watch"],
-    "sqlite3": [
-        *("stream_dmr.store", "stream_dmr.store_rows", "stream_dmr.store_schema"),
-        *("stream_dmr.results", "stream_dmr.verdicts"),
-    ],
-    "filterpy": ["stream_dmr.length_filter", "stream_dmr.segmentation"],
-    "onnxruntime": ["stream_dmr.segmentation"],
-    "ray": ["stream_dmr.batch.ray_engine"],
-    "nodes": [*ASSEMBLY, "nodes"],
-    "typer": [
-        *("stream_dmr.cli", "stream_dmr.cli_calibrate", "stream_dmr.cli_export"),
-        *("stream_dmr.cli_evaluate", "stream_dmr.cli_support", "stream_dmr.cli_train"),
-        *("stream_dmr.cli_replay", "stream_dmr.cli_view", "stream_dmr.demo"),
-        *("stream_dmr.cli_recover", "stream_dmr.cli_learn"),
-        *("stream_dmr.cli_report", "stream_dmr.cli_batch", "stream_dmr.cli_run"),
-    ],
+    "sqlite3": ["stream_dmr.results"],
+    "filterpy": ["stream_dmr.lengths", "stream_dmr.segmentation"],
+    "onnxruntime": ["stream_dmr.segmentation.detection"],
+    "ray": ["stream_dmr.batch"],
+    "nodes": ["stream_dmr.running", "stream_dmr.replay", "stream_dmr.batch", "nodes"],
+    "typer": ["stream_dmr.cli"],
 }
 
 
@@ -118,11 +131,18 @@ def is_inside(module: str, rooms: list[str]) -> bool:
     return any(module == room or module.startswith(f"{room}.") for room in rooms)
 
 
-def floor_of(module: str) -> int:
-    for floor, rooms in enumerate(FLOORS):
-        if module in rooms or ("nodes" in rooms and is_inside(module, ["nodes"])):
-            return floor
-    return FLOORS.index(["*"])
+def room_of(module: str) -> str:
+    rooms = [room for room in ROOMS if is_inside(module, [room])]
+    room = max(rooms, key=len)
+    assert room == module or room != "stream_dmr", f"{module} belongs to no room"
+    return room
+
+
+def test_every_module_belongs_to_a_room():
+    with_modules = {room_of(module) for module in MODULES}
+    assert with_modules == set(ROOMS)
+    for package in WITHOUT_MODULES:
+        assert [module for module in MODULES if room_of(module) == package] == [package]
 
 
 @pytest.mark.parametrize("library", WHO_KNOWS)
@@ -141,7 +161,8 @@ def test_imports_point_downwards():
         (module_of(path), name)
         for path in FILES
         for name in imports(path)
-        if is_inside(name, ["stream_dmr", "nodes"]) and floor_of(name) > floor_of(module_of(path))
+        if is_inside(name, ["stream_dmr", "nodes"])
+        and ROOMS.index(room_of(name)) < ROOMS.index(room_of(module_of(path)))
     ]
     assert not upwards
 

@@ -54,7 +54,7 @@ def main() -> None:
 
 def measure(folder: Path, address: str, steps_ns: list[int]) -> list[str]:
     """A run with the clock off by each of these for some seconds; what was said of the clock."""
-    from stream_dmr.running.result_writer import Observer
+    from stream_dmr.running.observer import Observer
     from stream_dmr.running.run import RunRequest, run
 
     library, stop, has_begun = ctypes.CDLL(None), threading.Event(), threading.Event()

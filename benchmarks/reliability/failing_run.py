@@ -16,7 +16,7 @@ from small_scene import write_crossing_fish, write_small_scene
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import Frame
 from stream_dmr.recording.segments.recover import recover
-from stream_dmr.running.result_writer import Observer
+from stream_dmr.running.observer import Observer
 from stream_dmr.running.run import RunRequest, run
 
 _FPS = 5  # of capture time: a new segment is tried again 5 s after one that failed

@@ -11,8 +11,9 @@ from small_scene import write_small_scene
 from soak import metrics_of
 
 from stream_dmr.messages import LocalizedFish, Message
-from stream_dmr.running.result_writer import Observer
+from stream_dmr.running.observer import Observer
 from stream_dmr.running.run import RunRequest, RunSummary, run
+from stream_dmr.watch.watch import Watch
 
 _TIMES = 3
 
@@ -95,4 +96,4 @@ def measured(
         template=str(scene / "species.ply"),
         config=folder / "config.toml",
     )
-    return run(request, stop=stop or threading.Event(), observer=observer)
+    return run(request, stop=stop or threading.Event(), observer=Watch(observer))

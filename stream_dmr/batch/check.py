@@ -17,9 +17,15 @@ from stream_dmr.batch.places import (
 )
 from stream_dmr.errors import OutputError
 from stream_dmr.results.provenance import sha256_of
+from stream_dmr.results.verify import Change, verify
 
 Finding = tuple[Path, str]  # a file, and what is wrong with it
 _OF_OUTCOME = ("status", "reason", "num_frames", "num_fish", "elapsed_s")
+
+
+def verify_all(folder: Path) -> tuple[list[Change], int]:
+    """`verify` of runs, exports and batches."""
+    return verify(folder, {VIDEOS: check_batch})
 
 
 def check_batch(out: Path) -> Iterator[Finding]:

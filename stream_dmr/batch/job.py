@@ -10,15 +10,16 @@ from pathlib import Path
 
 from stream_dmr.batch.dataset import write_tables
 from stream_dmr.batch.manifest import Job
-from stream_dmr.batch.only import Only
 from stream_dmr.batch.places import DONE, FAILED, OUTCOME, VIDEO_FOLDERS
 from stream_dmr.batch.progress import Progress
 from stream_dmr.batch.scout import SIGHTINGS, scout
 from stream_dmr.errors import UserError
 from stream_dmr.files import rename_durably
 from stream_dmr.results.provenance import add_files
-from stream_dmr.running.result_writer import Observer
+from stream_dmr.running.observer import Observer
+from stream_dmr.running.only import Only
 from stream_dmr.running.run import RunRequest, run
+from stream_dmr.watch.watch import Watch
 
 SCOUT = "scout"  # the piece of a raw video that finds out where its fish are
 
@@ -95,7 +96,7 @@ def _work(job: Job, part: Path, observer: Observer) -> tuple[int, int]:
     if job.piece == SCOUT:
         part.mkdir()
         return scout(request, part / SIGHTINGS, observer=observer), 0
-    summary = run(request, stop=threading.Event(), observer=observer)
+    summary = run(request, stop=threading.Event(), observer=Watch(observer))
     if not job.piece:  # tables are for whole videos
         write_tables(part, job)
     return summary.num_frames, len(summary.fish)

@@ -21,9 +21,9 @@ from stream_dmr.batch.job import SCOUT, folder_of, outcome_of
 from stream_dmr.batch.manifest import Job
 from stream_dmr.batch.places import DONE
 from stream_dmr.batch.scout import SIGHTINGS
-from stream_dmr.batch.sightings import read_sightings
 from stream_dmr.errors import UserError
 from stream_dmr.running.config import load_config
+from stream_dmr.running.sightings import read_sightings
 from stream_dmr.segmentation.annotations.boxes import UNKNOWN_ID
 from stream_dmr.segmentation.annotations.files import load_boxes
 from stream_dmr.sources.open_source import open_source

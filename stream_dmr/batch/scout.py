@@ -4,9 +4,9 @@ from contextlib import closing
 from pathlib import Path
 
 from nodes.crop_fish import CropFish
-from stream_dmr.batch.sightings import Scout, write_sightings
 from stream_dmr.running.inputs import RunRequest, checked_inputs
-from stream_dmr.running.result_writer import Observer
+from stream_dmr.running.observer import Observer
+from stream_dmr.running.sightings import Scout, write_sightings
 from stream_dmr.segmentation.tracking.tracked_fish import FollowedFish
 
 SIGHTINGS = "sightings.csv"

@@ -12,7 +12,8 @@ from rich.table import Table
 from stream_dmr.evaluation.compare import Distributions, Evaluation, distribution_rows, summary_rows
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.replay.replay import ReplaySummary
-from stream_dmr.running.run import Observer, RunSummary
+from stream_dmr.running.observer import Observer
+from stream_dmr.running.run import RunSummary
 
 _LINE_EVERY_S = 10.0  # where there is no terminal to draw a bar on
 _PLAIN_WIDTH = 120

@@ -28,9 +28,11 @@ def learn_template(
     """
     from rich.progress import Progress
 
+    from stream_dmr.camera import Calibration
     from stream_dmr.errors import OutputError
     from stream_dmr.fitting.shape.learn import ROUNDS, learn, well_seen
-    from stream_dmr.messages import FishCrop
+    from stream_dmr.localization.localize import localize
+    from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
     from stream_dmr.recording.reading.reader import messages, open_recordings
     from stream_dmr.running.config import load_config, parse_config
     from stream_dmr.template.template import load_template, save_template
@@ -52,9 +54,13 @@ def learn_template(
         )
         for one in opened
     ]
+
+    def localized(mesh: FittedMesh, calibration: Calibration | None) -> LocalizedFish:
+        return localize(mesh, settings=settings.localize, calibration=calibration)
+
     with Progress(transient=True) as progress:
         reading = progress.add_task("looking for fish that are seen well", total=None)
-        samples = well_seen(crops, base, settings.fit_mesh, settings.localize)
+        samples = well_seen(crops, base, settings.fit_mesh, localized)
         progress.remove_task(reading)
         task = progress.add_task("learning", total=ROUNDS)
         learnt = learn(

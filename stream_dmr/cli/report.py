@@ -22,9 +22,9 @@ def verify(
     folder: Annotated[Path, typer.Argument(help="The --out of runs or of exports.", metavar="DIR")],
 ) -> None:
     """Check that results are still what their run measured; exit 1 and say what was changed."""
-    from stream_dmr.results.verify import verify as verify_results
+    from stream_dmr.batch.check import verify_all
 
-    changes, num_files = verify_results(folder)
+    changes, num_files = verify_all(folder)
     for change in changes:
         print(f"{change.path}: {change.what}")
     if changes:

@@ -76,6 +76,7 @@ def run(
         from stream_dmr.running.run import RunRequest
         from stream_dmr.running.run import run as measure
         from stream_dmr.watch.journal import Journal
+        from stream_dmr.watch.watch import Watch
 
         request = RunRequest(
             source=source,
@@ -94,7 +95,7 @@ def run(
             haul=haul,
         )
         with nullcontext(Journal()) if log_json else RunDisplay() as observer:
-            summary = measure(request, stop=stop, observer=observer)
+            summary = measure(request, stop=stop, observer=Watch(observer))
         _print_summary(summary, request.out, timings=timings)
     if stop.signal_number:
         print(f"stopped by {signal.Signals(stop.signal_number).name}", file=sys.stderr)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from stream_dmr.recording.reading.selection import Part
+    from stream_dmr.recording.messages.selection import Part
 
 TemplateOption = Annotated[
     str, typer.Option(help="The species: halibut, cod, or a mesh with its TOML beside it.")
@@ -48,7 +48,7 @@ def warn(lines: Iterable[str]) -> None:
 
 def parse_part(time: str | None, track: list[int] | None) -> "Part":
     """The part of a recording that --time and --track ask for."""
-    from stream_dmr.recording.reading.selection import Part
+    from stream_dmr.recording.messages.selection import Part
 
     time_s = None if time is None else _parse_time(time)
     return Part.of_seconds(time_s, frozenset(track) if track else None)

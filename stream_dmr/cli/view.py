@@ -13,7 +13,7 @@ import typer
 from stream_dmr.cli.support import TimeOption, TrackOption, parse_part, warn
 
 if TYPE_CHECKING:
-    from stream_dmr.recording.reading.selection import Part
+    from stream_dmr.recording.messages.selection import Part
 
 _Source = Annotated[
     str | None,

@@ -77,7 +77,7 @@ def open_files(
 def _extras(header: RunHeader, settings: RecordingSettings) -> Iterator[ExtraTopics]:
     if settings.foxglove:
         with _needs("foxglove", "foxglove = true"):
-            from stream_dmr.recording.messages.foxglove import FoxgloveView
+            from stream_dmr.recording.foxglove import FoxgloveView
         yield FoxgloveView(header, settings)
     if settings.frames == "h264":
         with _needs("h264", 'frames = "h264"'):

@@ -1,6 +1,6 @@
 """Records a run: every message of every stage, to every sink."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -16,14 +16,13 @@ from stream_dmr.recording.messages.header import RunHeader
 from stream_dmr.recording.messages.record import Record, make_record
 from stream_dmr.recording.rerun.live import LiveView
 from stream_dmr.recording.settings import RecordingSettings
-from stream_dmr.results.tables import Tables
 
 _QUEUE_MESSAGES = 64  # some 6 frames; where the disk can't keep up, the run waits: nothing is lost
 _SHORTEST_PAUSE_S = 0.05
 
 
 class Recorder:
-    """Writes recording.mcap and .rrd, or segments of them, and the tables, into one folder.
+    """Writes recording.mcap and .rrd, or segments of them, into one folder.
 
     A thread of its own encodes and writes, so that measuring waits for no disk. Thread-safe; the
     messages of one stage must come in their order. Raises OutputError where the folder can't be
@@ -37,13 +36,14 @@ class Recorder:
         settings: RecordingSettings,
         *,
         live: bool = False,
-        resume: bool = False,
+        sinks: Sequence[Sink] = (),
         files: OpenSinks = open_files,
         on_refusal: Callable[[str], None] | None = None,
         in_one_thread: bool = False,
     ) -> None:
-        """With `live`, the view is served as well, at `live_address`; `resume` keeps the tables.
+        """With `live`, the view is served as well, at `live_address`.
 
+        Each of `sinks` gets every record as well, before the recording does, and is closed with it.
         `files` opens those of the recording: `open_files` or, for a run without an end,
         `open_segments`. With `on_refusal`, that is told what the disk refuses, instead of an
         exception, and each sink is tried again with what follows: measuring goes on. With
@@ -52,18 +52,16 @@ class Recorder:
         self.live_address: str | None = None
         self._on_refusal = on_refusal
         self._settings = settings
-        self._sinks: list[Sink] = []
+        self._sinks: list[Sink] = [*sinks]
         self._refused: list[Sink] = []
         self._failure: BaseException | None = None
         self._lock = Lock()
         self._queue: Queue[Record | None] = Queue(_QUEUE_MESSAGES)
         self._thread = Thread(target=self._write_all, name="recorder", daemon=True)
         self._in_one_thread, self._is_open = in_one_thread, True
-        make_folder(out_dir)
         with ExitStack() as undo:
             undo.callback(self._close_sinks)
-            is_endless = on_refusal is not None
-            self._sinks.append(Tables(out_dir, resume=resume, is_endless=is_endless))
+            make_folder(out_dir)
             self._sinks += files(out_dir, header, settings)
             if live:
                 self._sinks.append(view := LiveView(header, settings))

@@ -5,9 +5,9 @@ from collections.abc import Iterator, Sequence
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LocalizedFish, Message
 from stream_dmr.recording.messages.codec import decode
+from stream_dmr.recording.messages.selection import WHOLE, Part
 from stream_dmr.recording.reading.frame_images import RecordedPictures, Restorer, is_as_seen
 from stream_dmr.recording.reading.reader import Recording, messages
-from stream_dmr.recording.reading.selection import WHOLE, Part
 
 
 class Tape:

@@ -14,16 +14,18 @@ from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.selection import WHOLE, Part
 from stream_dmr.recording.reading.frame_images import SourcePictures
 from stream_dmr.recording.reading.reader import Recording, open_recordings
-from stream_dmr.recording.reading.selection import WHOLE, Part
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.replay.comparator import Judge, Mismatch, Scribe
 from stream_dmr.replay.recorded_messages import Playback, Tape
+from stream_dmr.results.tables import Tables
 from stream_dmr.running.config import Config, load_config, parse_config, to_toml
 from stream_dmr.running.folder import prepare_folder
+from stream_dmr.running.observer import Observer
 from stream_dmr.running.pipeline import Node, StageCounters, run_chain
-from stream_dmr.running.run import Observer, later_nodes, resume
+from stream_dmr.running.run import later_nodes, resume
 from stream_dmr.segmentation.tracking.fish_finder import open_finder
 from stream_dmr.template.template import Template, load_template
 
@@ -95,7 +97,13 @@ def replay(
             prepare_folder(request.out, overwrite=request.overwrite)
             header = _header(request, recording.header, config, template, calibration)
             recorder = stack.enter_context(
-                Recorder(request.out, header, config.recording, in_one_thread=is_light)
+                Recorder(
+                    request.out,
+                    header,
+                    config.recording,
+                    sinks=[Tables(request.out)],
+                    in_one_thread=is_light,
+                )
             )
         judge = None
         if request.check:

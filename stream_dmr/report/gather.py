@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate, LocalizedFish
 from stream_dmr.recording.messages.codec import decode
+from stream_dmr.recording.messages.selection import WHOLE, Part
 from stream_dmr.recording.reading.reader import Recording, messages
-from stream_dmr.recording.reading.selection import WHOLE, Part
 from stream_dmr.recording.rerun.meshes import Meshes
 
 Key = tuple[int, int]  # frame index, track id

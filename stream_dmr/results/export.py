@@ -15,10 +15,10 @@ from stream_dmr.errors import OutputError
 from stream_dmr.files import make_folder, writing_to
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.recording.messages.codec import reference
+from stream_dmr.recording.messages.pictures import Picture
 from stream_dmr.recording.messages.record import make_record
-from stream_dmr.recording.reading.pictures import Picture
+from stream_dmr.recording.messages.selection import WHOLE, Part
 from stream_dmr.recording.reading.reader import messages, open_recordings
-from stream_dmr.recording.reading.selection import WHOLE, Part
 from stream_dmr.recording.rerun.meshes import Meshes
 from stream_dmr.recording.rerun.view_geometry import place
 from stream_dmr.recording.settings import RecordingSettings
@@ -26,8 +26,8 @@ from stream_dmr.results.finished_fish import database_of, read_fish, read_runs
 from stream_dmr.results.fish_table import fish_record, write_csv, write_parquet
 from stream_dmr.results.fisheries import FisheriesSettings
 from stream_dmr.results.provenance import read_origin, seal_files
+from stream_dmr.results.run_facts import run_facts
 from stream_dmr.results.tables import Tables
-from stream_dmr.running.result_writer import run_facts
 
 MeshFormat = Literal["ply", "glb"]
 TableFormat = Literal["csv", "parquet"]

@@ -10,13 +10,13 @@ from pathlib import Path
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate
+from stream_dmr.recording.messages.selection import WHOLE, Part
 from stream_dmr.recording.reading.reader import Recording, messages
-from stream_dmr.recording.reading.selection import WHOLE, Part
+from stream_dmr.results.run_facts import run_facts
 from stream_dmr.results.store import NAME, RunFacts
 from stream_dmr.results.store_rows import read_estimates
 from stream_dmr.results.store_schema import open_database
 from stream_dmr.results.verdicts import NOTHING_SAID, Review, read_verdicts, reviews
-from stream_dmr.running.result_writer import run_facts
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -7,18 +7,17 @@ keep a copy of provenance.json elsewhere.
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from stream_dmr.batch.check import check_batch
-from stream_dmr.batch.places import VIDEOS
 from stream_dmr.csv_file import set_aside
 from stream_dmr.errors import OutputError, RecordingError, UserError
 from stream_dmr.messages import LengthEstimate, LocalizedFish
+from stream_dmr.recording.messages.selection import WHOLE
 from stream_dmr.recording.reading.reader import messages, open_recordings
-from stream_dmr.recording.reading.selection import WHOLE
 from stream_dmr.results.finished_fish import (
     FishResult,
     database_of,
@@ -28,17 +27,21 @@ from stream_dmr.results.finished_fish import (
 )
 from stream_dmr.results.provenance import NAME as PROVENANCE
 from stream_dmr.results.provenance import lines_sha256, read_provenance, sha256_of, verdicts_sum
+from stream_dmr.results.run_facts import run_facts
 from stream_dmr.results.store import NAME as DATABASE
 from stream_dmr.results.store import RunFacts
 from stream_dmr.results.tables import FRAMES_COLUMNS, LENGTHS_COLUMNS, frames_row, lengths_row
 from stream_dmr.results.verdicts import Verdict, read_verdicts
-from stream_dmr.running.result_writer import run_facts
 
 _MADE_BY = ("config_sha256", "calibration_sha256", "template_sha256")
 _COMPARED = (
     *("length_mm", "length_std_mm", "frames_seen", "frames_used", "first_frame", "last_frame"),
     *("first_timestamp_ns", "last_timestamp_ns", "status"),
 )
+
+
+Checks = Mapping[str, Callable[[Path], Iterable[tuple[Path, str]]]]
+"""By the file that a folder has: what is found there, each with the file that it concerns."""
 
 
 class Change(NamedTuple):
@@ -48,12 +51,13 @@ class Change(NamedTuple):
     what: str
 
 
-def verify(folder: Path) -> tuple[list[Change], int]:
+def verify(folder: Path, others: Checks = MappingProxyType({})) -> tuple[list[Change], int]:
     """Check a folder of results or exports and those in it; what was changed, and files checked.
 
-    Raises UserError where there is nothing to check.
+    `others` are checks of folders that hold a file of that name. Raises UserError where there is
+    nothing to check.
     """
-    marks = (DATABASE, PROVENANCE, VIDEOS)
+    marks = (DATABASE, PROVENANCE, *others)
     places = {path.parent for name in marks for path in folder.rglob(name)}
     if not places:
         raise UserError(
@@ -62,16 +66,17 @@ def verify(folder: Path) -> tuple[list[Change], int]:
         )
     changes, num_files = list[Change](), 0
     for place in sorted(places):
-        changes += dict.fromkeys(_changes(place))
+        changes += dict.fromkeys(_changes(place, others))
         num_files += sum(1 for path in place.iterdir() if path.is_file())
         num_files += sum(1 for _ in place.glob("dataset/*/*/*/*.parquet"))
     return changes, num_files
 
 
-def _changes(folder: Path) -> Iterator[Change]:
+def _changes(folder: Path, others: Checks) -> Iterator[Change]:
     yield from _against_provenance(folder)
-    if (folder / VIDEOS).is_file():
-        yield from (Change(*finding) for finding in check_batch(folder))
+    for name, check in others.items():
+        if (folder / name).is_file():
+            yield from (Change(*finding) for finding in check(folder))
     database = database_of(folder)
     if database is None:
         return

@@ -20,14 +20,13 @@ from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.localization.localize import LocalizeSettings
 from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.results.fisheries import FisheriesSettings
-from stream_dmr.running.drift import DriftSettings
+from stream_dmr.running.settings import DriftSettings, WatchSettings
 from stream_dmr.segmentation.detection.detectors import DetectFishSettings
 from stream_dmr.segmentation.masks.crop import CropFishSettings
 from stream_dmr.segmentation.tracking.tracked_fish import TrackFishSettings
 from stream_dmr.segmentation.training.settings import TrainSettings
 from stream_dmr.settings import Settings
 from stream_dmr.sources.settings import ReadFramesSettings
-from stream_dmr.watch.settings import WatchSettings
 
 _HEADER = """\
 # Every knob of stream-dmr with its default. Keep only the lines that you change, if you like;

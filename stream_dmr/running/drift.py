@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
-from pydantic import Field
 from scipy.stats import mannwhitneyu
 
-from stream_dmr.settings import Settings
+from stream_dmr.running.settings import DriftSettings
 
 _LONGEST_PX = 480  # of the pictures that are compared
 _SAMPLES = 9  # pictures of which the median is taken: fish and waves are in few of them
@@ -23,27 +22,6 @@ _NIGHT_LEVELS = 8.0  # mean brightness below which edges are too dark to tell
 _RECOGNISED = 0.3  # correlation of the edges once they lie on each other, 1 for equal ones
 _BLUR_PX = 1.5  # before that: half a pixel aside must not matter
 _IN_A_ROW = 3  # comparisons that must agree before an alarm, and before its end
-
-
-class DriftSettings(Settings):
-    """`[drift]`: alarms of a run without an end; lengths measured since are marked."""
-
-    sample_s: float = Field(
-        default=5.0, gt=0, le=3600, description="between two pictures of the scene, s"
-    )
-    shift_px: float = Field(
-        default=3.0, gt=0, description="the rail this far off its place is an alarm, frame px"
-    )
-    sharpness: float = Field(
-        default=0.5, gt=0, lt=1, description="edges this much weaker than once are an alarm, ratio"
-    )
-    reference_fish: int = Field(
-        default=50, ge=10, description="the first fish, by whose fits later ones are judged"
-    )
-    recent_fish: int = Field(default=30, ge=10, description="the latest fish, which are judged")
-    worse_iou: float = Field(
-        default=0.01, gt=0, lt=1, description="a median IoU lower by this is an alarm, if no chance"
-    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -8,7 +8,8 @@ from stream_dmr.recording.reading.reader import open_recordings
 from stream_dmr.recording.segments.open_tracks import unfinished
 from stream_dmr.recording.segments.recover import Repair
 from stream_dmr.results.store import LengthStore
-from stream_dmr.running.drift import DriftSettings, FitWatch, SceneWatch, decode_scene, encode_scene
+from stream_dmr.running.drift import FitWatch, SceneWatch, decode_scene, encode_scene
+from stream_dmr.running.settings import DriftSettings
 from stream_dmr.sources.clip_folder import ClipFolder
 from stream_dmr.sources.live import LiveStream
 from stream_dmr.sources.open_source import Source

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nodes.read_frames import ReadFrames
-from stream_dmr.batch.only import Only, OnlyFish, OnlyFrames
-from stream_dmr.batch.sightings import SightedFish
 from stream_dmr.calibration.file import load_calibration, require_size
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
 from stream_dmr.recording.messages.header import RunHeader
 from stream_dmr.running.config import Config, load_config, to_toml
+from stream_dmr.running.only import Only, OnlyFish, OnlyFrames
+from stream_dmr.running.sightings import SightedFish
 from stream_dmr.segmentation.tracking.fish_finder import FishFinder, open_finder
 from stream_dmr.sources.open_source import Source
 from stream_dmr.template.template import Template, load_template

@@ -13,12 +13,13 @@ from stream_dmr.recording.segments.recover import Repair
 from stream_dmr.recording.segments.retention import Retention
 from stream_dmr.recording.segments.segments import open_segments
 from stream_dmr.results.provenance import sealed
+from stream_dmr.results.run_facts import run_facts
 from stream_dmr.results.store import LengthStore, flagged_fish
+from stream_dmr.results.tables import Tables
 from stream_dmr.running.error_policy import left_open
 from stream_dmr.running.folder import consistent_csv, prepare_folder
 from stream_dmr.running.inputs import Inputs
-from stream_dmr.running.result_writer import Observer, run_facts
-from stream_dmr.watch.watch import Watch
+from stream_dmr.running.observer import Observer, OpenRun
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +27,6 @@ class Outputs:
     """Where a run writes to."""
 
     store: LengthStore
-    watch: Watch
     recorder: Recorder
     repairs: Sequence[Repair]
     left: Sequence[LocalizedFish]  # of fish that were in view when an earlier run was broken off
@@ -64,28 +64,21 @@ def open_outputs(inputs: Inputs, observer: Observer) -> Iterator[Outputs]:
                 on_refusal=observer.warn if is_endless else None,
             )
         )
-        watch = Watch(
-            observer,
-            config.watch,
-            source=inputs.source,
-            store=store,
-            out_dir=out,
-            silence_s=config.read_frames.silence_s,
-        )
-        stack.enter_context(closing(watch))
-        left = left_open(repairs if is_endless else [], store, on_notice=watch.warn)
+        stack.enter_context(closing(observer))
+        observer.open(OpenRun(config=config, source=inputs.source, store=store, out=out))
+        left = left_open(repairs if is_endless else [], store, on_notice=observer.warn)
         recorder = Recorder(
             out,
             header,
             config.recording,
             live=request.live,
-            resume=inputs.goes_on,
-            files=partial(open_segments, left=left, on_notice=watch.warn)
+            sinks=[Tables(out, resume=inputs.goes_on, is_endless=is_endless)],
+            files=partial(open_segments, left=left, on_notice=observer.warn)
             if is_endless
             else open_files,
-            on_refusal=watch.warn if is_endless else None,
+            on_refusal=observer.warn if is_endless else None,
         )
         stack.enter_context(recorder)
         stack.enter_context(closing(retention))
         retention.start()
-        yield Outputs(store=store, watch=watch, recorder=recorder, repairs=repairs, left=left)
+        yield Outputs(store=store, recorder=recorder, repairs=repairs, left=left)

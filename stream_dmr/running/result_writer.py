@@ -3,42 +3,15 @@
 from collections import Counter, defaultdict, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from hashlib import sha256
 from statistics import median
 
-from stream_dmr import __version__
 from stream_dmr.messages import FishCrop, Frame, LengthEstimate, LocalizedFish, Message
-from stream_dmr.recording.messages.header import RunHeader
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.results.store import LengthStore, RunFacts
+from stream_dmr.results.store import LengthStore
 from stream_dmr.running.error_policy import DriftWatch
+from stream_dmr.running.observer import Observer
 
 INTERRUPTED = "interrupted by a restart, finished with what was recorded; it may count twice"
-
-
-class Observer:
-    """Is told how a run goes, from its threads; this one doesn't listen."""
-
-    def warn(self, line: str) -> None:
-        """Something the user should know, once each."""
-
-    def serving(self, address: str) -> None:
-        """The view can be watched there from now on."""
-
-    def begin(self, num_frames: int | None) -> None:
-        """The inputs are fine and the chain starts."""
-
-    def frame_done(self) -> None:
-        """A frame has left the last stage."""
-
-    def fish_seen(self, num_fish: int) -> None:
-        """So many fish were seen so far."""
-
-    def fish_finished(self, estimate: LengthEstimate) -> None:
-        """The track of a fish has ended, and its length is in the store."""
-
-    def take(self, message: Message) -> None:
-        """A message of some stage, as the next one gets it."""
 
 
 class Tally:
@@ -136,20 +109,3 @@ class Tally:
             self._clips[clip] += 1
             self._store.clip_progress(clip, frames_done=self._clips[clip])
         self._observer.frame_done()
-
-
-def run_facts(header: RunHeader, *, vessel: str = "", trip: str = "", haul: str = "") -> RunFacts:
-    """What the store says of a run; each hash is of the bytes that the recording holds."""
-    parts = header.attachments()
-    hashes = {name: sha256(data).hexdigest() for name, data in parts.items()}
-    return RunFacts(
-        source=header.source,
-        command=header.command,
-        software_version=__version__,
-        config_sha256=hashes["config.toml"],
-        calibration_sha256=hashes.get("calibration.yaml", ""),
-        template_sha256=hashes["template.pb"],
-        vessel=vessel,
-        trip=trip,
-        haul=haul,
-    )

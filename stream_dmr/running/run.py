@@ -19,9 +19,10 @@ from stream_dmr.running.config import Config
 from stream_dmr.running.error_policy import DriftWatch, Tolerance, go_on
 from stream_dmr.running.folder import RESULTS, SEGMENTED
 from stream_dmr.running.inputs import Inputs, RunRequest, checked_inputs
+from stream_dmr.running.observer import Observer
 from stream_dmr.running.outputs import Outputs, open_outputs
 from stream_dmr.running.pipeline import Node, StageCounters, run_chain
-from stream_dmr.running.result_writer import Observer, Tally
+from stream_dmr.running.result_writer import Tally
 from stream_dmr.sources.open_source import LiveStream
 from stream_dmr.template.template import Template
 
@@ -57,8 +58,8 @@ def run(
         with open_outputs(inputs, observer) as outputs:
             resume(nodes, outputs.left)
             _say_what_matters(inputs, outputs, observer)
-            outputs.watch.begin(inputs.source.num_frames)
-            return _run_chain(inputs, nodes, outputs, stop=stop)
+            observer.begin(inputs.source.num_frames)
+            return _run_chain(inputs, nodes, outputs, observer, stop=stop)
     finally:
         inputs.reader.close()
         for line in (*inputs.source.warnings, *inputs.detections.warnings):
@@ -66,17 +67,16 @@ def run(
 
 
 def _say_what_matters(inputs: Inputs, outputs: Outputs, observer: Observer) -> None:
-    watch = outputs.watch
     for repair in outputs.repairs:
-        watch.warn(repair.line)
+        observer.warn(repair.line)
     if outputs.recorder.live_address is not None:
         observer.serving(f"stream-dmr view {outputs.recorder.live_address}")
-    if watch.address is not None:
-        observer.serving(watch.address)
+    if observer.address is not None:
+        observer.serving(observer.address)
     if inputs.calibration is None:
-        watch.warn("without --calibration there are relative shapes, no millimetres")
+        observer.warn("without --calibration there are relative shapes, no millimetres")
     if isinstance(inputs.source, LiveStream) and inputs.config.recording.frames == "reference":
-        watch.warn(
+        observer.warn(
             "a live source can't be read again, so its pictures are not kept but for the "
             'view; record them with [recording] frames = "jpeg" or "h264"'
         )
@@ -110,24 +110,29 @@ def resume(nodes: Sequence[Node], left: Iterable[LocalizedFish]) -> None:
 
 
 def _run_chain(
-    inputs: Inputs, nodes: Sequence[Node], outputs: Outputs, *, stop: threading.Event
+    inputs: Inputs,
+    nodes: Sequence[Node],
+    outputs: Outputs,
+    observer: Observer,
+    *,
+    stop: threading.Event,
 ) -> RunSummary:
-    request, store, watch = inputs.request, outputs.store, outputs.watch
+    request, store = inputs.request, outputs.store
     has_no_ids = not (request.boxes or request.masks)
     tally = Tally(
         outputs.recorder,
         store,
-        watch,
+        observer,
         numbers_frames_on=inputs.is_endless and has_no_ids,
         keeps=_MOST_LAST_FISH if inputs.is_endless else None,
-        clips=go_on(inputs.source, store, on_notice=watch.warn),
+        clips=go_on(inputs.source, store, on_notice=observer.warn),
         left=outputs.left,
-        drift=DriftWatch(store, inputs.config.drift, on_notice=watch.warn)
+        drift=DriftWatch(store, inputs.config.drift, on_notice=observer.warn)
         if inputs.is_endless and inputs.calibration is not None
         else None,
     )
     began = time.perf_counter()
-    tolerance = Tolerance(is_endless=inputs.is_endless, on_notice=watch.warn)
+    tolerance = Tolerance(is_endless=inputs.is_endless, on_notice=observer.warn)
 
     def frame_done() -> None:
         tolerance.frame_done()
@@ -139,7 +144,7 @@ def _run_chain(
             nodes,
             on_message=tally.record,
             on_frame=frame_done,
-            on_start=watch.attach,
+            on_start=observer.attach,
             on_failure=tolerance.allows,
             stop=stop,
         )

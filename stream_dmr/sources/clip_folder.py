@@ -7,8 +7,8 @@ from pathlib import Path
 from threading import Event
 
 from stream_dmr.errors import SourceError
+from stream_dmr.files import natural_order
 from stream_dmr.messages import Frame
-from stream_dmr.sources.picture_folder import natural_order
 from stream_dmr.sources.settings import ReadFramesSettings
 from stream_dmr.sources.video_file import VideoFile
 

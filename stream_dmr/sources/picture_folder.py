@@ -1,6 +1,5 @@
 """A folder of pictures as a source of frames."""
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from stream_dmr.errors import SourceError
+from stream_dmr.files import natural_order
 from stream_dmr.messages import Frame
 
 _PICTURES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
@@ -100,12 +100,6 @@ def _pictures_in(folder: Path) -> list[Path]:
         f"{folder}: expected a folder of pictures ({', '.join(sorted(_PICTURES))}) or of videos, "
         "found none"
     )
-
-
-def natural_order(path: Path) -> tuple[list[str | int], str]:
-    """A sorting key by which `2.png` comes before `10.png`."""
-    parts = re.split(r"([0-9]+)", path.name)
-    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 
 
 def _read_picture(path: Path) -> np.ndarray | None:

@@ -1,67 +1,68 @@
 """Watching a run: its state, the server that shows it, and the watchdog."""
 
-from pathlib import Path
-
 from stream_dmr.messages import LengthEstimate, Message
-from stream_dmr.results.store import LengthStore
+from stream_dmr.running.observer import Observer, OpenRun
 from stream_dmr.running.pipeline import Chain
-from stream_dmr.running.result_writer import Observer
-from stream_dmr.sources.open_source import Source
 from stream_dmr.watch.server import WatchServer
 from stream_dmr.watch.service import Watchdog
-from stream_dmr.watch.settings import WatchSettings
 from stream_dmr.watch.state import RunState
 
 
 class Watch(Observer):
     """Hands on to an observer what it is told; serves and tells systemd what it saw."""
 
-    def __init__(
-        self,
-        observer: Observer,
-        settings: WatchSettings,
-        *,
-        source: Source,
-        store: LengthStore,
-        out_dir: Path,
-        silence_s: float,
-    ) -> None:
-        """Raises ConfigError or OutputError where it can't listen as asked."""
+    def __init__(self, observer: Observer) -> None:
         self._observer = observer
-        self.state = RunState(source, out_dir, silence_s=silence_s, stuck_s=settings.stuck_s)
-        self.state.trouble = lambda: store.trouble
-        self._server = WatchServer(self.state, settings) if settings.port else None
-        self._watchdog = Watchdog(lambda: not self.state.is_stuck())
+        self._state: RunState | None = None  # from `open` on
+        self._server: WatchServer | None = None
+        self._watchdog: Watchdog | None = None
 
-    @property
-    def address(self) -> str | None:
-        """Of the status page, where it is served."""
-        return None if self._server is None else self._server.address
+    def open(self, run: OpenRun) -> None:
+        """Serve as `[watch]` says; ConfigError or OutputError where it can't listen as asked."""
+        self._observer.open(run)
+        settings, silence_s = run.config.watch, run.config.read_frames.silence_s
+        state = RunState(run.source, run.out, silence_s=silence_s, stuck_s=settings.stuck_s)
+        state.trouble = lambda: run.store.trouble
+        self._server = WatchServer(state, settings) if settings.port else None
+        self._watchdog = Watchdog(lambda: not state.is_stuck())
+        self._state = state
+        self.address = None if self._server is None else self._server.address
 
     def attach(self, chain: Chain) -> None:
         """Watch this chain's counters."""
-        self.state.chain = chain
+        if self._state is not None:
+            self._state.chain = chain
+        self._observer.attach(chain)
 
     def close(self) -> None:
         """Stop serving. Idempotent."""
-        self._watchdog.close()
+        if self._watchdog is not None:
+            self._watchdog.close()
+            self._watchdog = None
         if self._server is not None:
             self._server.close()
-            self._server = None
+            self._server = self.address = None
+        self._observer.close()
 
     def take(self, message: Message) -> None:  # noqa: D102
-        self.state.take(message)
+        if self._state is not None:
+            self._state.take(message)
         self._observer.take(message)
 
     def warn(self, line: str) -> None:  # noqa: D102
-        self.state.warn(line)
+        if self._state is not None:
+            self._state.warn(line)
         self._observer.warn(line)
+
+    def serving(self, address: str) -> None:  # noqa: D102
+        self._observer.serving(address)
 
     def begin(self, num_frames: int | None) -> None:  # noqa: D102
         self._observer.begin(num_frames)
 
     def frame_done(self) -> None:  # noqa: D102
-        self.state.frame_done()
+        if self._state is not None:
+            self._state.frame_done()
         self._observer.frame_done()
 
     def fish_seen(self, num_fish: int) -> None:  # noqa: D102

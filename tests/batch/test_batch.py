@@ -18,6 +18,7 @@ import pytest
 from pyarrow import dataset
 
 from stream_dmr.batch.batch import batch
+from stream_dmr.batch.check import verify_all
 from stream_dmr.batch.job import Outcome, do_job, folder_of, outcome_of
 from stream_dmr.batch.local import LocalEngine
 from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
@@ -26,7 +27,6 @@ from stream_dmr.batch.progress import Clock, duration
 from stream_dmr.errors import UserError
 from stream_dmr.results.provenance import seal_verdicts
 from stream_dmr.results.verdicts import Verdict, add_verdict
-from stream_dmr.results.verify import verify
 from stream_dmr.running.run import run
 from tests.support.command import invoke, rows
 from tests.support.fish_run import FISH, request
@@ -98,7 +98,7 @@ def test_a_job_is_what_run_makes(season: Path, tmp_path: Path):
     assert (outcome.num_frames, outcome.num_fish) == (len(FISH), 2)
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
-    assert verify(folder)[0] == []
+    assert verify_all(folder)[0] == []
     assert outcome_of(job, tmp_path) == outcome
 
 
@@ -178,17 +178,17 @@ def test_pandas_opens_the_data_set(finished: Path):
 def test_a_changed_data_set_is_found(season: Path, tmp_path: Path):
     (job,) = jobs_of(season, tmp_path, row())
     measure([job], tmp_path)
-    assert verify(tmp_path)[0] == []
+    assert verify_all(tmp_path)[0] == []
     (copy,) = (tmp_path / "dataset" / "fish").rglob("*.parquet")
     copy.write_bytes(copy.read_bytes() + b"x")
-    (change,) = verify(tmp_path)[0]
+    (change,) = verify_all(tmp_path)[0]
     assert change.path == copy
     assert "is not what videos/video/fish.parquet is" in change.what
     shutil.copy(tmp_path / "videos" / "video" / "fish.parquet", copy)
     elsewhere = copy.parents[1] / "trip=9" / copy.name
     elsewhere.parent.mkdir()
     copy.rename(elsewhere)  # which makes it another trip's
-    assert [(change.path, change.what) for change in verify(tmp_path)[0]] == [
+    assert [(change.path, change.what) for change in verify_all(tmp_path)[0]] == [
         (copy, "is missing"),
         (elsewhere, "is of no video that is done, by videos.csv"),
     ]
@@ -207,16 +207,16 @@ def test_a_changed_table_of_videos(
 ):
     jobs = jobs_of(season, tmp_path, row(vessel="Sea Bird"), row(video="no/broken.mp4"))
     measure(jobs, tmp_path)
-    assert verify(tmp_path)[0] == []
+    assert verify_all(tmp_path)[0] == []
     table = tmp_path / "videos.csv"
     text = table.read_text()
     assert before in text
     table.write_text(text.replace(before, after, 1))
-    found = [change.what for change in verify(tmp_path)[0]]
+    found = [change.what for change in verify_all(tmp_path)[0]]
     assert "was changed: its SHA-256 is not that in provenance.json" in found
     assert any(what.startswith(expected) for what in found), found
     measure(jobs, tmp_path)
-    assert verify(tmp_path)[0] == []
+    assert verify_all(tmp_path)[0] == []
 
 
 def test_one_report_of_all_videos(season: Path, tmp_path: Path):
@@ -236,10 +236,10 @@ def test_one_report_of_all_videos(season: Path, tmp_path: Path):
     assert all(f'id="fish-{one["id"]}"' in text for one in fish)
     assert fish[1]["time_s"] < fish[2]["time_s"]  # the second clip's clock begins anew
     assert [line.split(":")[0] for line in shown["notes"]] == ["broken"]
-    assert verify(tmp_path)[0] == []  # the report is known there
+    assert verify_all(tmp_path)[0] == []  # the report is known there
     measure(jobs, tmp_path)
     target.write_text(text + " ")
-    assert [change.path for change in verify(tmp_path)[0]] == [target]
+    assert [change.path for change in verify_all(tmp_path)[0]] == [target]
     refusal = invoke("review", {str(tmp_path): None})
     assert refusal.code == 2
     assert "review its videos one by one" in refusal.error
@@ -254,7 +254,7 @@ def test_verdicts_come_into_the_data_set_with_the_next_batch(season: Path, tmp_p
     measure([job], tmp_path)
     fish = dataset.dataset(tmp_path / "dataset" / "fish").to_table().to_pylist()
     assert [one["verdict"] for one in fish] == [None, "reject"]
-    assert verify(tmp_path)[0] == []
+    assert verify_all(tmp_path)[0] == []
 
 
 def test_what_is_done_is_not_done_again(season: Path, tmp_path: Path):
@@ -400,7 +400,7 @@ def test_killed_at_random_moments_it_gets_there(tmp_path: Path, seed: int):
     assert ended.returncode == 0, ended.stderr
     assert int(ended.stdout.split()[0]) > 2
     assert_same_tables(tmp_path / "out" / "videos" / "video", tmp_path / "alone")
-    assert verify(tmp_path / "out")[0] == []
+    assert verify_all(tmp_path / "out")[0] == []
     assert [line["status"] for line in rows(tmp_path / "out" / "videos.csv")] == ["done"] * 2
 
 
@@ -447,7 +447,7 @@ def test_pieces_make_the_tables_of_the_whole(tmp_path: Path, timeout_s: float, p
     assert summary.outcomes[0].num_fish == 4
     folder = folder_of(job, out)
     assert_same_tables(folder, tmp_path / "alone")
-    assert verify(folder)[0] == []
+    assert verify_all(folder)[0] == []
     assert [path.name for path in (out / "videos").iterdir()] == ["video"]
     assert not (out / "pieces").exists()
     fish = dataset.dataset(out / "dataset" / "fish", partitioning="hive").to_table()

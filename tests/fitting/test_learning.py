@@ -15,7 +15,7 @@ from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.shape.learn import Sample, _Crowd, _unlikeliness, learn, well_seen
 from stream_dmr.fitting.shape.proportions import NUM_KNOTS, Proportions
 from stream_dmr.fitting.target import Target
-from stream_dmr.localization.localize import LocalizeSettings
+from stream_dmr.localization.localize import LocalizeSettings, localize
 from stream_dmr.template.template import load_template, save_template, simplified
 from tests.support.shapes import crop_of, pose
 
@@ -107,8 +107,11 @@ class TestLearning:
         assert _unlikeliness(np.zeros(SIZE)) == 0.0
 
     def test_too_few_fish_are_refused(self):
+        def localized(mesh, calibration):
+            return localize(mesh, settings=LocalizeSettings(), calibration=calibration)
+
         with pytest.raises(TemplateError, match="expected 5 or more fish"):
-            well_seen([([], None)], HALIBUT, SETTINGS, LocalizeSettings())
+            well_seen([([], None)], HALIBUT, SETTINGS, localized)
 
 
 @given(vector=vectors)

@@ -35,12 +35,13 @@ from stream_dmr.recording.files import OpenSinks, open_files
 from stream_dmr.recording.mcap.sink import McapSink
 from stream_dmr.recording.messages.codec import CODEC_VERSION, decode, reference
 from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.pictures import checksum
 from stream_dmr.recording.messages.topics import FOXGLOVE_TOPICS, TOPICS, topics_table
-from stream_dmr.recording.reading.pictures import checksum
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.rerun.view_geometry import place
 from stream_dmr.recording.segments.segments import open_segments
 from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.results.tables import Tables
 from tests.support.reading import read_header, read_messages, read_metadata
 from tests.support.recorded_run import assert_same, header, run, template
 from tests.support.vulkan import needs_vulkan
@@ -208,7 +209,7 @@ def test_two_threads_write_whole_records(tmp_path: Path, messages: list[Message]
 
 
 def test_every_sink_is_closed_where_one_fails(tmp_path: Path, messages: list[Message]):
-    recorder = Recorder(tmp_path, header(), RecordingSettings())
+    recorder = Recorder(tmp_path, header(), RecordingSettings(), sinks=[Tables(tmp_path)])
     for message in messages:
         recorder.write(message)
     (tmp_path / "recording.mcap").mkdir()  # so that the rename fails

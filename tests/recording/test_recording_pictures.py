@@ -16,10 +16,10 @@ from stream_dmr.errors import ConfigError, RecordingError
 from stream_dmr.messages import FishCrop, Frame, Message
 from stream_dmr.recording.mcap.video import H264Topic, decode_video
 from stream_dmr.recording.messages.record import make_record
+from stream_dmr.recording.messages.selection import WHOLE, Part
 from stream_dmr.recording.messages.topics import KEY_FRAME_NS
 from stream_dmr.recording.reading.frame_images import RecordedPictures, is_as_seen
 from stream_dmr.recording.reading.reader import messages, open_recordings
-from stream_dmr.recording.reading.selection import WHOLE, Part
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.settings import RecordingSettings
 from tests.support.reading import read_messages

@@ -16,9 +16,9 @@ from rerun.chunk import RrdReader
 
 from stream_dmr.errors import SourceError
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LocalizedFish, Message
+from stream_dmr.recording.messages.pictures import checksum
 from stream_dmr.recording.messages.record import make_record
 from stream_dmr.recording.reading.convert import convert
-from stream_dmr.recording.reading.pictures import checksum
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.rerun.live import LiveView
 from stream_dmr.recording.rerun.meshes import Meshes

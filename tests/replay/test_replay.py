@@ -14,9 +14,9 @@ from stream_dmr.calibration.file import load_calibration, save_calibration
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish
 from stream_dmr.recording.messages.codec import decode
+from stream_dmr.recording.messages.selection import Part
 from stream_dmr.recording.messages.topics import TOPICS
 from stream_dmr.recording.reading.reader import messages, open_recordings
-from stream_dmr.recording.reading.selection import Part
 from stream_dmr.replay.difference import differences
 from tests.support.command import invoke, rows
 from tests.support.tiny_clip import write_clip

@@ -7,7 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stream_dmr.running.drift import (
-    DriftSettings,
     FitWatch,
     SceneWatch,
     compare,
@@ -15,6 +14,7 @@ from stream_dmr.running.drift import (
     encode_scene,
     scene_of,
 )
+from stream_dmr.running.settings import DriftSettings
 
 SECOND_NS = 10**9
 SETTINGS = DriftSettings()

@@ -15,7 +15,8 @@ from stream_dmr.results.store_rows import read_estimates
 from stream_dmr.results.store_schema import open_database
 from stream_dmr.results.tables import lengths_row
 from stream_dmr.running.config import load_config, to_toml
-from stream_dmr.running.run import RESULTS, Observer, RunRequest, run
+from stream_dmr.running.observer import Observer
+from stream_dmr.running.run import RESULTS, RunRequest, run
 from tests.support.command import invoke, rows
 from tests.support.reading import read_header, read_messages
 from tests.support.tiny_clip import draw_mask, draw_picture, write_clip

@@ -16,7 +16,7 @@ from stream_dmr.segmentation.masks.crop import (
     frame_from_crop_map,
 )
 from stream_dmr.segmentation.masks.grabcut import GrabCut
-from stream_dmr.segmentation.masks.segmenter import Segmented
+from stream_dmr.segmentation.segmenter import Segmented
 
 SETTINGS = CropFishSettings()
 WIDE = Camera(  # strong barrel distortion, off-centre, unequal focal lengths

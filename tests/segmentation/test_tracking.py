@@ -13,7 +13,7 @@ from stream_dmr.camera import Camera
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.detection.detector import Candidate
 from stream_dmr.segmentation.masks.crop import CropFishSettings, crop_fish
-from stream_dmr.segmentation.masks.segmenter import Segmented, Segmenter
+from stream_dmr.segmentation.segmenter import Segmented, Segmenter
 from stream_dmr.segmentation.tracking.tracked_fish import FollowedFish, TrackFishSettings
 
 WIDTH, HEIGHT = 640, 480

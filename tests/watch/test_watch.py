@@ -21,14 +21,16 @@ from prometheus_client.parser import text_string_to_metric_families
 from stream_dmr.errors import ConfigError, OutputError
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.running.config import Config
-from stream_dmr.running.run import Observer, RunRequest, run
+from stream_dmr.running.observer import Observer
+from stream_dmr.running.run import RunRequest, run
+from stream_dmr.running.settings import WatchSettings
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.settings import ReadFramesSettings
 from stream_dmr.watch.journal import Journal
 from stream_dmr.watch.server import WatchServer
 from stream_dmr.watch.service import Watchdog
-from stream_dmr.watch.settings import WatchSettings
 from stream_dmr.watch.state import RunState
+from stream_dmr.watch.watch import Watch
 from tests.support.camera import free_port
 from tests.support.recorded_run import HEIGHT, WIDTH
 from tests.support.recorded_run import run as recorded_messages
@@ -197,7 +199,7 @@ def test_a_run_counts_every_frame_of_every_stage(tmp_path: Path):
         config=clip / "quick.toml",
         out=tmp_path / "out",
     )
-    run(request, stop=threading.Event(), observer=observer)
+    run(request, stop=threading.Event(), observer=Watch(observer))
     assert observer.served == observer.address
     for number, metrics in enumerate(observer.seen, start=1):
         frames = {k[1:]: v for k, v in metrics.items() if k[0] == "stream_dmr_frames_total"}

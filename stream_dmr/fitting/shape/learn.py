@@ -29,8 +29,7 @@ from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.shape.proportions import NUM_KNOTS, Proportions
 from stream_dmr.fitting.target import Target
 from stream_dmr.fitting.tracks import TrackFitter
-from stream_dmr.localization.localize import LocalizeSettings, localize
-from stream_dmr.messages import FishCrop
+from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
 from stream_dmr.template.template import Template
 
 _FRAMES_PER_FISH = 4  # the best ones: more say little that is new
@@ -77,12 +76,13 @@ def well_seen(
     recordings: Iterable[tuple[Iterable[FishCrop], Calibration | None]],
     template: Template,
     settings: FitMeshSettings,
-    gates: LocalizeSettings,
+    localized: Callable[[FittedMesh, Calibration | None], LocalizedFish],
 ) -> list[Sample]:
     """The best frames of each fish that are whole, little bent and well fitted.
 
-    `recordings` are the crops of each, in the order of their capture, with its calibration. Of many
-    fish an even choice is taken. Raises TemplateError where too few were seen well.
+    `recordings` are the crops of each, in the order of their capture, with its calibration;
+    `localized` says whether a fit passes the gates, and how bent the fish is. Of many fish an even
+    choice is taken. Raises TemplateError where too few were seen well.
     """
     fish: dict[tuple[int, int], list[tuple[float, int, Sample]]] = defaultdict(list)
     settings = settings.model_copy(update={"scan_iterations": 0})
@@ -91,7 +91,7 @@ def well_seen(
         tracks = TrackFitter(template, settings, calibration=calibration)
         for crop in crops:
             mesh = tracks.fit(crop)
-            place = localize(mesh, settings=gates, calibration=calibration)
+            place = localized(mesh, calibration)
             if mesh.shape is None or not place.accepted:
                 continue
             is_straight = place.bending_ratio is not None and place.bending_ratio <= _MOST_BENT

@@ -26,6 +26,7 @@ from stream_dmr.errors import RecordingError
 from stream_dmr.messages import LocalizedFish, Message
 from stream_dmr.recording.messages.codec import check_version, decode
 from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.selection import WHOLE, Part, Spans
 from stream_dmr.recording.messages.topics import (
     CARRIED,
     RECOVERED,
@@ -36,7 +37,6 @@ from stream_dmr.recording.messages.topics import (
     TOPICS,
     VIDEO,
 )
-from stream_dmr.recording.reading.selection import WHOLE, Part, Spans
 
 # What the mcap library lets through on damaged bytes; its CRC error is a ValueError.
 _DAMAGE = (

@@ -16,14 +16,14 @@ from google.protobuf.message import Message as Proto
 from stream_dmr import messages
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.errors import RecordingError
-from stream_dmr.recording.messages.schema import proto_class
-from stream_dmr.recording.reading.pictures import (
+from stream_dmr.recording.messages.pictures import (
     Picture,
     checksum,
     compress,
     compress_mask,
     decompress,
 )
+from stream_dmr.recording.messages.schema import proto_class
 
 CODEC_VERSION = 3
 """Raised when a file written from now on would be read wrongly by an older reader.

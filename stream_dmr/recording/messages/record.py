@@ -6,8 +6,8 @@ from functools import cached_property, partial
 
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, Message
 from stream_dmr.recording.messages.codec import encode
+from stream_dmr.recording.messages.pictures import checksum, compress, decompress
 from stream_dmr.recording.messages.topics import TOPICS, Topic
-from stream_dmr.recording.reading.pictures import checksum, compress, decompress
 from stream_dmr.recording.settings import RecordingSettings
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from stream_dmr.files import writing_to
 from stream_dmr.messages import FittedMesh, Frame, Message
 from stream_dmr.recording.messages.record import Record
+from stream_dmr.recording.messages.selection import WHOLE, Part
 from stream_dmr.recording.messages.topics import TOPICS
 from stream_dmr.recording.reading.frame_images import RecordedPictures, SourcePictures
 from stream_dmr.recording.reading.reader import messages, open_recordings
-from stream_dmr.recording.reading.selection import WHOLE, Part
 from stream_dmr.recording.rerun.meshes import Meshes
 from stream_dmr.recording.rerun.sink import RerunSink
 from stream_dmr.recording.settings import RecordingSettings

@@ -11,10 +11,10 @@ from jaxtyping import UInt8
 from stream_dmr.errors import RecordingError, SourceError
 from stream_dmr.messages import Frame
 from stream_dmr.recording.messages.codec import reference
+from stream_dmr.recording.messages.pictures import checksum
+from stream_dmr.recording.messages.selection import Part
 from stream_dmr.recording.messages.topics import KEY_FRAME_NS
-from stream_dmr.recording.reading.pictures import checksum
 from stream_dmr.recording.reading.reader import Recording
-from stream_dmr.recording.reading.selection import Part
 
 
 @runtime_checkable

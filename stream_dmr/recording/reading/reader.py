@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from stream_dmr.errors import RecordingError
+from stream_dmr.files import natural_order
 from stream_dmr.messages import Message
 from stream_dmr.recording.mcap.file import McapFile
 from stream_dmr.recording.messages.codec import decode
 from stream_dmr.recording.messages.header import RunHeader
-from stream_dmr.recording.reading.selection import WHOLE, Part
+from stream_dmr.recording.messages.selection import WHOLE, Part
 from stream_dmr.recording.rerun.file import RrdFile
-from stream_dmr.sources.picture_folder import natural_order
 
 Kinds = Collection[type[Message]]
 

@@ -20,8 +20,8 @@ from stream_dmr.messages import (
 )
 from stream_dmr.recording.messages import topics
 from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.pictures import compress, paint
 from stream_dmr.recording.messages.record import Record
-from stream_dmr.recording.reading.pictures import compress, paint
 from stream_dmr.recording.rerun.blueprint import (
     NOMINAL_DEPTH,
     PICTURES,

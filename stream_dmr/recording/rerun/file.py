@@ -24,8 +24,8 @@ from stream_dmr.errors import RecordingError
 from stream_dmr.messages import Message
 from stream_dmr.recording.messages.codec import check_version
 from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.selection import WHOLE, Part
 from stream_dmr.recording.messages.topics import END, TOPICS
-from stream_dmr.recording.reading.selection import WHOLE, Part
 from stream_dmr.recording.rerun.program import rerun_program
 
 _HEADER = "/messages/header/"

@@ -8,7 +8,7 @@ from threading import Event, Thread
 
 from stream_dmr.csv_file import set_aside
 from stream_dmr.errors import OutputError, RecordingError
-from stream_dmr.files import free_bytes, rename_durably
+from stream_dmr.files import free_bytes, natural_order, rename_durably
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.recording.files import STEM
 from stream_dmr.recording.mcap.file import McapFile
@@ -17,7 +17,6 @@ from stream_dmr.recording.messages.codec import without_picture
 from stream_dmr.recording.messages.topics import FOXGLOVE_TOPICS, THINNED, TOPICS, VIDEO
 from stream_dmr.recording.reading.rewrite import rewrite
 from stream_dmr.recording.rerun.file import is_closed
-from stream_dmr.sources.picture_folder import natural_order
 
 _LEFT_OUT = {TOPICS[FishCrop].topic, VIDEO, *FOXGLOVE_TOPICS}
 _PERIOD_S = 5.0

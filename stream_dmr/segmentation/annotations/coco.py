@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from stream_dmr.errors import AnnotationError
+from stream_dmr.files import natural_order
 from stream_dmr.segmentation.annotations.boxes import UNKNOWN_ID, Box, by_frame, corners
-from stream_dmr.sources.picture_folder import natural_order
 
 _ID_NAMES = ("track_id", "instance_id")
 _TOO_MUCH = (OverflowError, RecursionError)  # a number without an end; brackets without number

@@ -12,7 +12,7 @@ from stream_dmr.camera import Camera, crop_from_frame, frame_from_crop
 from stream_dmr.messages import CropQuality, FishCrop, FishEnds, Frame
 from stream_dmr.segmentation.annotations.detections import Detection
 from stream_dmr.segmentation.masks.quality import glare, sharpness, touches_border
-from stream_dmr.segmentation.masks.segmenter import Segmenter
+from stream_dmr.segmentation.segmenter import Segmenter
 from stream_dmr.settings import Settings
 
 _SMALLEST_PART = 0.05  # of the largest part's area: the tail behind a gaff stays, specks go

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from stream_dmr.segmentation.masks.segmenter import Segmented
+from stream_dmr.segmentation.segmenter import Segmented
 
 _CONTEXT = 0.2  # of the box's longer side: the ring around it that shows what is not fish
 _WORKING_PX = 256  # of the longer side: finer costs much time and moves the outline little

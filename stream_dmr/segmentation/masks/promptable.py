@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from stream_dmr.errors import ModelError
 from stream_dmr.segmentation.detection.onnx_session import open_session
-from stream_dmr.segmentation.masks.segmenter import Segmented
+from stream_dmr.segmentation.segmenter import Segmented
 
 _FREE_SIDE_PX = 256  # where the model takes pictures of any size
 _CORNER_LABELS = np.array([2.0, 3.0], np.float32)

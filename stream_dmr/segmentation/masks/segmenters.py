@@ -4,7 +4,7 @@ from pathlib import Path
 
 from stream_dmr.errors import ModelError
 from stream_dmr.segmentation.masks.grabcut import GrabCut
-from stream_dmr.segmentation.masks.segmenter import Segmenter
+from stream_dmr.segmentation.segmenter import Segmenter
 
 
 def open_segmenter(name: str) -> Segmenter:

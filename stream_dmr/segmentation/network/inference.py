@@ -15,10 +15,10 @@ from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from stream_dmr.messages import FishEnds
-from stream_dmr.segmentation.masks.segmenter import Segmented
+from stream_dmr.segmentation.network.boxes import box_picture
 from stream_dmr.segmentation.network.network import ENDS_STRIDE, SIZE_PX, UNet, normalise
 from stream_dmr.segmentation.network.weights import load_weights
-from stream_dmr.segmentation.training.boxes import box_picture
+from stream_dmr.segmentation.segmenter import Segmented
 
 _LEAST_APART = 3.0  # cells between head and tail
 _PEAK_REACH = 2  # cells around a map's peak whose mean says where it is between the cells

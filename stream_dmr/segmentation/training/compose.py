@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+from stream_dmr.segmentation.network.boxes import box_picture, crop_around, jitter
 from stream_dmr.segmentation.network.network import SIZE_PX
 from stream_dmr.segmentation.training.bank import Bank
-from stream_dmr.segmentation.training.boxes import box_picture, crop_around, jitter
 from stream_dmr.segmentation.training.occluders import (
     Occluder,
     draw_into,

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from stream_dmr.errors import AnnotationError
+from stream_dmr.segmentation.network.boxes import box_picture, crop_around, jitter
 from stream_dmr.segmentation.network.network import SIZE_PX
-from stream_dmr.segmentation.training.boxes import box_picture, crop_around, jitter
 from stream_dmr.segmentation.training.own_masks import read_annotated
 from stream_dmr.segmentation.training.sample import Sample
 from stream_dmr.segmentation.training.weather import photograph

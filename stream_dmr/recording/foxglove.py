@@ -20,9 +20,9 @@ from scipy.spatial.transform import Rotation
 from stream_dmr.camera import Calibration
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, Frame, LocalizedFish
 from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.pictures import compress
 from stream_dmr.recording.messages.record import Record
 from stream_dmr.recording.messages.topics import FOXGLOVE_TOPICS
-from stream_dmr.recording.reading.pictures import compress
 from stream_dmr.recording.rerun.palette import color
 from stream_dmr.recording.rerun.throttle import Pace, Waiting
 from stream_dmr.recording.rerun.view_geometry import halved, outlines, place, view_factor
