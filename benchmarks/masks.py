@@ -27,7 +27,7 @@ from stream_dmr.segmentation.network.inference import UNetSegmenter
 from stream_dmr.segmentation.network.network import SIZE_PX
 from stream_dmr.segmentation.network.weights import SHIPPED
 from stream_dmr.sources.open_source import open_source
-from stream_dmr.sources.settings import ReadFramesSettings
+from stream_dmr.sources.read_settings import ReadFramesSettings
 
 _LEAST_PX = 64  # of a true mask in its crop
 _SHOWN, _PER_ROW = 36, 12  # crops on the sheet: the worst third, the others at random

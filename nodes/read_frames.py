@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from stream_dmr.messages import Frame
 from stream_dmr.sources.open_source import open_source
-from stream_dmr.sources.settings import ReadFramesSettings
+from stream_dmr.sources.read_settings import ReadFramesSettings
 
 
 class ReadFrames:

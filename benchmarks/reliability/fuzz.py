@@ -26,7 +26,7 @@ from stream_dmr.results.export import Export
 from stream_dmr.running.config import load_config
 from stream_dmr.segmentation.annotations.detections import open_annotations
 from stream_dmr.sources.open_source import open_source
-from stream_dmr.sources.settings import ReadFramesSettings
+from stream_dmr.sources.read_settings import ReadFramesSettings
 from stream_dmr.template.template import load_template
 
 _SLOW_S = 10.0

@@ -85,7 +85,8 @@ def _convert(
     from stream_dmr.errors import RecordingError
     from stream_dmr.recording.reading.convert import EVERY_FRAME
     from stream_dmr.recording.reading.convert import convert as convert_recording
-    from stream_dmr.sources.open_source import ReadFramesSettings, open_source
+    from stream_dmr.sources.open_source import open_source
+    from stream_dmr.sources.read_settings import ReadFramesSettings
 
     if recording.resolve() == rrd.resolve():
         raise RecordingError(f"{rrd}: expected another file to write to; choose one with --out")

@@ -18,7 +18,7 @@ from stream_dmr.recording.reading.frame_images import RecordedPictures, SourcePi
 from stream_dmr.recording.reading.reader import Recording, messages
 from stream_dmr.segmentation.masks.crop import frame_from_crop_map
 from stream_dmr.sources.open_source import open_source
-from stream_dmr.sources.settings import ReadFramesSettings
+from stream_dmr.sources.read_settings import ReadFramesSettings
 
 MASK, MESH, HEAD, CENTER, TAIL = (
     *((80, 220, 255), (90, 230, 90)),  # BGR

@@ -26,7 +26,7 @@ from stream_dmr.segmentation.masks.crop import CropFishSettings
 from stream_dmr.segmentation.tracking.tracked_fish import TrackFishSettings
 from stream_dmr.segmentation.training.settings import TrainSettings
 from stream_dmr.settings import Settings
-from stream_dmr.sources.settings import ReadFramesSettings
+from stream_dmr.sources.read_settings import ReadFramesSettings
 
 _HEADER = """\
 # Every knob of stream-dmr with its default. Keep only the lines that you change, if you like;

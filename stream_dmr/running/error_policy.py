@@ -10,9 +10,7 @@ from stream_dmr.recording.segments.recover import Repair
 from stream_dmr.results.store import LengthStore
 from stream_dmr.running.drift import FitWatch, SceneWatch, decode_scene, encode_scene
 from stream_dmr.running.settings import DriftSettings
-from stream_dmr.sources.clip_folder import ClipFolder
-from stream_dmr.sources.live import LiveStream
-from stream_dmr.sources.open_source import Source
+from stream_dmr.sources.source import ResumePoint, Source
 
 _MOST_IN_A_ROW = 100  # failures with no frame between them that went through: the run is broken
 
@@ -21,14 +19,13 @@ def go_on(
     source: Source, store: LengthStore, *, on_notice: Callable[[str], None]
 ) -> dict[str, int] | None:
     """Let a source go on after an earlier run; of a folder of clips, the frames done of each."""
-    if isinstance(source, LiveStream):
-        source.resume_after(store.resume_after_ns())
-        source.listen(on_notice)
-    if not isinstance(source, ClipFolder):
-        return None
     done, frames_done = store.clips_before()
-    source.resume(done=done, frames_done=frames_done, after_ns=store.before.timestamp_ns)
-    return frames_done
+    after_ns = store.resume_after_ns() if source.is_live else store.before.timestamp_ns
+    source.listen(on_notice)
+    source.resume(
+        ResumePoint(after_ns=after_ns, clips_done=frozenset(done), frames_done=frames_done)
+    )
+    return frames_done if source.has_clips else None
 
 
 def left_open(

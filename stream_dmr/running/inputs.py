@@ -12,7 +12,7 @@ from stream_dmr.running.config import Config, load_config, to_toml
 from stream_dmr.running.only import Only, OnlyFish, OnlyFrames
 from stream_dmr.running.sightings import SightedFish
 from stream_dmr.segmentation.tracking.fish_finder import FishFinder, open_finder
-from stream_dmr.sources.open_source import Source
+from stream_dmr.sources.source import Source
 from stream_dmr.template.template import Template, load_template
 
 

@@ -7,7 +7,7 @@ from stream_dmr.messages import LengthEstimate, Message
 from stream_dmr.results.store import LengthStore
 from stream_dmr.running.config import Config
 from stream_dmr.running.pipeline import Chain
-from stream_dmr.sources.open_source import Source
+from stream_dmr.sources.source import Source
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.annotations.detections import Detection
 from stream_dmr.segmentation.tracking.fish_finder import FishFinder
-from stream_dmr.sources.open_source import Source
+from stream_dmr.sources.source import Source
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,6 @@ from stream_dmr.running.observer import Observer
 from stream_dmr.running.outputs import Outputs, open_outputs
 from stream_dmr.running.pipeline import Node, StageCounters, run_chain
 from stream_dmr.running.result_writer import Tally
-from stream_dmr.sources.open_source import LiveStream
 from stream_dmr.template.template import Template
 
 _MOST_LAST_FISH = 100  # that a source without an end is summed up by; the store has them all
@@ -75,7 +74,7 @@ def _say_what_matters(inputs: Inputs, outputs: Outputs, observer: Observer) -> N
         observer.serving(observer.address)
     if inputs.calibration is None:
         observer.warn("without --calibration there are relative shapes, no millimetres")
-    if isinstance(inputs.source, LiveStream) and inputs.config.recording.frames == "reference":
+    if inputs.source.is_live and inputs.config.recording.frames == "reference":
         observer.warn(
             "a live source can't be read again, so its pictures are not kept but for the "
             'view; record them with [recording] frames = "jpeg" or "h264"'

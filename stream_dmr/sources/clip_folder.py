@@ -1,7 +1,7 @@
 """A folder of clips, to which a recorder on board may still be adding, as one source of frames."""
 
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
@@ -9,30 +9,31 @@ from threading import Event
 from stream_dmr.errors import SourceError
 from stream_dmr.files import natural_order
 from stream_dmr.messages import Frame
-from stream_dmr.sources.settings import ReadFramesSettings
+from stream_dmr.sources.read_settings import ReadFramesSettings
+from stream_dmr.sources.source import ResumePoint, Source
 from stream_dmr.sources.video_file import VideoFile
 
 _SUFFIXES = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv"}
-_SETTLE_S = 5.0  # a clip that has not grown for so long is whole, or never will be
+_SETTLE_S = 5.0  # a clip that has not grown for so long is complete, or never will be; chosen
 _POLL_S = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Size:
+class _FileState:
+    """Size and time of the last write of a file, to see whether it still grows."""
+
     num_bytes: int
     modified_ns: int
 
 
-class ClipFolder:
-    """The clips of a folder in natural order of their names, all of one size, frames numbered on.
+class ClipFolder(Source):
+    """The clips of a folder in natural order of their names, all of one size.
 
-    A clip is read once it has stopped growing or a later one is there. One that can't be read, or
-    has another size, is left out with a warning. Capture times: a clip ends when its file was
-    last modified, but never begins before the one before it ended.
+    Frames are numbered through all clips. A clip is read once it has stopped growing or a later
+    one is there. One that can't be read, or has another size, is left out with a warning. Capture
+    times: a clip ends when its file was last modified, but never begins before its predecessor
+    ended.
     """
-
-    is_endless = True
-    num_frames: int | None = None
 
     def __init__(self, folder: Path, settings: ReadFramesSettings) -> None:
         """Raises SourceError where no clip can be read."""
@@ -41,18 +42,29 @@ class ClipFolder:
         self._folder = folder
         self._settings = settings
         self._closing = Event()
-        self._begun: set[str] = set()
-        self._skip: Mapping[str, int] = {}
+        self._begun: set[str] = set()  # names of clips that were read, are being read or left out
+        self._frames_done: Mapping[str, int] = {}
         self._after_ns = 0
         self._video: VideoFile | None = None
         first = self._first_clip()
         self.width, self.height, self.fps = first.width, first.height, first.fps
+        self.num_frames = None
         first.close()
 
-    def resume(self, *, done: Iterable[str], frames_done: Mapping[str, int], after_ns: int) -> None:
-        """Leave out whole clips, so many frames of others, and begin after this capture time."""
-        self._begun.update(done)
-        self._skip, self._after_ns = frames_done, after_ns
+    @property
+    def is_endless(self) -> bool:
+        """True: the folder may grow; it ends when no new clip came for `clips_wait_s`."""
+        return True
+
+    @property
+    def has_clips(self) -> bool:
+        """True."""
+        return True
+
+    def resume(self, point: ResumePoint) -> None:
+        """Skip the clips and frames that were done, and begin after the last capture time."""
+        self._begun.update(point.clips_done)
+        self._frames_done, self._after_ns = point.frames_done, point.after_ns
 
     def __iter__(self) -> Iterator[Frame]:
         frame_index, last_ns = 0, self._after_ns
@@ -65,12 +77,12 @@ class ClipFolder:
             for frame in self._video:
                 frame_index += 1
                 last_ns = start_ns + frame.timestamp_ns
-                if frame.frame_index > self._skip.get(path.name, 0):
+                if frame.frame_index > self._frames_done.get(path.name, 0):
                     yield replace(frame, frame_index=frame_index, timestamp_ns=last_ns)
             self.warnings += self._video.warnings
 
     def close(self) -> None:
-        """Let go of the clip; iteration ends."""
+        """Release the clip; the iteration ends."""
         self._closing.set()
         if self._video is not None:
             self._video.close()
@@ -100,24 +112,24 @@ class ClipFolder:
         return video
 
     def _next_clip(self) -> Path | None:
-        """Wait for a clip that is whole; None at the end, or when none came for too long."""
-        sizes: dict[str, _Size] = {}
-        since = waited_from = time.monotonic()
+        """Wait for a complete clip; None when closed, or when none came for `clips_wait_s`."""
+        seen: dict[str, _FileState] = {}
+        unchanged_since = waiting_since = time.monotonic()
         while not self._closing.is_set():
             paths = [path for path in clips_in(self._folder) if path.name not in self._begun]
             if len(paths) > 1:
                 return paths[0]
             now = time.monotonic()
             if paths:
-                size = _size_of(paths[0])
-                if size is None:
+                state = _state_of(paths[0])
+                if state is None:
                     continue
-                if size != sizes.get(paths[0].name):
-                    sizes[paths[0].name] = size
-                    since = waited_from = now
-                if now - since >= _SETTLE_S or _is_old(size):
+                if state != seen.get(paths[0].name):
+                    seen[paths[0].name] = state
+                    unchanged_since = waiting_since = now
+                if now - unchanged_since >= _SETTLE_S or _is_old(state):
                     return paths[0]
-            elif now - waited_from >= self._settings.clips_wait_s:
+            elif now - waiting_since >= self._settings.clips_wait_s:
                 return None
             self._closing.wait(_POLL_S)
         return None
@@ -135,20 +147,21 @@ def clips_in(folder: Path) -> list[Path]:
     return sorted(files, key=natural_order)
 
 
-def _size_of(path: Path) -> _Size | None:
-    """None where it was removed since."""
+def _state_of(path: Path) -> _FileState | None:
+    """Size and time of the last write; None where the file was removed meanwhile."""
     try:
-        facts = path.stat()
+        status = path.stat()
     except FileNotFoundError:
         return None
-    return _Size(num_bytes=facts.st_size, modified_ns=facts.st_mtime_ns)
+    return _FileState(num_bytes=status.st_size, modified_ns=status.st_mtime_ns)
 
 
-def _is_old(size: _Size) -> bool:
-    """Last written before the time in which a clip settles, by the wall clock as files have it."""
-    return time.time_ns() - size.modified_ns > _SETTLE_S * 1e9
+def _is_old(state: _FileState) -> bool:
+    """Whether the last write was longer ago than `_SETTLE_S`, by the wall clock that files use."""
+    return time.time_ns() - state.modified_ns > _SETTLE_S * 1e9
 
 
 def _start_ns(path: Path, video: VideoFile) -> int:
-    size, duration_s = _size_of(path), (video.num_frames or 0) / video.fps
-    return 0 if size is None else size.modified_ns - round(duration_s * 1e9)
+    """Capture time of the first frame: last write minus duration, ns since 1970; 0 if removed."""
+    state, duration_s = _state_of(path), (video.num_frames or 0) / video.fps
+    return 0 if state is None else state.modified_ns - round(duration_s * 1e9)

@@ -34,7 +34,7 @@ class ResizedError(DecodingError):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Picture:
+class DecodedPicture:
     """One decoded picture, with the time in ms that the container or stream gives it."""
 
     milliseconds: float
@@ -63,7 +63,7 @@ class Decoder:
             start_new_session=True,  # Ctrl-C is for us alone
         )
 
-    def read(self, *, timeout_s: float) -> Picture | None:
+    def read(self, *, timeout_s: float) -> DecodedPicture | None:
         """Wait for the next picture; None at the end.
 
         Raises DecodingError where none comes for `timeout_s`, where the process has died, or
@@ -85,7 +85,7 @@ class Decoder:
                 self._memory = -1
             self._text, self._slots = b"", None
 
-    def _read(self, timeout_s: float) -> Picture | None:
+    def _read(self, timeout_s: float) -> DecodedPicture | None:
         until = time.monotonic() + timeout_s
         while (said := self._hear(until)) is not None:
             if "shape" in said:
@@ -109,13 +109,13 @@ class Decoder:
         shared = mmap.mmap(self._memory, size)
         self._slots = np.frombuffer(shared, np.uint8).reshape(-1, self.height, self.width, 3)
 
-    def _take(self, said: dict[str, Any]) -> Picture:
+    def _take(self, said: dict[str, Any]) -> DecodedPicture:
         assert self._slots is not None
         assert self._process.stdin is not None
         image = self._slots[said["slot"]].copy()
         with suppress(BrokenPipeError):  # it died since; the next read says so
             self._process.stdin.write(bytes([said["slot"]]))
-        return Picture(milliseconds=said["milliseconds"], image=image)
+        return DecodedPicture(milliseconds=said["milliseconds"], image=image)
 
     def _hear(self, until: float) -> dict[str, Any] | None:
         """The next line; None where the process has ended."""

@@ -10,25 +10,25 @@ from jaxtyping import UInt8, UInt16
 from stream_dmr.errors import SourceError
 from stream_dmr.files import natural_order
 from stream_dmr.messages import Frame
+from stream_dmr.sources.source import Source, check_size, nominal_ns
 
-_PICTURES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
-_SECOND_NS = 1_000_000_000
+_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
+_DEPTHS = {"uint8", "uint16"}
 
 
-class PictureFolder:
+class PictureFolder(Source):
     """A folder of pictures in natural order (`2.png` before `10.png`), all of one size.
 
     Grey and 16-bit pictures become 8-bit BGR. One that can't be decoded is left out with a warning
     but keeps its frame index, so that boxes and masks stay with their pictures.
     """
 
-    is_endless = False
-
     def __init__(self, folder: Path, *, fps: float) -> None:
+        """Raises SourceError where no picture can be decoded."""
         self._paths = _pictures_in(folder)
         self._is_closed = False
         self.name = folder.resolve().name
-        self.num_frames: int | None = len(self._paths)
+        self.num_frames = len(self._paths)
         self.fps = fps
         self.warnings: list[str] = []
         first = next((p for p in map(_read_picture, self._paths) if p is not None), None)
@@ -60,32 +60,6 @@ class PictureFolder:
         self._is_closed = True
 
 
-def nominal_ns(frame_index: int, fps: float) -> int:
-    """The time of a frame where only a constant rate is known, ns since the first frame."""
-    return round((frame_index - 1) * _SECOND_NS / fps)
-
-
-def check_size(
-    image: UInt8[np.ndarray, "H W 3"] | UInt16[np.ndarray, "H W 3"],
-    *,
-    width: int,
-    height: int,
-    where: str,
-) -> None:
-    """Raises SourceError, naming both sizes, where a picture isn't `width` x `height` px."""
-    if image.shape[:2] != (height, width):
-        size = image.shape[1], image.shape[0]
-        raise size_error(size, expected=(width, height), where=where)
-
-
-def size_error(size: tuple[int, int], *, expected: tuple[int, int], where: str) -> SourceError:
-    """What to tell about a frame of another size; both are width and height in px."""
-    return SourceError(
-        f"{where}: expected {expected[0]}x{expected[1]} px, as the first frame has, got "
-        f"{size[0]}x{size[1]} px; pictures of one source must have one size"
-    )
-
-
 def _pictures_in(folder: Path) -> list[Path]:
     try:
         files = [p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")]
@@ -93,11 +67,11 @@ def _pictures_in(folder: Path) -> list[Path]:
         raise SourceError(
             f"{folder}: expected a folder of pictures, but it can't be read: {error.strerror}"
         ) from None
-    pictures = [p for p in files if p.suffix.lower() in _PICTURES]
+    pictures = [p for p in files if p.suffix.lower() in _SUFFIXES]
     if pictures:
         return sorted(pictures, key=natural_order)
     raise SourceError(
-        f"{folder}: expected a folder of pictures ({', '.join(sorted(_PICTURES))}) or of videos, "
+        f"{folder}: expected a folder of pictures ({', '.join(sorted(_SUFFIXES))}) or of videos, "
         "found none"
     )
 
@@ -105,14 +79,14 @@ def _pictures_in(folder: Path) -> list[Path]:
 def _read_picture(path: Path) -> np.ndarray | None:
     """A picture as BGR of its own depth, turned upright if it says so; None if it can't be read."""
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    return picture if picture is not None and picture.dtype in (np.uint8, np.uint16) else None
+    return picture if picture is not None and picture.dtype.name in _DEPTHS else None
 
 
 def _full_scale_of(paths: list[Path]) -> int:
-    """The number that stands for white in a folder of 16-bit pictures.
+    """The value of white in a folder of 16-bit pictures: 4095 or 65535.
 
-    Sensors of 12 bits often write their numbers unscaled into 16, where they come out all but
-    black: so a folder whose pictures all would is taken for 12 bits. Some five of them are asked.
+    Sensors of 12 bits often write their values unscaled into 16 bits, where they come out all but
+    black. A folder is taken for 12 bits where about five pictures, evenly spaced, stay below 4096.
     """
     sample = map(_read_picture, paths[:: max(1, len(paths) // 4)])
     brightest = max((int(p.max()) for p in sample if p is not None), default=2**16 - 1)
@@ -122,7 +96,7 @@ def _full_scale_of(paths: list[Path]) -> int:
 def _to_8_bit(
     picture: UInt8[np.ndarray, "H W 3"] | UInt16[np.ndarray, "H W 3"], full_scale: int
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """One factor for the whole folder, so that nothing flickers; what is above white is white."""
+    """Scaled by one factor for the whole folder, so that brightness does not flicker; clipped."""
     if picture.dtype == np.uint8:
         return picture
     return cv2.convertScaleAbs(picture, alpha=255 / full_scale)

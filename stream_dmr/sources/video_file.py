@@ -6,41 +6,39 @@ from pathlib import Path
 
 from stream_dmr.errors import SourceError
 from stream_dmr.messages import Frame
-from stream_dmr.sources.decoder import Decoder, DecodingError, Picture, ResizedError
-from stream_dmr.sources.picture_folder import nominal_ns, size_error
-from stream_dmr.sources.settings import ReadFramesSettings
+from stream_dmr.sources.decoder import DecodedPicture, Decoder, DecodingError, ResizedError
+from stream_dmr.sources.read_settings import ReadFramesSettings
+from stream_dmr.sources.source import Source, nominal_ns, size_error
 
-_NONSENSE_MS = 1e12  # 31 years
-_LEAST_FPS, _MOST_FPS = 1e-3, 1e6
-_MOST_FRAMES = 1e12
-_TEXT = bytes(range(32, 127)) + b"\t\r\n"
+# OpenCV passes on whatever a damaged container or a stream claims; outside of these it is no claim.
+_MAX_MS = 1e12  # 31 years
+_MIN_FPS, _MAX_FPS = 1e-3, 1e6
+_MAX_FRAMES = 1e12
+_TEXT_BYTES = bytes(range(32, 127)) + b"\t\r\n"
 
 
-class VideoFile:
+class VideoFile(Source):
     """A video file; a damaged one gives the frames that still decode, and a warning."""
-
-    is_endless = False
 
     def __init__(self, path: Path, settings: ReadFramesSettings) -> None:
         """Raises SourceError where not even a first frame can be read."""
         self.name = path.name
         self.warnings: list[str] = []
-        self._patience_s = settings.silence_s
+        self._timeout_s = settings.silence_s
         self._is_closed = False
-        start = _start_of(path)
+        start = _first_bytes(path)
         # Absolute, since FFmpeg takes what stands before a colon in a relative path for a protocol.
         self._decoder = Decoder(str(path.resolve()))
         try:
-            self._first = self._decoder.read(timeout_s=self._patience_s)
+            self._first = self._decoder.read(timeout_s=self._timeout_s)
         except DecodingError:
             self._first = None
         if self._first is None:
             self._decoder.close()
-            raise SourceError(f"{path}: {_why_unreadable(path, start)}")
+            raise SourceError(f"{path}: {_unreadable_reason(path, start)}")
         self.height, self.width = self._decoder.height, self._decoder.width
-        promised = self._decoder.promised
-        self.num_frames = int(promised) if 1 <= promised < _MOST_FRAMES else None
-        self.fps = usual_fps(self._decoder.fps, settings)
+        self.num_frames = promised_frames(self._decoder.promised)
+        self.fps = plausible_fps(self._decoder.fps, settings)
 
     def __iter__(self) -> Iterator[Frame]:
         """Raises SourceError at a frame of another size."""
@@ -61,19 +59,19 @@ class VideoFile:
                 source=self.name,
             )
             pending = self._read(after=frame_index)
-        self._compare_with_promise(frame_index)
+        self._warn_if_cut_off(frame_index)
         self.close()
 
     def close(self) -> None:
-        """Let go of the file; iteration ends."""
+        """Release the file; the iteration ends."""
         self._is_closed = True
         self._first = None
         self._decoder.close()
 
-    def _read(self, *, after: int) -> Picture | None:
-        """The next picture; None at the end, and where the decoder breaks down for good."""
+    def _read(self, *, after: int) -> DecodedPicture | None:
+        """The next picture; None at the end, and with a warning where the decoder fails."""
         try:
-            return None if self._is_closed else self._decoder.read(timeout_s=self._patience_s)
+            return None if self._is_closed else self._decoder.read(timeout_s=self._timeout_s)
         except ResizedError as error:
             raise size_error(
                 (error.width, error.height),
@@ -87,7 +85,7 @@ class VideoFile:
                 )
             return None
 
-    def _compare_with_promise(self, num_read: int) -> None:
+    def _warn_if_cut_off(self, num_read: int) -> None:
         # Containers without a frame count promise duration x rate, which may be one too many.
         if not self._is_closed and self.num_frames and num_read < self.num_frames - 1:
             self.warnings.append(
@@ -99,26 +97,31 @@ class VideoFile:
 def container_ns(milliseconds: float, *, frame_index: int, fps: float, previous_ns: int) -> int:
     """A container's timestamp as ns since the start of the stream, above `previous_ns`.
 
-    OpenCV hands them out as float milliseconds; rounded to whole ns they are exact, since a double
-    is off by some 0.01 ns after a day. (Matroska itself only keeps whole milliseconds.) Where the
-    container has none (OpenCV then says 0) or nonsense, the frame rate tells the time. One that
-    stands still or steps back is moved to 1 ns after the last, so that the right ones after it
-    stay as they are.
+    OpenCV gives float milliseconds; rounded to whole ns they are exact, since a double is off by
+    some 0.01 ns after a day. (Matroska itself only keeps whole milliseconds.) Where the container
+    has no timestamp (OpenCV then gives 0) or an impossible one, the nominal time at `fps` is
+    used. One that repeats or steps back becomes 1 ns after the previous one, so that the correct
+    ones after it stay as they are.
     """
-    if milliseconds == 0 or not abs(milliseconds) < _NONSENSE_MS:
+    if milliseconds == 0 or not abs(milliseconds) < _MAX_MS:
         timestamp_ns = nominal_ns(frame_index, fps)
     else:
         timestamp_ns = round(milliseconds * 1e6)
     return max(timestamp_ns, previous_ns + 1)
 
 
-def usual_fps(fps: float, settings: ReadFramesSettings) -> float:
-    """The container's frame rate, where it is one."""
-    return fps if _LEAST_FPS <= fps <= _MOST_FPS else settings.images_fps
+def plausible_fps(fps: float, settings: ReadFramesSettings) -> float:
+    """The container's frame rate; `images_fps` where it is missing or impossible."""
+    return fps if _MIN_FPS <= fps <= _MAX_FPS else settings.images_fps
 
 
-def _start_of(path: Path) -> bytes:
-    """The bytes that name a file's format. Raises SourceError where they can't be a video's."""
+def promised_frames(promised: float) -> int | None:
+    """The container's number of frames; None where it is missing or impossible."""
+    return int(promised) if 1 <= promised < _MAX_FRAMES else None
+
+
+def _first_bytes(path: Path) -> bytes:
+    """The bytes that identify a file's format. Raises SourceError where they can't be a video's."""
     try:
         with path.open("rb") as file:
             start = file.read(512)
@@ -128,13 +131,13 @@ def _start_of(path: Path) -> bytes:
         ) from None
     if not start:
         raise SourceError(f"{path}: expected a video, got an empty file; copy it again")
-    if not start.translate(None, delete=_TEXT):  # FFmpeg would film a terminal that prints it
+    if not start.translate(None, delete=_TEXT_BYTES):  # FFmpeg would render the text as a video
         raise SourceError(f"{path}: expected a video, got a text file")
     return start
 
 
-def _why_unreadable(path: Path, start: bytes) -> str:
-    """What to tell about a file that gives no picture."""
+def _unreadable_reason(path: Path, start: bytes) -> str:
+    """Why a file gives no picture, judged by its first bytes and its MP4 index."""
     if start[8:12] == b"WAVE" or start[:3] == b"ID3" or start[:4] in (b"fLaC", b"OggS"):
         return "expected a video, got an audio file with no pictures in it"
     if start[4:8] == b"ftyp" and not _has_index(path):
@@ -146,7 +149,10 @@ def _why_unreadable(path: Path, start: bytes) -> str:
 
 
 def _has_index(path: Path) -> bool:
-    """Does an MP4 have its `moov` box? Walks the boxes at the top: size (4 bytes), name (4)."""
+    """Whether an MP4 has its `moov` box.
+
+    Walks the top-level boxes: size (4 bytes, big-endian), name (4); ISO/IEC 14496-12, 4.2.
+    """
     end = path.stat().st_size
     with path.open("rb") as file:
         while len(head := file.read(16)) >= 8:

@@ -6,7 +6,6 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from stream_dmr.sources.live import LiveStream
 from stream_dmr.watch.state import RunState
 
 
@@ -41,20 +40,20 @@ class RunMetrics(Collector):
         yield waiting
 
     def _camera(self) -> Iterator[Metric]:
-        source = self._state.source
-        if not isinstance(source, LiveStream):
+        counts = self._state.source.counts
+        if counts is None:
             return
         frames = CounterMetricFamily(
             "stream_dmr_camera_frames", "Frames that came from the camera.", labels=["outcome"]
         )
         for outcome in ("received", "passed_on", "dropped", "failed"):
-            frames.add_metric([outcome], getattr(source.counts, outcome))
+            frames.add_metric([outcome], getattr(counts, outcome))
         yield frames
-        yield _gauge("camera_queue_frames", "Frames that wait for the chain.", source.num_waiting)
+        yield _gauge("camera_queue_frames", "Frames that wait for the chain.", counts.waiting)
         yield CounterMetricFamily(
             "stream_dmr_camera_reconnects",
             "How often a lost camera was found again.",
-            value=source.counts.reconnects,
+            value=counts.reconnects,
         )
         age_s = self._state.last_frame_age_s()
         yield _gauge("last_frame_age_seconds", "Since the last frame came.", age_s or 0.0)

@@ -12,8 +12,7 @@ import numpy as np
 
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.running.pipeline import Chain
-from stream_dmr.sources.live import LiveStream
-from stream_dmr.sources.open_source import Source
+from stream_dmr.sources.source import Source
 
 _FRAMES_KEPT = 16  # more than are on their way through the chain, so that fish find their picture
 _FISH_KEPT = 20
@@ -132,9 +131,10 @@ class RunState:
 
     def last_frame_age_s(self) -> float | None:
         """Since the last frame came from the camera; None where the source is none."""
-        if not isinstance(self.source, LiveStream):
+        counts = self.source.counts
+        if counts is None:
             return None
-        return (time.monotonic_ns() - self.source.counts.last_arrival_ns) / 1e9
+        return (time.monotonic_ns() - counts.last_arrival_ns) / 1e9
 
     def disk_free_bytes(self) -> int:
         """Room where the results go."""

@@ -418,7 +418,7 @@ def test_what_is_found_beyond_the_frame_does_not_count():
 def test_masks_of_a_scene_fill_their_crops(scenes):
     from stream_dmr.segmentation.annotations.detections import open_annotations
     from stream_dmr.sources.open_source import open_source
-    from stream_dmr.sources.settings import ReadFramesSettings
+    from stream_dmr.sources.read_settings import ReadFramesSettings
 
     scene = scenes / "realistic"
     detections = open_annotations(boxes=scene / "boxes.txt", masks=scene / "masks")

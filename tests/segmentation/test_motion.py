@@ -17,7 +17,8 @@ from stream_dmr.segmentation.detection.motion import MotionDetector, MotionSetti
 from stream_dmr.simulation.backdrop import Backdrop
 from stream_dmr.simulation.film import film
 from stream_dmr.simulation.scene import make_scene
-from stream_dmr.sources.open_source import ReadFramesSettings, open_source
+from stream_dmr.sources.open_source import open_source
+from stream_dmr.sources.read_settings import ReadFramesSettings
 
 SIZE = (320, 240)
 FISH_BGR = (200, 205, 210)

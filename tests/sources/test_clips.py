@@ -15,7 +15,8 @@ from stream_dmr.errors import SourceError
 from stream_dmr.messages import Frame
 from stream_dmr.sources.clip_folder import ClipFolder
 from stream_dmr.sources.open_source import open_source
-from stream_dmr.sources.settings import ReadFramesSettings
+from stream_dmr.sources.read_settings import ReadFramesSettings
+from stream_dmr.sources.source import ResumePoint
 
 AT_ONCE = ReadFramesSettings(clips_wait_s=0.0)
 OLD_S = 1_700_000_000
@@ -76,7 +77,13 @@ def test_a_restart_reads_what_was_not_read(tmp_path: Path):
     for first in (1, 5, 9):
         clip(tmp_path / f"{first}.avi", first=first)
     folder = ClipFolder(tmp_path, AT_ONCE)
-    folder.resume(done=["1.avi"], frames_done={"5.avi": 3}, after_ns=2 * OLD_S * 10**9)
+    folder.resume(
+        ResumePoint(
+            after_ns=2 * OLD_S * 10**9,
+            clips_done=frozenset({"1.avi"}),
+            frames_done={"5.avi": 3},
+        )
+    )
     frames = list(folder)
     assert numbers(frames) == [8, 9, 10, 11, 12]
     assert frames[0].timestamp_ns > 2 * OLD_S * 10**9

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from nodes.read_frames import ReadFrames
 from stream_dmr.errors import SourceError
 from stream_dmr.sources.open_source import open_source
-from stream_dmr.sources.picture_folder import nominal_ns
-from stream_dmr.sources.settings import ReadFramesSettings
+from stream_dmr.sources.read_settings import ReadFramesSettings
+from stream_dmr.sources.source import nominal_ns
 from stream_dmr.sources.video_file import container_ns
 
 SETTINGS = ReadFramesSettings()

@@ -25,7 +25,7 @@ from stream_dmr.running.observer import Observer
 from stream_dmr.running.run import RunRequest, run
 from stream_dmr.running.settings import WatchSettings
 from stream_dmr.sources.open_source import open_source
-from stream_dmr.sources.settings import ReadFramesSettings
+from stream_dmr.sources.read_settings import ReadFramesSettings
 from stream_dmr.watch.journal import Journal
 from stream_dmr.watch.server import WatchServer
 from stream_dmr.watch.service import Watchdog

@@ -11,54 +11,45 @@ from dataclasses import dataclass
 from stream_dmr.errors import SourceError
 from stream_dmr.messages import Frame
 from stream_dmr.sources.capture_clock import CaptureClock
-from stream_dmr.sources.decoder import Decoder, DecodingError, Picture
-from stream_dmr.sources.settings import ReadFramesSettings
-from stream_dmr.sources.video_file import usual_fps
+from stream_dmr.sources.decoder import DecodedPicture, Decoder, DecodingError
+from stream_dmr.sources.read_settings import ReadFramesSettings
+from stream_dmr.sources.source import CameraCounts, ResumePoint, Source
+from stream_dmr.sources.video_file import plausible_fps, promised_frames
 
-_FIRST_PAUSE_S = 0.25
-_LARGEST_STEP_NS = 1_000_000_000  # a clock is set right by less without a word
-_MOST_FRAMES = 1e12
-
-
-@dataclass(kw_only=True)
-class CameraCounts:
-    """Frames that came = frames passed on + dropped + failed + those that wait."""
-
-    received: int = 0
-    passed_on: int = 0
-    dropped: int = 0  # newer ones came before the chain had time for them
-    failed: int = 0  # of another size than the camera's first
-    reconnects: int = 0
-    last_arrival_ns: int = 0  # monotonic clock
+_FIRST_PAUSE_S = 0.25  # before the first attempt to reconnect; doubled up to `retry_s`
+_CLOCK_STEP_NS = 1_000_000_000  # smaller corrections of the system's clock are not reported
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Arrival:
-    picture: Picture
+    """A decoded picture, when it arrived, and over which connection (0 is the first)."""
+
+    picture: DecodedPicture
     monotonic_ns: int
     connection: int
 
 
-class LiveStream:
-    """A camera by its index or a network stream; one that is lost is reached for again, for ever.
+class LiveStream(Source):
+    """A camera by its index or a network stream; a lost connection is retried until `close`.
 
-    At most `live_queue` frames wait; where more come the oldest goes. Addresses of stored videos,
-    which promise their number of frames, are read to their end, and nothing of them is dropped.
+    A thread receives pictures into a queue of at most `live_queue`; when it is full, the oldest is
+    dropped. Addresses of stored videos, which promise their number of frames, are read to their
+    end, and nothing of them is dropped.
     """
 
     def __init__(self, address: str, settings: ReadFramesSettings) -> None:
         """Raises SourceError where no picture comes for `connect_s`."""
         is_camera = address.isdecimal()
-        # Names are recorded; passwords not.
+        # Names are recorded, so user and password are cut out of addresses.
         self.name = f"camera {address}" if is_camera else re.sub(r"(?<=://)[^/]*@", "", address)
         self.warnings: list[str] = []
-        self.counts = CameraCounts()
+        self._counts = CameraCounts()
         self._address = address
         self._settings = settings
         self._on_notice: Callable[[str], None] = self.warnings.append
         self._after_ns = 0
         self._queue: deque[_Arrival] = deque()
-        self._changed = threading.Condition()
+        self._changed = threading.Condition()  # guards queue and counts
         self._closing = threading.Event()
         self._has_ended = False
         self._failure: BaseException | None = None
@@ -71,47 +62,51 @@ class LiveStream:
                 "check that it is switched on and reachable"
             )
         self.width, self.height = self._decoder.width, self._decoder.height
-        self.fps = usual_fps(self._decoder.fps, settings)
-        promised = self._decoder.promised
-        self.num_frames = int(promised) if 1 <= promised < _MOST_FRAMES else None
-        self._pump = threading.Thread(
-            target=self._run, args=(first,), name=f"pump of {self.name}", daemon=True
+        self.fps = plausible_fps(self._decoder.fps, settings)
+        self.num_frames = promised_frames(self._decoder.promised)
+        self._receiver = threading.Thread(
+            target=self._receive, args=(first,), name=f"receiver of {self.name}", daemon=True
         )
-        self._pump.start()
+        self._receiver.start()
 
     @property
     def is_endless(self) -> bool:
-        """Whether it has no end but `close`."""
+        """True unless the address is that of a stored video."""
         return self.num_frames is None
 
     @property
-    def num_waiting(self) -> int:
-        """Frames that the chain has not taken yet."""
-        return len(self._queue)
+    def is_live(self) -> bool:
+        """True: the pictures can't be read again."""
+        return True
+
+    @property
+    def counts(self) -> CameraCounts:
+        """Frames received, passed on and lost since the iteration began."""
+        return self._counts
 
     def listen(self, on_notice: Callable[[str], None]) -> None:
-        """Be told, in the pump's thread, of losses and returns; few different lines."""
+        """Call `on_notice` in the receiving thread for losses and returns; few different lines."""
         self._on_notice = on_notice
 
-    def resume_after(self, timestamp_ns: int) -> None:
-        """Let all capture times be later than this one, of an earlier run."""
-        self._after_ns = timestamp_ns
+    def resume(self, point: ResumePoint) -> None:
+        """Make all capture times later than those of earlier runs."""
+        self._after_ns = point.after_ns
 
     def __iter__(self) -> Iterator[Frame]:
-        """The frames from now on; those that came before count for nothing."""
+        """The frames from now on; those of a camera that arrived before are discarded uncounted."""
         if self.is_endless:
             with self._changed:
                 self._queue.clear()
-                self.counts = CameraCounts(last_arrival_ns=time.monotonic_ns())
+                self._counts = CameraCounts(last_arrival_ns=time.monotonic_ns())
         now_ns = time.monotonic_ns()
         clock = CaptureClock(wall_ns=time.time_ns(), monotonic_ns=now_ns, after_ns=self._after_ns)
         frame_index, connection = 0, 0
-        while (arrival := self._take()) is not None:
+        while (arrival := self._dequeue()) is not None:
             frame_index += 1
             if arrival.connection != connection:
                 connection = arrival.connection
                 clock.reconnected()
-            self._watch_wall(clock)
+            self._report_clock_step(clock)
             yield Frame(
                 frame_index=frame_index,
                 timestamp_ns=clock.stamp(
@@ -123,79 +118,84 @@ class LiveStream:
             )
 
     def close(self) -> None:
-        """Let go of the device or connection; iteration ends."""
+        """Release the device or connection; the iteration ends."""
         self._closing.set()
         self._decoder.close()
         with self._changed:
-            self.counts.dropped += len(self._queue)
+            self._counts.dropped += len(self._queue)
             self._queue.clear()
             self._has_ended = True
             self._changed.notify_all()
-        while self._pump.is_alive():  # which may have begun another decoder meanwhile
+        while self._receiver.is_alive():  # it may have started another decoder meanwhile
             self._decoder.close()
-            self._pump.join(_FIRST_PAUSE_S)
+            self._receiver.join(_FIRST_PAUSE_S)
         self._decoder.close()
 
-    def _take(self) -> _Arrival | None:
+    def _dequeue(self) -> _Arrival | None:
+        """Wait for the next picture; None at the end. Raises what ended the receiving thread."""
         with self._changed:
             self._changed.wait_for(lambda: self._queue or self._has_ended)
             if not self._queue:
                 if self._failure is not None:
                     raise self._failure
                 return None
-            self.counts.passed_on += 1
+            self._counts.passed_on += 1
             self._changed.notify_all()
             return self._queue.popleft()
 
-    def _run(self, first: Picture) -> None:
-        """The pump: pictures into the queue, whatever becomes of the connection."""
+    def _receive(self, first: DecodedPicture) -> None:
+        """The receiving thread: pictures into the queue, reconnecting where necessary."""
         try:
-            self._put(first)
-            self._read_on()
+            self._enqueue(first)
+            self._receive_until_closed()
         except BaseException as error:
             self._failure = error
         with self._changed:
             self._has_ended = True
             self._changed.notify_all()
 
-    def _read_on(self) -> None:
+    def _receive_until_closed(self) -> None:
         while not self._closing.is_set():
             try:
                 picture = self._decoder.read(timeout_s=self._settings.silence_s)
-                why = "the stream ended"
+                reason = "the stream ended"
             except DecodingError as error:
-                picture, why = None, str(error)
+                picture, reason = None, str(error)
             if picture is not None:
-                self._put(picture)
+                self._enqueue(picture)
             elif self.is_endless:
-                self._lost(why)
+                self._reconnect(reason)
             else:
                 return
 
-    def _put(self, picture: Picture) -> None:
+    def _enqueue(self, picture: DecodedPicture) -> None:
         arrival = _Arrival(
             picture=picture,
             monotonic_ns=time.monotonic_ns(),
-            connection=self.counts.reconnects,
+            connection=self._counts.reconnects,
         )
         with self._changed:
             if not self.is_endless:
                 self._changed.wait_for(
                     lambda: len(self._queue) < self._settings.live_queue or self._closing.is_set()
                 )
-            self.counts.received += 1
-            self.counts.last_arrival_ns = arrival.monotonic_ns
+            self._counts.received += 1
+            self._counts.last_arrival_ns = arrival.monotonic_ns
             if len(self._queue) >= self._settings.live_queue:
                 self._queue.popleft()
-                self.counts.dropped += 1
+                self._counts.dropped += 1
             self._queue.append(arrival)
             self._changed.notify_all()
 
-    def _lost(self, why: str) -> None:
-        """Reach for the camera again and again, with longer pauses, none the same."""
+    def _reconnect(self, reason: str) -> None:
+        """Try until the camera gives a picture of the first one's size, or `close`.
+
+        The pauses double, and each is shortened at random by up to a half, so that several boxes
+        do not ask one camera in step.
+        """
         if self._closing.is_set():
             return
-        self._on_notice(f"{self.name} is lost: {why}; reaching for it again")
+        self._on_notice(f"{self.name} is lost: {reason}; reconnecting")
         pause_s, picture = _FIRST_PAUSE_S, None
         while picture is None:
             self._decoder.close()
@@ -204,37 +204,40 @@ class LiveStream:
             pause_s = min(2 * pause_s, self._settings.retry_s)
             try:
                 self._decoder = Decoder(self._address)
-            except OSError:  # no more processes or memory: the system's trouble may pass too
+            except OSError:  # no process or memory is free: that may pass, too
                 continue
             picture = self._first_picture()
             if picture is not None and picture.image.shape[:2] != (self.height, self.width):
-                with self._changed:
-                    self.counts.received += 1
-                    self.counts.failed += 1
-                self._on_notice(
-                    f"{self.name}: its pictures no longer are {self.width}x{self.height} px; set "
-                    "it back, or calibrate anew"
-                )
+                self._refuse_size()
                 picture = None
         with self._changed:
-            self.counts.reconnects += 1
+            self._counts.reconnects += 1
         self._on_notice(f"{self.name} is back")
-        self._put(picture)
+        self._enqueue(picture)
 
-    def _first_picture(self) -> Picture | None:
+    def _refuse_size(self) -> None:
+        with self._changed:
+            self._counts.received += 1
+            self._counts.failed += 1
+        self._on_notice(
+            f"{self.name}: its pictures no longer are {self.width}x{self.height} px; set it back, "
+            "or calibrate again"
+        )
+
+    def _first_picture(self) -> DecodedPicture | None:
         try:
             return self._decoder.read(timeout_s=self._settings.connect_s)
         except DecodingError:
             return None
 
-    def _watch_wall(self, clock: CaptureClock) -> None:
+    def _report_clock_step(self, clock: CaptureClock) -> None:
         step_ns = clock.wall_step_ns(wall_ns=time.time_ns(), monotonic_ns=time.monotonic_ns())
-        if abs(step_ns) > _LARGEST_STEP_NS:
+        if abs(step_ns) > _CLOCK_STEP_NS:
             self._on_notice(
-                "the system's clock was set; capture times go on by the time of the start"
+                "the system's clock was set; capture times continue from the time of the start"
             )
 
 
 def _stream_ns(milliseconds: float) -> int | None:
-    """The stream's own timestamp; None where it gives none."""
+    """The stream's own timestamp; None where it gives none, or one beyond 31 years."""
     return round(milliseconds * 1e6) if 0 < milliseconds < 1e12 else None

@@ -1,0 +1,114 @@
+"""The interface of every source of frames: what it gives, and what it can do."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import UInt8, UInt16
+
+from stream_dmr.errors import SourceError
+from stream_dmr.messages import Frame
+
+_SECOND_NS = 1_000_000_000
+
+
+@dataclass(kw_only=True)
+class CameraCounts:
+    """Frames of a live source: received = passed on + dropped + failed + waiting."""
+
+    received: int = 0
+    passed_on: int = 0
+    dropped: int = 0  # newer ones came before the chain had time for them
+    failed: int = 0  # of another size than the camera's first
+    reconnects: int = 0
+    last_arrival_ns: int = 0  # monotonic clock
+
+    @property
+    def waiting(self) -> int:
+        """Frames that the chain has not taken yet."""
+        return self.received - self.passed_on - self.dropped - self.failed
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResumePoint:
+    """How far earlier runs in the same output folder came."""
+
+    after_ns: int = 0  # the last capture time; every later one must be larger
+    clips_done: frozenset[str] = frozenset()  # names of clips that were read to their end
+    frames_done: Mapping[str, int] = field(default_factory=dict[str, int])  # of the other clips
+
+
+class Source(ABC):
+    """Frames in order, to be iterated once; `frame_index` from 1, `timestamp_ns` increasing.
+
+    The properties say what a source can do, so that no user has to ask for its class. The defaults
+    are those of a file: it ends, can be read again, and begins anew in every run.
+    """
+
+    name: str  # file name or address, for people
+    width: int  # px, of every frame
+    height: int
+    num_frames: int | None  # as the source promises; None where it doesn't
+    fps: float
+    warnings: list[str]  # problems that did not end the reading, one line each; complete at the end
+
+    @property
+    def is_endless(self) -> bool:
+        """True for cameras and growing folders, which end only when closed (or idle for long)."""
+        return False
+
+    @property
+    def is_live(self) -> bool:
+        """True for cameras and streams: their frames come by themselves and only once."""
+        return False
+
+    @property
+    def has_clips(self) -> bool:
+        """True where `Frame.source` names one of several clips, each read once over all runs."""
+        return False
+
+    @property
+    def counts(self) -> CameraCounts | None:
+        """Frames received, passed on and lost so far; None unless the source `is_live`."""
+        return None
+
+    def listen(self, on_notice: Callable[[str], None]) -> None:  # noqa: B027, optional
+        """Call `on_notice`, in any thread, with a line for each loss and return of a camera."""
+
+    def resume(self, point: ResumePoint) -> None:  # noqa: B027, optional
+        """Continue after earlier runs; call it before the iteration."""
+
+    @abstractmethod
+    def __iter__(self) -> Iterator[Frame]:
+        """Raises SourceError where a frame doesn't fit those before it."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release the file or device; the iteration ends."""
+
+
+def nominal_ns(frame_index: int, fps: float) -> int:
+    """The time of a frame where only a constant rate is known, ns since the first frame."""
+    return round((frame_index - 1) * _SECOND_NS / fps)
+
+
+def check_size(
+    image: UInt8[np.ndarray, "H W 3"] | UInt16[np.ndarray, "H W 3"],
+    *,
+    width: int,
+    height: int,
+    where: str,
+) -> None:
+    """Raise SourceError, naming both sizes, unless a picture is `width` x `height` px."""
+    if image.shape[:2] != (height, width):
+        size = image.shape[1], image.shape[0]
+        raise size_error(size, expected=(width, height), where=where)
+
+
+def size_error(size: tuple[int, int], *, expected: tuple[int, int], where: str) -> SourceError:
+    """The error for a frame of another size; both are width and height in px."""
+    return SourceError(
+        f"{where}: expected {expected[0]}x{expected[1]} px, as the first frame has, got "
+        f"{size[0]}x{size[1]} px; pictures of one source must have one size"
+    )
