@@ -17,9 +17,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from nodes.crop_fish import CropFish
-from nodes.read_frames import ReadFrames
 from stream_dmr.messages import FishCrop, FittedMesh, Message
+from stream_dmr.nodes.crop_fish import CropFish
+from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.report.pictures import drawn, outlines_of
 from stream_dmr.running.config import load_config
 from stream_dmr.running.pipeline import run_chain

@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, UInt8
 
-from nodes.crop_fish import CropFish
 from stream_dmr.calibration.file import load_calibration
 from stream_dmr.messages import FishCrop
+from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.segmentation.annotations.detections import open_annotations
 from stream_dmr.segmentation.annotations.files import Masks
 from stream_dmr.segmentation.masks.crop import CropFishSettings, frame_from_crop_map

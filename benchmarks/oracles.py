@@ -21,8 +21,8 @@ from table1.dmr import through_all
 from table1.fish import FISH_PER_SCENE, FRAMES_PER_SCENE, Haul, watch
 from targets import body_template
 
-from nodes.smooth_length import SmoothLength
 from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish
+from stream_dmr.nodes.smooth_length import SmoothLength
 from stream_dmr.running.config import Config
 from stream_dmr.running.run import later_nodes
 from stream_dmr.simulation.body import HALIBUT, Body

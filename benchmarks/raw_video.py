@@ -24,11 +24,11 @@ from chain import write_clip
 from jaxtyping import Bool
 from masks import iou, write_sheet
 
-from nodes.crop_fish import CropFish
-from nodes.read_frames import ReadFrames
 from stream_dmr.calibration.file import load_calibration
 from stream_dmr.evaluation.files import read_truth
 from stream_dmr.messages import FishCrop, LengthEstimate, Message
+from stream_dmr.nodes.crop_fish import CropFish
+from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.running.config import load_config
 from stream_dmr.running.pipeline import StageCounters, run_chain
 from stream_dmr.running.run import later_nodes

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from hota import score
 
-from nodes.crop_fish import CropFish
 from stream_dmr.messages import Frame
+from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.segmentation.detection.detectors import DetectFishSettings, open_detector
 from stream_dmr.segmentation.masks.crop import CropFishSettings
 from stream_dmr.segmentation.tracking.tracked_fish import FollowedFish, TrackFishSettings

@@ -1,6 +1,6 @@
 """Lengths of hooked, bent fish from one calibrated camera.
 
-Conventions, valid everywhere in this package and in `nodes`:
+Conventions, valid everywhere in this package:
 
 Camera frame
     OpenCV's: x right, y down, z forward, in millimetres. The world frame is the reference

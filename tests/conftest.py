@@ -6,7 +6,7 @@ import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
-install_import_hook(["stream_dmr", "nodes"], "beartype.beartype")
+install_import_hook("stream_dmr", "beartype.beartype")
 
 # Nothing is timed in tests: the first example pays for imports and compilers. By default the same
 # examples come each time, so that a change is judged by itself; `make test-slow` draws new ones.

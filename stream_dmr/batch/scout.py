@@ -3,7 +3,7 @@
 from contextlib import closing
 from pathlib import Path
 
-from nodes.crop_fish import CropFish
+from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.running.inputs import RunRequest, checked_inputs
 from stream_dmr.running.observer import Observer
 from stream_dmr.running.sightings import Scout, write_sightings

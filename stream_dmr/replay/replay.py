@@ -7,12 +7,12 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from nodes.crop_fish import CropFish
-from nodes.read_frames import ReadFrames
 from stream_dmr.calibration.file import load_calibration
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
+from stream_dmr.nodes.crop_fish import CropFish
+from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.recording.messages.header import RunHeader
 from stream_dmr.recording.messages.selection import WHOLE, Part
 from stream_dmr.recording.reading.frame_images import SourcePictures

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from nodes.read_frames import ReadFrames
 from stream_dmr.calibration.file import load_calibration, require_size
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
+from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.recording.messages.header import RunHeader
 from stream_dmr.running.config import Config, load_config, to_toml
 from stream_dmr.running.only import Only, OnlyFish, OnlyFrames

@@ -6,15 +6,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from nodes.crop_fish import CropFish
-from nodes.fit_mesh import FitMesh
-from nodes.localize import Localize
-from nodes.smooth_length import SmoothLength
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.fitting.compile_kernels import rehearse
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.messages import LengthEstimate, LocalizedFish
+from stream_dmr.nodes.crop_fish import CropFish
+from stream_dmr.nodes.fit_mesh import FitMesh
+from stream_dmr.nodes.localize import Localize
+from stream_dmr.nodes.smooth_length import SmoothLength
 from stream_dmr.running.config import Config
 from stream_dmr.running.error_policy import DriftWatch, Tolerance, go_on
 from stream_dmr.running.folder import RESULTS, SEGMENTED

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from nodes.fit_mesh import FitMesh
 from stream_dmr.camera import crop_from_frame, frame_from_crop
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.paper.objective import Objective
@@ -13,6 +12,7 @@ from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
 from stream_dmr.geometry import arc_length
 from stream_dmr.messages import FishEnds, SolverReport
+from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.template.template import load_template
 from tests.support.shapes import (
     FRAME_CAMERA,

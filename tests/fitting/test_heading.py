@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nodes.fit_mesh import FitMesh
 from stream_dmr.camera import crop_from_frame
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.heading import HeadMemory
 from stream_dmr.fitting.paper.skinning import Rig
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.messages import FishEnds
+from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.template.template import load_template
 from tests.support.shapes import FRAME_CAMERA, STRAIGHT, crop_of, fish_template, pose
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 from tests.support.shapes import crop_of, pose
-from nodes.fit_mesh import FitMesh
+from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.compile_kernels import rehearse
 from stream_dmr.fitting.settings import FitMeshSettings

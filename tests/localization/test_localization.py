@@ -4,7 +4,6 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from nodes.localize import Localize
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.geometry import arc_length
 from stream_dmr.localization.localize import (
@@ -24,6 +23,7 @@ from stream_dmr.localization.localize import (
     localize,
 )
 from stream_dmr.messages import CropQuality, FittedMesh, FittedShape, LossTerms
+from stream_dmr.nodes.localize import Localize
 
 GOOD = CropQuality(touches_border=False, visible_fraction=1.0, sharpness=9.0, mask_area_px=1e4)
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from nodes.localize import Localize
-from nodes.smooth_length import SmoothLength
 from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.localization.localize import LocalizeSettings
+from stream_dmr.nodes.localize import Localize
+from stream_dmr.nodes.smooth_length import SmoothLength
 from tests.lengths.test_lengths import frame
 from tests.localization.test_localization import make_calibration, make_mesh, straight_fish
 

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nodes.crop_fish import CropFish
 from stream_dmr.camera import Camera, crop_from_frame, frame_from_crop
 from stream_dmr.messages import Frame
+from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.segmentation.annotations.detections import Annotations, Detection
 from stream_dmr.segmentation.annotations.files import Box
 from stream_dmr.segmentation.masks.crop import (

@@ -4,8 +4,8 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from nodes.crop_fish import CropFish
 from stream_dmr.errors import ModelError
+from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.segmentation.annotations.detections import Annotations
 from stream_dmr.segmentation.masks.crop import CropFishSettings
 from stream_dmr.segmentation.masks.grabcut import GrabCut

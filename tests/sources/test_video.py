@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nodes.read_frames import ReadFrames
 from stream_dmr.errors import SourceError
+from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
 from stream_dmr.sources.source import nominal_ns
