@@ -1,8 +1,8 @@
 """Throughput of `stream-dmr batch`: `python benchmarks/backlog.py --videos 4 --engines local ray`.
 
-Copies of the embedded scene with their masks, and all of them in one raw video, in pieces of a
-scene's length: with one worker and with two; `--rounds 3` gives medians. The first video of each
-worker also pays for its start; `docs/scale.md` has the figures.
+Copies of the embedded scene with their masks, and all of them in one raw video; with one worker and
+with two; `--rounds 3` gives medians. The first video of each worker also pays for its start;
+`docs/scale.md` has the figures.
 """
 
 import argparse
@@ -23,8 +23,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from stream_dmr.batch.batch import Engine, batch
-from stream_dmr.batch.local import LocalEngine
+from stream_dmr.batch.driver import run_batch
+from stream_dmr.batch.engine import Engine
+from stream_dmr.batch.local_engine import LocalEngine
 from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
 
 DEMO = Path(__file__).resolve().parents[1] / "recordings" / "demo"
@@ -35,8 +36,7 @@ class Backlog(NamedTuple):
 
     name: str
     jobs: list[Job]
-    piece_frames: int
-    num_frames: int  # of all videos; what a piece skips before its first fish is work, too
+    num_frames: int  # of all videos
 
 
 @contextmanager
@@ -58,14 +58,13 @@ def engine_of(name: str, workers: int) -> Iterator[Engine]:
 
 
 def backlogs(folder: Path, videos: int) -> Iterator[Backlog]:
-    """So many videos with masks; one raw video as long as all of them, in pieces and whole."""
+    """So many videos with masks; one raw video as long as all of them."""
     masks = {"boxes": DEMO / "boxes.txt", "masks": DEMO / "masks"}
     with_masks = [{"video": DEMO / "video.mp4"} | masks] * videos
     num_frames = write_repeated(folder / "long.mp4", DEMO / "video.mp4", times=videos)
-    yield Backlog("masks", jobs_of(folder / "masks.csv", with_masks), 0, num_frames)
+    yield Backlog("masks", jobs_of(folder / "masks.csv", with_masks), num_frames)
     raw = jobs_of(folder / "raw.csv", [{"video": folder / "long.mp4"}])
-    yield Backlog("raw, in pieces", raw, num_frames // videos, num_frames)
-    yield Backlog("raw, whole", raw, 0, num_frames)
+    yield Backlog("raw", raw, num_frames)
 
 
 def jobs_of(manifest: Path, rows: Sequence[Mapping[str, object]]) -> list[Job]:
@@ -100,7 +99,7 @@ def measure(name: str, workers: int, work: Backlog, out: Path) -> float:
     with engine_of(name, workers) as engine:
         ready_s = time.perf_counter() - began
         stop = threading.Event()
-        summary = batch(work.jobs, out, engine, piece_frames=work.piece_frames, stop=stop)
+        summary = run_batch(work.jobs, out, engine, stop=stop)
     frames = work.num_frames
     fish = sum(one.num_fish for one in summary.outcomes)
     in_work = sum(one.elapsed_s for one in summary.outcomes)
@@ -125,7 +124,7 @@ def main() -> None:
         works = list(backlogs(Path(folder), arguments.videos))
         kinds = list(product(works, arguments.engines, arguments.workers))
         for number, (work, name, workers) in product(range(arguments.rounds), kinds):
-            if work.name == "raw, whole" and (name, workers) != ("local", 1):
+            if work.name == "raw" and (name, workers) != ("local", 1):
                 continue  # one video keeps one worker busy, wherever
             out = Path(folder) / f"{work.name}-{name}-{workers}-{number}"
             rates[work.name, name, workers].append(measure(name, workers, work, out))

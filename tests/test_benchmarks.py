@@ -99,13 +99,12 @@ def race_laps(setup, pair):
 
 
 def test_the_backlog_is_as_long_raw_as_with_masks(tmp_path):
-    with_masks, in_pieces, whole = backlog.backlogs(tmp_path, videos=2)
+    with_masks, whole = backlog.backlogs(tmp_path, videos=2)
     assert [job.trip for job in with_masks.jobs] == ["0", "1"]
     lengths = [cv2.VideoCapture(job.video).get(cv2.CAP_PROP_FRAME_COUNT) for job in with_masks.jobs]
-    (raw,) = in_pieces.jobs
+    (raw,) = whole.jobs
     assert cv2.VideoCapture(raw.video).get(cv2.CAP_PROP_FRAME_COUNT) == sum(lengths)
-    assert in_pieces.piece_frames == lengths[0]
-    assert whole.jobs == [raw]
+    assert with_masks.num_frames == whole.num_frames == sum(lengths)
 
 
 def test_deodr_draws_our_silhouette_half_a_pixel_wider():

@@ -1,7 +1,7 @@
 """The results of a batch as one Parquet data set, partitioned by vessel and trip.
 
-`DIR/dataset/fish` has one row a fish, `DIR/dataset/frames` one row a fish and frame; both hold the
-files of hive partitions, `vessel=.../trip=.../VIDEO.parquet`, one of each video.
+`DIR/dataset/fish` has one row a fish, `DIR/dataset/frames` one row a fish and frame; both are
+partitioned as by Hive, with one file a video: `vessel=.../trip=.../VIDEO.parquet`.
 """
 
 import csv
@@ -13,8 +13,8 @@ from typing import Any
 
 from pyarrow import Table, parquet
 
+from stream_dmr.batch.layout import TABLE_KINDS, dataset_file
 from stream_dmr.batch.manifest import Job
-from stream_dmr.batch.places import KINDS, in_dataset
 from stream_dmr.errors import OutputError
 from stream_dmr.recording.reading.reader import open_recordings
 from stream_dmr.results.finished_fish import FishResult, read_fish
@@ -26,17 +26,17 @@ from stream_dmr.results.verdicts import read_verdicts
 from stream_dmr.running.config import parse_config
 
 _PARTITIONS = ("vessel", "trip")
-_WHOLE_NUMBERS = ("frame_index", "timestamp_ns", "track_id")
-_MADE_BY = ("run_id", "software_version", "config_sha256")
-_OF_VIDEO = {"video": str, "haul": str}
-FISH_SCHEMA = _OF_VIDEO | {k: v for k, v in FISH_TABLE.items() if k not in _PARTITIONS}
-_FRAMES: dict[str, type] = {
-    **_OF_VIDEO,
+_INTEGER_COLUMNS = ("frame_index", "timestamp_ns", "track_id")
+_RUN_COLUMNS = ("run_id", "software_version", "config_sha256")
+_VIDEO_COLUMNS = {"video": str, "haul": str}
+_FISH_SCHEMA = _VIDEO_COLUMNS | {k: v for k, v in FISH_TABLE.items() if k not in _PARTITIONS}
+_FRAMES_SCHEMA: dict[str, type] = {
+    **_VIDEO_COLUMNS,
     **dict.fromkeys(FRAMES_COLUMNS, float),
-    **dict.fromkeys(_WHOLE_NUMBERS, int),
+    **dict.fromkeys(_INTEGER_COLUMNS, int),
     "accepted": bool,
     "reason": str,
-    **dict.fromkeys(_MADE_BY, str),
+    **dict.fromkeys(_RUN_COLUMNS, str),
 }
 
 
@@ -48,34 +48,33 @@ def write_tables(folder: Path, job: Job) -> None:
     fish = read_fish(folder, recording)
     of_video = {"video": job.name, "haul": job.haul}
     records = [fish_record(one, header.template, settings) | of_video for one in fish]
-    tables = {"fish": (records, FISH_SCHEMA), "frames": (_frames(folder, fish, of_video), _FRAMES)}
-    for kind, (rows, schema) in tables.items():
-        _write(folder / f"{kind}.parquet", rows, schema)
-    add_files(folder, [folder / f"{kind}.parquet" for kind in KINDS])
+    _write(folder / "fish.parquet", records, _FISH_SCHEMA)
+    _write(folder / "frames.parquet", _frame_records(folder, fish, of_video), _FRAMES_SCHEMA)
+    add_files(folder, [folder / f"{kind}.parquet" for kind in TABLE_KINDS])
 
 
-def _frames(
+def _frame_records(
     folder: Path, fish: Sequence[FishResult], of_video: dict[str, str]
 ) -> list[dict[str, Any]]:
-    made = {one.estimate.track_id: {"run_id": one.run_id} | asdict(one.facts) for one in fish}
+    by_track = {one.estimate.track_id: {"run_id": one.run_id} | asdict(one.facts) for one in fish}
     frames = list[dict[str, Any]]()
     with (folder / "frames.csv").open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
-            record = {name: _value(row[name], _FRAMES[name]) for name in FRAMES_COLUMNS}
-            frames.append(record | of_video | made.get(record["track_id"], {}))
+            record = {name: _value(row[name], _FRAMES_SCHEMA[name]) for name in FRAMES_COLUMNS}
+            frames.append(record | of_video | by_track.get(record["track_id"], {}))
     return frames
 
 
 def publish(folder: Path, job: Job, out: Path) -> None:
-    """Make the tables of a finished video a part of the data set. Idempotent.
+    """Copy the tables of a finished video into the data set. Idempotent.
 
-    What reviewers have said since they were written comes in as well.
+    They are written anew where a reviewer has added verdicts since.
     """
-    if _last_said(folder) > _time(folder, "fish"):
+    if _last_verdict_ns(folder) > _written_ns(folder, "fish"):
         write_tables(folder, job)
-    for kind in KINDS:
+    for kind in TABLE_KINDS:
         target = _target(out, kind, job)
-        if target.exists() and target.stat().st_mtime_ns >= _time(folder, kind):
+        if target.exists() and target.stat().st_mtime_ns >= _written_ns(folder, kind):
             continue
         target.parent.mkdir(parents=True, exist_ok=True)
         draft = target.with_suffix(".part")
@@ -84,9 +83,9 @@ def publish(folder: Path, job: Job, out: Path) -> None:
 
 
 def withdraw_others(jobs: Iterable[Job], out: Path) -> None:
-    """Take out of the data set what is of no finished video, such as one that was redone."""
+    """Remove all but the files of finished `jobs` from the data set."""
     jobs = list(jobs)
-    for kind in KINDS:
+    for kind in TABLE_KINDS:
         known = {_target(out, kind, job) for job in jobs}
         for path in (out / "dataset" / kind).rglob("*"):
             if path.is_file() and path not in known:
@@ -94,20 +93,20 @@ def withdraw_others(jobs: Iterable[Job], out: Path) -> None:
 
 
 def _target(out: Path, kind: str, job: Job) -> Path:
-    return in_dataset(out, kind, vessel=job.vessel, trip=job.trip, name=job.name)
+    return dataset_file(out, kind, vessel=job.vessel, trip=job.trip, name=job.name)
 
 
-def _time(folder: Path, kind: str) -> int:
+def _written_ns(folder: Path, kind: str) -> int:
     return (folder / f"{kind}.parquet").stat().st_mtime_ns
 
 
-def _last_said(folder: Path) -> int:
-    """When a reviewer last said something, ns since 1970; 0 for never."""
+def _last_verdict_ns(folder: Path) -> int:
+    """When a reviewer gave the last verdict, ns since 1970; 0 without any."""
     try:
-        said = read_verdicts(folder / DATABASE)
-    except OutputError:  # `verify` says what is wrong with it
+        verdicts = read_verdicts(folder / DATABASE)
+    except OutputError:  # which `verify` reports
         return 0
-    return said[-1].written_ns if said else 0
+    return verdicts[-1].written_ns if verdicts else 0
 
 
 def _write(path: Path, records: list[dict[str, Any]], schema: dict[str, type]) -> None:

@@ -1,10 +1,9 @@
-"""The manifest of a batch: a row names a video, where its fish are, and where it comes from."""
+"""The manifest of a batch: one row a video, with its annotations and its vessel, trip and haul."""
 
 import csv
 import json
 import re
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -19,9 +18,9 @@ _FILES = COLUMNS[:4]
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One video. Paths are absolute, "" where there is none; it travels to workers as JSON."""
+    """One video of a batch; workers get it as JSON. Paths are absolute, "" where there is none."""
 
-    name: str  # of its folder, unlike any other's
+    name: str  # of its folder; unique in the manifest
     video: str
     calibration: str = ""
     boxes: str = ""
@@ -31,40 +30,32 @@ class Job:
     haul: str = ""
     config: str = ""
     template: str = "halibut"
-    piece: str = ""  # of the video, where this is one; see `pieces`
-    sightings: str = ""  # where the fish of a piece are, as its video's scout noted
-    tracks: Sequence[int] = ()  # the fish that a piece measures
-    first_frame: int = 0
-    last_frame: int = 0
-    share: float = 1.0  # of the work that the whole video is
-
-    @property
-    def label(self) -> str:
-        """Unlike that of any other video, and of any other piece."""
-        return f"{self.name}/{self.piece}" if self.piece else self.name
 
     @property
     def key(self) -> str:
-        """Of all that its results depend on: a video that is done counts as done by it."""
-        stamps = [_stamp(path) for path in (self.video, self.masks)]
-        contents = [_content(path) for path in (self.calibration, self.boxes, self.config)]
+        """SHA-256 over every input of a video; a finished video is skipped while it is unchanged.
+
+        Videos and masks count by size and time of change, since reading them takes too long.
+        """
+        stamps = [_size_and_time(path) for path in (self.video, self.masks)]
+        hashes = [_content_hash(path) for path in (self.calibration, self.boxes, self.config)]
         mesh = Path(self.template)
-        contents += [_content(str(path)) for path in (mesh, mesh.with_suffix(".toml"))]
-        made_of = [__version__, asdict(self), stamps, contents]
-        return sha256(json.dumps(made_of).encode()).hexdigest()
+        hashes += [_content_hash(str(path)) for path in (mesh, mesh.with_suffix(".toml"))]
+        inputs = [__version__, asdict(self), stamps, hashes]
+        return sha256(json.dumps(inputs).encode()).hexdigest()
 
     @property
     def num_bytes(self) -> int:
-        """Of the video: by these the time left is estimated."""
+        """Size of the video, from which the time left is estimated; 0 where it is no file."""
         path = Path(self.video)
         return path.stat().st_size if path.is_file() else 0
 
 
 def read_manifest(path: Path, *, config: Path | None, template: str) -> list[Job]:
-    """The jobs of a manifest; its relative paths start from its own folder.
+    """The jobs of a manifest; relative paths start from the manifest's folder.
 
-    Raises UserError where it can't be read or lacks its columns. Files that it names are not
-    looked at here: a missing one is the failure of its own row.
+    Raises UserError where it can't be read or lacks its columns. Whether the files that it names
+    exist is not checked: a missing one fails its own video.
     """
     rows = _rows(path)
     names = _names([row["video"] or "" for row in rows])
@@ -98,9 +89,9 @@ def _rows(path: Path) -> list[dict[str | None, str | None]]:
 
 
 def _names(videos: list[str]) -> list[str]:
-    """A folder's name for each: that of the video, and a number where it comes again.
+    """A folder name for each video: its file's name, with a number where that occurs again.
 
-    None ends like the folder of a video that is being measured.
+    No name ends with `.part`, which marks an unfinished folder.
     """
     stems = [re.sub(r"[^A-Za-z0-9._-]+", "-", Path(v).stem).strip("-.") or "video" for v in videos]
     seen, names, taken = Counter[str](), list[str](), set[str]()
@@ -114,8 +105,7 @@ def _names(videos: list[str]) -> list[str]:
     return names
 
 
-def _stamp(path: str) -> list[int]:
-    """Size and time of change: videos are too large to be read just for this."""
+def _size_and_time(path: str) -> list[int]:
     try:
         status = Path(path).stat() if path else None
     except OSError:
@@ -123,7 +113,7 @@ def _stamp(path: str) -> list[int]:
     return [] if status is None else [status.st_size, status.st_mtime_ns]
 
 
-def _content(path: str) -> str:
+def _content_hash(path: str) -> str:
     try:
         return sha256(Path(path).read_bytes()).hexdigest() if path else ""
     except OSError:

@@ -1,70 +1,58 @@
-"""How far a batch is, and how long it will take."""
+"""Progress of a batch, and an estimate of the time left."""
 
+import math
 import time
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 
 from stream_dmr.batch.manifest import Job
 
-_SAY_S = 5.0  # between two lines of progress
-_LEAST = 0.01  # of the work that gives an estimate: first frames wait for what is loaded for them
-Progress = Callable[[float], None]  # gets the share of one job that is done, 0 to 1
+_LOG_EVERY_S = 5.0  # between two lines of progress
+_MIN_SHARE = 0.01  # of the work, before a pace is estimated: the first frames also load and compile
+OnProgress = Callable[[float], None]  # takes the share of one video that is done, 0 to 1
 
 
-class Clock:
-    """Progress over all videos by their bytes, with an estimate of the time left."""
+class BatchProgress:
+    """Progress over all videos by their bytes; logs a line now and then."""
 
-    def __init__(self, videos: Sequence[Job], say: Callable[[str], None]) -> None:
-        self._bytes = {job.name: max(1, job.num_bytes) for job in videos}
-        self._shares = {name: defaultdict[str, float](float) for name in self._bytes}  # by piece
-        self._over = set[str]()
-        self._say = say
-        self._began = time.monotonic()
-        self._said = self._began
-        self._before = 0.0  # share that was done when it began
+    def __init__(self, jobs: Sequence[Job], log: Callable[[str], None]) -> None:
+        self._bytes = {job.name: max(1, job.num_bytes) for job in jobs}
+        self._shares = dict.fromkeys(self._bytes, 0.0)
+        self._finished = set[str]()
+        self._log = log
+        self._began = self._logged = time.monotonic()
 
-    def of(self, job: Job) -> Progress:
-        """What takes the shares of one job, which may be a piece of a video."""
+    def of(self, job: Job) -> OnProgress:
+        """The function that takes the share done of one video, from any thread."""
 
         def take(share: float) -> None:
-            self._shares[job.name][job.piece] = job.share * share
+            self._shares[job.name] = share
 
         return take
 
-    def begin(self) -> None:
-        """All that is over so far was over before; the pace is that of what comes now."""
-        self._before, self._began = self._share(), time.monotonic()
+    def finish(self, name: str) -> None:
+        """Count a video as over, measured or failed."""
+        self._finished.add(name)
+        self._shares[name] = 1.0
+        self._logged = -math.inf  # so that the next `update` says so
 
-    def over(self, name: str) -> None:
-        """A video is over, well or not."""
-        self._over.add(name)
-        self._said = -_SAY_S
-
-    def pause(self) -> None:
-        """Say how far all of it is, now and then."""
+    def update(self) -> None:
+        """Log a line if one is due."""
         now = time.monotonic()
-        if now - self._said >= _SAY_S:
-            self._said = now
-            self._say(self.line(now - self._began))
+        if now - self._logged >= _LOG_EVERY_S:
+            self._logged = now
+            self._log(self.line(now - self._began))
 
     def line(self, elapsed_s: float) -> str:
-        """Videos over, the share of all bytes, and the time left at this pace."""
-        share = self._share()
-        made = share - self._before
-        left = duration(elapsed_s * (1 - share) / made) if made >= _LEAST else "unknown"
-        over = len(self._over)
+        """The videos over, the share of all bytes, and the time left at the pace so far."""
+        total = max(1, sum(self._bytes.values()))
+        share = sum(self._bytes[name] * done for name, done in self._shares.items()) / total
+        left = duration(elapsed_s * (1 - share) / share) if share >= _MIN_SHARE else "unknown"
+        over = len(self._finished)
         return f"{over} of {len(self._bytes)} videos, {100 * share:.0f} %, time left: {left}"
-
-    def _share(self) -> float:
-        done = (
-            size * (1.0 if name in self._over else sum(list(self._shares[name].values())))
-            for name, size in self._bytes.items()
-        )
-        return sum(done) / max(1, sum(self._bytes.values()))
 
 
 def duration(seconds: float) -> str:
-    """Seconds in words, as coarse as they are certain."""
+    """Seconds as text in s, min or h; two units would say more than an estimate knows."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -1,21 +1,21 @@
-"""The engine past one machine: a Ray task for each video. All machines see the same folders."""
+"""The engine for several machines: one Ray task a video. All machines see the same folders."""
 
 import logging
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from importlib import import_module  # an extra: nothing here needs it to be installed
+from importlib import import_module  # Ray is an extra: type checks pass without it
 from pathlib import Path
 from typing import Any
 
-from stream_dmr.batch.job import Outcome, do_job
+from stream_dmr.batch.layout import FAILED
 from stream_dmr.batch.manifest import Job
-from stream_dmr.batch.places import FAILED
-from stream_dmr.batch.progress import Clock
+from stream_dmr.batch.measure_video import Outcome, measure_video
+from stream_dmr.batch.progress import BatchProgress
 from stream_dmr.errors import ConfigError, UserError
 
-_MOST_RETRIES = 3  # of a video whose worker or machine died; its own mistakes are not tried again
-_WAIT_S = 1.0
+_MAX_RETRIES = 3  # of a video whose worker or machine died (Ray's default); errors are not retried
+_POLL_S = 1.0  # how soon `stop` is seen
 
 
 class RayEngine:
@@ -24,8 +24,8 @@ class RayEngine:
     def __init__(self, *, address: str | None = None, gpus: float = 0.0) -> None:
         """`address` of a cluster, "auto" for the one that this machine belongs to, None: a new one.
 
-        ConfigError without the package, UserError where the cluster can't be reached, or has no
-        GPUs though it should.
+        `gpus`: share of a GPU for each video. Raises ConfigError without the package, UserError
+        where the cluster can't be reached or has no GPUs though `gpus` asks for some.
         """
         try:
             ray: Any = import_module("ray")
@@ -46,24 +46,24 @@ class RayEngine:
             ray.shutdown()
             raise UserError(
                 f"--gpus {gpus:g}: expected a cluster with GPUs, found none; videos would wait for "
-                "ever: leave it out"
+                "ever; leave out --gpus"
             )
         self._measure: Any = ray.remote(
-            num_cpus=1, num_gpus=gpus, max_retries=_MOST_RETRIES, max_calls=0
-        )(measure)
+            num_cpus=1, num_gpus=gpus, max_retries=_MAX_RETRIES, max_calls=0
+        )(measure_on_worker)
 
     def close(self) -> None:
-        """Leave the cluster; one that was started here ends."""
+        """Disconnect from the cluster; a cluster that was started here ends."""
         self._ray.shutdown()
 
     def outcomes(
-        self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, clock: Clock
+        self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, progress: BatchProgress
     ) -> Iterator[Outcome]:
-        """See `batch.Engine`."""
+        """See `Engine`."""
         waiting = {self._measure.remote(asdict(job), str(out.resolve())): job for job in jobs}
         while waiting:
-            done, _ = self._ray.wait(list(waiting), timeout=_WAIT_S)
-            clock.pause()
+            done, _ = self._ray.wait(list(waiting), timeout=_POLL_S)
+            progress.update()
             for task in done:
                 yield self._outcome(task, waiting.pop(task))
             if stop.is_set():
@@ -75,10 +75,14 @@ class RayEngine:
         try:
             return Outcome(**self._ray.get(task))
         except self._ray.exceptions.RayError as error:
-            last = str(error).strip().splitlines()[-1]
-            return Outcome(name=job.label, key=job.key, status=FAILED, reason=f"on Ray: {last}")
+            last_line = str(error).strip().splitlines()[-1]
+            reason = f"on Ray: {last_line}"
+            return Outcome(name=job.name, key=job.key, status=FAILED, reason=reason)
 
 
-def measure(job: dict[str, Any], out: str) -> dict[str, Any]:
-    """The task: a video's outcome. Plain values travel between versions of Python."""
-    return asdict(do_job(Job(**job), Path(out)))
+def measure_on_worker(job: dict[str, Any], out: str) -> dict[str, Any]:
+    """Measure a job given as a dict, return its Outcome as one: plain values need no pickled class.
+
+    `out` is the batch's folder.
+    """
+    return asdict(measure_video(Job(**job), Path(out)))

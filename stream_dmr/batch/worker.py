@@ -1,8 +1,8 @@
-"""A process that measures videos: `python -m stream_dmr.batch.worker OUT`, a job in each line.
+"""A process that measures videos: `python -m stream_dmr.batch.worker OUT`, one job a line on stdin.
 
-It answers on stdout: the share of the video that is done, as often as it grows by a hundredth, and
-OVER. It ends with the process that started it, when its stdin closes: nobody else would take note
-of its work.
+It answers on stdout: the share of the video that is done, whenever that grew by a hundredth, and
+FINISHED. When its stdin closes it exits at once, in the middle of a video as well: the process that
+started it has ended, and nothing would record the outcome.
 """
 
 import json
@@ -12,35 +12,36 @@ import sys
 import threading
 from pathlib import Path
 
-from stream_dmr.batch.job import do_job
 from stream_dmr.batch.manifest import Job
+from stream_dmr.batch.measure_video import measure_video
 
-OVER = "over"
+FINISHED = "finished"
 
 
 def main() -> None:
-    """Do the jobs that come."""
+    """Measure the jobs that come on stdin."""
     jobs = queue.Queue[str]()
-    threading.Thread(target=_read, args=(jobs,), daemon=True).start()
+    threading.Thread(target=_read_stdin, args=(jobs,), daemon=True).start()
     while True:
-        do_job(Job(**json.loads(jobs.get())), Path(sys.argv[1]), on_progress=Hundredths().say)
-        print(OVER, flush=True)
+        job, out = Job(**json.loads(jobs.get())), Path(sys.argv[1])
+        measure_video(job, out, on_progress=PercentPrinter().update)
+        print(FINISHED, flush=True)
 
 
-class Hundredths:
-    """Says a share, but not too often."""
+class PercentPrinter:
+    """Prints a share at each whole percent."""
 
     def __init__(self) -> None:
-        self._said = 0
+        self._printed = 0
 
-    def say(self, share: float) -> None:
-        """Print it where it has grown by a hundredth."""
-        if int(100 * share) > self._said:
-            self._said = int(100 * share)
+    def update(self, share: float) -> None:
+        """Print `share` where it has grown by a hundredth since the last print."""
+        if int(100 * share) > self._printed:
+            self._printed = int(100 * share)
             print(share, flush=True)
 
 
-def _read(jobs: queue.Queue[str]) -> None:
+def _read_stdin(jobs: queue.Queue[str]) -> None:
     for line in sys.stdin:
         jobs.put(line)
     os._exit(0)

@@ -13,7 +13,7 @@ import typer
 from stream_dmr.cli.support import ConfigOption, TemplateOption, stop_on_signals
 
 if TYPE_CHECKING:
-    from stream_dmr.batch.batch import Engine
+    from stream_dmr.batch.engine import Engine
 
 Engines = Literal["local", "ray"]
 
@@ -40,13 +40,6 @@ def batch(
     workers: Annotated[
         int, typer.Option(help="Videos at a time, with local.", show_default="one a core")
     ] = 0,
-    piece_frames: Annotated[
-        int,
-        typer.Option(
-            help="Longer videos are measured in pieces of so many frames; 0: never.",
-            min=0,
-        ),
-    ] = 20000,
     template: TemplateOption = "halibut",
     config: ConfigOption = None,
 ) -> None:
@@ -56,7 +49,7 @@ def batch(
     a row a fish, a row a fish and frame). A video that can't be measured fails alone.
     """
     with stop_on_signals() as stop:
-        from stream_dmr.batch.batch import batch as run_batch
+        from stream_dmr.batch.driver import run_batch
         from stream_dmr.batch.manifest import read_manifest
         from stream_dmr.batch.progress import duration
         from stream_dmr.running.config import load_config
@@ -70,9 +63,8 @@ def batch(
                 jobs,
                 out,
                 where,
-                piece_frames=piece_frames,
                 stop=stop,
-                say=lambda line: print(line, file=sys.stderr, flush=True),
+                log=lambda line: print(line, file=sys.stderr, flush=True),
             )
     failed = sum(outcome.status != "done" for outcome in summary.outcomes)
     print(
@@ -89,7 +81,7 @@ def batch(
 @contextmanager
 def _engine(name: str, workers: int, address: str | None, gpus: float) -> Iterator["Engine"]:
     if name == "local":
-        from stream_dmr.batch.local import LocalEngine
+        from stream_dmr.batch.local_engine import LocalEngine
 
         yield LocalEngine(workers or os.cpu_count() or 1)
         return

@@ -22,7 +22,7 @@ def verify(
     folder: Annotated[Path, typer.Argument(help="The --out of runs or of exports.", metavar="DIR")],
 ) -> None:
     """Check that results are still what their run measured; exit 1 and say what was changed."""
-    from stream_dmr.batch.check import verify_all
+    from stream_dmr.batch.verify_batch import verify_all
 
     changes, num_files = verify_all(folder)
     for change in changes:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from stream_dmr.batch.places import DONE, FAILED, VIDEO_FOLDERS, VIDEOS, read_videos
+from stream_dmr.batch.layout import DONE, FAILED, VIDEO_FOLDERS, VIDEOS, read_videos
 from stream_dmr.errors import UserError
 from stream_dmr.files import make_folder, writing_to
 from stream_dmr.recording.reading.reader import open_recordings

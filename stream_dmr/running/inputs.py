@@ -9,8 +9,6 @@ from stream_dmr.errors import UserError
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.recording.messages.header import RunHeader
 from stream_dmr.running.config import Config, load_config, to_toml
-from stream_dmr.running.only import Only, OnlyFish, OnlyFrames
-from stream_dmr.running.sightings import SightedFish
 from stream_dmr.segmentation.tracking.fish_finder import FishFinder, open_finder
 from stream_dmr.sources.source import Source
 from stream_dmr.template.template import Template, load_template
@@ -34,7 +32,6 @@ class RunRequest:
     vessel: str = ""  # where the fish come from, for the exports
     trip: str = ""
     haul: str = ""
-    only: Only | None = None  # a piece of the source
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +43,7 @@ class Inputs:
     template: Template
     calibration: Calibration | None
     detections: FishFinder
-    reader: ReadFrames | OnlyFrames
+    reader: ReadFrames
 
     @property
     def source(self) -> Source:
@@ -84,7 +81,12 @@ def checked_inputs(request: RunRequest) -> Inputs:
     config = load_config(request.config)
     template = load_template(request.template)
     calibration = None if request.calibration is None else load_calibration(request.calibration)
-    detections = _finder(request, config)
+    detections = open_finder(
+        boxes=request.boxes,
+        masks=request.masks,
+        detect=config.detect_fish,
+        track=config.track_fish,
+    )
     reader = ReadFrames(request.source, config.read_frames)
     inputs = Inputs(
         request=request,
@@ -92,7 +94,7 @@ def checked_inputs(request: RunRequest) -> Inputs:
         template=template,
         calibration=calibration,
         detections=detections,
-        reader=reader if request.only is None else OnlyFrames(reader, request.only),
+        reader=reader,
     )
     if calibration is not None:
         try:
@@ -101,16 +103,3 @@ def checked_inputs(request: RunRequest) -> Inputs:
             reader.close()
             raise
     return inputs
-
-
-def _finder(request: RunRequest, config: Config) -> FishFinder:
-    if request.only is not None and request.only.sightings is not None:
-        finder: FishFinder = SightedFish(request.only.sightings)
-    else:
-        finder = open_finder(
-            boxes=request.boxes,
-            masks=request.masks,
-            detect=config.detect_fish,
-            track=config.track_fish,
-        )
-    return finder if request.only is None else OnlyFish(finder, request.only)

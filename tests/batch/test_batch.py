@@ -11,20 +11,18 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from pyarrow import dataset
 
-from stream_dmr.batch.batch import batch
-from stream_dmr.batch.check import verify_all
-from stream_dmr.batch.job import Outcome, do_job, folder_of, outcome_of
-from stream_dmr.batch.local import LocalEngine
+from stream_dmr.batch.driver import run_batch
+from stream_dmr.batch.layout import results_folder
+from stream_dmr.batch.local_engine import LocalEngine
 from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
-from stream_dmr.batch.pieces import pieces_of
-from stream_dmr.batch.progress import Clock, duration
-from stream_dmr.errors import UserError
+from stream_dmr.batch.measure_video import Outcome, measure_video, read_outcome
+from stream_dmr.batch.progress import BatchProgress
+from stream_dmr.batch.verify_batch import verify_all
 from stream_dmr.results.provenance import seal_verdicts
 from stream_dmr.results.verdicts import Verdict, add_verdict
 from stream_dmr.running.run import run
@@ -34,6 +32,10 @@ from tests.support.tiny_clip import write_clip
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
 TABLES = ("lengths.csv", "frames.csv")
+COMING_AND_GOING = [
+    *([1, 2], [1, 2], [1, 2], [1, 2], [1], [1, 3], [1, 3], [3], [3], [3]),
+    *([], [4], [4], [4], [4], [4], [4], [4], [2, 4], [2]),
+]
 
 
 def write_manifest(path: Path, *jobs: dict[str, str]) -> Path:
@@ -73,14 +75,14 @@ class ThisProcess:
     """An engine without processes, which take seconds to start."""
 
     def outcomes(
-        self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, clock: Clock
+        self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, progress: BatchProgress
     ) -> Iterator[Outcome]:
         for job in jobs:
-            yield do_job(job, out, on_progress=clock.of(job))
+            yield measure_video(job, out, on_progress=progress.of(job))
 
 
 def measure(jobs: list[Job], out: Path) -> dict[str, str]:
-    summary = batch(jobs, out, ThisProcess(), stop=threading.Event())
+    summary = run_batch(jobs, out, ThisProcess(), stop=threading.Event())
     return {one.name: one.status for one in summary.outcomes}
 
 
@@ -89,26 +91,26 @@ def assert_same_tables(folder: Path, other: Path) -> None:
         assert (folder / name).read_bytes() == (other / name).read_bytes()
 
 
-def test_a_job_is_what_run_makes(season: Path, tmp_path: Path):
+def test_a_batch_measures_a_video_as_run_does(season: Path, tmp_path: Path):
     (job,) = jobs_of(season, tmp_path, row())
     shares = list[float]()
-    outcome = do_job(job, tmp_path, on_progress=shares.append)
-    folder = folder_of(job, tmp_path)
+    outcome = measure_video(job, tmp_path, on_progress=shares.append)
+    folder = results_folder(job, tmp_path)
     assert_same_tables(folder, season / "alone")
     assert (outcome.num_frames, outcome.num_fish) == (len(FISH), 2)
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
     assert verify_all(folder)[0] == []
-    assert outcome_of(job, tmp_path) == outcome
+    assert read_outcome(job, tmp_path) == outcome
 
 
-def test_videos_are_measured_and_a_bad_one_fails_alone(season: Path, tmp_path: Path):
+def test_a_bad_video_fails_alone(season: Path, tmp_path: Path):
     lines = row(), row("other", trip="8"), row(video="broken/video.mp4"), row(masks="none")
     jobs = jobs_of(season, tmp_path, *lines, row(video="missing.mp4", vessel=""))
     assert [job.name for job in jobs] == ["video", "video-2", "video-3", "video-4", "missing"]
     statuses = measure(jobs, tmp_path / "out")
     assert list(statuses.values()) == ["done", "done", "failed", "failed", "failed"]
-    assert_same_tables(folder_of(jobs[0], tmp_path / "out"), season / "alone")
+    assert_same_tables(results_folder(jobs[0], tmp_path / "out"), season / "alone")
     table = rows(tmp_path / "out" / "videos.csv")
     assert [line["status"] for line in table] == list(statuses.values())
     assert "broken" in table[2]["reason"]
@@ -123,7 +125,7 @@ def test_the_data_set_holds_every_fish_and_every_frame(season: Path, tmp_path: P
     fish = dataset.dataset(tmp_path / "dataset" / "fish", partitioning="hive").to_table()
     frames = dataset.dataset(tmp_path / "dataset" / "frames", partitioning="hive").to_table()
     for job in jobs:
-        folder = folder_of(job, tmp_path)
+        folder = results_folder(job, tmp_path)
         measured = rows(folder / "lengths.csv")
         found = [one for one in fish.to_pylist() if one["video"] == job.name]
         assert [one["track_id"] for one in found] == [int(one["track_id"]) for one in measured]
@@ -175,7 +177,7 @@ def test_pandas_opens_the_data_set(finished: Path):
     assert list(of_first.round(6)) == [float(line["length_mm"]) for line in lengths]
 
 
-def test_a_changed_data_set_is_found(season: Path, tmp_path: Path):
+def test_verify_finds_a_changed_data_set(season: Path, tmp_path: Path):
     (job,) = jobs_of(season, tmp_path, row())
     measure([job], tmp_path)
     assert verify_all(tmp_path)[0] == []
@@ -183,14 +185,14 @@ def test_a_changed_data_set_is_found(season: Path, tmp_path: Path):
     copy.write_bytes(copy.read_bytes() + b"x")
     (change,) = verify_all(tmp_path)[0]
     assert change.path == copy
-    assert "is not what videos/video/fish.parquet is" in change.what
+    assert "differs from videos/video/fish.parquet" in change.what
     shutil.copy(tmp_path / "videos" / "video" / "fish.parquet", copy)
     elsewhere = copy.parents[1] / "trip=9" / copy.name
     elsewhere.parent.mkdir()
     copy.rename(elsewhere)  # which makes it another trip's
     assert [(change.path, change.what) for change in verify_all(tmp_path)[0]] == [
         (copy, "is missing"),
-        (elsewhere, "is of no video that is done, by videos.csv"),
+        (elsewhere, "belongs to no finished video of videos.csv"),
     ]
 
 
@@ -202,7 +204,7 @@ def test_a_changed_data_set_is_found(season: Path, tmp_path: Path):
         ("Sea Bird", "Other", "is missing"),  # where the data set has that vessel's fish
     ],
 )
-def test_a_changed_table_of_videos(
+def test_verify_finds_a_changed_table_of_videos(
     season: Path, tmp_path: Path, before: str, after: str, expected: str
 ):
     jobs = jobs_of(season, tmp_path, row(vessel="Sea Bird"), row(video="no/broken.mp4"))
@@ -219,7 +221,7 @@ def test_a_changed_table_of_videos(
     assert verify_all(tmp_path)[0] == []
 
 
-def test_one_report_of_all_videos(season: Path, tmp_path: Path):
+def test_a_report_shows_all_videos(season: Path, tmp_path: Path):
     jobs = jobs_of(season, tmp_path, row(), row("other"), row(video="no/broken.mp4"))
     measure(jobs, tmp_path)
     target = tmp_path / "report.html"
@@ -245,10 +247,10 @@ def test_one_report_of_all_videos(season: Path, tmp_path: Path):
     assert "review its videos one by one" in refusal.error
 
 
-def test_verdicts_come_into_the_data_set_with_the_next_batch(season: Path, tmp_path: Path):
+def test_the_next_call_takes_verdicts_into_the_data_set(season: Path, tmp_path: Path):
     (job,) = jobs_of(season, tmp_path, row())
     measure([job], tmp_path)
-    database = folder_of(job, tmp_path) / "lengths.db"
+    database = results_folder(job, tmp_path) / "lengths.db"
     add_verdict(database, Verdict(track_id=2, kind="reject", reason="a glove", reviewer="Ada"))
     seal_verdicts(database.parent)
     measure([job], tmp_path)
@@ -257,35 +259,35 @@ def test_verdicts_come_into_the_data_set_with_the_next_batch(season: Path, tmp_p
     assert verify_all(tmp_path)[0] == []
 
 
-def test_what_is_done_is_not_done_again(season: Path, tmp_path: Path):
+def test_finished_videos_are_skipped(season: Path, tmp_path: Path):
     jobs = jobs_of(season, tmp_path, row(), row("other"), row(video="broken/video.mp4"))
     measure(jobs, tmp_path)
     before = {p: p.stat().st_mtime_ns for p in tmp_path.glob("videos/*/recording.mcap")}
-    summary = batch(jobs, tmp_path, ThisProcess(), stop=threading.Event())
+    summary = run_batch(jobs, tmp_path, ThisProcess(), stop=threading.Event())
     assert summary.num_before == 2
     assert {p: p.stat().st_mtime_ns for p in tmp_path.glob("videos/*/recording.mcap")} == before
     assert [one.status for one in summary.outcomes] == ["done", "done", "failed"]
 
 
-def test_another_trip_or_another_config_is_done_again(season: Path, tmp_path: Path):
+def test_a_changed_trip_is_measured_again_and_replaces_the_old_row(season: Path, tmp_path: Path):
     measure(jobs_of(season, tmp_path, row()), tmp_path)
     (job,) = jobs_of(season, tmp_path, row(trip="9"))
-    assert outcome_of(job, tmp_path) is None
+    assert read_outcome(job, tmp_path) is None
     measure([job], tmp_path)
     files = list((tmp_path / "dataset" / "fish").rglob("*.parquet"))
     assert [path.parent.name for path in files] == ["trip=9"]  # the old row is gone
 
 
-def test_without_results_there_is_no_outcome(season: Path, tmp_path: Path):
+def test_a_damaged_outcome_counts_as_none(season: Path, tmp_path: Path):
     (job,) = jobs_of(season, tmp_path, row())
-    folder = folder_of(job, tmp_path)
+    folder = results_folder(job, tmp_path)
     for content in ("", "{", "{}", '{"name": "video"}'):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "outcome.json").write_text(content)
-        assert outcome_of(job, tmp_path) is None
+        assert read_outcome(job, tmp_path) is None
 
 
-def test_killed_at_any_moment_it_goes_on_where_it_was(season: Path, tmp_path: Path):
+def test_a_killed_worker_or_batch_loses_no_finished_video(season: Path, tmp_path: Path):
     """First its worker is killed, which one video is charged with, then the batch itself."""
     clip, out = season / "clip", tmp_path / "out"
     manifest = write_manifest(season / f"{tmp_path.name}.csv", row(), row("other"), row("clip"))
@@ -332,7 +334,7 @@ def wait_for(condition, seconds: float = 300.0) -> None:  # type: ignore[no-unty
         time.sleep(0.01)
 
 
-def test_the_command(season: Path, tmp_path: Path):
+def test_the_command_exits_with_2_where_a_video_failed(season: Path, tmp_path: Path):
     manifest = write_manifest(season / f"{tmp_path.name}.csv", row(), row(video="missing.mp4"))
     clip = season / "clip"
     outcome = invoke(
@@ -345,41 +347,11 @@ def test_the_command(season: Path, tmp_path: Path):
     assert "missing: failed: " in outcome.err
 
 
-@pytest.mark.parametrize(
-    ("text", "match"),
-    [
-        ("", "expected the columns"),
-        ("video,calibration\n", "expected the columns"),
-        (f"{','.join(COLUMNS)},more\n", "expected the columns"),
-        (f"{','.join(COLUMNS)}\n", "a row for each video"),
-        (f"{','.join(COLUMNS)}\n,,,,,,\n", "line 2: expected 7 cells"),
-        (f"{','.join(COLUMNS)}\na.mp4,,,,,,,,\n", "line 2: expected 7 cells"),
-    ],
-)
-def test_a_wrong_manifest_is_refused(tmp_path: Path, text: str, match: str):
-    (tmp_path / "m.csv").write_text(text)
-    with pytest.raises(UserError, match=match):
-        read_manifest(tmp_path / "m.csv", config=None, template="cod")
-    with pytest.raises(UserError, match="expected a manifest"):
-        read_manifest(tmp_path / "none.csv", config=None, template="cod")
-
-
-def test_the_time_left_is_by_bytes(season: Path, tmp_path: Path):
-    jobs = jobs_of(season, tmp_path, row(), row())
-    clock = Clock(jobs, print)
-    assert clock.line(10.0).endswith("time left: unknown")
-    clock.of(jobs[0])(0.5)
-    assert clock.line(10.0) == "0 of 2 videos, 25 %, time left: 30 s"
-    clock.over(jobs[0].name)
-    assert clock.line(10.0) == "1 of 2 videos, 50 %, time left: 10 s"
-    assert (duration(200.0), duration(7200.0)) == ("3 min", "2.0 h")
-
-
-def test_a_stop_ends_it_soon_and_leaves_nothing_half_done(season: Path, tmp_path: Path):
+def test_a_stopped_batch_leaves_nothing_unfinished(season: Path, tmp_path: Path):
     jobs = jobs_of(season, tmp_path, row(), row("other"))
     stop = threading.Event()
     stop.set()
-    summary = batch(jobs, tmp_path, LocalEngine(1), stop=stop)
+    summary = run_batch(jobs, tmp_path, LocalEngine(1), stop=stop)
     assert summary.outcomes == []
     assert shutil.disk_usage(tmp_path).free > 0
     assert [line["status"] for line in rows(tmp_path / "videos.csv")] == ["waiting"] * 2
@@ -387,7 +359,7 @@ def test_a_stop_ends_it_soon_and_leaves_nothing_half_done(season: Path, tmp_path
 
 @pytest.mark.slow  # a dozen starts and more
 @pytest.mark.parametrize("seed", [1, 2])
-def test_killed_at_random_moments_it_gets_there(tmp_path: Path, seed: int):
+def test_a_batch_killed_at_random_moments_finishes_in_the_end(tmp_path: Path, seed: int):
     clip = tmp_path / "clip"
     write_clip(clip, fish=COMING_AND_GOING)
     write_clip(tmp_path / "other", fish=[[1], [1], [1]])
@@ -405,7 +377,7 @@ def test_killed_at_random_moments_it_gets_there(tmp_path: Path, seed: int):
 
 
 @pytest.mark.slow  # a cluster takes a minute to start
-def test_ray_on_two_nodes_loses_a_worker_and_nothing_else(season: Path, tmp_path: Path):
+def test_ray_measures_all_videos_though_a_worker_dies(season: Path, tmp_path: Path):
     pytest.importorskip("ray", reason="needs Ray: pip install 'stream-dmr[ray]'")
     clip, out = season / "clip", tmp_path / "out"
     lines = row(), row("other"), row(video="broken/video.mp4"), row("clip")
@@ -420,120 +392,3 @@ def test_ray_on_two_nodes_loses_a_worker_and_nothing_else(season: Path, tmp_path
     assert statuses == ["done", "done", "failed", "done"]
     for name in ("video", "video-4"):
         assert_same_tables(out / "videos" / name, season / "alone")
-
-
-COMING_AND_GOING = [
-    *([1, 2], [1, 2], [1, 2], [1, 2], [1], [1, 3], [1, 3], [3], [3], [3]),
-    *([], [4], [4], [4], [4], [4], [4], [4], [2, 4], [2]),
-]
-
-
-@pytest.mark.parametrize(("timeout_s", "piece_frames"), [(0.25, 4), (100.0, 9)])
-def test_pieces_make_the_tables_of_the_whole(tmp_path: Path, timeout_s: float, piece_frames: int):
-    clip = tmp_path / "clip"
-    write_clip(clip, fish=COMING_AND_GOING)  # fish cross every cut; 2 comes back at the end
-    config = clip / "quick.toml"
-    text = config.read_text() + f"\n[smooth_length]\ntrack_timeout_s = {timeout_s}\n"
-    config.write_text(text + "max_std_ratio = 1e9\n")
-    run(request(clip, tmp_path / "alone"), stop=threading.Event())
-    manifest = write_manifest(tmp_path / "manifest.csv", row())
-    (job,) = read_manifest(manifest, config=config, template=str(clip / "tiny.ply"))
-    pieces = pieces_of(job, piece_frames, tmp_path)
-    assert len(pieces) >= 2
-    assert sorted(i for piece in pieces for i in piece.tracks) == [1, 2, 3, 4]
-    out = tmp_path / "out"
-    summary = batch([job], out, ThisProcess(), piece_frames=piece_frames, stop=threading.Event())
-    assert [one.status for one in summary.outcomes] == ["done"]
-    assert summary.outcomes[0].num_fish == 4
-    folder = folder_of(job, out)
-    assert_same_tables(folder, tmp_path / "alone")
-    assert verify_all(folder)[0] == []
-    assert [path.name for path in (out / "videos").iterdir()] == ["video"]
-    assert not (out / "pieces").exists()
-    fish = dataset.dataset(out / "dataset" / "fish", partitioning="hive").to_table()
-    assert fish.num_rows == 4
-
-
-@pytest.fixture(scope="module")
-def unnamed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Job]:
-    """A clip whose boxes don't say which fish they are, and what `run` makes of it.
-
-    They lie too high, so that each follows the edges of the fish's last mask.
-    """
-    folder = tmp_path_factory.mktemp("unnamed")
-    clip = folder / "clip"
-    write_clip(clip, fish=COMING_AND_GOING)
-    lines = [line.split(",") for line in (clip / "boxes.txt").read_text().splitlines()]
-    moved = [f"{i},-1,{x},{int(y) - 5},{','.join(rest)}\n" for i, _, x, y, *rest in lines]
-    (clip / "boxes.txt").write_text("".join(moved))
-    config = clip / "quick.toml"
-    with config.open("a") as file:
-        file.write("\n[smooth_length]\ntrack_timeout_s = 0.25\nmax_std_ratio = 1e9\n")
-        file.write("\n[track_fish]\nmin_track_frames = 2\nmin_mask_confidence = 0.0\n")
-    run(
-        request(clip, folder / "alone", masks=None, boxes=clip / "boxes.txt"),
-        stop=threading.Event(),
-    )
-    manifest = write_manifest(folder / "m.csv", row(masks="", boxes="clip/boxes.txt"))
-    (job,) = read_manifest(manifest, config=config, template=str(clip / "tiny.ply"))
-    return folder, job
-
-
-def test_fish_that_nobody_named_are_found_once_and_measured_in_pieces(
-    unnamed: tuple[Path, Job], tmp_path: Path
-):
-    folder, job = unnamed
-    assert len(rows(folder / "alone" / "lengths.csv")) >= 3
-    (scout,) = pieces_of(job, 5, tmp_path)
-    assert scout.piece == "scout"
-    assert do_job(scout, tmp_path).num_frames == len(COMING_AND_GOING)
-    pieces = pieces_of(job, 5, tmp_path)
-    assert len(pieces) >= 2
-    assert sum(piece.share for piece in [scout, *pieces]) == pytest.approx(1.0)
-    summary = batch([job], tmp_path, ThisProcess(), piece_frames=5, stop=threading.Event())
-    assert [one.status for one in summary.outcomes] == ["done"]
-    assert_same_tables(folder_of(job, tmp_path), folder / "alone")
-    assert not (tmp_path / "pieces").exists()
-
-
-def test_a_video_fails_once_however_many_of_its_pieces_do(tmp_path: Path):
-    clip = tmp_path / "clip"
-    write_clip(clip, fish=COMING_AND_GOING)
-    (clip / "calibration.yaml").write_text("no calibration")
-    manifest = write_manifest(tmp_path / "manifest.csv", row())
-    (job,) = read_manifest(manifest, config=clip / "quick.toml", template=str(clip / "tiny.ply"))
-    said = list[str]()
-    stop, out = threading.Event(), tmp_path / "out"
-    summary = batch([job], out, ThisProcess(), piece_frames=4, stop=stop, say=said.append)
-    assert [one.status for one in summary.outcomes] == ["failed"]
-    assert len(said) == 1
-
-
-def test_what_the_scout_cannot_read_fails_alone(unnamed: tuple[Path, Job], tmp_path: Path):
-    """Scout and pieces in one batch, beside a video whose calibration is wrong."""
-    _, job = unnamed
-    broken = replace(job, name="broken", calibration=str(tmp_path / "none.yaml"))
-    summary = batch([broken, job], tmp_path, ThisProcess(), piece_frames=5, stop=threading.Event())
-    assert [one.status for one in summary.outcomes] == ["failed", "done"]
-    assert "none.yaml" in rows(tmp_path / "videos.csv")[0]["reason"]
-
-
-def test_pieces_that_are_done_are_kept(tmp_path: Path):
-    clip = tmp_path / "clip"
-    write_clip(clip, fish=COMING_AND_GOING)
-    manifest = write_manifest(tmp_path / "manifest.csv", row())
-    (job,) = read_manifest(manifest, config=clip / "quick.toml", template=str(clip / "tiny.ply"))
-    out = tmp_path / "out"
-    first = pieces_of(job, 9, out)[0]
-    do_job(first, out)
-    before = (folder_of(first, out) / "recording.mcap").stat().st_ino
-    summary = batch([job], out, ThisProcess(), piece_frames=9, stop=threading.Event())
-    assert [one.status for one in summary.outcomes] == ["done"]
-    assert (folder_of(job, out) / "recording-1.mcap").stat().st_ino == before
-
-
-def test_what_says_not_which_fish_it_is_stays_whole(season: Path, tmp_path: Path):
-    (job,) = jobs_of(season, tmp_path, row(masks="none"))
-    assert pieces_of(job, 2, tmp_path) == [job]
-    (job,) = jobs_of(season, tmp_path, row())
-    assert pieces_of(job, 100, tmp_path) == [job]

@@ -16,10 +16,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import stream_dmr.fitting.fitter
-from stream_dmr.batch.batch import batch
-from stream_dmr.batch.job import Outcome, do_job
+from stream_dmr.batch.driver import run_batch
 from stream_dmr.batch.manifest import Job, read_manifest
-from stream_dmr.batch.progress import Clock
+from stream_dmr.batch.measure_video import Outcome, measure_video
+from stream_dmr.batch.progress import BatchProgress
 
 assert stream_dmr.fitting.fitter  # loaded here, once
 
@@ -28,15 +28,15 @@ class ThisProcess:
     """Measures one after the other, where a kill hits all there is."""
 
     def outcomes(
-        self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, clock: Clock
+        self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, progress: BatchProgress
     ) -> Iterator[Outcome]:
         for job in jobs:
-            yield do_job(job, out)
+            yield measure_video(job, out)
 
 
 def check(out: Path) -> None:
-    """Whatever has its name is whole."""
-    for folder in [*out.glob("videos/*"), *out.glob("pieces/*/*")]:
+    """Assert that every folder without `.part` in its name is finished."""
+    for folder in out.glob("videos/*"):
         if folder.suffix != ".part":
             assert json.loads((folder / "outcome.json").read_text())["status"] == "done", folder
 
@@ -50,7 +50,7 @@ def main() -> None:
     while True:
         child = os.fork()
         if child == 0:
-            batch(jobs, out, ThisProcess(), piece_frames=5, stop=threading.Event())
+            run_batch(jobs, out, ThisProcess(), stop=threading.Event())
             os._exit(0)
         patience_s = moments.uniform(0.0, 1.0 + 1.0 * len(killed))
         until = time.monotonic() + patience_s

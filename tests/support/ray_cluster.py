@@ -14,7 +14,7 @@ from pathlib import Path
 
 from ray.cluster_utils import Cluster
 
-from stream_dmr.batch.batch import batch
+from stream_dmr.batch.driver import run_batch
 from stream_dmr.batch.manifest import read_manifest
 from stream_dmr.batch.ray_engine import RayEngine
 from stream_dmr.errors import UserError
@@ -50,7 +50,7 @@ def main() -> None:
         with closing(RayEngine(address=cluster.address)) as engine:
             cluster.wait_for_nodes()
             killer.start()
-            summary = batch(jobs, out, engine, piece_frames=1, stop=threading.Event(), say=print)
+            summary = run_batch(jobs, out, engine, stop=threading.Event(), log=print)
             killer.join()
     finally:
         cluster.shutdown()

@@ -69,10 +69,6 @@ class FishCounter:
             del self._clearly_seen[number]
         return self._ids[number]
 
-    def counted(self, number: int) -> int | None:
-        """The id of the fish that a track is by now, if it is one."""
-        return self._ids.get(number)
-
     def _counts(self, crop: FishCrop) -> bool:
         width, height = crop.frame_camera.width, crop.frame_camera.height
         x0, y0, x1, y1 = crop.bbox_xyxy_px.tolist()

@@ -3,8 +3,6 @@
 from collections.abc import Iterable
 from dataclasses import replace
 
-import numpy as np
-
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.annotations.detections import Detection
 from stream_dmr.segmentation.detection.detector import Detector
@@ -25,20 +23,13 @@ class FollowedFish:
         self._tracker = Tracker(settings)
         self._counter = FishCounter(settings)
         self._edges = LastEdges()
-        self.boxes: dict[int, np.ndarray] = {}  # of this frame, as the detector gave them, by track
-        self.beyond: dict[int, np.ndarray] = {}  # and how far they were moved, likewise
 
     def detect(self, frame: Frame) -> list[Detection]:
         """What may be fish in one frame, by the numbers of their tracks. Frames come in order."""
         sightings = self._tracker.step(frame, self._detector.find(frame))
-        self.boxes = {one.number: one.candidate.bbox_xyxy_px for one in sightings}
-        self.beyond = self._edges.beyond
+        boxes = {one.number: one.candidate.bbox_xyxy_px for one in sightings}
         visible = {one.number: one.visible_fraction for one in sightings}
-        return self._edges.mended(self.boxes, visible, frame)
-
-    def fish(self, number: int) -> int | None:
-        """The id of the fish that a track is; None while it doesn't count as one."""
-        return self._counter.counted(number)
+        return self._edges.mended(boxes, visible, frame)
 
     def admit(self, crops: Iterable[FishCrop]) -> list[FishCrop]:
         """The crops of those tracks that count as fish by now, by the fish's ids."""

@@ -1,22 +1,33 @@
-"""Where a batch keeps what, below its --out."""
+"""Names and places of the files of a batch, below its --out."""
 
 import csv
 from pathlib import Path
 from urllib.parse import quote
 
+from stream_dmr.batch.manifest import Job
 from stream_dmr.errors import OutputError
 
-VIDEOS = "videos.csv"  # what became of each video
+VIDEOS = "videos.csv"  # the outcome of each video
 VIDEO_FOLDERS = "videos"
-OUTCOME = "outcome.json"  # what became of one, in its folder
-KINDS = ("fish", "frames")  # of tables, one row each
+OUTCOME = "outcome.json"  # the outcome of one video, in its folder
+TABLE_KINDS = ("fish", "frames")  # tables of the data set
 RESULT_COLUMNS = ("status", "reason", "frames", "fish", "elapsed_s")
 VIDEO_COLUMNS = ("name", "video", "vessel", "trip", "haul", *RESULT_COLUMNS)
 DONE, FAILED, WAITING = "done", "failed", "waiting"
 
 
+def results_folder(job: Job, out: Path) -> Path:
+    """The folder of a finished or failed video."""
+    return out / VIDEO_FOLDERS / job.name
+
+
+def unfinished_folder(job: Job, out: Path) -> Path:
+    """The folder of a video while it is measured."""
+    return out / VIDEO_FOLDERS / f"{job.name}.part"
+
+
 def read_videos(out: Path) -> list[dict[str, str]]:
-    """The rows of videos.csv. OutputError where it is damaged."""
+    """The rows of videos.csv. Raises OutputError where it is damaged."""
     path = out / VIDEOS
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -28,11 +39,11 @@ def read_videos(out: Path) -> list[dict[str, str]]:
     return [dict(zip(VIDEO_COLUMNS, row, strict=True)) for row in rows[1:]]
 
 
-def in_dataset(out: Path, kind: str, *, vessel: str, trip: str, name: str) -> Path:
-    """The table of a video in the data set, partitioned as Hive does.
+def dataset_file(out: Path, kind: str, *, vessel: str, trip: str, name: str) -> Path:
+    """The Parquet file of a video in the data set, in Hive's partitions.
 
-    Without a name, vessel or trip is that of no letters: pandas can't join others to what Hive has
-    for none.
+    A missing vessel or trip is the empty string: pandas can't join other partitions to Hive's
+    `__HIVE_DEFAULT_PARTITION__`.
     """
     partition = Path(f"vessel={quote(vessel, safe='')}", f"trip={quote(trip, safe='')}")
     return out / "dataset" / kind / partition / f"{name}.parquet"

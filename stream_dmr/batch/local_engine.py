@@ -1,4 +1,4 @@
-"""The engine for one machine: processes that measure one video after the other."""
+"""The engine for one machine: processes, each of which measures one video after the other."""
 
 import json
 import os
@@ -13,40 +13,41 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import IO
 
-from stream_dmr.batch.job import Outcome, outcome_of
+from stream_dmr.batch.layout import FAILED
 from stream_dmr.batch.manifest import Job
-from stream_dmr.batch.places import FAILED
-from stream_dmr.batch.progress import Clock, Progress
+from stream_dmr.batch.measure_video import Outcome, read_outcome
+from stream_dmr.batch.progress import BatchProgress, OnProgress
+from stream_dmr.batch.worker import FINISHED
 
-_MOST_SAID = 300  # bytes of what a broken process said last
-_POLL_S = 0.2
+_MAX_STDERR_BYTES = 300  # of a crashed process, for the table of videos: about two lines
+_POLL_S = 0.2  # how soon `stop` is seen
 
 
 class LocalEngine:
-    """So many processes: a video that breaks its own breaks no other."""
+    """Runs worker processes: a video that crashes its process fails alone."""
 
     def __init__(self, workers: int) -> None:
         self._num_workers = workers
 
     def outcomes(
-        self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, clock: Clock
+        self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, progress: BatchProgress
     ) -> Iterator[Outcome]:
-        """See `batch.Engine`."""
-        waiting, over = queue.Queue[Job](), queue.Queue[Outcome]()
+        """See `Engine`."""
+        waiting, finished = queue.Queue[Job](), queue.Queue[Outcome]()
         for job in jobs:
             waiting.put(job)
         workers = [_Worker(out, stop) for _ in range(min(self._num_workers, len(jobs)))]
         threads = [
-            threading.Thread(target=worker.work, args=(waiting, over, clock), name="worker")
+            threading.Thread(target=worker.work, args=(waiting, finished, progress), name="worker")
             for worker in workers
         ]
         for thread in threads:
             thread.start()
         try:
-            while any(thread.is_alive() for thread in threads) or not over.empty():
+            while any(thread.is_alive() for thread in threads) or not finished.empty():
                 with suppress(queue.Empty):
-                    yield over.get(timeout=_POLL_S)
-                clock.pause()
+                    yield finished.get(timeout=_POLL_S)
+                progress.update()
                 if stop.is_set():
                     for worker in workers:
                         worker.kill()
@@ -58,23 +59,25 @@ class LocalEngine:
 
 
 class _Worker:
-    """A process, started again where a video broke it. `work` is for a thread of its own."""
+    """A worker process, started again after a crash; `work` runs in a thread of its own."""
 
-    _errors: IO[bytes]  # what the process says on stderr
+    _errors: IO[bytes]  # stderr of the process
 
     def __init__(self, out: Path, stop: threading.Event) -> None:
         self._out, self._stop = out, stop
         self._process: subprocess.Popen[str] | None = None
 
-    def work(self, jobs: queue.Queue[Job], over: queue.Queue[Outcome], clock: Clock) -> None:
-        """Take jobs until there are none."""
+    def work(
+        self, jobs: queue.Queue[Job], finished: queue.Queue[Outcome], progress: BatchProgress
+    ) -> None:
+        """Measure jobs until there are none."""
         with tempfile.TemporaryFile() as self._errors:
             try:
                 while not self._stop.is_set():
                     job = jobs.get_nowait()
-                    outcome = self._do(job, clock.of(job))
+                    outcome = self._measure(job, progress.of(job))
                     if outcome is not None:
-                        over.put(outcome)
+                        finished.put(outcome)
             except queue.Empty:
                 pass
             finally:
@@ -85,25 +88,25 @@ class _Worker:
         if self._process is not None:
             self._process.kill()
 
-    def _do(self, job: Job, on_progress: Progress) -> Outcome | None:
-        """What became of a job; None where it was ended on purpose."""
+    def _measure(self, job: Job, on_progress: OnProgress) -> Outcome | None:
+        """The outcome of a job; None where `stop` ended its process."""
         process = self._process = self._process or self._start()
         assert process.stdin is not None
         assert process.stdout is not None
-        is_over = False
+        is_finished = False
         with suppress(BrokenPipeError):
             process.stdin.write(json.dumps(asdict(job)) + "\n")
             process.stdin.flush()
         for line in process.stdout:
-            if is_over := line.strip() == "over":
+            if is_finished := line.strip() == FINISHED:
                 break
             on_progress(float(line))
-        if is_over:
-            return outcome_of(job, self._out) or _failed(job, "its files changed meanwhile")
+        if is_finished:
+            return read_outcome(job, self._out) or _failed(job, "its files changed meanwhile")
         code = self._end()
         if self._stop.is_set():
             return None
-        return _failed(job, f"its process ended ({code}): {self._last_words()}")
+        return _failed(job, f"its process ended ({code}): {self._end_of_stderr()}")
 
     def _start(self) -> subprocess.Popen[str]:
         self._errors.truncate(0)
@@ -113,12 +116,12 @@ class _Worker:
             stdout=subprocess.PIPE,
             stderr=self._errors,
             text=True,
-            env=os.environ | {"OMP_NUM_THREADS": "1"},  # one video, one core
-            start_new_session=True,  # Ctrl-C is for the batch
+            env=os.environ | {"OMP_NUM_THREADS": "1"},  # one core a video
+            start_new_session=True,  # Ctrl-C goes to the batch alone
         )
 
     def _end(self) -> int:
-        """Close a process' stdin, which ends it, and wait; its exit code."""
+        """Close the process' stdin, which ends it, and wait; return its exit code."""
         process, self._process = self._process, None
         if process is None:
             return 0
@@ -126,11 +129,11 @@ class _Worker:
             pass
         return process.returncode
 
-    def _last_words(self) -> str:
+    def _end_of_stderr(self) -> str:
         size = self._errors.seek(0, os.SEEK_END)
-        self._errors.seek(max(0, size - _MOST_SAID))
+        self._errors.seek(max(0, size - _MAX_STDERR_BYTES))
         return " ".join(self._errors.read().decode(errors="replace").split())
 
 
 def _failed(job: Job, reason: str) -> Outcome:
-    return Outcome(name=job.label, key=job.key, status=FAILED, reason=reason)
+    return Outcome(name=job.name, key=job.key, status=FAILED, reason=reason)

@@ -1,0 +1,155 @@
+"""`stream-dmr batch`: measures every video of a manifest once, also when it is killed and repeated.
+
+Each video gets a folder of its own; videos.csv and the Parquet data set follow from these folders.
+"""
+
+import csv
+import shutil
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from stream_dmr.batch.dataset import publish, withdraw_others
+from stream_dmr.batch.engine import Engine
+from stream_dmr.batch.layout import (
+    DONE,
+    VIDEO_COLUMNS,
+    VIDEO_FOLDERS,
+    VIDEOS,
+    WAITING,
+    results_folder,
+    unfinished_folder,
+)
+from stream_dmr.batch.manifest import Job
+from stream_dmr.batch.measure_video import Outcome, finish_folder, read_outcome
+from stream_dmr.batch.progress import BatchProgress
+from stream_dmr.errors import OutputError
+from stream_dmr.files import make_folder, writing_to
+from stream_dmr.results.provenance import seal_files
+from stream_dmr.results.store import require_free
+
+_LOCK_PATIENCE_S = 10.0  # a killed process may hold its folder while the kernel ends it; generous
+_LOCK_POLL_S = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchSummary:
+    """The outcomes of a batch."""
+
+    outcomes: Sequence[Outcome]  # in the order of the manifest; none for videos that still wait
+    num_before: int  # done by earlier calls
+    elapsed_s: float
+
+
+def run_batch(
+    jobs: Sequence[Job],
+    out: Path,
+    engine: Engine,
+    *,
+    stop: threading.Event,
+    log: Callable[[str], None] = lambda line: None,
+) -> BatchSummary:
+    """Measure every video that is not done yet; results go below `out`.
+
+    Failed videos are tried again by the next call. Setting `stop` ends the batch soon; unfinished
+    videos begin anew with the next call. Raises OutputError where `out` can't be written to or
+    another batch is writing there.
+    """
+    make_folder(out / VIDEO_FOLDERS)
+    _remove_unfinished(out)
+    began = time.perf_counter()
+    results = _BatchResults(jobs, out, log)
+    num_before = len(results.outcomes)
+    todo = {job.name: job for job in jobs if job.name not in results.outcomes}
+    progress = BatchProgress(list(todo.values()), log)
+    if todo and not stop.is_set():
+        for outcome in engine.outcomes(list(todo.values()), out, stop=stop, progress=progress):
+            progress.finish(outcome.name)
+            results.add(todo[outcome.name], outcome)
+    results.close()
+    return BatchSummary(
+        outcomes=[results.outcomes[job.name] for job in jobs if job.name in results.outcomes],
+        num_before=num_before,
+        elapsed_s=time.perf_counter() - began,
+    )
+
+
+class _BatchResults:
+    """The outcomes of all videos: writes videos.csv, and the data set of the finished ones."""
+
+    def __init__(self, jobs: Sequence[Job], out: Path, log: Callable[[str], None]) -> None:
+        """Begins with the videos that earlier calls have finished."""
+        self._jobs, self._out, self._log = jobs, out, log
+        known = {job.name: read_outcome(job, out) for job in jobs}
+        self.outcomes = {name: one for name, one in known.items() if one and one.status == DONE}
+        for job in self._done():
+            publish(results_folder(job, out), job, out)
+        self._write_table()
+
+    def add(self, job: Job, outcome: Outcome) -> None:
+        """Record what became of a video."""
+        self.outcomes[job.name] = outcome
+        if outcome.status == DONE:
+            publish(results_folder(job, self._out), job, self._out)
+        else:
+            _record_failure(job, self._out, outcome)
+            self._log(f"{outcome.name}: failed: {outcome.reason}")
+        self._write_table()
+
+    def close(self) -> None:
+        """Remove from the data set the tables of videos that are not finished."""
+        withdraw_others(self._done(), self._out)
+        self._write_table()
+
+    def _done(self) -> list[Job]:
+        outcomes = self.outcomes
+        return [j for j in self._jobs if j.name in outcomes and outcomes[j.name].status == DONE]
+
+    def _write_table(self) -> None:
+        """Write videos.csv: one row a video, in the order of the manifest."""
+        target = self._out / VIDEOS
+        draft = target.with_suffix(".csv.part")
+        with writing_to(target):
+            with draft.open("w", newline="", encoding="utf-8") as file:
+                writer = csv.writer(file, lineterminator="\n")
+                writer.writerow(VIDEO_COLUMNS)
+                for job in self._jobs:
+                    origin = (job.name, job.video, job.vessel, job.trip, job.haul)
+                    writer.writerow(origin + _result_cells(self.outcomes.get(job.name)))
+            draft.replace(target)
+        seal_files(self._out, [target], runs={})
+
+
+def _result_cells(outcome: Outcome | None) -> tuple[object, ...]:
+    if outcome is None:
+        return (WAITING, "", "", "", "")
+    numbers = (outcome.num_frames, outcome.num_fish, outcome.elapsed_s)
+    return (outcome.status, outcome.reason, *numbers)
+
+
+def _remove_unfinished(out: Path) -> None:
+    """Remove the folders that a killed batch left unfinished.
+
+    Raises OutputError where another batch is still writing to one.
+    """
+    for folder in out.glob(f"{VIDEO_FOLDERS}/*.part"):
+        deadline = time.monotonic() + _LOCK_PATIENCE_S
+        while True:
+            try:
+                require_free(folder)
+                break
+            except OutputError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(_LOCK_POLL_S)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _record_failure(job: Job, out: Path, outcome: Outcome) -> None:
+    """Write the outcome of a video whose process died before it could."""
+    if read_outcome(job, out) is None:
+        folder = unfinished_folder(job, out)
+        shutil.rmtree(folder, ignore_errors=True)
+        finish_folder(folder, results_folder(job, out), outcome)

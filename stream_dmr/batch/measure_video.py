@@ -1,0 +1,122 @@
+"""Measures one video of a batch: its folder appears complete, or not at all."""
+
+import json
+import shlex
+import shutil
+import threading
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from stream_dmr.batch.dataset import write_tables
+from stream_dmr.batch.layout import DONE, FAILED, OUTCOME, results_folder, unfinished_folder
+from stream_dmr.batch.manifest import Job
+from stream_dmr.batch.progress import OnProgress
+from stream_dmr.errors import UserError
+from stream_dmr.files import rename_durably
+from stream_dmr.results.provenance import add_files
+from stream_dmr.running.observer import Observer
+from stream_dmr.running.run import RunRequest, run
+from stream_dmr.watch.watch import Watch
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of a video; outcome.json holds these fields."""
+
+    name: str  # of the job
+    key: str  # of the job: an outcome counts while this is unchanged
+    status: str  # DONE or FAILED
+    reason: str = ""  # why it failed
+    num_frames: int = 0
+    num_fish: int = 0
+    elapsed_s: float = 0.0
+
+
+def read_outcome(job: Job, out: Path) -> Outcome | None:
+    """The outcome of a job from an earlier call; None where it has none or its inputs changed."""
+    try:
+        text = (results_folder(job, out) / OUTCOME).read_text(encoding="utf-8")
+        outcome = Outcome(**json.loads(text))
+    except (OSError, ValueError, TypeError):
+        return None
+    return outcome if outcome.key == job.key else None
+
+
+def measure_video(job: Job, out: Path, *, on_progress: OnProgress = lambda share: None) -> Outcome:
+    """Measure a video into its folder below `out`; a UserError becomes a failed outcome.
+
+    The run writes to a folder of another name, which is renamed at the end: a killed process leaves
+    nothing that looks finished.
+    """
+    target, folder = results_folder(job, out), unfinished_folder(job, out)
+    began, key = time.perf_counter(), job.key
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        observer = Watch(_ProgressObserver(on_progress))
+        summary = run(request_of(job, folder), stop=threading.Event(), observer=observer)
+        write_tables(folder, job)
+        outcome = Outcome(
+            name=job.name,
+            key=key,
+            status=DONE,
+            num_frames=summary.num_frames,
+            num_fish=len(summary.fish),
+            elapsed_s=round(time.perf_counter() - began, 3),
+        )
+    except UserError as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        outcome = Outcome(name=job.name, key=key, status=FAILED, reason=str(error))
+    finish_folder(folder, target, outcome)
+    return outcome
+
+
+def finish_folder(folder: Path, target: Path, outcome: Outcome) -> None:
+    """Write the outcome and rename the folder to `target`, in place of an earlier one."""
+    folder.mkdir(exist_ok=True)
+    (folder / OUTCOME).write_text(json.dumps(asdict(outcome)) + "\n", encoding="utf-8")
+    add_files(folder, [folder / OUTCOME])
+    shutil.rmtree(target, ignore_errors=True)
+    rename_durably(folder, target)
+
+
+def request_of(job: Job, out: Path) -> RunRequest:
+    """The run that measures a video, as a user would have asked for it."""
+
+    def path(text: str) -> Path | None:
+        return Path(text) if text else None
+
+    options = {"source": job.video, "calibration": job.calibration, "boxes": job.boxes}
+    options |= {"masks": job.masks, "template": job.template, "config": job.config}
+    words = [word for key, value in options.items() if value for word in (f"--{key}", value)]
+    return RunRequest(
+        source=job.video,
+        out=out,
+        calibration=path(job.calibration),
+        boxes=path(job.boxes),
+        masks=path(job.masks),
+        template=job.template,
+        config=path(job.config),
+        command=shlex.join(["stream-dmr", "run", *words]),
+        vessel=job.vessel,
+        trip=job.trip,
+        haul=job.haul,
+    )
+
+
+class _ProgressObserver(Observer):
+    """Reports the share of a video's frames that is done."""
+
+    def __init__(self, on_progress: OnProgress) -> None:
+        self._on_progress = on_progress
+        self._num_frames: int | None = None
+        self._done = 0
+
+    def begin(self, num_frames: int | None) -> None:
+        self._num_frames = num_frames
+
+    def frame_done(self) -> None:
+        self._done += 1
+        if self._num_frames:
+            self._on_progress(min(1.0, self._done / self._num_frames))

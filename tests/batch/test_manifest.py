@@ -1,0 +1,93 @@
+"""The manifest of a batch: which rows are refused, how videos are named, what makes a job new."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
+from stream_dmr.errors import UserError
+
+HEADER = ",".join(COLUMNS) + "\n"
+
+
+def read(path: Path, text: str) -> list[Job]:
+    path.write_text(text, encoding="utf-8")
+    return read_manifest(path, config=None, template="cod")
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("", "expected the columns"),
+        ("video,calibration\n", "expected the columns"),
+        (f"{','.join(COLUMNS)},more\n", "expected the columns"),
+        (HEADER, "a row for each video"),
+        (f"{HEADER},,,,,,\n", "line 2: expected 7 cells"),
+        (f"{HEADER}a.mp4,,,,,,,,\n", "line 2: expected 7 cells"),
+    ],
+)
+def test_a_wrong_manifest_is_refused(tmp_path: Path, text: str, match: str):
+    with pytest.raises(UserError, match=match):
+        read(tmp_path / "m.csv", text)
+    with pytest.raises(UserError, match="expected a manifest"):
+        read_manifest(tmp_path / "none.csv", config=None, template="cod")
+
+
+def test_relative_paths_start_from_the_manifest(tmp_path: Path):
+    (job,) = read(tmp_path / "m.csv", f"{HEADER}a.mp4,b.yaml,,/masks,v,t,h\n")
+    assert (job.video, job.calibration) == (str(tmp_path / "a.mp4"), str(tmp_path / "b.yaml"))
+    assert (job.boxes, job.masks) == ("", "/masks")
+    assert (job.vessel, job.trip, job.haul) == ("v", "t", "h")
+
+
+@given(st.lists(st.text("aä./-1", min_size=1, max_size=4), min_size=1, max_size=6, unique=True))
+def test_names_of_videos_are_unique_folder_names(
+    tmp_path_factory: pytest.TempPathFactory, videos: list[str]
+):
+    folder = tmp_path_factory.getbasetemp()
+    names = [
+        job.name for job in read(folder / "m.csv", HEADER + "".join(f"{v},,,,,,\n" for v in videos))
+    ]
+    assert len(set(names)) == len(videos)
+    assert all(Path(name).name == name and not name.endswith(".part") for name in names)
+
+
+@pytest.fixture
+def job(tmp_path: Path) -> Job:
+    names = ("video.mp4", "calibration.yaml", "boxes.txt", "config.toml", "tiny.ply", "tiny.toml")
+    for name in names:
+        (tmp_path / name).write_text(name)
+    video, calibration, boxes, config, template, _ = (str(tmp_path / name) for name in names)
+    return Job(
+        name="video",
+        video=video,
+        calibration=calibration,
+        boxes=boxes,
+        config=config,
+        template=template,
+    )
+
+
+def test_a_key_is_unchanged_while_all_inputs_are(job: Job):
+    assert replace(job).key == job.key
+
+
+@pytest.mark.parametrize("name", ["video.mp4", "boxes.txt", "config.toml", "tiny.ply", "tiny.toml"])
+@pytest.mark.parametrize(
+    "change", [lambda path: path.write_text("anything else"), lambda path: path.unlink()]
+)
+def test_a_changed_file_changes_the_key(
+    job: Job, tmp_path: Path, name: str, change: Callable[[Path], object]
+):
+    before = job.key
+    change(tmp_path / name)
+    assert job.key != before
+
+
+@pytest.mark.parametrize("field", ["vessel", "trip", "haul", "masks"])
+def test_a_changed_row_changes_the_key(job: Job, field: str):
+    assert replace(job, **{field: "another"}).key != job.key

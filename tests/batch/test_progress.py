@@ -1,0 +1,51 @@
+"""Progress of a batch: shares by bytes, the time left, and how often it is logged."""
+
+from pathlib import Path
+
+import pytest
+
+from stream_dmr.batch.manifest import Job
+from stream_dmr.batch.progress import BatchProgress, duration
+from stream_dmr.batch.worker import PercentPrinter
+
+
+@pytest.fixture
+def jobs(tmp_path: Path) -> list[Job]:
+    """Two videos, the second of which is three times as large."""
+    for name, size in (("a", 100), ("b", 300)):
+        (tmp_path / name).write_bytes(bytes(size))
+    return [Job(name=name, video=str(tmp_path / name)) for name in ("a", "b")]
+
+
+def test_time_left_follows_the_share_of_bytes(jobs: list[Job]):
+    progress = BatchProgress(jobs, print)
+    assert progress.line(10.0).endswith("time left: unknown")
+    progress.of(jobs[1])(0.5)
+    assert progress.line(30.0) == "0 of 2 videos, 38 %, time left: 50 s"
+    progress.finish("a")
+    assert progress.line(30.0) == "1 of 2 videos, 62 %, time left: 18 s"
+
+
+def test_a_finished_video_is_logged_at_once(jobs: list[Job]):
+    lines = list[str]()
+    progress = BatchProgress(jobs, lines.append)
+    progress.update()
+    assert not lines
+    progress.finish("b")
+    progress.update()
+    progress.update()
+    assert len(lines) == 1
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.4, "0 s"), (89.0, "89 s"), (200.0, "3 min"), (7200.0, "2.0 h")]
+)
+def test_durations_have_one_unit(seconds: float, text: str):
+    assert duration(seconds) == text
+
+
+def test_a_worker_prints_each_percent_once(capsys: pytest.CaptureFixture[str]):
+    printer = PercentPrinter()
+    for share in (0.001, 0.012, 0.013, 0.5, 0.5, 1.0):
+        printer.update(share)
+    assert capsys.readouterr().out.split() == ["0.012", "0.5", "1.0"]
