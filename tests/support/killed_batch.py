@@ -52,7 +52,7 @@ def main() -> None:
         if child == 0:
             run_batch(jobs, out, ThisProcess(), stop=threading.Event())
             os._exit(0)
-        patience_s = moments.uniform(0.0, 1.0 + 1.0 * len(killed))
+        patience_s = moments.uniform(0.0, 0.2 + 0.2 * len(killed))
         until = time.monotonic() + patience_s
         while os.waitpid(child, os.WNOHANG) == (0, 0):
             if time.monotonic() > until:
