@@ -17,7 +17,11 @@ if TYPE_CHECKING:
     from stream_dmr.recording.messages.selection import Part
 
 TemplateOption = Annotated[
-    str, typer.Option(help="The species: halibut, cod, or a mesh with its TOML beside it.")
+    str,
+    typer.Option(
+        help="The body form: halibut, cod, salmon, bream, tuna, pike, eel, or a mesh with its TOML "
+        "beside it."
+    ),
 ]
 ConfigOption = Annotated[
     Path | None, typer.Option(help="A config.toml; left-out settings keep their defaults.")

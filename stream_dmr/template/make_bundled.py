@@ -1,20 +1,12 @@
-"""Makes the bundled templates: `python -m stream_dmr.template.make_bundled` writes them.
+"""Makes the bundled templates from `body_forms.toml`: `python -m stream_dmr.template.make_bundled`.
 
-Each is a body of revolution made flat: rings along the midline whose half depth and half thickness
-follow a table of the species' proportions, in fork lengths (snout to the middle of the tail fin,
-the length by which both species are measured). Fins that stand in the silhouette are part of the
-outline. Individuals differ; `learn` your own stock's proportions where it matters.
-
-Pacific halibut, *Hippoglossus stenolepis*: body depth 31-35 % of the standard length without fins
-(FAO species guide, Eastern Central Pacific); width about one third of the length, crescent-shaped
-tail (IPHC). Dorsal and anal fins run from the eyes to the tail's base and add some 3 % on
-each side; the head takes about a quarter of the length.
-
-Atlantic cod, *Gadus morhua*: depth goes about four times, head 3.5 to 4.5 times into the body's
-length (FDA Regulatory Fish Encyclopedia); body compressed, tail truncate to slightly forked
-(FAO species guide, Western Central Atlantic). Folded fins add little.
+Each is a body of elliptic sections along a straight midline, whose half depth and half thickness
+follow a table of the species' proportions, in fork lengths: the length by which these species are
+measured. Fins that stand in the silhouette are part of the outline. A new body form is one more
+table in that file, with its source, and a run of this module.
 """
 
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,109 +14,51 @@ import numpy as np
 import trimesh
 from scipy.interpolate import PchipInterpolator
 
-_NUM_RINGS = 36
-_NUM_SECTORS = 16
+from stream_dmr.template.ring_mesh import ring_mesh
+
+_TABLES = Path(__file__).with_name("body_forms.toml")
+_NUM_RINGS, _NUM_SECTORS = (
+    36,
+    16,
+)  # chosen: 578 vertices, whose outline is within 0.1 % of the table
+# Chosen near the thirds of the body: the paper's template has two joints, and says no more.
+_JOINTS = (0.36, 0.68)
+_CENTER = 0.5
+_TAIL_FROM = 0.9  # where the lobes of the tail fin begin to reach backwards
 
 
-@dataclass(frozen=True)
-class Species:
-    """Proportions in fork lengths: half depth and half thickness at places along the midline."""
+@dataclass(frozen=True, kw_only=True)
+class BodyForm:
+    """Proportions of one species, in fork lengths; the fields are explained in the TOML."""
 
     name: str
     title: str
+    source: str
+    condition: float
+    condition_source: str
     places: tuple[float, ...]
     half_depth: tuple[float, ...]
     half_thickness: tuple[float, ...]
-    lobe: float  # how far the tail's lobes reach past its middle
-    center: float  # place of the center keypoint
-    joints: tuple[float, float]
+    lobe: float
 
 
-HALIBUT = Species(
-    name="halibut",
-    title="Pacific halibut, Hippoglossus stenolepis",
-    places=(0.0, 0.03, 0.10, 0.20, 0.32, 0.45, 0.58, 0.70, 0.80, 0.87, 0.90, 0.95, 1.0),
-    half_depth=(
-        0.0,
-        0.032,
-        0.077,
-        0.132,
-        0.178,
-        0.190,
-        0.170,
-        0.124,
-        0.070,
-        0.034,
-        0.036,
-        0.082,
-        0.125,
-    ),
-    half_thickness=(
-        0.0,
-        0.014,
-        0.032,
-        0.046,
-        0.050,
-        0.047,
-        0.040,
-        0.030,
-        0.021,
-        0.014,
-        0.011,
-        0.006,
-        0.003,
-    ),
-    lobe=0.022,
-    center=0.5,
-    joints=(0.36, 0.68),
-)
-COD = Species(
-    name="cod",
-    title="Atlantic cod, Gadus morhua",
-    places=(0.0, 0.03, 0.10, 0.20, 0.32, 0.45, 0.58, 0.70, 0.80, 0.87, 0.91, 0.96, 1.0),
-    half_depth=(
-        0.0,
-        0.032,
-        0.068,
-        0.098,
-        0.113,
-        0.108,
-        0.092,
-        0.072,
-        0.047,
-        0.028,
-        0.030,
-        0.055,
-        0.080,
-    ),
-    half_thickness=(
-        0.0,
-        0.026,
-        0.054,
-        0.072,
-        0.074,
-        0.066,
-        0.053,
-        0.039,
-        0.025,
-        0.015,
-        0.011,
-        0.006,
-        0.003,
-    ),
-    lobe=0.012,
-    center=0.5,
-    joints=(0.36, 0.68),
-)
+def body_forms() -> dict[str, BodyForm]:
+    """All body forms of the TOML, by name."""
+    tables = tomllib.loads(_TABLES.read_text(encoding="utf-8"))
+    rows = ("places", "half_depth", "half_thickness")
+    return {
+        name: BodyForm(name=name, **table | {row: tuple(table[row]) for row in rows})
+        for name, table in tables.items()
+    }
 
 
-def body_mesh(species: Species) -> trimesh.Trimesh:
+def body_mesh(form: BodyForm) -> trimesh.Trimesh:
     """A closed mesh in fork lengths, x from snout to tail, y the depth, z the thickness."""
     # More rings where the outline turns: at the snout and at the tail.
     place = (1 - np.cos(np.linspace(0, np.pi, _NUM_RINGS + 2)[1:-1])) / 2
-    depth = PchipInterpolator(species.places, species.half_depth)(place)
-    thickness = PchipInterpolator(species.places, species.half_thickness)(place)
-    lobe = species.lobe * np.clip((place - 0.9) / 0.1, 0.0, 1.0) ** 2
+    depth = PchipInterpolator(form.places, form.half_depth)(place)
+    thickness = PchipInterpolator(form.places, form.half_thickness)(place)
+    lobe = form.lobe * np.clip((place - _TAIL_FROM) / (1 - _TAIL_FROM), 0.0, 1.0) ** 2
     angle = np.linspace(0, 2 * np.pi, _NUM_SECTORS, endpoint=False)
     rings = np.stack(
         [
@@ -134,53 +68,31 @@ def body_mesh(species: Species) -> trimesh.Trimesh:
         ],
         axis=-1,
     )
-    ends = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    mesh = trimesh.Trimesh(np.vstack([rings.reshape(-1, 3), ends]), _faces(), process=False)
-    if mesh.volume < 0:
-        mesh.invert()
-    return mesh
+    return ring_mesh(rings, snout=np.zeros(3), tail=np.array([1.0, 0.0, 0.0]))
 
 
-def _faces() -> np.ndarray:
-    """Two triangles between neighbours on neighbouring rings, and a fan at each end."""
-    ring, sector = np.meshgrid(np.arange(_NUM_RINGS - 1), np.arange(_NUM_SECTORS), indexing="ij")
-    a = (ring * _NUM_SECTORS + sector).ravel()
-    b = (ring * _NUM_SECTORS + (sector + 1) % _NUM_SECTORS).ravel()
-    c, d = a + _NUM_SECTORS, b + _NUM_SECTORS
-    first = np.arange(_NUM_SECTORS)
-    after = (first + 1) % _NUM_SECTORS
-    last = (_NUM_RINGS - 1) * _NUM_SECTORS
-    snout = np.full(_NUM_SECTORS, _NUM_RINGS * _NUM_SECTORS)
-    return np.vstack(
-        [
-            np.stack([a, c, b], axis=1),
-            np.stack([b, c, d], axis=1),
-            np.stack([snout, first, after], axis=1),
-            np.stack([snout + 1, last + after, last + first], axis=1),
-        ]
-    )
+def template_toml(form: BodyForm) -> str:
+    """The text of the TOML beside the mesh, as `load_template` reads it."""
 
-
-def _toml(species: Species) -> str:
     def point(place: float) -> str:
         return f"[{place}, 0.0, 0.0]"
 
     return (
-        f'name = "{species.title}"\n'
-        f"joints = [{', '.join(map(point, species.joints))}]\n"
+        f'name = "{form.title}"\n'
+        f"joints = [{', '.join(map(point, _JOINTS))}]\n"
         "[keypoints]\n"
-        f"head = {point(0.0)}\ncenter = {point(species.center)}\ntail = {point(1.0)}\n"
+        f"head = {point(0.0)}\ncenter = {point(_CENTER)}\ntail = {point(1.0)}\n"
         "[length]  # of this template: the tail keypoint is the middle of the fin\n"
-        f'tail = "fork"\ntotal_per_fork = {1 + species.lobe:g}\n'
+        f'tail = "fork"\ntotal_per_fork = {1 + form.lobe:g}\n'
     )
 
 
 def main() -> None:
-    """Write every species' mesh and TOML beside this file."""
-    for species in (HALIBUT, COD):
-        base = Path(__file__).parent / "bundled" / species.name
-        body_mesh(species).export(base.with_suffix(".ply"))
-        base.with_suffix(".toml").write_text(_toml(species))
+    """Write every form's mesh and TOML into the folder `bundled` beside this file."""
+    for form in body_forms().values():
+        path = Path(__file__).parent / "bundled" / form.name
+        body_mesh(form).export(path.with_suffix(".ply"))
+        path.with_suffix(".toml").write_text(template_toml(form))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from trimesh.proximity import closest_point_naive
 
 from stream_dmr.errors import TemplateError
 from stream_dmr.geometry import arc_length
-from stream_dmr.template import make_bundled
+from stream_dmr.template.make_bundled import body_forms, body_mesh, template_toml
 from stream_dmr.template.template import (
     BUNDLED,
     bundled_names,
@@ -67,18 +67,25 @@ class TestBundled:
         assert thin < broad < 0.5
 
     def test_is_what_its_script_makes(self, name, tmp_path):
-        species = next(s for s in (make_bundled.HALIBUT, make_bundled.COD) if s.name == name)
-        make_bundled.body_mesh(species).export(tmp_path / "again.ply")
+        form = body_forms()[name]
+        body_mesh(form).export(tmp_path / "again.ply")
         again = trimesh.load_mesh(tmp_path / "again.ply", process=False)
         kept = trimesh.load_mesh(BUNDLED / f"{name}.ply", process=False)
         # Not byte for byte: the last digit of a cosine is the machine's own, a float32's is not.
         np.testing.assert_allclose(again.vertices, kept.vertices, rtol=0, atol=1e-7)
         np.testing.assert_array_equal(again.faces, kept.faces)
-        assert (BUNDLED / f"{name}.toml").read_text() == make_bundled._toml(species)
+        assert (BUNDLED / f"{name}.toml").read_text() == template_toml(form)
+
+    def test_weighs_what_is_published_for_its_length(self, name):
+        """A fish is about as dense as water: volume over length cubed is its condition factor."""
+        form = body_forms()[name]
+        volume = body_of(load_template(name)).volume
+        assert volume == pytest.approx(form.condition, rel=0.35)
 
 
-def test_every_species_of_the_script_is_bundled():
-    assert bundled_names() == sorted(s.name for s in (make_bundled.HALIBUT, make_bundled.COD))
+def test_every_body_form_is_bundled_with_its_source():
+    assert bundled_names() == sorted(body_forms())
+    assert all(form.source and form.condition_source for form in body_forms().values())
 
 
 class TestCanonicalForm:
@@ -293,6 +300,6 @@ class TestRefusals:
         trimesh.PointCloud(fish_mesh().vertices).export(tmp_path / "fish.ply")
         self.assert_refused(tmp_path / "fish.ply", "expected one mesh with faces")
 
-    @pytest.mark.parametrize("name", ["tuna", "no/such/mesh.ply", "."])
+    @pytest.mark.parametrize("name", ["herring", "no/such/mesh.ply", "."])
     def test_unknown_name(self, name):
-        self.assert_refused(name, "one of cod, halibut")
+        self.assert_refused(name, "one of bream, cod, eel, halibut, pike, salmon, tuna;")
