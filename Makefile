@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 .PHONY: demo test test-slow bench faults soak table1 check format golden config clean
 
 demo: $(STAMP)  ## the main job on the embedded scene, lengths beside the truth
-	$(BIN)/python -m stream_dmr.cli.demo
+	$(BIN)/stream-dmr demo
 
 test: $(STAMP)  ## the tests of a few minutes
 	$(BIN)/pytest -n 2 --dist worksteal

@@ -27,8 +27,7 @@ from stream_dmr.batch.driver import run_batch
 from stream_dmr.batch.engine import Engine
 from stream_dmr.batch.local_engine import LocalEngine
 from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
-
-DEMO = Path(__file__).resolve().parents[1] / "recordings" / "demo"
+from stream_dmr.simulation import DEMO_SCENE
 
 
 class Backlog(NamedTuple):
@@ -59,9 +58,9 @@ def engine_of(name: str, workers: int) -> Iterator[Engine]:
 
 def backlogs(folder: Path, videos: int) -> Iterator[Backlog]:
     """So many videos with masks; one raw video as long as all of them."""
-    masks = {"boxes": DEMO / "boxes.txt", "masks": DEMO / "masks"}
-    with_masks = [{"video": DEMO / "video.mp4"} | masks] * videos
-    num_frames = write_repeated(folder / "long.mp4", DEMO / "video.mp4", times=videos)
+    masks = {"boxes": DEMO_SCENE / "boxes.txt", "masks": DEMO_SCENE / "masks"}
+    with_masks = [{"video": DEMO_SCENE / "video.mp4"} | masks] * videos
+    num_frames = write_repeated(folder / "long.mp4", DEMO_SCENE / "video.mp4", times=videos)
     yield Backlog("masks", jobs_of(folder / "masks.csv", with_masks), num_frames)
     raw = jobs_of(folder / "raw.csv", [{"video": folder / "long.mp4"}])
     yield Backlog("raw", raw, num_frames)
@@ -73,9 +72,13 @@ def jobs_of(manifest: Path, rows: Sequence[Mapping[str, object]]) -> list[Job]:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
         for number, row in enumerate(rows):
-            of_all = {"calibration": DEMO / "calibration.yaml", "vessel": "demo", "trip": number}
+            of_all = {
+                "calibration": DEMO_SCENE / "calibration.yaml",
+                "vessel": "demo",
+                "trip": number,
+            }
             writer.writerow(row | of_all)
-    return read_manifest(manifest, config=None, template=str(DEMO / "species.ply"))
+    return read_manifest(manifest, config=None, template=str(DEMO_SCENE / "species.ply"))
 
 
 def write_repeated(path: Path, video: Path, *, times: int) -> int:

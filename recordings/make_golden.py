@@ -13,22 +13,21 @@ from pathlib import Path
 
 from stream_dmr.replay.replay import ReplayRequest, replay
 from stream_dmr.running.run import RunRequest, run
+from stream_dmr.simulation import DEMO_SCENE
 
-HERE = Path(__file__).parent
-GOLDEN = HERE / "golden"
+GOLDEN = Path(__file__).parent / "golden"
 
 
 def main() -> None:
     """Say what moved since the last time, then replace it."""
     if (GOLDEN / "recording.mcap").exists():
         _print_moved()
-    demo = HERE / "demo"
     with tempfile.TemporaryDirectory() as folder:
         request = RunRequest(
-            source=str(demo / "video.mp4"),
-            boxes=demo / "boxes.txt",
-            masks=demo / "masks",
-            calibration=demo / "calibration.yaml",
+            source=str(DEMO_SCENE / "video.mp4"),
+            boxes=DEMO_SCENE / "boxes.txt",
+            masks=DEMO_SCENE / "masks",
+            calibration=DEMO_SCENE / "calibration.yaml",
             out=Path(folder) / "out",
             command="make golden",
         )

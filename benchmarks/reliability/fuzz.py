@@ -25,6 +25,7 @@ from stream_dmr.recording.reading.reader import open_recordings
 from stream_dmr.results.export import Export
 from stream_dmr.running.config import load_config
 from stream_dmr.segmentation.annotations.detections import open_annotations
+from stream_dmr.simulation import DEMO_SCENE
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
 from stream_dmr.template.template import load_template
@@ -46,7 +47,7 @@ class Input:
 
 def inputs(folder: Path, root: Path) -> list[Input]:
     """All kinds; those that have no original in the repository are made from one that it has."""
-    clip, golden = root / "recordings" / "demo", root / "recordings" / "golden" / "recording.mcap"
+    clip, golden = DEMO_SCENE, root / "recordings" / "golden" / "recording.mcap"
     made = folder / "originals"
     made.mkdir(parents=True)
     write_coco(clip / "boxes.txt", made / "coco.json")

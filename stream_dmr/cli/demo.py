@@ -1,58 +1,55 @@
-"""`python -m stream_dmr.cli.demo`: the main job on the embedded scene, beside the truth.
-
-Exits with 1 where a fish of the scene was not measured.
-"""
+"""`stream-dmr demo`: the main job on the embedded scene, beside the true lengths."""
 
 import os
+import shlex
 import sys
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
-from stream_dmr.cli.main import exit_codes
 from stream_dmr.cli.run import run
 
-SCENE = Path(__file__).resolve().parents[2] / "recordings" / "demo"
-OUT = Path("runs") / "demo"
 
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the results; replaced if it exists.")] = (
+        Path("runs/demo")
+    ),
+) -> None:
+    """Measure the fish of the embedded scene from its video, and print the true lengths beside.
 
-def measure_scene(scene: Path, *, out: Path, config: Path | None = None) -> bool:
-    """Run over a scene as `stream-dmr simulate` makes it; True where every fish was measured.
-
-    Results of an earlier run in `out` are replaced.
+    Exits with 1 where a fish was not measured.
     """
+    from stream_dmr.simulation import DEMO_SCENE
+
+    source, calibration = DEMO_SCENE / "video.mp4", DEMO_SCENE / "calibration.yaml"
+    template = DEMO_SCENE / "species.ply"
+    arguments = ["--source", source, "--calibration", calibration, "--template", template]
+    print(shlex.join(["stream-dmr", "run", *map(str, arguments), "--out", str(out)]), flush=True)
     run(
-        source=str(scene / "video.mp4"),
-        boxes=scene / "boxes.txt",
-        masks=scene / "masks",
-        calibration=scene / "calibration.yaml",
-        template=str(scene / "species.ply"),
-        config=config,
+        source=str(source),
+        calibration=calibration,
+        template=str(template),
         out=out,
         overwrite=True,
     )
-    from stream_dmr.cli.display import print_evaluation
-    from stream_dmr.evaluation.compare import evaluate
-
-    evaluation = evaluate(out / "lengths.csv", scene / "truth.csv")
-    print("\nbeside the truth:\n")
-    print_evaluation(evaluation)
-    command = os.path.relpath(
-        Path(sys.executable).with_name("stream-dmr")
-    )  # no activated venv needed
-    print(f"\nlook at it: {command} view {out}")
-    return evaluation.fraction_measured == 1.0
-
-
-def demo() -> None:
-    """Measure the fish of the embedded scene."""
-    if not measure_scene(SCENE, out=OUT):
-        print("a fish was not measured")
+    all_measured = print_beside_truth(out / "lengths.csv", DEMO_SCENE / "truth.csv")
+    program = os.path.relpath(Path(sys.executable).with_name("stream-dmr"))  # venv not activated
+    print(f"\nlook at it: {program} view {out}")
+    if not all_measured:
+        print("error: a fish of the scene was not measured", file=sys.stderr)
         raise typer.Exit(1)
 
 
-if __name__ == "__main__":
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(demo)
-    with exit_codes():
-        app()
+def print_beside_truth(lengths: Path, truth: Path) -> bool:
+    """Print measured lengths beside the true ones; True if every fish was measured.
+
+    Fish are compared by track_id: here both count them in the order in which they come into view.
+    """
+    from stream_dmr.cli.display import print_evaluation
+    from stream_dmr.evaluation.compare import evaluate
+
+    evaluation = evaluate(lengths, truth)
+    print("\nbeside the truth:\n")
+    print_evaluation(evaluation)
+    return evaluation.fraction_measured == 1.0

@@ -12,6 +12,7 @@ import typer
 from stream_dmr import __version__
 from stream_dmr.cli.batch import batch
 from stream_dmr.cli.calibrate import calibrate
+from stream_dmr.cli.demo import demo
 from stream_dmr.cli.evaluate import evaluate
 from stream_dmr.cli.export import export
 from stream_dmr.cli.learn import learn_template
@@ -31,7 +32,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    *(run, calibrate, replay, recover, view, convert, export),
+    *(demo, run, calibrate, replay, recover, view, convert, export),
     *(report, review, verify, batch, evaluate, train, learn_template),
 ):
     app.command()(command)

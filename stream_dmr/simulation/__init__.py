@@ -4,6 +4,11 @@ Its bodies bend by continuous curvature along an analytic outline, not by the fi
 model, so that fitting them is no test against itself.
 """
 
+from pathlib import Path
+
 from stream_dmr.simulation.writer import simulate
 
-__all__ = ["simulate"]
+__all__ = ["DEMO_SCENE", "simulate"]
+
+# Four fish in 54 frames, made by `stream-dmr simulate`; it is part of an installation.
+DEMO_SCENE = Path(__file__).parent / "demo_scene"
