@@ -2,23 +2,18 @@
 
     python benchmarks/replays.py RUN...
 
-Each RUN is the folder of a run. What `--from crop` must be told again is taken from the recorded
-command, so start this where the runs were started. Exits 1 where anything differs.
+Each RUN is the folder of a run, whose source, boxes and masks are where they were. Exits 1 where
+anything differs.
 """
 
 import os
-import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-
-from stream_dmr.recording.reading.reader import open_recordings
 
 STAGES = ("crop", "fit", "localize", "smooth")
 FORMATS = ("recording.mcap", "recording.rrd")
 PROCESSORS = (1, 2)
-OPTIONS = ("--source", "--boxes", "--masks")
 THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
@@ -42,8 +37,6 @@ def replayed(recording: Path, stage: str, processors: int) -> str:
     """The number of messages that are equal, or what the command says."""
     command = [sys.executable, "-m", "stream_dmr.cli.main", "replay", str(recording)]
     command += ["--check", "--from", stage]
-    if stage == "crop":
-        command += as_run(recording)
     held = set(sorted(os.sched_getaffinity(0))[:processors])
     outcome = subprocess.run(
         command,
@@ -55,14 +48,6 @@ def replayed(recording: Path, stage: str, processors: int) -> str:
     if outcome.returncode:
         return (outcome.stderr + outcome.stdout).strip().splitlines()[-1]
     return f"{outcome.stdout.strip().splitlines()[-1].split()[1]} equal"
-
-
-def as_run(recording: Path) -> Iterator[str]:
-    """Source, boxes and masks, as the recorded command has them."""
-    words = iter(shlex.split(open_recordings([recording]).header.command))
-    for word in words:
-        if word in OPTIONS:
-            yield from (word, next(words))
 
 
 if __name__ == "__main__":

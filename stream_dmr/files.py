@@ -1,9 +1,10 @@
-"""Files: whole writes, names that survive a power loss, and the order of numbered ones."""
+"""Files: whole writes, names that survive a power loss, hashes, and the order of numbered ones."""
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from hashlib import file_digest, sha256
 from pathlib import Path
 
 from stream_dmr.errors import OutputError
@@ -104,6 +105,18 @@ def make_folder(path: Path) -> Path:
     with writing_to(path):
         path.mkdir(parents=True, exist_ok=True)
     return path
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, in hex."""
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()
+
+
+def sha256_of_files(paths: Iterable[Path]) -> str:
+    """SHA-256 of the names and contents of files, in hex: of the output of `sha256sum *`."""
+    lines = (f"{sha256_of(path)}  {path.name}\n" for path in sorted(paths))
+    return sha256("".join(lines).encode("utf-8", "backslashreplace")).hexdigest()
 
 
 def natural_order(path: Path) -> tuple[list[str | int], str]:

@@ -16,7 +16,7 @@ from stream_dmr.batch.layout import (
     read_videos,
 )
 from stream_dmr.errors import OutputError
-from stream_dmr.results.provenance import sha256_of
+from stream_dmr.files import sha256_of
 from stream_dmr.results.verify import Change, verify
 
 Finding = tuple[Path, str]  # a file, and what is wrong with it

@@ -37,7 +37,12 @@ def replay(
     template: Annotated[
         str | None, typer.Option(help="A species instead of the recorded one.")
     ] = None,
-    source: Annotated[str | None, typer.Option(help="The recorded clip, for --from crop.")] = None,
+    source: Annotated[
+        str | None,
+        typer.Option(
+            help="The recorded clip, for --from crop.", show_default="the run's, if it is unchanged"
+        ),
+    ] = None,
     boxes: Annotated[Path | None, typer.Option(help="As in the run, for --from crop.")] = None,
     masks: Annotated[Path | None, typer.Option(help="As in the run, for --from crop.")] = None,
     time: TimeOption = None,

@@ -12,7 +12,7 @@ _Source = Annotated[
     str | None,
     typer.Option(
         help="The recorded clip, for pictures of the fish.",
-        show_default="the one that the recorded command names",
+        show_default="the one that was measured, if it is still there",
     ),
 ]
 _Config = Annotated[Path | None, typer.Option(help="Its [fisheries] instead of the run's.")]

@@ -47,11 +47,14 @@ class Tape:
             assert isinstance(message, Frame)
             yield message
 
-    def pictures(self, found: Restorer | None, *, exact: bool) -> Iterator[Frame]:
+    def pictures(
+        self, found: Restorer | None, *, exact: bool, missing_source: str
+    ) -> Iterator[Frame]:
         """The frames with their pictures, `found` or as the recording holds them.
 
         Raises RecordingError where it holds none, and, with `exact`, where they are not to the
-        last bit those that the run went on from; without it, `notes` says so.
+        last bit those that the run went on from; without it, `notes` says so. `missing_source` says
+        why the source was not found.
         """
         found = found or RecordedPictures(self._recording, self._part)
         for frame in self.frames():
@@ -59,7 +62,7 @@ class Tape:
             whole = found.restore(frame, payload)
             if whole.image.size == 0:
                 raise RecordingError(
-                    "--from crop: the recording refers to its source's pictures; give --source"
+                    f"--from crop: the recording refers to its source's pictures: {missing_source}"
                 )
             if not is_as_seen(whole, payload):
                 self._note_for_the_eye(exact=exact)

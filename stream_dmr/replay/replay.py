@@ -19,6 +19,7 @@ from stream_dmr.recording.reading.frame_images import SourcePictures
 from stream_dmr.recording.reading.reader import Recording, open_recordings
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.replay.comparator import Judge, Mismatch, Scribe
+from stream_dmr.replay.recorded_files import find_crop_files, inputs_with
 from stream_dmr.replay.recorded_messages import Playback, Tape
 from stream_dmr.results.tables import Tables
 from stream_dmr.running.config import Config, load_config, parse_config, to_toml
@@ -90,7 +91,9 @@ def replay(
     is_light = FittedMesh not in recomputed  # no stage computes outside of Python for long
     carried = _carried(request, tape)
     with ExitStack() as stack:
-        frames, nodes = _chain(request, tape, config, template, calibration, stack, first)
+        frames, nodes = _chain(
+            request, recording.header, tape, config, template, calibration, stack, first
+        )
         resume(nodes, carried)
         recorder = None
         if request.out is not None:
@@ -154,12 +157,6 @@ def _refuse_impossible(request: ReplayRequest, recording: Recording) -> None:
         )
     if request.first == "crop" and request.part.tracks is not None:
         raise UserError("--track with --from crop: crops are made of whole frames; use --from fit")
-    was_told = any(f"--{name}" in recording.header.command for name in ("boxes", "masks"))
-    if request.first == "crop" and was_told and request.boxes is None and request.masks is None:
-        raise UserError(
-            "--from crop: expected to be told where the fish are, as in the run; "
-            "give its --boxes, --masks or both"
-        )
 
 
 def _inputs(
@@ -200,7 +197,14 @@ def _header(
     template: Template,
     calibration: Calibration | None,
 ) -> RunHeader:
-    file = request.calibration
+    file, is_cut_anew = request.calibration, request.first == "crop"
+    inputs = inputs_with(
+        recorded.inputs,
+        source=request.source if is_cut_anew else None,
+        boxes=request.boxes if is_cut_anew else None,
+        masks=request.masks if is_cut_anew else None,
+        calibration=file,
+    )
     return RunHeader(
         source=recorded.source,
         command=request.command,
@@ -208,11 +212,13 @@ def _header(
         template=template,
         calibration=calibration,
         calibration_file=recorded.calibration_file if file is None else file.read_bytes(),
+        inputs=inputs,
     )
 
 
 def _chain(
     request: ReplayRequest,
+    header: RunHeader,
     tape: Tape,
     config: Config,
     template: Template,
@@ -224,19 +230,23 @@ def _chain(
     computed = later_nodes(config, template=template, calibration=calibration)
     if first == 0:
         camera = None if calibration is None else calibration.camera
+        files = find_crop_files(
+            header, source=request.source, boxes=request.boxes, masks=request.masks
+        )
         detections = open_finder(
-            boxes=request.boxes,
-            masks=request.masks,
+            boxes=files.boxes,
+            masks=files.masks,
             detect=config.detect_fish,
             track=config.track_fish,
         )
         pictures = None
-        if request.source is not None:
-            reader = ReadFrames(request.source, config.read_frames)
+        if files.source is not None:
+            reader = ReadFrames(files.source, config.read_frames)
             stack.callback(reader.close)
             pictures = SourcePictures(reader)
         crop_fish = CropFish(config.crop_fish, camera=camera, detections=detections)
-        return tape.pictures(pictures, exact=request.check), [crop_fish, *computed]
+        frames = tape.pictures(pictures, exact=request.check, missing_source=files.missing_source)
+        return frames, [crop_fish, *computed]
     logged = [*STAGES.values()][:first]
     if request.out is None:
         logged = logged[-1:]

@@ -1,11 +1,8 @@
 """The pictures of a report: a fish as it was seen, and the outlines of its mask and its mesh."""
 
-import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -104,10 +101,9 @@ def frames_of(
 
 
 def named_source(recording: Recording) -> str | None:
-    """The source by the name that the recorded command gave it, if there is such a file."""
-    words = shlex.split(recording.header.command)
-    named = [after for word, after in pairwise(words) if word == "--source"]
-    return named[0] if named and Path(named[0]).exists() else None
+    """The place of the recorded source, where there is still a file or folder."""
+    inputs = recording.header.known_inputs
+    return inputs.source.path if inputs is not None and inputs.source.exists() else None
 
 
 class _Pictures:

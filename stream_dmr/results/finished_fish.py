@@ -5,11 +5,12 @@ import os
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate
+from stream_dmr.recording.messages.run_inputs import RunInputs
 from stream_dmr.recording.messages.selection import WHOLE, Part
 from stream_dmr.recording.reading.reader import Recording, messages
 from stream_dmr.results.run_facts import run_facts
@@ -77,11 +78,11 @@ def read_runs(database: Path) -> dict[str, RunFacts]:
 
 
 def numbers_its_own(folder: Path) -> bool:
-    """Whether a run in a folder was given no files that say which fish is which. OutputError."""
+    """True where a run in a folder was given no files that say which fish is which. OutputError."""
     database = database_of(folder)
     runs = {} if database is None else read_runs(database)
-    commands = (one.command for one in runs.values() if " run " in one.command)
-    return any("--boxes" not in one and "--masks" not in one for one in commands)
+    given = [RunInputs.from_facts(asdict(facts)) for facts in runs.values()]
+    return any(inputs is not None and not (inputs.boxes or inputs.masks) for inputs in given)
 
 
 def fish_by_run(database: Path) -> dict[str, list[str]]:
@@ -99,11 +100,11 @@ def _opened(database: Path) -> closing[sqlite3.Connection]:
 
 
 def _runs(connection: sqlite3.Connection) -> Iterator[tuple[str, RunFacts]]:
-    names = [field.name for field in fields(RunFacts)]
-    for run_id, *values in connection.execute(
-        f"SELECT run_id, {', '.join(names)} FROM runs ORDER BY started_ns"
-    ):
-        yield run_id, RunFacts(**{n: v or "" for n, v in zip(names, values, strict=True)})
+    rows = connection.execute("SELECT * FROM runs ORDER BY started_ns")
+    columns = [column[0] for column in rows.description]
+    for values in rows:
+        row = dict(zip(columns, values, strict=True))  # an older database has fewer columns
+        yield row["run_id"], RunFacts(**{f.name: row.get(f.name) or "" for f in fields(RunFacts)})
 
 
 def _stored_fish(database: Path, held: dict[int, Review]) -> list[FishResult]:

@@ -5,25 +5,19 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
-from hashlib import file_digest, sha256
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from stream_dmr import __version__
 from stream_dmr.errors import OutputError
-from stream_dmr.files import rename_durably, writing_to
+from stream_dmr.files import rename_durably, sha256_of, writing_to
 from stream_dmr.results.finished_fish import database_of, fish_by_run, read_runs
 from stream_dmr.results.store import NAME as DATABASE
 from stream_dmr.results.store import RunFacts
 from stream_dmr.results.verdicts import Verdict, read_verdicts
 
 NAME = "provenance.json"
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file, in hex."""
-    with path.open("rb") as file:
-        return file_digest(file, "sha256").hexdigest()
 
 
 @contextmanager

@@ -11,14 +11,16 @@ def run_facts(header: RunHeader, *, vessel: str = "", trip: str = "", haul: str 
     """What the store says of a run; each hash is of the bytes that the recording holds."""
     parts = header.attachments()
     hashes = {name: sha256(data).hexdigest() for name, data in parts.items()}
-    return RunFacts(
-        source=header.source,
-        command=header.command,
-        software_version=__version__,
-        config_sha256=hashes["config.toml"],
-        calibration_sha256=hashes.get("calibration.yaml", ""),
-        template_sha256=hashes["template.pb"],
-        vessel=vessel,
-        trip=trip,
-        haul=haul,
-    )
+    given = {} if header.inputs is None else header.inputs.metadata()
+    facts = {
+        "source": header.source,
+        "command": header.command,
+        "software_version": __version__,
+        "config_sha256": hashes["config.toml"],
+        "calibration_sha256": hashes.get("calibration.yaml", ""),
+        "template_sha256": hashes["template.pb"],
+        "vessel": vessel,
+        "trip": trip,
+        "haul": haul,
+    }
+    return RunFacts(**given | facts)

@@ -44,6 +44,13 @@ class RunFacts:
     config_sha256: str
     calibration_sha256: str
     template_sha256: str
+    source_path: str = ""  # the files that the run was given, see `RunInputs`
+    source_sha256: str = ""
+    boxes_path: str = ""
+    boxes_sha256: str = ""
+    masks_path: str = ""
+    masks_sha256: str = ""
+    calibration_path: str = ""
     vessel: str = ""
     trip: str = ""
     haul: str = ""

@@ -18,6 +18,12 @@ FISH_COLUMNS = [
     *("track_id", "length_mm", "length_std_mm", "frames_seen", "frames_used", "first_frame"),
     *("last_frame", "first_timestamp_ns", "last_timestamp_ns", "status"),
 ]
+# Columns of `runs` that the first databases lack. Older versions read and write tables that have
+# them, so they need no new VERSION.
+_ADDED_COLUMNS = (
+    *("source_path", "source_sha256", "boxes_path", "boxes_sha256"),
+    *("masks_path", "masks_sha256", "calibration_path"),
+)
 _TABLES = """
 CREATE TABLE runs (
     run_id TEXT PRIMARY KEY,
@@ -29,7 +35,10 @@ CREATE TABLE runs (
     config_sha256 TEXT NOT NULL,
     calibration_sha256 TEXT NOT NULL, -- '': no calibration
     template_sha256 TEXT NOT NULL,
-    vessel TEXT, trip TEXT, haul TEXT
+    vessel TEXT, trip TEXT, haul TEXT,
+    -- the files that the run was given; NULL: by an older stream-dmr, '': it was given none
+    source_path TEXT, source_sha256 TEXT, boxes_path TEXT, boxes_sha256 TEXT,
+    masks_path TEXT, masks_sha256 TEXT, calibration_path TEXT
 ) STRICT;
 CREATE TABLE fish (
     number INTEGER PRIMARY KEY, -- in the order in which the tracks ended
@@ -157,3 +166,7 @@ def _prepare(database: sqlite3.Connection) -> None:
             f"BEGIN; {_TABLES} PRAGMA application_id = {APPLICATION_ID}; "
             f"PRAGMA user_version = {VERSION}; COMMIT;"
         )
+    known = {column[1] for column in database.execute("PRAGMA table_info(runs)")}
+    for name in _ADDED_COLUMNS:
+        if name not in known:
+            database.execute(f"ALTER TABLE runs ADD COLUMN {name} TEXT")

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from stream_dmr.csv_file import set_aside
 from stream_dmr.errors import OutputError, RecordingError, UserError
+from stream_dmr.files import sha256_of
 from stream_dmr.messages import LengthEstimate, LocalizedFish
 from stream_dmr.recording.messages.selection import WHOLE
 from stream_dmr.recording.reading.reader import messages, open_recordings
@@ -26,7 +27,7 @@ from stream_dmr.results.finished_fish import (
     read_stored,
 )
 from stream_dmr.results.provenance import NAME as PROVENANCE
-from stream_dmr.results.provenance import lines_sha256, read_provenance, sha256_of, verdicts_sum
+from stream_dmr.results.provenance import lines_sha256, read_provenance, verdicts_sum
 from stream_dmr.results.run_facts import run_facts
 from stream_dmr.results.store import NAME as DATABASE
 from stream_dmr.results.store import RunFacts
@@ -142,8 +143,8 @@ def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
     for run_id, facts in made["runs"].items():
         for field in fields(RunFacts):
             now = getattr(runs.get(run_id), field.name, "missing")
-            if now != facts.get(field.name):
-                was = facts.get(field.name)
+            was = facts.get(field.name, "")  # older ones have fewer
+            if now != was:
                 yield Change(database, f"run {run_id}: {field.name} is {now!r}, was {was!r}")
     yield from _verdicts(database, said, made.get("verdicts", {}))
 

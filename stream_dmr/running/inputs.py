@@ -8,6 +8,7 @@ from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.run_inputs import InputFile, RunInputs
 from stream_dmr.running.config import Config, load_config, to_toml
 from stream_dmr.segmentation.tracking.fish_finder import FishFinder, open_finder
 from stream_dmr.sources.source import Source
@@ -70,6 +71,25 @@ class Inputs:
             template=self.template,
             calibration=self.calibration,
             calibration_file=b"" if file is None else file.read_bytes(),
+            inputs=self._given(),
+        )
+
+    def _given(self) -> RunInputs:
+        """The files of the request with their hashes; frames without an end have none."""
+        request = self.request
+        if not Path(request.source).exists():
+            source = InputFile(path=self.source.name)
+        elif self.is_endless:
+            source = InputFile(path=str(Path(request.source).absolute()))
+        else:
+            source = InputFile.read(request.source)
+        return RunInputs(
+            source=source,
+            boxes=None if request.boxes is None else InputFile.read(request.boxes),
+            masks=None if request.masks is None else InputFile.read(request.masks),
+            calibration=None
+            if request.calibration is None
+            else InputFile.read(request.calibration),
         )
 
 

@@ -12,7 +12,7 @@ from stream_dmr.files import natural_order
 from stream_dmr.messages import Frame
 from stream_dmr.sources.source import Source, check_size, nominal_ns
 
-_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
+PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 _DEPTHS = {"uint8", "uint16"}
 
 
@@ -67,12 +67,12 @@ def _pictures_in(folder: Path) -> list[Path]:
         raise SourceError(
             f"{folder}: expected a folder of pictures, but it can't be read: {error.strerror}"
         ) from None
-    pictures = [p for p in files if p.suffix.lower() in _SUFFIXES]
+    pictures = [p for p in files if p.suffix.lower() in PICTURE_SUFFIXES]
     if pictures:
         return sorted(pictures, key=natural_order)
+    suffixes = ", ".join(sorted(PICTURE_SUFFIXES))
     raise SourceError(
-        f"{folder}: expected a folder of pictures ({', '.join(sorted(_SUFFIXES))}) or of videos, "
-        "found none"
+        f"{folder}: expected a folder of pictures ({suffixes}) or of videos, found none"
     )
 
 

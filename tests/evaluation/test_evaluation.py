@@ -61,9 +61,15 @@ def test_fish_of_other_numbers_are_refused(tmp_path):
 def test_numbers_that_a_run_gave_itself_are_warned_of(tmp_path):
     out = measure(tmp_path)
     truth = write(tmp_path, "b.csv", TRUTH)
-    for command, is_warned in (("", True), (" --masks clip/masks", False)):
+    old = "UPDATE runs SET source_path = NULL, command = 'stream-dmr run --source x"
+    for change, is_warned in (
+        ("UPDATE runs SET masks_path = masks_path", False),
+        ("UPDATE runs SET masks_path = ''", True),
+        (f"{old} --masks=clip/masks'", False),
+        (f"{old}'", True),
+    ):
         with closing(sqlite3.connect(out / "lengths.db")) as database:
-            database.execute(f"UPDATE runs SET command = 'stream-dmr run --source x{command}'")
+            database.execute(change)
             database.commit()
         outcome = invoke("evaluate", {"--lengths": str(out / "lengths.csv"), "--truth": str(truth)})
         assert outcome.code == 0

@@ -276,7 +276,6 @@ class TestDifferences:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"--from": "crop"}, "--boxes"),
         ({"--from": "smooth", "--template": "cod"}, "--from fit"),
         ({"--check": None, "--time": "0:1"}, "--time"),
     ],

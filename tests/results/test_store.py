@@ -7,6 +7,7 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from hypothesis import strategies as st
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate
+from stream_dmr.results.finished_fish import read_runs
 from stream_dmr.results.store import LengthStore, RunFacts
 from stream_dmr.results.tables import lengths_row
 from tests.support.small_disk import fill, small_disk
@@ -109,6 +111,18 @@ def test_a_row_says_what_made_it(store: LengthStore):
     ]
     assert reader.execute("SELECT ended_ns > started_ns FROM runs").fetchone() == (1,)
     reader.close()
+
+
+def test_a_database_from_before_a_column_is_read_and_gone_on_with(store: LengthStore):
+    store.add(fish(1))
+    store.close()
+    with closing(sqlite3.connect(store.path)) as database:
+        for name in ("source_path", "masks_path", "calibration_path"):
+            database.execute(f"ALTER TABLE runs DROP COLUMN {name}")
+    assert list(read_runs(store.path).values()) == [FACTS]
+    facts = replace(FACTS, source_path="/clips/clip.mp4")
+    LengthStore(store.path.parent, facts).close()
+    assert list(read_runs(store.path).values()) == [FACTS, facts]
 
 
 def test_one_file_is_left(store: LengthStore):

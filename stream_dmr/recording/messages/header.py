@@ -12,6 +12,7 @@ from stream_dmr import __version__
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import RecordingError
 from stream_dmr.recording.messages.codec import CODEC_VERSION, decode, encode
+from stream_dmr.recording.messages.run_inputs import RunInputs
 from stream_dmr.template.template import Template
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "torch", "scipy", "numba", "mcap", "rerun-sdk")
@@ -27,6 +28,12 @@ class RunHeader:
     template: Template
     calibration: Calibration | None = None
     calibration_file: bytes = b""  # the user's file as it was; empty where there is none
+    inputs: RunInputs | None = None  # None: recorded before these were
+
+    @property
+    def known_inputs(self) -> RunInputs | None:
+        """`inputs`, or of an old recording what its command tells of them."""
+        return self.inputs or RunInputs.from_command(self.command)
 
     @cached_property
     def checksum(self) -> int:
@@ -35,9 +42,11 @@ class RunHeader:
 
     def metadata(self) -> dict[str, str]:
         """The record `run`: who wrote this, from what, and with which versions."""
+        given = {} if self.inputs is None else self.inputs.metadata()
         return {
             "source": self.source,
             "command": self.command,
+            **given,
             "codec_version": str(CODEC_VERSION),
             "attachments_crc32": str(self.checksum),
             "stream_dmr": __version__,
@@ -69,6 +78,7 @@ class RunHeader:
             template=decode(Template, attachments["template.pb"]),
             calibration=None if calibration is None else decode(Calibration, calibration),
             calibration_file=attachments.get("calibration.yaml", b""),
+            inputs=RunInputs.from_metadata(metadata),
         )
         recorded = metadata.get("attachments_crc32")  # the first recordings have none
         if recorded is not None and recorded != str(_checksum(attachments)):
