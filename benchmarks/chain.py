@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import cv2
 
-from stream_dmr.calibration.file import save_calibration
+from stream_dmr.calibration.calibration_file import save_calibration
 from stream_dmr.running.config import Config, to_toml
 from stream_dmr.running.run import RunRequest, run
-from stream_dmr.simulation.film import Shot, film
-from stream_dmr.simulation.scene import HEIGHT, WIDTH, make_scene
-from stream_dmr.simulation.writer import encode_mask, write_species
+from stream_dmr.simulation.film import FilmedFrame, film
+from stream_dmr.simulation.rail_scene import HEIGHT, WIDTH, make_scene
+from stream_dmr.simulation.write_scene import encode_mask, write_species
 
 NUM_FISH = 3
 _MOSTLY = 0.9  # of each fish is in view, as in the middle of a passage
@@ -73,10 +73,10 @@ def measure(clip: Path, recording: dict[str, bool]) -> Rate:
     return Rate(count / summary.elapsed_s, count, cpu_s * 1e3 / count, busy)
 
 
-def _shows_all(shot: Shot, num_fish: int) -> bool:
+def _shows_all(shot: FilmedFrame, num_fish: int) -> bool:
     visible = [box for box in shot.boxes if box.visible_fraction >= _MOSTLY]
     return len(visible) == num_fish
 
 
-def _write_mask(path: Path, shot: Shot, num_fish: int) -> None:
+def _write_mask(path: Path, shot: FilmedFrame, num_fish: int) -> None:
     path.write_bytes(encode_mask(shot.labels, num_fish=num_fish))

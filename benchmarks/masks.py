@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, UInt8
 
-from stream_dmr.calibration.file import load_calibration
+from stream_dmr.calibration.calibration_file import load_calibration
 from stream_dmr.messages import FishCrop
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.segmentation.annotations.detections import open_annotations

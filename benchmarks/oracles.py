@@ -25,15 +25,15 @@ from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish
 from stream_dmr.nodes.smooth_length import SmoothLength
 from stream_dmr.running.config import Config
 from stream_dmr.running.run import later_nodes
-from stream_dmr.simulation.body import HALIBUT, Body
-from stream_dmr.simulation.fish import pose_fish
 from stream_dmr.simulation.presets import PRESETS
-from stream_dmr.simulation.scene import Scene, make_scene
+from stream_dmr.simulation.rail_scene import RailScene, make_scene
+from stream_dmr.simulation.simulated_body import HALIBUT, SimulatedBody
+from stream_dmr.simulation.simulated_fish import pose_fish
 from stream_dmr.template.template import Template
 
 T = TypeVar("T")
 FIRST_SEED = 5000
-BODIES: dict[str, Callable[[Body], Body]] = {
+BODIES: dict[str, Callable[[SimulatedBody], SimulatedBody]] = {
     "nothing": lambda own: HALIBUT,
     "each fish's own body": lambda own: own,
     "only how broad it is": lambda own: replace(HALIBUT, half_width=own.half_width),
@@ -56,7 +56,7 @@ def errors_of(task: tuple[str, int]) -> dict[str, list[float]]:
     return found
 
 
-def scene_of(task: tuple[str, int], *, num_frames: int = FRAMES_PER_SCENE) -> Scene:
+def scene_of(task: tuple[str, int], *, num_frames: int = FRAMES_PER_SCENE) -> RailScene:
     """The scene of a preset and a seed."""
     preset, seed = task
     return make_scene(num_fish=FISH_PER_SCENE, num_frames=num_frames, preset=preset, seed=seed)
@@ -77,7 +77,7 @@ def sum_up(frames: Sequence[LocalizedFish], config: Config) -> LengthEstimate:
     return final
 
 
-def slant_std_rad(scene: Scene) -> float:
+def slant_std_rad(scene: RailScene) -> float:
     """Root mean square over the fish of their mean angle with the reference plane."""
     normal = scene.calibration.plane.rotation[:, 2]
     slants = []

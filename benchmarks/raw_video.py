@@ -24,8 +24,8 @@ from chain import write_clip
 from jaxtyping import Bool
 from masks import iou, write_sheet
 
-from stream_dmr.calibration.file import load_calibration
-from stream_dmr.evaluation.files import read_truth
+from stream_dmr.calibration.calibration_file import load_calibration
+from stream_dmr.evaluation.length_tables import read_truth
 from stream_dmr.messages import FishCrop, LengthEstimate, Message
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
@@ -36,7 +36,7 @@ from stream_dmr.segmentation.annotations.files import Masks
 from stream_dmr.segmentation.masks.crop import frame_from_crop_map
 from stream_dmr.segmentation.tracking.fish_finder import open_finder
 from stream_dmr.simulation.presets import PRESETS
-from stream_dmr.simulation.writer import simulate
+from stream_dmr.simulation.write_scene import simulate
 from stream_dmr.template.template import load_template
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stream_dmr.calibration.file import save_calibration
+from stream_dmr.calibration.calibration_file import save_calibration
 from stream_dmr.messages import Frame, LengthEstimate, Message
 from stream_dmr.recording.mcap.sink import McapSink
 from stream_dmr.recording.messages.codec import encode, reference

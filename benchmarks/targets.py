@@ -14,10 +14,15 @@ from stream_dmr.messages import CropQuality, FishCrop, Frame
 from stream_dmr.segmentation.annotations.detections import Detection
 from stream_dmr.segmentation.masks.crop import CropFishSettings, crop_fish
 from stream_dmr.segmentation.masks.grabcut import GrabCut
-from stream_dmr.simulation.body import HALIBUT, JOINT_ARCS, body_mesh, keypoints
-from stream_dmr.simulation.body import Body as SimulatedBody
+from stream_dmr.simulation.rail_scene import RailScene, Visit, make_scene
 from stream_dmr.simulation.render import draw_mask
-from stream_dmr.simulation.scene import Scene, Visit, make_scene
+from stream_dmr.simulation.simulated_body import (
+    HALIBUT,
+    JOINT_ARCS,
+    SimulatedBody,
+    keypoints,
+    straight_body,
+)
 from stream_dmr.template.template import Template, make_template
 
 _NUM_FRAMES = 60
@@ -46,7 +51,7 @@ def species_template() -> Template:
 
 def body_template(simulated: SimulatedBody) -> Template:
     """A simulated body with 577 vertices: as fine as the bundled templates."""
-    mesh = body_mesh(simulated, num_rings=36, num_sides=16)
+    mesh = straight_body(simulated, num_rings=36, num_sides=16)
     points = {"keypoints": keypoints(), "joints": keypoints(JOINT_ARCS)}
     body = trimesh.Trimesh(mesh.points, mesh.faces, process=False)
     return make_template(body, points, name="simulated halibut")
@@ -117,7 +122,7 @@ def _placed(
     return points, rays.min(axis=0), rays.max(axis=0)
 
 
-def _crop(scene: Scene, visit: Visit, frame_index: int, *, size: int) -> FishCrop:
+def _crop(scene: RailScene, visit: Visit, frame_index: int, *, size: int) -> FishCrop:
     camera = scene.calibration.camera
     posed = scene.pose(visit, frame_index)
     mask = draw_mask(posed.vertices, posed.faces, camera=camera)

@@ -21,7 +21,7 @@ from stream_dmr.segmentation.masks.crop import CropFishSettings
 from stream_dmr.segmentation.tracking.tracked_fish import FollowedFish, TrackFishSettings
 from stream_dmr.simulation.film import film
 from stream_dmr.simulation.presets import PRESETS
-from stream_dmr.simulation.scene import Scene, Visit, make_scene
+from stream_dmr.simulation.rail_scene import RailScene, Visit, make_scene
 
 _SWING_MM = 700.0  # of each fish to either side
 _LEAST_VISIBLE = 0.3  # a fish of which less is to be seen is nobody's to find
@@ -36,13 +36,13 @@ class Outcome(NamedTuple):
     counted: int
 
 
-def pair_scene(*, preset: str, seed: int) -> Scene:
+def pair_scene(*, preset: str, seed: int) -> RailScene:
     """Two fish that swing through the picture past each other."""
     scene = crossing_scene(preset=preset, seed=seed)
     return replace(scene, visits=[scene.visits[0], scene.visits[2]])
 
 
-def crossing_scene(*, preset: str, seed: int, num_frames: int = 60) -> Scene:
+def crossing_scene(*, preset: str, seed: int, num_frames: int = 60) -> RailScene:
     """Three fish that come together and swing through the picture past each other."""
     slots = make_scene(num_fish=3, num_frames=2 * num_frames, preset=preset, seed=seed)
     visits = [_swinging(visit, side=1 - i) for i, visit in enumerate(slots.visits)]
@@ -59,7 +59,7 @@ def _swinging(visit: Visit, *, side: int) -> Visit:
     return replace(visit, first_frame=4 + 3 * (visit.fish.track_id - 1), poses=poses)
 
 
-def measure(scene: Scene) -> Outcome:
+def measure(scene: RailScene) -> Outcome:
     """Film a scene, follow its fish, and compare."""
     fish = FollowedFish(open_detector(DetectFishSettings()), TrackFishSettings())
     node = CropFish(CropFishSettings(), camera=scene.calibration.camera, detections=fish)
@@ -80,7 +80,7 @@ def measure(scene: Scene) -> Outcome:
     return Outcome(idf1=scores.idf1, hota=scores.hota, num_fish=num_fish, counted=counted)
 
 
-def scenes(kind: str, count: int) -> Iterator[Scene]:
+def scenes(kind: str, count: int) -> Iterator[RailScene]:
     """Scenes of one kind: a preset, or a preset with crossings."""
     preset, _, meeting = kind.partition(", ")
     meet = {"pair": pair_scene, "crossing": crossing_scene}

@@ -14,7 +14,7 @@ from targets import species_template
 from stream_dmr.messages import LocalizedFish
 from stream_dmr.running.config import Config
 from stream_dmr.running.run import later_nodes
-from stream_dmr.simulation.motion import FPS
+from stream_dmr.simulation.pose_sequence import FPS
 from stream_dmr.simulation.presets import PRESETS
 
 _NUM_FRAMES = 600  # of a scene: some 48 of each fish

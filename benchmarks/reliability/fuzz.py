@@ -16,7 +16,7 @@ from typing import get_args
 import numpy as np
 from mutants import Mutate, by_box, by_byte, by_chunk, by_line, by_node, by_record, of_header
 
-from stream_dmr.calibration.file import load_calibration
+from stream_dmr.calibration.calibration_file import load_calibration
 from stream_dmr.errors import UserError
 from stream_dmr.messages import Frame, Message
 from stream_dmr.recording.messages.codec import decode

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from measured import ROOT  # noqa: F401
 
-from stream_dmr.calibration.file import save_calibration
+from stream_dmr.calibration.calibration_file import save_calibration
 from tests.support.tiny_clip import HEIGHT, WIDTH, calibration, write_template
 
 NUM_FRAMES = 160

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from numba import njit
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.evaluation.files import LengthRow
+from stream_dmr.evaluation.length_tables import LengthRow
 from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.template.template import Template
 from table1.fish import Haul

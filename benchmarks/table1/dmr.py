@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from stream_dmr.evaluation.files import LengthRow
+from stream_dmr.evaluation.length_tables import LengthRow
 from stream_dmr.localization.localize import LocalizeSettings
 from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish, Message
 from stream_dmr.running.config import Config

@@ -18,9 +18,9 @@ from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.annotations.detections import Detection
 from stream_dmr.segmentation.masks.crop import CropFishSettings, crop_fish
 from stream_dmr.segmentation.masks.grabcut import GrabCut
-from stream_dmr.simulation.film import Shot, film
-from stream_dmr.simulation.motion import FPS
-from stream_dmr.simulation.scene import Scene, make_scene
+from stream_dmr.simulation.film import FilmedFrame, film
+from stream_dmr.simulation.pose_sequence import FPS
+from stream_dmr.simulation.rail_scene import RailScene, make_scene
 
 FISH_PER_SCENE = 18  # 41 scenes, each with a camera and a plane of its own, are 738 fish
 FRAMES_PER_SCENE = 151  # 12 of them for each fish
@@ -46,7 +46,7 @@ class Haul(NamedTuple):
     frames: list[list[Sighting]]
 
 
-def table_scene(index: int) -> Scene:
+def table_scene(index: int) -> RailScene:
     """The scene number `index` of the table, from 0."""
     return make_scene(
         num_fish=FISH_PER_SCENE,
@@ -56,7 +56,7 @@ def table_scene(index: int) -> Scene:
     )
 
 
-def watch(scene: Scene, *, with_second: bool) -> Haul:
+def watch(scene: RailScene, *, with_second: bool) -> Haul:
     """Film a scene; `with_second` by both cameras, which takes twice as long."""
     first = scene.calibration
     second = replace(scene, calibration=_beside(first), seed=scene.seed + _SECOND_FILM)
@@ -82,7 +82,7 @@ def _beside(calibration: Calibration) -> Calibration:
 
 
 def _sightings(
-    left: Shot, right: Shot | None, first: Calibration, second: Calibration
+    left: FilmedFrame, right: FilmedFrame | None, first: Calibration, second: Calibration
 ) -> Iterator[Sighting]:
     ours = dict(chain_crops(left, first))
     if right is None:
@@ -101,13 +101,13 @@ def _seen(crop: FishCrop) -> FishCrop:
     return replace(crop, image=None)
 
 
-def chain_crops(shot: Shot, calibration: Calibration) -> Iterator[tuple[int, FishCrop]]:
+def chain_crops(shot: FilmedFrame, calibration: Calibration) -> Iterator[tuple[int, FishCrop]]:
     """Every fish of a frame by its track id, with its picture, as the chain cuts it out."""
     yield from _crops(shot, calibration, _CHAIN)
 
 
 def _crops(
-    shot: Shot, calibration: Calibration, settings: CropFishSettings
+    shot: FilmedFrame, calibration: Calibration, settings: CropFishSettings
 ) -> Iterator[tuple[int, FishCrop]]:
     """Every fish of a frame by its track id, cut out as the chain does from boxes and masks."""
     frame = Frame(

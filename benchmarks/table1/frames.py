@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.camera import frame_from_crop
-from stream_dmr.evaluation.files import LengthRow
+from stream_dmr.evaluation.length_tables import LengthRow
 from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.localization.localize import LocalizeSettings, localize
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms

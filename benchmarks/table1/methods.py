@@ -6,7 +6,7 @@ from pathlib import Path
 
 from targets import species_template
 
-from stream_dmr.evaluation.files import LengthRow
+from stream_dmr.evaluation.length_tables import LengthRow
 from table1 import results, stereo
 from table1.bfs import BruteForce
 from table1.dmr import Dmr, Paper

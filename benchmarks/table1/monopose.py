@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
-from stream_dmr.evaluation.files import LengthRow
+from stream_dmr.evaluation.length_tables import LengthRow
 from stream_dmr.fitting.distance_map import signed_distance
 from stream_dmr.fitting.target import mask_contour
 from stream_dmr.messages import FishCrop, FittedMesh

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from stream_dmr.evaluation.compare import Evaluation, compare
-from stream_dmr.evaluation.metrics import EvaluateSettings
+from stream_dmr.evaluation.length_errors import EvaluateSettings
 from table1.dmr import PAPER_FRAMES
 from table1.results import Fish
 

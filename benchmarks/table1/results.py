@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from stream_dmr.evaluation.files import LengthRow
+from stream_dmr.evaluation.length_tables import LengthRow
 
 CACHE = Path(__file__).parent / "cache"
 _COLUMNS = ("row", "track_id", "truth_mm", "length_mm", "std_mm", "ci95_low_mm", "ci95_high_mm")

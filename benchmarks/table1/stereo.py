@@ -11,7 +11,7 @@ it is.
 import numpy as np
 from jaxtyping import Float
 
-from stream_dmr.evaluation.files import LengthRow
+from stream_dmr.evaluation.length_tables import LengthRow
 from stream_dmr.geometry import arc_length, arc_lengths
 from stream_dmr.localization.localize import LocalizeSettings
 from stream_dmr.messages import FishCrop

@@ -36,7 +36,7 @@ def calibrate(
 
     from stream_dmr.calibration.board import calibrate as calibrate_camera
     from stream_dmr.calibration.board import draw_views, parse_board
-    from stream_dmr.calibration.file import save_calibration
+    from stream_dmr.calibration.calibration_file import save_calibration
 
     console = Console()
     result = calibrate_camera(

@@ -39,8 +39,8 @@ def evaluate(
     from stream_dmr.cli.display import print_distributions, print_evaluation
     from stream_dmr.errors import OutputError
     from stream_dmr.evaluation.compare import evaluate, evaluate_histogram
-    from stream_dmr.evaluation.files import is_histogram
     from stream_dmr.evaluation.histogram_plot import plot_histograms
+    from stream_dmr.evaluation.length_tables import is_histogram
     from stream_dmr.results.finished_fish import numbers_its_own
     from stream_dmr.running.config import load_config
 

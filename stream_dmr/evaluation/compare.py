@@ -11,14 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.errors import UserError
-from stream_dmr.evaluation.files import (
-    Interval,
-    LengthRow,
-    read_histogram,
-    read_lengths,
-    read_truth,
-)
-from stream_dmr.evaluation.metrics import (
+from stream_dmr.evaluation.length_errors import (
     DistributionErrors,
     EvaluateSettings,
     FishErrors,
@@ -28,6 +21,13 @@ from stream_dmr.evaluation.metrics import (
     fish_errors,
     interval_figures,
     length_histogram,
+)
+from stream_dmr.evaluation.length_tables import (
+    Interval,
+    LengthRow,
+    read_histogram,
+    read_lengths,
+    read_truth,
 )
 
 

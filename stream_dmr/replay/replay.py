@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from stream_dmr.calibration.file import load_calibration
+from stream_dmr.calibration.calibration_file import load_calibration
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish, Message

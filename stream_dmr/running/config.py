@@ -14,7 +14,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from stream_dmr.errors import ConfigError
-from stream_dmr.evaluation.metrics import EvaluateSettings
+from stream_dmr.evaluation.length_errors import EvaluateSettings
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.localization.localize import LocalizeSettings

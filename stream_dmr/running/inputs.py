@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from stream_dmr.calibration.file import load_calibration, require_size
+from stream_dmr.calibration.calibration_file import load_calibration, require_size
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
 from stream_dmr.nodes.read_frames import ReadFrames

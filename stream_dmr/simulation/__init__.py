@@ -6,7 +6,7 @@ model, so that fitting them is no test against itself.
 
 from pathlib import Path
 
-from stream_dmr.simulation.writer import simulate
+from stream_dmr.simulation.write_scene import simulate
 
 __all__ = ["DEMO_SCENE", "simulate"]
 

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int16, UInt8, UInt16
 
 from stream_dmr.simulation.backdrop import Backdrop, draw_gaff, draw_hook, draw_line
-from stream_dmr.simulation.fish import PosedFish
+from stream_dmr.simulation.rail_scene import RailScene, Visit
 from stream_dmr.simulation.render import Patch, draw_fish_patch, frame_window, paste
-from stream_dmr.simulation.scene import Scene, Visit
+from stream_dmr.simulation.simulated_fish import PosedFish
 
 _BACKDROP, _FRAME, _SENSOR = (
     8,
@@ -23,7 +23,7 @@ _MIN_BOX_PIXELS = 30  # fewer are too few to be called seen
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Box:
+class VisibleBox:
     """What can be seen of one fish in one frame; the box is tight around its visible mask."""
 
     frame_index: int
@@ -33,16 +33,16 @@ class Box:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Shot:
+class FilmedFrame:
     """One frame of the film with its annotations."""
 
     frame_index: int
     image: UInt8[np.ndarray, "H W 3"]
     labels: UInt16[np.ndarray, "H W"]  # track id, 0 is background
-    boxes: list[Box]
+    boxes: list[VisibleBox]
 
 
-def film(scene: Scene) -> Iterator[Shot]:
+def film(scene: RailScene) -> Iterator[FilmedFrame]:
     """Film a scene, frame by frame from 1; the same scene gives the same frames."""
     camera = scene.calibration.camera
     backdrop = Backdrop(
@@ -54,8 +54,8 @@ def film(scene: Scene) -> Iterator[Shot]:
 
 
 def _shoot(
-    scene: Scene, backdrop: Backdrop, noise: Int16[np.ndarray, "A B 3"], frame_index: int
-) -> Shot:
+    scene: RailScene, backdrop: Backdrop, noise: Int16[np.ndarray, "A B 3"], frame_index: int
+) -> FilmedFrame:
     rng = np.random.default_rng((scene.seed, _FRAME, frame_index))
     image = backdrop.draw(frame_index)
     labels = np.zeros(image.shape[:2], np.uint16)
@@ -72,7 +72,7 @@ def _shoot(
         pixels_in_all[track_id] = int(mask.sum())
     for visit in visits:
         labels[_draw_gaff(scene, visit, posed[visit.fish.track_id], image, frame_index)] = 0
-    return Shot(
+    return FilmedFrame(
         frame_index=frame_index,
         image=_expose(image, rng, noise),
         labels=labels,
@@ -95,7 +95,7 @@ def ragged(
 
 
 def _draw_fish(
-    scene: Scene,
+    scene: RailScene,
     visit: Visit,
     posed: PosedFish,
     image: UInt8[np.ndarray, "H W 3"],
@@ -113,14 +113,14 @@ def _draw_fish(
     return patch
 
 
-def _center_before(scene: Scene, visit: Visit, frame_index: int) -> Float[np.ndarray, "2"]:
+def _center_before(scene: RailScene, visit: Visit, frame_index: int) -> Float[np.ndarray, "2"]:
     """Where the center was a frame ago; in the first frame, where it is."""
     earlier = scene.pose(visit, max(frame_index - 1, visit.first_frame))
     return scene.calibration.camera.project(earlier.keypoints)[1]
 
 
 def _draw_gaff(
-    scene: Scene,
+    scene: RailScene,
     visit: Visit,
     posed: PosedFish,
     image: UInt8[np.ndarray, "H W 3"],
@@ -141,7 +141,7 @@ def _draw_gaff(
 
 def _boxes(
     labels: UInt16[np.ndarray, "H W"], pixels_in_all: dict[int, int], frame_index: int
-) -> list[Box]:
+) -> list[VisibleBox]:
     """Tight boxes of what is visible; a pixel spans one unit, from its index to the next."""
     boxes = []
     for track_id, pixels in sorted(pixels_in_all.items()):
@@ -150,7 +150,7 @@ def _boxes(
         if seen >= _MIN_BOX_PIXELS:
             x, y, width, height = cv2.boundingRect(visible)
             boxes.append(
-                Box(
+                VisibleBox(
                     frame_index=frame_index,
                     track_id=track_id,
                     xywh_px=(x, y, width, height),
@@ -160,7 +160,7 @@ def _boxes(
     return boxes
 
 
-def _draw_sensor_noise(scene: Scene) -> Int16[np.ndarray, "A B 3"]:
+def _draw_sensor_noise(scene: RailScene) -> Int16[np.ndarray, "A B 3"]:
     """One picture of noise, larger than the frames, which each frame is to cut at random.
 
     Noise of its own for every frame would take longer than all the rest.

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numba import njit
 
 from stream_dmr.camera import Camera
-from stream_dmr.simulation.fish import PosedFish
+from stream_dmr.simulation.simulated_fish import PosedFish
 from stream_dmr.simulation.skin import draw_skin
 
 _TOWARDS_LIGHT = np.array([-0.35, -0.75, -0.56])  # camera frame: from above, behind the camera

@@ -9,8 +9,8 @@ from scipy.spatial.distance import pdist
 from typer.testing import CliRunner
 
 from stream_dmr.calibration.board import calibrate, draw_views, parse_board
+from stream_dmr.calibration.calibration_file import load_calibration
 from stream_dmr.calibration.corners import find_corners, read_grey
-from stream_dmr.calibration.file import load_calibration
 from stream_dmr.calibration.lens_fit import fit_lens, require_determined
 from stream_dmr.errors import CalibrationError, OutputError
 from tests.support.board_views import (

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.calibration.file import load_calibration, require_size, save_calibration
+from stream_dmr.calibration.calibration_file import load_calibration, require_size, save_calibration
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.errors import CalibrationError, OutputError
 from tests.test_camera import cameras, planes

@@ -15,7 +15,7 @@ from stream_dmr.evaluation.compare import (
     summary_rows,
 )
 from stream_dmr.evaluation.histogram_plot import plot_histograms
-from stream_dmr.evaluation.metrics import EvaluateSettings
+from stream_dmr.evaluation.length_errors import EvaluateSettings
 from tests.support.command import invoke
 from tests.support.fish_run import measure
 

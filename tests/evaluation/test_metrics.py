@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import entropy, wasserstein_distance
 
-from stream_dmr.evaluation.metrics import (
+from stream_dmr.evaluation.length_errors import (
     EvaluateSettings,
     fish_errors,
     histogram_bias_mm,

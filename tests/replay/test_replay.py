@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stream_dmr.calibration.file import load_calibration, save_calibration
+from stream_dmr.calibration.calibration_file import load_calibration, save_calibration
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish
 from stream_dmr.recording.messages.codec import decode

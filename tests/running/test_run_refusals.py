@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from stream_dmr.calibration.file import save_calibration
+from stream_dmr.calibration.calibration_file import save_calibration
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import Frame
 from tests.support.command import Outcome, invoke, rows

@@ -16,7 +16,7 @@ from stream_dmr.segmentation.detection.detector import Candidate
 from stream_dmr.segmentation.detection.motion import MotionDetector, MotionSettings
 from stream_dmr.simulation.backdrop import Backdrop
 from stream_dmr.simulation.film import film
-from stream_dmr.simulation.scene import make_scene
+from stream_dmr.simulation.rail_scene import make_scene
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
 

@@ -13,7 +13,7 @@ from stream_dmr.segmentation.network.network import ENDS_STRIDE, UNet, normalise
 from stream_dmr.segmentation.network.weights import SHIPPED, load_weights, save_weights
 from stream_dmr.segmentation.training.losses import ends_are_right, ends_loss, mask_iou, mask_loss
 from stream_dmr.simulation.film import film
-from stream_dmr.simulation.scene import make_scene
+from stream_dmr.simulation.rail_scene import make_scene
 
 numbers = st.floats(-50, 200)
 sides = st.floats(1, 150)

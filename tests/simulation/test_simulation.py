@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from stream_dmr.calibration.file import load_calibration
+from stream_dmr.calibration.calibration_file import load_calibration
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.simulation import simulate
 from stream_dmr.simulation.film import film, ragged
-from stream_dmr.simulation.scene import make_scene
-from stream_dmr.simulation.writer import encode_mask
+from stream_dmr.simulation.rail_scene import make_scene
+from stream_dmr.simulation.write_scene import encode_mask
 
 NUM_FISH, NUM_FRAMES = 3, 24
 

@@ -8,12 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stream_dmr.geometry import arc_length, bending_ratio
-from stream_dmr.simulation.body import CENTER_ARC, HALIBUT, body_mesh, draw_body, keypoints
-from stream_dmr.simulation.fish import Pose, draw_fish, pose_fish
+from stream_dmr.simulation.center_line import NUM_STEPS, bend_center_line, total_bend_rad
 from stream_dmr.simulation.presets import PRESETS
+from stream_dmr.simulation.rail_scene import draw_calibration, draw_view, make_scene
 from stream_dmr.simulation.render import draw_fish_patch, draw_mask, frame_window
-from stream_dmr.simulation.scene import draw_calibration, draw_view, make_scene
-from stream_dmr.simulation.spine import NUM_STEPS, bend_spine, total_bend_rad
+from stream_dmr.simulation.simulated_body import (
+    CENTER_ARC,
+    HALIBUT,
+    draw_body,
+    keypoints,
+    straight_body,
+)
+from stream_dmr.simulation.simulated_fish import HangingPose, draw_fish, pose_fish
 
 SEEDS = st.integers(0, 2**32 - 1)
 PRESET_NAMES = st.sampled_from(sorted(PRESETS))
@@ -23,8 +29,8 @@ def random_bends(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).normal(0.0, 2.0, (3, 3))
 
 
-def straight_pose() -> Pose:
-    return Pose(
+def straight_pose() -> HangingPose:
+    return HangingPose(
         bends=np.zeros((3, 3)),
         yaw_rad=0.3,
         sway_rad=0.2,
@@ -35,13 +41,13 @@ def straight_pose() -> Pose:
 
 @given(seed=SEEDS, length_mm=st.floats(100.0, 3000.0))
 def test_centre_line_is_as_long_as_the_fish_however_it_is_bent(seed, length_mm):
-    spine = bend_spine(random_bends(seed), length_mm=length_mm)
+    spine = bend_center_line(random_bends(seed), length_mm=length_mm)
     assert arc_length(spine.points) == pytest.approx(length_mm, rel=1e-9)
 
 
 @given(seed=SEEDS)
 def test_body_frames_stay_rotations_along_the_tangent(seed):
-    spine = bend_spine(random_bends(seed), length_mm=1.0)
+    spine = bend_center_line(random_bends(seed), length_mm=1.0)
     np.testing.assert_allclose(
         np.swapaxes(spine.frames, 1, 2) @ spine.frames,
         np.broadcast_to(np.eye(3), spine.frames.shape),
@@ -56,7 +62,7 @@ def test_body_frames_stay_rotations_along_the_tangent(seed):
 def test_a_bend_in_one_plane_turns_the_tail_by_the_total_bend(angle_deg):
     bends = np.zeros((3, 1))
     bends[1, 0] = np.radians(angle_deg) * np.pi / 2  # sin(pi s) integrates to 2 / pi
-    spine = bend_spine(bends, length_mm=700.0)
+    spine = bend_center_line(bends, length_mm=700.0)
     turned = np.degrees(np.arccos(spine.frames[0, :, 0] @ spine.frames[-1, :, 0]))
     assert np.degrees(total_bend_rad(bends)) == pytest.approx(angle_deg, rel=1e-4)
     assert turned == pytest.approx(angle_deg, rel=1e-4)
@@ -65,7 +71,7 @@ def test_a_bend_in_one_plane_turns_the_tail_by_the_total_bend(angle_deg):
 def test_twist_alone_leaves_the_centre_line_straight():
     bends = np.zeros((3, 2))
     bends[0] = [1.0, -0.5]
-    spine = bend_spine(bends, length_mm=700.0)
+    spine = bend_center_line(bends, length_mm=700.0)
     assert bending_ratio(spine.points) == pytest.approx(1.0, abs=1e-12)
     assert total_bend_rad(bends) == 0.0
 
@@ -127,7 +133,7 @@ def test_bodies_are_closed_and_keep_their_volume_when_bent(seed):
 
 
 def test_mean_body_has_the_proportions_of_a_halibut():
-    points = body_mesh(HALIBUT).points
+    points = straight_body(HALIBUT).points
     breadth, thickness = np.ptp(points[:, 1:], axis=0)
     assert breadth == pytest.approx(0.38, rel=1e-3)
     assert thickness == pytest.approx(0.10, rel=1e-2)
@@ -139,7 +145,7 @@ def test_mean_body_has_the_proportions_of_a_halibut():
 
 
 def test_template_keypoints_touch_the_mean_mesh():
-    mesh = body_mesh(HALIBUT)
+    mesh = straight_body(HALIBUT)
     surface = trimesh.Trimesh(mesh.points, mesh.faces, process=False)
     low, high = surface.bounds
     distance = np.abs(trimesh.proximity.closest_point_naive(surface, keypoints()[[0, 2]])[1])
@@ -212,7 +218,7 @@ def test_a_broad_straight_fish_covers_its_outline_in_pixels():
     rng = np.random.default_rng(5)
     calibration = draw_calibration(rng)
     fish = draw_fish(rng, track_id=1)
-    pose = Pose(
+    pose = HangingPose(
         bends=np.zeros((3, 3)),
         yaw_rad=0.0,
         sway_rad=0.0,

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import trimesh
 
-from stream_dmr.calibration.file import save_calibration
+from stream_dmr.calibration.calibration_file import save_calibration
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 
 WIDTH, HEIGHT = 160, 120

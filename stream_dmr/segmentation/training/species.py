@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.simulation.body import Body, body_mesh
-from stream_dmr.simulation.spine import Spine, bend_spine, total_bend_rad
+from stream_dmr.simulation.center_line import CenterLine, bend_center_line, total_bend_rad
+from stream_dmr.simulation.simulated_body import SimulatedBody, straight_body
 
 _RINGS, _SIDES = 40, 20  # of the body's mesh
 _ORDER_SIZES = np.array([1.0, 0.6, 0.3])  # C-bend, S-bend, and one finer
@@ -20,7 +20,7 @@ _FIN_COLUMNS, _FIN_ROWS = 9, 3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Shape:
-    """A straight fish as a mesh, in body lengths (see `simulation.body`)."""
+    """A straight fish as a mesh, in body lengths (see `simulation.simulated_body`)."""
 
     points: Float[np.ndarray, "V 3"]
     texture: Float[np.ndarray, "V 2"]  # along (0 to 1.03) and across (-1 to 1) the skin
@@ -41,7 +41,7 @@ def draw_shape(rng: np.random.Generator) -> Shape:
     """The straight body of one fish of a species of its own."""
     is_flatfish = bool(rng.random() < 0.45)
     body = _draw_flat(rng) if is_flatfish else _draw_round(rng)
-    mesh = body_mesh(body, num_rings=_RINGS, num_sides=_SIDES)
+    mesh = straight_body(body, num_rings=_RINGS, num_sides=_SIDES)
     sheets = [] if is_flatfish and rng.random() < 0.8 else _draw_fins(rng, body)
     points, texture, faces = [mesh.points], [np.column_stack([mesh.points[:, 0], mesh.across])], []
     faces.append(mesh.faces)
@@ -61,7 +61,7 @@ def draw_shape(rng: np.random.Generator) -> Shape:
 
 def pose_shape(rng: np.random.Generator, shape: Shape) -> Posed:
     """Bent, twisted and turned at random, its head to the left; mostly broad side on."""
-    spine = bend_spine(_draw_bends(rng, shape.is_flatfish), length_mm=1.0)
+    spine = bend_center_line(_draw_bends(rng, shape.is_flatfish), length_mm=1.0)
     middle = spine.frames[len(spine.frames) // 2]
     about_axis = rng.choice([0.0, np.pi]) + np.radians(rng.normal(0.0, 22.0))
     if rng.random() < 0.25:
@@ -75,13 +75,13 @@ def pose_shape(rng: np.random.Generator, shape: Shape) -> Posed:
     return Posed(vertices=spine.place(shape.points), ends=_ends(spine))
 
 
-def _ends(spine: Spine) -> Float[np.ndarray, "2 3"]:
+def _ends(spine: CenterLine) -> Float[np.ndarray, "2 3"]:
     return spine.place(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
 
 
-def _draw_flat(rng: np.random.Generator) -> Body:
+def _draw_flat(rng: np.random.Generator) -> SimulatedBody:
     tail_half_width = rng.uniform(0.05, 0.13)
-    return Body(
+    return SimulatedBody(
         half_width=rng.uniform(0.13, 0.27),
         widest_at=rng.uniform(0.36, 0.52),
         half_thickness=rng.uniform(0.03, 0.06),
@@ -93,9 +93,9 @@ def _draw_flat(rng: np.random.Generator) -> Body:
     )
 
 
-def _draw_round(rng: np.random.Generator) -> Body:
+def _draw_round(rng: np.random.Generator) -> SimulatedBody:
     half_width = rng.uniform(0.06, 0.17)
-    return Body(
+    return SimulatedBody(
         half_width=half_width,
         widest_at=rng.uniform(0.22, 0.45),
         half_thickness=half_width * rng.uniform(0.45, 0.95),
@@ -108,7 +108,7 @@ def _draw_round(rng: np.random.Generator) -> Body:
 
 
 def _draw_fins(
-    rng: np.random.Generator, body: Body
+    rng: np.random.Generator, body: SimulatedBody
 ) -> list[tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 2"]]]:
     """Thin sheets on back (y < 0) and belly: points, and where on the skin their colour is."""
     fins = []
@@ -124,7 +124,7 @@ def _draw_fins(
 
 
 def _draw_fin(
-    rng: np.random.Generator, body: Body, *, start: float, end: float, side: float
+    rng: np.random.Generator, body: SimulatedBody, *, start: float, end: float, side: float
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 2"]]:
     along, out = np.meshgrid(
         np.linspace(0.0, 1.0, _FIN_COLUMNS), np.linspace(0.0, 1.0, _FIN_ROWS), indexing="ij"

@@ -1,4 +1,4 @@
-"""The body of a simulated fish: outline, thickness and tail fin as formulas, and its straight mesh.
+"""The body of a simulated fish: outline, thickness and tail fin as formulas, and a straight mesh.
 
 Body coordinates, in body lengths: s along the body from the snout (0) to the fork of the tail fin
 (1), y across the broad side, z through the thickness. The lobes of the tail fin reach beyond s = 1.
@@ -14,7 +14,7 @@ JOINT_ARCS = (0.33, 0.66)  # bend points that a template made from this body nam
 
 
 @dataclass(frozen=True, kw_only=True)
-class Body:
+class SimulatedBody:
     """Proportions of one fish, all as fractions of its length.
 
     The default is the mean halibut: a rhombic outline with its long fins included, 0.38 broad and
@@ -63,11 +63,11 @@ class Body:
         )
 
 
-HALIBUT = Body()
+HALIBUT = SimulatedBody()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class BodyMesh:
+class StraightBody:
     """The straight body as a closed mesh."""
 
     points: Float[np.ndarray, "V 3"]  # (s, y, z) in body lengths
@@ -75,7 +75,7 @@ class BodyMesh:
     faces: Int[np.ndarray, "F 3"]  # counter-clockwise outside
 
 
-def draw_body(rng: np.random.Generator) -> Body:
+def draw_body(rng: np.random.Generator) -> SimulatedBody:
     """An individual: 5 % (standard deviation) in width, 10 % in thickness, and in its landmarks."""
     vary = rng.standard_normal(5).clip(-2.0, 2.0)
     return replace(
@@ -88,7 +88,7 @@ def draw_body(rng: np.random.Generator) -> Body:
     )
 
 
-def body_mesh(body: Body, *, num_rings: int = 60, num_sides: int = 24) -> BodyMesh:
+def straight_body(body: SimulatedBody, *, num_rings: int = 60, num_sides: int = 24) -> StraightBody:
     """The straight body: rings from snout to tail, denser at the snout, closed at both ends.
 
     `num_sides` is even: the last ring is zipped along the edge of the tail fin, so that the fork
@@ -97,7 +97,7 @@ def body_mesh(body: Body, *, num_rings: int = 60, num_sides: int = 24) -> BodyMe
     s = np.linspace(0.0, 1.0, num_rings + 1)[1:] ** 1.3
     angle = 2 * np.pi * np.arange(num_sides) / num_sides
     rings = body.surface(*np.meshgrid(s, angle, indexing="ij"))
-    return BodyMesh(
+    return StraightBody(
         points=np.concatenate([np.zeros((1, 3)), rings.reshape(-1, 3)]),
         across=np.concatenate([[0.0], np.tile(np.cos(angle), num_rings)]),
         faces=_faces(num_rings, num_sides),

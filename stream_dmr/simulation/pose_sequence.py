@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Float
 
-from stream_dmr.simulation.fish import Pose
+from stream_dmr.simulation.center_line import total_bend_rad
 from stream_dmr.simulation.presets import Preset
-from stream_dmr.simulation.spine import total_bend_rad
+from stream_dmr.simulation.simulated_fish import HangingPose
 
 FPS = 15
 _TRAVEL_MM = 1850.0  # from the middle of the picture to its lower or upper edge
@@ -17,7 +17,7 @@ _ROW_SIZES = np.array([0.0, 1.0, 0.45])  # flatfish bend through their thickness
 
 def draw_poses(
     rng: np.random.Generator, preset: Preset, *, lane_mm: float, num_frames: int
-) -> list[Pose]:
+) -> list[HangingPose]:
     """Poses of one fish for each frame of its passage, smooth in time; `lane_mm` is its X."""
     seconds = np.arange(num_frames) / FPS
     bends = _draw_bends(rng, preset, seconds)
@@ -27,18 +27,20 @@ def draw_poses(
     tilt = np.radians(preset.tilt_deg) * _wander(rng, seconds, (), fastest_hz=0.6)
     centers = _draw_path(rng, seconds, lane_mm=lane_mm)
     return [
-        Pose(bends=b, yaw_rad=float(y), sway_rad=float(s), tilt_rad=float(t), center_world_mm=c)
+        HangingPose(
+            bends=b, yaw_rad=float(y), sway_rad=float(s), tilt_rad=float(t), center_world_mm=c
+        )
         for b, y, s, t, c in zip(bends, yaw, sway, tilt, centers, strict=True)
     ]
 
 
 def draw_still_pose(
     rng: np.random.Generator, preset: Preset, *, center_world_mm: Float[np.ndarray, "3"]
-) -> Pose:
+) -> HangingPose:
     """One pose out of the middle of a passage, its center moved here but as far off the plane."""
     pose = draw_poses(rng, preset, lane_mm=0.0, num_frames=15)[7]
     center = center_world_mm + np.array([0.0, 0.0, pose.center_world_mm[2]])
-    return Pose(
+    return HangingPose(
         bends=pose.bends,
         yaw_rad=pose.yaw_rad,
         sway_rad=pose.sway_rad,

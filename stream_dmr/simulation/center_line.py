@@ -14,7 +14,7 @@ NUM_STEPS = 200
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Spine:
+class CenterLine:
     """A centre line with its body frames, head first.
 
     The columns of a frame are the tangent, the direction across the broad side, and the direction
@@ -43,9 +43,9 @@ class Spine:
 
     def moved(
         self, rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]
-    ) -> "Spine":
+    ) -> "CenterLine":
         """The same centre line, turned and shifted: point -> rotation @ point + translation."""
-        return Spine(
+        return CenterLine(
             points=self.points @ rotation.T + translation,
             frames=rotation @ self.frames,
             length_mm=self.length_mm,
@@ -70,7 +70,7 @@ def total_bend_rad(bends: Float[np.ndarray, "3 K"]) -> float:
     return float(np.linalg.norm(turning, axis=1).sum() / NUM_STEPS)
 
 
-def bend_spine(bends: Float[np.ndarray, "3 K"], *, length_mm: float) -> Spine:
+def bend_center_line(bends: Float[np.ndarray, "3 K"], *, length_mm: float) -> CenterLine:
     """Integrate `curvature` along a body of this length, from a head at the origin heading along x.
 
     Every step is as long as the next and goes along the tangent in its middle, so the arc length
@@ -85,7 +85,7 @@ def bend_spine(bends: Float[np.ndarray, "3 K"], *, length_mm: float) -> Spine:
         frames[index + 1] = frames[index] @ whole[index]
     tangents = (frames[:-1] @ half)[:, :, 0]
     points = np.concatenate([np.zeros((1, 3)), np.cumsum(tangents, axis=0)])
-    return Spine(points=points * (length_mm / NUM_STEPS), frames=frames, length_mm=length_mm)
+    return CenterLine(points=points * (length_mm / NUM_STEPS), frames=frames, length_mm=length_mm)
 
 
 def _middles() -> Float[np.ndarray, "N"]:

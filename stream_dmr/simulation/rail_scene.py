@@ -7,9 +7,15 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
-from stream_dmr.simulation.fish import Fish, Pose, PosedFish, draw_fish, pose_fish
-from stream_dmr.simulation.motion import draw_poses, draw_still_pose
+from stream_dmr.simulation.pose_sequence import draw_poses, draw_still_pose
 from stream_dmr.simulation.presets import Preset, find_preset
+from stream_dmr.simulation.simulated_fish import (
+    HangingPose,
+    PosedFish,
+    SimulatedFish,
+    draw_fish,
+    pose_fish,
+)
 
 WIDTH, HEIGHT = 1280, 960
 _GROUP = 3  # fish that follow each other closely; then nothing hangs on the line for a while
@@ -25,12 +31,12 @@ _CALIBRATION, _FISH, _VIEW = range(3)
 class Visit:
     """One fish and its poses, from `first_frame` on, one a frame."""
 
-    fish: Fish
+    fish: SimulatedFish
     first_frame: int
-    poses: list[Pose]
+    poses: list[HangingPose]
     is_gaffed: bool
 
-    def pose_at(self, frame_index: int) -> Pose:
+    def pose_at(self, frame_index: int) -> HangingPose:
         """How the fish hangs in a frame of its visit."""
         return self.poses[frame_index - self.first_frame]
 
@@ -43,7 +49,7 @@ class Visit:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Scene:
+class RailScene:
     """Everything that is true of a simulated clip, before anything is drawn."""
 
     seed: int
@@ -62,14 +68,14 @@ class Scene:
         return pose_fish(visit.fish, pose, calibration=self.calibration)
 
 
-def make_scene(*, num_fish: int, num_frames: int, preset: str, seed: int) -> Scene:
+def make_scene(*, num_fish: int, num_frames: int, preset: str, seed: int) -> RailScene:
     """Draw a scene; equal arguments give equal scenes. Track ids count from 1.
 
     Up to three fish are in sight together; the first and the last frames, and those between
     groups of three, show none.
     """
     chosen = find_preset(preset)
-    return Scene(
+    return RailScene(
         seed=seed,
         preset=chosen,
         calibration=draw_calibration(np.random.default_rng((seed, _CALIBRATION))),
@@ -102,7 +108,7 @@ def draw_calibration(rng: np.random.Generator) -> Calibration:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class View:
+class SimulatedView:
     """One random bent fish before a random camera: for tests and benchmarks without a video."""
 
     calibration: Calibration
@@ -119,14 +125,16 @@ class View:
         return self.calibration.camera.project(self.posed.vertices)
 
 
-def draw_view(*, preset: str, seed: int) -> View:
+def draw_view(*, preset: str, seed: int) -> SimulatedView:
     """A random fish, wholly inside the picture; `render.draw_mask` gives its exact mask."""
     rng = np.random.default_rng((seed, _VIEW))
     calibration = draw_calibration(rng)
     place = np.array([rng.uniform(-900.0, 900.0), rng.uniform(-500.0, 500.0), 0.0])
     pose = draw_still_pose(rng, find_preset(preset), center_world_mm=place)
     fish = draw_fish(rng, track_id=1)
-    return View(calibration=calibration, posed=pose_fish(fish, pose, calibration=calibration))
+    return SimulatedView(
+        calibration=calibration, posed=pose_fish(fish, pose, calibration=calibration)
+    )
 
 
 def _draw_visit(index: int, *, num_fish: int, num_frames: int, preset: Preset, seed: int) -> Visit:

@@ -10,12 +10,12 @@ import numpy as np
 import trimesh
 from jaxtyping import UInt16
 
-from stream_dmr.calibration.file import save_calibration
+from stream_dmr.calibration.calibration_file import save_calibration
 from stream_dmr.errors import OutputError, UserError
-from stream_dmr.simulation.body import HALIBUT, JOINT_ARCS, body_mesh, keypoints
-from stream_dmr.simulation.film import Box, film
-from stream_dmr.simulation.motion import FPS
-from stream_dmr.simulation.scene import Scene, make_scene
+from stream_dmr.simulation.film import VisibleBox, film
+from stream_dmr.simulation.pose_sequence import FPS
+from stream_dmr.simulation.rail_scene import RailScene, make_scene
+from stream_dmr.simulation.simulated_body import HALIBUT, JOINT_ARCS, keypoints, straight_body
 
 _MAX_FISH = 65535  # what a 16-bit mask can tell apart
 
@@ -58,7 +58,7 @@ def simulate(out: Path, *, num_fish: int, num_frames: int, preset: str, seed: in
 
 def write_species(out: Path) -> None:
     """Write the mean body as a template for the fit: `species.ply` with `species.toml`."""
-    mesh = body_mesh(HALIBUT)
+    mesh = straight_body(HALIBUT)
     trimesh.Trimesh(mesh.points, mesh.faces, process=False).export(out / "species.ply")
     head, center, tail = keypoints().tolist()
     (out / "species.toml").write_text(
@@ -92,14 +92,14 @@ def _empty_masks(folder: Path) -> None:
             path.unlink()
 
 
-def _write_truth(out: Path, scene: Scene) -> None:
+def _write_truth(out: Path, scene: RailScene) -> None:
     fish = [visit.fish for visit in scene.visits]
     lengths = [(one.track_id, f"{one.length_mm:.6f}") for one in fish]
     _write_csv(out / "truth.csv", ("track_id", "length_mm"), lengths)
     _write_csv(out / "truth_frames.csv", TRUTH_FRAMES_COLUMNS, _truth_rows(scene))
 
 
-def _truth_rows(scene: Scene) -> Iterable[tuple[int | str, ...]]:
+def _truth_rows(scene: RailScene) -> Iterable[tuple[int | str, ...]]:
     for frame_index in range(1, scene.num_frames + 1):
         for visit in scene.visits_at(frame_index):
             posed = scene.pose(visit, frame_index)
@@ -123,7 +123,7 @@ def _write_csv(path: Path, columns: Iterable[str], rows: Iterable[Iterable[int |
         writer.writerows(rows)
 
 
-def _write_film(out: Path, scene: Scene) -> None:
+def _write_film(out: Path, scene: RailScene) -> None:
     camera = scene.calibration.camera
     codec = cv2.VideoWriter.fourcc(*"mp4v")
     video = cv2.VideoWriter(str(out / "video.mp4"), codec, FPS, (camera.width, camera.height))
@@ -141,7 +141,7 @@ def _write_film(out: Path, scene: Scene) -> None:
         video.release()
 
 
-def _mot_line(box: Box) -> str:
+def _mot_line(box: VisibleBox) -> str:
     """MOT Challenge text: frame, id, x, y, w, h, conf, class, visibility."""
     numbers = (box.frame_index, box.track_id, *box.xywh_px, 1, 1, f"{box.visible_fraction:.3f}")
     return ",".join(map(str, numbers)) + "\n"

@@ -8,8 +8,14 @@ from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import Calibration, ReferencePlane
 from stream_dmr.geometry import arc_length, bending_ratio
-from stream_dmr.simulation.body import Body, BodyMesh, body_mesh, draw_body, keypoints
-from stream_dmr.simulation.spine import Spine, bend_spine, total_bend_rad
+from stream_dmr.simulation.center_line import CenterLine, bend_center_line, total_bend_rad
+from stream_dmr.simulation.simulated_body import (
+    SimulatedBody,
+    StraightBody,
+    draw_body,
+    keypoints,
+    straight_body,
+)
 
 # World: X right, Y down, Z away from the camera. A straight fish hangs head up along Y with its
 # broad side across X; +z of the body, the side with the eyes, looks at the camera.
@@ -17,17 +23,17 @@ _WORLD_FROM_HANGING = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Fish:
+class SimulatedFish:
     """An individual, the same in every frame."""
 
     track_id: int
     length_mm: float
-    body: Body
-    mesh: BodyMesh
+    body: SimulatedBody
+    mesh: StraightBody
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Pose:
+class HangingPose:
     """How a fish hangs in one frame."""
 
     bends: Float[np.ndarray, "3 K"]  # see `spine.curvature`
@@ -46,7 +52,7 @@ class Pose:
 class PosedFish:
     """A fish in one frame, in the camera frame in mm: the truth, before anything is drawn."""
 
-    fish: Fish
+    fish: SimulatedFish
     vertices: Float[np.ndarray, "V 3"]
     midline: Float[np.ndarray, "M 3"]
     keypoints: Float[np.ndarray, "3 3"]  # head, center, tail
@@ -67,14 +73,16 @@ class PosedFish:
         return bending_ratio(self.midline)
 
 
-def draw_fish(rng: np.random.Generator, *, track_id: int) -> Fish:
+def draw_fish(rng: np.random.Generator, *, track_id: int) -> SimulatedFish:
     """A random halibut of 500 to 1000 mm; most are nearer to the lower end, as in a catch."""
     body = draw_body(rng)
     length_mm = 500.0 + 500.0 * float(rng.beta(1.8, 3.0))
-    return Fish(track_id=track_id, length_mm=length_mm, body=body, mesh=body_mesh(body))
+    return SimulatedFish(
+        track_id=track_id, length_mm=length_mm, body=body, mesh=straight_body(body)
+    )
 
 
-def pose_fish(fish: Fish, pose: Pose, *, calibration: Calibration) -> PosedFish:
+def pose_fish(fish: SimulatedFish, pose: HangingPose, *, calibration: Calibration) -> PosedFish:
     """Bend the fish, hang it up and bring it into the camera frame."""
     spine = _in_camera(_hang(fish, pose), calibration.plane)
     return PosedFish(
@@ -85,9 +93,9 @@ def pose_fish(fish: Fish, pose: Pose, *, calibration: Calibration) -> PosedFish:
     )
 
 
-def _hang(fish: Fish, pose: Pose) -> Spine:
+def _hang(fish: SimulatedFish, pose: HangingPose) -> CenterLine:
     """The centre line in the world frame: its centroid under the hook, then yaw, tilt and sway."""
-    spine = bend_spine(pose.bends, length_mm=fish.length_mm)
+    spine = bend_center_line(pose.bends, length_mm=fish.length_mm)
     middle = spine.frames[len(spine.frames) // 2]
     spine = spine.moved(middle.T, np.zeros(3))
     # Gravity pulls the centroid under the head, where the hook is.
@@ -100,5 +108,5 @@ def _hang(fish: Fish, pose: Pose) -> Spine:
     return turned.moved(np.eye(3), pose.center_world_mm - center)
 
 
-def _in_camera(spine_world: Spine, plane: ReferencePlane) -> Spine:
+def _in_camera(spine_world: CenterLine, plane: ReferencePlane) -> CenterLine:
     return spine_world.moved(plane.rotation, plane.translation_mm)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from stream_dmr.errors import UserError
-from stream_dmr.evaluation.metrics import Histogram
+from stream_dmr.evaluation.length_errors import Histogram
 
 Interval = tuple[float, float]
 _Record = Mapping[str, str | None]
