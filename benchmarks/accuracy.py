@@ -14,7 +14,8 @@ from pathlib import Path
 
 from stream_dmr.evaluation.compare import Evaluation, evaluate
 from stream_dmr.running.config import Config, to_toml
-from stream_dmr.running.run import RunRequest, run
+from stream_dmr.running.measure_source import measure_source
+from stream_dmr.running.run_request import RunRequest
 
 _QUIET = {"mcap": False, "rrd": False}
 _PAPER = {"deformation": "linear-blend", "solver": "adam"}
@@ -41,7 +42,7 @@ def measure(scene: Path, template: str, changes: dict) -> tuple[Evaluation, floa
             config=config,
             out=Path(folder) / "out",
         )
-        summary = run(request, stop=threading.Event())
+        summary = measure_source(request, stop=threading.Event())
         return evaluate(request.out / "lengths.csv", scene / "truth.csv"), summary.elapsed_s
 
 

@@ -11,7 +11,8 @@ import cv2
 
 from stream_dmr.calibration.calibration_file import save_calibration
 from stream_dmr.running.config import Config, to_toml
-from stream_dmr.running.run import RunRequest, run
+from stream_dmr.running.measure_source import measure_source
+from stream_dmr.running.run_request import RunRequest
 from stream_dmr.simulation.film import FilmedFrame, film
 from stream_dmr.simulation.rail_scene import HEIGHT, WIDTH, make_scene
 from stream_dmr.simulation.write_scene import encode_mask, write_species
@@ -66,7 +67,7 @@ def measure(clip: Path, recording: dict[str, bool]) -> Rate:
             out=Path(folder) / "out",
         )
         began = time.process_time()
-        summary = run(request, stop=threading.Event())
+        summary = measure_source(request, stop=threading.Event())
         cpu_s = time.process_time() - began
     count = summary.num_frames
     busy = {counter.stage: counter.busy_s * 1e3 / count for counter in summary.counters}

@@ -22,8 +22,8 @@ from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.report.pictures import drawn, outlines_of
 from stream_dmr.running.config import load_config
+from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.running.pipeline import run_chain
-from stream_dmr.running.run import later_nodes
 from stream_dmr.segmentation.tracking.fish_finder import open_finder
 from stream_dmr.template.template import load_template
 

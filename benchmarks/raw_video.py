@@ -30,8 +30,8 @@ from stream_dmr.messages import FishCrop, LengthEstimate, Message
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.running.config import load_config
+from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.running.pipeline import StageCounters, run_chain
-from stream_dmr.running.run import later_nodes
 from stream_dmr.segmentation.annotations.files import Masks
 from stream_dmr.segmentation.masks.crop import frame_from_crop_map
 from stream_dmr.segmentation.tracking.fish_finder import open_finder

@@ -13,7 +13,7 @@ from targets import species_template
 
 from stream_dmr.messages import LocalizedFish
 from stream_dmr.running.config import Config
-from stream_dmr.running.run import later_nodes
+from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.simulation.pose_sequence import FPS
 from stream_dmr.simulation.presets import PRESETS
 

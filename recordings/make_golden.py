@@ -12,7 +12,8 @@ import threading
 from pathlib import Path
 
 from stream_dmr.replay.replay import ReplayRequest, replay
-from stream_dmr.running.run import RunRequest, run
+from stream_dmr.running.measure_source import measure_source
+from stream_dmr.running.run_request import RunRequest
 from stream_dmr.simulation import DEMO_SCENE
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -31,7 +32,7 @@ def main() -> None:
             out=Path(folder) / "out",
             command="make golden",
         )
-        run(request, stop=threading.Event())
+        measure_source(request, stop=threading.Event())
         GOLDEN.mkdir(exist_ok=True)
         for name in ("recording.mcap", "lengths.csv"):
             shutil.copy(request.out / name, GOLDEN / name)

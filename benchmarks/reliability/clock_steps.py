@@ -54,15 +54,16 @@ def main() -> None:
 
 def measure(folder: Path, address: str, steps_ns: list[int]) -> list[str]:
     """A run with the clock off by each of these for some seconds; what was said of the clock."""
-    from stream_dmr.running.observer import Observer
-    from stream_dmr.running.run import RunRequest, run
+    from stream_dmr.running.measure_source import measure_source
+    from stream_dmr.running.run_observer import RunObserver
+    from stream_dmr.running.run_request import RunRequest
 
     library, stop, has_begun = ctypes.CDLL(None), threading.Event(), threading.Event()
     library.disturb_clock.argtypes = [ctypes.c_longlong]
     library.disturb_clock(steps_ns[0])
     said: list[str] = []
 
-    class Listening(Observer):
+    class Listening(RunObserver):
         def warn(self, line: str) -> None:
             said.extend([line] if "clock was set" in line else [])
 
@@ -85,7 +86,7 @@ def measure(folder: Path, address: str, steps_ns: list[int]) -> list[str]:
         template=str(folder / "scene" / "species.ply"),
         config=folder / "config.toml",
     )
-    run(request, stop=stop, observer=Listening())
+    measure_source(request, stop=stop, observer=Listening())
     stepping.join()
     return said
 

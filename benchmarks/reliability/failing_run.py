@@ -16,8 +16,9 @@ from small_scene import write_crossing_fish, write_small_scene
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import Frame
 from stream_dmr.recording.segments.recover import recover
-from stream_dmr.running.observer import Observer
-from stream_dmr.running.run import RunRequest, run
+from stream_dmr.running.measure_source import measure_source
+from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.running.run_request import RunRequest
 
 _FPS = 5  # of capture time: a new segment is tried again 5 s after one that failed
 _CONFIG = QUICK.replace("[watch]\nport = {port}\n", "").replace(
@@ -40,7 +41,7 @@ def prepare(folder: Path) -> None:
     (folder / "config.toml").write_text(config)
 
 
-class Healing(Observer):
+class Healing(RunObserver):
     """Lets writes work again after some frames."""
 
     def __init__(self, case: Case) -> None:
@@ -74,7 +75,7 @@ def measure(case: Case) -> dict:
     observer, refused = Healing(case), ""
     _LIBRARY.disturb_writes(bytes(out), case.at, count, case.error)
     try:
-        run(request, stop=threading.Event(), observer=observer)
+        measure_source(request, stop=threading.Event(), observer=observer)
     except OutputError as error:
         refused = str(error)
     writes = _LIBRARY.disturb_seen()

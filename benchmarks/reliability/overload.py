@@ -11,15 +11,16 @@ from small_scene import write_small_scene
 from soak import metrics_of
 
 from stream_dmr.messages import LocalizedFish, Message
-from stream_dmr.running.observer import Observer
-from stream_dmr.running.run import RunRequest, RunSummary, run
+from stream_dmr.running.measure_source import RunSummary, measure_source
+from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.running.run_request import RunRequest
 from stream_dmr.watch.watch import Watch
 
 _TIMES = 3
 
 
 @dataclass
-class Late(Observer):
+class Late(RunObserver):
     """How long after its capture each fish of a frame was localized, s."""
 
     timer: threading.Timer  # of the end, from the first frame on
@@ -38,8 +39,8 @@ def overload(folder: Path, *, seconds: float) -> dict[str, object]:
     scene = write_small_scene(folder / "scene", step_px=2)
     port = free_port()
     (folder / "config.toml").write_text(QUICK.format(port=port))
-    whole = measured(scene, str(scene / "video.mp4"), folder, "whole", Observer())
-    again = measured(scene, str(scene / "video.mp4"), folder, "again", Observer())  # compiled
+    whole = measured(scene, str(scene / "video.mp4"), folder, "whole", RunObserver())
+    again = measured(scene, str(scene / "video.mp4"), folder, "again", RunObserver())  # compiled
     pace = again.num_frames / again.elapsed_s
     (folder / "pictures").mkdir()
     write_pictures(scene / "video.mp4", folder / "pictures")
@@ -84,7 +85,7 @@ def measured(
     source: str,
     folder: Path,
     name: str,
-    observer: Observer,
+    observer: RunObserver,
     *,
     stop: threading.Event | None = None,
 ) -> RunSummary:
@@ -96,4 +97,4 @@ def measured(
         template=str(scene / "species.ply"),
         config=folder / "config.toml",
     )
-    return run(request, stop=stop or threading.Event(), observer=Watch(observer))
+    return measure_source(request, stop=stop or threading.Event(), observer=Watch(observer))

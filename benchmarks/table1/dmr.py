@@ -8,8 +8,8 @@ from stream_dmr.evaluation.length_tables import LengthRow
 from stream_dmr.localization.localize import LocalizeSettings
 from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish, Message
 from stream_dmr.running.config import Config
+from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.running.pipeline import Node
-from stream_dmr.running.run import later_nodes
 from stream_dmr.template.template import Template
 from table1.fish import Haul
 

@@ -15,7 +15,7 @@ from targets import species_template
 from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
 from stream_dmr.report.pictures import drawn, outlines_of
 from stream_dmr.running.config import Config
-from stream_dmr.running.run import later_nodes
+from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.simulation.film import film
 from table1 import results
 from table1.fish import chain_crops, table_scene

@@ -15,8 +15,9 @@ from stream_dmr.batch.progress import OnProgress
 from stream_dmr.errors import UserError
 from stream_dmr.files import rename_durably
 from stream_dmr.results.provenance import add_files
-from stream_dmr.running.observer import Observer
-from stream_dmr.running.run import RunRequest, run
+from stream_dmr.running.measure_source import measure_source
+from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.running.run_request import RunRequest
 from stream_dmr.watch.watch import Watch
 
 
@@ -55,7 +56,7 @@ def measure_video(job: Job, out: Path, *, on_progress: OnProgress = lambda share
     shutil.rmtree(folder, ignore_errors=True)
     try:
         observer = Watch(_ProgressObserver(on_progress))
-        summary = run(request_of(job, folder), stop=threading.Event(), observer=observer)
+        summary = measure_source(request_of(job, folder), stop=threading.Event(), observer=observer)
         write_tables(folder, job)
         outcome = Outcome(
             name=job.name,
@@ -105,7 +106,7 @@ def request_of(job: Job, out: Path) -> RunRequest:
     )
 
 
-class _ProgressObserver(Observer):
+class _ProgressObserver(RunObserver):
     """Reports the share of a video's frames that is done."""
 
     def __init__(self, on_progress: OnProgress) -> None:

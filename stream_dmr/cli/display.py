@@ -12,15 +12,15 @@ from rich.table import Table
 from stream_dmr.evaluation.compare import Distributions, Evaluation, distribution_rows, summary_rows
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.replay.replay import ReplaySummary
-from stream_dmr.running.observer import Observer
-from stream_dmr.running.run import RunSummary
+from stream_dmr.running.measure_source import RunSummary
+from stream_dmr.running.run_observer import RunObserver
 
 _LINE_EVERY_S = 10.0  # where there is no terminal to draw a bar on
 _PLAIN_WIDTH = 120
 _MOST_SHOWN = 20  # differences of a replay
 
 
-class RunDisplay(Observer):
+class RunDisplay(RunObserver):
     """A progress bar on a terminal, a plain line now and then elsewhere; all of it on stderr."""
 
     def __init__(self) -> None:

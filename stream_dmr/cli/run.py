@@ -18,7 +18,7 @@ from stream_dmr.cli.support import (
 )
 
 if TYPE_CHECKING:
-    from stream_dmr.running.run import RunSummary
+    from stream_dmr.running.measure_source import RunSummary
 
 
 def run(
@@ -73,8 +73,8 @@ def run(
     """
     with stop_on_signals() as stop:
         from stream_dmr.cli.display import RunDisplay
-        from stream_dmr.running.run import RunRequest
-        from stream_dmr.running.run import run as measure
+        from stream_dmr.running.measure_source import measure_source
+        from stream_dmr.running.run_request import RunRequest
         from stream_dmr.watch.journal import Journal
         from stream_dmr.watch.watch import Watch
 
@@ -95,7 +95,7 @@ def run(
             haul=haul,
         )
         with nullcontext(Journal()) if log_json else RunDisplay() as observer:
-            summary = measure(request, stop=stop, observer=Watch(observer))
+            summary = measure_source(request, stop=stop, observer=Watch(observer))
         _print_summary(summary, request.out, timings=timings)
     if stop.signal_number:
         print(f"stopped by {signal.Signals(stop.signal_number).name}", file=sys.stderr)

@@ -23,10 +23,10 @@ from stream_dmr.replay.recorded_files import find_crop_files, inputs_with
 from stream_dmr.replay.recorded_messages import Playback, Tape
 from stream_dmr.results.tables import Tables
 from stream_dmr.running.config import Config, load_config, parse_config, to_toml
-from stream_dmr.running.folder import prepare_folder
-from stream_dmr.running.observer import Observer
+from stream_dmr.running.measure_source import later_nodes, resume
 from stream_dmr.running.pipeline import Node, StageCounters, run_chain
-from stream_dmr.running.run import later_nodes, resume
+from stream_dmr.running.run_folder import prepare_folder
+from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.segmentation.tracking.fish_finder import open_finder
 from stream_dmr.template.template import Template, load_template
 
@@ -73,14 +73,14 @@ class ReplaySummary:
 
 
 def replay(
-    request: ReplayRequest, *, stop: threading.Event, observer: Observer | None = None
+    request: ReplayRequest, *, stop: threading.Event, observer: RunObserver | None = None
 ) -> ReplaySummary:
     """Compute a recording anew from one stage on; with `check`, compare with what was recorded.
 
     Raises a UserError where an input is wrong or the recording damaged; a torn recording is
     replayed as far as it is whole, and `observer` is warned of what is lost.
     """
-    observer = observer or Observer()
+    observer = observer or RunObserver()
     recording = open_recordings(request.recordings)
     _refuse_impossible(request, recording)
     config, template, calibration = _inputs(request, recording.header)

@@ -20,7 +20,7 @@ from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.localization.localize import LocalizeSettings
 from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.results.fisheries import FisheriesSettings
-from stream_dmr.running.settings import DriftSettings, WatchSettings
+from stream_dmr.running.run_settings import DriftSettings, WatchSettings
 from stream_dmr.segmentation.detection.detectors import DetectFishSettings
 from stream_dmr.segmentation.masks.crop import CropFishSettings
 from stream_dmr.segmentation.tracking.tracked_fish import TrackFishSettings

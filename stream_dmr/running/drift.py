@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from scipy.stats import mannwhitneyu
 
-from stream_dmr.running.settings import DriftSettings
+from stream_dmr.running.run_settings import DriftSettings
 
 _LONGEST_PX = 480  # of the pictures that are compared
 _SAMPLES = 9  # pictures of which the median is taken: fish and waves are in few of them

@@ -9,7 +9,7 @@ from stream_dmr.recording.segments.open_tracks import unfinished
 from stream_dmr.recording.segments.recover import Repair
 from stream_dmr.results.store import LengthStore
 from stream_dmr.running.drift import FitWatch, SceneWatch, decode_scene, encode_scene
-from stream_dmr.running.settings import DriftSettings
+from stream_dmr.running.run_settings import DriftSettings
 from stream_dmr.sources.source import ResumePoint, Source
 
 _MOST_IN_A_ROW = 100  # failures with no frame between them that went through: the run is broken

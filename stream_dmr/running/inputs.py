@@ -1,7 +1,6 @@
 """What a run is asked for, read and checked before the first frame."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from stream_dmr.calibration.calibration_file import load_calibration, require_size
 from stream_dmr.camera import Calibration
@@ -10,29 +9,10 @@ from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.recording.messages.header import RunHeader
 from stream_dmr.recording.messages.run_inputs import InputFile, RunInputs
 from stream_dmr.running.config import Config, load_config, to_toml
+from stream_dmr.running.run_request import RunRequest
 from stream_dmr.segmentation.tracking.fish_finder import FishFinder, open_finder
 from stream_dmr.sources.source import Source
 from stream_dmr.template.template import Template, load_template
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunRequest:
-    """What the user asks for."""
-
-    source: str  # path, address or camera index
-    out: Path
-    calibration: Path | None = None
-    boxes: Path | None = None
-    masks: Path | None = None
-    template: str = "halibut"  # name of a bundled one, or a path
-    config: Path | None = None
-    overwrite: bool = False  # replace the results of an earlier run in `out`
-    resume: bool = False  # go on after them; a live source always does
-    live: bool = False  # serve the view while measuring
-    command: str = ""  # as typed, for the recording
-    vessel: str = ""  # where the fish come from, for the exports
-    trip: str = ""
-    haul: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,9 +17,9 @@ from stream_dmr.results.run_facts import run_facts
 from stream_dmr.results.store import LengthStore, flagged_fish
 from stream_dmr.results.tables import Tables
 from stream_dmr.running.error_policy import left_open
-from stream_dmr.running.folder import consistent_csv, prepare_folder
 from stream_dmr.running.inputs import Inputs
-from stream_dmr.running.observer import Observer, OpenRun
+from stream_dmr.running.run_folder import consistent_csv, prepare_folder
+from stream_dmr.running.run_observer import OpenRun, RunObserver
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ class Outputs:
 
 
 @contextmanager
-def open_outputs(inputs: Inputs, observer: Observer) -> Iterator[Outputs]:
+def open_outputs(inputs: Inputs, observer: RunObserver) -> Iterator[Outputs]:
     """Make ready everything that a run writes to; closed in the reverse order.
 
     Raises OutputError where the folder can't be written to, or holds an earlier run's results.

@@ -9,7 +9,7 @@ from stream_dmr.messages import FishCrop, Frame, LengthEstimate, LocalizedFish, 
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.results.store import LengthStore
 from stream_dmr.running.error_policy import DriftWatch
-from stream_dmr.running.observer import Observer
+from stream_dmr.running.run_observer import RunObserver
 
 INTERRUPTED = "interrupted by a restart, finished with what was recorded; it may count twice"
 
@@ -26,7 +26,7 @@ class Tally:
         self,
         recorder: Recorder,
         store: LengthStore,
-        observer: Observer,
+        observer: RunObserver,
         *,
         numbers_frames_on: bool,
         keeps: int | None = None,

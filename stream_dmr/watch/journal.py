@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 from stream_dmr.messages import LengthEstimate
-from stream_dmr.running.observer import Observer
+from stream_dmr.running.run_observer import RunObserver
 
 _SAME_S = 60.0  # the same line once in so long, with how often it came meanwhile
 _MOST_LINES = 200  # that are told apart; beyond it, the longest silent ones are forgotten
@@ -49,7 +49,7 @@ class Seldom(logging.Filter):
         return True
 
 
-class Journal(Observer):
+class Journal(RunObserver):
     """Writes what a run says of itself, for a service's log."""
 
     def __init__(self) -> None:

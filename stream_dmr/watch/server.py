@@ -11,7 +11,7 @@ from typing import Any
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from stream_dmr.errors import ConfigError, OutputError
-from stream_dmr.running.settings import WatchSettings
+from stream_dmr.running.run_settings import WatchSettings
 from stream_dmr.watch.metrics import registry_of
 from stream_dmr.watch.picture import as_jpeg, draw
 from stream_dmr.watch.state import RunState

@@ -1,17 +1,17 @@
 """Watching a run: its state, the server that shows it, and the watchdog."""
 
 from stream_dmr.messages import LengthEstimate, Message
-from stream_dmr.running.observer import Observer, OpenRun
 from stream_dmr.running.pipeline import Chain
+from stream_dmr.running.run_observer import OpenRun, RunObserver
 from stream_dmr.watch.server import WatchServer
 from stream_dmr.watch.service import Watchdog
 from stream_dmr.watch.state import RunState
 
 
-class Watch(Observer):
+class Watch(RunObserver):
     """Hands on to an observer what it is told; serves and tells systemd what it saw."""
 
-    def __init__(self, observer: Observer) -> None:
+    def __init__(self, observer: RunObserver) -> None:
         self._observer = observer
         self._state: RunState | None = None  # from `open` on
         self._server: WatchServer | None = None

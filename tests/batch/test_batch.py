@@ -25,7 +25,7 @@ from stream_dmr.batch.progress import BatchProgress
 from stream_dmr.batch.verify_batch import verify_all
 from stream_dmr.results.provenance import seal_verdicts
 from stream_dmr.results.verdicts import Verdict, add_verdict
-from stream_dmr.running.run import run
+from stream_dmr.running.measure_source import measure_source
 from tests.support.command import invoke, rows
 from tests.support.fish_run import FISH, request
 from tests.support.tiny_clip import write_clip
@@ -61,7 +61,7 @@ def season(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_clip(folder / "other", fish=[[1], [1], [1], [1, 3], [3], [3]])
     (folder / "broken").mkdir()
     (folder / "broken" / "video.mp4").write_bytes(b"this is no video")
-    run(request(folder / "clip", folder / "alone"), stop=threading.Event())
+    measure_source(request(folder / "clip", folder / "alone"), stop=threading.Event())
     return folder
 
 
@@ -363,7 +363,7 @@ def test_a_batch_killed_at_random_moments_finishes_in_the_end(tmp_path: Path, se
     clip = tmp_path / "clip"
     write_clip(clip, fish=COMING_AND_GOING)
     write_clip(tmp_path / "other", fish=[[1], [1], [1]])
-    run(request(clip, tmp_path / "alone"), stop=threading.Event())
+    measure_source(request(clip, tmp_path / "alone"), stop=threading.Event())
     manifest = write_manifest(tmp_path / "m.csv", row(), row("other"))
     script = SUPPORT / "killed_batch.py"
     command = [sys.executable, str(script), str(manifest), str(clip / "quick.toml")]

@@ -14,7 +14,7 @@ from stream_dmr.running.drift import (
     encode_scene,
     scene_of,
 )
-from stream_dmr.running.settings import DriftSettings
+from stream_dmr.running.run_settings import DriftSettings
 
 SECOND_NS = 10**9
 SETTINGS = DriftSettings()

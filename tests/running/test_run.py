@@ -15,8 +15,10 @@ from stream_dmr.results.store_rows import read_estimates
 from stream_dmr.results.store_schema import open_database
 from stream_dmr.results.tables import lengths_row
 from stream_dmr.running.config import load_config, to_toml
-from stream_dmr.running.observer import Observer
-from stream_dmr.running.run import RESULTS, RunRequest, run
+from stream_dmr.running.measure_source import measure_source
+from stream_dmr.running.run_folder import RESULTS
+from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.running.run_request import RunRequest
 from tests.support.command import invoke, rows
 from tests.support.reading import read_header, read_messages
 from tests.support.tiny_clip import draw_mask, draw_picture, write_clip
@@ -224,7 +226,7 @@ def test_lengths_csv_is_mended_from_the_database(tmp_path: Path):
     assert (out / "lengths.csv").read_text() == text
 
 
-class StopAt(Observer):
+class StopAt(RunObserver):
     """Sets the event when so many frames are done."""
 
     def __init__(self, num_frames: int) -> None:
@@ -244,7 +246,7 @@ def test_a_run_stopped_at_any_frame_leaves_valid_results(tmp_path: Path, num_fra
     clip = tmp_path / "clip"
     write_clip(clip, fish=[[1, 2]] * 12)
     observer = StopAt(num_frames)
-    summary = run(
+    summary = measure_source(
         RunRequest(
             source=str(clip / "video.mp4"),
             masks=clip / "masks",
@@ -267,7 +269,7 @@ def test_of_a_source_without_an_end_only_the_last_fish_stay_in_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Weeks of fish are in the store, and in the tables; the summary of a run has room for some."""
-    monkeypatch.setattr("stream_dmr.running.run._MOST_LAST_FISH", 1)
+    monkeypatch.setattr("stream_dmr.running.measure_source._MOST_LAST_FISH", 1)
     clip, clips, out = tmp_path / "clip", tmp_path / "clips", tmp_path / "out"
     write_clip(clip, fish=[[1, 2]] * 6)
     config = clip / "quick.toml"
@@ -282,6 +284,6 @@ def test_of_a_source_without_an_end_only_the_last_fish_stay_in_memory(
         config=config,
         out=out,
     )
-    summary = run(request, stop=threading.Event())
+    summary = measure_source(request, stop=threading.Event())
     assert len(summary.fish) == 1
     assert len((out / "lengths.csv").read_text().splitlines()) == 1 + 2

@@ -3,7 +3,8 @@
 import threading
 from pathlib import Path
 
-from stream_dmr.running.run import RunRequest, run
+from stream_dmr.running.measure_source import measure_source
+from stream_dmr.running.run_request import RunRequest
 from tests.support.tiny_clip import write_clip
 
 FISH = [[1], [1, 2], [1, 2], [1, 2], [1, 2], [2]]
@@ -30,5 +31,5 @@ def measure(folder: Path, **other: object) -> Path:
     toml.write_text(toml.read_text() + '[length]\ntail = "fork"\ntotal_per_fork = 1.05\n')
     config = clip / "quick.toml"
     config.write_text(config.read_text() + "\n[smooth_length]\nmax_std_ratio = 1e9\n")
-    run(request(clip, folder / "out", **other), stop=threading.Event())
+    measure_source(request(clip, folder / "out", **other), stop=threading.Event())
     return folder / "out"

@@ -21,9 +21,10 @@ from prometheus_client.parser import text_string_to_metric_families
 from stream_dmr.errors import ConfigError, OutputError
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.running.config import Config
-from stream_dmr.running.observer import Observer
-from stream_dmr.running.run import RunRequest, run
-from stream_dmr.running.settings import WatchSettings
+from stream_dmr.running.measure_source import measure_source
+from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.running.run_request import RunRequest
+from stream_dmr.running.run_settings import WatchSettings
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
 from stream_dmr.watch.journal import Journal
@@ -169,7 +170,7 @@ def test_a_phone_sees_fish_problems_and_warnings(server: WatchServer, state: Run
     assert 'src="picture.jpg?' in dom
 
 
-class Watcher(Observer):
+class Watcher(RunObserver):
     """Reads the metrics at every frame, as a run goes on."""
 
     def __init__(self, address: str) -> None:
@@ -199,7 +200,7 @@ def test_a_run_counts_every_frame_of_every_stage(tmp_path: Path):
         config=clip / "quick.toml",
         out=tmp_path / "out",
     )
-    run(request, stop=threading.Event(), observer=Watch(observer))
+    measure_source(request, stop=threading.Event(), observer=Watch(observer))
     assert observer.served == observer.address
     for number, metrics in enumerate(observer.seen, start=1):
         frames = {k[1:]: v for k, v in metrics.items() if k[0] == "stream_dmr_frames_total"}

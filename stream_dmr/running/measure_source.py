@@ -17,12 +17,13 @@ from stream_dmr.nodes.localize import Localize
 from stream_dmr.nodes.smooth_length import SmoothLength
 from stream_dmr.running.config import Config
 from stream_dmr.running.error_policy import DriftWatch, Tolerance, go_on
-from stream_dmr.running.folder import RESULTS, SEGMENTED
-from stream_dmr.running.inputs import Inputs, RunRequest, checked_inputs
-from stream_dmr.running.observer import Observer
+from stream_dmr.running.inputs import Inputs, checked_inputs
 from stream_dmr.running.outputs import Outputs, open_outputs
 from stream_dmr.running.pipeline import Node, StageCounters, run_chain
 from stream_dmr.running.result_writer import Tally
+from stream_dmr.running.run_folder import RESULTS, SEGMENTED
+from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.running.run_request import RunRequest
 from stream_dmr.template.template import Template
 
 _MOST_LAST_FISH = 100  # that a source without an end is summed up by; the store has them all
@@ -39,8 +40,8 @@ class RunSummary:
     files: Sequence[Path]  # the results
 
 
-def run(
-    request: RunRequest, *, stop: threading.Event, observer: Observer | None = None
+def measure_source(
+    request: RunRequest, *, stop: threading.Event, observer: RunObserver | None = None
 ) -> RunSummary:
     """Turn a clip into fish lengths, with every stage recorded in `request.out`.
 
@@ -48,7 +49,7 @@ def run(
     results of what was done. Raises a UserError where an input is wrong, also in the middle of
     the source; everything computed before is kept then, and a note of the exception says where.
     """
-    observer = observer or Observer()
+    observer = observer or RunObserver()
     inputs = checked_inputs(request)
     try:
         nodes = _nodes(inputs)
@@ -65,7 +66,7 @@ def run(
             observer.warn(line)
 
 
-def _say_what_matters(inputs: Inputs, outputs: Outputs, observer: Observer) -> None:
+def _say_what_matters(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> None:
     for repair in outputs.repairs:
         observer.warn(repair.line)
     if outputs.recorder.live_address is not None:
@@ -112,7 +113,7 @@ def _run_chain(
     inputs: Inputs,
     nodes: Sequence[Node],
     outputs: Outputs,
-    observer: Observer,
+    observer: RunObserver,
     *,
     stop: threading.Event,
 ) -> RunSummary:

@@ -20,7 +20,7 @@ class OpenRun:
     out: Path
 
 
-class Observer:
+class RunObserver:
     """Is told how a run goes, from its threads; this one doesn't listen."""
 
     address: str | None = None  # where it shows the run, once that is open
