@@ -1,6 +1,7 @@
 """What a run is asked for, read and checked before the first frame."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from stream_dmr.calibration.calibration_file import load_calibration, require_size
 from stream_dmr.camera import Calibration
