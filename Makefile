@@ -13,12 +13,11 @@ test: $(STAMP)  ## the tests of a few minutes
 	$(BIN)/pytest -n 2 --dist worksteal
 
 test-slow: $(STAMP)  ## the long ones, and those on material outside the repository
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[ray]'
 	$(BIN)/pytest -m "slow or scenes"
 	$(BIN)/pytest -n 2 --dist worksteal --hypothesis-profile new
 
 bench: $(STAMP)  ## the fit beside other renderers, and the chain: docs/performance.md, six minutes
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[bench]' \
-		|| echo "the extra bench could not be installed: what needs it is left out"
 	$(BIN)/python benchmarks/solvers.py
 
 table1: $(STAMP)  ## Table 1 of the paper on simulated fish: docs/accuracy.md; FISH=60 for a quick look

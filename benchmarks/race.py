@@ -65,7 +65,7 @@ def has_deodr() -> str:
     try:
         import deodr  # noqa: F401
     except ImportError as error:
-        return f"DEODR could not be imported ({error}); pip install '.[bench]'"
+        return f"DEODR could not be imported ({error}); pip install deodr"
     return ""
 
 

@@ -13,6 +13,8 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import duckdb
+import pandas
 import pytest
 from pyarrow import dataset
 
@@ -158,7 +160,6 @@ def finished(season: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_duckdb_opens_the_data_set(finished: Path):
-    duckdb = pytest.importorskip("duckdb", reason="needs DuckDB: pip install duckdb")
     query = "SELECT vessel, trip, count(*) FROM read_parquet('{}', hive_partitioning = true) "
     query += "GROUP BY ALL ORDER BY trip"
     fish = duckdb.sql(query.format(finished / "dataset/fish/**/*.parquet")).fetchall()
@@ -168,7 +169,6 @@ def test_duckdb_opens_the_data_set(finished: Path):
 
 
 def test_pandas_opens_the_data_set(finished: Path):
-    pandas = pytest.importorskip("pandas", reason="needs pandas: pip install pandas")
     fish = pandas.read_parquet(finished / "dataset/fish")
     assert set(fish["vessel"]) == {"Sea/Bird"}
     assert sorted(fish["trip"]) == ["", "", "7", "7"]

@@ -1,7 +1,6 @@
 """Watching a run: the page, its picture, /metrics, /health, the log, and what systemd is told."""
 
 import json
-import shutil
 import socket
 import subprocess
 import threading
@@ -32,6 +31,7 @@ from stream_dmr.watch.server import WatchServer
 from stream_dmr.watch.service import Watchdog
 from stream_dmr.watch.state import RunState
 from stream_dmr.watch.watch import Watch
+from tests.support.browser import chromium
 from tests.support.camera import free_port
 from tests.support.recorded_run import HEIGHT, WIDTH
 from tests.support.recorded_run import run as recorded_messages
@@ -154,13 +154,10 @@ def test_a_port_in_use_is_refused(server: WatchServer, state: RunState):
 
 
 def test_a_phone_sees_fish_problems_and_warnings(server: WatchServer, state: RunState):
-    browser = shutil.which("chromium") or shutil.which("chromium-browser")
-    if browser is None:
-        pytest.skip("needs a browser: apt install chromium")
     state.warn("<b>the lens</b> is dirty")
     state.warn("<b>the lens</b> is dirty")
     state.trouble = lambda: "no space left"
-    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--window-size=390,800"]
+    command = [chromium(), "--headless", "--no-sandbox", "--disable-gpu", "--window-size=390,800"]
     command += ["--virtual-time-budget=4000", "--dump-dom", server.address]
     dom = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
     assert "<td>Fish 2</td>" in dom
