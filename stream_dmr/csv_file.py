@@ -1,4 +1,4 @@
-"""One CSV file, written row by row, each of them whole; a large one is set aside."""
+"""A CSV file that is written row by row, holds only complete rows, and is rotated when large."""
 
 import csv
 import io
@@ -6,13 +6,13 @@ import os
 from pathlib import Path
 
 from stream_dmr.errors import OutputError
-from stream_dmr.files import WholeFile, natural_order
+from stream_dmr.files import TransactionalFile, natural_order
 
-_BLOCK_BYTES = 1 << 16
+_BLOCK_BYTES = 1 << 16  # read at once when searching for the last line, backwards
 
 
-class TableFile:
-    """A CSV file with its header from the start, in which every row is whole."""
+class CsvFile:
+    """A CSV file with its header as the first line; every row in it is complete."""
 
     def __init__(
         self,
@@ -20,34 +20,35 @@ class TableFile:
         columns: list[str],
         *,
         resume: bool = False,
-        waits: bool = False,
-        most_bytes: int | None = None,
+        retry_open: bool = False,
+        max_bytes: int | None = None,
     ) -> None:
-        """With `resume`, whole rows that are there stay. OutputError where the disk refuses it.
+        """Open `path` for writing; raises OutputError where the disk refuses it.
 
-        With `waits`, it is then opened with a later row. One of more than `most_bytes` is set
-        aside under a number, and begun anew.
+        `resume`: complete rows that are in the file stay. `retry_open`: where the file can't be
+        opened now, it is opened with a later row instead of raising. `max_bytes`: a file that has
+        grown to this size is renamed (see `rotated_files`), and a new one begins.
         """
-        self._path, self._columns, self._most_bytes = path, columns, most_bytes
-        self._file: WholeFile | None = None
+        self._path, self._columns, self._max_bytes = path, columns, max_bytes
+        self._file: TransactionalFile | None = None
         try:
             self._open(resume=resume)
         except OSError as error:
-            if not waits:
+            if not retry_open:
                 raise self._refusal(error) from error
 
     def add(self, row: list[str]) -> None:
-        """Append a row; OutputError where the disk refuses it, and nothing of it stays."""
+        """Append a row. Raises OutputError where the disk refuses it; nothing of it stays then."""
         try:
             file = self._file or self._open(resume=True)
-            if self._most_bytes is not None and file.tell() >= self._most_bytes:
-                file = self._begin_anew()
+            if self._max_bytes is not None and file.tell() >= self._max_bytes:
+                file = self._rotate()
             file.write(_line(row))
         except OSError as error:
             raise self._refusal(error) from error
 
     def sync(self) -> None:
-        """Wait until the disk has it."""
+        """Wait until the rows are on the disk."""
         if self._file is not None:
             self._file.sync()
 
@@ -56,9 +57,9 @@ class TableFile:
         if self._file is not None:
             self._file.close()
 
-    def _open(self, *, resume: bool) -> WholeFile:
-        keep = _whole_lines(self._path) if resume and self._path.exists() else 0
-        file = WholeFile(self._path, keep=keep)
+    def _open(self, *, resume: bool) -> TransactionalFile:
+        keep = _complete_bytes(self._path) if resume and self._path.exists() else 0
+        file = TransactionalFile(self._path, keep=keep)
         try:
             if keep == 0:
                 file.write(_line(self._columns))
@@ -68,10 +69,11 @@ class TableFile:
         self._file = file
         return file
 
-    def _begin_anew(self) -> WholeFile:
+    def _rotate(self) -> TransactionalFile:
         self.close()
         self._file = None
-        self._path.rename(numbered(self._path, 1 + last_number(self._path)))
+        number = 1 + _last_rotation(self._path)
+        self._path.rename(self._path.with_stem(f"{self._path.stem}-{number:06d}"))
         return self._open(resume=False)
 
     def _refusal(self, error: OSError) -> OutputError:
@@ -81,8 +83,19 @@ class TableFile:
         )
 
 
-def _whole_lines(path: Path) -> int:
-    """The bytes of a file up to the end of its last whole line."""
+def rotated_files(path: Path) -> list[Path]:
+    """The files `frames-000001.csv`, ... that a large `frames.csv` was renamed to, oldest first."""
+    return sorted(path.parent.glob(f"{path.stem}-[0-9]*{path.suffix}"), key=natural_order)
+
+
+def _last_rotation(path: Path) -> int:
+    """The highest number of a rotated file; 0 where there is none."""
+    names = (rotated.stem.rpartition("-")[2] for rotated in rotated_files(path))
+    return max((int(name) for name in names if name.isdecimal()), default=0)
+
+
+def _complete_bytes(path: Path) -> int:
+    """The size of a file up to the end of its last complete line."""
     with path.open("rb") as file:
         end = file.seek(0, os.SEEK_END)
         while end > 0:
@@ -93,22 +106,6 @@ def _whole_lines(path: Path) -> int:
                 return start + newline + 1
             end = start
     return 0
-
-
-def numbered(path: Path, number: int) -> Path:
-    """Where a table that became large is set aside: frames-000001.csv."""
-    return path.with_stem(f"{path.stem}-{number:06d}")
-
-
-def last_number(path: Path) -> int:
-    """Of the tables that were set aside; 0 where there are none."""
-    names = (aside.stem.rpartition("-")[2] for aside in set_aside(path))
-    return max((int(name) for name in names if name.isdecimal()), default=0)
-
-
-def set_aside(path: Path) -> list[Path]:
-    """The tables that became large, the oldest first."""
-    return sorted(path.parent.glob(f"{path.stem}-[0-9]*{path.suffix}"), key=natural_order)
 
 
 def _line(row: list[str]) -> bytes:

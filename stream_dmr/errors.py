@@ -1,10 +1,10 @@
-"""What can go wrong on the user's side, each with the one line that mends it."""
+"""Errors of the user's input; each message says what was expected, what came, and what to do."""
 
 
 class UserError(Exception):
     """The user's input is wrong: the command prints this one line and exits with 2.
 
-    The message says what was expected, what came instead, and how to mend it.
+    The message says what was expected, what came instead, and what to do.
     """
 
 

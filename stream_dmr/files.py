@@ -1,8 +1,8 @@
-"""Files: whole writes, names that survive a power loss, hashes, and the order of numbered ones."""
+"""Files: writes undone when they fail, durable renames, hashes, natural order of names."""
 
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from contextlib import contextmanager, suppress
 from hashlib import file_digest, sha256
 from pathlib import Path
@@ -10,14 +10,15 @@ from pathlib import Path
 from stream_dmr.errors import OutputError
 
 
-class WholeFile:
-    """An unbuffered file for writing that takes a failed write back.
+class TransactionalFile:
+    """An unbuffered file for writing, in which a failed write leaves nothing behind.
 
-    So a full disk leaves the file at the end of the last whole record, ready to be ended properly.
+    So a full disk leaves the file at the end of its last complete record, ready for its closing
+    record once there is room.
     """
 
     def __init__(self, path: Path, *, keep: int = 0) -> None:
-        """Of a file that is there, the first `keep` bytes stay."""
+        """Open or create `path`; the first `keep` bytes of an existing file stay."""
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT, 0o666)
         try:
             self.truncate(keep)
@@ -26,18 +27,18 @@ class WholeFile:
             raise
 
     def write(self, data: bytes) -> int:
-        """Append `data`; where that fails, OSError, with the file as it was.
+        """Append `data`, returning its size. Raises OSError, with the file cut back to before.
 
-        Where not even that can be had, the next write begins with it.
+        Where even the cutting fails, the next write tries it first.
         """
         rest = memoryview(data)
         try:
-            if self._is_torn:
+            if self._has_partial_write:
                 self.truncate(self._size)
             while rest:
                 rest = rest[os.write(self._fd, rest) :]
         except OSError:
-            self._is_torn = True
+            self._has_partial_write = True
             with suppress(OSError):
                 self.truncate(self._size)
             raise
@@ -48,7 +49,7 @@ class WholeFile:
         """Cut back to `size` bytes; the next write continues there."""
         os.ftruncate(self._fd, size)
         self._size = os.lseek(self._fd, size, os.SEEK_SET)
-        self._is_torn = False
+        self._has_partial_write = False
 
     def tell(self) -> int:
         """Bytes written so far."""
@@ -58,7 +59,7 @@ class WholeFile:
         """Nothing is buffered here."""
 
     def sync(self) -> None:
-        """Wait until the disk has what was written."""
+        """Wait until the written data is on the disk."""
         os.fdatasync(self._fd)
 
     def close(self) -> None:
@@ -69,9 +70,9 @@ class WholeFile:
 
 
 def free_bytes(folder: Path) -> int:
-    """Room on the disk of a folder, for who isn't its administrator."""
-    room = os.statvfs(folder)
-    return room.f_bavail * room.f_frsize
+    """Free space on the disk of a folder, without the part that is reserved for the superuser."""
+    disk = os.statvfs(folder)
+    return disk.f_bavail * disk.f_frsize
 
 
 def rename_durably(path: Path, target: Path) -> None:
@@ -81,7 +82,7 @@ def rename_durably(path: Path, target: Path) -> None:
 
 
 def sync_path(path: Path) -> None:
-    """Wait until the disk has a file, or the names in a folder."""
+    """Wait until a file, or the names in a folder, are on the disk."""
     fd = os.open(path, os.O_RDONLY)
     try:
         os.fsync(fd)
@@ -90,8 +91,8 @@ def sync_path(path: Path) -> None:
 
 
 @contextmanager
-def writing_to(path: Path) -> Iterator[None]:
-    """Turn what the system refuses while writing to `path` into an OutputError."""
+def writing_to(path: Path) -> Generator[None, None, None]:
+    """Raise an OSError in the block as an OutputError about `path`."""
     try:
         yield
     except OSError as error:
@@ -101,7 +102,7 @@ def writing_to(path: Path) -> Iterator[None]:
 
 
 def make_folder(path: Path) -> Path:
-    """Make a folder where there is none; OutputError where that can't be."""
+    """Make a folder and its parents unless they exist. Raises OutputError."""
     with writing_to(path):
         path.mkdir(parents=True, exist_ok=True)
     return path
@@ -120,6 +121,6 @@ def sha256_of_files(paths: Iterable[Path]) -> str:
 
 
 def natural_order(path: Path) -> tuple[list[str | int], str]:
-    """A sorting key by which `2.png` comes before `10.png`."""
+    """Sorting key that orders numbers in names by value: `2.png` before `10.png`."""
     parts = re.split(r"([0-9]+)", path.name)
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name

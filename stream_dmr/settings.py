@@ -4,9 +4,10 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Settings(BaseModel):
-    """One table of `config.toml`; it lives beside the algorithm that it steers.
+    """Base class of one table of `config.toml`, defined beside the algorithm that uses it.
 
-    Unknown keys and wrong types are refused; `config.py` turns the refusal into one clear line.
+    Unknown keys, wrong types and values out of range raise pydantic's ValidationError, which
+    `running.config` turns into a ConfigError of one line.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)

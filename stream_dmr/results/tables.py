@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from stream_dmr.csv_file import TableFile
+from stream_dmr.csv_file import CsvFile
 from stream_dmr.errors import OutputError
 from stream_dmr.files import rename_durably, writing_to
 from stream_dmr.messages import LengthEstimate, LocalizedFish
@@ -46,15 +46,15 @@ class Tables:
         and what the disk refuses is tried again: a file with every row, a row of lengths.csv with
         the next one. A row of frames.csv that it refuses is left out.
         """
-        again = {"resume": resume, "waits": is_endless}
-        self._lengths = TableFile(out_dir / "lengths.csv", LENGTHS_COLUMNS, **again)
+        again = {"resume": resume, "retry_open": is_endless}
+        self._lengths = CsvFile(out_dir / "lengths.csv", LENGTHS_COLUMNS, **again)
         self._lengths_refused: list[list[str]] = []
         self._is_endless = is_endless
-        self._frames = TableFile(
+        self._frames = CsvFile(
             out_dir / "frames.csv",
             FRAMES_COLUMNS,
             **again,
-            most_bytes=_LARGEST_BYTES if is_endless else None,
+            max_bytes=_LARGEST_BYTES if is_endless else None,
         )
         self._waiting: dict[tuple[int, int], LocalizedFish] = {}
 
@@ -99,7 +99,7 @@ def write_lengths(path: Path, estimates: Iterable[LengthEstimate]) -> None:
     """
     draft = path.with_suffix(".csv.part")
     try:
-        with closing(TableFile(draft, LENGTHS_COLUMNS)) as table, writing_to(path):
+        with closing(CsvFile(draft, LENGTHS_COLUMNS)) as table, writing_to(path):
             for estimate in estimates:
                 table.add(lengths_row(estimate))
             table.sync()

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from stream_dmr.csv_file import set_aside
+from stream_dmr.csv_file import rotated_files
 from stream_dmr.errors import OutputError, RecordingError, UserError
 from stream_dmr.files import sha256_of
 from stream_dmr.messages import LengthEstimate, LocalizedFish
@@ -215,7 +215,7 @@ def _csv(
         yield Change(path, "is missing")
         return
     found: dict[str, list[str]] = {}
-    for table in (older := set_aside(path)) + [path]:
+    for table in (older := rotated_files(path)) + [path]:
         rows = _rows(table, columns)
         if rows is None:
             yield Change(table, "its columns are not those of stream-dmr")

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.csv_file import TableFile, set_aside
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate, LocalizedFish, Message
 from stream_dmr.recording.messages.record import make_record
@@ -141,17 +140,3 @@ def test_a_full_disk_is_refused_in_one_line(tmp_path: Path, messages: list[Messa
     text = (tmp_path / "frames.csv").read_text()
     assert text.endswith("\n")
     assert 0 < len(read(tmp_path / "frames.csv")) < 20
-
-
-def test_a_large_table_is_set_aside_and_begun_anew(tmp_path: Path):
-    path, row = tmp_path / "frames.csv", ["1", "2"]
-    table = TableFile(path, ["a", "b"], most_bytes=20)
-    for _ in range(20):
-        table.add(row)
-    table.close()
-    files = [*set_aside(path), path]
-    assert [file.name for file in files[:2]] == ["frames-000001.csv", "frames-000002.csv"]
-    texts = [file.read_text() for file in files]
-    assert all(text.startswith("a,b\n") for text in texts)
-    assert sum(text.count("1,2\n") for text in texts) == 20
-    assert all(len(text) <= 24 for text in texts)

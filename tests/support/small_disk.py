@@ -1,5 +1,6 @@
 """A disk of its own for a test, as small as it likes."""
 
+import resource
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,3 +32,14 @@ def fill(disk: Path) -> Path:
             file.write(bytes(free))
             file.flush()
     return ballast
+
+
+@contextmanager
+def file_size_limit(size: int) -> Iterator[None]:
+    """Files can't grow beyond this size, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

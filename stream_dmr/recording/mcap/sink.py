@@ -20,7 +20,7 @@ from mcap_protobuf.schema import register_schema
 
 from stream_dmr import __version__
 from stream_dmr.errors import OutputError
-from stream_dmr.files import WholeFile, rename_durably, sync_path
+from stream_dmr.files import TransactionalFile, rename_durably, sync_path
 from stream_dmr.messages import Frame, LocalizedFish
 from stream_dmr.recording.messages.header import RunHeader
 from stream_dmr.recording.messages.record import Record
@@ -86,7 +86,7 @@ class McapSink:
         self._spans: dict[int, tuple[int, int]] = {}  # first and last capture time of each track
         self._closed = False
         try:
-            self._file = WholeFile(self._part)
+            self._file = TransactionalFile(self._part)
         except OSError as error:
             raise self._refusal(error) from error
         try:
@@ -219,7 +219,7 @@ class McapSink:
         )
 
 
-def new_writer(file: WholeFile) -> Writer:
+def new_writer(file: TransactionalFile) -> Writer:
     """A writer of chunks that stand alone, with checksums on all that it writes."""
     writer = Writer(
         cast(IO[bytes], file),
@@ -231,7 +231,7 @@ def new_writer(file: WholeFile) -> Writer:
     return writer
 
 
-def _start(file: WholeFile, header: RunHeader, number: int | None) -> Writer:
+def _start(file: TransactionalFile, header: RunHeader, number: int | None) -> Writer:
     writer = new_writer(file)
     writer.add_metadata(RUN, header.metadata())
     if number is not None:

@@ -8,7 +8,7 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.records import Message as McapMessage
 
 from stream_dmr import __version__
-from stream_dmr.files import WholeFile
+from stream_dmr.files import TransactionalFile
 from stream_dmr.recording.mcap.file import whole_records
 from stream_dmr.recording.mcap.sink import new_writer
 from stream_dmr.recording.messages.topics import RUN
@@ -25,7 +25,7 @@ def rewrite(path: Path, *, note: str, edit: Edit = lambda topic, data: data) -> 
     """
     copy = path.with_name(path.name + REWRITTEN)
     try:
-        with closing(WholeFile(copy)) as file:
+        with closing(TransactionalFile(copy)) as file:
             num_messages = _copy(whole_records(path), file, note, edit)
             file.sync()
     except BaseException:
@@ -34,7 +34,7 @@ def rewrite(path: Path, *, note: str, edit: Edit = lambda topic, data: data) -> 
     return copy, num_messages
 
 
-def _copy(records: Iterable[object], file: WholeFile, note: str, edit: Edit) -> int:
+def _copy(records: Iterable[object], file: TransactionalFile, note: str, edit: Edit) -> int:
     """Everything but the index, which the writer makes; the number of messages."""
     writer, num_messages = new_writer(file), 0
     schemas, channels, topics = {0: 0}, dict[int, int](), dict[int, str]()

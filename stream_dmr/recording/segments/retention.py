@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from threading import Event, Thread
 
-from stream_dmr.csv_file import set_aside
+from stream_dmr.csv_file import rotated_files
 from stream_dmr.errors import OutputError, RecordingError
 from stream_dmr.files import free_bytes, natural_order, rename_durably
 from stream_dmr.messages import FishCrop, Frame
@@ -82,7 +82,7 @@ class Retention:
 
     def _steps(self) -> Iterator[str]:
         """Do what makes room, one at a time, and name it."""
-        for table in set_aside(self._folder / "frames.csv"):
+        for table in rotated_files(self._folder / "frames.csv"):
             yield from self._remove(table, "the table of frames")
         stems, marked = self._finished(), set(self._marked())
         is_marked = {stem: bool(marked & set(self._facts(stem)[0])) for stem in stems}
