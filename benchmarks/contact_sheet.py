@@ -37,7 +37,7 @@ def watch(video: str, *, template: str, path: Path | None) -> list[Pair]:
     """Every crop with its fit, in the order of the frames."""
     config = load_config(path)
     finder = open_finder(boxes=None, masks=None, detect=config.detect_fish, track=config.track_fish)
-    node = CropFish(config.crop_fish, camera=None, detections=finder)
+    node = CropFish(config.crop_fish, camera=None, finder=finder)
     later = later_nodes(config, template=load_template(template), calibration=None)
     crops: dict[tuple[int, int], FishCrop] = {}
     pairs: list[Pair] = []

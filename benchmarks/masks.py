@@ -20,12 +20,13 @@ from jaxtyping import Bool, UInt8
 from stream_dmr.calibration.calibration_file import load_calibration
 from stream_dmr.messages import FishCrop
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.segmentation.annotations.detections import open_annotations
-from stream_dmr.segmentation.annotations.files import Masks
-from stream_dmr.segmentation.masks.crop import CropFishSettings, frame_from_crop_map
-from stream_dmr.segmentation.network.inference import UNetSegmenter
-from stream_dmr.segmentation.network.network import SIZE_PX
-from stream_dmr.segmentation.network.weights import SHIPPED
+from stream_dmr.segmentation.annotations.annotated_fish import open_annotated_fish
+from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
+from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map
+from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
+from stream_dmr.segmentation.network.unet import SIZE_PX
+from stream_dmr.segmentation.network.unet_segmenter import UNetSegmenter
+from stream_dmr.segmentation.network.unet_weights import SHIPPED
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
 
@@ -37,9 +38,9 @@ def crops_of(scene: Path, segmenter: str) -> Iterator[tuple[FishCrop, Bool[np.nd
     """Every crop with a fish in it, and its true mask."""
     file = scene / "calibration.yaml"
     camera = load_calibration(file).camera if file.exists() else None
-    detections = open_annotations(boxes=scene / "boxes.txt", masks=None)
-    node = CropFish(CropFishSettings(segmenter=segmenter), camera=camera, detections=detections)
-    masks = Masks(scene / "masks")
+    detections = open_annotated_fish(boxes=scene / "boxes.txt", masks=None)
+    node = CropFish(CropFishSettings(segmenter=segmenter), camera=camera, finder=detections)
+    masks = MaskFolder(scene / "masks")
     video = scene / "video.mp4"
     source = open_source(str(video if video.exists() else scene / "frames"), ReadFramesSettings())
     for frame in source:

@@ -32,8 +32,8 @@ from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.running.config import load_config
 from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.running.pipeline import StageCounters, run_chain
-from stream_dmr.segmentation.annotations.files import Masks
-from stream_dmr.segmentation.masks.crop import frame_from_crop_map
+from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
+from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map
 from stream_dmr.segmentation.tracking.fish_finder import open_finder
 from stream_dmr.simulation.presets import PRESETS
 from stream_dmr.simulation.write_scene import simulate
@@ -67,7 +67,7 @@ def measure(scene: Path, arguments: argparse.Namespace) -> Row:
     template = arguments.template or str(folder / "species.ply")
     raw = chain(scene, arguments.config, template, given=False)
     given = chain(scene, arguments.config, template, given=True)
-    pairs, names = _against_masks(raw.crops, Masks(scene / "masks"))
+    pairs, names = _against_masks(raw.crops, MaskFolder(scene / "masks"))
     ious = np.array([iou(crop.mask, true) for crop, true in pairs])
     if arguments.sheet:
         write_sheet(pairs, ious, arguments.sheet.with_stem(f"{arguments.sheet.stem}-{scene.name}"))
@@ -93,7 +93,7 @@ def chain(scene: Path, path: Path | None, template: str, *, given: bool) -> Ran:
         detect=config.detect_fish,
         track=config.track_fish,
     )
-    crop_fish = CropFish(config.crop_fish, camera=calibration.camera, detections=finder)
+    crop_fish = CropFish(config.crop_fish, camera=calibration.camera, finder=finder)
     later = later_nodes(config, template=load_template(template), calibration=calibration)
     ran = Ran([], [], [])
 
@@ -112,7 +112,7 @@ def chain(scene: Path, path: Path | None, template: str, *, given: bool) -> Ran:
 
 
 def _against_masks(
-    crops: Iterable[FishCrop], masks: Masks
+    crops: Iterable[FishCrop], masks: MaskFolder
 ) -> tuple[list[tuple[FishCrop, Bool[np.ndarray, "S S"]]], dict[int, int]]:
     """Every crop with its true mask, and which true fish each found one mostly is (0: none)."""
     pairs, votes = [], {}

@@ -11,9 +11,10 @@ from stream_dmr.camera import Camera
 from stream_dmr.fitting.body import JOINT, ROOT, Body, rest_vector
 from stream_dmr.fitting.contour.deformation import KINDS, deform
 from stream_dmr.messages import CropQuality, FishCrop, Frame
-from stream_dmr.segmentation.annotations.detections import Detection
-from stream_dmr.segmentation.masks.crop import CropFishSettings, crop_fish
-from stream_dmr.segmentation.masks.grabcut import GrabCut
+from stream_dmr.segmentation.detection.fish_detection import Detection
+from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
+from stream_dmr.segmentation.masks.cropping import crop_fish
+from stream_dmr.segmentation.masks.grabcut_segmenter import GrabCutSegmenter
 from stream_dmr.simulation.rail_scene import RailScene, Visit, make_scene
 from stream_dmr.simulation.render import draw_mask
 from stream_dmr.simulation.simulated_body import (
@@ -130,7 +131,9 @@ def _crop(scene: RailScene, visit: Visit, frame_index: int, *, size: int) -> Fis
     image = np.zeros((*mask.shape, 3), np.uint8)
     frame = Frame(frame_index=frame_index, timestamp_ns=0, image=image, source="simulation")
     settings = CropFishSettings(crop_size_px=size)
-    return crop_fish(frame, detection, frame_camera=camera, settings=settings, segmenter=GrabCut())
+    return crop_fish(
+        frame, detection, frame_camera=camera, settings=settings, segmenter=GrabCutSegmenter()
+    )
 
 
 def _box(mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "4"]:

@@ -16,9 +16,9 @@ from hota import score
 
 from stream_dmr.messages import Frame
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.segmentation.detection.detectors import DetectFishSettings, open_detector
-from stream_dmr.segmentation.masks.crop import CropFishSettings
-from stream_dmr.segmentation.tracking.tracked_fish import FollowedFish, TrackFishSettings
+from stream_dmr.segmentation.detection.open_detector import DetectFishSettings, open_detector
+from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
+from stream_dmr.segmentation.tracking.tracked_fish import TrackedFish, TrackFishSettings
 from stream_dmr.simulation.film import film
 from stream_dmr.simulation.presets import PRESETS
 from stream_dmr.simulation.rail_scene import RailScene, Visit, make_scene
@@ -61,8 +61,8 @@ def _swinging(visit: Visit, *, side: int) -> Visit:
 
 def measure(scene: RailScene) -> Outcome:
     """Film a scene, follow its fish, and compare."""
-    fish = FollowedFish(open_detector(DetectFishSettings()), TrackFishSettings())
-    node = CropFish(CropFishSettings(), camera=scene.calibration.camera, detections=fish)
+    fish = TrackedFish(open_detector(DetectFishSettings()), TrackFishSettings())
+    node = CropFish(CropFishSettings(), camera=scene.calibration.camera, finder=fish)
     truth, found = [], []
     for shot in film(scene):
         index = shot.frame_index

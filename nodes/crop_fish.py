@@ -4,25 +4,26 @@ from collections.abc import Sequence
 
 from stream_dmr.camera import Camera
 from stream_dmr.messages import FishCrop, Frame
-from stream_dmr.segmentation.masks.crop import CropFishSettings, crop_fish
-from stream_dmr.segmentation.masks.segmenters import open_segmenter
+from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
+from stream_dmr.segmentation.masks.cropping import crop_fish
+from stream_dmr.segmentation.masks.open_segmenter import open_segmenter
 from stream_dmr.segmentation.tracking.fish_finder import FishFinder
 
 
 class CropFish:
-    """Frame -> FishCrop, one per fish. Without a calibrated camera a nominal one stands in."""
+    """Frame -> FishCrop, one per fish. Without a calibrated camera a nominal one is assumed."""
 
     def __init__(
-        self, settings: CropFishSettings, *, camera: Camera | None, detections: FishFinder
+        self, settings: CropFishSettings, *, camera: Camera | None, finder: FishFinder
     ) -> None:
-        """Raises ModelError where the model that `settings.segmenter` names can't be used."""
-        self.detections = detections
+        """Raises ModelError where the model that `settings.segmenter` names cannot be used."""
+        self._finder = finder
         self._segmenter = open_segmenter(settings.segmenter)
         self._settings = settings
         self._camera = camera
 
     def step(self, frame: Frame, /) -> list[FishCrop]:
-        """The fish of one frame, by id. Raises AnnotationError where its mask can't be used."""
+        """The fish of one frame, by id. Raises AnnotationError for an unusable mask."""
         if self._camera is None:
             height, width = frame.image.shape[:2]
             self._camera = Camera.nominal(width=width, height=height)
@@ -34,14 +35,14 @@ class CropFish:
                 settings=self._settings,
                 segmenter=self._segmenter,
             )
-            for detection in self.detections.detect(frame)
+            for detection in self._finder.detect(frame)
         ]
-        return self.detections.admit(crops)
+        return self._finder.admit(crops)
 
     def tick(self, timestamp_ns: int, /) -> Sequence[FishCrop]:
-        """Nothing waits for time to pass here."""
+        """No output: crops do not wait for time to pass."""
         return ()
 
     def close(self) -> Sequence[FishCrop]:
-        """Nothing is owed at the end."""
+        """No output at the end."""
         return ()

@@ -24,7 +24,7 @@ from stream_dmr.recording.reading.convert import convert
 from stream_dmr.recording.reading.reader import open_recordings
 from stream_dmr.results.export import Export
 from stream_dmr.running.config import load_config
-from stream_dmr.segmentation.annotations.detections import open_annotations
+from stream_dmr.segmentation.annotations.annotated_fish import open_annotated_fish
 from stream_dmr.simulation import DEMO_SCENE
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
@@ -178,7 +178,7 @@ def names_and_sizes(folder: Path) -> set[tuple[str, int]]:
 def read_boxes(path: Path) -> None:
     """All of them, on a frame."""
     picture = np.zeros((960, 1280, 3), np.uint8)
-    found = open_annotations(boxes=path, masks=None)
+    found = open_annotated_fish(boxes=path, masks=None)
     for index in range(1, 8):
         found.detect(Frame(frame_index=index, timestamp_ns=index, image=picture, source="x"))
 
@@ -190,7 +190,7 @@ def read_masks(path: Path) -> None:
     shutil.copy(path, folder / "000001.png")
     picture = np.zeros((960, 1280, 3), np.uint8)
     frame = Frame(frame_index=1, timestamp_ns=0, image=picture, source="x")
-    open_annotations(boxes=None, masks=folder).detect(frame)
+    open_annotated_fish(boxes=None, masks=folder).detect(frame)
 
 
 def read_template(path: Path) -> None:

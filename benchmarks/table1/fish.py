@@ -15,9 +15,10 @@ from jaxtyping import Float
 
 from stream_dmr.camera import Calibration, ReferencePlane
 from stream_dmr.messages import FishCrop, Frame
-from stream_dmr.segmentation.annotations.detections import Detection
-from stream_dmr.segmentation.masks.crop import CropFishSettings, crop_fish
-from stream_dmr.segmentation.masks.grabcut import GrabCut
+from stream_dmr.segmentation.detection.fish_detection import Detection
+from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
+from stream_dmr.segmentation.masks.cropping import crop_fish
+from stream_dmr.segmentation.masks.grabcut_segmenter import GrabCutSegmenter
 from stream_dmr.simulation.film import FilmedFrame, film
 from stream_dmr.simulation.pose_sequence import FPS
 from stream_dmr.simulation.rail_scene import RailScene, make_scene
@@ -128,7 +129,7 @@ def _crops(
             detection,
             frame_camera=calibration.camera,
             settings=settings,
-            segmenter=GrabCut(),  # not asked: the mask is given
+            segmenter=GrabCutSegmenter(),  # not asked: the mask is given
         )
         yield box.track_id, crop
 

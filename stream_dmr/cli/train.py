@@ -43,9 +43,9 @@ def train(
         raise typer.BadParameter("--images and --masks belong together: give both or neither")
     with stop_on_signals() as stop:
         from stream_dmr.running.config import load_config
-        from stream_dmr.segmentation.training.display import TrainDisplay
-        from stream_dmr.segmentation.training.train import TrainRequest
-        from stream_dmr.segmentation.training.train import train as train_network
+        from stream_dmr.segmentation.training.train_display import TrainDisplay
+        from stream_dmr.segmentation.training.train_unet import TrainRequest
+        from stream_dmr.segmentation.training.train_unet import train as train_network
 
         settings = load_config(config).train
         request = TrainRequest(

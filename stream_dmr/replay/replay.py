@@ -244,7 +244,7 @@ def _chain(
             reader = ReadFrames(files.source, config.read_frames)
             stack.callback(reader.close)
             pictures = SourcePictures(reader)
-        crop_fish = CropFish(config.crop_fish, camera=camera, detections=detections)
+        crop_fish = CropFish(config.crop_fish, camera=camera, finder=detections)
         frames = tape.pictures(pictures, exact=request.check, missing_source=files.missing_source)
         return frames, [crop_fish, *computed]
     logged = [*STAGES.values()][:first]

@@ -13,7 +13,7 @@ from stream_dmr.messages import FishCrop, FittedShape, Frame
 from stream_dmr.recording.messages.selection import WHOLE
 from stream_dmr.recording.reading.frame_images import RecordedPictures, SourcePictures
 from stream_dmr.recording.reading.reader import Recording, messages
-from stream_dmr.segmentation.masks.crop import frame_from_crop_map
+from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
 

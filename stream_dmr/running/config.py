@@ -21,10 +21,10 @@ from stream_dmr.localization.localize import LocalizeSettings
 from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.results.fisheries import FisheriesSettings
 from stream_dmr.running.run_settings import DriftSettings, WatchSettings
-from stream_dmr.segmentation.detection.detectors import DetectFishSettings
-from stream_dmr.segmentation.masks.crop import CropFishSettings
+from stream_dmr.segmentation.detection.open_detector import DetectFishSettings
+from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
 from stream_dmr.segmentation.tracking.tracked_fish import TrackFishSettings
-from stream_dmr.segmentation.training.settings import TrainSettings
+from stream_dmr.segmentation.training.train_settings import TrainSettings
 from stream_dmr.settings import Settings
 from stream_dmr.sources.read_settings import ReadFramesSettings
 

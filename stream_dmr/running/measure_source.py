@@ -85,7 +85,7 @@ def _say_what_matters(inputs: Inputs, outputs: Outputs, observer: RunObserver) -
 def _nodes(inputs: Inputs) -> list[Node]:
     calibration = inputs.calibration
     camera = None if calibration is None else calibration.camera
-    crop_fish = CropFish(inputs.config.crop_fish, camera=camera, detections=inputs.detections)
+    crop_fish = CropFish(inputs.config.crop_fish, camera=camera, finder=inputs.detections)
     return [
         crop_fish,
         *later_nodes(inputs.config, template=inputs.template, calibration=calibration),

@@ -1,7 +1,7 @@
-"""What turns a box into a mask: one small interface, asked on the crop, not on the frame.
+"""The interface of a segmenter: an image and a box in, a mask out.
 
-A crop is already free of lens distortion, and its pixel map to the frame is in one place
-(`crop.frame_from_crop_map`); a segmenter therefore knows nothing of cameras.
+A segmenter sees the crop, not the frame. A crop is free of lens distortion, and its pixel map to
+the frame is in one place (`masks.crop_geometry`), so that a segmenter needs no camera.
 """
 
 from dataclasses import dataclass
@@ -14,19 +14,19 @@ from stream_dmr.messages import FishEnds
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Segmented:
-    """The fish that a box means, as a segmenter sees it."""
+class SegmentedFish:
+    """The fish that a box encloses, as found by a segmenter."""
 
-    probability: Float32[np.ndarray, "S S"]  # of being fish, 0 to 1, at the crop's pixels
-    ends: FishEnds | None  # None from a segmenter that doesn't look for them
+    probability: Float32[np.ndarray, "S S"]  # of each crop pixel to be fish, 0 to 1
+    ends: FishEnds | None  # None from a segmenter that does not locate them
 
 
 @runtime_checkable
 class Segmenter(Protocol):
-    """A box in, a mask out."""
+    """Finds the mask of the fish in a box."""
 
     def segment(
         self, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
-    ) -> Segmented:
+    ) -> SegmentedFish:
         """The fish in a box, half-open in pixels of the crop `image` (BGR)."""
         ...

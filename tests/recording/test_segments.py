@@ -235,7 +235,7 @@ def write_clips(folder: Path, *, num_frames: int) -> dict[str, str]:
 
 
 def write_swaying_fish(path: Path, *, num_frames: int) -> None:
-    """A fish that motion finds, before a ground that GrabCut can tell from it."""
+    """A fish that motion finds, before a ground that GrabCutSegmenter can tell from it."""
     grains = np.random.default_rng(0).integers(120, 220, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     ground = cv2.GaussianBlur(grains, (5, 5), 0)
     video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (WIDTH, HEIGHT))

@@ -7,9 +7,10 @@ from PIL import Image
 
 from stream_dmr.errors import AnnotationError, UserError
 from stream_dmr.messages import Frame
-from stream_dmr.segmentation.annotations.detections import Annotations, open_annotations
-from stream_dmr.segmentation.annotations.files import Masks, load_boxes
-from stream_dmr.segmentation.masks.grabcut import segment_box
+from stream_dmr.segmentation.annotations.annotated_fish import AnnotatedFish, open_annotated_fish
+from stream_dmr.segmentation.annotations.box_files import load_boxes
+from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
+from stream_dmr.segmentation.masks.grabcut_segmenter import segment_box
 
 SIZE = {"width": 8, "height": 6}
 numbers = st.floats(-1e4, 1e4).map(lambda x: round(x, 3))
@@ -142,13 +143,13 @@ def test_masks_give_ids_whatever_they_are_stored_as(tmp_path, kind):
     else:
         labels = labels.astype(np.uint16) * 100 if kind == "16-bit" else labels
         cv2.imwrite(str(path), labels)
-    np.testing.assert_array_equal(Masks(tmp_path).labels(1, **SIZE), labels)
+    np.testing.assert_array_equal(MaskFolder(tmp_path).labels(1, **SIZE), labels)
 
 
 def test_a_1_bit_mask_is_fish_1(tmp_path):
     labels = labels_of(id1=(1, 1, 5, 4))
     Image.fromarray(labels == 1).save(tmp_path / "000001.png")
-    np.testing.assert_array_equal(Masks(tmp_path).labels(1, **SIZE), labels)
+    np.testing.assert_array_equal(MaskFolder(tmp_path).labels(1, **SIZE), labels)
 
 
 def test_masks_that_cannot_be_used_are_refused(tmp_path):
@@ -158,7 +159,7 @@ def test_masks_that_cannot_be_used_are_refused(tmp_path):
     (tmp_path / "000003.png").write_bytes(b"no picture")
     (tmp_path / "000004.png").write_bytes(whole[:-30])
     (tmp_path / "000005.png").touch()
-    masks = Masks(tmp_path)
+    masks = MaskFolder(tmp_path)
     with pytest.raises(AnnotationError, match=r"000001.*8x6 px, got 16x12 px"):
         masks.labels(1, **SIZE)
     with pytest.raises(AnnotationError, match=r"000002.*colour \(RGB\)"):
@@ -171,15 +172,15 @@ def test_masks_that_cannot_be_used_are_refused(tmp_path):
 
 def test_folders_without_masks_are_refused(tmp_path):
     with pytest.raises(AnnotationError, match="found none there"):
-        Masks(tmp_path / "missing")
+        MaskFolder(tmp_path / "missing")
     with pytest.raises(AnnotationError, match="found no PNG"):
-        Masks(tmp_path)
+        MaskFolder(tmp_path)
     (tmp_path / "00001.png").touch()
     with pytest.raises(AnnotationError, match=r"found 00001\.png"):
-        Masks(tmp_path)
+        MaskFolder(tmp_path)
     (tmp_path / "000000.png").touch()
     with pytest.raises(AnnotationError, match=r"counted from 000001\.png"):
-        Masks(tmp_path)
+        MaskFolder(tmp_path)
 
 
 def frame_at(index, image=None):
@@ -190,7 +191,7 @@ def frame_at(index, image=None):
 
 def test_masks_alone_give_the_boxes(tmp_path):
     cv2.imwrite(str(tmp_path / "000001.png"), labels_of(id3=(4, 1, 7, 5), id1=(0, 0, 2, 2)))
-    annotations = open_annotations(boxes=None, masks=tmp_path)
+    annotations = open_annotated_fish(boxes=None, masks=tmp_path)
     first, second = annotations.detect(frame_at(1))
     assert (first.track_id, second.track_id) == (1, 3)
     assert list(second.bbox_xyxy_px) == [4, 1, 7, 5]
@@ -204,7 +205,7 @@ def test_masks_alone_give_the_boxes(tmp_path):
 def test_a_frame_without_boxes_needs_no_mask(tmp_path):
     cv2.imwrite(str(tmp_path / "000001.png"), labels_of(id1=(0, 0, 2, 2)))
     boxes = boxes_file(tmp_path, "1,1,0,0,3,3,1\n4,1,0,0,3,3,1\n")
-    annotations = open_annotations(boxes=boxes, masks=tmp_path)
+    annotations = open_annotated_fish(boxes=boxes, masks=tmp_path)
     for index in (1, 2, 3, 4):
         annotations.detect(frame_at(index))
     assert annotations.warnings == ["masks: no picture for 1 frames, the first of them 4"]
@@ -216,7 +217,7 @@ def test_boxes_choose_among_the_masks_and_mismatches_are_told(tmp_path):
         tmp_path,
         "1,1,0,0,3,3,1,1,0.5\n1,2,3,3,2,2,1,1,1\n2,1,0,0,3,3,1\n2,9,-20,0,10,10,1\n",
     )
-    annotations = open_annotations(boxes=boxes, masks=tmp_path)
+    annotations = open_annotated_fish(boxes=boxes, masks=tmp_path)
     first, second = annotations.detect(frame_at(1))
     assert (first.track_id, first.visible_fraction, first.mask.sum()) == (1, 0.5, 4)
     assert (second.track_id, second.mask.any()) == (2, False)
@@ -232,7 +233,7 @@ def test_boxes_choose_among_the_masks_and_mismatches_are_told(tmp_path):
 
 def test_neither_boxes_nor_masks():
     with pytest.raises(UserError, match="--boxes, --masks or both"):
-        open_annotations(boxes=None, masks=None)
+        open_annotated_fish(boxes=None, masks=None)
 
 
 def fish_on_sea(*, seed=0, size=(240, 180), axes=(70, 22), angle=30.0, center=(120, 90)):
@@ -252,7 +253,7 @@ def box_around(mask):
 
 
 def test_boxes_alone_leave_the_mask_to_a_segmenter(tmp_path):
-    annotations = Annotations(
+    annotations = AnnotatedFish(
         boxes=load_boxes(boxes_file(tmp_path, "1,1,10,10,50,20,1,1,1")), masks=None
     )
     [detection] = annotations.detect(frame_at(1, np.zeros((90, 120, 3), np.uint8)))

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 from stream_dmr.errors import AnnotationError
 from stream_dmr.messages import Frame
-from stream_dmr.segmentation.annotations.boxes import UNKNOWN_ID, Box
-from stream_dmr.segmentation.annotations.detections import Annotations
-from stream_dmr.segmentation.annotations.files import load_boxes
-from stream_dmr.segmentation.detection.detectors import DetectFishSettings
+from stream_dmr.segmentation.annotations.annotated_box import UNKNOWN_ID, AnnotatedBox
+from stream_dmr.segmentation.annotations.annotated_fish import AnnotatedFish
+from stream_dmr.segmentation.annotations.box_files import load_boxes
+from stream_dmr.segmentation.detection.open_detector import DetectFishSettings
 from stream_dmr.segmentation.tracking.fish_finder import open_finder
-from stream_dmr.segmentation.tracking.tracked_fish import FollowedFish, TrackFishSettings
+from stream_dmr.segmentation.tracking.tracked_fish import TrackedFish, TrackFishSettings
 
 numbers = st.integers(-200, 2000).map(lambda n: n / 8)
 sizes = st.integers(1, 4000).map(lambda n: n / 8)
@@ -53,7 +53,7 @@ def cvat_video(table) -> str:
     return f"<annotations><version>1.1</version>{tracks}</annotations>"
 
 
-def contents(frames: dict[int, list[Box]]) -> list[tuple]:
+def contents(frames: dict[int, list[AnnotatedBox]]) -> list[tuple]:
     return [(f, b.track_id, *b.bbox_xyxy_px) for f, boxes in frames.items() for b in boxes]
 
 
@@ -129,10 +129,10 @@ def test_boxes_with_ids_are_taken_as_they_are_and_others_are_followed(tmp_path):
     named, unnamed = tmp_path / "named.txt", tmp_path / "unnamed.txt"
     named.write_text("".join(f"{f},7,{10 * f},20,50,30,1\n" for f in range(1, 9)))
     unnamed.write_text("".join(f"{f},-1,{10 * f},20,50,30,0.8,-1,-1,-1\n" for f in range(1, 9)))
-    assert isinstance(finder(named), Annotations)
-    assert isinstance(finder(None), FollowedFish)
+    assert isinstance(finder(named), AnnotatedFish)
+    assert isinstance(finder(None), TrackedFish)
     followed = finder(unnamed)
-    assert isinstance(followed, FollowedFish)
+    assert isinstance(followed, TrackedFish)
     image = np.zeros((100, 200, 3), np.uint8)
     for f in range(1, 9):
         found = followed.detect(Frame(frame_index=f, timestamp_ns=f, image=image, source=""))

@@ -7,16 +7,15 @@ from hypothesis import strategies as st
 from stream_dmr.camera import Camera, crop_from_frame, frame_from_crop
 from stream_dmr.messages import Frame
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.segmentation.annotations.detections import Annotations, Detection
-from stream_dmr.segmentation.annotations.files import Box
-from stream_dmr.segmentation.masks.crop import (
-    CropFishSettings,
-    clean_mask,
-    crop_fish,
-    frame_from_crop_map,
-)
-from stream_dmr.segmentation.masks.grabcut import GrabCut
-from stream_dmr.segmentation.segmenter import Segmented
+from stream_dmr.segmentation.annotations.annotated_box import AnnotatedBox
+from stream_dmr.segmentation.annotations.annotated_fish import AnnotatedFish
+from stream_dmr.segmentation.detection.fish_detection import Detection
+from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map
+from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
+from stream_dmr.segmentation.masks.cropping import crop_fish
+from stream_dmr.segmentation.masks.grabcut_segmenter import GrabCutSegmenter
+from stream_dmr.segmentation.masks.mask_cleaning import clean_mask
+from stream_dmr.segmentation.segmenter import SegmentedFish
 
 SETTINGS = CropFishSettings()
 WIDE = Camera(  # strong barrel distortion, off-centre, unequal focal lengths
@@ -50,7 +49,7 @@ def crop_of(mask, camera, *, box=None, frame=None, **knobs):
         detection_of(mask, box=box),
         frame_camera=camera,
         settings=CropFishSettings(**knobs),
-        segmenter=GrabCut(),
+        segmenter=GrabCutSegmenter(),
     )
 
 
@@ -142,8 +141,8 @@ def test_the_whole_box_is_in_the_crop_with_its_margin(camera, x, y, w, h):
     box = [x, y, min(x + w, 640), min(y + h, 480)]
     crop = crop_of(np.zeros((480, 640), bool), camera, box=box)
     x0, y0, x1, y1 = np.array(box) - 0.5
-    corners = np.array([[x0, y0], [x1, y0], [x0, y1], [x1, y1]])
-    seen = crop_from_frame(corners, crop_camera=crop.crop_camera, frame_camera=camera)
+    box_from_xywh = np.array([[x0, y0], [x1, y0], [x0, y1], [x1, y1]])
+    seen = crop_from_frame(box_from_xywh, crop_camera=crop.crop_camera, frame_camera=camera)
     margin = 128 * 0.15 / 1.3
     assert seen.min() > margin - 1.0
     assert seen.max() < 127 - margin + 1.0
@@ -296,12 +295,14 @@ def test_a_tiny_mask_counts_as_none():
 
 
 def box_of(track_id, *xyxy, visibility=1.0):
-    return Box(track_id=track_id, bbox_xyxy_px=np.array(xyxy, np.float64), visibility=visibility)
+    return AnnotatedBox(
+        track_id=track_id, bbox_xyxy_px=np.array(xyxy, np.float64), visibility=visibility
+    )
 
 
 def test_the_node_crops_every_fish_and_stands_in_for_a_missing_camera():
     boxes = {1: [box_of(2, 10, 10, 60, 30), box_of(5, 50, 20, 90, 70, visibility=0.4)]}
-    node = CropFish(SETTINGS, camera=None, detections=Annotations(boxes=boxes, masks=None))
+    node = CropFish(SETTINGS, camera=None, finder=AnnotatedFish(boxes=boxes, masks=None))
     frame = grey_frame(Camera.nominal(width=120, height=90))
     first, second = node.step(frame)
     assert (first.track_id, second.track_id) == (2, 5)
@@ -318,7 +319,7 @@ class Painter:
 
     def segment(self, image, bbox_xyxy_px):
         self.bbox_xyxy_px = bbox_xyxy_px
-        return Segmented(probability=image[..., 0].astype(np.float32) / 255, ends=None)
+        return SegmentedFish(probability=image[..., 0].astype(np.float32) / 255, ends=None)
 
 
 def segmented(picture, box, camera, **knobs):
@@ -354,7 +355,7 @@ def test_a_mask_found_in_the_crop_is_the_one_given_in_the_frame(camera, x, y, w,
     extent = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
     if not camera.distortion.any():
         np.testing.assert_allclose(in_crop, extent, atol=1.5)
-    # Through a lens the box's edges are arcs; their middles lie inside the corners.
+    # Through a lens the box's edges are arcs; their middles lie inside the box_from_xywh.
     assert np.all(
         (in_crop[:2] > np.array(extent[:2]) - 1.5) & (in_crop[2:] < np.array(extent[2:]) + 1.5)
     )
@@ -401,7 +402,7 @@ def test_what_is_found_beyond_the_frame_does_not_count():
 
     class Everywhere:
         def segment(self, image, bbox_xyxy_px):
-            return Segmented(probability=np.ones(image.shape[:2], np.float32), ends=None)
+            return SegmentedFish(probability=np.ones(image.shape[:2], np.float32), ends=None)
 
     detection = Detection(
         track_id=1, bbox_xyxy_px=np.array([0.0, 0, 50, 60]), mask=None, visible_fraction=1.0
@@ -416,13 +417,13 @@ def test_what_is_found_beyond_the_frame_does_not_count():
 
 @pytest.mark.scenes
 def test_masks_of_a_scene_fill_their_crops(scenes):
-    from stream_dmr.segmentation.annotations.detections import open_annotations
+    from stream_dmr.segmentation.annotations.annotated_fish import open_annotated_fish
     from stream_dmr.sources.open_source import open_source
     from stream_dmr.sources.read_settings import ReadFramesSettings
 
     scene = scenes / "realistic"
-    detections = open_annotations(boxes=scene / "boxes.txt", masks=scene / "masks")
-    node = CropFish(SETTINGS, camera=None, detections=detections)
+    detections = open_annotated_fish(boxes=scene / "boxes.txt", masks=scene / "masks")
+    node = CropFish(SETTINGS, camera=None, finder=detections)
     crops = []
     source = open_source(str(scene / "video.mp4"), ReadFramesSettings())
     for frame in source:

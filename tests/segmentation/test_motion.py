@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stream_dmr.messages import Frame
-from stream_dmr.segmentation.detection.background import Background
+from stream_dmr.segmentation.detection.background_model import Background
 from stream_dmr.segmentation.detection.blobs import fish_shapes
 from stream_dmr.segmentation.detection.camera_motion import CameraMotion, compose
 from stream_dmr.segmentation.detection.detector import Candidate
-from stream_dmr.segmentation.detection.motion import MotionDetector, MotionSettings
+from stream_dmr.segmentation.detection.motion_detector import MotionDetector, MotionSettings
 from stream_dmr.simulation.backdrop import Backdrop
 from stream_dmr.simulation.film import film
 from stream_dmr.simulation.rail_scene import make_scene

@@ -13,9 +13,9 @@ from onnx import TensorProto, helper, numpy_helper
 
 from stream_dmr.errors import ModelError
 from stream_dmr.messages import Frame
-from stream_dmr.segmentation.detection.detectors import DetectFishSettings, open_detector
 from stream_dmr.segmentation.detection.letterbox import Letterbox
 from stream_dmr.segmentation.detection.onnx_detector import OnnxDetector, OnnxSettings
+from stream_dmr.segmentation.detection.open_detector import DetectFishSettings, open_detector
 
 INPUT = 320
 SCORE = 0.9
@@ -76,8 +76,8 @@ def outputs_of(layout: str, boxes: np.ndarray) -> list[np.ndarray]:
 @given(sides, sides, st.tuples(sides, sides), st.data())
 def test_boxes_come_back_exactly(width: int, height: int, inner: tuple[int, int], data):
     letterbox = Letterbox.of(frame_size=(width, height), input_size=inner)
-    corners = st.tuples(st.floats(0, width), st.floats(0, height))
-    box = np.array([[*data.draw(corners), *data.draw(corners)]])
+    box_from_xywh = st.tuples(st.floats(0, width), st.floats(0, height))
+    box = np.array([[*data.draw(box_from_xywh), *data.draw(box_from_xywh)]])
     there = letterbox.to_input(box)
     np.testing.assert_allclose(letterbox.to_frame(there), box, atol=1e-9 * max(width, height))
     whole = letterbox.to_input(np.array([[0.0, 0.0, width, height]]))[0]

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stream_dmr.segmentation.detection.detector import Candidate
-from stream_dmr.segmentation.tracking.split_blobs import Expected, extent, part
+from stream_dmr.segmentation.tracking.observation import oriented_extent
+from stream_dmr.segmentation.tracking.split_blobs import PredictedSilhouette, split_merged_blob
 
 SIZE = (400, 500)
 
@@ -26,10 +27,10 @@ def candidate_of(mask):
 
 def expected_of(mask, *, off=(0.0, 0.0)):
     one = candidate_of(mask)
-    return Expected(
+    return PredictedSilhouette(
         shape=one.foreground,
         corner=one.bbox_xyxy_px[:2] + off,
-        length_px=extent(mask)[1],
+        length_px=oriented_extent(mask)[1],
         area_px=float(mask.sum()),
         is_whole=True,
     )
@@ -53,7 +54,7 @@ offsets = st.tuples(st.floats(-6, 6), st.floats(-6, 6))
 @settings(max_examples=25, deadline=None)
 def test_two_known_fish_get_their_own_pieces(across, along, one_off, other_off):
     one, other = fish(200, 120), fish(200 + across, 120 + along)
-    pieces = part(
+    pieces = split_merged_blob(
         candidate_of(one | other),
         [expected_of(one, off=one_off), expected_of(other, off=other_off)],
     )
@@ -70,7 +71,7 @@ def test_two_known_fish_get_their_own_pieces(across, along, one_off, other_off):
 @settings(max_examples=25, deadline=None)
 def test_a_fish_that_nobody_knew_is_what_is_left_over(across, off):
     known, new = fish(250, 120), fish(250 + across, 250)
-    pieces = part(candidate_of(known | new), [expected_of(known, off=off)])
+    pieces = split_merged_blob(candidate_of(known | new), [expected_of(known, off=off)])
     assert len(pieces) == 2
     assert share(new & ~known, in_frame(pieces[1])) > 0.65
     assert share(known & ~new, in_frame(pieces[1])) < 0.2
@@ -80,22 +81,22 @@ def test_a_fish_that_nobody_knew_is_what_is_left_over(across, off):
 @pytest.mark.parametrize("off", [(0, 0), (15, 25), (-10, -40)])
 def test_a_fish_that_turns_or_was_expected_elsewhere_stays_whole(width, off):
     before, now = fish(250, 200, width=20), fish(250, 200, width=width)
-    assert len(part(candidate_of(now), [expected_of(before, off=off)])) == 1
+    assert len(split_merged_blob(candidate_of(now), [expected_of(before, off=off)])) == 1
 
 
 def test_a_line_at_a_fish_is_no_second_fish():
     before = fish(250, 250)
     now = before.copy()
     now[20:200, 246:252] = True
-    assert len(part(candidate_of(now), [expected_of(before)])) == 1
+    assert len(split_merged_blob(candidate_of(now), [expected_of(before)])) == 1
 
 
 def test_boxes_alone_are_not_cut():
     whole = candidate_of(fish(200, 120) | fish(210, 240))
     box = Candidate(bbox_xyxy_px=whole.bbox_xyxy_px, score=1.0)
-    assert part(box, [expected_of(fish(200, 120))]) == [box]
+    assert split_merged_blob(box, [expected_of(fish(200, 120))]) == [box]
 
 
 def test_a_fish_that_has_gone_gets_no_piece_of_another():
     gone, here = fish(250, 110), fish(250, 250)
-    assert len(part(candidate_of(here), [expected_of(gone), expected_of(here)])) == 1
+    assert len(split_merged_blob(candidate_of(here), [expected_of(gone), expected_of(here)])) == 1

@@ -6,11 +6,11 @@ from onnx import TensorProto, helper, numpy_helper
 
 from stream_dmr.errors import ModelError
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.segmentation.annotations.detections import Annotations
-from stream_dmr.segmentation.masks.crop import CropFishSettings
-from stream_dmr.segmentation.masks.grabcut import GrabCut
-from stream_dmr.segmentation.masks.promptable import PromptableModel
-from stream_dmr.segmentation.masks.segmenters import open_segmenter
+from stream_dmr.segmentation.annotations.annotated_fish import AnnotatedFish
+from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
+from stream_dmr.segmentation.masks.grabcut_segmenter import GrabCutSegmenter
+from stream_dmr.segmentation.masks.open_segmenter import open_segmenter
+from stream_dmr.segmentation.masks.promptable_segmenter import PromptableSegmenter
 
 SIDE = 64
 
@@ -82,7 +82,7 @@ def test_a_bright_fish_lies_where_it_is_in_the_crop(tmp_path, prompts, size):
 def test_models_that_are_no_such_model_are_refused_at_once(tmp_path, changes, complaint):
     path = model(tmp_path / "bad.onnx", **changes)
     with pytest.raises(ModelError, match=complaint) as caught:
-        PromptableModel(path)
+        PromptableSegmenter(path)
     assert "\n" not in str(caught.value)
 
 
@@ -91,8 +91,8 @@ def test_names_and_files_that_are_no_segmenter_are_refused_at_once(tmp_path):
     for name in ("sam", "unet.onx", str(tmp_path / "text.onnx"), str(tmp_path / "none.onnx")):
         settings = CropFishSettings(segmenter=name)
         with pytest.raises(ModelError, match="expected"):
-            CropFish(settings, camera=None, detections=Annotations(boxes={}, masks=None))
+            CropFish(settings, camera=None, finder=AnnotatedFish(boxes={}, masks=None))
 
 
 def test_grabcut_needs_no_file():
-    assert isinstance(open_segmenter("grabcut"), GrabCut)
+    assert isinstance(open_segmenter("grabcut"), GrabCutSegmenter)

@@ -12,9 +12,10 @@ from pydantic import ValidationError
 from stream_dmr.camera import Camera
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.detection.detector import Candidate
-from stream_dmr.segmentation.masks.crop import CropFishSettings, crop_fish
-from stream_dmr.segmentation.segmenter import Segmented, Segmenter
-from stream_dmr.segmentation.tracking.tracked_fish import FollowedFish, TrackFishSettings
+from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
+from stream_dmr.segmentation.masks.cropping import crop_fish
+from stream_dmr.segmentation.segmenter import SegmentedFish, Segmenter
+from stream_dmr.segmentation.tracking.tracked_fish import TrackedFish, TrackFishSettings
 
 WIDTH, HEIGHT = 640, 480
 SEA = 60
@@ -58,11 +59,11 @@ class WholeBox:
     def __init__(self, confidence: float) -> None:
         self._confidence = confidence
 
-    def segment(self, image: np.ndarray, bbox_xyxy_px: np.ndarray) -> Segmented:
+    def segment(self, image: np.ndarray, bbox_xyxy_px: np.ndarray) -> SegmentedFish:
         probability = np.zeros(image.shape[:2], np.float32)
         x0, y0, x1, y1 = bbox_xyxy_px.round().astype(int)
         probability[max(y0, 0) : y1, max(x0, 0) : x1] = self._confidence
-        return Segmented(probability=probability, ends=None)
+        return SegmentedFish(probability=probability, ends=None)
 
 
 def follow(
@@ -75,7 +76,7 @@ def follow(
 ) -> dict[int, list[Found]]:
     """The fish of each frame; `only`: frames that arrive, as a live source drops some."""
     script = Script(frames)
-    fish = FollowedFish(script, TrackFishSettings.model_validate({"min_track_frames": 1, **knobs}))
+    fish = TrackedFish(script, TrackFishSettings.model_validate({"min_track_frames": 1, **knobs}))
     camera = Camera.nominal(width=WIDTH, height=HEIGHT)
     found = {}
     for i in only or range(1, len(frames) + 1):
@@ -268,11 +269,11 @@ def test_a_box_follows_the_edges_of_the_last_sure_mask_by_a_tenth_at_most(
     class Longer:
         """Sees the fish reach on below every box, by an eighth of the box's height."""
 
-        def segment(self, image: np.ndarray, bbox_xyxy_px: np.ndarray) -> Segmented:
+        def segment(self, image: np.ndarray, bbox_xyxy_px: np.ndarray) -> SegmentedFish:
             probability = np.zeros(image.shape[:2], np.float32)
             x0, y0, x1, y1 = bbox_xyxy_px.round().astype(int)
             probability[max(y0, 0) : y1 + (y1 - y0) // 8, max(x0, 0) : x1] = confidence
-            return Segmented(probability=probability, ends=None)
+            return SegmentedFish(probability=probability, ends=None)
 
     found = follow([[climb(i)] for i in range(10)], segmenter=Longer())
     for i in range(2, 11):

@@ -7,11 +7,16 @@ from hypothesis import strategies as st
 from stream_dmr.errors import ModelError
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.detection.unet_detector import UNetDetector
-from stream_dmr.segmentation.network.boxes import box_picture, crop_around, jitter
-from stream_dmr.segmentation.network.inference import UNetSegmenter, _find_ends, _fuse
-from stream_dmr.segmentation.network.network import ENDS_STRIDE, UNet, normalise
-from stream_dmr.segmentation.network.weights import SHIPPED, load_weights, save_weights
-from stream_dmr.segmentation.training.losses import ends_are_right, ends_loss, mask_iou, mask_loss
+from stream_dmr.segmentation.network.box_coverage import box_picture, crop_around, jitter
+from stream_dmr.segmentation.network.unet import ENDS_STRIDE, UNet, normalise
+from stream_dmr.segmentation.network.unet_segmenter import UNetSegmenter, _find_ends, _fuse
+from stream_dmr.segmentation.network.unet_weights import SHIPPED, load_weights, save_weights
+from stream_dmr.segmentation.training.unet_losses import (
+    ends_are_right,
+    ends_loss,
+    mask_iou,
+    mask_loss,
+)
 from stream_dmr.simulation.film import film
 from stream_dmr.simulation.rail_scene import make_scene
 

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from stream_dmr.errors import AnnotationError
-from stream_dmr.segmentation.training.backgrounds import BACKGROUND_PX, draw_background
-from stream_dmr.segmentation.training.bank import Bank, load_or_make_bank, make_bank
-from stream_dmr.segmentation.training.compose import draw_sample
-from stream_dmr.segmentation.training.own_masks import read_annotated
-from stream_dmr.segmentation.training.own_pictures import draw_own, load_own_fish
-from stream_dmr.segmentation.training.patches import PATCH_PX, draw_fish_patch
-from stream_dmr.segmentation.training.sample import Sample
+from stream_dmr.segmentation.training.annotated_images import read_annotated
+from stream_dmr.segmentation.training.annotated_samples import draw_own, load_own_fish
+from stream_dmr.segmentation.training.fish_patches import PATCH_PX, draw_fish_patch
+from stream_dmr.segmentation.training.patch_bank import Bank, load_or_make_bank, make_bank
+from stream_dmr.segmentation.training.random_backgrounds import BACKGROUND_PX, draw_background
+from stream_dmr.segmentation.training.scene_composition import draw_sample
+from stream_dmr.segmentation.training.training_sample import Sample
 
 
 @pytest.fixture(scope="module")

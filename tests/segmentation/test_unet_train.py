@@ -7,9 +7,9 @@ from typer.testing import CliRunner
 
 from stream_dmr.cli.main import app
 from stream_dmr.errors import ModelError, OutputError
-from stream_dmr.segmentation.network.weights import SHIPPED, load_weights
-from stream_dmr.segmentation.training.settings import TrainSettings
-from stream_dmr.segmentation.training.train import TrainObserver, TrainRequest, train
+from stream_dmr.segmentation.network.unet_weights import SHIPPED, load_weights
+from stream_dmr.segmentation.training.train_settings import TrainSettings
+from stream_dmr.segmentation.training.train_unet import TrainObserver, TrainRequest, train
 
 TINY = TrainSettings(
     epochs=2,

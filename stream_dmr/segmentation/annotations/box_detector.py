@@ -1,22 +1,22 @@
-"""Another program's detections, from a file without ids: they are followed like our own."""
+"""Detections of another program, from a boxes file without ids."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from stream_dmr.messages import Frame
-from stream_dmr.segmentation.annotations.boxes import Box
+from stream_dmr.segmentation.annotations.annotated_box import AnnotatedBox
 from stream_dmr.segmentation.detection.detector import Candidate
 
 
 class BoxDetector:
-    """Gives a frame the boxes that a file has for it, as far as they lie in the picture."""
+    """A `Detector` that gives the boxes of a file, clipped to the frame."""
 
-    def __init__(self, frames: Mapping[int, Sequence[Box]]) -> None:
+    def __init__(self, frames: Mapping[int, Sequence[AnnotatedBox]]) -> None:
         self._frames = frames
 
     def find(self, frame: Frame) -> list[Candidate]:
-        """The boxes of a frame by its number."""
+        """The file's boxes of this frame that are at least one pixel wide and high inside it."""
         height, width = frame.image.shape[:2]
         candidates = []
         for box in self._frames.get(frame.frame_index, ()):

@@ -1,8 +1,8 @@
 """Boxes from COCO's JSON (cocodataset.org, "Data format"), as annotation tools export it.
 
-Frames are counted from 1 in the natural order of the pictures' file names. Fish are followed by
-`track_id` or `instance_id`, of the annotation itself or among its `attributes`; without them they
-are for the tracker to follow.
+Frames are counted from 1 in the natural order of the pictures' file names. The track id is
+`track_id` or `instance_id`, of the annotation itself or among its `attributes`; boxes without
+either get `UNKNOWN_ID`.
 """
 
 import json
@@ -12,31 +12,39 @@ from typing import Any
 
 from stream_dmr.errors import AnnotationError
 from stream_dmr.files import natural_order
-from stream_dmr.segmentation.annotations.boxes import UNKNOWN_ID, Box, by_frame, corners
+from stream_dmr.segmentation.annotations.annotated_box import (
+    UNKNOWN_ID,
+    AnnotatedBox,
+    box_from_xywh,
+    group_by_frame,
+)
 
 _ID_NAMES = ("track_id", "instance_id")
-_TOO_MUCH = (OverflowError, RecursionError)  # a number without an end; brackets without number
+_TOO_LARGE = (OverflowError, RecursionError)  # an infinite number; deeply nested brackets
 
 
-def load_coco(text: str, path: Path) -> dict[int, list[Box]]:
-    """Boxes by frame, from a file's text. Raises AnnotationError with what is wrong, and where."""
+def parse_coco(text: str, path: Path) -> dict[int, list[AnnotatedBox]]:
+    """Boxes by frame, from a file's text; `path` is for messages.
+
+    Raises AnnotationError with what was expected, and where.
+    """
     try:
         table = json.loads(text)
         names = {int(image["id"]): str(image["file_name"]) for image in table["images"]}
         annotations = list(table["annotations"])
-    except (ValueError, KeyError, TypeError, AttributeError, *_TOO_MUCH) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, *_TOO_LARGE) as error:
         raise AnnotationError(
             f'{path}: expected COCO\'s JSON with "images" (id, file_name) and "annotations", '
             f"got: {type(error).__name__} {error}"
         ) from None
     order = sorted(names, key=lambda image_id: natural_order(Path(names[image_id])))
     frames = {image_id: number for number, image_id in enumerate(order, start=1)}
-    return by_frame(_boxes(annotations, frames, path))
+    return group_by_frame(_boxes(annotations, frames, path))
 
 
 def _boxes(
     annotations: list[Any], frames: dict[int, int], path: Path
-) -> Iterator[tuple[str, int, Box]]:
+) -> Iterator[tuple[str, int, AnnotatedBox]]:
     for number, annotation in enumerate(annotations, start=1):
         where = f"{path}, annotation {number}"
         try:
@@ -44,21 +52,21 @@ def _boxes(
             x, y, width, height = (float(value) for value in annotation["bbox"])
             track_id = _track_id(annotation)
             score = float(annotation.get("score", 1.0))
-        except (ValueError, KeyError, TypeError, AttributeError, *_TOO_MUCH):
+        except (ValueError, KeyError, TypeError, AttributeError, *_TOO_LARGE):
             raise AnnotationError(
                 f"{where}: expected the image_id of one of the images and a bbox of x, y, width, "
                 f"height, got {str(annotation)[:80]}"
             ) from None
-        box = corners(x, y, width, height, where=where)
+        box = box_from_xywh(x, y, width, height, where=where)
         yield (
             where,
             frame_index,
-            Box(track_id=track_id, bbox_xyxy_px=box, visibility=1.0, score=score),
+            AnnotatedBox(track_id=track_id, bbox_xyxy_px=box, visibility=1.0, score=score),
         )
 
 
 def _track_id(annotation: dict[str, Any]) -> int:
-    """The fish's id as the file has it; UNKNOWN_ID where it has none."""
+    """The annotation's track id; UNKNOWN_ID where it has none."""
     for place in (annotation, annotation.get("attributes") or {}):
         for name in _ID_NAMES:
             if place.get(name) is not None:

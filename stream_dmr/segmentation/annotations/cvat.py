@@ -1,7 +1,7 @@
 """Boxes from CVAT's XML, version 1.1 (docs.cvat.ai, "CVAT"), for videos and for pictures.
 
-CVAT counts frames, pictures and tracks from 0, we from 1. A video's tracks follow fish; boxes of
-pictures don't, so those are for the tracker to follow.
+CVAT counts frames, pictures and tracks from 0, this package from 1. A box inside a video's track
+gets the track's id; a box of a single picture gets `UNKNOWN_ID`.
 """
 
 import xml.etree.ElementTree as ET
@@ -9,21 +9,29 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from stream_dmr.errors import AnnotationError
-from stream_dmr.segmentation.annotations.boxes import UNKNOWN_ID, Box, by_frame, corners
+from stream_dmr.segmentation.annotations.annotated_box import (
+    UNKNOWN_ID,
+    AnnotatedBox,
+    box_from_xywh,
+    group_by_frame,
+)
 
 
-def load_cvat(text: str, path: Path) -> dict[int, list[Box]]:
-    """Boxes by frame, from a file's text. Raises AnnotationError with what is wrong, and where."""
+def parse_cvat(text: str, path: Path) -> dict[int, list[AnnotatedBox]]:
+    """Boxes by frame, from a file's text; `path` is for messages.
+
+    Raises AnnotationError with what was expected, and where.
+    """
     try:
         root = ET.fromstring(text)
     except ET.ParseError as error:
         raise AnnotationError(f"{path}: expected CVAT's XML, got: {error}") from None
     if root.tag != "annotations":
         raise AnnotationError(f"{path}: expected CVAT's <annotations>, got <{root.tag}>")
-    return by_frame(_boxes(root, path))
+    return group_by_frame(_boxes(root, path))
 
 
-def _boxes(root: ET.Element, path: Path) -> Iterator[tuple[str, int, Box]]:
+def _boxes(root: ET.Element, path: Path) -> Iterator[tuple[str, int, AnnotatedBox]]:
     for track in root.iter("track"):
         for box in track.iter("box"):
             where = f"{path}, track {track.get('id')}, frame {box.get('frame')}"
@@ -37,7 +45,7 @@ def _boxes(root: ET.Element, path: Path) -> Iterator[tuple[str, int, Box]]:
 
 def _box(
     element: ET.Element, frame: str | None, track: str | None, where: str
-) -> tuple[str, int, Box]:
+) -> tuple[str, int, AnnotatedBox]:
     try:
         x0, y0, x1, y1 = (float(element.attrib[name]) for name in ("xtl", "ytl", "xbr", "ybr"))
         frame_index = int(frame or "") + 1
@@ -47,5 +55,5 @@ def _box(
             f"{where}: expected a frame's number and a box with xtl, ytl, xbr, ybr, "
             f"got {element.attrib}"
         ) from None
-    box = corners(x0, y0, x1 - x0, y1 - y0, where=where)
-    return where, frame_index, Box(track_id=track_id, bbox_xyxy_px=box, visibility=1.0)
+    box = box_from_xywh(x0, y0, x1 - x0, y1 - y0, where=where)
+    return where, frame_index, AnnotatedBox(track_id=track_id, bbox_xyxy_px=box, visibility=1.0)

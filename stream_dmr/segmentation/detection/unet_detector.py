@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32
 
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.detection.detector import Candidate
-from stream_dmr.segmentation.network.inference import UNetSegmenter
+from stream_dmr.segmentation.network.unet_segmenter import UNetSegmenter
 
 _MULTIPLE_PX = 16  # the network halves its input four times
 _LEAST_PX = 24  # area in the network's picture

@@ -1,6 +1,7 @@
-"""When a track becomes a fish: clearly seen long enough, and inside the zone of the count.
+"""Confirm a track as a fish once it was clearly segmented in enough frames inside the zone.
 
-Whatever moves may be followed; that it is a fish, and no gaff or wave, its masks say.
+The tracker follows whatever moves. Gaffs and waves are told from fish by their masks, which are
+empty or of low confidence.
 """
 
 from collections import Counter
@@ -11,13 +12,14 @@ from pydantic import Field, field_validator
 from stream_dmr.messages import FishCrop
 from stream_dmr.settings import Settings
 
-_MOST_DOUBTFUL = 1000  # tracks that are no fish yet; a run of weeks has many that never are
+# Bounds the memory of a run of weeks; tracks live for seconds, so older ones have ended long ago.
+_MAX_UNCONFIRMED_TRACKS = 1000
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
-class CounterSettings(Settings):
-    """The part of `[track_fish]` that says which tracks count as fish; each counts once."""
+class ConfirmationSettings(Settings):
+    """The part of `[track_fish]` that decides which tracks count as fish; each counts once."""
 
     min_track_frames: int = Field(
         default=4, ge=1, description="frames in which a fish is clearly seen before it counts"
@@ -34,46 +36,48 @@ class CounterSettings(Settings):
 
     @field_validator("zone")
     @classmethod
-    def _has_an_inside(cls, zone: list[float]) -> list[float]:
+    def _has_positive_area(cls, zone: list[float]) -> list[float]:
         left, top, right, bottom = zone
         if not (left < right and top < bottom):
             raise ValueError("left, top, right, bottom with left < right and top < bottom")
         return zone
 
 
-class FishCounter:
-    """Gives fish their ids, from 1, in the order in which they come to count; never one again."""
+class FishConfirmation:
+    """Assigns fish ids, from 1 in the order of confirmation; none is used twice."""
 
-    def __init__(self, settings: CounterSettings) -> None:
+    def __init__(self, settings: ConfirmationSettings) -> None:
         self._settings = settings
-        self._ids: dict[int, int] = {}  # of tracks by their number
-        self._clearly_seen: Counter[int] = Counter()  # frames of those that don't count yet
-        self.count = 0
+        self._fish_ids: dict[int, int] = {}  # by track number
+        self._num_clear_frames: Counter[int] = Counter()  # of unconfirmed tracks
 
-    def track_id(self, crop: FishCrop) -> int | None:
-        """The id of the fish that a track is, by its crop of a frame; None while it is none.
+    def update(self, crop: FishCrop) -> int | None:
+        """Take a track's crop of one frame into account; returns its fish id once confirmed.
 
-        A fish that has been counted keeps its id outside the zone.
+        `crop.track_id` is the track's number. A confirmed fish keeps its id outside the zone. A
+        crop without `mask_confidence` (a given mask) counts as clearly seen.
         """
         number = crop.track_id
-        if number not in self._ids:
+        if number not in self._fish_ids:
             confidence = crop.quality.mask_confidence
             if confidence is None or confidence >= self._settings.min_mask_confidence:
-                self._clearly_seen[number] += 1
-                if len(self._clearly_seen) > _MOST_DOUBTFUL:
-                    del self._clearly_seen[min(self._clearly_seen)]
-            if not self._counts(crop):
+                self._num_clear_frames[number] += 1
+                if len(self._num_clear_frames) > _MAX_UNCONFIRMED_TRACKS:
+                    del self._num_clear_frames[min(self._num_clear_frames)]
+            if not self._is_confirmed_by(crop):
                 return None
-            self.count += 1
-            self._ids[number] = self.count
-            del self._clearly_seen[number]
-        return self._ids[number]
+            self._fish_ids[number] = len(self._fish_ids) + 1
+            del self._num_clear_frames[number]
+        return self._fish_ids[number]
 
-    def _counts(self, crop: FishCrop) -> bool:
+    def _is_confirmed_by(self, crop: FishCrop) -> bool:
         width, height = crop.frame_camera.width, crop.frame_camera.height
         x0, y0, x1, y1 = crop.bbox_xyxy_px.tolist()
         left, top, right, bottom = self._settings.zone
-        is_beside = left * width <= (x0 + x1) / 2 <= right * width
-        is_level = top * height <= (y0 + y1) / 2 <= bottom * height
-        is_seen = self._clearly_seen[crop.track_id] >= self._settings.min_track_frames
-        return is_beside and is_level and is_seen
+        is_in_zone = (
+            left * width <= (x0 + x1) / 2 <= right * width
+            and top * height <= (y0 + y1) / 2 <= bottom * height
+        )
+        return is_in_zone and (
+            self._num_clear_frames[crop.track_id] >= self._settings.min_track_frames
+        )

@@ -1,48 +1,49 @@
-"""Where the fish of a run come from: files that somebody made, or the video itself."""
+"""The source of a run's fish: annotation files, or detection and tracking in the video itself."""
 
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from stream_dmr.messages import FishCrop, Frame
+from stream_dmr.segmentation.annotations.annotated_box import UNKNOWN_ID
+from stream_dmr.segmentation.annotations.annotated_fish import AnnotatedFish, open_annotated_fish
 from stream_dmr.segmentation.annotations.box_detector import BoxDetector
-from stream_dmr.segmentation.annotations.boxes import UNKNOWN_ID
-from stream_dmr.segmentation.annotations.detections import Annotations, Detection, open_annotations
-from stream_dmr.segmentation.annotations.files import load_boxes
-from stream_dmr.segmentation.detection.detectors import DetectFishSettings, open_detector
-from stream_dmr.segmentation.tracking.tracked_fish import FollowedFish, TrackFishSettings
+from stream_dmr.segmentation.annotations.box_files import load_boxes
+from stream_dmr.segmentation.detection.fish_detection import Detection
+from stream_dmr.segmentation.detection.open_detector import DetectFishSettings, open_detector
+from stream_dmr.segmentation.tracking.tracked_fish import TrackedFish, TrackFishSettings
 
 
 @runtime_checkable
 class FishFinder(Protocol):
-    """Which fish are in a frame."""
+    """Finds the fish of each frame: `detect` before the crops are cut, then `admit`."""
 
     @property
     def warnings(self) -> list[str]:
-        """What the user should know of the frames so far, a line each; best read at the end."""
+        """What the user should know of the frames so far, one line each; complete at the end."""
         ...
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """What may be fish in one frame. Raises AnnotationError where its mask can't be used."""
+        """What may be fish in one frame. Raises AnnotationError for an unusable mask."""
         ...
 
     def admit(self, crops: Iterable[FishCrop]) -> list[FishCrop]:
-        """Those of the frame's crops that are of fish, by the fish's ids."""
+        """Those of the frame's crops that show fish, with the fish's ids."""
         ...
 
 
 def open_finder(
     *, boxes: Path | None, masks: Path | None, detect: DetectFishSettings, track: TrackFishSettings
 ) -> FishFinder:
-    """The fish that the files describe; without files, and for boxes without ids, followed ones.
+    """Fish from annotation files where given; tracked ones otherwise, and for boxes without ids.
 
-    Raises AnnotationError or ModelError where what is asked for can't be read.
+    Raises AnnotationError or ModelError where a file cannot be read.
     """
     if boxes is None and masks is None:
-        return FollowedFish(open_detector(detect), track)
+        return TrackedFish(open_detector(detect), track)
     if boxes is None or masks is not None:
-        return open_annotations(boxes=boxes, masks=masks)
+        return open_annotated_fish(boxes=boxes, masks=masks)
     frames = load_boxes(boxes)
     if any(box.track_id == UNKNOWN_ID for found in frames.values() for box in found):
-        return FollowedFish(BoxDetector(frames), track)
-    return Annotations(boxes=frames, masks=None)
+        return TrackedFish(BoxDetector(frames), track)
+    return AnnotatedFish(boxes=frames, masks=None)

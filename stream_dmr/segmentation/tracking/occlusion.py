@@ -1,97 +1,91 @@
-"""What is remembered of a fish that others hide, and who is who once they part.
+"""Identities of fish that were hidden, or merged into one blob, settled when they are seen apart.
 
-While fish are one shape nothing says which part is whose. Each is therefore remembered as it was
-before they met, moved on with the speed that it had; when shapes part, all of them are given to all
-of the fish at once, by place, length, size and colour. So two may even swap what they were given in
-the meantime. The same brings back a fish that went behind something.
+While several fish form one blob, nothing tells which part is whose. Each track therefore keeps a
+snapshot from before they met, predicted at the speed that it had then. When blobs separate, all
+snapshots are assigned to all observations at once, by position, length, area and colour, so that
+even a swap made in the meantime is undone. The same re-identifies a fish that was behind something.
 """
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
-_FARTHEST = 1.5  # lengths between a fish and where it was expected
-_PLACE_STD = 0.25  # lengths
+from stream_dmr.segmentation.tracking.observation import Observation
+
+IMPOSSIBLE = 1e6  # cost of an assignment that is ruled out; above any sum of real costs
+
+# Chosen on simulated crossings (benchmarks/tracking.py) by IDF1; see docs/segmentation.md.
+_MAX_DISTANCE = 1.5  # lengths between the predicted and the observed center
+_POSITION_STD = 0.25  # lengths
 _LOG_LENGTH_STD = 0.3  # fish turn and bend
 _LOG_AREA_STD = 0.7
 _COLOUR_STD = 25.0  # grey levels
-_MOST_COST = 12.0  # a sum of five squares, each about 1
-_MOST_COST_OF_NEW = 5.0  # likewise, of a shape that nobody followed before
-_STAYING = 0.5  # what a shape is cheaper for the fish that has it already
-_SLOWER = 0.95  # speed, from frame to frame, of what is hidden by nothing that is seen
-_NEVER = 1e6
-
-
-@runtime_checkable
-class Seen(Protocol):
-    """A candidate in a frame, as far as memory goes."""
-
-    box: Float[np.ndarray, "4"]
-    middle: Float[np.ndarray, "2"]
-    area: float
-    length: float
-    colour: Float[np.ndarray, "3"]
-    is_piece: bool
-    touches_border: bool
+_MAX_COST = 12.0  # of seven squares (x, y, length, area, three colours), each about 1
+_MAX_COST_OF_NEW = 5.0  # for an observation that no track has followed yet
+_OWNER_DISCOUNT = 0.5  # keeps an observation with its track unless another fits clearly better
+_SPEED_DECAY = 0.95  # per frame, of a fish that no visible blob hides
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
-class Memory:
-    """A fish as it was last seen by itself; place and speed move on from frame to frame."""
+class TrackSnapshot:
+    """A fish as it was last seen separately; position and speed are predicted frame by frame."""
 
-    x: Float[np.ndarray, "4 1"]  # middle x, y; speed per frame, px
-    P: Float[np.ndarray, "4 4"]
-    area: float
-    length: float
-    colour: Float[np.ndarray, "3"]
-    is_covered: bool = False  # by something that is seen
+    state: Float[np.ndarray, "4 1"]  # center x, y in px; speed in px per frame
+    covariance: Float[np.ndarray, "4 4"]
+    area: float  # px^2
+    length: float  # px
+    colour: Float[np.ndarray, "3"]  # mean B, G, R; grey levels
+    is_covered: bool = False  # predicted inside a visible blob, which hides it
 
-    def move(self, F: Float[np.ndarray, "4 4"], Q: Float[np.ndarray, "4 4"]) -> None:
-        """Move on as a Kalman filter that sees nothing."""
-        self.x = F @ self.x
-        self.P = F @ self.P @ F.T + Q
+    def predict(self, F: Float[np.ndarray, "4 4"], Q: Float[np.ndarray, "4 4"]) -> None:
+        """Kalman prediction, without a measurement: x = F x, P = F P F' + Q."""
+        self.state = F @ self.state
+        self.covariance = F @ self.covariance @ F.T + Q
 
-    def stay_inside_one_of(self, boxes: Iterable[Float[np.ndarray, "4"]]) -> None:
-        """Stay in the box that this is in, however it moves; elsewhere move ever more slowly."""
+    def constrain_to_one_of(self, boxes: Iterable[Float[np.ndarray, "4"]]) -> None:
+        """Keep the center inside the first of `boxes` that contains it, however that box moves.
+
+        Outside all of them the fish is not covered, and its speed decays.
+        """
         box = next((box for box in boxes if self.is_inside(box)), None)
         self.is_covered = box is not None
         if box is None:
-            self.x[2:] *= _SLOWER
+            self.state[2:] *= _SPEED_DECAY
             return
         margin = np.minimum(self.length, box[2:] - box[:2]) / 4
-        self.x[:2, 0] = self.x[:2, 0].clip(box[:2] + margin, box[2:] - margin)
+        self.state[:2, 0] = self.state[:2, 0].clip(box[:2] + margin, box[2:] - margin)
 
-    def cost(self, look: Seen) -> float:
-        """How little a candidate is this fish; `_NEVER` where it can't be."""
-        away = look.middle - self.x[:2, 0]
-        if np.hypot(*away) > _FARTHEST * self.length:
-            return _NEVER
-        cost = away @ away / (_PLACE_STD * self.length) ** 2
-        cost += (np.log(look.length / self.length) / _LOG_LENGTH_STD) ** 2
-        cost += (np.log(look.area / self.area) / _LOG_AREA_STD) ** 2
-        cost += np.sum((look.colour - self.colour) ** 2) / _COLOUR_STD**2
-        return float(cost) if cost < _MOST_COST else _NEVER
+    def cost(self, observation: Observation) -> float:
+        """Sum of squared deviations over their variances; `IMPOSSIBLE` beyond the gates."""
+        offset = observation.center - self.state[:2, 0]
+        if np.hypot(*offset) > _MAX_DISTANCE * self.length:
+            return IMPOSSIBLE
+        cost = offset @ offset / (_POSITION_STD * self.length) ** 2
+        cost += (np.log(observation.length / self.length) / _LOG_LENGTH_STD) ** 2
+        cost += (np.log(observation.area / self.area) / _LOG_AREA_STD) ** 2
+        cost += np.sum((observation.colour - self.colour) ** 2) / _COLOUR_STD**2
+        return float(cost) if cost < _MAX_COST else IMPOSSIBLE
 
     def is_inside(self, box: Float[np.ndarray, "4"]) -> bool:
-        """Whether this fish is expected inside a box."""
-        return bool(np.all(self.x[:2, 0] >= box[:2]) and np.all(self.x[:2, 0] <= box[2:]))
+        """True where the predicted center lies inside a box."""
+        return bool(np.all(self.state[:2, 0] >= box[:2]) and np.all(self.state[:2, 0] <= box[2:]))
 
 
-def who_is_who(
-    memories: Sequence[Memory], owned: Sequence[int], looks: Sequence[Seen]
+def reidentify(
+    snapshots: Sequence[TrackSnapshot], owners: Sequence[int], observations: Sequence[Observation]
 ) -> dict[int, int]:
-    """Which memory each look is, by their indices, so that all of it costs least.
+    """The snapshot of each observation, as indices, by the assignment of least total cost.
 
-    Looks begin with those that were given away already: the first to memory `owned[0]`, and so on.
+    The first `len(owners)` observations are already followed, observation i by the track of
+    snapshot `owners[i]`; the others are new. Observations that fit no snapshot are left out.
     """
-    costs = np.array([[memory.cost(look) for look in looks] for memory in memories])
-    costs[:, len(owned) :][costs[:, len(owned) :] > _MOST_COST_OF_NEW] = _NEVER
-    for column, row in enumerate(owned):
-        costs[row, column] = min(costs[row, column], _MOST_COST) - _STAYING
+    costs = np.array([[one.cost(observation) for observation in observations] for one in snapshots])
+    costs[:, len(owners) :][costs[:, len(owners) :] > _MAX_COST_OF_NEW] = IMPOSSIBLE
+    for column, row in enumerate(owners):
+        costs[row, column] = min(costs[row, column], _MAX_COST) - _OWNER_DISCOUNT
     rows, columns = linear_sum_assignment(costs)
     pairs = zip(rows.tolist(), columns.tolist(), strict=True)
-    return {column: row for row, column in pairs if costs[row, column] < _NEVER}
+    return {column: row for row, column in pairs if costs[row, column] < IMPOSSIBLE}

@@ -1,101 +1,65 @@
-"""One followed fish: where it is, where it should be next, and what it looks like."""
+"""One followed fish: its predicted position, size, appearance, and certainty of identity."""
 
 from collections import deque
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from filterpy.kalman import KalmanFilter
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
-from stream_dmr.segmentation.detection.detector import Candidate, whole_pixels
-from stream_dmr.segmentation.tracking.occlusion import Memory
-from stream_dmr.segmentation.tracking.split_blobs import Expected, extent
+from stream_dmr.segmentation.detection.detector import Candidate
+from stream_dmr.segmentation.tracking.observation import Observation, fraction_inside
+from stream_dmr.segmentation.tracking.occlusion import IMPOSSIBLE, TrackSnapshot
+from stream_dmr.segmentation.tracking.split_blobs import PredictedSilhouette
 
-# Standard deviations; those of motion are fractions of the fish's size, so that any zoom will do.
-_PLACE_STD = 0.08  # of a candidate's middle
+# Chosen on simulated scenes and crossings (benchmarks/tracking.py) by IDF1 and fish counted; see
+# docs/segmentation.md. Lengths are fractions of the fish's size, so that any zoom will do.
+_POSITION_STD = 0.08  # of a candidate's center
 _SPEED_STD = 0.5  # of a new fish, per frame
 _ACCELERATION_STD = 0.06  # per frame squared
 _LOG_AREA_STD = 0.5  # from frame to frame: flatfish turn edge-on within three
 _COLOUR_STD = 25.0  # grey levels: one side of a flatfish is dark, and turning shades it
-_MOST_COST = 25.0  # a sum of four squares, each about 1
-NEVER = 1e6
-_FARTHEST = 1.2  # sizes between a fish and where it was expected
-_SHORTER = 0.93  # times its length a fish may seem in the next frame, turning to or fro
-_PIECE_DOUBT = 9.0  # times the variance of a candidate's middle is that of a piece's
-_LEARN = 0.35  # of a fish's size and colour, per frame
-_FLEETING = 2  # frames: what was seen in no more is not waited for
-_MOST_WAITED = 30  # frames that two fish may stay one candidate
-_BEFORE = 3  # frames before the first in which fish are seen to be one
-_SETTLED = 5  # frames by itself
+_MAX_COST = 25.0  # of six squares (x, y, area, three colours), each about 1
+_MAX_DISTANCE = 1.2  # sizes between the predicted and the observed center
+_MAX_SHORTENING = 0.93  # of the length, per frame: a fish that turns seems shorter than it is
+_PIECE_VARIANCE_RATIO = 9.0  # variance of a piece's center over that of a whole candidate's
+_LEARNING_RATE = 0.35  # of area and colour, per frame
+_MIN_HIDEABLE_FRAMES = 3  # frames seen from which on a track is kept while another fish hides it
+_MAX_MERGED_FRAMES = 30  # that fish may stay merged in one candidate
+_SNAPSHOT_DELAY = 3  # frames: silhouettes are wrong some frames before a merge shows
+_SETTLING_FRAMES = 5  # consecutive frames seen separately after which an identity is certain
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Sighting:
-    """One followed fish in one frame."""
+class TrackedCandidate:
+    """A track's candidate in one frame."""
 
-    number: int  # of the track; not a fish's id yet
+    track_number: int  # from 1; a fish id is given at confirmation
     candidate: Candidate
     visible_fraction: float  # 0 to 1
 
 
-class Look:
-    """What a candidate looks like to the tracker."""
-
-    def __init__(
-        self,
-        image: UInt8[np.ndarray, "H W 3"],
-        candidate: Candidate,
-        *,
-        whole: Candidate | None = None,
-    ) -> None:
-        """`whole`: the candidate that this is a piece of."""
-        self.candidate, self.whole, self.is_piece = candidate, whole, whole is not None
-        self.box = candidate.bbox_xyxy_px
-        self.middle = (self.box[:2] + self.box[2:]) / 2
-        x0, y0, x1, y1 = whole_pixels(self.box)
-        fish = candidate.foreground
-        if fish is None:  # a box's corners are sea
-            fish = np.zeros((y1 - y0, x1 - x0), np.uint8)
-            axes = ((x1 - x0) // 3, (y1 - y0) // 3)
-            cv2.ellipse(fish, ((x1 - x0) // 2, (y1 - y0) // 2), axes, 0, 0, 360, 1, cv2.FILLED)
-        self.area = float(max(1, np.count_nonzero(fish)))
-        self.length = extent(fish > 0)[1]
-        part = image[y0:y1, x0:x1]
-        self.colour = np.array(
-            cv2.mean(part, fish[: part.shape[0], : part.shape[1]].astype(np.uint8))[:3]
-        )
-        height, width = image.shape[:2]
-        self.touches_border = bool(min(x0, y0, width - x1, height - y1) <= 1)
-
-    @property
-    def outer_box(self) -> Float[np.ndarray, "4"]:
-        """The box of the whole candidate."""
-        return self.box if self.whole is None else self.whole.bbox_xyxy_px
-
-    def share_in(self, box: Float[np.ndarray, "4"]) -> float:
-        """The share of this box that lies in another."""
-        return share_of(self.box, box)
-
-
 class Track:
-    """One fish, followed."""
+    """One fish, followed by a constant-velocity Kalman filter on the center of its box."""
 
-    def __init__(self, look: Look, number: int, frame_index: int) -> None:
-        self.look, self.number, self.frame_index = look, number, frame_index
-        self._whole = look  # as last seen by itself; pieces would lead it astray, bit by bit
-        self.area, self.colour, self.length = look.area, look.colour, look.length
-        self.was_alone = not look.is_piece  # once at least: what is always a piece may be no fish
-        self.lost_frames, self.frames_seen, self._waited = 0, 1, 0
-        self.memory: Memory | None = None  # while it is not sure who this is
-        self._before: deque[Memory] = deque(maxlen=_BEFORE)  # of the frames in which it was sure
-        self._alone_frames = 1
-        self._filter = KalmanFilter(dim_x=4, dim_z=2)  # middle x, y; speed per frame
-        self._filter.x = np.array([*look.middle, 0.0, 0.0])[:, None]
+    def __init__(self, observation: Observation, number: int, frame_index: int) -> None:
+        """`frame_index`: the frame of the first observation."""
+        self.observation, self.number, self.frame_index = observation, number, frame_index
+        # As last seen separately: following pieces, position and size would drift.
+        self._whole = observation
+        self.area, self.colour = observation.area, observation.colour
+        self.length = observation.length
+        self.was_separate = not observation.is_piece  # what is always a piece may be no fish
+        self.lost_frames, self.frames_seen, self._merged_frames = 0, 1, 0
+        self.snapshot: TrackSnapshot | None = None  # None while the identity is certain
+        self._history: deque[TrackSnapshot] = deque(maxlen=_SNAPSHOT_DELAY)
+        self._separate_frames = 1
+        self._filter = KalmanFilter(dim_x=4, dim_z=2)  # center x, y; speed per frame
+        self._filter.x = np.array([*observation.center, 0.0, 0.0])[:, None]
         self._filter.H = np.eye(2, 4)
-        self._filter.R = np.eye(2) * (_PLACE_STD * self.size) ** 2
-        self._filter.P = np.diag([_PLACE_STD**2] * 2 + [_SPEED_STD**2] * 2) * self.size**2
-        self._before.append(self._now())
+        self._filter.R = np.eye(2) * (_POSITION_STD * self.size) ** 2
+        self._filter.P = np.diag([_POSITION_STD**2] * 2 + [_SPEED_STD**2] * 2) * self.size**2
+        self._history.append(self._current_snapshot())
 
     @property
     def size(self) -> float:
@@ -103,155 +67,144 @@ class Track:
         return float(max(self._whole.box[2:] - self._whole.box[:2]))
 
     @property
-    def middle(self) -> Float[np.ndarray, "2"]:
-        """Where the fish is, or is expected, px."""
+    def center(self) -> Float[np.ndarray, "2"]:
+        """Where the fish is, or is predicted to be; frame x, y in px."""
         return self._filter.x[:2, 0]
 
+    @property
+    def may_be_hidden(self) -> bool:
+        """True once it was seen for long enough to be kept while another fish hides it."""
+        return self.frames_seen >= _MIN_HIDEABLE_FRAMES
+
+    @property
+    def is_settled(self) -> bool:
+        """True once it was seen separately for so long that its identity is certain again."""
+        return self.lost_frames == 0 and self._separate_frames >= _SETTLING_FRAMES
+
     def predict(self, frame_index: int) -> None:
-        """Move on to a frame; a fish is lost there until it is updated."""
+        """Predict to a frame; the fish counts as lost there until it is updated."""
         dt = frame_index - self.frame_index
         self.frame_index = frame_index
         self.lost_frames += dt
         F = np.eye(4)
         F[:2, 2:] = dt * np.eye(2)
-        drift = np.vstack([dt**2 / 2 * np.eye(2), dt * np.eye(2)])
-        Q = drift @ drift.T * (_ACCELERATION_STD * self.size) ** 2
+        # Q = G G' sigma_a^2 for a constant acceleration within the step
+        G = np.vstack([dt**2 / 2 * np.eye(2), dt * np.eye(2)])
+        Q = G @ G.T * (_ACCELERATION_STD * self.size) ** 2
         self._filter.predict(F=F, Q=Q)
-        for memory in self._before if self.memory is None else [self.memory]:
-            memory.move(F, Q)
+        for snapshot in self._history if self.snapshot is None else [self.snapshot]:
+            snapshot.predict(F, Q)
 
-    @property
-    def may_hide(self) -> bool:
-        """Whether this was seen for long enough to be taken for a fish that another one hides."""
-        return self.frames_seen > _FLEETING
-
-    def wait(self, look: Look) -> None:
-        """Another fish hides this one, or it hides the other: it is somewhere in the candidate."""
-        self._waited += 1
-        if self._waited > _MOST_WAITED:
+    def merge_into(self, observation: Observation) -> None:
+        """Keep a fish that is hidden, or hides another, somewhere inside this candidate."""
+        self._merged_frames += 1
+        if self._merged_frames > _MAX_MERGED_FRAMES:
             return
         self.lost_frames = 1
-        quarter = np.minimum(self.look.box[2:] - self.look.box[:2], look.box[2:] - look.box[:2]) / 4
-        inside = self.middle.clip(look.box[:2] + quarter, look.box[2:] - quarter)
-        self._filter.x[:2, 0] = inside
-        self.remember()
+        own, other = self.observation.box, observation.box
+        quarter = np.minimum(own[2:] - own[:2], other[2:] - other[:2]) / 4
+        self._filter.x[:2, 0] = self.center.clip(other[:2] + quarter, other[2:] - quarter)
+        self.make_uncertain()
 
-    def update(self, look: Look) -> None:
-        """Take a candidate for this fish."""
-        self.look, self.lost_frames, self._waited = look, 0, 0
+    def update(self, observation: Observation) -> None:
+        """Take an observation for this fish."""
+        self.observation, self.lost_frames, self._merged_frames = observation, 0, 0
         self.frames_seen += 1
-        self._alone_frames = 0 if look.is_piece else self._alone_frames + 1
-        if look.is_piece and self.was_alone:
-            self._filter.update(look.middle[:, None], R=_PIECE_DOUBT * self._filter.R)
+        self._separate_frames = 0 if observation.is_piece else self._separate_frames + 1
+        if observation.is_piece and self.was_separate:
+            self._filter.update(
+                observation.center[:, None], R=_PIECE_VARIANCE_RATIO * self._filter.R
+            )
             return
-        self._whole = look
-        self.was_alone = not look.is_piece
-        self.length = max(look.length, _SHORTER * self.length)
-        self._filter.update(look.middle[:, None])
-        rate = max(_LEARN, 1 / self.frames_seen)
-        if not look.touches_border or look.area > self.area:  # what is cut off shows too little
-            self.area *= (look.area / self.area) ** rate
-        self.colour = self.colour + rate * (look.colour - self.colour)
-        if self.memory is None:
-            self._before.append(self._now())
+        self._whole = observation
+        self.was_separate = not observation.is_piece
+        self.length = max(observation.length, _MAX_SHORTENING * self.length)
+        self._filter.update(observation.center[:, None])
+        rate = max(_LEARNING_RATE, 1 / self.frames_seen)
+        if not observation.touches_border or observation.area > self.area:  # else it is cut off
+            self.area *= (observation.area / self.area) ** rate
+        self.colour = self.colour + rate * (observation.colour - self.colour)
+        if self.snapshot is None:
+            self._history.append(self._current_snapshot())
 
-    def _now(self) -> Memory:
-        return Memory(
-            x=self._filter.x.copy(),
-            P=self._filter.P.copy(),
+    def _current_snapshot(self) -> TrackSnapshot:
+        return TrackSnapshot(
+            state=self._filter.x.copy(),
+            covariance=self._filter.P.copy(),
             area=self.area,
             length=self.length,
             colour=self.colour,
         )
 
-    def remember(self) -> Memory:
-        """From now on it is not sure who this is: keep in mind what it was a little earlier.
-
-        The shapes of fish that meet are wrong some frames before that shows.
-        """
-        if self.memory is None:
-            self.memory = self._before[0]
-        return self.memory
-
-    @property
-    def is_sure(self) -> bool:
-        """Whether this was seen by itself for so long that what came before is settled."""
-        return self.lost_frames == 0 and self._alone_frames >= _SETTLED
+    def make_uncertain(self) -> TrackSnapshot:
+        """Mark the identity as uncertain; returns the snapshot from before it became so."""
+        if self.snapshot is None:
+            self.snapshot = self._history[0]
+        return self.snapshot
 
     def settle(self) -> None:
-        """This is who it seems to be."""
-        self.memory = None
-        self._before.clear()
-        self._before.append(self._now())
+        """Mark the identity as certain."""
+        self.snapshot = None
+        self._history.clear()
+        self._history.append(self._current_snapshot())
 
-    def become(self, number: int, memory: Memory) -> None:
-        """Be this fish from now on, here and as it looks now."""
+    def take_identity(self, number: int, snapshot: TrackSnapshot) -> None:
+        """Continue as another fish: with its number and features, at this track's position."""
         if number != self.number:
-            self.number, self.memory = number, memory
-            self.area, self.length, self.colour = memory.area, memory.length, memory.colour
+            self.number, self.snapshot = number, snapshot
+            self.area, self.length, self.colour = snapshot.area, snapshot.length, snapshot.colour
 
-    def resume(self, look: Look) -> None:
-        """Be seen again, after a gap."""
-        assert self.memory is not None
-        self._filter.x, self._filter.P = self.memory.x.copy(), self.memory.P.copy()
-        self.update(look)
+    def resume(self, observation: Observation) -> None:
+        """Continue from the snapshot with an observation after a gap."""
+        snapshot = self.make_uncertain()
+        self._filter.x, self._filter.P = snapshot.state.copy(), snapshot.covariance.copy()
+        self.update(observation)
 
-    def cost(self, look: Look) -> float:
-        """How little a candidate is this fish, as a sum of squares over their variances."""
-        away = look.middle - self.middle
-        if np.hypot(*away) > _FARTHEST * max(self.size, 1.0):
-            return NEVER
-        place = self._filter.P[:2, :2] + self._filter.R
-        growth = np.log(look.area / self.area)
-        if look.touches_border:
+    def cost(self, observation: Observation) -> float:
+        """Sum of squared deviations over their variances; `IMPOSSIBLE` beyond the gates."""
+        offset = observation.center - self.center
+        if np.hypot(*offset) > _MAX_DISTANCE * max(self.size, 1.0):
+            return IMPOSSIBLE
+        S = self._filter.P[:2, :2] + self._filter.R  # S = HPH' + R
+        growth = np.log(observation.area / self.area)
+        if observation.touches_border:
             growth = max(growth, 0.0)
-        cost = away @ np.linalg.solve(place, away) + (growth / _LOG_AREA_STD) ** 2 / self._patience
-        cost += np.sum((look.colour - self.colour) ** 2) / _COLOUR_STD**2
-        return float(cost) if cost < _MOST_COST else NEVER
+        num_steps = float(max(1, self.lost_frames))  # in which an unseen fish may have turned
+        cost = offset @ np.linalg.solve(S, offset) + (growth / _LOG_AREA_STD) ** 2 / num_steps
+        cost += np.sum((observation.colour - self.colour) ** 2) / _COLOUR_STD**2
+        return float(cost) if cost < _MAX_COST else IMPOSSIBLE
 
-    @property
-    def _patience(self) -> float:
-        """What a fish turns in the frames in which it was not seen."""
-        return float(max(1, self.lost_frames))
+    def fraction_inside(self, box: Float[np.ndarray, "4"]) -> float:
+        """The fraction of this fish's predicted box that lies inside `box`."""
+        return fraction_inside(self._whole.box + np.tile(self._predicted_offset, 2), box)
 
-    def share_in(self, box: Float[np.ndarray, "4"]) -> float:
-        """The share of the box where this fish is expected that lies in another."""
-        return share_of(self._whole.box + np.tile(self._way, 2), box)
-
-    def expected(self) -> Expected | None:
-        """The fish's last shape, moved on; None where the detector gives no shapes."""
+    def predicted_silhouette(self) -> PredictedSilhouette | None:
+        """The last separate silhouette at its predicted position; None from boxes alone."""
         shape = self._whole.candidate.foreground
-        corner = self._whole.box[:2] + self._way
         if shape is None:
             return None
-        return Expected(
+        return PredictedSilhouette(
             shape=shape,
-            corner=corner,
+            corner=self._whole.box[:2] + self._predicted_offset,
             length_px=self.length,
             area_px=self.area,
-            is_whole=self.was_alone,
+            is_whole=self.was_separate,
         )
 
     @property
-    def _way(self) -> Float[np.ndarray, "2"]:
-        """From where the whole fish was seen to where it is expected, px."""
-        return self.middle - self._whole.middle
+    def _predicted_offset(self) -> Float[np.ndarray, "2"]:
+        """From the center last seen separately to the predicted one, px."""
+        return self.center - self._whole.center
 
-    def is_inside(self, width: int, height: int) -> bool:
-        """Whether the fish is in the picture, as far as one can tell."""
-        return bool(np.all(self.middle >= 0) and np.all(self.middle <= [width, height]))
+    def is_in_frame(self, width: int, height: int) -> bool:
+        """True where the predicted center lies inside the frame."""
+        return bool(np.all(self.center >= 0) and np.all(self.center <= [width, height]))
 
-    def sighting(self) -> Sighting:
-        """This frame's part of the track."""
-        is_cut = self.look.touches_border
-        return Sighting(
-            number=self.number,
-            candidate=self.look.candidate,
-            visible_fraction=min(1.0, self.look.area / self.area) if is_cut else 1.0,
+    def tracked_candidate(self) -> TrackedCandidate:
+        """This frame's candidate; at the frame's border its visible fraction follows its area."""
+        is_cut = self.observation.touches_border
+        return TrackedCandidate(
+            track_number=self.number,
+            candidate=self.observation.candidate,
+            visible_fraction=min(1.0, self.observation.area / self.area) if is_cut else 1.0,
         )
-
-
-def share_of(box: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> float:
-    """The share of a box that lies in another."""
-    overlap = np.minimum(box[2:], other[2:]) - np.maximum(box[:2], other[:2])
-    return float(np.prod(np.maximum(overlap, 0)) / max(np.prod(box[2:] - box[:2]), 1e-9))

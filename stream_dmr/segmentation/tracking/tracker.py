@@ -1,11 +1,9 @@
-"""Who is who from frame to frame: each fish keeps its id through gaps and crossings.
+"""Multi-object tracking: each fish keeps its number through gaps, merged blobs and crossings.
 
-A constant-velocity Kalman filter per fish and the cheapest assignment of all fish to all
-candidates, as in Bewley et al. ("Simple online and realtime tracking", ICIP 2016). Where two fish
-meet their boxes say little, so size and colour weigh as well, and a candidate that swallows two
-fish is neither of them; who is who when they part is settled by `memory`. filterpy and SciPy do the
-work: the tracking libraries that allow this use either bring a second OpenCV (`trackers`), forbid
-today's NumPy (`norfair`) or know boxes alone.
+A constant-velocity Kalman filter per fish and the cheapest assignment of fish to candidates, after
+Bewley et al., "Simple online and realtime tracking", ICIP 2016. Where fish meet, their boxes say
+little, so area and colour weigh as well; a blob that contains several fish is split by
+`split_blobs` or assigned to none of them, and `occlusion` settles their identities afterwards.
 """
 
 from collections.abc import Sequence
@@ -16,28 +14,31 @@ from scipy.optimize import linear_sum_assignment
 
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.detection.detector import Candidate
-from stream_dmr.segmentation.tracking.occlusion import who_is_who
-from stream_dmr.segmentation.tracking.split_blobs import part
-from stream_dmr.segmentation.tracking.track import NEVER, Look, Sighting, Track
+from stream_dmr.segmentation.tracking.observation import Observation
+from stream_dmr.segmentation.tracking.occlusion import IMPOSSIBLE, reidentify
+from stream_dmr.segmentation.tracking.split_blobs import split_merged_blob
+from stream_dmr.segmentation.tracking.track import Track, TrackedCandidate
 from stream_dmr.settings import Settings
 
-_SWALLOWED = 0.55  # of a fish's expected box inside a candidate
-_SWOLLEN = 1.3  # times the larger of two fish: a candidate that is both
-_BESIDE = 0.3  # of a candidate inside a followed fish's box: a part of it, no new fish
-_COVERED_FRAMES = 30  # that another fish may hide one
-_KNOWN = 8  # frames after which a fish is known well enough to be known again
+# Chosen on simulated scenes and crossings (benchmarks/tracking.py) by IDF1 and fish counted; see
+# docs/segmentation.md.
+_MIN_MERGED_FRACTION = 0.55  # of a fish's predicted box inside a candidate that contains the fish
+_MIN_MERGED_AREA_RATIO = 1.3  # of a merged blob over the largest fish in it
+_MAX_OVERLAP_OF_NEW = 0.3  # of a new candidate inside a followed fish's box; above, it is a part
+_MAX_COVERED_FRAMES = 30  # that a fish may be hidden by another one
+_MIN_KNOWN_FRAMES = 8  # frames seen before a fish can be re-identified
 
 
 class TrackerSettings(Settings):
     """The part of `[track_fish]` that says how fish are followed from frame to frame."""
 
     max_lost_frames: int = Field(
-        default=7, ge=0, description="a fish unseen for more frames in a row is gone"
+        default=7, ge=0, description="a fish unseen for more consecutive frames is gone"
     )
     max_hidden_frames: int = Field(
         default=0,
         ge=0,
-        description="a fish lost in the open is known again within so many frames; 0 at a rail, "
+        description="a fish lost in the open is re-identified within so many frames; 0 at a rail, "
         "where the next fish soon hangs in its place",
     )
     min_score: float = Field(
@@ -46,145 +47,188 @@ class TrackerSettings(Settings):
 
 
 class Tracker:
-    """Follows every candidate; which of the tracks are fish is for others to say."""
+    """Follows every candidate; `confirmation` decides which tracks are fish."""
 
     def __init__(self, settings: TrackerSettings) -> None:
         self._settings = settings
         self._tracks: list[Track] = []
-        self._hidden: list[Track] = []  # lost for longer, but perhaps behind something
-        self._started = 0
+        self._hidden: list[Track] = []  # lost for longer, but may come out from behind something
+        self._num_started = 0
 
-    def step(self, frame: Frame, candidates: Sequence[Candidate]) -> list[Sighting]:
-        """The tracks seen in a frame, by number. Frames must come in order; some may be missing."""
-        looks = [Look(frame.image, c) for c in candidates if c.score >= self._settings.min_score]
+    def step(self, frame: Frame, candidates: Sequence[Candidate]) -> list[TrackedCandidate]:
+        """The tracks seen in a frame. Frames must come in order; some may be missing."""
+        observations = [
+            Observation(frame.image, candidate)
+            for candidate in candidates
+            if candidate.score >= self._settings.min_score
+        ]
         for track in (*self._tracks, *self._hidden):
             track.predict(frame.frame_index)
-        looks = [piece for look in looks for piece in self._part(frame, look)]
-        swallowed = self._swallowed(looks)
-        looks = [look for i, look in enumerate(looks) if i not in swallowed]
-        free = self._assign(looks)
-        self._hide(looks)
+        observations = [piece for one in observations for piece in self._split(frame, one)]
+        observations = self._without_merged(observations)
+        unassigned = self._assign(observations)
+        self._keep_covered(observations)
         self._drop_lost(frame)
-        free = self._recognise(free)
-        seen = [track for track in self._tracks if track.lost_frames == 0]
-        for look in free:
-            is_beside = not any(look.share_in(track.look.box) > _BESIDE for track in seen)
-            if look.is_piece or is_beside:
-                self._started += 1
-                self._tracks.append(Track(look, self._started, frame.frame_index))
-        return [t.sighting() for t in self._tracks if t.lost_frames == 0 and t.was_alone]
-
-    def _part(self, frame: Frame, look: Look) -> list[Look]:
-        """A candidate, or its pieces where several fish share it."""
-        inside = [t for t in self._tracks if t.may_hide and t.share_in(look.box) > _SWALLOWED]
-        largest = max((track.area for track in inside), default=np.inf)
-        if look.area < _SWOLLEN * largest or any(t.look.touches_border for t in inside):
-            return [look]
-        expected = [track.expected() for track in inside]
-        pieces = part(look.candidate, [one for one in expected if one is not None])
-        if len(pieces) < 2:
-            return [look]
-        return [Look(frame.image, piece, whole=look.candidate) for piece in pieces]
-
-    def _swallowed(self, looks: Sequence[Look]) -> set[int]:
-        """The candidates that are several fish at once; those fish wait until they part."""
-        found = set()
-        for i, look in enumerate(looks):
-            inside = [t for t in self._tracks if t.may_hide and t.share_in(look.box) > _SWALLOWED]
-            largest = max((track.area for track in inside), default=0.0)
-            if len(inside) > 1 and look.area > _SWOLLEN * largest:
-                found.add(i)
-                for track in inside:
-                    track.wait(look)
-        return found
-
-    def _hide(self, looks: Sequence[Look]) -> None:
-        """Let fish wait that should be where another one has just been seen: they are behind it."""
-        for track in self._tracks:
-            if track.lost_frames > 0 and track.may_hide:
-                for look in looks:
-                    if track.share_in(look.box) > _SWALLOWED:
-                        track.wait(look)
-                        break
-
-    def _assign(self, looks: Sequence[Look]) -> list[Look]:
-        """Give each track its candidate; the candidates left over are returned."""
-        if not self._tracks or not looks:
-            return list(looks)
-        costs = np.array([[track.cost(look) for look in looks] for track in self._tracks])
-        taken = set()
-        for row, column in zip(*linear_sum_assignment(costs), strict=True):
-            if costs[row, column] < NEVER:
-                self._tracks[row].update(looks[column])
-                taken.add(column)
-        return [look for i, look in enumerate(looks) if i not in taken]
-
-    def _drop_lost(self, frame: Frame) -> None:
-        height, width = frame.image.shape[:2]
-        tracks = [track for track in self._tracks if track.is_inside(width, height)]
-        most = self._settings.max_lost_frames
-        self._tracks = [track for track in tracks if track.lost_frames <= most]
-        gone = [track for track in tracks if track.lost_frames > most]
-        self._hidden = [
-            track
-            for track in (*self._hidden, *gone)
-            if track.lost_frames - 1 <= self._most_hidden_frames(track)  # it may be seen yet
-            and track.frames_seen >= _KNOWN
-            and not track.look.touches_border
+        self._start_tracks(self._reidentify(unassigned), frame.frame_index)
+        return [
+            t.tracked_candidate() for t in self._tracks if t.lost_frames == 0 and t.was_separate
         ]
 
-    def _most_hidden_frames(self, track: Track) -> int:
-        is_covered = track.memory is not None and track.memory.is_covered
-        return max(self._settings.max_hidden_frames, _COVERED_FRAMES if is_covered else 0)
+    def _fish_inside(self, observation: Observation) -> list[Track]:
+        """The tracks whose predicted box lies mostly inside an observation's."""
+        return [
+            track
+            for track in self._tracks
+            if track.may_be_hidden and track.fraction_inside(observation.box) > _MIN_MERGED_FRACTION
+        ]
 
-    def _recognise(self, free: Sequence[Look]) -> list[Look]:
-        """Say who is who among fish that were one, or were lost; the looks of others remain."""
+    def _split(self, frame: Frame, observation: Observation) -> list[Observation]:
+        """The pieces of a blob that several fish share; `[observation]` for any other."""
+        fish = self._fish_inside(observation)
+        largest = max((track.area for track in fish), default=np.inf)
+        is_merged = observation.area >= _MIN_MERGED_AREA_RATIO * largest
+        if not is_merged or any(track.observation.touches_border for track in fish):
+            return [observation]
+        silhouettes = [track.predicted_silhouette() for track in fish]
+        pieces = split_merged_blob(
+            observation.candidate, [one for one in silhouettes if one is not None]
+        )
+        if len(pieces) < 2:
+            return [observation]
+        return [Observation(frame.image, one, whole=observation.candidate) for one in pieces]
+
+    def _without_merged(self, observations: Sequence[Observation]) -> list[Observation]:
+        """Drop observations that contain several fish; those fish are kept inside them."""
+        separate = []
+        for observation in observations:
+            fish = self._fish_inside(observation)
+            largest = max((track.area for track in fish), default=0.0)
+            if len(fish) > 1 and observation.area > _MIN_MERGED_AREA_RATIO * largest:
+                for track in fish:
+                    track.merge_into(observation)
+            else:
+                separate.append(observation)
+        return separate
+
+    def _assign(self, observations: Sequence[Observation]) -> list[Observation]:
+        """Update each track with its observation; returns the unassigned observations."""
+        if not self._tracks or not observations:
+            return list(observations)
+        costs = np.array([[track.cost(one) for one in observations] for track in self._tracks])
+        assigned = set()
+        for row, column in zip(*linear_sum_assignment(costs), strict=True):
+            if costs[row, column] < IMPOSSIBLE:
+                self._tracks[row].update(observations[column])
+                assigned.add(column)
+        return [one for i, one in enumerate(observations) if i not in assigned]
+
+    def _keep_covered(self, observations: Sequence[Observation]) -> None:
+        """Keep lost fish that are predicted where another one has just been seen: behind it."""
         for track in self._tracks:
-            if track.frames_seen >= _KNOWN and (track.lost_frames > 0 or track.look.is_piece):
-                track.remember()
-        unsure = [t for t in (*self._tracks, *self._hidden) if t.memory is not None]
-        young = [t for t in self._tracks if t.frames_seen < _KNOWN and t.lost_frames == 0]
-        new = [*free, *(track.look for track in young)]
-        new = [look for look in new if not look.is_piece and not look.touches_border]
-        taken = self._identify(unsure, new)
-        self._tracks = [t for t in self._tracks if t not in young or t.look not in taken]
+            if track.lost_frames > 0 and track.may_be_hidden:
+                for observation in observations:
+                    if track.fraction_inside(observation.box) > _MIN_MERGED_FRACTION:
+                        track.merge_into(observation)
+                        break
+
+    def _drop_lost(self, frame: Frame) -> None:
+        """Drop tracks that left the frame or were lost for too long, unless they may be hidden."""
+        height, width = frame.image.shape[:2]
+        tracks = [track for track in self._tracks if track.is_in_frame(width, height)]
+        max_lost_frames = self._settings.max_lost_frames
+        self._tracks = [track for track in tracks if track.lost_frames <= max_lost_frames]
+        lost = [track for track in tracks if track.lost_frames > max_lost_frames]
+        self._hidden = [
+            track
+            for track in (*self._hidden, *lost)
+            if track.lost_frames - 1 <= self._max_hidden_frames(track)  # this frame may show it
+            and track.frames_seen >= _MIN_KNOWN_FRAMES
+            and not track.observation.touches_border
+        ]
+
+    def _max_hidden_frames(self, track: Track) -> int:
+        is_covered = track.snapshot is not None and track.snapshot.is_covered
+        return max(self._settings.max_hidden_frames, _MAX_COVERED_FRAMES if is_covered else 0)
+
+    def _start_tracks(self, observations: Sequence[Observation], frame_index: int) -> None:
+        """Start a track for each observation that is no part of a fish that is seen."""
+        seen = [track for track in self._tracks if track.lost_frames == 0]
+        for observation in observations:
+            is_apart = not any(
+                observation.fraction_inside(track.observation.box) > _MAX_OVERLAP_OF_NEW
+                for track in seen
+            )
+            if observation.is_piece or is_apart:
+                self._num_started += 1
+                self._tracks.append(Track(observation, self._num_started, frame_index))
+
+    def _reidentify(self, unassigned: Sequence[Observation]) -> list[Observation]:
+        """Settle the identities of fish that were merged or lost; returns what is still unassigned.
+
+        Tracks too young to be known count as new observations: they may be an older fish.
+        """
+        for track in self._tracks:
+            is_unclear = track.lost_frames > 0 or track.observation.is_piece
+            if is_unclear and track.frames_seen >= _MIN_KNOWN_FRAMES:
+                track.make_uncertain()
+        uncertain = [t for t in (*self._tracks, *self._hidden) if t.snapshot is not None]
+        young = [
+            t for t in self._tracks if t.frames_seen < _MIN_KNOWN_FRAMES and t.lost_frames == 0
+        ]
+        new = [*unassigned, *(track.observation for track in young)]
+        new = [one for one in new if not one.is_piece and not one.touches_border]
+        taken = self._exchange(uncertain, new)
+        self._tracks = [t for t in self._tracks if t not in young or t.observation not in taken]
         self._tracks += [track for track in self._hidden if track.lost_frames == 0]
         self._hidden = [track for track in self._hidden if track.lost_frames > 0]
-        self._settle(unsure)
-        return [look for look in free if look not in taken]
+        self._settle(uncertain)
+        return [one for one in unassigned if one not in taken]
 
-    def _identify(self, unsure: Sequence[Track], new: Sequence[Look]) -> list[Look]:
-        """Give their looks and new ones to the fish that they are likeliest; returns those given.
+    def _exchange(
+        self, uncertain: Sequence[Track], new: Sequence[Observation]
+    ) -> list[Observation]:
+        """Reassign the uncertain fish to their tracks' and to new observations; returns the taken.
 
-        A track goes on as another fish where that is so; the numbers wander, not the tracks.
+        Where a track shows another fish, the fish's number and snapshot move to it.
         """
-        owners = [t for t in unsure if t.lost_frames == 0 and not t.look.is_piece]
-        if not unsure or not (owners or new):
+        owners = [t for t in uncertain if t.lost_frames == 0 and not t.observation.is_piece]
+        if not uncertain or not (owners or new):
             return []
-        looks = [*(track.look for track in owners), *new]
-        fish = [(track.number, track.remember()) for track in unsure]
-        owned = [unsure.index(track) for track in owners]
-        who = who_is_who([memory for _, memory in fish], owned, looks)
-        tracks = {row: owners[column] for column, row in who.items() if column < len(owners)}
-        spare = [track for track in unsure if track not in tracks.values()]
-        rows = [row for row in range(len(unsure)) if row not in tracks]
-        for row in sorted(rows, key=lambda row: unsure[row] not in spare):  # first those that stay
-            tracks[row] = unsure[row] if unsure[row] in spare else spare[0]
-            spare.remove(tracks[row])
-        for row, track in tracks.items():
-            track.become(*fish[row])
-        given = {column: row for column, row in who.items() if column >= len(owners)}
-        for column, row in given.items():
-            tracks[row].resume(looks[column])
-        return [looks[column] for column in given]
+        observations = [*(track.observation for track in owners), *new]
+        fish = [(track.number, track.make_uncertain()) for track in uncertain]
+        fish_of = reidentify(
+            [snapshot for _, snapshot in fish],
+            [uncertain.index(track) for track in owners],
+            observations,
+        )
+        track_of = {row: owners[i] for i, row in fish_of.items() if i < len(owners)}
+        _distribute_others(track_of, uncertain)
+        for row, track in track_of.items():
+            track.take_identity(*fish[row])
+        taken = {i: row for i, row in fish_of.items() if i >= len(owners)}
+        for i, row in taken.items():
+            track_of[row].resume(observations[i])
+        return [observations[i] for i in taken]
 
-    def _settle(self, unsure: Sequence[Track]) -> None:
-        """Who is alone is sure again; the others are in what hides them, wherever it moves."""
-        seen = [track for track in unsure if track.lost_frames == 0]
-        for track in unsure:
-            boxes = [one.look.outer_box for one in (seen if track.lost_frames else [track])]
-            track.remember().stay_inside_one_of(boxes)
-        lost = [track.remember() for track in unsure if track.lost_frames > 0]
+    def _settle(self, uncertain: Sequence[Track]) -> None:
+        """Settle fish seen separately; keep the others inside the blobs that may hide them."""
+        seen = [track for track in uncertain if track.lost_frames == 0]
+        for track in uncertain:
+            blobs = [one.observation.outer_box for one in (seen if track.lost_frames else [track])]
+            track.make_uncertain().constrain_to_one_of(blobs)
+        lost = [track.make_uncertain() for track in uncertain if track.lost_frames > 0]
         for track in seen:
-            if track.is_sure and not any(one.is_inside(track.look.box) for one in lost):
+            if track.is_settled and not any(one.is_inside(track.observation.box) for one in lost):
                 track.settle()
+
+
+def _distribute_others(track_of: dict[int, Track], uncertain: Sequence[Track]) -> None:
+    """Give every fish without a track one of those left over, its own where possible.
+
+    `track_of`: tracks by the fish's index in `uncertain`; completed in place.
+    """
+    spare = [track for track in uncertain if track not in track_of.values()]
+    rows = [row for row in range(len(uncertain)) if row not in track_of]
+    for row in sorted(rows, key=lambda row: uncertain[row] not in spare):  # own tracks first
+        track_of[row] = uncertain[row] if uncertain[row] in spare else spare[0]
+        spare.remove(track_of[row])

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from stream_dmr.segmentation.training.skins import ALONG_END, draw_skin_pair
-from stream_dmr.segmentation.training.species import Posed, Shape, draw_shape, pose_shape
+from stream_dmr.segmentation.training.random_fish import Posed, Shape, draw_shape, pose_shape
+from stream_dmr.segmentation.training.random_skins import ALONG_END, draw_skin_pair
 from stream_dmr.simulation.render import rasterize, vertex_normals
 from stream_dmr.simulation.skin import noise
 

@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from stream_dmr.errors import AnnotationError
-from stream_dmr.segmentation.network.boxes import box_picture, crop_around, jitter
-from stream_dmr.segmentation.network.network import SIZE_PX
-from stream_dmr.segmentation.training.own_masks import read_annotated
-from stream_dmr.segmentation.training.sample import Sample
-from stream_dmr.segmentation.training.weather import photograph
+from stream_dmr.segmentation.network.box_coverage import box_picture, crop_around, jitter
+from stream_dmr.segmentation.network.unet import SIZE_PX
+from stream_dmr.segmentation.training.annotated_images import read_annotated
+from stream_dmr.segmentation.training.image_degradation import photograph
+from stream_dmr.segmentation.training.training_sample import Sample
 
 _CUT_PX = 256  # of a cut-out fish with its surroundings
 _SURROUNDINGS = 0.6  # on each side, of the fish's longer side: room to turn it

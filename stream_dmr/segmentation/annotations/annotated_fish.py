@@ -1,49 +1,44 @@
-"""Which fish are in a frame, where, and of what outline: here as files say it."""
+"""Fish by the boxes and masks that annotation files give for each frame."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Integer
+from jaxtyping import Bool, Integer
 
 from stream_dmr.errors import UserError
 from stream_dmr.messages import FishCrop, Frame
-from stream_dmr.segmentation.annotations.files import Box, Masks, load_boxes
+from stream_dmr.segmentation.annotations.annotated_box import AnnotatedBox
+from stream_dmr.segmentation.annotations.box_files import load_boxes
+from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
+from stream_dmr.segmentation.detection.fish_detection import Detection
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Detection:
-    """One fish seen in one frame."""
+def open_annotated_fish(*, boxes: Path | None, masks: Path | None) -> "AnnotatedFish":
+    """Open a boxes file, a masks folder, or both.
 
-    track_id: int
-    bbox_xyxy_px: Float[np.ndarray, "4"]  # half-open, frame pixels
-    # Of the frame's size, all False where there is nothing; None: for a segmenter to find.
-    mask: Bool[np.ndarray, "H W"] | None
-    visible_fraction: float  # 0 to 1
-
-
-def open_annotations(*, boxes: Path | None, masks: Path | None) -> "Annotations":
-    """The fish that a boxes file, a masks folder or both describe.
-
-    Raises AnnotationError where they can't be read, UserError where neither is given.
+    Raises AnnotationError where one cannot be read, UserError where neither is given.
     """
     if boxes is None and masks is None:
-        raise UserError("expected to be told where the fish are: give --boxes, --masks or both")
-    return Annotations(
+        raise UserError(
+            "expected boxes or masks of the fish, got neither; give --boxes, --masks or both"
+        )
+    return AnnotatedFish(
         boxes=None if boxes is None else load_boxes(boxes),
-        masks=None if masks is None else Masks(masks),
+        masks=None if masks is None else MaskFolder(masks),
     )
 
 
-class Annotations:
-    """Fish by boxes and masks from files.
+class AnnotatedFish:
+    """A `FishFinder` that reads boxes and masks from files.
 
-    Boxes alone: a segmenter is to find the masks. Masks alone: they give the boxes. Both: the boxes
-    say which fish there are; one whose mask is missing keeps its box and gets an empty mask.
+    With boxes alone, the segmenter finds the masks. With masks alone, each id's tightest box is
+    used. With both, the boxes decide which fish there are; one without a mask gets an empty mask.
     """
 
-    def __init__(self, *, boxes: dict[int, list[Box]] | None, masks: Masks | None) -> None:
+    def __init__(
+        self, *, boxes: dict[int, list[AnnotatedBox]] | None, masks: MaskFolder | None
+    ) -> None:
         self._boxes = boxes
         self._masks = masks
         self._frames_without_mask: list[int] = []
@@ -52,7 +47,7 @@ class Annotations:
         self._masked_ids: set[int] = set()
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """The fish of one frame, by id. Raises AnnotationError where its mask can't be used."""
+        """The fish of one frame, ordered by id. Raises AnnotationError for an unusable mask."""
         if self._boxes is None:
             labels = self._labels(frame, is_expected=True)
             return [] if labels is None else _detections_of(labels)
@@ -69,12 +64,12 @@ class Annotations:
         ]
 
     def admit(self, crops: Iterable[FishCrop]) -> list[FishCrop]:
-        """All of them: what files describe is fish."""
+        """All crops: every annotated object is a fish."""
         return list(crops)
 
     @property
     def warnings(self) -> list[str]:
-        """What didn't fit together in the frames so far, a line each; best read at the end."""
+        """Mismatches between boxes and masks in the frames so far, one line each."""
         lines = []
         if missing := self._frames_without_mask:
             lines.append(
@@ -99,12 +94,12 @@ class Annotations:
         labels = self._masks.labels(frame.frame_index, width=width, height=height)
         if labels is not None:
             self._masked_ids.update(_ids(labels))
-        elif is_expected:  # where no fish is boxed, none is missed
+        elif is_expected:  # a frame without boxes needs no mask
             self._frames_without_mask.append(frame.frame_index)
         return labels
 
-    def _boxes_inside(self, frame: Frame, boxes: Sequence[Box]) -> list[Box]:
-        """Those with at least a pixel's centre in the frame."""
+    def _boxes_inside(self, frame: Frame, boxes: Sequence[AnnotatedBox]) -> list[AnnotatedBox]:
+        """The boxes that contain at least one pixel centre of the frame."""
         height, width = frame.image.shape[:2]
         inside = []
         for box in boxes:
@@ -117,7 +112,7 @@ class Annotations:
         return inside
 
     def _mask(
-        self, frame: Frame, box: Box, labels: Integer[np.ndarray, "H W"] | None
+        self, frame: Frame, box: AnnotatedBox, labels: Integer[np.ndarray, "H W"] | None
     ) -> Bool[np.ndarray, "H W"] | None:
         if self._masks is None:
             return None
@@ -127,7 +122,7 @@ class Annotations:
 
 
 def _detections_of(labels: Integer[np.ndarray, "H W"]) -> list[Detection]:
-    """One detection per id in a label picture, with the tightest box around it."""
+    """One detection per id in a label picture, with its tightest box."""
     detections = []
     for track_id in _ids(labels):
         mask = labels == track_id
@@ -140,7 +135,7 @@ def _detections_of(labels: Integer[np.ndarray, "H W"]) -> list[Detection]:
 
 
 def _ids(labels: Integer[np.ndarray, "H W"]) -> list[int]:
-    return np.unique(labels[labels > 0]).tolist()  # only fish are sorted, not the sea around them
+    return np.unique(labels[labels > 0]).tolist()  # background is most of it: sorting it is slow
 
 
 def _join(ids: list[int]) -> str:

@@ -8,7 +8,7 @@ from jaxtyping import Float32, UInt8
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from stream_dmr.segmentation.training.sample import Sample
+from stream_dmr.segmentation.training.training_sample import Sample
 
 Draw = Callable[[np.random.Generator], Sample]
 Batch = tuple[

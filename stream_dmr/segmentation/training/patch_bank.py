@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from stream_dmr.segmentation.training.backgrounds import BACKGROUND_PX, draw_background
-from stream_dmr.segmentation.training.patches import PATCH_PX, draw_fish_patch
+from stream_dmr.segmentation.training.fish_patches import PATCH_PX, draw_fish_patch
+from stream_dmr.segmentation.training.random_backgrounds import BACKGROUND_PX, draw_background
 
 BANK_VERSION = 2
 """Part of the file's name; raise it when fish or backgrounds are drawn otherwise."""

@@ -5,9 +5,9 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from stream_dmr.segmentation.training.settings import TrainSettings
-from stream_dmr.segmentation.training.train import TrainObserver
-from stream_dmr.segmentation.training.training import Scores
+from stream_dmr.segmentation.training.train_settings import TrainSettings
+from stream_dmr.segmentation.training.train_unet import TrainObserver
+from stream_dmr.segmentation.training.unet_trainer import Scores
 
 
 class TrainDisplay(TrainObserver):

@@ -12,15 +12,15 @@ import torch
 
 from stream_dmr import __version__
 from stream_dmr.errors import ModelError, OutputError
-from stream_dmr.segmentation.network.weights import SHIPPED, load_weights
-from stream_dmr.segmentation.training.bank import Bank, load_or_make_bank
-from stream_dmr.segmentation.training.compose import draw_sample
-from stream_dmr.segmentation.training.dataset import Draw, Pictures
-from stream_dmr.segmentation.training.own_pictures import Cut, draw_own, load_own_fish
-from stream_dmr.segmentation.training.report import draw_curve, draw_worst
-from stream_dmr.segmentation.training.sample import Sample
-from stream_dmr.segmentation.training.settings import TrainSettings
-from stream_dmr.segmentation.training.training import Scores, Training
+from stream_dmr.segmentation.network.unet_weights import SHIPPED, load_weights
+from stream_dmr.segmentation.training.annotated_samples import Cut, draw_own, load_own_fish
+from stream_dmr.segmentation.training.patch_bank import Bank, load_or_make_bank
+from stream_dmr.segmentation.training.sample_dataset import Draw, Pictures
+from stream_dmr.segmentation.training.scene_composition import draw_sample
+from stream_dmr.segmentation.training.train_settings import TrainSettings
+from stream_dmr.segmentation.training.training_plots import draw_curve, draw_worst
+from stream_dmr.segmentation.training.training_sample import Sample
+from stream_dmr.segmentation.training.unet_trainer import Scores, Training
 
 _UNSEEN = 10  # times smaller than the bank to learn from is the one to check on
 

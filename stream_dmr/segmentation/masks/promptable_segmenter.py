@@ -1,4 +1,4 @@
-"""A user's own promptable model as an ONNX file: a picture and a box in, a mask out.
+"""A user's promptable model as an ONNX file: an image and a box in, a mask out.
 
 Inputs: the crop as (1, 3, H, W), RGB from 0 to 1, and its box, either as one input of four numbers
 (x0, y0, x1, y1 in input pixels), or as the Segment Anything family takes it (Kirillov et al.,
@@ -14,46 +14,46 @@ from jaxtyping import Float, Float32, UInt8
 
 from stream_dmr.errors import ModelError
 from stream_dmr.segmentation.detection.onnx_session import open_session
-from stream_dmr.segmentation.segmenter import Segmented
+from stream_dmr.segmentation.segmenter import SegmentedFish
 
-_FREE_SIDE_PX = 256  # where the model takes pictures of any size
-_CORNER_LABELS = np.array([2.0, 3.0], np.float32)
+_DEFAULT_SIDE_PX = 256  # for a model that takes images of any size; twice a default crop
+_CORNER_LABELS = np.array([2.0, 3.0], np.float32)  # top left and bottom right, as in SAM
 
 
-class PromptableModel:
-    """A `Segmenter` from an ONNX file; it looks for no ends."""
+class PromptableSegmenter:
+    """A `Segmenter` from an ONNX file, which locates no ends."""
 
     def __init__(self, path: Path) -> None:
-        """Raises ModelError, with one line, for a file that is no such model."""
+        """Raises ModelError for a file that is no such model; it is tried on three images."""
         self._path = path
         self._session = open_session(path)
         self._picture, self._prompts = self._read_inputs()
         self._size = self._read_size()
-        middle = np.array([40.0, 30.0, 90.0, 100.0])
+        box = np.array([40.0, 30.0, 90.0, 100.0])
         for value in (0, 90, 255):
             picture = np.full((128, 128, 3), value, np.uint8)
             picture[30:100, 40:90] = 160
-            self._try(picture, middle)
+            self._try(picture, box)
 
     def segment(
         self, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
-    ) -> Segmented:
+    ) -> SegmentedFish:
         """The fish in a box, half-open in pixels of the crop `image` (BGR)."""
         size = len(image)
         logits = self._run(image, bbox_xyxy_px)
         logits = cv2.resize(logits, (size, size), interpolation=cv2.INTER_LINEAR)
         probability = 1 / (1 + np.exp(-np.nan_to_num(logits).clip(-50, 50)))
-        return Segmented(probability=probability.astype(np.float32), ends=None)
+        return SegmentedFish(probability=probability.astype(np.float32), ends=None)
 
     def _run(
         self, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
     ) -> Float32[np.ndarray, "h w"]:
         """The logits of the best mask, over the whole crop at the model's own size."""
         scale = self._size / len(image)
-        way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-        picture = cv2.resize(image, (self._size, self._size), interpolation=way)
+        interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+        picture = cv2.resize(image, (self._size, self._size), interpolation=interpolation)
         rgb = picture[..., ::-1].transpose(2, 0, 1)[None].astype(np.float32) / 255
-        # From half-open edges to pixel centres, at which such models count.
+        # From half-open edges to pixel centers, from which such models count.
         corners = (bbox_xyxy_px * scale - 0.5).astype(np.float32)
         feed: dict[str, np.ndarray] = {self._picture: np.ascontiguousarray(rgb)}
         for name, shape in self._prompts.items():
@@ -65,7 +65,7 @@ class PromptableModel:
         return masks[int(np.argmax(others[0]))]
 
     def _read_inputs(self) -> tuple[str, dict[str, tuple[int, ...]]]:
-        """The picture's input, and the prompts' with the shapes that one box has there."""
+        """The name of the image input, and the shape of one box in each prompt input."""
         pictures, prompts = [], {}
         for one in self._session.get_inputs():
             if len(one.shape) == 4 and one.shape[1] == 3:
@@ -84,17 +84,17 @@ class PromptableModel:
         return pictures[0], prompts
 
     def _read_size(self) -> int:
-        """The side of the square picture that the model takes, px."""
+        """The side of the square image that the model takes, px."""
         shape = next(i.shape for i in self._session.get_inputs() if i.name == self._picture)
         sides = {n for n in shape[2:] if isinstance(n, int)}
         if len(sides) > 1 or any(n < 32 for n in sides):
             raise self._refusal("square pictures of at least 32 px", f"{shape}")
-        return sides.pop() if sides else _FREE_SIDE_PX
+        return sides.pop() if sides else _DEFAULT_SIDE_PX
 
     def _try(self, image: UInt8[np.ndarray, "S S 3"], box: Float[np.ndarray, "4"]) -> None:
         try:
             logits = self._run(image, box)
-        except Exception as error:  # onnxruntime's own are no subclasses of anything
+        except Exception as error:  # onnxruntime's errors share no base class
             reason = f"{error}".strip().splitlines()[0][:120]
             raise self._refusal("a model that takes a picture and a box", reason) from None
         if min(logits.shape) < 16:

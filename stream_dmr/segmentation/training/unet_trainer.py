@@ -14,12 +14,17 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel
 
 from stream_dmr.errors import ModelError, UserError
-from stream_dmr.segmentation.network.network import UNet, normalise
-from stream_dmr.segmentation.network.weights import save_weights
-from stream_dmr.segmentation.training.dataset import Batch, Draw, Pictures, collate, load
-from stream_dmr.segmentation.training.losses import ends_are_right, ends_loss, mask_iou, mask_loss
-from stream_dmr.segmentation.training.sample import Sample
-from stream_dmr.segmentation.training.settings import TrainSettings
+from stream_dmr.segmentation.network.unet import UNet, normalise
+from stream_dmr.segmentation.network.unet_weights import save_weights
+from stream_dmr.segmentation.training.sample_dataset import Batch, Draw, Pictures, collate, load
+from stream_dmr.segmentation.training.train_settings import TrainSettings
+from stream_dmr.segmentation.training.training_sample import Sample
+from stream_dmr.segmentation.training.unet_losses import (
+    ends_are_right,
+    ends_loss,
+    mask_iou,
+    mask_loss,
+)
 
 _AVERAGE = 0.995  # most of the running average of the weights that a step leaves as it was
 _WARM_UP = 0.04  # of all steps

@@ -10,18 +10,18 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from stream_dmr.segmentation.network.boxes import box_picture, crop_around, jitter
-from stream_dmr.segmentation.network.network import SIZE_PX
-from stream_dmr.segmentation.training.bank import Bank
+from stream_dmr.segmentation.network.box_coverage import box_picture, crop_around, jitter
+from stream_dmr.segmentation.network.unet import SIZE_PX
+from stream_dmr.segmentation.training.fish_patches import PATCH_PX
+from stream_dmr.segmentation.training.image_degradation import motion_kernel, photograph, weather
 from stream_dmr.segmentation.training.occluders import (
     Occluder,
     draw_into,
     draw_line,
     draw_occluders,
 )
-from stream_dmr.segmentation.training.patches import PATCH_PX
-from stream_dmr.segmentation.training.sample import Sample
-from stream_dmr.segmentation.training.weather import motion_kernel, photograph, weather
+from stream_dmr.segmentation.training.patch_bank import Bank
+from stream_dmr.segmentation.training.training_sample import Sample
 
 _LOOK_PX, _LOOK_UNITS = 96, 2.0  # the coarse look at the whole scene, in which the box is found
 _NO_BOX_SHARE = 0.12  # of the pictures, where every fish is wanted wherever it is

@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 from stream_dmr.errors import ModelError
-from stream_dmr.segmentation.network.network import UNet
+from stream_dmr.segmentation.network.unet import UNet
 
 SHIPPED = Path(__file__).parent / "weights" / "unet.pt"
 _FORMAT = "stream-dmr unet 1"  # a new number where the network's layers change

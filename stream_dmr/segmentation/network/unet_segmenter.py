@@ -15,10 +15,10 @@ from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from stream_dmr.messages import FishEnds
-from stream_dmr.segmentation.network.boxes import box_picture
-from stream_dmr.segmentation.network.network import ENDS_STRIDE, SIZE_PX, UNet, normalise
-from stream_dmr.segmentation.network.weights import load_weights
-from stream_dmr.segmentation.segmenter import Segmented
+from stream_dmr.segmentation.network.box_coverage import box_picture
+from stream_dmr.segmentation.network.unet import ENDS_STRIDE, SIZE_PX, UNet, normalise
+from stream_dmr.segmentation.network.unet_weights import load_weights
+from stream_dmr.segmentation.segmenter import SegmentedFish
 
 _LEAST_APART = 3.0  # cells between head and tail
 _PEAK_REACH = 2  # cells around a map's peak whose mean says where it is between the cells
@@ -39,14 +39,14 @@ class UNetSegmenter:
 
     def segment(
         self, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
-    ) -> Segmented:
+    ) -> SegmentedFish:
         """The fish in a box, half-open in pixels of the crop `image` (BGR) of any size."""
         size = len(image)
         scale = SIZE_PX / size
         in_box = box_picture(bbox_xyxy_px * scale, size=SIZE_PX)
         with _one_thread():
             probability, ends = self.segment_batch(_resize(image, SIZE_PX)[None], in_box[None])
-        return Segmented(
+        return SegmentedFish(
             probability=np.clip(_resize(probability[0], size), 0, 1),
             ends=_find_ends(ends[0], scale=scale),
         )

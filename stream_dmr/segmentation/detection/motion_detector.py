@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float32, UInt8
 from pydantic import Field
 
 from stream_dmr.messages import Frame
-from stream_dmr.segmentation.detection.background import Background
+from stream_dmr.segmentation.detection.background_model import Background
 from stream_dmr.segmentation.detection.blobs import fish_shapes
 from stream_dmr.segmentation.detection.camera_motion import (
     Affine,

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, log_softmax, max_pool2d
 
-from stream_dmr.segmentation.network.network import ENDS_STRIDE
+from stream_dmr.segmentation.network.unet import ENDS_STRIDE
 
 _THIN_PX = 5  # a tail seen edge-on is narrower
 _THIN_WEIGHT = 4.0  # of such a pixel in the cross entropy, beyond the 1 of every pixel

@@ -1,15 +1,15 @@
-"""What can be said of a crop at a glance: cut off, blown out, blurred."""
+"""Quality of a crop: cut off by the frame, overexposed, blurred."""
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-_BLOWN = 250  # grey level of every channel: no skin is so bright
+_OVEREXPOSED_LEVEL = 250  # grey level of every channel; brighter than any skin in our scenes
 _BORDER_PX = 1  # a mask this near to the frame's edge touches it
 
 
 def touches_border(extent: Float[np.ndarray, "4"] | None, *, shape: tuple[int, ...]) -> bool:
-    """Whether a mask, by its box in the frame, reaches the frame's edge; an empty one does not."""
+    """True where a half-open box in px reaches the edge of a frame of shape (H, W); None: False."""
     if extent is None:
         return False
     height, width = shape
@@ -18,13 +18,16 @@ def touches_border(extent: Float[np.ndarray, "4"] | None, *, shape: tuple[int, .
 
 
 def glare(image: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]) -> float:
-    """The share of the mask where the sensor saw nothing but light; 0 for an empty one."""
-    is_blown = cv2.inRange(image, np.full(3, _BLOWN), np.full(3, 255)) > 0
-    return float(np.count_nonzero(is_blown & mask) / max(np.count_nonzero(mask), 1))
+    """The fraction of the mask that is overexposed, 0 to 1; 0 for an empty mask."""
+    is_overexposed = cv2.inRange(image, np.full(3, _OVEREXPOSED_LEVEL), np.full(3, 255)) > 0
+    return float(np.count_nonzero(is_overexposed & mask) / max(np.count_nonzero(mask), 1))
 
 
 def sharpness(image: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]) -> float:
-    """Variance of the Laplacian inside the mask (Pech-Pacheco et al., ICPR 2000)."""
+    """Variance of the Laplacian inside the mask, squared grey levels; 0 for an empty mask.
+
+    After Pech-Pacheco et al., "Diatom autofocusing in brightfield microscopy", ICPR 2000.
+    """
     if not mask.any():
         return 0.0
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from stream_dmr.segmentation.training.dataset import Pictures
-from stream_dmr.segmentation.training.sample import Sample
-from stream_dmr.segmentation.training.training import Scores, Training
+from stream_dmr.segmentation.training.sample_dataset import Pictures
+from stream_dmr.segmentation.training.training_sample import Sample
+from stream_dmr.segmentation.training.unet_trainer import Scores, Training
 
 _NUM_WORST = 32
 _PER_ROW = 8

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from stream_dmr.errors import ModelError
 from stream_dmr.segmentation.detection.detector import Detector
-from stream_dmr.segmentation.detection.motion import MotionDetector, MotionSettings
+from stream_dmr.segmentation.detection.motion_detector import MotionDetector, MotionSettings
 from stream_dmr.segmentation.detection.onnx_detector import OnnxDetector, OnnxSettings
 from stream_dmr.settings import Settings
 
@@ -44,8 +44,8 @@ def open_detector(settings: DetectFishSettings) -> Detector:
     suffix = Path(settings.detector).suffix.lower()
     if settings.detector == "unet" or suffix == ".pt":
         from stream_dmr.segmentation.detection.unet_detector import UNetDetector
-        from stream_dmr.segmentation.network.inference import UNetSegmenter
-        from stream_dmr.segmentation.network.weights import SHIPPED
+        from stream_dmr.segmentation.network.unet_segmenter import UNetSegmenter
+        from stream_dmr.segmentation.network.unet_weights import SHIPPED
 
         weights = SHIPPED if settings.detector == "unet" else Path(settings.detector)
         return UNetDetector(UNetSegmenter.load(weights), longer_px=settings.unet_working_px)

@@ -1,0 +1,34 @@
+"""Boxes of fish from a file, in whichever of three formats it is written."""
+
+from pathlib import Path
+
+from stream_dmr.errors import AnnotationError
+from stream_dmr.segmentation.annotations.annotated_box import AnnotatedBox
+from stream_dmr.segmentation.annotations.coco import parse_coco
+from stream_dmr.segmentation.annotations.cvat import parse_cvat
+from stream_dmr.segmentation.annotations.mot import COLUMNS, parse_mot
+
+_PARSERS = {".json": parse_coco, ".xml": parse_cvat}
+
+
+def load_boxes(path: Path) -> dict[int, list[AnnotatedBox]]:
+    """Boxes by frame (from 1), within a frame by id; none from an empty text file.
+
+    `.json` is read as COCO, `.xml` as CVAT, everything else as MOT Challenge text. Raises
+    AnnotationError with the place in the file and what was expected there.
+    """
+    parse = _PARSERS.get(path.suffix.lower(), parse_mot)
+    return parse(_read_text(path), path)
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise AnnotationError(
+            f"{path}: expected a text file of boxes ({COLUMNS}), got binary data"
+        ) from None
+    except OSError as error:
+        raise AnnotationError(
+            f"{path}: expected a file of boxes, but it can't be read: {error.strerror}"
+        ) from None

@@ -1,0 +1,74 @@
+"""Masks from files: one label picture per frame, as in DAVIS 2017.
+
+Pont-Tuset et al., "The 2017 DAVIS Challenge on Video Object Segmentation", arXiv:1704.00675.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Integer
+from PIL import Image
+
+from stream_dmr.errors import AnnotationError
+
+_FILE_NAME = re.compile(r"\d{6,}\.png")
+# What Pillow raises for a PNG that it cannot decode.
+_DECODING_ERRORS = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
+_LABEL_MODES = {"1", "L", "P", "I", "I;16", "I;16B"}  # one channel; "P": palette indices
+
+
+class MaskFolder:
+    """A folder of label pictures `000001.png` ...: a pixel's value is a fish's id, 0 is background.
+
+    Pictures are read on demand. Palette pictures give their indices, not their colours.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Raises AnnotationError where the folder is missing or holds no such pictures."""
+        if not folder.is_dir():
+            raise AnnotationError(f"{folder}: expected a folder of masks, found none there")
+        names = sorted(entry.name for entry in folder.iterdir() if entry.suffix == ".png")
+        if not any(_FILE_NAME.fullmatch(name) for name in names):
+            found = f"{names[0]} and the like" if names else "no PNG"
+            raise AnnotationError(
+                f"{folder}: expected masks named 000001.png, 000002.png ..., found {found}"
+            )
+        if "000000.png" in names:
+            raise AnnotationError(
+                f"{folder}: expected masks counted from 000001.png, found 000000.png; "
+                "rename them by one"
+            )
+        self.folder = folder
+
+    def labels(
+        self, frame_index: int, *, width: int, height: int
+    ) -> Integer[np.ndarray, "H W"] | None:
+        """The label picture of a frame of that size in px; None where the folder has none.
+
+        Raises AnnotationError for a picture in colour, of another size, or unreadable.
+        """
+        path = self.folder / f"{frame_index:06d}.png"
+        try:
+            with Image.open(path) as picture:
+                _check_labels(picture, path, size=(width, height))
+                # A 1-bit picture is decoded as bool, every other mode as unsigned integers.
+                labels = np.asarray(picture)
+        except FileNotFoundError:
+            return None
+        except _DECODING_ERRORS:
+            raise AnnotationError(f"{path}: expected a PNG mask, but it can't be decoded") from None
+        return labels.astype(np.uint8) if labels.dtype == bool else labels
+
+
+def _check_labels(picture: Image.Image, path: Path, *, size: tuple[int, int]) -> None:
+    if picture.mode not in _LABEL_MODES:
+        raise AnnotationError(
+            f"{path}: expected one channel whose pixels are fish ids, got a picture in colour "
+            f"({picture.mode}); write the ids as grey values or palette indices"
+        )
+    if picture.size != size:
+        raise AnnotationError(
+            f"{path}: expected a mask of the frame's size, {size[0]}x{size[1]} px, "
+            f"got {picture.size[0]}x{picture.size[1]} px"
+        )

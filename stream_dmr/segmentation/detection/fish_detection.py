@@ -1,0 +1,17 @@
+"""One fish in one frame, as detectors, trackers and annotation files hand it to the crop."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Detection:
+    """One fish seen in one frame."""
+
+    track_id: int
+    bbox_xyxy_px: Float[np.ndarray, "4"]  # half-open, frame pixels
+    # Of the frame's size, all False for an empty mask; None: the segmenter is to find it.
+    mask: Bool[np.ndarray, "H W"] | None
+    visible_fraction: float  # 0 to 1

@@ -1,0 +1,143 @@
+"""Boxes and pixels between frame and crop.
+
+Boxes are half-open and count from pixel edges; cameras count from pixel centers. A crop is free of
+lens distortion, so that a box's edges are curves there: they are mapped by their midpoints, which
+is right to a pixel for any usable lens.
+"""
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from stream_dmr.camera import Camera, crop_from_frame, frame_from_crop
+from stream_dmr.messages import FishCrop
+
+_MAX_SAMPLES = 4  # per crop pixel and axis; more changed no mask in tests and cost time
+_RAYS_PER_EDGE = 9  # of a box, to measure it after undistortion
+
+
+def mask_bbox(mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "4"] | None:
+    """The box around a mask, half-open; None for an empty one."""
+    x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
+    return np.array([x, y, x + width, y + height], np.float64) if width else None
+
+
+def mask_bbox_in_frame(crop: FishCrop) -> Float[np.ndarray, "4"] | None:
+    """The box around a crop's mask, half-open in frame pixels; None for an empty mask."""
+    box = mask_bbox(crop.mask)
+    if box is None:
+        return None
+    midpoints = frame_from_crop(
+        _edge_midpoints(box), crop_camera=crop.crop_camera, frame_camera=crop.frame_camera
+    )
+    return _box_of_midpoints(midpoints)
+
+
+def box_in_crop(
+    bbox_xyxy_px: Float[np.ndarray, "4"], *, crop_camera: Camera, frame_camera: Camera
+) -> Float[np.ndarray, "4"]:
+    """A box of the frame in the crop's pixels, half-open."""
+    midpoints = crop_from_frame(
+        _edge_midpoints(bbox_xyxy_px), crop_camera=crop_camera, frame_camera=frame_camera
+    )
+    return _box_of_midpoints(midpoints)
+
+
+def _edge_midpoints(bbox_xyxy_px: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4 2"]:
+    """The midpoints of the left, top, right and bottom edge, as pixels."""
+    x0, y0, x1, y1 = bbox_xyxy_px - 0.5
+    x, y = (x0 + x1) / 2, (y0 + y1) / 2
+    return np.array([[x0, y], [x, y0], [x1, y], [x, y1]])
+
+
+def _box_of_midpoints(midpoints: Float[np.ndarray, "4 2"]) -> Float[np.ndarray, "4"]:
+    return midpoints[np.arange(4), [0, 1, 0, 1]] + 0.5
+
+
+def visible_bbox(
+    bbox_xyxy_px: Float[np.ndarray, "4"],
+    mask: Bool[np.ndarray, "H W"] | None,
+    *,
+    width: int,
+    height: int,
+) -> Float[np.ndarray, "4"]:
+    """The smallest box around a box, clipped to the frame's size, and around a mask if given."""
+    box = np.clip(bbox_xyxy_px, 0, [width, height, width, height])
+    extent = None if mask is None else mask_bbox(mask)
+    if extent is None:
+        return box
+    return np.concatenate([np.minimum(box[:2], extent[:2]), np.maximum(box[2:], extent[2:])])
+
+
+def box_iou(one: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> float:
+    """Intersection over union of two boxes."""
+    sides = np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2])
+    both = np.prod(np.maximum(sides, 0))
+    return float(both / (np.prod(one[2:] - one[:2]) + np.prod(other[2:] - other[:2]) - both))
+
+
+def camera_around(
+    bbox_xyxy_px: Float[np.ndarray, "4"], *, frame_camera: Camera, margin: float, size_px: int
+) -> Camera:
+    """The crop camera, `size_px` wide and high, that sees a box of the frame with its margins.
+
+    `margin` is a fraction of the box's longer side, on each side. The box is measured after
+    undistortion, by rays through its outline: near the corners of a wide lens a fish is much larger
+    there than in the frame.
+    """
+    x0, y0, x1, y1 = bbox_xyxy_px - 0.5
+    along = np.linspace(0, 1, _RAYS_PER_EDGE)
+    x, y = x0 + along * (x1 - x0), y0 + along * (y1 - y0)
+    outline = np.concatenate(
+        [np.column_stack([x, np.full(_RAYS_PER_EDGE, edge)]) for edge in (y0, y1)]
+        + [np.column_stack([np.full(_RAYS_PER_EDGE, edge), y]) for edge in (x0, x1)]
+    )
+    rays = frame_camera.back_project(outline)
+    low, high = rays.min(axis=0), rays.max(axis=0)
+    extent_px = (high - low)[:2] * frame_camera.K[[0, 1], [0, 1]]
+    side_px = max(1.0, *extent_px)  # boxes of no size come from stray clicks of annotators
+    return frame_camera.crop(
+        center_px=frame_camera.project((low + high)[None] / 2)[0],
+        side_px=float(side_px * (1 + 2 * margin)),
+        size=size_px,
+    )
+
+
+def resample(
+    images: Sequence[UInt8[np.ndarray, "H W *_"]], *, crop_camera: Camera, frame_camera: Camera
+) -> list[UInt8[np.ndarray, "S S *_"]]:
+    """Images of the frame as the crop camera sees them; 0 outside the frame.
+
+    A crop pixel is the mean of n x n samples, about one per frame pixel: single samples of a
+    shrunken mask jump along its outline. Known shapes through a strong lens come out with an area
+    right to 0.3 % and an outline as good as pixels allow.
+    """
+    size = crop_camera.width
+    scale = float((frame_camera.K[[0, 1], [0, 1]] / crop_camera.K[[0, 1], [0, 1]]).max())
+    samples = min(max(math.ceil(scale), 1), _MAX_SAMPLES)
+    x, y = frame_from_crop_map(crop_camera, frame_camera=frame_camera, samples=samples)
+    fine = [
+        cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) for image in images
+    ]
+    return [cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA) for image in fine]
+
+
+def frame_from_crop_map(
+    crop_camera: Camera, *, frame_camera: Camera, samples: int = 1
+) -> tuple[Float32[np.ndarray, "N N"], Float32[np.ndarray, "N N"]]:
+    """Frame x and y of `samples` x `samples` points in each crop pixel: `frame_from_crop` as a map.
+
+    OpenCV's map for undistortion is this very one, in 0.1 ms instead of 13 ms for 192 x 192; being
+    float32 it differs by at most 2e-4 px in frames up to 4096 px wide.
+    """
+    K = crop_camera.K.copy()
+    K[:2, :2] *= samples
+    K[:2, 2] = (K[:2, 2] + 0.5) * samples - 0.5  # pixel centers are integers, edges at halves
+    size = (crop_camera.width * samples, crop_camera.height * samples)
+    x, y = cv2.initUndistortRectifyMap(
+        frame_camera.K, frame_camera.distortion, np.eye(3), K, size, cv2.CV_32FC1
+    )
+    return x, y

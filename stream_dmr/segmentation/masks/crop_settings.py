@@ -1,0 +1,28 @@
+"""`[crop_fish]`: how fish are cut out of the frame."""
+
+from pydantic import Field
+
+from stream_dmr.settings import Settings
+
+
+class CropFishSettings(Settings):
+    """`[crop_fish]`: how fish are cut out of the frame."""
+
+    crop_size_px: int = Field(
+        default=128, ge=32, le=1024, description="width and height of a crop, px"
+    )
+    margin: float = Field(
+        default=0.15,
+        ge=0,
+        le=2,
+        description="room on each side, as a fraction of the fish's longer side",
+    )
+    min_mask_area_px: int = Field(
+        default=64, ge=1, description="a smaller mask counts as none, in frame px"
+    )
+    segmenter: str = Field(
+        default="unet",
+        min_length=1,
+        description='what finds the mask in a box: "unet", "grabcut", weights of `stream-dmr train`'
+        " (.pt), or a promptable model (.onnx)",
+    )

@@ -1,0 +1,47 @@
+"""Cut a fish out of a frame: image and mask as an ideal pinhole camera would have seen them."""
+
+from stream_dmr.camera import Camera
+from stream_dmr.messages import CropQuality, FishCrop, Frame
+from stream_dmr.segmentation.detection.fish_detection import Detection
+from stream_dmr.segmentation.masks.crop_quality import glare, sharpness, touches_border
+from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
+from stream_dmr.segmentation.masks.masked_crop import FrameView, crop_given_mask, crop_segmented
+from stream_dmr.segmentation.segmenter import Segmenter
+
+
+def crop_fish(
+    frame: Frame,
+    detection: Detection,
+    *,
+    frame_camera: Camera,
+    settings: CropFishSettings,
+    segmenter: Segmenter,
+) -> FishCrop:
+    """One fish, seen through a crop camera around its box and its mask.
+
+    Where the detection has no mask, the segmenter finds it in the crop.
+    """
+    view = FrameView(image=frame.image, camera=frame_camera, settings=settings)
+    if detection.mask is None:
+        crop = crop_segmented(view, detection.bbox_xyxy_px, segmenter)
+    else:
+        crop = crop_given_mask(view, detection.bbox_xyxy_px, detection.mask)
+    return FishCrop(
+        frame_index=frame.frame_index,
+        timestamp_ns=frame.timestamp_ns,
+        track_id=detection.track_id,
+        bbox_xyxy_px=detection.bbox_xyxy_px,
+        image=crop.image,
+        mask=crop.mask,
+        crop_camera=crop.crop_camera,
+        frame_camera=frame_camera,
+        quality=CropQuality(
+            touches_border=crop.is_cut or touches_border(crop.extent, shape=view.shape),
+            visible_fraction=detection.visible_fraction,
+            sharpness=sharpness(crop.image, crop.mask),
+            mask_area_px=crop.area_px,
+            mask_confidence=crop.confidence,
+            glare=glare(crop.image, crop.mask),
+        ),
+        ends=crop.ends,
+    )

@@ -1,0 +1,59 @@
+"""Position, size and appearance of a detector's candidate, as the tracker compares them."""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from stream_dmr.segmentation.detection.detector import Candidate, whole_pixels
+from stream_dmr.segmentation.masks.crop_quality import touches_border
+
+
+class Observation:
+    """A candidate of one frame with its measured features; all lengths in frame pixels."""
+
+    def __init__(
+        self,
+        image: UInt8[np.ndarray, "H W 3"],
+        candidate: Candidate,
+        *,
+        whole: Candidate | None = None,
+    ) -> None:
+        """`whole`: the merged candidate of which this one is a piece; None: not a piece."""
+        self.candidate, self.whole, self.is_piece = candidate, whole, whole is not None
+        self.box = candidate.bbox_xyxy_px
+        self.center = (self.box[:2] + self.box[2:]) / 2
+        x0, y0, x1, y1 = whole_pixels(self.box)
+        silhouette = candidate.foreground
+        if silhouette is None:  # the corners of a box are background: an ellipse stands in
+            silhouette = np.zeros((y1 - y0, x1 - x0), np.uint8)
+            center, axes = ((x1 - x0) // 2, (y1 - y0) // 2), ((x1 - x0) // 3, (y1 - y0) // 3)
+            cv2.ellipse(silhouette, center, axes, 0, 0, 360, 1, cv2.FILLED)
+        self.area = float(max(1, np.count_nonzero(silhouette)))
+        self.length = oriented_extent(silhouette > 0)[1]
+        region = image[y0:y1, x0:x1]
+        inside = silhouette[: region.shape[0], : region.shape[1]].astype(np.uint8)
+        self.colour = np.array(cv2.mean(region, inside)[:3])  # mean B, G, R; grey levels
+        edges = np.array([x0, y0, x1, y1], np.float64)
+        self.touches_border = touches_border(edges, shape=image.shape[:2])
+
+    @property
+    def outer_box(self) -> Float[np.ndarray, "4"]:
+        """The box of the whole candidate, for a piece; its own otherwise."""
+        return self.box if self.whole is None else self.whole.bbox_xyxy_px
+
+    def fraction_inside(self, box: Float[np.ndarray, "4"]) -> float:
+        """The fraction of this observation's box that lies inside `box`."""
+        return fraction_inside(self.box, box)
+
+
+def fraction_inside(box: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> float:
+    """The fraction of the area of `box` that lies inside `other`, 0 to 1."""
+    overlap = np.minimum(box[2:], other[2:]) - np.maximum(box[:2], other[:2])
+    return float(np.prod(np.maximum(overlap, 0)) / max(np.prod(box[2:] - box[:2]), 1e-9))
+
+
+def oriented_extent(shape: Bool[np.ndarray, "H W"]) -> tuple[float, float]:
+    """Width and length of the smallest rotated rectangle around a shape, px; zeros if empty."""
+    points = cv2.findNonZero(shape.view(np.uint8))
+    sides = (0.0, 0.0) if points is None else cv2.minAreaRect(points)[1]
+    return min(sides), max(sides)
