@@ -1,0 +1,1 @@
+"""Recordings in MCAP and Rerun files: written, read, converted, repaired."""

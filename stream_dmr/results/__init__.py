@@ -1,0 +1,1 @@
+"""Finished lengths: database, tables, exports, provenance and its verification."""

@@ -1,0 +1,1 @@
+"""One run: configuration, inputs, the chain of nodes, outputs, recovery."""

@@ -1,0 +1,1 @@
+"""Template meshes with their joints and keypoints, and the bundled species."""

@@ -1,0 +1,1 @@
+"""Status page, metrics and health of a run that is in progress."""

@@ -1,0 +1,1 @@
+"""What the HTTP servers of this machine share: addresses, tokens, requests."""

@@ -1,0 +1,70 @@
+"""The generated parts of the guide are up to date, and its links lead somewhere."""
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.support.pages import pages
+from tests.support.plan import Plan, direct
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+PAGES += sorted((ROOT / "docs").rglob("*.md"))
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+HEADING = re.compile(r"^#+ +(.*)$", re.MULTILINE)
+
+
+@pytest.mark.parametrize(("path", "text"), [pytest.param(*page, id=page[0].name) for page in pages()])
+def test_generated_part_of_a_page_is_up_to_date(path, text):
+    assert path.exists(), f"{path} is missing: run `make docs`"
+    assert path.read_text(encoding="utf-8") == text, f"{path.name} is out of date: run `make docs`"
+
+
+def test_plan_leaves_out_what_a_chain_implies():
+    plan = Plan(rooms=dict.fromkeys("abc", ""), imports={("a", "b"), ("b", "c"), ("a", "c")})
+    assert direct(plan) == {("a", "b"), ("b", "c")}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_of_a_page_lead_to_files_and_headings(page):
+    broken = [
+        link
+        for link in LINK.findall(without_code(page.read_text(encoding="utf-8")))
+        if not link.startswith(("http://", "https://")) and not leads_somewhere(page, link)
+    ]
+    assert not broken
+
+
+def leads_somewhere(page: Path, link: str) -> bool:
+    name, _, anchor = link.partition("#")
+    target = (page.parent / name).resolve() if name else page
+    if not target.exists() or not target.is_relative_to(ROOT):
+        return False
+    return not anchor or anchor in anchors(target)
+
+
+def anchors(page: Path) -> set[str]:
+    """GitHub's anchors of a page's headings."""
+    headings = HEADING.findall(without_code(page.read_text(encoding="utf-8")))
+    kept = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings)
+    return {heading.strip().replace(" ", "-") for heading in kept}
+
+
+def without_code(text: str) -> str:
+    return re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+
+
+def test_every_page_of_the_guide_is_linked_from_its_index():
+    for index in (ROOT / "docs" / "README.md", ROOT / "docs" / "research" / "README.md"):
+        linked = {(index.parent / link).resolve() for link in LINK.findall(index.read_text())}
+        assert set(index.parent.glob("*.md")) - {index} <= linked
+
+
+def test_every_picture_of_the_guide_is_shown():
+    shown = {(page.parent / link).resolve() for page in PAGES for link in LINK.findall(page.read_text())}
+    pictures = subprocess.run(
+        ["git", "ls-files", "docs/images"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert {ROOT / name for name in pictures.stdout.split()} <= shown
