@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-slow bench faults soak table1 check format golden config clean
+.PHONY: demo test test-slow bench faults soak table1 check format golden config docs clean
 
 demo: $(STAMP)  ## the main job on the embedded scene, lengths beside the truth
 	$(BIN)/stream-dmr demo
@@ -17,14 +17,14 @@ test-slow: $(STAMP)  ## the long ones, and those on material outside the reposit
 	$(BIN)/pytest -m "slow or scenes"
 	$(BIN)/pytest -n 2 --dist worksteal --hypothesis-profile new
 
-bench: $(STAMP)  ## the fit beside other renderers, and the chain: docs/performance.md, six minutes
+bench: $(STAMP)  ## the fit beside other renderers, and the chain: docs/research/fit-speed.md, six minutes
 	$(BIN)/python benchmarks/solvers.py
 
-table1: $(STAMP)  ## Table 1 of the paper on simulated fish: docs/accuracy.md; FISH=60 for a quick look
+table1: $(STAMP)  ## Table 1 of the paper on simulated fish: docs/research/table1.md; FISH=60 for a quick look
 	cd benchmarks && ../$(BIN)/python -m table1 $(if $(FISH),--fish $(FISH)) \
 		$(if $(ROWS),--rows $(ROWS)) $(if $(AGAIN),--again)
 
-faults: $(STAMP)  ## all that goes wrong at sea: docs/reliability.md, two hours; FAULTS="--only clock"
+faults: $(STAMP)  ## all that goes wrong at sea: docs/research/crashes.md, two hours; FAULTS="--only clock"
 	$(BIN)/python benchmarks/reliability/faults.py $(FAULTS)
 
 soak: $(STAMP)  ## an hour of a looped live stream; SOAK="--minutes 5" for less
@@ -45,6 +45,9 @@ golden: $(STAMP)  ## recordings/golden anew, after saying what moved
 config: $(STAMP)  ## config.toml anew from the settings classes
 	$(BIN)/python -m stream_dmr.running.config > config.toml.new
 	mv config.toml.new config.toml
+
+docs: $(STAMP)  ## the plan of the imports, the tables of settings, reasons and files, anew from the code
+	$(BIN)/python -m tests.support.pages
 
 # The stamp comes last, so that an interrupted installation is taken up again.
 $(STAMP): pyproject.toml constraints.txt

@@ -2,7 +2,7 @@
 
 Copies of the embedded scene with their masks, and all of them in one raw video; with one worker and
 with two; `--rounds 3` gives medians. The first video of each worker also pays for its start;
-`docs/scale.md` has the figures.
+`docs/research/batch-speed.md` has the figures.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""How fast the fit is, beside `adam` and DEODR: tables and a plot in docs/performance.md.
+"""How fast the fit is, beside `adam` and DEODR: tables and a plot in docs/research/fit-speed.md.
 
     python benchmarks/solvers.py [--targets N] [--dry]
 
@@ -112,7 +112,7 @@ def main() -> None:
     text = markdown(results)
     print(text)
     if not arguments.dry:
-        write(DOCS / "performance.md", text)
+        write(DOCS / "research" / "fit-speed.md", text)
         plot(results.laps, DOCS / "images" / "performance.png")
 
 

@@ -16,7 +16,9 @@ LINK = re.compile(r"\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#+ +(.*)$", re.MULTILINE)
 
 
-@pytest.mark.parametrize(("path", "text"), [pytest.param(*page, id=page[0].name) for page in pages()])
+@pytest.mark.parametrize(
+    ("path", "text"), [pytest.param(*page, id=page[0].name) for page in pages()]
+)
 def test_generated_part_of_a_page_is_up_to_date(path, text):
     assert path.exists(), f"{path} is missing: run `make docs`"
     assert path.read_text(encoding="utf-8") == text, f"{path.name} is out of date: run `make docs`"
@@ -63,7 +65,9 @@ def test_every_page_of_the_guide_is_linked_from_its_index():
 
 
 def test_every_picture_of_the_guide_is_shown():
-    shown = {(page.parent / link).resolve() for page in PAGES for link in LINK.findall(page.read_text())}
+    shown = {
+        (page.parent / link).resolve() for page in PAGES for link in LINK.findall(page.read_text())
+    }
     pictures = subprocess.run(
         ["git", "ls-files", "docs/images"], cwd=ROOT, capture_output=True, text=True, check=True
     )

@@ -1,4 +1,4 @@
-"""The table and its pictures, into docs/accuracy.md and docs/images."""
+"""The table and its pictures, into docs/research/table1.md and docs/images."""
 
 from pathlib import Path
 from typing import Any

@@ -8,7 +8,7 @@ from stream_dmr.settings import Settings
 
 
 class RecordingSettings(Settings):
-    """What is recorded, and how exactly. `docs/recording.md` says what each choice costs."""
+    """What is recorded, and how exactly. `docs/files.md` says what each choice keeps."""
 
     mcap: bool = Field(default=True, description="write recording.mcap, the record of truth")
     rrd: bool = Field(default=True, description="write recording.rrd, the view for Rerun")

@@ -32,7 +32,7 @@ class FisheriesSettings(Settings):
         default="Clark 1992, IPHC Report of Assessment and Research Activities 1991: 113-116; "
         "net weight (gutted, head off), 6.921e-6 lb cm^-3.24",
         description="where a and b come from; it stands in the exports; what of the default was "
-        "checked, and against what: docs/report.md",
+        "checked, and against what: docs/research/fishery-numbers.md",
     )
     legal_cm: float = Field(
         default=81.3, ge=0, description="the least length that may be landed, cm; 0: no flag"
@@ -42,7 +42,8 @@ class FisheriesSettings(Settings):
     )
     legal_source: str = Field(
         default="IPHC-IB-2017-01: 32 inches, commercial, head on; lower jaw to middle of tail",
-        description="where the legal size comes from; it stands in the exports; see docs/report.md",
+        description="where the legal size comes from; it stands in the exports; see "
+        "docs/research/fishery-numbers.md",
     )
 
 

@@ -3,11 +3,14 @@
 A generated file is written whole; a generated table stands between two marks of its page.
 """
 
+import ast
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from stream_dmr import messages
+from stream_dmr.recording.messages.topics import topics_table
 from stream_dmr.running.config import Config
 from tests.support.plan import draw_plan, read_plan
 
@@ -44,13 +47,52 @@ def _allowed(setting: dict[str, Any]) -> str:
     return ", ".join(bounds)
 
 
+def files_tables() -> str:
+    """Topics, schemas and entities, then the fields of every message."""
+    return "\n".join([topics_table() + "\n", *_message_tables()])
+
+
+def _message_tables() -> Iterator[str]:
+    """For each class of messages.py its fields, their types, and the comments on them."""
+    source = Path(messages.__file__).read_text(encoding="utf-8")
+    lines = source.splitlines()
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.ClassDef):
+            rows = [
+                (f"`{ast.unparse(field.target)}`", _type(field), _comment(lines, field))
+                for field in node.body
+                if isinstance(field, ast.AnnAssign)
+            ]
+            text = (ast.get_docstring(node) or "").splitlines()[0]
+            yield f"**{node.name}**: {text}\n\n" + _markdown(["field", "type", ""], iter(rows))
+
+
+def _type(field: ast.AnnAssign) -> str:
+    return f"`{ast.unparse(field.annotation)}`".replace("np.ndarray, ", "")
+
+
+def _comment(lines: list[str], field: ast.AnnAssign) -> str:
+    """What stands behind a field, or before it in lines of its own."""
+    _, mark, behind = lines[field.lineno - 1].partition("#")
+    if mark:
+        return behind.strip()
+    before = field.lineno - 1
+    while lines[before - 1].strip().startswith("#"):
+        before -= 1
+    return " ".join(line.strip(" #") for line in lines[before : field.lineno - 1])
+
+
 def _markdown(head: list[str], rows: Iterator[tuple[str, ...]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+    escaped = ([cell.replace("|", "\\|") for cell in cells] for cells in lines)
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in escaped)
 
 
 WHOLE: dict[str, Callable[[], str]] = {"images/plan.svg": lambda: draw_plan(read_plan())}
-TABLES: dict[str, Callable[[], str]] = {"settings.md": settings_tables}
+TABLES: dict[str, Callable[[], str]] = {
+    "settings.md": settings_tables,
+    "files.md": files_tables,
+}
 
 
 def pages() -> Iterator[tuple[Path, str]]:

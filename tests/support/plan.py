@@ -9,14 +9,16 @@ from functools import cache
 from typing import NamedTuple
 from xml.sax.saxutils import escape
 
-from tests.test_architecture import FILES, MODULES, ROOMS, ROOT, imports, is_inside, module_of
+from tests.test_architecture import FILES, ROOMS, ROOT, imports, is_inside, module_of
 
+PACKAGE = ROOT / "stream_dmr"
 _GROUND = "ground floor"
-_ROW_PX, _TOP_PX, _BOX_PX, _TEXT_PX, _ARCS_PX = 34, 20, 130, 620, 330
+_ROW_PX, _TOP_PX, _BOX_PX, _TEXT_PX, _ARCS_PX = 34, 20, 130, 640, 330
 _STYLE = """
   text { font: 14px sans-serif; fill: #222 } .name { font-weight: bold }
   rect { fill: #e8f0f7; stroke: #4a6d8c } path { fill: none; stroke: #b9c2ca; stroke-width: 1 }
-  .direct { stroke: #24557a; stroke-width: 1.8; marker-end: url(#head) } #head path { fill: #24557a }
+  .direct { stroke: #24557a; stroke-width: 1.8; marker-end: url(#head) }
+  #head path { fill: #24557a }
 """
 
 
@@ -29,9 +31,8 @@ class Plan(NamedTuple):
 
 def room_name(module: str) -> str:
     """The package that a module lies in; the modules beside the packages are one room."""
-    parts = module.removeprefix("stream_dmr.").split(".")
-    is_package = any(ROOT.joinpath(*top, parts[0]).is_dir() for top in (["stream_dmr"], []))
-    return parts[0] if is_package and parts[0] != "stream_dmr" else _GROUND
+    first = module.removeprefix("stream_dmr").removeprefix(".").partition(".")[0]
+    return first if first and (PACKAGE / first).is_dir() else _GROUND
 
 
 @cache
@@ -41,7 +42,7 @@ def read_plan() -> Plan:
         (room_name(module_of(path)), room_name(name))
         for path in FILES
         for name in imports(path)
-        if is_inside(name, ["stream_dmr", "nodes"])
+        if is_inside(name, ["stream_dmr"])
     }
     rooms = dict.fromkeys(room_name(room) for room in ROOMS)
     return Plan(
@@ -103,10 +104,9 @@ def _arc(top: float, bottom: float, is_direct: bool) -> str:
 
 def _description(room: str) -> str:
     if room == _GROUND:
-        loose = [room_name(m) == _GROUND and m.removeprefix("stream_dmr.") for m in sorted(MODULES)]
-        return ", ".join(name for name in loose if name and name != "stream_dmr")
-    folders = (ROOT / "stream_dmr" / room, ROOT / room)
-    file = next(folder for folder in folders if folder.is_dir()) / "__init__.py"
+        loose = [file.stem for file in sorted(PACKAGE.glob("*.py")) if file.stem != "__init__"]
+        return ", ".join(loose)
+    file = PACKAGE / room / "__init__.py"
     text = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8")))
     assert text, f"{file}: expected a docstring, got none; say in one line what the room does"
-    return text.splitlines()[0].rstrip(".")
+    return text.splitlines()[0].rstrip(".").replace("`", "")

@@ -73,7 +73,7 @@ FOXGLOVE_TOPICS = {
 
 
 def topics_table() -> str:
-    """The tables in `docs/recording.md`, which `python -m` this module prints."""
+    """The tables in `docs/files.md`, which `python -m` this module prints."""
     lines = ["| message | topic (.mcap) | schema | entities (.rrd) |", "|---|---|---|---|"]
     for row in TOPICS.values():
         entities = ", ".join(f"`{path}`" for path in row.entities)

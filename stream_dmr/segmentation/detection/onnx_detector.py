@@ -30,7 +30,7 @@ class OnnxSettings(Settings):
     """The part of `[detect_fish]` that a detector from an ONNX file reads."""
 
     onnx_layout: Layout = Field(
-        default="yolo", description="what the model puts out; docs/segmentation.md has the shapes"
+        default="yolo", description="what the model puts out; docs/models.md has the shapes"
     )
     onnx_input_px: int = Field(
         default=640,

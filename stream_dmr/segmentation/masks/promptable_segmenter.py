@@ -104,6 +104,6 @@ class PromptableSegmenter:
 
     def _refusal(self, expected: str, got: str) -> ModelError:
         return ModelError(
-            f"{self._path}: expected {expected}, got {got}; docs/segmentation.md says what a "
+            f"{self._path}: expected {expected}, got {got}; docs/models.md says what a "
             "promptable model looks like"
         )
