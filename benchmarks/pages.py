@@ -1,7 +1,7 @@
 """How fluid the page of `stream-dmr report` is: `python benchmarks/pages.py RUN --fish 2000`.
 
 The fish of a run, repeated until there are so many, in headless Chromium: seconds until the page is
-there, and milliseconds until what was asked for is drawn; `docs/research/report-speed.md` has the figures.
+there, and milliseconds until what was asked for is drawn. Figures: docs/research/report-speed.md.
 """
 
 import argparse

@@ -2,10 +2,16 @@
 
 import re
 import subprocess
+from contextlib import closing
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
+from stream_dmr.results.fish_table import FISH_TABLE
+from stream_dmr.results.store_schema import open_database
+from stream_dmr.results.tables import FRAMES_COLUMNS, LENGTHS_COLUMNS
+from stream_dmr.results.verdicts import Verdict
 from tests.support.pages import pages
 from tests.support.plan import Plan, direct
 
@@ -22,6 +28,18 @@ HEADING = re.compile(r"^#+ +(.*)$", re.MULTILINE)
 def test_generated_part_of_a_page_is_up_to_date(path, text):
     assert path.exists(), f"{path} is missing: run `make docs`"
     assert path.read_text(encoding="utf-8") == text, f"{path.name} is out of date: run `make docs`"
+
+
+def test_page_of_the_files_names_every_table_and_column(tmp_path):
+    with closing(open_database(tmp_path / "lengths.db")) as database:
+        in_database = database.execute(
+            "SELECT name FROM sqlite_master WHERE type = 'table' UNION "
+            "SELECT c.name FROM sqlite_master AS t JOIN pragma_table_info(t.name) AS c"
+        ).fetchall()
+    columns = {*LENGTHS_COLUMNS, *FRAMES_COLUMNS, *FISH_TABLE, *(name for (name,) in in_database)}
+    columns |= {field.name for field in fields(Verdict)}
+    page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
+    assert not columns - set(re.findall(r"`(\w+)`", page))
 
 
 def test_plan_leaves_out_what_a_chain_implies():
