@@ -15,10 +15,10 @@ from deodr.differentiable_renderer import Scene2D
 from jaxtyping import Float
 from torch import Tensor
 
-from stream_dmr.fitting.body import JOINT, ROOT
 from stream_dmr.fitting.paper import adam, losses
 from stream_dmr.fitting.paper.silhouette import project
 from stream_dmr.fitting.paper.skinning import Parameters, Rig, deform, spine
+from stream_dmr.fitting.parameters import NUM_PER_JOINT, NUM_ROOT
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
 from stream_dmr.template.template import Template
@@ -46,19 +46,19 @@ class DeodrSolver:
         mask, distance = torch.as_tensor(target.mask), torch.as_tensor(target.distance)
         K, anchor = torch.as_tensor(target.K), torch.as_tensor(target.anchor)
         origin = torch.as_tensor(start)[None]
-        num_joints = (len(start) - ROOT) // JOINT
+        num_joints = (len(start) - NUM_ROOT) // NUM_PER_JOINT
         unit = step * torch.tensor(adam._ROOT_STEPS + adam._JOINT_STEPS * num_joints)
         moved = torch.zeros_like(origin, requires_grad=True)
         optimizer = torch.optim.Adam([moved], lr=1.0, betas=(0.8, 0.95))
         schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, adam._DECAY)
         for _ in range(iterations):
-            flat = origin + moved * unit
-            vertices = deform(self._rig, flat, spine).vertices
+            vector = origin + moved * unit
+            vertices = deform(self._rig, vector, spine).vertices
             depths = (vertices[0, :, 2] + anchor[2]).detach().numpy()
             pixels = project(vertices + anchor, K)[0]
             covered = _Render.apply(pixels, depths, scene, self._neighbors)[None]
             watch(_hard_iou(covered, mask))
-            parameters = Parameters.from_flat(flat)
+            parameters = Parameters.from_vector(vector)
             terms = (
                 losses.iou_loss(covered, mask),
                 losses.boundary_loss(covered, distance),

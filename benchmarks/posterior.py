@@ -22,12 +22,11 @@ from table1.fish import watch
 from targets import species_template
 
 from stream_dmr.camera import Calibration
-from stream_dmr.fitting.body import rest_vector
-from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.normal_equations import normal_equations, prior_loss
+from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.mesh_levels import Bodies
-from stream_dmr.fitting.size.scan import SIZE
+from stream_dmr.fitting.parameters import LOG_SIZE
 from stream_dmr.fitting.size.scanner import SCATTER
 from stream_dmr.fitting.tracks import TrackFitter
 from stream_dmr.localization.localize import localize
@@ -42,7 +41,7 @@ CONFIG = Config.model_validate({"smooth_length": {"min_frames": 1}})
 
 
 @njit
-def walk(body, kind, target, lambdas, priors, start, rest, spread, nat, steps, thin, rng):  # type: ignore[no-untyped-def]
+def walk(problem, start, spread, nat, steps, thin, rng):  # type: ignore[no-untyped-def]
     """Parameters (steps / thin, P) as often as they are likely; `spread` (P, P) shapes steps."""
     size = len(start)
     here, kept = start.copy(), np.empty((steps // thin, size))
@@ -50,8 +49,8 @@ def walk(body, kind, target, lambdas, priors, start, rest, spread, nat, steps, t
     for step in range(steps):
         length = 2.0 / np.sqrt(size) * np.exp(rng.uniform(-1.5, 0.7))
         there = here + length * (spread @ rng.standard_normal(size)) * (step > 0)
-        terms = evaluate(body, kind, target, there, False)[0]
-        other = np.sum(terms * lambdas) + prior_loss(target, there, rest, priors)
+        terms = evaluate(problem, there, False).terms
+        other = np.sum(terms * problem.lambdas) + prior_loss(problem, there)
         if np.log(rng.random()) < (loss - other) / nat:
             here, loss = there, other
         if step % thin == thin - 1:
@@ -64,21 +63,18 @@ class Sampler:
 
     def __init__(self, tracks: TrackFitter, bodies: Bodies, config: Config) -> None:
         self._fitter, self._settings = tracks.fitter, config.fit_mesh
-        self._body, self._kind = bodies.coarse, KINDS[config.fit_mesh.deformation]
-        self._rest = rest_vector(len(bodies.coarse.joints))
+        self._body = bodies.coarse
         self._rng = np.random.default_rng(1)
-        self._weights = config.fit_mesh.rough_lambdas(), config.fit_mesh.priors()
 
     def log_size(self, crop: FishCrop, start: np.ndarray) -> tuple[float, float]:
         """Mean and std."""
         target, nat = self._fitter.target(crop).coarse(), self._settings.nat
-        problem = self._body, self._kind, target, *self._weights
-        _, _, *seen = evaluate(self._body, self._kind, target, start, False)
-        H, _ = normal_equations(*problem, start, self._rest, *seen)
+        problem = Problem.from_settings(self._settings, self._body, target, with_smoothness=False)
+        H, _ = normal_equations(problem, start, evaluate(problem, start, False).rendering)
         values, vectors = np.linalg.eigh((H + H.T) / (2 * nat))
         spread = vectors / np.sqrt(np.maximum(values, 1 / _STIFFEST))
-        kept = walk(*problem, start, self._rest, spread, nat, _STEPS, _THIN, self._rng)
-        sizes = kept[int(_BURN_IN * len(kept)) :, SIZE]
+        kept = walk(problem, start, spread, nat, _STEPS, _THIN, self._rng)
+        sizes = kept[int(_BURN_IN * len(kept)) :, LOG_SIZE]
         return float(sizes.mean()), float(sizes.std())
 
 
@@ -113,7 +109,7 @@ def _lengths(
         assert fish.length_mm is not None
         assert fish.length_std_mm is not None
         mean, std = sampler.log_size(crop, shape.parameters)
-        length_mm = fish.length_mm * np.exp(mean - shape.parameters[SIZE])
+        length_mm = fish.length_mm * np.exp(mean - shape.parameters[LOG_SIZE])
         others = (fish.length_std_mm / fish.length_mm) ** 2 - shape.length_std_ratio**2
         variance = others + (SCATTER * std) ** 2
         yield fish, replace(fish, length_mm=length_mm, length_std_mm=length_mm * variance**0.5)

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from targets import Pair
 
 from stream_dmr.fitting.cold_start import cold_starts
+from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.contour.solver import ContourSolver
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.mesh_levels import Bodies
@@ -54,7 +55,7 @@ class _Watched(ContourSolver):
 
     def _minimise(self, *arguments: Any, **options: Any) -> Solution:
         solution = super()._minimise(*arguments, **options)
-        is_whole = arguments[0] is self._body  # a coarse mesh only looks around
+        is_whole = arguments[0].body is self._body  # a coarse mesh only looks around
         if is_whole and solution.iou >= GOAL:
             raise _Reached
         return solution
@@ -102,7 +103,12 @@ class Race:
     def _warm(
         self, pair: Pair, before: Float[np.ndarray, "P"]
     ) -> dict[str, Callable[[], Took | None]]:
-        return self._from(pair, lambda t: recentered(self._bodies.fine, 0, t, before), near=True)
+        return self._from(pair, lambda t: recentered(self._problem(t), before), near=True)
+
+    def _problem(self, target: Target) -> Problem:
+        return Problem.from_settings(
+            FitMeshSettings(), self._bodies.fine, target, with_smoothness=True
+        )
 
     def _from(
         self, pair: Pair, start: Callable[[Target], Float[np.ndarray, "P"]], *, near: bool
@@ -212,9 +218,9 @@ def _stopping_adam() -> Iterator[None]:
     """`AdamSolver` hands every iterate to its `_Best`; this one stops at the goal."""
 
     class Best(adam._Best):
-        def update(self, flat: Any, loss: Any, iou: Any) -> None:
+        def update(self, parameters: Any, loss: Any, iou: Any) -> None:
             _stop_at_goal(float(iou.max()))
-            super().update(flat, loss, iou)
+            super().update(parameters, loss, iou)
 
     original, adam._Best = adam._Best, Best
     try:

@@ -15,7 +15,6 @@ from clock import Took, took, typical
 from jaxtyping import Float
 from targets import Known, Pair
 
-from stream_dmr.fitting.body import rest_vector
 from stream_dmr.fitting.contour import (
     deformation,
     levenberg_marquardt,
@@ -26,11 +25,13 @@ from stream_dmr.fitting.contour import (
 from stream_dmr.fitting.contour.deformation import KINDS, deform
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.outline import project
+from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.contour.solver import ContourSolver
 from stream_dmr.fitting.distance_map import signed_distance
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.mesh_levels import Bodies
 from stream_dmr.fitting.paper.adam import AdamSolver
+from stream_dmr.fitting.parameters import LOG_SIZE
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target, mask_contour
 from stream_dmr.fitting.uncertainty import covariance
@@ -89,7 +90,11 @@ class Setup:
     def start(self, pair: Pair) -> tuple[Target, Float[np.ndarray, "P"]]:
         """What the solver of a warm fit is given."""
         target = Target.from_crop(pair.now, plane_normal=pair.plane_normal)
-        return target, recentered(self.body, SPINE, target, self.before(pair))
+        return target, recentered(self.problem(target), self.before(pair))
+
+    def problem(self, target: Target) -> Problem:
+        """Of the fine mesh."""
+        return Problem.from_settings(self.settings, self.body, target, with_smoothness=True)
 
 
 def warm(setup: Setup, pair: Pair) -> Warm:
@@ -112,7 +117,7 @@ def cold(setup: Setup, known: Known) -> Cold:
     lap = took(lambda: fitted.append(fitter.fit(known.crop, None).mesh))
     shape = fitted[0].shape
     v, K = setup.body.num_vertices, known.crop.crop_camera.K
-    points = deform(setup.body, SPINE, known.flat)[v : v + 3]
+    points = deform(setup.body, SPINE, known.parameters)[v : v + 3]
     truth = project(points, np.array([0.0, 0.0, 1.0]), K)
     head = shape.keypoints_px[0]
     is_flipped = np.linalg.norm(head - truth[2]) < np.linalg.norm(head - truth[0])
@@ -148,27 +153,26 @@ def losses(setup: Setup, pair: Pair) -> Losses:
         ContourSolver(setup.bodies, bare).refine(target, start),
         AdamSolver(setup.template, patient).refine(target, start),
     )
-    lambdas = setup.settings.lambdas()
-    values = [evaluate(setup.body, SPINE, target, end.flat, True)[0] @ lambdas for end in ends]
+    problem = setup.problem(target)
+    values = [evaluate(problem, end.parameters, True).terms @ problem.lambdas for end in ends]
     return Losses(*map(float, values))
 
 
 def fit_parts(setup: Setup, pair: Pair) -> dict[str, Callable[[], object]]:
     """What a warm `Fitter.fit` does, each part to be timed by itself."""
-    body, settings, before = setup.body, setup.settings, setup.before(pair)
+    settings, before = setup.settings, setup.before(pair)
     target, start = setup.start(pair)
-    solver = ContourSolver(setup.bodies, settings)
-    flat = solver.refine(target, start).flat
-    _, _, points, pixels, rim, covered = evaluate(body, SPINE, target, flat, True)
+    problem, solver = setup.problem(target), ContourSolver(setup.bodies, settings)
+    parameters = solver.refine(target, start).parameters
+    rendering = evaluate(problem, parameters, True).rendering
     mask, fitter = pair.now.mask, setup.fitter(pair)
-    outline_of = {"points": points, "pixels": pixels, "rim": rim, "covered": covered}
     return {
         "signed distance map": lambda: signed_distance(mask),
         "contour of the mask": lambda: mask_contour(mask),
-        "start moved onto the mask": lambda: recentered(body, SPINE, target, before),
+        "start moved onto the mask": lambda: recentered(problem, before),
         "solver": lambda: solver.refine(target, start),
-        "terms of the result": lambda: evaluate(body, SPINE, target, flat, True),
-        "covariance": lambda: covariance(body, target, settings, flat, **outline_of),
+        "terms of the result": lambda: evaluate(problem, parameters, True),
+        "covariance": lambda: covariance(problem, settings, parameters, rendering),
         "all of `Fitter.fit`": lambda: fitter.fit(pair.now, before),
     }
 
@@ -176,29 +180,27 @@ def fit_parts(setup: Setup, pair: Pair) -> dict[str, Callable[[], object]]:
 def iteration_parts(setup: Setup, pair: Pair) -> dict[str, Callable[[], object]]:
     """What one iteration of the solver does."""
     body, lm, out = setup.body, levenberg_marquardt, outline
-    lambdas, priors = setup.settings.lambdas(), setup.settings.priors()
-    rest = rest_vector(len(body.joints))
-    target, flat = setup.start(pair)
-    _, _, points, pixels, rim, covered = evaluate(body, SPINE, target, flat, True)
-    visible, _, _ = normal_equations.visible_rim(pixels, rim, covered)
+    target, start = setup.start(pair)
+    problem, size = setup.problem(target), np.exp(start[LOG_SIZE])
+    rendering = evaluate(problem, start, True).rendering
+    points, pixels, rim, covered = rendering
+    visible = normal_equations.visible_rim(rendering).edges
     chosen, vertices = np.unique(visible), points[: body.num_vertices]
-    rows = np.random.default_rng(0).normal(size=(len(visible) + len(target.contour), len(flat)))
-    weights = np.ones(len(rows))
-    problem = (body, SPINE, target, lambdas, priors, flat, rest, points, pixels, rim, covered)
-    H, g = normal_equations.normal_equations(*problem)
-    mesh = (body.faces, body.edges, body.edge_faces)
+    rows = np.random.default_rng(0).normal(size=(len(visible) + len(target.contour), len(start)))
+    residuals = normal_equations.Residuals(rows, np.ones(len(rows)), np.ones(len(rows)))
+    H, g = normal_equations.normal_equations(problem, start, rendering)
     return {
-        "evaluate": lambda: evaluate(body, SPINE, target, flat, True),
-        "- deform": lambda: deform(body, SPINE, flat),
+        "evaluate": lambda: evaluate(problem, start, True),
+        "- deform": lambda: deform(body, SPINE, start),
         "- project": lambda: project(vertices, target.anchor, target.K),
-        "- rim": lambda: out.rim_edges(pixels, *mesh),
+        "- rim": lambda: out.rim_edges(pixels, body),
         "- coverage": lambda: out.coverage(pixels, rim, len(target.mask)),
-        "- overlap": lambda: out.overlap(covered, target.mask, target.distance, target.mask_area),
-        "- smoothness": lambda: mesh_terms.smoothness(body, points, np.exp(flat[5])),
-        "normal equations": lambda: normal_equations.normal_equations(*problem),
-        "- visible rim": lambda: normal_equations.visible_rim(pixels, rim, covered),
-        "- jacobian": lambda: deformation.jacobian(body, SPINE, flat, chosen),
-        "- sums of squares": lambda: normal_equations.weighted_squares(rows, weights, weights),
+        "- overlap": lambda: out.overlap(covered, target),
+        "- smoothness": lambda: mesh_terms.smoothness(body, points, size),
+        "normal equations": lambda: normal_equations.normal_equations(problem, start, rendering),
+        "- visible rim": lambda: normal_equations.visible_rim(rendering),
+        "- jacobian": lambda: deformation.jacobian(body, SPINE, start, chosen),
+        "- sums of squares": lambda: normal_equations.weighted_squares(residuals),
         "solve": lambda: lm.solve(H, g, 1e-2, np.zeros(len(g), np.bool_)),
     }
 
@@ -216,6 +218,7 @@ sys.path.insert(0, "benchmarks")
 from targets import species_template
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.compile_kernels import rehearse
+from stream_dmr.fitting.parameters import LOG_SIZE
 from stream_dmr.fitting.settings import FitMeshSettings
 fitter = Fitter(species_template(), FitMeshSettings())
 ready = time.perf_counter()

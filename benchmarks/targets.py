@@ -8,8 +8,17 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import Camera
-from stream_dmr.fitting.body import JOINT, ROOT, Body, rest_vector
+from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.deformation import KINDS, deform
+from stream_dmr.fitting.parameters import (
+    JOINT_ROTATION,
+    LOG_SIZE,
+    NUM_PER_JOINT,
+    NUM_ROOT,
+    ROOT_ROTATION,
+    ROOT_TRANSLATION,
+    rest_vector,
+)
 from stream_dmr.messages import CropQuality, FishCrop, Frame
 from stream_dmr.segmentation.detection.fish_detection import Detection
 from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
@@ -41,7 +50,7 @@ class Known(NamedTuple):
     """A crop of the template itself, bent by the fit's own deformation: IoU 1 can be reached."""
 
     crop: FishCrop
-    flat: Float[np.ndarray, "P"]
+    parameters: Float[np.ndarray, "P"]
     bend_rad: float
 
 
@@ -74,51 +83,55 @@ def draw_known(body: Body, *, size: int, seed: int, most_bend_rad: float) -> Kno
         "zyx", [rng.uniform(-np.pi, np.pi), rng.normal(0, 0.13), rng.uniform(-0.7, 0.7)]
     )
     bend, slant = rng.uniform(0, most_bend_rad), rng.uniform(0, 2 * np.pi)
-    flat = rest_vector(len(body.joints))
-    flat[:3] = turn.as_rotvec()
-    joints = flat[ROOT:].reshape(-1, JOINT)
+    parameters = rest_vector(len(body.joints))
+    parameters[ROOT_ROTATION] = turn.as_rotvec()
+    joints = parameters[NUM_ROOT:].reshape(-1, NUM_PER_JOINT)
     share = np.linspace(-0.5, 0.5, len(joints))[:, None]
     axis = np.array([0.0, np.cos(slant), np.sin(slant)])
-    joints[:, :3] = _joint_bend(body, flat, share * axis, bend) * share * axis
-    return _known_crop(body, flat, size=size, bend_rad=bend)
+    joints[:, JOINT_ROTATION] = _joint_bend(body, parameters, share * axis, bend) * share * axis
+    return _known_crop(body, parameters, size=size, bend_rad=bend)
 
 
 def _joint_bend(
-    body: Body, flat: Float[np.ndarray, "P"], turns: Float[np.ndarray, "J 3"], bend: float
+    body: Body, parameters: Float[np.ndarray, "P"], turns: Float[np.ndarray, "J 3"], bend: float
 ) -> float:
     """How far the joints turn so that head and tail differ by `bend`: weights aren't 0 and 1."""
     low, high = 0.0, 2.0 * bend + 1e-3
     for _ in range(30):
         middle = (low + high) / 2
-        trial = flat.copy()
-        trial[ROOT:].reshape(-1, JOINT)[:, :3] = middle * turns
+        trial = parameters.copy()
+        trial[NUM_ROOT:].reshape(-1, NUM_PER_JOINT)[:, JOINT_ROTATION] = middle * turns
         steps = np.diff(deform(body, KINDS["spine"], trial)[body.num_vertices + 3 :], axis=0)
         ends = steps[[0, -1]] / np.linalg.norm(steps[[0, -1]], axis=1, keepdims=True)
         low, high = (middle, high) if np.arccos(ends[0] @ ends[1]) < bend else (low, middle)
     return low
 
 
-def _known_crop(body: Body, flat: Float[np.ndarray, "P"], *, size: int, bend_rad: float) -> Known:
+def _known_crop(
+    body: Body, parameters: Float[np.ndarray, "P"], *, size: int, bend_rad: float
+) -> Known:
     """The body in the middle of a crop, filling all but 15 % on each side."""
-    flat = flat.copy()
-    flat[5] = np.log(0.12)
+    parameters = parameters.copy()
+    parameters[LOG_SIZE] = np.log(0.12)
     for _ in range(3):  # depth differs along the body, so centering takes a few rounds
-        points, low, high = _placed(body, flat)
-        flat[3:5] -= (low + high) / 2 / np.exp(flat[5])
-    points, low, high = _placed(body, flat)
+        points, low, high = _placed(body, parameters)
+        parameters[ROOT_TRANSLATION] -= (low + high) / 2 / np.exp(parameters[LOG_SIZE])
+    points, low, high = _placed(body, parameters)
     focal = 0.77 * size / float((high - low).max())
     middle = (size - 1) / 2
     K = np.array([[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]])
     camera = Camera(width=size, height=size, K=K, distortion=np.zeros(5))
     mask = draw_mask(points, body.faces, camera=camera)
-    return Known(crop_of_mask(mask, camera), flat, bend_rad)
+    return Known(crop_of_mask(mask, camera), parameters, bend_rad)
 
 
 def _placed(
-    body: Body, flat: Float[np.ndarray, "P"]
+    body: Body, parameters: Float[np.ndarray, "P"]
 ) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Vertices before the camera, and the corners of the box around their rays."""
-    points = deform(body, KINDS["spine"], flat)[: body.num_vertices] + np.array([0.0, 0.0, 1.0])
+    points = deform(body, KINDS["spine"], parameters)[: body.num_vertices] + np.array(
+        [0.0, 0.0, 1.0]
+    )
     rays = points[:, :2] / points[:, 2:]
     return points, rays.min(axis=0), rays.max(axis=0)
 

@@ -21,8 +21,11 @@ class FitMesh:
         *,
         template: Template,
         calibration: Calibration | None,
+        with_covariance: bool = False,
     ) -> None:
-        self._tracks = TrackFitter(template, settings, calibration=calibration)
+        self._tracks = TrackFitter(
+            template, settings, calibration=calibration, with_covariance=with_covariance
+        )
 
     def step(self, crop: FishCrop, /) -> list[FittedMesh]:
         """Fit one crop; what can't be fitted is passed on with its reason."""

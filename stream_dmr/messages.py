@@ -121,14 +121,14 @@ class FittedShape:
     their common scale is arbitrary.
     """
 
-    parameters: Float[np.ndarray, "P"]  # layout: stream_dmr.fitting.paper.skinning.Parameters
+    parameters: Float[np.ndarray, "P"]  # layout: stream_dmr.fitting.parameters
     vertices: Float[np.ndarray, "V 3"] | None  # None: not recorded, `parameters` give them
     keypoints: Float[np.ndarray, "3 3"]  # head, center, tail
     keypoints_px: Float[np.ndarray, "3 2"]  # the same in frame pixels
     midline: Float[np.ndarray, "M 3"]  # head keypoint to tail keypoint
     iou: float  # of the hard silhouette with the mask
     losses: LossTerms
-    covariance: Float[np.ndarray, "P P"] | None  # of `parameters`; None: not recorded
+    covariance: Float[np.ndarray, "P P"] | None  # of `parameters`; None: not asked for
     length_std_ratio: float  # std of the arc length, as a fraction of it
 
     def __post_init__(self) -> None:

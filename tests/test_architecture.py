@@ -63,6 +63,7 @@ ROOMS = [
     "stream_dmr.fitting.settings",
     "stream_dmr.fitting.mesh_levels",
     "stream_dmr.fitting.body",
+    "stream_dmr.fitting.parameters",
     "stream_dmr.fitting",
     "stream_dmr.segmentation.training",
     "stream_dmr.segmentation.tracking",

@@ -23,8 +23,10 @@ from targets import draw_known, draw_pair, species_template
 
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
+from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.paper.silhouette import project, silhouette
 from stream_dmr.fitting.paper.skinning import Rig, deform, spine
+from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -37,7 +39,8 @@ def test_known_targets_can_be_matched(seed):
     body = Body.from_template(TEMPLATE)
     known = draw_known(body, size=128, seed=seed, most_bend_rad=2.0)
     target = Target.from_crop(known.crop, plane_normal=TOWARD_CAMERA)
-    assert evaluate(body, 0, target, known.flat, True)[1] > 0.99
+    problem = Problem.from_settings(FitMeshSettings(), body, target, with_smoothness=True)
+    assert evaluate(problem, known.parameters, True).iou > 0.99
 
 
 def test_pairs_are_whole_and_differ():
@@ -112,7 +115,7 @@ def test_deodr_draws_our_silhouette_half_a_pixel_wider():
     peer = import_module("deodr_solver")
     body, rig = Body.from_template(TEMPLATE), Rig.from_template(TEMPLATE, device="cpu")
     known = draw_known(body, size=96, seed=1, most_bend_rad=1.0)
-    vertices = deform(rig, torch.as_tensor(known.flat)[None], spine).vertices
+    vertices = deform(rig, torch.as_tensor(known.parameters)[None], spine).vertices
     vertices = vertices + torch.tensor([0.0, 0.0, 1.0])
     pixels = project(vertices, torch.as_tensor(known.crop.crop_camera.K)).requires_grad_()
     neighbors, scene = peer._neighbors(rig.faces.numpy()), peer._scene(rig, 96)

@@ -1,7 +1,7 @@
 """A template prepared for deformation: points bound to the midline, edges paired with faces.
 
-Plain arrays, so that torch, numpy and compiled loops all work on one and the same binding; and the
-layout of the parameters that deform it.
+Plain arrays, so that torch, numpy and kernels (`stream_dmr.compiled`) all work on one and the same
+binding.
 """
 
 from typing import NamedTuple
@@ -10,15 +10,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from stream_dmr.template.template import Template
-
-# A deformation has ROOT + JOINT * J parameters: rotation vector (3, rad), x and y of the
-# translation (2, body lengths) and log scale (1) of the root; then of each joint rotation vector
-# (3, rad), translation (3, body lengths), log scale (1), and the Cholesky factor of the precision Q
-# of its weight (6: the logs of its diagonal, then the entries (1,0), (2,0), (2,1)).
-ROOT = 6
-JOINT = 13
-# Radius of a joint's Gaussian before it is learnt, in body lengths.
-_REST_RADIUS = 0.25
 
 
 class Body(NamedTuple):
@@ -74,13 +65,6 @@ class Body(NamedTuple):
             num_neighbors=np.bincount(edges.ravel()),
             num_vertices=len(template.rest_vertices),
         )
-
-
-def rest_vector(num_joints: int) -> Float[np.ndarray, "P"]:
-    """Parameters of the template at rest, one body length at depth 1."""
-    joint = np.zeros(JOINT)
-    joint[7:10] = -np.log(_REST_RADIUS)
-    return np.concatenate([np.zeros(ROOT), np.tile(joint, num_joints)])
 
 
 def bind_to_midline(

@@ -6,8 +6,16 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.fitting.body import JOINT, ROOT, rest_vector
 from stream_dmr.fitting.heading import is_turned
+from stream_dmr.fitting.parameters import (
+    JOINT_ROTATION,
+    LOG_SIZE,
+    NUM_PER_JOINT,
+    NUM_ROOT,
+    ROOT_ROTATION,
+    ROOT_TRANSLATION,
+    rest_vector,
+)
 from stream_dmr.fitting.target import Target
 from stream_dmr.template.template import Template
 
@@ -39,11 +47,11 @@ def cold_starts(target: Target, template: Template) -> Float[np.ndarray, "B P"]:
     middle = root.apply(template.keypoints[[0, 2]].mean(axis=0))[:, :2]
     offset = (center_px - target.K[:2, 2]) / focal - target.anchor[:2]
     starts = np.tile(rest_vector(num_joints), (len(bends), 1))
-    starts[:, :3] = root.as_rotvec()
-    starts[:, 3:5] = offset / length[:, None] - middle
-    starts[:, 5] = np.log(length)
-    joints = starts[:, ROOT:].reshape(len(bends), num_joints, JOINT)
-    joints[:, :, :3] = np.linspace(-0.5, 0.5, num_joints)[:, None] * axis[:, None]
+    starts[:, ROOT_ROTATION] = root.as_rotvec()
+    starts[:, ROOT_TRANSLATION] = offset / length[:, None] - middle
+    starts[:, LOG_SIZE] = np.log(length)
+    joints = starts[:, NUM_ROOT:].reshape(len(bends), num_joints, NUM_PER_JOINT)
+    joints[..., JOINT_ROTATION] = np.linspace(-0.5, 0.5, num_joints)[:, None] * axis[:, None]
     return starts[~is_turned(starts, target.heading)]
 
 

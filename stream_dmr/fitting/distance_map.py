@@ -6,7 +6,7 @@ one sweep, since within a row nothing beyond the ends of a pixel's own run can b
 """
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int32
 
 from stream_dmr.compiled import compiled
 
@@ -23,7 +23,7 @@ def signed_distance(mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
 
 
 @compiled
-def _along_columns(mask):
+def _along_columns(mask: Bool[np.ndarray, "H W"]) -> Int32[np.ndarray, "H W"]:
     """Distance of each pixel to the nearest one of the other side in its column."""
     height, width = mask.shape
     gap = np.full((height, width), _NONE, np.int32)
@@ -39,7 +39,9 @@ def _along_columns(mask):
 
 
 @compiled
-def _along_rows(mask, gap):
+def _along_rows(
+    mask: Bool[np.ndarray, "H W"], gap: Int32[np.ndarray, "H W"]
+) -> Float[np.ndarray, "H W"]:
     height, width = mask.shape
     signed = np.empty((height, width))
     # The envelope: where its parabolas stand, their values at 0, and from where on each is lowest.
@@ -58,7 +60,14 @@ def _along_rows(mask, gap):
 
 
 @compiled
-def _envelope(gap, first, last, places, starts, froms):
+def _envelope(
+    gap: Int32[np.ndarray, "W"],
+    first: int,
+    last: int,
+    places: Float[np.ndarray, "W"],
+    starts: Float[np.ndarray, "W"],
+    froms: Float[np.ndarray, "W"],
+) -> int:
     """Parabolas of one run of pixels; those of its two neighbours stand on the ground."""
     count = 0
     for k in range(max(first - 1, 0), min(last + 2, len(gap))):
@@ -82,7 +91,16 @@ def _envelope(gap, first, last, places, starts, froms):
 
 
 @compiled
-def _fill(signed, first, last, sign, places, starts, froms, count):
+def _fill(
+    signed: Float[np.ndarray, "W"],
+    first: int,
+    last: int,
+    sign: float,
+    places: Float[np.ndarray, "W"],
+    starts: Float[np.ndarray, "W"],
+    froms: Float[np.ndarray, "W"],
+    count: int,
+) -> None:
     if count == 0:
         signed[first : last + 1] = sign * np.inf
         return

@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.camera import frame_from_crop
+from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.cold_start import cold_starts
-from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.outline import project
+from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.contour.solver import ContourSolver
 from stream_dmr.fitting.heading import is_turned
 from stream_dmr.fitting.mesh_levels import Bodies
@@ -18,7 +19,7 @@ from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.size.scanner import SizeScanner
 from stream_dmr.fitting.solver import Solution, Solver
 from stream_dmr.fitting.target import Target
-from stream_dmr.fitting.uncertainty import covariance
+from stream_dmr.fitting.uncertainty import covariance, length_std_ratio
 from stream_dmr.fitting.warm_start import recentered
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms, SolverReport
 from stream_dmr.template.template import Template
@@ -47,14 +48,18 @@ class Fitter:
         settings: FitMeshSettings,
         *,
         plane_normal: Float[np.ndarray, "3"] | None = None,
+        with_covariance: bool = False,
     ) -> None:
-        """`plane_normal`, in the camera frame, is of the plane that fish hang in, if known."""
+        """`plane_normal`, in the camera frame, is of the plane that fish hang in, if known.
+
+        `with_covariance`: fits carry that of their parameters.
+        """
         normal = _TOWARD_CAMERA if plane_normal is None else plane_normal
         self._plane_normal = np.ascontiguousarray(normal)
         self._template = template
         self._settings = settings
+        self._with_covariance = with_covariance
         self._bodies = Bodies.of(template, max_faces=settings.max_faces)
-        self._kind = KINDS[settings.deformation]
         self._solver = self._make_solver()
         self._scanner = SizeScanner(self._bodies, settings)
 
@@ -99,7 +104,7 @@ class Fitter:
             return Fit(_message(crop, None, None, "fit diverged"), None)
         shape = self._shape(target, sized, crop, size_std)
         report = self._report(solution, is_cold=is_cold, since_ns=since_ns)
-        return Fit(_message(crop, shape, report, ""), solution.flat)
+        return Fit(_message(crop, shape, report, ""), solution.parameters)
 
     def _report(self, solution: Solution, *, is_cold: bool, since_ns: int) -> SolverReport:
         return SolverReport(
@@ -127,7 +132,7 @@ class Fitter:
         """
         solution = None
         if warm is not None and not is_turned(warm, target.heading):
-            start = recentered(self._bodies.fine, self._kind, target, warm)
+            start = recentered(self._problem(self._bodies.fine, target), warm)
             solution = self._solver.refine(target, start)
             if solution.iou >= self._settings.cold_below_iou:
                 return solution, False
@@ -140,24 +145,18 @@ class Fitter:
         self, target: Target, solution: Solution, crop: FishCrop, size_std: float | None
     ) -> FittedShape:
         """`size_std` of the log size, where it is known better than by the covariance."""
-        flat, v = solution.flat, self._bodies.whole.num_vertices
-        terms, iou, points, pixels, rim, covered = evaluate(
-            self._bodies.whole, self._kind, target, flat, True
-        )
-        spread, length_std = covariance(
-            self._bodies.whole,
-            target,
-            self._settings,
-            flat,
-            points=points,
-            pixels=pixels,
-            rim=rim,
-            covered=covered,
-        )
+        parameters, v = solution.parameters, self._bodies.whole.num_vertices
+        problem = self._problem(self._bodies.whole, target)
+        terms, iou, rendering = evaluate(problem, parameters, True)
+        points, spread = rendering.points, None
+        if size_std is None or self._with_covariance:
+            spread = covariance(problem, self._settings, parameters, rendering)
+            if size_std is None:
+                size_std = length_std_ratio(problem, parameters, points, spread)
         placed = points + target.anchor
         keypoints_px = project(points[v : v + 3], target.anchor, target.K)
         return FittedShape(
-            parameters=flat,
+            parameters=parameters,
             vertices=placed[:v],
             keypoints=placed[v : v + 3],
             keypoints_px=frame_from_crop(
@@ -166,13 +165,16 @@ class Fitter:
             midline=placed[v + 3 :],
             iou=iou,
             losses=LossTerms(**dict(zip(LossTerms.__slots__, terms.tolist(), strict=True))),
-            covariance=spread,
-            length_std_ratio=length_std if size_std is None else size_std,
+            covariance=spread if self._with_covariance else None,
+            length_std_ratio=size_std,
         )
+
+    def _problem(self, body: Body, target: Target) -> Problem:
+        return Problem.from_settings(self._settings, body, target, with_smoothness=True)
 
 
 def _is_finite(solution: Solution) -> bool:
-    return bool(np.isfinite(solution.flat).all() and np.isfinite(solution.loss))
+    return bool(np.isfinite(solution.parameters).all() and np.isfinite(solution.loss))
 
 
 def _message(

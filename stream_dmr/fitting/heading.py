@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import Camera
+from stream_dmr.fitting.parameters import ROOT_ROTATION
 from stream_dmr.messages import FishEnds
 
 # Added to the L_rec of a fit whose head is at the wrong end, when fits are compared: such a one is
@@ -32,13 +33,14 @@ def told(ends: FishEnds | None, crop_camera: Camera) -> Float[np.ndarray, "2"]:
 
 
 def is_turned(
-    flats: Float[np.ndarray, "*B P"], heading: Float[np.ndarray, "2"]
+    parameters: Float[np.ndarray, "*B P"], heading: Float[np.ndarray, "2"]
 ) -> Bool[np.ndarray, "*B"]:
     """Whether the body of such parameters has its head at the other end."""
     if not heading.any():  # most are not known
-        return np.zeros(flats.shape[:-1], np.bool_)
-    forward = Rotation.from_rotvec(flats[..., :3].reshape(-1, 3)).apply([-1.0, 0.0, 0.0])[:, :2]
-    return (forward @ heading < 0).reshape(flats.shape[:-1])
+        return np.zeros(parameters.shape[:-1], np.bool_)
+    root = Rotation.from_rotvec(parameters[..., ROOT_ROTATION].reshape(-1, 3))
+    forward = root.apply([-1.0, 0.0, 0.0])[:, :2]
+    return (forward @ heading < 0).reshape(parameters.shape[:-1])
 
 
 class HeadMemory:

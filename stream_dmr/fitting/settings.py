@@ -6,6 +6,12 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
+from stream_dmr.fitting.parameters import (
+    JOINT_ROTATION,
+    JOINT_WEIGHT,
+    NUM_PER_JOINT,
+    Priors,
+)
 from stream_dmr.settings import Settings
 
 
@@ -91,10 +97,6 @@ class FitMeshSettings(Settings):
             ]
         )
 
-    def rough_lambdas(self) -> Float[np.ndarray, "6"]:
-        """Those without the mesh's smoothness, which tells poses apart no better and is dear."""
-        return self.lambdas() * [1, 1, 1, 1, 0, 0]
-
     @property
     def nat(self) -> float:
         """A nat of likelihood in L_rec.
@@ -104,12 +106,10 @@ class FitMeshSettings(Settings):
         """
         return self.prior_weight * self.edge_std_px**2
 
-    def priors(self) -> Float[np.ndarray, "14"]:
-        """Weights of the squares of the tilt, then of each joint's 13 parameters.
-
-        Their layout stands in `stream_dmr.fitting.body`. The joints' translations and scales have
-        L_t and L_s.
-        """
-        turns = [self.twist_std_rad, self.bend_std_rad, self.bend_std_rad]
-        spread = [self.tilt_std_rad, *turns, *[np.inf] * 4, *[self.weight_std] * 6]
-        return self.prior_weight / np.square(spread)
+    def priors(self) -> Priors:
+        """Of tilt, bends and skinning weights; joints' translations and scales have L_t and L_s."""
+        std = np.full(NUM_PER_JOINT, np.inf)
+        std[JOINT_ROTATION] = self.twist_std_rad, self.bend_std_rad, self.bend_std_rad
+        std[JOINT_WEIGHT] = self.weight_std
+        weights = self.prior_weight / np.square([self.tilt_std_rad, *std])
+        return Priors(float(weights[0]), weights[1:].copy())

@@ -12,7 +12,7 @@ from stream_dmr.fitting.target import Target
 class Solution(NamedTuple):
     """The best iterate by L_rec, and why the search ended."""
 
-    flat: Float[np.ndarray, "P"]  # layout: stream_dmr.fitting.body
+    parameters: Float[np.ndarray, "P"]  # layout: stream_dmr.fitting.parameters
     loss: float  # L_rec of eq. (3)
     iou: float  # of the hard silhouette
     iterations: int
@@ -22,7 +22,7 @@ class Solution(NamedTuple):
 
 def rank(target: Target, solution: Solution) -> float:
     """L_rec as a search compares it: from afar a fit may turn round, whatever it began with."""
-    return solution.loss + TURNED * float(is_turned(solution.flat, target.heading))
+    return solution.loss + TURNED * float(is_turned(solution.parameters, target.heading))
 
 
 @runtime_checkable

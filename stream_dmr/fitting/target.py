@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.distance_map import signed_distance
@@ -19,7 +19,7 @@ _BORDER_PX = 0.6  # nearer to the picture's border there is no edge of the fish,
 
 
 class Target(NamedTuple):
-    """Plain arrays, which compiled code takes as they are."""
+    """Plain arrays, which kernels take as they are: `stream_dmr.compiled`."""
 
     K: Float[np.ndarray, "3 3"]
     anchor: Float[np.ndarray, "3"]  # where the root rests: depth 1, in the middle of the crop
@@ -68,7 +68,7 @@ def _halved_px(pixels: Float[np.ndarray, "*N 2"]) -> Float[np.ndarray, "*N 2"]:
 
 
 @compiled
-def _halved(picture):
+def _halved(picture: Float[np.ndarray, "S S"]) -> Float[np.ndarray, "S//2 S//2"]:
     """Means of 2x2 pixels."""
     out = np.empty((picture.shape[0] // 2, picture.shape[1] // 2))
     for i in range(out.shape[0]):
@@ -96,8 +96,10 @@ def mask_contour(
 
 
 @compiled
-def _edge(traced, height, width):
-    """One closed curve of traced pixels (N, 2), smoothed, resampled and moved outward."""
+def _edge(
+    traced: Int[np.ndarray, "N 2"], height: int, width: int
+) -> tuple[Float[np.ndarray, "C 2"], Float[np.ndarray, "C 2"], Float[np.ndarray, "C"]]:
+    """One closed curve of traced pixels, smoothed, resampled and moved outward."""
     smooth = _smooth(traced)
     steps = np.empty(len(smooth))
     for n in range(len(smooth)):
@@ -124,7 +126,7 @@ def _edge(traced, height, width):
 
 
 @compiled
-def _smooth(traced):
+def _smooth(traced: Int[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
     """Gaussian smoothing around a closed curve."""
     kernel = np.exp(-0.5 * (np.arange(-_REACH, _REACH + 1) / _SMOOTHING_PX) ** 2)
     kernel /= kernel.sum()

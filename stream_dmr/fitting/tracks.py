@@ -31,10 +31,13 @@ class TrackFitter:
         settings: FitMeshSettings,
         *,
         calibration: Calibration | None,
+        with_covariance: bool = False,
     ) -> None:
         """Fish hang in the plane of the calibration, if there is one."""
         normal = None if calibration is None else calibration.plane.rotation[:, 2]
-        self.fitter = Fitter(template, settings, plane_normal=normal)
+        self.fitter = Fitter(
+            template, settings, plane_normal=normal, with_covariance=with_covariance
+        )
         self._least_iou = settings.cold_below_iou
         self._tracks: dict[int, _Track] = {}
 

@@ -54,7 +54,12 @@ def measure_source(
     try:
         nodes = _nodes(inputs)
         if inputs.is_endless:  # no frame of a camera shall wait for a compiler
-            rehearse(Fitter(inputs.template, inputs.config.fit_mesh))
+            fitter = Fitter(
+                inputs.template,
+                inputs.config.fit_mesh,
+                with_covariance=_records_covariance(inputs.config),
+            )
+            rehearse(fitter)
         with open_outputs(inputs, observer) as outputs:
             resume(nodes, outputs.left)
             _say_what_matters(inputs, outputs, observer)
@@ -97,10 +102,19 @@ def later_nodes(
 ) -> list[Node]:
     """The nodes that a crop passes, from the fit to the length."""
     return [
-        FitMesh(config.fit_mesh, template=template, calibration=calibration),
+        FitMesh(
+            config.fit_mesh,
+            template=template,
+            calibration=calibration,
+            with_covariance=_records_covariance(config),
+        ),
         Localize(config.localize, calibration=calibration),
         SmoothLength(config.smooth_length),
     ]
+
+
+def _records_covariance(config: Config) -> bool:
+    return config.recording.meshes == "vertices"
 
 
 def resume(nodes: Sequence[Node], left: Iterable[LocalizedFish]) -> None:

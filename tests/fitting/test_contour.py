@@ -9,17 +9,19 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.fitting.body import JOINT, ROOT, Body
+from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour import deformation, normal_equations, outline, rotation
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.mesh_terms import smoothness_slope
+from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.contour.pull_back import pull_back
 from stream_dmr.fitting.paper.losses import laplacian_loss, normal_loss
 from stream_dmr.fitting.paper.objective import Objective
 from stream_dmr.fitting.paper.silhouette import project, silhouette
 from stream_dmr.fitting.paper.silhouette import rim_edges as torch_rim_edges
 from stream_dmr.fitting.paper.skinning import DEFORMATIONS, Parameters, Rig
+from stream_dmr.fitting.parameters import LOG_SIZE, NUM_PER_JOINT, NUM_ROOT
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target, mask_contour
 from stream_dmr.template.template import load_template
@@ -47,7 +49,6 @@ TEMPLATES = {
 BODIES = {name: Body.from_template(template) for name, template in TEMPLATES.items()}
 RIGS = {name: Rig.from_template(template) for name, template in TEMPLATES.items()}
 CAMERA = crop_camera()
-SETTINGS = FitMeshSettings()
 # A plane that looks past the camera, so that no component of its normal is 0.
 PLANE_NORMAL = np.array([0.2, -0.3, 0.93]) / np.linalg.norm([0.2, -0.3, 0.93])
 
@@ -60,7 +61,7 @@ five = settings(max_examples=5)
 def motion(name, seed, *, size=0.5):
     rng = np.random.default_rng(seed)
     flat = random_flat(rng, num_joints=len(TEMPLATES[name].joints), size=size)
-    flat[0, 5] += np.log(0.25)  # about a third of the picture
+    flat[0, LOG_SIZE] += np.log(0.25)  # about a third of the picture
     return flat
 
 
@@ -73,8 +74,13 @@ def target_of(flat, name, *, size=96):
     return Target.from_crop(crop_of(flat, RIGS[name], size=size), plane_normal=PLANE_NORMAL)
 
 
+def problem_of(name, kind, target):
+    options = FitMeshSettings(deformation=kind)
+    return Problem.from_settings(options, BODIES[name], target, with_smoothness=True)
+
+
 def torch_points(name, flat, kind):
-    return DEFORMATIONS[kind](RIGS[name], Parameters.from_flat(flat))[0]
+    return DEFORMATIONS[kind](RIGS[name], Parameters.from_vector(flat))[0]
 
 
 def torch_slopes(function, flat):
@@ -151,13 +157,10 @@ class TestDeformation:
     def test_slopes_of_the_rim_s_pixels_are_autograd_s(self, name, kind, seed):
         flat = motion(name, seed, size=0.2)
         target = target_of(fish_pose(0), "2 joints")
-        _, _, points, pixels, rim, _ = evaluate(
-            BODIES[name], KINDS[kind], target, flat[0].numpy(), True
-        )
-        rim = rim[:: max(1, len(rim) // 6)]
-        index, slopes = normal_equations.rim_slopes(
-            BODIES[name], KINDS[kind], target, flat[0].numpy(), points, rim
-        )
+        problem, parameters = problem_of(name, kind, target), flat[0].numpy()
+        points, pixels, rim, _ = evaluate(problem, parameters, True).rendering
+        rim = np.ascontiguousarray(rim[:: max(1, len(rim) // 6)])
+        index, slopes = normal_equations.rim_slopes(problem, parameters, points, rim)
         chosen = np.unique(rim)
         assert (np.flatnonzero(index >= 0) == chosen).all()
 
@@ -180,8 +183,7 @@ def seen(name, flat, *, moved_px=0.0):
 
 
 def rim_of(name, pixels):
-    body = BODIES[name]
-    return outline.rim_edges(pixels, body.faces, body.edges, body.edge_faces)
+    return outline.rim_edges(pixels, BODIES[name])
 
 
 @both_kinds
@@ -209,7 +211,7 @@ class TestMeshTerms:
         rig = RIGS[name]
 
         def weighted(vector):
-            parameters = Parameters.from_flat(vector[None])
+            parameters = Parameters.from_vector(vector[None])
             vertices = DEFORMATIONS[kind](rig, parameters)[:, : BODIES[name].num_vertices]
             laplacian = laplacian_loss(vertices / vector[5].exp(), rig)
             return (0.7 * normal_loss(vertices, rig) + 40.0 * laplacian)[0]
@@ -261,7 +263,7 @@ def test_terms_and_iou_are_those_of_the_torch_objective(name, kind, seed):
     flat = motion(name, seed)
     objective = Objective(RIGS[name], target, FitMeshSettings(deformation=kind))
     expected = objective.terms(flat)
-    found, hard, *_ = evaluate(BODIES[name], KINDS[kind], target, flat[0].numpy(), True)
+    found, hard, _ = evaluate(problem_of(name, kind, target), flat[0].numpy(), True)
     np.testing.assert_allclose(found, expected.terms[0], rtol=1e-9, atol=1e-9)
     assert hard == pytest.approx(expected.iou.item(), abs=1e-12)
 
@@ -269,12 +271,11 @@ def test_terms_and_iou_are_those_of_the_torch_objective(name, kind, seed):
 class TestVisibleRim:
     def visible(self, flat, *, size=96):
         target = target_of(flat, "halibut", size=size)
-        _, _, _, pixels, rim, covered = evaluate(
-            BODIES["halibut"], KINDS["spine"], target, flat[0].numpy(), True
-        )
-        inside = distance_transform_edt(covered >= 0.5)
-        outside = distance_transform_edt(covered < 0.5)
-        return pixels, rim, covered, inside - outside
+        problem = problem_of("halibut", "spine", target)
+        rendering = evaluate(problem, flat[0].numpy(), True).rendering
+        inside = distance_transform_edt(rendering.covered >= 0.5)
+        outside = distance_transform_edt(rendering.covered < 0.5)
+        return rendering, inside - outside
 
     def depth(self, field, places):
         """How deep places lie inside the silhouette, px to a pixel or so."""
@@ -284,9 +285,10 @@ class TestVisibleRim:
     @twenty
     @given(seed=seeds, bend=st.sampled_from([0.1, 0.5, 1.5]))
     def test_is_the_outer_outline(self, seed, bend):
-        pixels, rim, covered, field = self.visible(fish_pose(seed, bend_rad=bend))
+        rendering, field = self.visible(fish_pose(seed, bend_rad=bend))
+        _, pixels, _, covered = rendering
         assume(is_all_in(covered))
-        visible, normals, lengths = normal_equations.visible_rim(pixels, rim, covered)
+        visible, normals, lengths = normal_equations.visible_rim(rendering)
         middles = pixels[visible].mean(axis=1)
         steps = pixels[visible[:, 1]] - pixels[visible[:, 0]]
         np.testing.assert_allclose(np.linalg.norm(steps, axis=1), lengths)
@@ -304,9 +306,10 @@ class TestVisibleRim:
     @twenty
     @given(seed=seeds, bend=st.sampled_from([0.1, 0.5, 1.5]))
     def test_leaves_out_only_what_lies_inside(self, seed, bend):
-        pixels, rim, covered, field = self.visible(fish_pose(seed, bend_rad=bend))
+        rendering, field = self.visible(fish_pose(seed, bend_rad=bend))
+        _, pixels, rim, covered = rendering
         assume(is_all_in(covered))
-        visible, _, _ = normal_equations.visible_rim(pixels, rim, covered)
+        visible, _, _ = normal_equations.visible_rim(rendering)
         kept = {tuple(edge) for edge in visible.tolist()}
         is_kept = np.array([tuple(edge) in kept for edge in rim.tolist()])
         depth = self.depth(field, pixels[rim].mean(axis=1))
@@ -321,13 +324,13 @@ class TestVisibleRim:
     def test_a_body_folded_over_itself_hides_the_rim_inside(self):
         flat = fish_pose(0)
         flat[0, :3] = 0.0
-        joints = flat[0, ROOT:].view(2, JOINT)
+        joints = flat[0, NUM_ROOT:].view(2, NUM_PER_JOINT)
         joints[:, :3] = torch.tensor([[0.0, 2.8, 0.0], [0.0, -2.8, 0.0]])  # toward the camera
-        pixels, rim, covered, _ = self.visible(flat)
-        visible, _, _ = normal_equations.visible_rim(pixels, rim, covered)
-        layers = silhouette_layers(pixels)
+        rendering, _ = self.visible(flat)
+        visible, _, _ = normal_equations.visible_rim(rendering)
+        layers = silhouette_layers(rendering.pixels)
         assert (layers > 1.5).sum() > 0.1 * (layers > 0.5).sum()
-        assert len(visible) < 0.5 * len(rim)
+        assert len(visible) < 0.5 * len(rendering.rim)
 
 
 def is_all_in(covered):

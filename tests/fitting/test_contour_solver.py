@@ -12,7 +12,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.fitting.body import JOINT, ROOT, Body, rest_vector
+from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour import levenberg_marquardt
 from stream_dmr.fitting.contour.deformation import KINDS, deform
 from stream_dmr.fitting.contour.levenberg_marquardt import (
@@ -24,16 +24,19 @@ from stream_dmr.fitting.contour.levenberg_marquardt import (
     solve,
 )
 from stream_dmr.fitting.contour.normal_equations import (
-    _GAUGE,
-    _regularise,
+    GAUGE,
+    Residuals,
     normal_equations,
     prior_loss,
+    regularise,
     weighted_squares,
 )
+from stream_dmr.fitting.contour.problem import Options, Problem
 from stream_dmr.fitting.contour.solver import ContourSolver, mirror
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.mesh_levels import Bodies
 from stream_dmr.fitting.paper.skinning import Parameters, Rig, rest_parameters, rotation_matrices
+from stream_dmr.fitting.parameters import LOG_SIZE, NUM_PER_JOINT, NUM_ROOT, Priors, rest_vector
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
 from stream_dmr.geometry import arc_length
@@ -51,9 +54,8 @@ from tests.support.shapes import (
 HALIBUT = load_template("halibut")
 BODY = Body.from_template(HALIBUT)
 RIG = Rig.from_template(HALIBUT)
-SPINE = KINDS["spine"]
 SETTINGS = FitMeshSettings()
-LAMBDAS, PRIORS, REST = SETTINGS.lambdas(), SETTINGS.priors(), rest_vector(2)
+REST = rest_vector(2)
 FREE = np.zeros(len(REST), bool)  # nothing is held
 TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
 twenty = settings(max_examples=20)
@@ -66,19 +68,21 @@ def hooked(seed, *, most_bend_rad=0.6, tilt_rad=0.15, out_rad=0.15):
     tilt = Rotation.from_euler("yx", rng.normal(size=2) * tilt_rad)
     flat = rest_parameters(2)
     flat[0, :3] = torch.as_tensor((spin * tilt).as_rotvec())
-    flat[0, 5] = np.log(0.25)
+    flat[0, LOG_SIZE] = np.log(0.25)
     bend = rng.uniform(-most_bend_rad, most_bend_rad)
     turn = np.array([rng.normal() * 0.1, rng.normal() * out_rad, bend])
     # Weights never get to 0 and 1, so the joints turn further than the body bends.
-    flat[0, ROOT:].view(2, JOINT)[:, :3] = torch.as_tensor(1.25 * np.outer([-0.5, 0.5], turn))
+    flat[0, NUM_ROOT:].view(2, NUM_PER_JOINT)[:, :3] = torch.as_tensor(
+        1.25 * np.outer([-0.5, 0.5], turn)
+    )
     return flat
 
 
 def moved(flat, rng, *, size=1.0):
     """Parameters some pixels off, as a fish may have moved since the frame before."""
     near = flat[0].numpy().copy()
-    near[:ROOT] += size * rng.normal(size=ROOT) * [0.08, 0.08, 0.08, 0.03, 0.03, 0.04]
-    near[ROOT:].reshape(2, JOINT)[:, :3] += size * rng.normal(size=(2, 3)) * 0.08
+    near[:NUM_ROOT] += size * rng.normal(size=NUM_ROOT) * [0.08, 0.08, 0.08, 0.03, 0.03, 0.04]
+    near[NUM_ROOT:].reshape(2, NUM_PER_JOINT)[:, :3] += size * rng.normal(size=(2, 3)) * 0.08
     return near
 
 
@@ -86,16 +90,20 @@ def target_of(flat, *, plane_normal=TOWARD_CAMERA):
     return Target.from_crop(crop_of(flat, RIG, size=96), plane_normal=plane_normal)
 
 
-def energy(target, flat, *, kind=SPINE):
+def problem_of(target, *, kind="spine"):
+    options = FitMeshSettings(deformation=kind)
+    return Problem.from_settings(options, BODY, target, with_smoothness=True)
+
+
+def energy(target, flat, *, kind="spine"):
     """What `minimise` lowers: L_rec and the priors."""
-    terms = evaluate(BODY, kind, target, flat, True)[0]
-    return terms @ LAMBDAS + prior_loss(target, flat, REST, PRIORS)
+    problem = problem_of(target, kind=kind)
+    return evaluate(problem, flat, True).terms @ problem.lambdas + prior_loss(problem, flat)
 
 
-def descend(target, start, *, iterations=30, tolerance=1e-4, damping=1e-2, kind=SPINE):
-    return minimise(
-        BODY, kind, target, LAMBDAS, PRIORS, start, REST, FREE, iterations, tolerance, damping
-    )
+def descend(target, start, *, iterations=30, tolerance=1e-4, damping=1e-2, kind="spine"):
+    options = Options(iterations, tolerance, damping)
+    return minimise(problem_of(target, kind=kind), start, FREE, options)
 
 
 class TestNormalEquations:
@@ -105,7 +113,7 @@ class TestNormalEquations:
         rng = np.random.default_rng(seed)
         rows, residuals = rng.normal(size=(count, size)), rng.normal(size=count)
         weights = rng.uniform(0, 2, count)
-        H, g = weighted_squares(rows, residuals, weights)
+        H, g = weighted_squares(Residuals(rows, residuals, weights))
         np.testing.assert_allclose(H, rows.T @ (weights[:, None] * rows), atol=1e-11)
         np.testing.assert_allclose(g, rows.T @ (weights * residuals), atol=1e-11)
         np.testing.assert_array_equal(H, H.T)
@@ -157,32 +165,34 @@ class TestNormalEquations:
         """H = J^T J and g = J^T r, with J of the residuals below by autograd."""
         rng = np.random.default_rng(seed)
         flat = rest_parameters(num_joints) + torch.as_tensor(
-            rng.normal(size=(1, ROOT + JOINT * num_joints)) * 0.5
+            rng.normal(size=(1, NUM_ROOT + NUM_PER_JOINT * num_joints)) * 0.5
         )
-        lambdas, priors = rng.uniform(0.1, 2, 6), rng.uniform(0.1, 2, 14)
+        lambdas = rng.uniform(0.1, 2, 6)
+        priors = Priors(rng.uniform(0.1, 2), rng.uniform(0.1, 2, NUM_PER_JOINT))
         rest = rest_vector(num_joints)
         normal = rng.normal(size=3)
         target = target_of(hooked(0), plane_normal=normal / np.linalg.norm(normal))
 
         def squares(p):
             """Residuals of the gauge, of L_s and L_t, and of the priors, with their weights."""
-            parts = Parameters.from_flat(p[None])
-            gauge = parts.joint_rotations[0].sum(dim=0) * _GAUGE**0.5
+            parts = Parameters.from_vector(p[None])
+            gauge = parts.joint_rotations[0].sum(dim=0) * GAUGE**0.5
             scale = (parts.joint_log_scales[0].exp() - 1) * (2 * lambdas[2]) ** 0.5
             shift = parts.joint_translations[0].flatten() * (2 * lambdas[3]) ** 0.5
             tilt = torch.as_tensor(target.plane_normal) @ rotation_matrices(p[:3])[:, :1]
-            gap = (p - torch.as_tensor(rest))[ROOT:].view(num_joints, JOINT)
-            gap = gap * torch.as_tensor(priors[1:]).sqrt()
-            prior = torch.cat([tilt * priors[0] ** 0.5, gap.flatten()])
+            gap = (p - torch.as_tensor(rest))[NUM_ROOT:].view(num_joints, NUM_PER_JOINT)
+            gap = gap * torch.as_tensor(priors.joint).sqrt()
+            prior = torch.cat([tilt * priors.tilt**0.5, gap.flatten()])
             return torch.cat([gauge, scale, shift, prior]), prior
 
         J = torch.autograd.functional.jacobian(lambda p: squares(p)[0], flat[0]).numpy()
         residuals, prior = (part.numpy() for part in squares(flat[0]))
         H, g = np.zeros(J.shape[1:] * 2), np.zeros(J.shape[1])
-        _regularise(target, flat[0].numpy(), rest, lambdas, priors, H, g)
+        problem = problem_of(target)._replace(lambdas=lambdas, priors=priors, rest=rest)
+        regularise(problem, flat[0].numpy(), H, g)
         np.testing.assert_allclose(H, J.T @ J, atol=1e-10)
         np.testing.assert_allclose(g, J.T @ residuals, atol=1e-10)
-        loss = prior_loss(target, flat[0].numpy(), rest, priors)
+        loss = prior_loss(problem, flat[0].numpy())
         assert loss == pytest.approx(prior @ prior / 2, rel=1e-12)
 
     @pytest.mark.parametrize("seed", range(10))
@@ -191,11 +201,10 @@ class TestNormalEquations:
         flat = hooked(seed)
         target = target_of(flat)
         near = moved(flat, np.random.default_rng(seed))
-        _, hard, points, pixels, rim, covered = evaluate(BODY, SPINE, target, near, True)
+        problem = problem_of(target)
+        _, hard, rendering = evaluate(problem, near, True)
         assert hard < 0.92
-        _, g = normal_equations(
-            BODY, SPINE, target, LAMBDAS, PRIORS, near, REST, points, pixels, rim, covered
-        )
+        _, g = normal_equations(problem, near, rendering)
         steps = 1e-4 * np.eye(len(near))
         slope = [(energy(target, near + h) - energy(target, near - h)) / 2e-4 for h in steps]
         cosine = g @ slope / np.linalg.norm(g) / np.linalg.norm(slope)
@@ -210,11 +219,11 @@ class TestDescent:
         flat = hooked(seed)
         target = target_of(flat)
         start = moved(flat, np.random.default_rng(seed), size=size)
-        found = descend(target, start, kind=KINDS[kind])
-        ends_at = energy(target, found.flat, kind=KINDS[kind])
-        assert found.loss <= energy(target, start, kind=KINDS[kind]) + 1e-12
+        found = descend(target, start, kind=kind)
+        ends_at = energy(target, found.parameters, kind=kind)
+        assert found.loss <= energy(target, start, kind=kind) + 1e-12
         assert found.loss == pytest.approx(ends_at, rel=1e-9, abs=1e-12)
-        assert found.iou == evaluate(BODY, KINDS[kind], target, found.flat, True)[1]
+        assert found.iou == evaluate(problem_of(target, kind=kind), found.parameters, True).iou
         assert 1 <= found.iterations <= 30
 
     def test_the_start_is_left_alone(self):
@@ -232,15 +241,15 @@ class TestDescent:
         short = descend(target, start, iterations=2)
         assert (short.iterations, short.stop) == (2, EXHAUSTED)
         # Nothing is little enough to settle for, so it goes on until no step helps.
-        assert descend(target, found.flat, iterations=1000, tolerance=0.0).stop == STUCK
+        assert descend(target, found.parameters, iterations=1000, tolerance=0.0).stop == STUCK
 
     @pytest.mark.parametrize("iterations", [0, 1, 2])
     def test_its_curvature_is_of_where_the_last_step_began(self, iterations):
         flat = hooked(1)
         target, start = target_of(flat), moved(flat, np.random.default_rng(1))
-        began = descend(target, start, iterations=max(iterations - 1, 0)).flat
-        _, _, *seen = evaluate(BODY, SPINE, target, began, True)
-        H, _ = normal_equations(BODY, SPINE, target, LAMBDAS, PRIORS, began, REST, *seen)
+        began = descend(target, start, iterations=max(iterations - 1, 0)).parameters
+        problem = problem_of(target)
+        H, _ = normal_equations(problem, began, evaluate(problem, began, True).rendering)
         found = descend(target, start, iterations=iterations)
         assert found.iterations == iterations
         np.testing.assert_array_equal(found.H, H)
@@ -251,7 +260,7 @@ class TestDescent:
 
         def bits(job):
             found = descend(*job)
-            return found.flat.tobytes(), found.loss, found.iou, found.iterations, found.stop
+            return found.parameters.tobytes(), found.loss, found.iou, found.iterations, found.stop
 
         alone = [bits(job) for job in jobs]
         assert len(set(alone)) == 6
@@ -267,7 +276,7 @@ class TestMirror:
     @twenty
     @given(seed=seeds)
     def test_is_its_own_inverse(self, seed):
-        flat = np.random.default_rng(seed).normal(size=ROOT + 3 * JOINT)
+        flat = np.random.default_rng(seed).normal(size=NUM_ROOT + 3 * NUM_PER_JOINT)
         np.testing.assert_array_equal(mirror(mirror(flat)), flat)
 
     @pytest.mark.parametrize("kind", KINDS)
@@ -304,7 +313,7 @@ class TestMirror:
         solver = ContourSolver(Bodies(BODY, BODY, BODY), SETTINGS)
         for start in (flat[0].numpy(), mirror(flat[0].numpy())):
             found = solver.refine(target, start)
-            along = Rotation.from_rotvec(found.flat[:3]).as_matrix()[:, 0]
+            along = Rotation.from_rotvec(found.parameters[:3]).as_matrix()[:, 0]
             assert found.iou > 0.97
             assert abs(along @ normal) < 0.25
             assert along @ axis > 0.95

@@ -130,7 +130,7 @@ class TestBoundary:
 
 class TestRegularizers:
     def test_scale_and_translation_are_zero_at_rest(self):
-        rest = Parameters.from_flat(rest_parameters(3))
+        rest = Parameters.from_vector(rest_parameters(3))
         assert scale_loss(rest.joint_log_scales).item() == 0.0
         assert translation_loss(rest.joint_translations).item() == 0.0
 
@@ -142,8 +142,8 @@ class TestRegularizers:
 
     def test_gradients(self):
         flat = random_flat(np.random.default_rng(0), batch=2)
-        log_scales = Parameters.from_flat(flat).joint_log_scales.clone().requires_grad_()
-        shifts = Parameters.from_flat(flat).joint_translations.clone().requires_grad_()
+        log_scales = Parameters.from_vector(flat).joint_log_scales.clone().requires_grad_()
+        shifts = Parameters.from_vector(flat).joint_translations.clone().requires_grad_()
         assert torch.autograd.gradcheck(scale_loss, log_scales)
         assert torch.autograd.gradcheck(translation_loss, shifts)
 

@@ -6,15 +6,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
-from stream_dmr.fitting.body import Body, rest_vector
-from stream_dmr.fitting.contour.deformation import KINDS
+from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.levenberg_marquardt import NEAR, evaluate, minimise
 from stream_dmr.fitting.contour.normal_equations import prior_loss
+from stream_dmr.fitting.contour.problem import Options, Problem
 from stream_dmr.fitting.contour.solver import ContourSolver
 from stream_dmr.fitting.mesh_levels import Bodies
+from stream_dmr.fitting.parameters import LOG_SIZE, rest_vector
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.size.density import mean_and_std
-from stream_dmr.fitting.size.scan import SIZE, only_size, scan_sizes
+from stream_dmr.fitting.size.scan import only_size, scan_sizes
 from stream_dmr.fitting.size.scanner import SizeScanner
 from stream_dmr.fitting.target import Target
 from stream_dmr.template.template import load_template
@@ -25,7 +26,6 @@ FIVE = np.array([-0.1, -0.04, 0.0, 0.04, 0.1])
 BODY = Body.from_template(load_template("halibut"))
 BODIES = Bodies(BODY, BODY, BODY)
 SETTINGS = FitMeshSettings()
-LAMBDAS = SETTINGS.rough_lambdas()
 
 
 @settings(deadline=None)
@@ -94,53 +94,53 @@ def known():
 
 
 def scanned(target, flat, *, hopeless=np.inf):
-    return scan_sizes(
-        BODY, KINDS["spine"], target, LAMBDAS, SETTINGS.priors(), flat,
-        rest_vector(2), FIVE, hopeless, 4, SETTINGS.tolerance,
-    )  # fmt: skip
+    options = Options(4, SETTINGS.tolerance, NEAR)
+    return scan_sizes(problem_of(target), flat, FIVE, hopeless, options)
+
+
+def problem_of(target):
+    return Problem.from_settings(SETTINGS, BODY, target, with_smoothness=False)
 
 
 def test_every_fit_of_a_scan_has_the_size_it_is_to_have(known):
     for target, best, _ in known:
-        fits, losses, rooms, _ = scanned(target, best.flat)
-        np.testing.assert_allclose(fits[:, SIZE], best.flat[SIZE] + FIVE, atol=1e-12)
+        fits, losses, log_volumes, _ = scanned(target, best.parameters)
+        np.testing.assert_allclose(fits[:, LOG_SIZE], best.parameters[LOG_SIZE] + FIVE, atol=1e-12)
         assert np.isfinite(losses).all()
-        assert np.isfinite(rooms).all()
+        assert np.isfinite(log_volumes).all()
 
 
 def test_where_sizes_are_likely_a_scan_is_nearly_as_good_as_a_long_fit(known):
-    args = (rest_vector(2), only_size(len(rest_vector(2))), 30, SETTINGS.tolerance, NEAR)
+    held, options = only_size(len(rest_vector(2))), Options(30, SETTINGS.tolerance, NEAR)
     for target, best, _ in known:
-        _, losses, *_ = scanned(target, best.flat)
+        _, losses, *_ = scanned(target, best.parameters)
         for offset, loss in zip(FIVE, losses, strict=True):
-            start = best.flat.copy()
-            start[SIZE] += offset
-            _, alone, *_ = minimise(
-                BODY, KINDS["spine"], target, LAMBDAS, SETTINGS.priors(), start, *args
-            )
+            start = best.parameters.copy()
+            start[LOG_SIZE] += offset
+            alone = minimise(problem_of(target), start, held, options).loss
             if alone < losses[2] + 8 * SETTINGS.nat:
                 assert loss <= alone + 2 * SETTINGS.nat
 
 
 def test_a_size_is_looked_for_where_its_neighbour_is_headed(known):
     for target, best, _ in known:
-        fits, _, _, leads = scanned(target, best.flat)
-        straight, ahead = fits[2].copy(), fits[2] + 0.04 * leads[2]
-        straight[SIZE] += 0.04
-        assert ahead[SIZE] == pytest.approx(straight[SIZE])
+        fits, _, _, next_steps = scanned(target, best.parameters)
+        straight, ahead = fits[2].copy(), fits[2] + 0.04 * next_steps[2]
+        straight[LOG_SIZE] += 0.04
+        assert ahead[LOG_SIZE] == pytest.approx(straight[LOG_SIZE])
         assert loss_of(target, ahead) < loss_of(target, straight)
 
 
 def loss_of(target, flat):
-    terms, *_ = evaluate(BODY, KINDS["spine"], target, flat, False)
-    return terms @ LAMBDAS + prior_loss(target, flat, rest_vector(2), SETTINGS.priors())
+    problem = problem_of(target)
+    return evaluate(problem, flat, False).terms @ problem.lambdas + prior_loss(problem, flat)
 
 
 def test_behind_a_hopeless_size_none_is_tried(known):
     for target, best, _ in known:
-        _, everywhere, *_ = scanned(target, best.flat)
+        _, everywhere, *_ = scanned(target, best.parameters)
         hopeless = np.median(everywhere) - everywhere[2]
-        _, losses, *_ = scanned(target, best.flat, hopeless=hopeless)
+        _, losses, *_ = scanned(target, best.parameters, hopeless=hopeless)
         for outwards in (slice(2, None), slice(2, None, -1)):
             ends = everywhere[outwards] >= everywhere[2] + hopeless
             tried = np.append(True, ~np.logical_or.accumulate(ends)[:-1])
@@ -153,7 +153,7 @@ def test_known_fish_have_the_size_to_be_expected(known):
     scanner = SizeScanner(BODIES, SETTINGS)
     for target, best, flat in known:
         sized, std = scanner.expected(target, best)
-        assert sized.flat[SIZE] == pytest.approx(flat[SIZE], abs=3 * std + 0.01)
+        assert sized.parameters[LOG_SIZE] == pytest.approx(flat[LOG_SIZE], abs=3 * std + 0.01)
         assert 0.003 < std < 0.3
         assert sized.iou > best.iou - 0.05
 

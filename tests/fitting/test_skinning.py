@@ -35,7 +35,7 @@ def exponents(rotvec):
 
 def numbers(flat):
     """The parameters of one deformation as numpy arrays."""
-    return [np.asarray(part[0]) for part in Parameters.from_flat(flat)]
+    return [np.asarray(part[0]) for part in Parameters.from_vector(flat)]
 
 
 def slow_weights(point, joints, precisions):
@@ -112,16 +112,16 @@ def slow_binding(points, midline):
 class TestParameters:
     @forty
     @given(seed=seeds, batch=st.integers(1, 4), num_joints=st.integers(2, 5))
-    def test_flat_and_from_flat_are_inverses(self, seed, batch, num_joints):
+    def test_flat_and_from_vector_are_inverses(self, seed, batch, num_joints):
         flat = random_flat(np.random.default_rng(seed), batch=batch, num_joints=num_joints)
-        parameters = Parameters.from_flat(flat)
-        assert torch.equal(parameters.flat(), flat)
-        again = Parameters.from_flat(parameters.flat())
+        parameters = Parameters.from_vector(flat)
+        assert torch.equal(parameters.vector(), flat)
+        again = Parameters.from_vector(parameters.vector())
         assert all(torch.equal(a, b) for a, b in zip(parameters, again, strict=True))
 
     def test_every_column_is_in_one_place(self):
         flat = torch.arange(32.0, dtype=torch.float64)[None]
-        columns = torch.cat([part.flatten() for part in Parameters.from_flat(flat)])
+        columns = torch.cat([part.flatten() for part in Parameters.from_vector(flat)])
         assert sorted(columns.tolist()) == list(range(32))
 
 
@@ -130,14 +130,14 @@ class TestAgainstTheSlowTwin:
     @given(seed=seeds)
     def test_linear_blend_is_equation_1_and_2(self, seed):
         flat = random_flat(np.random.default_rng(seed))
-        fast = linear_blend(RIG, Parameters.from_flat(flat))[0]
+        fast = linear_blend(RIG, Parameters.from_vector(flat))[0]
         np.testing.assert_allclose(fast, slow_linear_blend(RIG, flat), atol=1e-12)
 
     @settings(max_examples=4, deadline=None)
     @given(seed=seeds)
     def test_spine_is_the_swept_body(self, seed):
         flat = random_flat(np.random.default_rng(seed))
-        fast = spine(RIG, Parameters.from_flat(flat))[0]
+        fast = spine(RIG, Parameters.from_vector(flat))[0]
         np.testing.assert_allclose(fast, slow_spine(RIG, flat), atol=1e-12)
 
     @forty
@@ -182,7 +182,7 @@ class TestRest:
 
     def test_the_spine_has_its_root_at_the_foot_of_the_center(self):
         # Where the center keypoint lies off the midline the rest mesh is shifted by that much.
-        rest = spine(RIG, Parameters.from_flat(rest_parameters(2)))[0]
+        rest = spine(RIG, Parameters.from_vector(rest_parameters(2)))[0]
         foot = RIG.feet[RIG.num_vertices + 1]
         torch.testing.assert_close(rest, RIG.points - foot, rtol=0, atol=1e-15)
 
@@ -200,7 +200,7 @@ class TestMotion:
             still[:, 6:].view(1, 2, 13)[..., 3:7] = 0.0
         moved = still.clone()
         moved[:, :6] = random_flat(rng)[:, :6]
-        before, after = DEFORMATIONS[name](RIG, Parameters.from_flat(torch.cat([still, moved])))
+        before, after = DEFORMATIONS[name](RIG, Parameters.from_vector(torch.cat([still, moved])))
         scale = moved[0, 5].exp()
         torch.testing.assert_close(
             torch.cdist(after, after, compute_mode="donot_use_mm_for_euclid_dist"),
@@ -220,7 +220,9 @@ class TestMotion:
         by_joints[:, :6] = 0.0
         joints = by_joints[:, 6:].view(1, 2, 13)
         joints[..., :3], joints[..., 3:7] = rotvec, 0.0  # the precisions stay random
-        root, joint = DEFORMATIONS[name](RIG, Parameters.from_flat(torch.cat([by_root, by_joints])))
+        root, joint = DEFORMATIONS[name](
+            RIG, Parameters.from_vector(torch.cat([by_root, by_joints]))
+        )
         torch.testing.assert_close(joint, root, rtol=0, atol=1e-13)
 
     @forty
@@ -244,7 +246,7 @@ class TestMotion:
         joints[..., 6] = log_scale
         scaled = deform(RIG, flat, spine)
         torch.testing.assert_close(scaled.midline, plain.midline, rtol=0, atol=1e-12)
-        feet = spine(replace(RIG, points=RIG.feet), Parameters.from_flat(flat))[
+        feet = spine(replace(RIG, points=RIG.feet), Parameters.from_vector(flat))[
             :, : RIG.num_vertices
         ]
         offsets, before = scaled.vertices - feet, plain.vertices - feet
@@ -267,7 +269,7 @@ class TestMotion:
         flat = random_flat(np.random.default_rng(seed)).requires_grad_()
         rig = fish_rig(subdivisions=0)
         assert torch.autograd.gradcheck(
-            lambda f: DEFORMATIONS[name](rig, Parameters.from_flat(f)), flat, fast_mode=True
+            lambda f: DEFORMATIONS[name](rig, Parameters.from_vector(f)), flat, fast_mode=True
         )
 
     @both_deformations
@@ -275,7 +277,7 @@ class TestMotion:
         rig = fish_rig(subdivisions=0)
         flat = rest_parameters(2).requires_grad_()
         assert torch.autograd.gradcheck(
-            lambda f: deformation(rig, Parameters.from_flat(f)), flat, fast_mode=True
+            lambda f: deformation(rig, Parameters.from_vector(f)), flat, fast_mode=True
         )
 
 

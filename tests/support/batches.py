@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from stream_dmr.fitting.body import JOINT, ROOT
 from stream_dmr.fitting.paper.skinning import Rig
+from stream_dmr.fitting.parameters import JOINT_ROTATION, NUM_PER_JOINT, NUM_ROOT
 from stream_dmr.template.template import load_template
 from tests.support.shapes import POINTS, crop_of, fish_template, pose
 
@@ -33,9 +33,10 @@ def crops_of_poses(name, seed, *, batch=3, size=96):
 def moved(flats, seed, *, size=1.0):
     """Parameters some pixels off, as fish may have moved since the frame before."""
     rng, near = np.random.default_rng(seed), flats.copy()
-    near[:, :ROOT] += (
-        size * rng.normal(size=(len(near), ROOT)) * [0.08, 0.08, 0.08, 0.03, 0.03, 0.04]
+    near[:, :NUM_ROOT] += (
+        size * rng.normal(size=(len(near), NUM_ROOT)) * [0.08, 0.08, 0.08, 0.03, 0.03, 0.04]
     )
-    joints = near[:, ROOT:].reshape(len(near), -1, JOINT)
-    joints[..., :3] += size * rng.normal(size=joints[..., :3].shape) * 0.08
+    joints = near[:, NUM_ROOT:].reshape(len(near), -1, NUM_PER_JOINT)
+    turns = joints[..., JOINT_ROTATION]
+    turns += size * rng.normal(size=turns.shape) * 0.08
     return near

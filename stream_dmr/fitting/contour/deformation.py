@@ -1,45 +1,48 @@
 """Both deformations of `skinning.py`, whole: points, and their slopes to the parameters."""
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from stream_dmr.compiled import compiled
-from stream_dmr.fitting.contour.joints import factors
+from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.linear_blend import blend_jacobian, blend_points, move_and_scale
 from stream_dmr.fitting.contour.rotation import rotation
 from stream_dmr.fitting.contour.spine import spine_jacobian, spine_points
+from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION, ROOT_TRANSLATION
 
 SPINE, LINEAR_BLEND = 0, 1
 KINDS = {"spine": SPINE, "linear-blend": LINEAR_BLEND}
 
 
 @compiled
-def deform(body, kind, flat):
-    """Deformed points (N, 3), centered on the root, in units of the root's depth."""
-    out = spine_points(body, flat) if kind == SPINE else blend_points(body, flat)
-    root, _ = rotation(flat[:3])
-    size = np.exp(flat[5])
+def deform(body: Body, kind: int, parameters: Float[np.ndarray, "P"]) -> Float[np.ndarray, "N 3"]:
+    """Deformed points, centered on the root, in units of the root's depth."""
+    out = spine_points(body, parameters) if kind == SPINE else blend_points(body, parameters)
+    root, _ = rotation(parameters[ROOT_ROTATION])
+    size = np.exp(parameters[LOG_SIZE])
     for n in range(len(out)):
         x, y, z = out[n, 0], out[n, 1], out[n, 2]
         for i in range(3):
             out[n, i] = root[i, 0] * x + root[i, 1] * y + root[i, 2] * z
     if kind == SPINE:
+        shift = parameters[ROOT_TRANSLATION]
         for n in range(len(out)):
-            out[n, 0] = size * (out[n, 0] + flat[3])
-            out[n, 1] = size * (out[n, 1] + flat[4])
+            out[n, 0] = size * (out[n, 0] + shift[0])
+            out[n, 1] = size * (out[n, 1] + shift[1])
             out[n, 2] = size * out[n, 2]
     else:
-        move_and_scale(body, flat, size, out)
+        move_and_scale(body, parameters, size, out)
     return out
 
 
 @compiled
-def jacobian(body, kind, flat, chosen):
-    """Slopes of the chosen points to the parameters, (C, 3, P)."""
-    num_joints = len(body.joints)
-    L = factors(flat, num_joints)
-    out = np.zeros((len(chosen), 3, len(flat)))
+def jacobian(
+    body: Body, kind: int, parameters: Float[np.ndarray, "P"], chosen: Int[np.ndarray, "C"]
+) -> Float[np.ndarray, "C 3 P"]:
+    """Slopes of the chosen points to the parameters."""
+    out = np.zeros((len(chosen), 3, len(parameters)))
     if kind == SPINE:
-        spine_jacobian(body, flat, L, chosen, out)
+        spine_jacobian(body, parameters, chosen, out)
     else:
-        blend_jacobian(body, flat, L, chosen, out)
+        blend_jacobian(body, parameters, chosen, out)
     return out

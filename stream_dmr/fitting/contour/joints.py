@@ -1,31 +1,37 @@
 """What both deformations share: the joints' weights, scales and blends, and the root.
 
 Skinning weights are a softmax of e_j, so that a blend X = sum_j W_j X_j has
-dX/de_j = W_j (X_j - X). The layout of the parameters stands in `stream_dmr.fitting.body`.
+dX/de_j = W_j (X_j - X). The layout of the parameters stands in `stream_dmr.fitting.parameters`.
 """
 
 import numpy as np
+from jaxtyping import Float
 
 from stream_dmr.compiled import compiled
-from stream_dmr.fitting.body import JOINT, ROOT
 from stream_dmr.fitting.contour.rotation import turn_slope
+from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION, ROOT_TRANSLATION
 
 
 @compiled
-def factors(flat, num_joints):
-    """Cholesky factors L of each joint's Q."""
-    L = np.zeros((num_joints, 3, 3))
-    for j in range(num_joints):
-        q = flat[ROOT + JOINT * j + 7 : ROOT + JOINT * (j + 1)]
+def factors(weight: Float[np.ndarray, "J 6"]) -> Float[np.ndarray, "J 3 3"]:
+    """Cholesky factors L of each joint's Q, from its parameters."""
+    L = np.zeros((len(weight), 3, 3))
+    for j in range(len(weight)):
         for i in range(3):
-            L[j, i, i] = np.exp(q[i])
-        L[j, 1, 0], L[j, 2, 0], L[j, 2, 1] = q[3], q[4], q[5]
+            L[j, i, i] = np.exp(weight[j, i])
+        L[j, 1, 0], L[j, 2, 0], L[j, 2, 1] = weight[j, 3], weight[j, 4], weight[j, 5]
     return L
 
 
 @compiled
-def weights(place, joints, L, W, dE):
-    """Skinning weights W (J,) at a place, and d e_j / d q_j (J, 6) of the softmax's arguments."""
+def weights(
+    place: Float[np.ndarray, "3"],
+    joints: Float[np.ndarray, "J 3"],
+    L: Float[np.ndarray, "J 3 3"],
+    W: Float[np.ndarray, "J"],
+    dE: Float[np.ndarray, "J 6"],
+) -> None:
+    """Skinning weights at a place into W, and d e_j / d q_j of the softmax's arguments into dE."""
     num_joints = len(joints)
     top = -np.inf
     for j in range(num_joints):
@@ -51,32 +57,40 @@ def weights(place, joints, L, W, dE):
 
 
 @compiled
-def blend(W, flat, column, width, out):
-    """sum_j W_j x_j of one kind of joint parameter."""
+def blend(
+    W: Float[np.ndarray, "J"], values: Float[np.ndarray, "J 3"], out: Float[np.ndarray, "3"]
+) -> None:
+    """sum_j W_j x_j into `out`."""
     out[:] = 0.0
     for j in range(len(W)):
-        for k in range(width):
-            out[k] += W[j] * flat[ROOT + JOINT * j + column + k]
+        for k in range(3):
+            out[k] += W[j] * values[j, k]
 
 
 @compiled
-def joint_scales(flat, num_joints):
-    """S_j of each joint."""
-    scales = np.empty(num_joints)
-    for j in range(num_joints):
-        scales[j] = np.exp(flat[ROOT + JOINT * j + 6])
-    return scales
+def root_slope(
+    root: Float[np.ndarray, "3 3"],
+    root_J: Float[np.ndarray, "3 3"],
+    size: float,
+    parameters: Float[np.ndarray, "P"],
+    v: Float[np.ndarray, "3"],
+    shift: Float[np.ndarray, "3"],
+    scale: float,
+    out: Float[np.ndarray, "3 P"],
+    A: Float[np.ndarray, "3 3"],
+) -> None:
+    """Slope of scale size (root v + shift + T_0) to the root's parameters into `out`.
 
-
-@compiled
-def root_slope(root, root_J, size, flat, v, shift, scale, out, A):
-    """Slope of scale size (root v + shift + T_0) to the root's six parameters."""
+    A is overwritten.
+    """
     turn_slope(root, root_J, v, A)
+    root_shift = parameters[ROOT_TRANSLATION]
+    to_rotation, to_translation = out[:, ROOT_ROTATION], out[:, ROOT_TRANSLATION]
     for i in range(3):
         moved = root[i, 0] * v[0] + root[i, 1] * v[1] + root[i, 2] * v[2] + shift[i]
         if i < 2:
-            moved += flat[3 + i]
-            out[i, 3 + i] = size * scale
+            moved += root_shift[i]
+            to_translation[i, i] = size * scale
         for m in range(3):
-            out[i, m] = size * scale * A[i, m]
-        out[i, 5] = size * scale * moved
+            to_rotation[i, m] = size * scale * A[i, m]
+        out[i, LOG_SIZE] = size * scale * moved

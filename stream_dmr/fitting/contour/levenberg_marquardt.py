@@ -3,15 +3,16 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from stream_dmr.compiled import compiled
-from stream_dmr.fitting.body import JOINT, ROOT
 from stream_dmr.fitting.contour.deformation import deform
 from stream_dmr.fitting.contour.mesh_terms import smoothness
 from stream_dmr.fitting.contour.normal_equations import normal_equations, prior_loss
-from stream_dmr.fitting.contour.outline import coverage, overlap, project, rim_edges
+from stream_dmr.fitting.contour.outline import Rendering, coverage, overlap, project, rim_edges
+from stream_dmr.fitting.contour.problem import LAPLACIAN, NORMAL, Options, Problem
 from stream_dmr.fitting.contour.rotation import dot
+from stream_dmr.fitting.parameters import LOG_SIZE, joints_of
 
 SETTLED, STUCK, EXHAUSTED = 0, 1, 2
 STOP_REASONS = ("L_rec settled", "no step lowers L_rec", "iterations used up")
@@ -25,7 +26,7 @@ _MOST_REFUSED = 3  # steps in a row, each ten times shorter: what is left to gai
 class Minimum(NamedTuple):
     """Where a search ended."""
 
-    flat: Float[np.ndarray, "P"]  # the best parameters
+    parameters: Float[np.ndarray, "P"]  # the best ones
     loss: float  # their L_rec with the priors
     iou: float  # of the hard silhouette
     iterations: int
@@ -33,79 +34,96 @@ class Minimum(NamedTuple):
     H: Float[np.ndarray, "P P"]  # curvature of the loss where the last step began, nothing held
 
 
-@compiled
-def evaluate(body, kind, target, flat, is_smooth):
-    """The six terms of eq. (3) and the hard IoU, with what the normal equations need again.
+class Evaluation(NamedTuple):
+    """One iterate, with what the normal equations need again."""
 
-    Without `is_smooth` the last two, L_normal and L_lap, are left at 0: they take a third of it.
+    terms: Float[np.ndarray, "6"]  # of eq. (3), before their lambdas
+    iou: float  # of the hard silhouette
+    rendering: Rendering
+
+
+@compiled
+def evaluate(
+    problem: Problem, parameters: Float[np.ndarray, "P"], with_smoothness: bool
+) -> Evaluation:
+    """The six terms of eq. (3) and the hard IoU.
+
+    Without smoothness the last two, L_normal and L_lap, are left at 0: they take a third of it.
     """
-    points = deform(body, kind, flat)
+    body, target = problem.body, problem.target
+    points = deform(body, problem.kind, parameters)
     pixels = project(points[: body.num_vertices], target.anchor, target.K)
-    rim = rim_edges(pixels, body.faces, body.edges, body.edge_faces)
+    rim = rim_edges(pixels, body)
     covered = coverage(pixels, rim, len(target.mask))
-    iou, boundary, hard = overlap(covered, target.mask, target.distance, target.mask_area)
+    iou, boundary, hard_iou = overlap(covered, target)
     normal, laplacian = 0.0, 0.0
-    if is_smooth:
-        normal, laplacian = smoothness(body, points, np.exp(flat[5]))
+    if with_smoothness:
+        normal, laplacian = smoothness(body, points, np.exp(parameters[LOG_SIZE]))
     scale, translation = 0.0, 0.0
+    joints = joints_of(parameters)
     for j in range(len(body.joints)):
-        base = ROOT + JOINT * j
-        scale += (np.exp(flat[base + 6]) - 1.0) ** 2
-        for i in range(3, 6):
-            translation += flat[base + i] ** 2
+        scale += (np.exp(joints.log_scale[j]) - 1.0) ** 2
+        for i in range(3):
+            translation += joints.translation[j, i] ** 2
     terms = np.array([iou, boundary, scale, translation, normal, laplacian])
-    return terms, hard, points, pixels, rim, covered
+    return Evaluation(terms, hard_iou, Rendering(points, pixels, rim, covered))
 
 
 @compiled
 def minimise(
-    body, kind, target, lambdas, priors, start, rest, held, iterations, tolerance, damping
-):
-    """Down from the start, in `iterations` steps at the most; what is `held` (P,) stays."""
-    flat = start.copy()
-    is_smooth = lambdas[4] > 0 or lambdas[5] > 0
-    terms, hard, points, pixels, rim, covered = evaluate(body, kind, target, flat, is_smooth)
-    loss = np.sum(terms * lambdas) + prior_loss(target, flat, rest, priors)
-    H, g = normal_equations(
-        body, kind, target, lambdas, priors, flat, rest, points, pixels, rim, covered
-    )
-    calm, refused = 0, 0
-    for iteration in range(1, iterations + 1):
+    problem: Problem,
+    start: Float[np.ndarray, "P"],
+    held: Bool[np.ndarray, "P"],
+    options: Options,
+) -> Minimum:
+    """Down from the start; parameters that are `held` keep their value."""
+    lambdas, tolerance, damping = problem.lambdas, options.tolerance, options.damping
+    with_smoothness = lambdas[NORMAL] > 0 or lambdas[LAPLACIAN] > 0
+    best = start.copy()
+    here = evaluate(problem, best, with_smoothness)
+    loss = np.sum(here.terms * lambdas) + prior_loss(problem, best)
+    H, g = normal_equations(problem, best, here.rendering)
+    num_calm, num_refused = 0, 0
+    for iteration in range(1, options.iterations + 1):
         step = solve(H, g, damping, held)
         if 0.5 * dot(g, step) < tolerance:
-            return Minimum(flat, loss, hard, iteration - 1, SETTLED, H)
-        trial = flat - step
-        found = evaluate(body, kind, target, trial, is_smooth)
-        gain = loss - np.sum(found[0] * lambdas) - prior_loss(target, trial, rest, priors)
+            return Minimum(best, loss, here.iou, iteration - 1, SETTLED, H)
+        trial = best - step
+        there = evaluate(problem, trial, with_smoothness)
+        gain = loss - np.sum(there.terms * lambdas) - prior_loss(problem, trial)
         if gain > 0:
-            flat = trial
+            best, here = trial, there
             loss -= gain
-            terms, hard, points, pixels, rim, covered = found
             damping *= _SHRINK
-            refused = 0
-            calm = calm + 1 if gain < tolerance else 0
-            if calm == 2:
-                return Minimum(flat, loss, hard, iteration, SETTLED, H)
-            if iteration < iterations:
-                H, g = normal_equations(
-                    body, kind, target, lambdas, priors, flat, rest, points, pixels, rim, covered
-                )
+            num_refused = 0
+            num_calm = num_calm + 1 if gain < tolerance else 0
+            if num_calm == 2:
+                return Minimum(best, loss, here.iou, iteration, SETTLED, H)
+            if iteration < options.iterations:
+                H, g = normal_equations(problem, best, here.rendering)
         else:
             damping *= _GROWTH
-            refused += 1
-            if refused == _MOST_REFUSED:
-                return Minimum(flat, loss, hard, iteration, STUCK, H)
-    return Minimum(flat, loss, hard, iterations, EXHAUSTED, H)
+            num_refused += 1
+            if num_refused == _MOST_REFUSED:
+                return Minimum(best, loss, here.iou, iteration, STUCK, H)
+    return Minimum(best, loss, here.iou, options.iterations, EXHAUSTED, H)
 
 
 @compiled
-def solve(H, g, damping, held):
+def solve(
+    H: Float[np.ndarray, "P P"],
+    g: Float[np.ndarray, "P"],
+    damping: float,
+    held: Bool[np.ndarray, "P"],
+) -> Float[np.ndarray, "P"]:
     """(H + damping diag H)^-1 g, with steps of 0 in the parameters that are held."""
     return solve_factorised(factorise(H, damping, held), np.where(held, 0.0, g))
 
 
 @compiled
-def factorise(H, damping, held):
+def factorise(
+    H: Float[np.ndarray, "P P"], damping: float, held: Bool[np.ndarray, "P"]
+) -> Float[np.ndarray, "P P"]:
     """Lower triangular L with L L^T = H + damping diag H: H is a sum of squares, so it exists.
 
     Rows and columns of what is held are those of the unit matrix.
@@ -127,7 +145,9 @@ def factorise(H, damping, held):
 
 
 @compiled
-def solve_factorised(L, g):
+def solve_factorised(
+    L: Float[np.ndarray, "P P"], g: Float[np.ndarray, "P"]
+) -> Float[np.ndarray, "P"]:
     """(L L^T)^-1 g."""
     x = g.copy()
     count = len(g)

@@ -5,13 +5,16 @@ than all the rest of an iteration, so the normal equations get their gradient al
 """
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from stream_dmr.compiled import compiled
+from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.pull_back import pull_back
+from stream_dmr.fitting.parameters import LOG_SIZE
 
 
 @compiled
-def smoothness(body, points, size):
+def smoothness(body: Body, points: Float[np.ndarray, "N 3"], size: float) -> tuple[float, float]:
     """L_normal and L_lap of eq. (5) of a body of this size, so that they are in body lengths."""
     edges, edge_faces = body.edges, body.edge_faces
     normals = _face_normals(points, body.faces)
@@ -34,7 +37,9 @@ def smoothness(body, points, size):
 
 
 @compiled
-def _face_normals(points, faces):
+def _face_normals(
+    points: Float[np.ndarray, "N 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "F 3"]:
     normals = np.empty((len(faces), 3))
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -48,19 +53,28 @@ def _face_normals(points, faces):
 
 
 @compiled
-def smoothness_slope(body, kind, flat, points, normal_weight, laplacian_weight):
-    """Slope (P,) of the weighted sum of both terms to the parameters."""
-    size = np.exp(flat[5])
+def smoothness_slope(
+    body: Body,
+    kind: int,
+    parameters: Float[np.ndarray, "P"],
+    points: Float[np.ndarray, "N 3"],
+    normal_weight: float,
+    laplacian_weight: float,
+) -> Float[np.ndarray, "P"]:
+    """Slope of the weighted sum of both terms to the parameters."""
+    size = np.exp(parameters[LOG_SIZE])
     forces = np.zeros((body.num_vertices, 3))
     _normal_forces(body, points, normal_weight, forces)
     laplacian = _laplacian_forces(body, points, laplacian_weight / size**2, forces)
-    slope = pull_back(body, kind, flat, points, forces)
-    slope[5] -= 2 * laplacian  # L_lap is of the body at size 1
+    slope = pull_back(body, kind, parameters, points, forces)
+    slope[LOG_SIZE] -= 2 * laplacian  # L_lap is of the body at size 1
     return slope
 
 
 @compiled
-def _normal_forces(body, points, weight, forces):
+def _normal_forces(
+    body: Body, points: Float[np.ndarray, "N 3"], weight: float, forces: Float[np.ndarray, "V 3"]
+) -> None:
     """Slope of sum_e (1 - n_p . n_q), by that of each face's normal n = N / |N|, N = u x v."""
     faces, edges, edge_faces = body.faces, body.edges, body.edge_faces
     normals = _face_normals(points, faces)
@@ -87,7 +101,9 @@ def _normal_forces(body, points, weight, forces):
 
 
 @compiled
-def _add_force(forces, a, b, x, y, z):
+def _add_force(
+    forces: Float[np.ndarray, "V 3"], a: int, b: int, x: float, y: float, z: float
+) -> None:
     """On b, and against it on a."""
     forces[b, 0] += x
     forces[b, 1] += y
@@ -98,7 +114,9 @@ def _add_force(forces, a, b, x, y, z):
 
 
 @compiled
-def _laplacian_forces(body, points, weight, forces):
+def _laplacian_forces(
+    body: Body, points: Float[np.ndarray, "N 3"], weight: float, forces: Float[np.ndarray, "V 3"]
+) -> float:
     """Slope of sum_v |p_v - mean of its neighbours|^2; returns the weighted sum itself."""
     edges, shares = body.edges, 1.0 / body.num_neighbors
     off = points[: body.num_vertices].copy()

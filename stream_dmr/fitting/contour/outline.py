@@ -4,14 +4,32 @@ The same formulas as `silhouette.py` and `losses.py`, which are the reference th
 them against.
 """
 
+from typing import NamedTuple
+
 import numpy as np
+from jaxtyping import Float, Int
 
 from stream_dmr.compiled import compiled
+from stream_dmr.fitting.body import Body
+from stream_dmr.fitting.target import Target
+
+COVERED = 0.5  # share of a pixel from which on it counts as the body's, or the mask's
+
+
+class Rendering(NamedTuple):
+    """A deformed body in its target's picture."""
+
+    points: Float[np.ndarray, "N 3"]  # deformed, centered on the root
+    pixels: Float[np.ndarray, "V 2"]  # of the vertices
+    rim: Int[np.ndarray, "R 2"]  # vertices of the edges between faces seen from the front and back
+    covered: Float[np.ndarray, "S S"]  # share of each pixel
 
 
 @compiled
-def project(points, anchor, K):
-    """Pixels (N, 2) of points that are centered on the root."""
+def project(
+    points: Float[np.ndarray, "N 3"], anchor: Float[np.ndarray, "3"], K: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "N 2"]:
+    """Pixels of points that are centered on the root."""
     out = np.empty((len(points), 2))
     for n in range(len(points)):
         depth = points[n, 2] + anchor[2]
@@ -21,8 +39,9 @@ def project(points, anchor, K):
 
 
 @compiled
-def rim_edges(pixels, faces, edges, edge_faces):
-    """Edges (R, 2) between faces that look at the camera and faces that look away."""
+def rim_edges(pixels: Float[np.ndarray, "V 2"], body: Body) -> Int[np.ndarray, "R 2"]:
+    """Edges between faces that look at the camera and faces that look away."""
+    faces, edges, edge_faces = body.faces, body.edges, body.edge_faces
     is_front = np.empty(len(faces), np.bool_)
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -41,8 +60,10 @@ def rim_edges(pixels, faces, edges, edge_faces):
 
 
 @compiled
-def coverage(pixels, rim, size):
-    """Covered share of each pixel, (S, S): signed areas of the rim edges, summed along rows."""
+def coverage(
+    pixels: Float[np.ndarray, "V 2"], rim: Int[np.ndarray, "R 2"], size: int
+) -> Float[np.ndarray, "{size} {size}"]:
+    """Covered share of each pixel: signed areas of the rim edges, summed along rows."""
     grid = np.zeros((size, size + 1))
     for r in range(len(rim)):
         x0, y0 = pixels[rim[r, 0], 0] + 0.5, pixels[rim[r, 0], 1] + 0.5
@@ -69,7 +90,9 @@ def coverage(pixels, rim, size):
 
 
 @compiled
-def _add_row(row, xa, xb, height, sign):
+def _add_row(
+    row: Float[np.ndarray, "columns"], xa: float, xb: float, height: float, sign: float
+) -> None:
     """Signed area right of one piece of an edge within one row of pixels."""
     size = len(row) - 1
     if xa > xb:
@@ -99,8 +122,9 @@ def _add_row(row, xa, xb, height, sign):
 
 
 @compiled
-def overlap(covered, mask, distance, mask_area):
+def overlap(covered: Float[np.ndarray, "S S"], target: Target) -> tuple[float, float, float]:
     """L_iou and L_boundary of eq. (3), and the hard IoU."""
+    mask, distance, mask_area = target.mask, target.distance, target.mask_area
     size = len(mask)
     both = total = boundary = 0.0
     hard_both = hard_total = 0
@@ -111,10 +135,19 @@ def overlap(covered, mask, distance, mask_area):
                 total += c
                 boundary += c * distance[i, k]
                 both += c * mask[i, k]
-                if c >= 0.5:
+                if c >= COVERED:
                     hard_total += 1
-                    if mask[i, k] > 0.5:
+                    if mask[i, k] > COVERED:
                         hard_both += 1
     iou = both / (total + mask_area - both)
     hard = hard_both / (hard_total + mask_area - hard_both)
-    return 1.0 - iou, boundary * 100.0 / size**3, hard
+    return 1.0 - iou, boundary_loss(boundary, size), hard
+
+
+@compiled
+def boundary_loss(distances_px: float, size: int) -> float:
+    """L_boundary of the sum of the distances of all that is covered: `losses.boundary_loss`.
+
+    It is their mean over the picture's pixels, in percent of its side.
+    """
+    return distances_px * 100.0 / size**3

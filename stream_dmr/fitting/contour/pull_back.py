@@ -5,32 +5,45 @@ points, each cross-section of the spine carries one push and one turn to its joi
 """
 
 import numpy as np
+from jaxtyping import Float
 
 from stream_dmr.compiled import compiled
-from stream_dmr.fitting.body import JOINT, ROOT
+from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.deformation import SPINE, jacobian
-from stream_dmr.fitting.contour.joints import blend, factors, joint_scales, weights
+from stream_dmr.fitting.contour.joints import blend, factors, weights
 from stream_dmr.fitting.contour.rotation import dot, rotation, turn_and_slope
+from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION, ROOT_TRANSLATION, joints_of
 
 
 @compiled
-def pull_back(body, kind, flat, points, forces):
-    """J^T f (P,) of forces (V, 3) on the vertices; `points` are those that `deform` gives."""
+def pull_back(
+    body: Body,
+    kind: int,
+    parameters: Float[np.ndarray, "P"],
+    points: Float[np.ndarray, "N 3"],
+    forces: Float[np.ndarray, "V 3"],
+) -> Float[np.ndarray, "P"]:
+    """J^T f of forces on the vertices; `points` are those that `deform` gives."""
     if kind == SPINE:
-        return _through_spine(body, flat, points, forces)
-    slopes = jacobian(body, kind, flat, np.arange(len(forces)))
-    out = np.zeros(len(flat))
+        return _through_spine(body, parameters, points, forces)
+    slopes = jacobian(body, kind, parameters, np.arange(len(forces)))
+    out = np.zeros(len(parameters))
     for n in range(len(forces)):
         for i in range(3):
-            for p in range(len(flat)):
+            for p in range(len(parameters)):
                 out[p] += forces[n, i] * slopes[n, i, p]
     return out
 
 
 @compiled
-def _through_spine(body, flat, points, forces):
-    out = np.zeros(len(flat))
-    local = _through_root(flat, points, forces, out)
+def _through_spine(
+    body: Body,
+    parameters: Float[np.ndarray, "P"],
+    points: Float[np.ndarray, "N 3"],
+    forces: Float[np.ndarray, "V 3"],
+) -> Float[np.ndarray, "P"]:
+    out = np.zeros(len(parameters))
+    local = _through_root(parameters, points, forces, out)
     num_places, num_segments = len(body.places), len(body.midline) - 1
     # Of each place and then each segment of the midline: sum of f, and of d f^T.
     push = np.zeros((num_places + num_segments, 3))
@@ -38,35 +51,47 @@ def _through_spine(body, flat, points, forces):
     _through_places(body, local, push, offsets)
     _through_midline(body, push[:num_places], offsets[num_places:])
     middles = (body.midline[1:] + body.midline[:-1]) / 2
-    _through_joints(body, flat, np.concatenate((body.places, middles)), push, offsets, out)
+    places = np.concatenate((body.places, middles))
+    _through_joints(body, parameters, places, push, offsets, out)
     return out
 
 
 @compiled
-def _through_root(flat, points, forces, out):
-    """Slopes to the root's parameters into `out`; the forces (V, 3) as the body feels them."""
-    root, J = rotation(flat[:3])
-    size = np.exp(flat[5])
+def _through_root(
+    parameters: Float[np.ndarray, "P"],
+    points: Float[np.ndarray, "N 3"],
+    forces: Float[np.ndarray, "V 3"],
+    out: Float[np.ndarray, "P"],
+) -> Float[np.ndarray, "V 3"]:
+    """Slopes to the root's parameters into `out`; the forces as the body feels them."""
+    root, J = rotation(parameters[ROOT_ROTATION])
+    size, shift = np.exp(parameters[LOG_SIZE]), parameters[ROOT_TRANSLATION]
+    to_rotation, to_translation = out[ROOT_ROTATION], out[ROOT_TRANSLATION]
     local, torque, q = np.empty_like(forces), np.zeros(3), np.empty(3)
     for n in range(len(forces)):
-        x = points[n, 0] / size - flat[3]
-        y = points[n, 1] / size - flat[4]
+        x = points[n, 0] / size - shift[0]
+        y = points[n, 1] / size - shift[1]
         z = points[n, 2] / size
         for i in range(3):
             q[i] = root[0, i] * x + root[1, i] * y + root[2, i] * z
             f = root[0, i] * forces[n, 0] + root[1, i] * forces[n, 1] + root[2, i] * forces[n, 2]
             local[n, i] = size * f
-            out[5] += forces[n, i] * points[n, i]
-        out[3] += size * forces[n, 0]
-        out[4] += size * forces[n, 1]
+            out[LOG_SIZE] += forces[n, i] * points[n, i]
+        to_translation[0] += size * forces[n, 0]
+        to_translation[1] += size * forces[n, 1]
         _add_cross(q, local[n], torque)
     for m in range(3):
-        out[m] += J[0, m] * torque[0] + J[1, m] * torque[1] + J[2, m] * torque[2]
+        to_rotation[m] += J[0, m] * torque[0] + J[1, m] * torque[1] + J[2, m] * torque[2]
     return local
 
 
 @compiled
-def _through_places(body, forces, push, offsets):
+def _through_places(
+    body: Body,
+    forces: Float[np.ndarray, "V 3"],
+    push: Float[np.ndarray, "U+M-1 3"],
+    offsets: Float[np.ndarray, "U+M-1 3 3"],
+) -> None:
     place_of, points, places = body.place_of, body.points, body.places
     for n in range(len(forces)):
         u = place_of[n]
@@ -77,7 +102,9 @@ def _through_places(body, forces, push, offsets):
 
 
 @compiled
-def _through_midline(body, push, offsets):
+def _through_midline(
+    body: Body, push: Float[np.ndarray, "U 3"], offsets: Float[np.ndarray, "M-1 3 3"]
+) -> None:
     """A segment moves all that lies behind it; the center holds against that."""
     nodes = np.zeros((len(body.midline), 3))
     middle = body.place_of[body.num_vertices + 1]
@@ -95,28 +122,38 @@ def _through_midline(body, push, offsets):
 
 
 @compiled
-def _share(body, u, i, force, nodes):
+def _share(body: Body, u: int, i: int, force: float, nodes: Float[np.ndarray, "M 3"]) -> None:
     k, t = body.segments[u], body.fractions[u]
     nodes[k, i] += (1.0 - t) * force
     nodes[k + 1, i] += t * force
 
 
 @compiled
-def _through_joints(body, flat, places, push, offsets, out):
+def _through_joints(
+    body: Body,
+    parameters: Float[np.ndarray, "P"],
+    places: Float[np.ndarray, "U+M-1 3"],
+    push: Float[np.ndarray, "U+M-1 3"],
+    offsets: Float[np.ndarray, "U+M-1 3 3"],
+    out: Float[np.ndarray, "P"],
+) -> None:
     """Slopes to the joints' parameters of the sum of f . R (s d + t) over the places.
 
     First the U places of the body, then the segments of its midline, whose scale s is 1.
     """
-    joints, num_joints = body.joints, len(body.joints)
-    L, S = factors(flat, num_joints), joint_scales(flat, num_joints)
+    num_joints, joints, to_joint = len(body.joints), joints_of(parameters), joints_of(out)
+    rotations, translations, rest_joints = joints.rotation, joints.translation, body.joints
+    to_rotation, to_translation = to_joint.rotation, to_joint.translation
+    to_scale, to_weight = to_joint.log_scale, to_joint.weight
+    L, S = factors(joints.weight), np.exp(joints.log_scale)
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
     omega, shift, back = np.empty(3), np.empty(3), np.empty(3)
     torque, spin = np.empty(3), np.empty(3)
     R, J, turned = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for u in range(len(places)):
-        weights(places[u], joints, L, W, dE)
-        blend(W, flat, 0, 3, omega)
-        blend(W, flat, 3, 3, shift)
+        weights(places[u], rest_joints, L, W, dE)
+        blend(W, rotations, omega)
+        blend(W, translations, shift)
         turn_and_slope(omega, R, J)
         scale = dot(W, S)
         for i in range(3):
@@ -135,20 +172,21 @@ def _through_joints(body, flat, places, push, offsets, out):
         for m in range(3):
             spin[m] = J[0, m] * torque[0] + J[1, m] * torque[1] + J[2, m] * torque[2]
         for j in range(num_joints):
-            base = ROOT + JOINT * j
             along = (S[j] - scale) * swell
             for m in range(3):
-                out[base + m] += W[j] * spin[m]
-                out[base + 3 + m] += W[j] * back[m]
-                along += spin[m] * (flat[base + m] - omega[m])
-                along += back[m] * (flat[base + 3 + m] - shift[m])
-            out[base + 6] += W[j] * S[j] * swell
+                to_rotation[j, m] += W[j] * spin[m]
+                to_translation[j, m] += W[j] * back[m]
+                along += spin[m] * (rotations[j, m] - omega[m])
+                along += back[m] * (translations[j, m] - shift[m])
+            to_scale[j] += W[j] * S[j] * swell
             for q in range(6):
-                out[base + 7 + q] += W[j] * along * dE[j, q]
+                to_weight[j, q] += W[j] * along * dE[j, q]
 
 
 @compiled
-def _add_cross(a, b, out):
+def _add_cross(
+    a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"], out: Float[np.ndarray, "3"]
+) -> None:
     out[0] += a[1] * b[2] - a[2] * b[1]
     out[1] += a[2] * b[0] - a[0] * b[2]
     out[2] += a[0] * b[1] - a[1] * b[0]

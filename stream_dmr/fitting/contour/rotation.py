@@ -5,12 +5,16 @@ the rotation vector omega (Sola et al., "A micro Lie theory", 2018, eq. (143)).
 """
 
 import numpy as np
+from jaxtyping import Float
 
 from stream_dmr.compiled import compiled
 
+Vector = Float[np.ndarray, "3"]
+Matrix = Float[np.ndarray, "3 3"]
+
 
 @compiled
-def rotation(w):
+def rotation(w: Vector) -> tuple[Matrix, Matrix]:
     """Rotation matrix of a rotation vector, and its right Jacobian."""
     R, J = np.empty((3, 3)), np.empty((3, 3))
     turn_and_slope(w, R, J)
@@ -18,7 +22,7 @@ def rotation(w):
 
 
 @compiled
-def turn_and_slope(w, R, J):
+def turn_and_slope(w: Vector, R: Matrix, J: Matrix) -> None:
     """The same into R and J: loops must not allocate."""
     a, b, c = _sines(w)
     _fill(w, a, b, R)
@@ -26,14 +30,14 @@ def turn_and_slope(w, R, J):
 
 
 @compiled
-def turn(w, R):
+def turn(w: Vector, R: Matrix) -> None:
     """The rotation matrix alone, into R."""
     a, b, _ = _sines(w)
     _fill(w, a, b, R)
 
 
 @compiled
-def _sines(w):
+def _sines(w: Vector) -> tuple[float, float, float]:
     """Sin(t) / t, (1 - cos t) / t^2 and (t - sin t) / t^3 of the angle t."""
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     if angle2 < 1e-8:
@@ -44,7 +48,7 @@ def _sines(w):
 
 
 @compiled
-def _fill(w, a, b, out):
+def _fill(w: Vector, a: float, b: float, out: Matrix) -> None:
     """I + a [w]x + b [w]x^2."""
     x, y, z = w[0], w[1], w[2]
     out[0, 0] = 1 - b * (y * y + z * z)
@@ -56,14 +60,14 @@ def _fill(w, a, b, out):
 
 
 @compiled
-def apply(R, v, out):
+def apply(R: Matrix, v: Vector, out: Vector) -> None:
     """R v into out: for three numbers faster than a call of BLAS."""
     for i in range(3):
         out[i] = R[i, 0] * v[0] + R[i, 1] * v[1] + R[i, 2] * v[2]
 
 
 @compiled
-def dot(a, b):
+def dot(a: Float[np.ndarray, "N"], b: Float[np.ndarray, "N"]) -> float:
     """Scalar product of two short vectors."""
     total = 0.0
     for k in range(len(a)):
@@ -72,8 +76,8 @@ def dot(a, b):
 
 
 @compiled
-def turn_slope(R, J, v, out):
-    """Slope d(R v)/d omega = -R [v]x J_r, a 3x3 matrix."""
+def turn_slope(R: Matrix, J: Matrix, v: Vector, out: Matrix) -> None:
+    """Slope d(R v)/d omega = -R [v]x J_r into `out`."""
     for k in range(3):
         c0 = J[1, k] * v[2] - J[2, k] * v[1]
         c1 = J[2, k] * v[0] - J[0, k] * v[2]

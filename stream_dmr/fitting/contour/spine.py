@@ -1,10 +1,11 @@
 """The spine deformation of `skinning.py` with its analytic Jacobian: compiled loops."""
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from stream_dmr.compiled import compiled
-from stream_dmr.fitting.body import JOINT, ROOT
-from stream_dmr.fitting.contour.joints import blend, factors, joint_scales, root_slope, weights
+from stream_dmr.fitting.body import Body
+from stream_dmr.fitting.contour.joints import blend, factors, root_slope, weights
 from stream_dmr.fitting.contour.rotation import (
     apply,
     dot,
@@ -13,26 +14,38 @@ from stream_dmr.fitting.contour.rotation import (
     turn_and_slope,
     turn_slope,
 )
+from stream_dmr.fitting.parameters import (
+    JOINT_LOG_SCALE,
+    JOINT_ROTATION,
+    JOINT_TRANSLATION,
+    JOINT_WEIGHT,
+    LOG_SIZE,
+    NUM_PER_JOINT,
+    NUM_ROOT,
+    ROOT_ROTATION,
+    joints_of,
+)
 
 
 @compiled
-def spine_points(body, flat):
+def spine_points(body: Body, parameters: Float[np.ndarray, "P"]) -> Float[np.ndarray, "N 3"]:
     """Points swept along the bent midline, before the root's own motion."""
-    num_joints = len(body.joints)
-    L, S = factors(flat, num_joints), joint_scales(flat, num_joints)
+    num_joints, joints, places = len(body.joints), joints_of(parameters), body.places
+    rotations, translations, rest_joints = joints.rotation, joints.translation, body.joints
+    L, S = factors(joints.weight), np.exp(joints.log_scale)
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
-    omega = np.empty(3)
-    nodes, _ = spine_nodes(body, flat, L, False)
+    blended = np.empty(3)
+    nodes, _ = spine_nodes(body, parameters, L, False)
     center = _at_place(body, nodes, body.place_of[body.num_vertices + 1])
     turns = np.empty((len(body.places), 3, 3))
     bases = np.empty((len(body.places), 3))
     scales = np.empty(len(body.places))
     for u in range(len(body.places)):
-        weights(body.places[u], body.joints, L, W, dE)
-        blend(W, flat, 0, 3, omega)
-        turn(omega, turns[u])
-        blend(W, flat, 3, 3, omega)
-        apply(turns[u], omega, bases[u])
+        weights(places[u], rest_joints, L, W, dE)
+        blend(W, rotations, blended)
+        turn(blended, turns[u])
+        blend(W, translations, blended)
+        apply(turns[u], blended, bases[u])
         k, t = body.segments[u], body.fractions[u]
         for i in range(3):
             bases[u, i] += (1.0 - t) * nodes[k, i] + t * nodes[k + 1, i] - center[i]
@@ -49,77 +62,94 @@ def spine_points(body, flat):
 
 
 @compiled
-def spine_jacobian(body, flat, L, chosen, out):
-    """Slopes (C, 3, P) of chosen points to the parameters, into `out`."""
-    num_joints = len(body.joints)
-    S = joint_scales(flat, num_joints)
-    nodes, slopes = spine_nodes(body, flat, L, True)
+def spine_jacobian(
+    body: Body,
+    parameters: Float[np.ndarray, "P"],
+    chosen: Int[np.ndarray, "C"],
+    out: Float[np.ndarray, "C 3 P"],
+) -> None:
+    """Slopes of chosen points to the parameters, into `out`."""
+    num_joints, joints, places = len(body.joints), joints_of(parameters), body.places
+    rotations, translations, rest_joints = joints.rotation, joints.translation, body.joints
+    L, S = factors(joints.weight), np.exp(joints.log_scale)
+    nodes, slopes = spine_nodes(body, parameters, L, True)
     middle = body.place_of[body.num_vertices + 1]
     center, center_slope = _at_place(body, nodes, middle), _at_place(body, slopes, middle)
-    root, root_J = rotation(flat[:3])
-    size = np.exp(flat[5])
+    root, root_J = rotation(parameters[ROOT_ROTATION])
+    size = np.exp(parameters[LOG_SIZE])
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
     omega, shift, off, o = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     v, Roff = np.empty(3), np.empty(3)
     A, along, none = np.empty((3, 3)), np.empty(3), np.zeros(3)
     R, J = np.empty((3, 3)), np.empty((3, 3))
-    local = np.empty((3, JOINT * num_joints))
+    # Slopes to the joints' parameters before the root's own motion.
+    local = np.empty((3, NUM_PER_JOINT * num_joints))
+    blocks = local.reshape(3, num_joints, NUM_PER_JOINT)
+    to_rotation, to_translation = blocks[:, :, JOINT_ROTATION], blocks[:, :, JOINT_TRANSLATION]
+    to_weight = blocks[:, :, JOINT_WEIGHT]
     for c in range(len(chosen)):
         n = chosen[c]
         u = body.place_of[n]
-        weights(body.places[u], body.joints, L, W, dE)
-        blend(W, flat, 0, 3, omega)
-        blend(W, flat, 3, 3, shift)
+        weights(places[u], rest_joints, L, W, dE)
+        blend(W, rotations, omega)
+        blend(W, translations, shift)
         scale = dot(W, S)
         turn_and_slope(omega, R, J)
         for i in range(3):
-            off[i] = body.points[n, i] - body.places[u, i]
+            off[i] = body.points[n, i] - places[u, i]
             o[i] = scale * off[i] + shift[i]
         turn_slope(R, J, o, A)
         apply(R, off, Roff)
         k, t = body.segments[u], body.fractions[u]
         for i in range(3):
-            for p in range(JOINT * num_joints):
+            for p in range(NUM_PER_JOINT * num_joints):
                 local[i, p] = (
                     (1.0 - t) * slopes[k, i, p] + t * slopes[k + 1, i, p] - center_slope[i, p]
                 )
         for j in range(num_joints):
-            b, base = JOINT * j, ROOT + JOINT * j
             for i in range(3):
                 along[i] = (S[j] - scale) * Roff[i]
                 for m in range(3):
-                    local[i, b + m] += W[j] * A[i, m]
-                    local[i, b + 3 + m] += W[j] * R[i, m]
-                    along[i] += A[i, m] * (flat[base + m] - omega[m])
-                    along[i] += R[i, m] * (flat[base + 3 + m] - shift[m])
-                local[i, b + 6] += W[j] * S[j] * Roff[i]
+                    to_rotation[i, j, m] += W[j] * A[i, m]
+                    to_translation[i, j, m] += W[j] * R[i, m]
+                    along[i] += A[i, m] * (rotations[j, m] - omega[m])
+                    along[i] += R[i, m] * (translations[j, m] - shift[m])
+                blocks[i, j, JOINT_LOG_SCALE] += W[j] * S[j] * Roff[i]
                 for q in range(6):
-                    local[i, b + 7 + q] += W[j] * along[i] * dE[j, q]
+                    to_weight[i, j, q] += W[j] * along[i] * dE[j, q]
         apply(R, o, v)
         for i in range(3):
             v[i] += (1.0 - t) * nodes[k, i] + t * nodes[k + 1, i] - center[i]
-        root_slope(root, root_J, size, flat, v, none, 1.0, out[c], A)
+        root_slope(root, root_J, size, parameters, v, none, 1.0, out[c], A)
         for i in range(3):
-            for p in range(JOINT * num_joints):
-                out[c, i, ROOT + p] = size * (
+            for p in range(NUM_PER_JOINT * num_joints):
+                out[c, i, NUM_ROOT + p] = size * (
                     root[i, 0] * local[0, p] + root[i, 1] * local[1, p] + root[i, 2] * local[2, p]
                 )
 
 
 @compiled
-def spine_nodes(body, flat, L, with_slope):
-    """The bent midline from its head, (M, 3), and its slope to the joints' parameters."""
+def spine_nodes(
+    body: Body,
+    parameters: Float[np.ndarray, "P"],
+    L: Float[np.ndarray, "J 3 3"],
+    with_slope: bool,
+) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "slopes 3 joints"]]:
+    """The bent midline from its head, and its slope to the joints' parameters, or none of it."""
     num_joints, count = len(body.joints), len(body.midline)
+    rotations, rest_joints = joints_of(parameters).rotation, body.joints
     place = np.zeros((count, 3))
-    slope = np.zeros((count if with_slope else 0, 3, JOINT * num_joints))
+    slope = np.zeros((count if with_slope else 0, 3, NUM_PER_JOINT * num_joints))
+    blocks = slope.reshape(len(slope), 3, num_joints, NUM_PER_JOINT)
+    to_rotation, to_weight = blocks[:, :, :, JOINT_ROTATION], blocks[:, :, :, JOINT_WEIGHT]
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
     omega, step, Rd, middle = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     A, R, J = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for k in range(count - 1):
         for i in range(3):
             middle[i] = (body.midline[k, i] + body.midline[k + 1, i]) / 2
-        weights(middle, body.joints, L, W, dE)
-        blend(W, flat, 0, 3, omega)
+        weights(middle, rest_joints, L, W, dE)
+        blend(W, rotations, omega)
         for i in range(3):
             step[i] = body.midline[k + 1, i] - body.midline[k, i]
         turn(omega, R)
@@ -132,19 +162,20 @@ def spine_nodes(body, flat, L, with_slope):
         turn_slope(R, J, step, A)
         slope[k + 1] = slope[k]
         for j in range(num_joints):
-            o, base = JOINT * j, ROOT + JOINT * j
             for i in range(3):
                 along = 0.0
-                for c in range(3):
-                    slope[k + 1, i, o + c] += W[j] * A[i, c]
-                    along += A[i, c] * (flat[base + c] - omega[c])
+                for m in range(3):
+                    to_rotation[k + 1, i, j, m] += W[j] * A[i, m]
+                    along += A[i, m] * (rotations[j, m] - omega[m])
                 for q in range(6):
-                    slope[k + 1, i, o + 7 + q] += W[j] * along * dE[j, q]
+                    to_weight[k + 1, i, j, q] += W[j] * along * dE[j, q]
     return place, slope
 
 
 @compiled
-def _at_place(body, nodes, u):
+def _at_place(
+    body: Body, nodes: Float[np.ndarray, "M *shape"], u: int
+) -> Float[np.ndarray, "*shape"]:
     """Where a place of the midline has gone; also for slopes, which interpolate alike."""
     k, t = body.segments[u], body.fractions[u]
     return (1.0 - t) * nodes[k] + t * nodes[k + 1]

@@ -6,9 +6,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stream_dmr.errors import ConfigError
-from stream_dmr.fitting.body import JOINT, ROOT
 from stream_dmr.fitting.paper.objective import Objective
 from stream_dmr.fitting.paper.skinning import Rig
+from stream_dmr.fitting.parameters import NUM_PER_JOINT, NUM_ROOT
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution, rank
 from stream_dmr.fitting.target import Target
@@ -48,7 +48,7 @@ class AdamSolver:
         """A few iterations from every start, the best ones to the end, the best of these."""
         rough = self._descend(target, starts, _SEARCH_ITERATIONS, _FAR)
         rough.sort(key=lambda solution: rank(target, solution))
-        best = np.stack([solution.flat for solution in rough[:_NUM_FINISHED]])
+        best = np.stack([solution.parameters for solution in rough[:_NUM_FINISHED]])
         fine = self._descend(target, best, self._settings.adam_iterations, _NEAR)
         return min(fine, key=lambda solution: rank(target, solution))
 
@@ -61,7 +61,7 @@ class AdamSolver:
         """
         objective = Objective(self._rig, target, self._settings)
         origin = torch.tensor(starts, device=self._settings.device)
-        num_joints = (starts.shape[1] - ROOT) // JOINT
+        num_joints = (starts.shape[1] - NUM_ROOT) // NUM_PER_JOINT
         unit = torch.tensor(_ROOT_STEPS + _JOINT_STEPS * num_joints, dtype=origin.dtype)
         unit = unit.to(origin.device) * step
         moved = torch.zeros_like(origin, requires_grad=True)
@@ -70,10 +70,10 @@ class AdamSolver:
         best = _Best(origin)
         last_checked = best.loss
         for iteration in range(1, iterations + 1):
-            flat = origin + moved * unit
-            terms, iou = objective.terms(flat)
+            parameters = origin + moved * unit
+            terms, iou = objective.terms(parameters)
             loss = terms @ objective.lambdas
-            best.update(flat.detach(), loss.detach(), iou)
+            best.update(parameters.detach(), loss.detach(), iou)
             if iteration % _CHECK_EVERY == 0:
                 if bool((last_checked - best.loss < self._settings.tolerance).all()):
                     return best.solutions(iteration, True, "L_rec settled")
@@ -89,21 +89,20 @@ class _Best:
     """The best iterate so far of each start."""
 
     def __init__(self, starts: Float[Tensor, "B P"]) -> None:
-        self.flat = starts
+        self.parameters = starts
         self.loss = torch.full_like(starts[:, 0], torch.inf)
         self._iou = torch.zeros_like(self.loss)
 
     def update(
-        self, flat: Float[Tensor, "B P"], loss: Float[Tensor, "B"], iou: Float[Tensor, "B"]
+        self, parameters: Float[Tensor, "B P"], loss: Float[Tensor, "B"], iou: Float[Tensor, "B"]
     ) -> None:
         is_better = loss < self.loss
-        self.flat = torch.where(is_better[:, None], flat, self.flat)
+        self.parameters = torch.where(is_better[:, None], parameters, self.parameters)
         self.loss = torch.where(is_better, loss, self.loss)
         self._iou = torch.where(is_better, iou, self._iou)
 
     def solutions(self, iterations: int, converged: bool, stop_reason: str) -> list[Solution]:
-        rows = zip(self.flat.cpu().numpy(), self.loss.tolist(), self._iou.tolist(), strict=True)
+        columns = self.parameters.cpu().numpy(), self.loss.tolist(), self._iou.tolist()
         return [
-            Solution(flat, loss, iou, iterations, converged, stop_reason)
-            for flat, loss, iou in rows
+            Solution(*row, iterations, converged, stop_reason) for row in zip(*columns, strict=True)
         ]

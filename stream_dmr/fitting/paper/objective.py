@@ -33,10 +33,10 @@ class Objective:
         self._K, self._anchor = tensor(target.K), tensor(target.anchor)
         self._mask, self._distance = tensor(target.mask), tensor(target.distance)
 
-    def terms(self, flat: Float[Tensor, "B P"]) -> Terms:
+    def terms(self, vector: Float[Tensor, "B P"]) -> Terms:
         """Each term of eq. (3); the shape terms are taken in body lengths."""
-        parameters = Parameters.from_flat(flat)
-        vertices = deform(self._rig, flat, self._deformation).vertices
+        parameters = Parameters.from_vector(vector)
+        vertices = deform(self._rig, vector, self._deformation).vertices
         pixels = project(vertices + self._anchor, self._K)
         covered = silhouette(pixels, self._rig, size=self._mask.shape[0])
         shape = vertices / parameters.root_log_scale.exp()[:, None, None]

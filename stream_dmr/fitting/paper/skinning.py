@@ -15,7 +15,19 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stream_dmr.fitting.body import JOINT, ROOT, Body, rest_vector
+from stream_dmr.fitting.body import Body
+from stream_dmr.fitting.parameters import (
+    JOINT_LOG_SCALE,
+    JOINT_ROTATION,
+    JOINT_TRANSLATION,
+    JOINT_WEIGHT,
+    LOG_SIZE,
+    NUM_PER_JOINT,
+    NUM_ROOT,
+    ROOT_ROTATION,
+    ROOT_TRANSLATION,
+    rest_vector,
+)
 from stream_dmr.template.template import Template
 
 
@@ -31,21 +43,21 @@ class Parameters(NamedTuple):
     joint_precisions: Float[Tensor, "B J 6"]  # Cholesky factor of Q, its diagonal as logs
 
     @classmethod
-    def from_flat(cls, flat: Float[Tensor, "B P"]) -> "Parameters":
-        """Split P = ROOT + JOINT * J columns."""
-        root, joints = flat[:, :ROOT], flat[:, ROOT:].unflatten(1, (-1, JOINT))
+    def from_vector(cls, vector: Float[Tensor, "B P"]) -> "Parameters":
+        """Split vectors as `stream_dmr.fitting.parameters` lays them out."""
+        joints = vector[:, NUM_ROOT:].unflatten(1, (-1, NUM_PER_JOINT))
         return cls(
-            root_rotation=root[:, :3],
-            root_translation=root[:, 3:5],
-            root_log_scale=root[:, 5],
-            joint_rotations=joints[..., :3],
-            joint_translations=joints[..., 3:6],
-            joint_log_scales=joints[..., 6],
-            joint_precisions=joints[..., 7:],
+            root_rotation=vector[:, ROOT_ROTATION],
+            root_translation=vector[:, ROOT_TRANSLATION],
+            root_log_scale=vector[:, LOG_SIZE],
+            joint_rotations=joints[..., JOINT_ROTATION],
+            joint_translations=joints[..., JOINT_TRANSLATION],
+            joint_log_scales=joints[..., JOINT_LOG_SCALE],
+            joint_precisions=joints[..., JOINT_WEIGHT],
         )
 
-    def flat(self) -> Float[Tensor, "B P"]:
-        """The inverse of `from_flat`."""
+    def vector(self) -> Float[Tensor, "B P"]:
+        """The inverse of `from_vector`."""
         root = torch.cat(
             [self.root_rotation, self.root_translation, self.root_log_scale[:, None]], dim=1
         )
@@ -158,9 +170,9 @@ def spine(rig: Rig, parameters: Parameters) -> Float[Tensor, "B N 3"]:
 DEFORMATIONS: dict[str, Deformation] = {"spine": spine, "linear-blend": linear_blend}
 
 
-def deform(rig: Rig, flat: Float[Tensor, "B P"], deformation: Deformation) -> Deformed:
+def deform(rig: Rig, vector: Float[Tensor, "B P"], deformation: Deformation) -> Deformed:
     """Deform vertices, keypoints and midline of the template together."""
-    points = deformation(rig, Parameters.from_flat(flat))
+    points = deformation(rig, Parameters.from_vector(vector))
     v = rig.num_vertices
     return Deformed(points[:, :v], points[:, v : v + 3], points[:, v + 3 :])
 

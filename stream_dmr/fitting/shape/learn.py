@@ -21,10 +21,11 @@ from scipy.optimize import minimize as descend
 
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import TemplateError
-from stream_dmr.fitting.body import Body, rest_vector
-from stream_dmr.fitting.contour.deformation import KINDS
+from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.levenberg_marquardt import NEAR, evaluate, minimise
 from stream_dmr.fitting.contour.normal_equations import prior_loss
+from stream_dmr.fitting.contour.problem import Options, Problem
+from stream_dmr.fitting.parameters import LOG_SIZE
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.shape.proportions import NUM_KNOTS, Proportions
 from stream_dmr.fitting.target import Target
@@ -158,11 +159,7 @@ class _Crowd:
     ) -> None:
         self._template, self._samples = template, samples
         self._least, self._best_poses = np.inf, [sample.pose for sample in samples]
-        self._kind = KINDS[settings.deformation]
-        self._rest = rest_vector(len(template.joints))
-        self._free = np.zeros(len(self._rest), np.bool_)
-        self._lambdas = settings.rough_lambdas()
-        self._priors = settings.priors()
+        self._settings = settings
         self._nat = settings.nat * _FRAMES_PER_FISH  # frames of a fish are much alike
 
     def nats(self, vector: Float[np.ndarray, "W"]) -> float:
@@ -190,7 +187,7 @@ class _Crowd:
         for sample in self._samples:
             self._follow(body, sample)
         return (
-            np.array([sample.pose[5] for sample in self._samples]),
+            np.array([sample.pose[LOG_SIZE] for sample in self._samples]),
             np.array([sample.iou for sample in self._samples]),
         )
 
@@ -200,28 +197,21 @@ class _Crowd:
     def _nats_as_posed(self, vector: Float[np.ndarray, "W"]) -> float:
         body, total = self._body(vector), 0.0
         for sample in self._samples:
-            terms, *_ = evaluate(body, self._kind, sample.target, sample.pose, False)
-            total += float(terms @ self._lambdas)
-            total += prior_loss(sample.target, sample.pose, self._rest, self._priors)
+            problem = self._problem(body, sample.target)
+            total += float(evaluate(problem, sample.pose, False).terms @ problem.lambdas)
+            total += prior_loss(problem, sample.pose)
         return total / self._nat + _unlikeliness(vector)
 
     def _follow(self, body: Body, sample: Sample) -> float:
         """Fit a sample anew from where it was; its loss."""
-        found = minimise(
-            body,
-            self._kind,
-            sample.target,
-            self._lambdas,
-            self._priors,
-            sample.pose,
-            self._rest,
-            self._free,
-            _POSE_ITERATIONS,
-            _POSE_TOLERANCE,
-            NEAR,
-        )
-        sample.pose, sample.iou = found.flat, found.iou
+        options = Options(_POSE_ITERATIONS, _POSE_TOLERANCE, NEAR)
+        free = np.zeros(len(sample.pose), np.bool_)
+        found = minimise(self._problem(body, sample.target), sample.pose, free, options)
+        sample.pose, sample.iou = found.parameters, found.iou
         return found.loss
+
+    def _problem(self, body: Body, target: Target) -> Problem:
+        return Problem.from_settings(self._settings, body, target, with_smoothness=False)
 
 
 def _unlikeliness(vector: Float[np.ndarray, "W"]) -> float:

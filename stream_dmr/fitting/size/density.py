@@ -1,6 +1,7 @@
 """From sizes that were tried to what is to be expected: a density and its moments, compiled."""
 
 import numpy as np
+from jaxtyping import Float
 
 from stream_dmr.compiled import compiled
 
@@ -10,10 +11,12 @@ _STEEPEST_END = 10.0  # nats per unit of log size: past the ends sizes get at le
 
 
 @compiled
-def mean_and_std(offsets, nats):
+def mean_and_std(
+    offsets: Float[np.ndarray, "G"], nats: Float[np.ndarray, "G"]
+) -> tuple[float, float]:
     """Of the density exp(-nats) over log sizes, which between those tried is a smooth curve.
 
-    `offsets` (G,) ascend. Past them the curve goes on straight, and steeply enough.
+    `offsets` ascend. Past them the curve goes on straight, and steeply enough.
     """
     last = len(offsets) - 1
     slopes = pchip_slopes(offsets, nats)
@@ -41,8 +44,8 @@ def mean_and_std(offsets, nats):
 
 
 @compiled
-def pchip_slopes(x, y):
-    """Slopes (G,) with which cubic pieces neither overshoot nor turn where the points do not.
+def pchip_slopes(x: Float[np.ndarray, "G"], y: Float[np.ndarray, "G"]) -> Float[np.ndarray, "G"]:
+    """Slopes with which cubic pieces neither overshoot nor turn where the points do not.
 
     Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5, 300 (1984); the ends by three points. That
     of SciPy's PchipInterpolator, whose set-up alone would be a tenth of a warm fit.
@@ -65,7 +68,9 @@ def pchip_slopes(x, y):
 
 
 @compiled
-def _end_slope(x, y, end, inwards):
+def _end_slope(
+    x: Float[np.ndarray, "G"], y: Float[np.ndarray, "G"], end: int, inwards: int
+) -> float:
     near, far = end + inwards, end + 2 * inwards
     h0, h1 = x[near] - x[end], x[far] - x[near]
     d0, d1 = (y[near] - y[end]) / h0, (y[far] - y[near]) / h1
@@ -78,7 +83,13 @@ def _end_slope(x, y, end, inwards):
 
 
 @compiled
-def _hermite(x, y, slopes, k, at):
+def _hermite(
+    x: Float[np.ndarray, "G"],
+    y: Float[np.ndarray, "G"],
+    slopes: Float[np.ndarray, "G"],
+    k: int,
+    at: float,
+) -> float:
     """The cubic piece between the points k and k + 1."""
     h = x[k + 1] - x[k]
     t = (at - x[k]) / h

@@ -1,63 +1,77 @@
 """How well each size of the fish explains its mask, when all else may follow: compiled loops."""
 
+from typing import NamedTuple
+
 import numpy as np
+from jaxtyping import Bool, Float
 
 from stream_dmr.compiled import compiled
-from stream_dmr.fitting.contour.levenberg_marquardt import (
-    NEAR,
-    factorise,
-    minimise,
-    solve_factorised,
-)
+from stream_dmr.fitting.contour.levenberg_marquardt import factorise, minimise, solve_factorised
+from stream_dmr.fitting.contour.problem import Options, Problem
+from stream_dmr.fitting.parameters import LOG_SIZE
 
-SIZE = 5  # the root's log scale, of the parameters
+
+class SizeFit(NamedTuple):
+    """The best fit of one size."""
+
+    parameters: Float[np.ndarray, "P"]
+    loss: float
+    log_volume: float  # half the log determinant of the loss's curvature in all but the size
+    next_step: Float[np.ndarray, "P"]  # slope of the best fit to the log size
+
+
+class SizeScan(NamedTuple):
+    """The best fits of G sizes."""
+
+    parameters: Float[np.ndarray, "G P"]
+    losses: Float[np.ndarray, "G"]  # infinite where not tried
+    log_volumes: Float[np.ndarray, "G"]
+    next_steps: Float[np.ndarray, "G P"]
 
 
 @compiled
 def scan_sizes(
-    body, kind, target, lambdas, priors, start, rest, offsets, hopeless, iterations, tolerance
-):
-    """Fit anew at each log size `start[SIZE] + offsets` (ascending, 0 among them).
+    problem: Problem,
+    start: Float[np.ndarray, "P"],
+    offsets: Float[np.ndarray, "G"],
+    hopeless: float,
+    options: Options,
+) -> SizeScan:
+    """Fit anew at each log size `start[LOG_SIZE] + offsets` (ascending, 0 among them).
 
     From the start outwards, each size from where its neighbour's fit is headed, and no further than
-    sizes whose loss is worse than the start's by `hopeless`. Returns the fits (G, P), their losses
-    (G,), infinite where not tried, half the log determinants of the loss's curvature in all but the
-    size (G,), and the slopes of the fits to the log size (G, P).
+    sizes whose loss is worse than the start's by `hopeless`.
     """
     count, middle = len(offsets), np.argmin(np.abs(offsets))
-    fits, leads = np.zeros((count, len(start))), np.zeros((count, len(start)))
-    losses, rooms = np.full(count, np.inf), np.zeros(count)
-    fits[middle], losses[middle], rooms[middle], leads[middle] = _fit_of_this_size(
-        body, kind, target, lambdas, priors, start, rest, iterations, tolerance
+    fits, next_steps = np.zeros((count, len(start))), np.zeros((count, len(start)))
+    losses, log_volumes = np.full(count, np.inf), np.zeros(count)
+    fits[middle], losses[middle], log_volumes[middle], next_steps[middle] = fit_at_size(
+        problem, start, options
     )
     for way in (1, -1):
         n = middle + way
         while 0 <= n < count and losses[n - way] < losses[middle] + hopeless:
-            guess = fits[n - way] + (offsets[n] - offsets[n - way]) * leads[n - way]
-            guess[SIZE] = start[SIZE] + offsets[n]
-            fits[n], losses[n], rooms[n], leads[n] = _fit_of_this_size(
-                body, kind, target, lambdas, priors, guess, rest, iterations, tolerance
-            )
+            guess = fits[n - way] + (offsets[n] - offsets[n - way]) * next_steps[n - way]
+            guess[LOG_SIZE] = start[LOG_SIZE] + offsets[n]
+            fits[n], losses[n], log_volumes[n], next_steps[n] = fit_at_size(problem, guess, options)
             n += way
-    return fits, losses, rooms, leads
+    return SizeScan(fits, losses, log_volumes, next_steps)
 
 
 @compiled
-def only_size(num_parameters):
-    """The mask (P,) of parameters that holds the size alone."""
+def only_size(num_parameters: int) -> Bool[np.ndarray, "P"]:
+    """The mask of parameters that holds the size alone."""
     held = np.zeros(num_parameters, np.bool_)
-    held[SIZE] = True
+    held[LOG_SIZE] = True
     return held
 
 
 @compiled
-def _fit_of_this_size(body, kind, target, lambdas, priors, start, rest, iterations, tolerance):
-    """The best fit (P,) of the start's size, its loss, half log determinant and slope (P,)."""
+def fit_at_size(problem: Problem, start: Float[np.ndarray, "P"], options: Options) -> SizeFit:
+    """The best fit of the start's size."""
     held = only_size(len(start))
-    found = minimise(
-        body, kind, target, lambdas, priors, start, rest, held, iterations, tolerance, NEAR
-    )
+    found = minimise(problem, start, held, options)
     L = factorise(found.H, 0.0, held)
-    lead = solve_factorised(L, np.where(held, 0.0, -found.H[SIZE]))
-    lead[SIZE] = 1.0
-    return found.flat, found.loss, np.sum(np.log(np.diag(L))), lead
+    next_step = solve_factorised(L, np.where(held, 0.0, -found.H[LOG_SIZE]))
+    next_step[LOG_SIZE] = 1.0
+    return SizeFit(found.parameters, found.loss, np.sum(np.log(np.diag(L))), next_step)

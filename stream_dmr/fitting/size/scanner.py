@@ -7,16 +7,16 @@ wherever its search has led it. So sizes near it are tried, with everything else
 """
 
 import numpy as np
-from jaxtyping import Float
 
-from stream_dmr.fitting.body import rest_vector
-from stream_dmr.fitting.contour.deformation import KINDS
+from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.levenberg_marquardt import NEAR, minimise
+from stream_dmr.fitting.contour.problem import Options, Problem
 from stream_dmr.fitting.contour.solver import solution_of
 from stream_dmr.fitting.mesh_levels import Bodies
+from stream_dmr.fitting.parameters import LOG_SIZE
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.size.density import mean_and_std
-from stream_dmr.fitting.size.scan import SIZE, only_size, scan_sizes
+from stream_dmr.fitting.size.scan import only_size, scan_sizes
 from stream_dmr.fitting.solver import Solution
 from stream_dmr.fitting.target import Target
 
@@ -38,47 +38,23 @@ class SizeScanner:
 
     def __init__(self, bodies: Bodies, settings: FitMeshSettings) -> None:
         self._body, self._coarse, self._settings = bodies.fine, bodies.coarse, settings
-        self._kind = KINDS[settings.deformation]
-        self._rest = rest_vector(len(bodies.fine.joints))
-        # The mesh's smoothness tells sizes apart no better, and is dear.
-        self._lambdas, self._priors = settings.rough_lambdas(), settings.priors()
+        self._options = Options(settings.scan_iterations, settings.tolerance, NEAR)
 
     def expected(self, target: Target, best: Solution) -> tuple[Solution, float]:
         """The fit at the expected size of the fish, and the std of this size's log."""
-        fits, losses, rooms, leads = scan_sizes(
-            self._coarse,
-            self._kind,
-            target.coarse(),
-            self._lambdas,
-            self._priors,
-            best.flat,
-            self._rest,
-            _OFFSETS,
-            _HOPELESS * self._settings.nat,
-            self._settings.scan_iterations,
-            self._settings.tolerance,
-        )
-        tried = np.isfinite(losses)
-        mean, std = mean_and_std(
-            _OFFSETS[tried], losses[tried] / self._settings.nat + _ROOM * rooms[tried]
-        )
+        start, nat = best.parameters, self._settings.nat
+        problem = self._problem(self._coarse, target.coarse())
+        scan = scan_sizes(problem, start, _OFFSETS, _HOPELESS * nat, self._options)
+        tried = np.isfinite(scan.losses)
+        nats = scan.losses[tried] / nat + _ROOM * scan.log_volumes[tried]
+        mean, std = mean_and_std(_OFFSETS[tried], nats)
         nearest = np.argmin(np.where(tried, np.abs(_OFFSETS - mean), np.inf))
-        start = fits[nearest] + (mean - _OFFSETS[nearest]) * leads[nearest]
-        start[SIZE] = best.flat[SIZE] + mean
-        return self._fit_of_this_size(target, start), SCATTER * std
-
-    def _fit_of_this_size(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
+        guess = scan.parameters[nearest] + (mean - _OFFSETS[nearest]) * scan.next_steps[nearest]
+        guess[LOG_SIZE] = start[LOG_SIZE] + mean
         found = minimise(
-            self._body,
-            self._kind,
-            target,
-            self._lambdas,
-            self._priors,
-            start,
-            self._rest,
-            only_size(len(start)),
-            self._settings.scan_iterations,
-            self._settings.tolerance,
-            NEAR,
+            self._problem(self._body, target), guess, only_size(len(guess)), self._options
         )
-        return solution_of(found)
+        return solution_of(found), SCATTER * std
+
+    def _problem(self, body: Body, target: Target) -> Problem:
+        return Problem.from_settings(self._settings, body, target, with_smoothness=False)

@@ -1,0 +1,54 @@
+"""What a descent minimises and how long it may take: the tuples that the kernels pass on."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.fitting.body import Body
+from stream_dmr.fitting.contour.deformation import KINDS
+from stream_dmr.fitting.parameters import Priors, rest_vector
+from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.target import Target
+
+# The terms of eq. (3), and their lambdas, in this order.
+IOU, BOUNDARY, SCALE, TRANSLATION, NORMAL, LAPLACIAN = range(6)
+
+
+class Problem(NamedTuple):
+    """L_rec of eq. (3) of one body on one target, with priors on its parameters.
+
+    Kernels take it as it is: `stream_dmr.compiled`.
+    """
+
+    body: Body
+    kind: int  # of the deformation: SPINE or LINEAR_BLEND
+    target: Target
+    lambdas: Float[np.ndarray, "6"]
+    priors: Priors
+    rest: Float[np.ndarray, "P"]  # where the priors have their minimum
+
+    @classmethod
+    def from_settings(
+        cls, settings: FitMeshSettings, body: Body, target: Target, *, with_smoothness: bool
+    ) -> "Problem":
+        """Without smoothness: no L_normal and L_lap, expensive terms that separate no poses."""
+        lambdas = settings.lambdas()
+        if not with_smoothness:
+            lambdas[[NORMAL, LAPLACIAN]] = 0.0
+        return cls(
+            body,
+            KINDS[settings.deformation],
+            target,
+            lambdas,
+            settings.priors(),
+            rest_vector(len(body.joints)),
+        )
+
+
+class Options(NamedTuple):
+    """Of one descent."""
+
+    iterations: int  # at most
+    tolerance: float  # of L_rec: it has settled when it falls by less
+    damping: float  # of the first step, as a share of the curvature's diagonal
