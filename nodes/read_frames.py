@@ -1,4 +1,4 @@
-"""ReadFrames: the head of the chain, frames in order from a file, folder, camera or stream."""
+"""ReadFrames, the first stage: frames in order from a file, folder, camera or stream."""
 
 from collections.abc import Iterator
 
@@ -8,7 +8,7 @@ from stream_dmr.sources.read_settings import ReadFramesSettings
 
 
 class ReadFrames:
-    """Iterates the frames of a source, once; `source` tells its size, rate and warnings."""
+    """Frames of a source, to be iterated once; `source` has its size, rate and warnings."""
 
     def __init__(self, source: str, settings: ReadFramesSettings) -> None:
         """Raises SourceError where nothing can be read from `source`."""
@@ -19,5 +19,5 @@ class ReadFrames:
         return iter(self.source)
 
     def close(self) -> None:
-        """Let go of the file or device; iteration ends."""
+        """Release the file or device; the iteration ends."""
         self.source.close()

@@ -22,11 +22,12 @@ from stream_dmr.errors import CalibrationError, OutputError
 
 __all__ = ["BoardResult", "calibrate", "draw_views", "parse_board"]
 
-# A view of a plane binds two of the four numbers of K. Two views would do on paper; five leave
-# each number bound several times over, so that the residuals, and the errors we print, mean much.
+# Each view of a plane gives two constraints on the four parameters of K (Zhang 2000, Sec. 2.4), so
+# two views would do; with five, each parameter is overdetermined and the residuals mean something.
 MIN_VIEWS = 5
 GOOD_VIEWS = 10
-_SAME_VIEW = 0.01  # of the picture's diagonal: boards closer together than that tell nothing new
+# The following are chosen by hand.
+_SAME_VIEW = 0.01  # of the picture's diagonal: closer boards add no information
 _OUTLIER = 3.0  # times the median RMS of all views
 _OUTLIER_PX = 1.0  # below that no view is an outlier
 _GOOD_RMS = 1 / 2000  # of the picture's longer side
@@ -35,7 +36,7 @@ _GOOD_COVERAGE = 0.4  # of the picture's area
 
 @dataclass(frozen=True, kw_only=True)
 class LeftOut:
-    """One photograph that did not take part, and why."""
+    """One photograph that was not used, and why."""
 
     path: Path
     reason: str
@@ -43,12 +44,12 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BoardResult:
-    """The calibration and all that a person needs to trust or distrust it."""
+    """The calibration and what is needed to judge it."""
 
     calibration: Calibration
     board: Board
-    fit: LensFit  # with the views and their errors
-    plane_view: BoardView  # the one of them in which the board lies in the reference plane
+    fit: LensFit  # with the views and their reprojection errors
+    plane_view: BoardView  # the view whose board lies in the reference plane
     left_out: tuple[LeftOut, ...]
     warnings: tuple[str, ...]
 
@@ -74,7 +75,7 @@ def calibrate(
             f"--square-mm: expected the side of one square in mm, above 0, got {square_mm:g}"
         )
     plane_image = Path(plane_image)
-    corners, size, left_out = _look(image_paths, plane_image, board)
+    corners, size, left_out = _find_boards(image_paths, plane_image, board)
     points = board_points_mm(board, square_mm)
     _require_views(corners, left_out)
     fit = fit_lens(corners, points, size)
@@ -97,7 +98,7 @@ def calibrate(
 
 
 def draw_views(result: BoardResult, folder: Path) -> None:
-    """Write a picture of each view with its corners drawn, to see that they are where they should.
+    """Write a picture of each view with its corners drawn, for a check by eye.
 
     Raises OutputError where the folder can't be written to.
     """
@@ -112,10 +113,10 @@ def draw_views(result: BoardResult, folder: Path) -> None:
         ) from error
 
 
-def _look(
+def _find_boards(
     image_paths: Iterable[Path | str], plane_image: Path, board: Board
 ) -> tuple[dict[Path, np.ndarray], tuple[int, int], list[LeftOut]]:
-    """Return corners by picture, the plane's first; its (width, height); and who is left out."""
+    """Corners (N, 2) in px by picture, the plane's first; its (width, height); those left out."""
     try:
         picture = read_grey(plane_image)
         plane_corners = _corners_or_refuse(picture, board)
@@ -199,10 +200,10 @@ def _outliers(fit: LensFit, plane_image: Path) -> list[LeftOut]:
 
 
 def _warnings(fit: LensFit) -> Iterator[str]:
-    """Say what a careful person would mend before going to sea."""
+    """What should be improved before the calibration is used."""
     width, height = fit.camera.width, fit.camera.height
     if len(fit.views) < GOOD_VIEWS:
-        yield f"only {len(fit.views)} views; {GOOD_VIEWS} to 20 make the lens more certain"
+        yield f"only {len(fit.views)} views; {GOOD_VIEWS} to 20 determine the lens better"
     limit = _GOOD_RMS * max(width, height)
     if fit.rms_px > limit:
         yield (
@@ -215,8 +216,8 @@ def _warnings(fit: LensFit) -> Iterator[str]:
     coverage = cv2.contourArea(hull) / (width * height)
     if coverage < _GOOD_COVERAGE:
         yield (
-            f"the boards cover {coverage:.0%} of the picture; distortion is a guess outside of "
-            "it, so show the board near all edges too"
+            f"the boards cover {coverage:.0%} of the picture; distortion is extrapolated outside "
+            "of them, so show the board near all edges too"
         )
     rim = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], np.float64)
     if np.abs(fit.camera.project(fit.camera.back_project(rim)) - rim).max() > 1.0:

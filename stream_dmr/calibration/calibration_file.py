@@ -22,17 +22,19 @@ _KEYS = (
     "rvec",
     "tvec",
 )
-_DISTORTION_SHAPES = [(4,), (5,), (8,), (12,), (14,)]  # what OpenCV's lens models have
-_REMEDY = "make the file anew with `stream-dmr calibrate`"
-_MIN_SLOPE = np.sin(np.radians(3.0))  # a plane seen flatter than this has no usable depth
-_MIN_DEPTH_MM = 10.0  # closer than that, tvec is in metres
+_DISTORTION_SHAPES = [(4,), (5,), (8,), (12,), (14,)]  # the sizes of OpenCV's lens models
+_REMEDY = "make the file again with `stream-dmr calibrate`"
+# Chosen: a plane seen at less than 3 degrees gives no usable depth; a plane nearer than 10 mm means
+# that tvec is in metres.
+_MIN_SLOPE = np.sin(np.radians(3.0))
+_MIN_DEPTH_MM = 10.0
 
 
 def load_calibration(path: Path | str) -> Calibration:
     """Read and check a calibration file.
 
     Raises CalibrationError where the file is missing, is no OpenCV YAML, lacks a key, holds a
-    value of the wrong shape or a value that no camera has, or has its plane behind the camera.
+    value of the wrong shape or out of range, or has its plane behind the camera.
     """
     path = Path(path)
     values = _read_values(path)
@@ -54,12 +56,12 @@ def load_calibration(path: Path | str) -> Calibration:
 def save_calibration(path: Path | str, calibration: Calibration) -> None:
     """Write a calibration file that `load_calibration` and OpenCV read.
 
-    The numbers come back equal to the last bit, but for the plane's rotation, which is stored as
-    a rotation vector (error below 1e-12). Raises OutputError where the file can't be written.
+    The numbers are read back bit by bit, except for the plane's rotation, which is stored as a
+    rotation vector (error below 1e-12). Raises OutputError where the file can't be written.
     """
     path = Path(path)
     camera, plane = calibration.camera, calibration.plane
-    # OpenCV takes the angle from its cosine, and so loses half the digits of small ones.
+    # cv2.Rodrigues takes the angle from its cosine, which loses half the digits of small angles.
     rvec = Rotation.from_matrix(plane.rotation).as_rotvec()[:, None]
     storage = cv2.FileStorage(
         ".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
@@ -79,7 +81,7 @@ def save_calibration(path: Path | str, calibration: Calibration) -> None:
 
 
 def require_size(calibration: Calibration, *, width: int, height: int) -> None:
-    """Raise CalibrationError unless the calibration was made for pictures of this size."""
+    """Raise CalibrationError unless the calibration is for pictures of `width` x `height` px."""
     camera = calibration.camera
     if (camera.width, camera.height) != (width, height):
         raise CalibrationError(
@@ -89,7 +91,7 @@ def require_size(calibration: Calibration, *, width: int, height: int) -> None:
 
 
 def _read_values(path: Path) -> dict[str, float | np.ndarray]:
-    """Every key's number or matrix, as OpenCV parses them."""
+    """The number or matrix of every key, as OpenCV parses them."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
@@ -128,9 +130,9 @@ def _value(node: cv2.FileNode, key: str, *, path: Path) -> float | np.ndarray:
 
 
 def _matrix(node: cv2.FileNode) -> Float[np.ndarray, "rows cols"] | None:
-    """An !!opencv-matrix; None where it is none.
+    """An !!opencv-matrix; None for another kind of node.
 
-    Number by number: `FileNode.mat` writes beyond its memory where the data don't match the size.
+    Read number by number: `FileNode.mat` writes out of bounds where the data don't match the size.
     """
     if not node.isMap():
         return None

@@ -11,14 +11,14 @@ from stream_dmr.errors import CalibrationError
 
 Board = tuple[int, int]  # inner corners a row, and a column
 
-# The board is looked for in a small copy, so that big photographs take no longer than small ones;
-# squares down to some 6 px of the copy are found.
+# The board is searched in a copy of this size, so that large photographs take no longer than small
+# ones; squares down to some 6 px of the copy are found.
 _SEARCH_SIDE_PX = 1280
-# Half the window of the sub-pixel search, in squares: as large as it can be without the next
-# corners in it. On rendered views 0.15 had twice the error of 0.4, and ten times when blurred.
+# Half the window of the sub-pixel search, in squares: as large as possible without including the
+# next corners. On rendered views 0.15 had twice the error of 0.4, and ten times when blurred.
 _WINDOW_SQUARES = 0.4
-_MAX_WINDOW_PX = 30  # beyond that it takes time and gains nothing
-_UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-4)
+_MAX_WINDOW_PX = 30  # larger ones took longer and were not more accurate
+_STOP_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-4)
 _DRAWN_SIDE_PX = 1600
 
 
@@ -42,7 +42,7 @@ def board_points_mm(board: Board, square_mm: float) -> Float[np.ndarray, "N 3"]:
 
 
 def read_grey(path: Path) -> UInt8[np.ndarray, "H W"]:
-    """Read a picture as the lens drew it: grey, 8 bit, and not turned by what EXIF says.
+    """Read a picture in sensor orientation: grey, 8 bit, EXIF rotation ignored.
 
     Raises CalibrationError where the file can't be read or is no picture.
     """
@@ -60,12 +60,12 @@ def read_grey(path: Path) -> UInt8[np.ndarray, "H W"]:
 def find_corners(
     picture: UInt8[np.ndarray, "H W"], board: Board
 ) -> Float[np.ndarray, "N 2"] | None:
-    """Sub-pixel inner corners in `picture`, row by row, or None where no whole board is seen.
+    """Sub-pixel inner corners in px, row by row; None where no whole board is found.
 
     The sector-based detector (Duda and Frese, "Accurate Detection and Localization of Checkerboard
     Corners for Calibration", BMVC 2018) finds them in a small copy; `cornerSubPix` then refines
     them in the picture itself. The first corner is the one nearest the picture's top-left and the
-    board's Z points away from the camera, whichever way round the detector read the board.
+    board's Z points away from the camera, in whichever order the detector returns them.
     """
     scale = max(1.0, max(picture.shape) / _SEARCH_SIDE_PX)
     found, corners = cv2.findChessboardCornersSB(
@@ -80,7 +80,7 @@ def find_corners(
 
 
 def draw_corners(path: Path, corners: Float[np.ndarray, "N 2"], board: Board, out: Path) -> None:
-    """Write the picture at `path`, large ones made smaller, with its corners drawn, to `out`."""
+    """Write the picture at `path`, reduced if large, with its corners drawn, to `out`."""
     picture = read_grey(path)
     scale = max(1.0, max(picture.shape) / _DRAWN_SIDE_PX)
     canvas = cv2.cvtColor(_resized(picture, scale), cv2.COLOR_GRAY2BGR)
@@ -104,11 +104,11 @@ def _refined(
     square_px = min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1))
     window = int(np.clip(_WINDOW_SQUARES * square_px, 2, _MAX_WINDOW_PX))
     start = coarse.astype(np.float32).reshape(-1, 1, 2)
-    fine = cv2.cornerSubPix(picture, start.copy(), (window, window), (-1, -1), _UNTIL)
+    fine = cv2.cornerSubPix(picture, start.copy(), (window, window), (-1, -1), _STOP_CRITERIA)
     fine = fine.reshape(-1, 2).astype(np.float64)
-    # A corner that wandered off found something else: the detector's own place is the better one.
-    strayed = np.linalg.norm(fine - coarse, axis=1) > square_px / 3
-    return np.where(strayed[:, None], coarse, fine)
+    # A corner that moved by more than that converged to something else: keep the detector's.
+    diverged = np.linalg.norm(fine - coarse, axis=1) > square_px / 3
+    return np.where(diverged[:, None], coarse, fine)
 
 
 def _in_order(corners: Float[np.ndarray, "N 2"], board: Board) -> Float[np.ndarray, "N 2"]:

@@ -1,4 +1,4 @@
-"""Fits a lens, and the plane of each board, to the corners found in photographs."""
+"""Fit of a lens and of each board's plane to the corners found in photographs."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +11,9 @@ from scipy.spatial.distance import pdist
 from stream_dmr.camera import Camera, ReferencePlane
 from stream_dmr.errors import CalibrationError
 
-MAX_FOCAL_STD = 0.01  # of the focal length; above, the views leave it undetermined
-# Between the two most different boards. The std alone does not tell: ten boards all square to the
-# camera fit any focal length equally well, and gave one 54 % wrong with a std of 0.01 %.
+MAX_FOCAL_STD = 0.01  # of the focal length; chosen: the views determine it within 1 %
+# Between the normals of the two most different boards. The std alone is not enough: ten boards, all
+# parallel to the sensor, fit any focal length equally well; one was 54 % wrong, its std 0.01 %.
 MIN_TILT_DEG = 10.0
 
 
@@ -29,7 +29,7 @@ class DistanceErrors:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BoardView:
-    """One photograph that took part in the calibration."""
+    """One photograph that was used."""
 
     path: Path
     corners_px: Float[np.ndarray, "N 2"]
@@ -40,7 +40,7 @@ class BoardView:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LensFit:
-    """A camera, and how well the views determine and obey it."""
+    """A camera, and how well the views determine it and agree with it."""
 
     camera: Camera
     focal_std_px: Float[np.ndarray, "2"]  # of fx and fy
@@ -58,8 +58,8 @@ def fit_lens(
     """Fit intrinsics, distortion and each board's plane to `corners`, (N, 2) for each picture.
 
     `points` are the corners on the board in mm, `size` is the pictures' (width, height). Distortion
-    is k1 k2 p1 p2, with k3 only where it is 3 of its standard deviations from zero: undetermined,
-    it follows the noise and bends the picture's rim, where no board was seen.
+    is k1 k2 p1 p2, with k3 only where it is 3 of its standard deviations from zero: fitted to
+    noise, it would distort the picture's edges, where no board was seen.
 
     Raises CalibrationError where the views leave the focal length undetermined.
     """
@@ -73,7 +73,7 @@ def fit_lens(
 
 
 def require_determined(fit: LensFit) -> None:
-    """Raise CalibrationError unless the boards were tilted enough to tell the focal length."""
+    """Raise CalibrationError unless the boards' tilts determine the focal length."""
     normals = np.stack([view.plane.rotation[:, 2] for view in fit.views])
     tilt_deg = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1))).max())
     if tilt_deg < MIN_TILT_DEG:
@@ -85,7 +85,7 @@ def require_determined(fit: LensFit) -> None:
 
 def _undetermined(got: str) -> CalibrationError:
     return CalibrationError(
-        f"expected boards tilted to different sides, which tell the focal length within "
+        f"expected boards tilted to different sides, which give the focal length within "
         f"{MAX_FOCAL_STD:.0%}, got {got}; add pictures with the board tilted by 20 to 40 degrees "
         "to the left, right, top and bottom"
     )
@@ -131,10 +131,10 @@ def _measure(
 def _find_plane(
     found: Float[np.ndarray, "N 2"], points: Float[np.ndarray, "N 3"], camera: Camera
 ) -> tuple[ReferencePlane, float]:
-    """Find the plane on which the board lies, and its reprojection error.
+    """The board's plane, and the RMS reprojection error in px.
 
-    A plane seen through noise has a second, mirrored pose of almost the same error; IPPE (Collins
-    and Bartoli, IJCV 2014) gives both, and the better one after refinement is the plane's.
+    A planar target has a second, mirrored pose of almost the same error; IPPE (Collins and
+    Bartoli, IJCV 2014) gives both, and the one with the smaller error after refinement is taken.
     """
     _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
         points, found, camera.K, camera.distortion, flags=cv2.SOLVEPNP_IPPE
@@ -155,7 +155,7 @@ def _distance_errors(
     camera: Camera,
     plane: ReferencePlane,
 ) -> DistanceErrors:
-    """Project the corners back onto the plane, as a fish's are, and compare their distances."""
+    """Errors of distances between corners that are back-projected onto the plane, as fish are."""
     rays = camera.back_project(found)
     measured = pdist(rays * plane.depth_mm(rays)[:, None])
     known = pdist(points)

@@ -1,4 +1,4 @@
-"""`stream-dmr evaluate`: lengths against the true ones, fish by fish, or against a histogram.
+"""`stream-dmr evaluate`: measured lengths against true ones, by fish and as distributions.
 
 Fish are paired by track_id; the two distributions are compared without pairing, as in the paper.
 """
@@ -33,7 +33,7 @@ from stream_dmr.evaluation.length_tables import (
 
 @dataclass(frozen=True, kw_only=True)
 class FishComparison:
-    """One fish of the truth beside what was measured of it."""
+    """One fish: its true length and what was measured."""
 
     track_id: int
     truth_mm: float
@@ -49,12 +49,12 @@ class FishComparison:
 
 @dataclass(frozen=True, kw_only=True)
 class Distributions:
-    """Two histograms of the same bins, and how they differ."""
+    """Two histograms with the same bins, and their differences."""
 
     predicted: Histogram
     truth: Histogram
     errors: DistributionErrors
-    num_outside: int  # measured fish outside of all bins
+    num_outside: int  # measured fish shorter or longer than all bins
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,15 +82,16 @@ _DEFAULTS = EvaluateSettings()
 def evaluate(
     lengths_csv: Path, truth_csv: Path, *, settings: EvaluateSettings = _DEFAULTS
 ) -> Evaluation:
-    """Compare fish by fish. Raises UserError, in one line, for whatever can't be read.
+    """Compare two CSV files fish by fish.
 
-    Also where no fish has the track_id of another: then nothing says which are the same.
+    Raises UserError where one can't be read, or where they have no track_id in common: then
+    nothing says which fish are the same.
     """
     lengths, truth = read_lengths(lengths_csv), read_truth(truth_csv)
     if lengths and not lengths.keys() & truth.keys():
         raise UserError(
             f"{lengths_csv}: expected fish by the track_ids of {truth_csv} ({_some(truth)}), got "
-            f"others ({_some(lengths)}); number them alike, or give a histogram as the truth"
+            f"others ({_some(lengths)}); use the same track_ids, or give a histogram as the truth"
         )
     return compare(lengths, truth, settings=settings)
 
@@ -103,10 +104,10 @@ def _some(ids: Iterable[int], most: int = 5) -> str:
 def evaluate_histogram(
     lengths_csv: Path, histogram_csv: Path, *, settings: EvaluateSettings = _DEFAULTS
 ) -> Distributions:
-    """Compare with a histogram, in its own bins. Raises UserError, also where no fish is in them.
+    """Compare lengths with a histogram, in its own bins.
 
-    Of the settings only the pseudo count is used. A histogram of shares stands for as many fish as
-    were measured.
+    Only the pseudo count of the settings is used. A histogram of shares is scaled to the number of
+    measured fish. Raises UserError where a file can't be read or no fish lies in the bins.
     """
     known = read_histogram(histogram_csv)
     lengths_mm = _measured_mm(read_lengths(lengths_csv))
@@ -123,7 +124,7 @@ def evaluate_histogram(
 def compare(
     lengths: Mapping[int, LengthRow], truth: Mapping[int, float], *, settings: EvaluateSettings
 ) -> Evaluation:
-    """Compare lengths with known ones, both by track_id; there is at least one known one."""
+    """Compare measured with true lengths (mm), both by track_id; at least one true one."""
     nothing = LengthRow(length_mm=None)
     fish = tuple(
         FishComparison(
@@ -180,7 +181,7 @@ def _distributions(
 
 
 def _intervals(fish: tuple[FishComparison, ...]) -> IntervalFigures | None:
-    """Over the fish that have an interval; NEES where all of these have a std, too."""
+    """Figures over the fish that have an interval; NEES only if all of them have a std."""
     known = [f for f in fish if f.length_mm is not None and f.ci95_mm is not None]
     stds_mm = [f.std_mm for f in known if f.std_mm is not None]
     return interval_figures(
@@ -192,7 +193,7 @@ def _intervals(fish: tuple[FishComparison, ...]) -> IntervalFigures | None:
 
 
 def summary_rows(evaluation: Evaluation) -> list[tuple[str, str]]:
-    """Name and value of each figure, ready for a table of two columns."""
+    """Name and value of each figure, for a table of two columns."""
     num_measured = sum(f.length_mm is not None for f in evaluation.fish)
     rows = [("fish measured", f"{num_measured} of {len(evaluation.fish)}")]
     for name, ids in (

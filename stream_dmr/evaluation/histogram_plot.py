@@ -7,11 +7,11 @@ from stream_dmr.evaluation.compare import Distributions
 
 
 def plot_histograms(path: Path, distributions: Distributions) -> None:
-    """Draw both histograms into a picture; the file's ending says its kind, PNG without one.
+    """Draw both histograms into a picture; the suffix of `path` is its format, PNG without one.
 
     Raises OutputError where it can't be written.
     """
-    from matplotlib.figure import Figure  # a quarter of a second
+    from matplotlib.figure import Figure  # its import takes a quarter of a second
 
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
@@ -27,5 +27,5 @@ def plot_histograms(path: Path, distributions: Distributions) -> None:
     axes.legend(frameon=False)
     try:
         figure.savefig(path, dpi=110)
-    except (OSError, ValueError) as error:  # ValueError: an ending that matplotlib doesn't know
+    except (OSError, ValueError) as error:  # ValueError: a suffix that matplotlib doesn't know
         raise OutputError(f"{path}: expected to write a picture there, got: {error}") from error

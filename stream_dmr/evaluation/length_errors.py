@@ -1,4 +1,4 @@
-"""How good lengths are: fish by fish, and as a distribution (paper, Sec. 3 and Table 1)."""
+"""Errors of lengths: by fish, of intervals, and of distributions (paper, Sec. 3 and Table 1)."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from stream_dmr.settings import Settings
 class EvaluateSettings(Settings):
     """`[evaluate]`: how distributions of lengths are compared.
 
-    The paper keeps 500 to 1000 mm and does not state its bin width; 50 mm is ours.
+    The paper uses 500 to 1000 mm and does not state its bin width; 50 mm is this project's choice.
     """
 
     first_bin_mm: float = Field(
@@ -30,7 +30,7 @@ class EvaluateSettings(Settings):
     )
 
     def edges_mm(self) -> Float[np.ndarray, "E"]:
-        """Ends of the bins: 500, 550, ..., 1000 mm by default."""
+        """Edges of the bins: 500, 550, ..., 1000 mm by default."""
         return self.first_bin_mm + self.bin_width_mm * np.arange(self.num_bins + 1)
 
 
@@ -55,7 +55,7 @@ class Histogram:
 def length_histogram(
     lengths_mm: Float[np.ndarray, "N"], edges_mm: Float[np.ndarray, "E"]
 ) -> Histogram | None:
-    """Histogram of the lengths within the edges, both ends included; None where there are none."""
+    """Histogram of the lengths within the edges, both ends included; None if there are none."""
     counts, _ = np.histogram(lengths_mm, bins=edges_mm)
     if counts.sum() == 0:
         return None
@@ -69,7 +69,7 @@ def histogram_bias_mm(predicted: Histogram, truth: Histogram) -> float:
 
 def histogram_emd_mm(predicted: Histogram, truth: Histogram) -> float:
     """Earth mover's distance in mm: how far, on average, a fish must move (Wasserstein-1)."""
-    from scipy.stats import wasserstein_distance  # half a second, of every command's start
+    from scipy.stats import wasserstein_distance  # its import takes half a second
 
     return float(
         wasserstein_distance(predicted.centers_mm, truth.centers_mm, predicted.shares, truth.shares)
@@ -130,7 +130,7 @@ class FishErrors:
 def fish_errors(
     predicted_mm: Float[np.ndarray, "N"], truth_mm: Float[np.ndarray, "N"]
 ) -> FishErrors | None:
-    """Errors of paired lengths; None where there are none. p90 interpolates linearly."""
+    """Errors of paired lengths; None if there are none. p90 interpolates linearly."""
     if len(truth_mm) == 0:
         return None
     error_mm = predicted_mm - truth_mm
@@ -150,15 +150,15 @@ def fish_errors(
 def is_covered(
     truth_mm: Float[np.ndarray, "N"], intervals_mm: Float[np.ndarray, "N 2"]
 ) -> Bool[np.ndarray, "N"]:
-    """Whether each interval, both ends included, holds its true length."""
+    """Whether each interval, both ends included, contains its true length."""
     return (intervals_mm[:, 0] <= truth_mm) & (truth_mm <= intervals_mm[:, 1])
 
 
 @dataclass(frozen=True, kw_only=True)
 class IntervalFigures:
-    """Whether 95 % intervals hold what they promise, over fish of known length."""
+    """How well 95 % intervals are calibrated, over fish of known length."""
 
-    coverage: float  # fraction of the intervals that hold the truth; 0.95 is right
+    coverage: float  # fraction of the intervals that contain the truth; 0.95 is right
     mean_width: float  # of the intervals, as a fraction of the true length
     nees: float | None  # mean of (error / std)^2; 1 is right; None: no stds
 
@@ -170,10 +170,10 @@ def interval_figures(
     intervals_mm: Float[np.ndarray, "N 2"],
     stds_mm: Float[np.ndarray, "N"] | None,
 ) -> IntervalFigures | None:
-    """Coverage, width and normalised estimation error squared; None where there are no fish.
+    """Coverage, mean width and normalised estimation error squared; None if there are no fish.
 
     NEES after Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and
-    navigation", 2001, Sec. 5.4: above 1 the stds promise too much, below 1 too little.
+    navigation", 2001, Sec. 5.4: above 1 the stds are too small, below 1 too large.
     """
     if len(truth_mm) == 0:
         return None

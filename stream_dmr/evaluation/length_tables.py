@@ -1,10 +1,10 @@
 """The tables that `stream-dmr evaluate` reads: lengths, true lengths, and histograms of them.
 
-- Lengths, as `run` writes lengths.csv; used: track_id, length_mm and, where there,
-  length_std_mm, ci95_low_mm, ci95_high_mm. An empty length_mm: not measured.
+- Lengths, as `run` writes lengths.csv: track_id, length_mm and, if present, length_std_mm,
+  ci95_low_mm, ci95_high_mm; other columns are ignored. An empty length_mm: not measured.
 - Truth: track_id, length_mm.
-- A histogram: bin_low_mm, bin_high_mm and either count (fish) or share (of all, at any scale), one
-  row a bin, each beginning where the one before ends.
+- A histogram: bin_low_mm, bin_high_mm and either count (fish) or share (at any scale), one row per
+  bin, each beginning where the previous one ends.
 """
 
 import csv
@@ -33,31 +33,31 @@ class LengthRow:
 
 @dataclass(frozen=True, kw_only=True)
 class KnownHistogram:
-    """A histogram that stands for the truth."""
+    """A histogram of true lengths."""
 
     histogram: Histogram
-    is_shares: bool  # without the number of fish; the heights are at any scale
+    is_shares: bool  # heights at any scale; the number of fish is unknown
 
 
 def is_histogram(path: Path) -> bool:
-    """Whether a table is a histogram rather than one row a fish, by its columns."""
+    """Whether a CSV file is a histogram rather than one row per fish, by its columns."""
     columns, _ = _open(path)
     return "bin_low_mm" in columns
 
 
 def read_lengths(path: Path) -> dict[int, LengthRow]:
-    """Rows by track_id, in the file's order. Raises UserError for what can't be read."""
+    """Rows by track_id, in the file's order. Raises UserError for a file that can't be read."""
     rows: dict[int, LengthRow] = {}
     for where, record in _records(path, "track_id", "length_mm"):
         track_id = _track_id(record, where)
         if track_id in rows:
-            raise UserError(f"{where}: expected one row a fish, got track {track_id} again")
+            raise UserError(f"{where}: expected one row per fish, got track {track_id} again")
         rows[track_id] = _row(record, where)
     return rows
 
 
 def read_truth(path: Path) -> dict[int, float]:
-    """Length in mm by track_id; every fish must have one. Raises UserError."""
+    """True length in mm by track_id. Raises UserError where a fish has none."""
     truth: dict[int, float] = {}
     for track_id, row in read_lengths(path).items():
         if row.length_mm is None:
@@ -69,7 +69,7 @@ def read_truth(path: Path) -> dict[int, float]:
 
 
 def read_histogram(path: Path) -> KnownHistogram:
-    """Read bins and heights. Raises UserError for gaps, overlaps, and heights that can't be."""
+    """Bins and heights. Raises UserError for gaps, overlaps and negative heights."""
     columns, _ = _open(path)
     height = "count" if "count" in columns else "share"
     edges_mm: list[float] = []
@@ -95,7 +95,7 @@ def read_histogram(path: Path) -> KnownHistogram:
 
 
 def _records(path: Path, *required: str) -> Iterator[tuple[str, _Record]]:
-    """Each row with the words that say where it stands. Raises UserError for missing columns."""
+    """Each row with its file and line, for messages. Raises UserError for missing columns."""
     columns, records = _open(path)
     if not set(required) <= set(columns):
         raise UserError(
@@ -144,7 +144,7 @@ def _required(record: _Record, column: str, where: str) -> float:
 
 
 def _number(record: _Record, column: str, where: str) -> float | None:
-    """Read a finite number, None where the field is empty or not there."""
+    """A finite number; None where the field is empty or missing."""
     text = (record.get(column) or "").strip()
     if not text:
         return None

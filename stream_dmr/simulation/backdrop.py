@@ -1,4 +1,4 @@
-"""What stands around the fish: the sea, the vessel's side with its roller, lines, hooks, a gaff."""
+"""The background and the gear: sea, the vessel's side with its roller, lines, hooks, a gaff."""
 
 import cv2
 import numpy as np
@@ -6,12 +6,13 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from stream_dmr.simulation.skin import noise
 
+# The numbers of this file were chosen by eye.
 _RAIL_PX = 58
-_SEA_MARGIN_PX = 240  # how far the layers of the sea drift before they turn back
+_SEA_MARGIN_PX = 240  # amplitude of the drift of the layers of the sea
 _GAFF_PX = 13
-_SUBPIXEL = 4  # bits of OpenCV's `shift`
+_SUBPIXEL = 4  # fractional bits, OpenCV's `shift`
 
-# Grey level of the waves -> colour of the water (BGR): troughs, green shoulders, foam.
+# Colour map of the waves: grey level -> BGR, from troughs over green slopes to foam.
 _SEA_STOPS = [0, 70, 130, 185, 212, 235, 255]
 _SEA_BGR = [
     (38, 30, 18),
@@ -25,7 +26,7 @@ _SEA_BGR = [
 
 
 class Backdrop:
-    """Sea and vessel of one scene; `draw(frame_index)` gives a fresh picture of them."""
+    """Sea and vessel of one scene; `draw(frame_index)` returns a new picture of them."""
 
     def __init__(self, rng: np.random.Generator, *, width: int, height: int) -> None:
         self._width, self._height = width, height
@@ -47,7 +48,7 @@ class Backdrop:
         _draw_roller(self._rail, self._rail_mask, self.roller_px)
 
     def draw(self, frame_index: int) -> UInt8[np.ndarray, "H W 3"]:
-        """The sea as it rolls on, and the vessel in front of it."""
+        """The sea at this frame, and the vessel in front of it, BGR."""
         swell = self._cut(self._swell, speed=0.021, frame_index=frame_index, phase=self._drift[0])
         chop = self._cut(self._chop, speed=-0.033, frame_index=frame_index, phase=self._drift[1])
         waves = cv2.addWeighted(swell, 0.62, chop, 0.38, 0.0)
@@ -70,7 +71,7 @@ def draw_line(
     mouth_px: Float[np.ndarray, "2"],
     roller_px: Float[np.ndarray, "2"],
 ) -> None:
-    """The gangion from the fish's mouth up towards the roller, out of the picture."""
+    """Draw the gangion from the fish's mouth up towards the roller, out of the picture."""
     top = np.array([(mouth_px[0] + roller_px[0]) / 2, -40.0])
     line = (_fixed(mouth_px), _fixed(top))
     cv2.line(image, *line, (52, 60, 62), 4, cv2.LINE_AA, _SUBPIXEL)
@@ -78,7 +79,7 @@ def draw_line(
 
 
 def draw_hook(image: UInt8[np.ndarray, "H W 3"], *, mouth_px: Float[np.ndarray, "2"]) -> None:
-    """The shank and bend of a circle hook in the fish's mouth, drawn over the fish."""
+    """Draw the shank and bend of a circle hook in the fish's mouth, over the fish."""
     center = _fixed(mouth_px - np.array([2.5, 1.0]))
     axes = (4 << _SUBPIXEL, 5 << _SUBPIXEL)
     cv2.ellipse(image, center, axes, 0, -40, 200, (150, 156, 158), 2, cv2.LINE_AA, _SUBPIXEL)
@@ -90,7 +91,7 @@ def draw_gaff(
     hand_px: Float[np.ndarray, "2"],
     tip_px: Float[np.ndarray, "2"],
 ) -> Bool[np.ndarray, "H W"]:
-    """A pole with a steel hook, from the hand to the tip, in front of everything; where it is."""
+    """Draw a pole with a steel hook from hand to tip; return the pixels that it covers."""
     hand, tip = _fixed(hand_px), _fixed(tip_px)
     colours = ((44, 72, 104), _GAFF_PX), ((84, 122, 160), _GAFF_PX - 5), ((130, 165, 196), 2)
     for colour, thickness in colours:
@@ -107,7 +108,7 @@ def draw_gaff(
 
 
 def _fixed(pixel: Float[np.ndarray, "2"]) -> tuple[int, int]:
-    """A pixel in OpenCV's fixed point numbers, which keep the part behind the point."""
+    """A pixel in OpenCV's fixed-point numbers, with `_SUBPIXEL` fractional bits."""
     x, y = np.round(pixel * (1 << _SUBPIXEL)).astype(int).tolist()
     return x, y
 
@@ -115,7 +116,7 @@ def _fixed(pixel: Float[np.ndarray, "2"]) -> tuple[int, int]:
 def _ripples(
     rng: np.random.Generator, size: tuple[int, int], grain: float
 ) -> Float32[np.ndarray, "A B"]:
-    """Waves with crests: ridged noise, longer across the picture than along it."""
+    """Waves with crests: ridged noise, 2.6 times longer along x than along y."""
     ridged = 1 - np.abs(noise(rng, *size, grain_px=(2.6 * grain, grain)))
     return ridged.astype(np.float32)
 
@@ -128,7 +129,7 @@ def _grey(waves: Float32[np.ndarray, "A B"]) -> UInt8[np.ndarray, "A B"]:
 def _draw_rail(
     rng: np.random.Generator, width: int
 ) -> tuple[UInt8[np.ndarray, "R W 3"], Bool[np.ndarray, "R W"]]:
-    """The vessel's side along the top: painted steel with rust running down, a rubbed edge."""
+    """Picture and mask of the vessel's side: painted steel with streaks of rust and a worn edge."""
     height = _RAIL_PX + 24
     slope = rng.uniform(-14.0, 14.0)
     edge = _RAIL_PX + slope * np.linspace(-1.0, 1.0, width)
@@ -147,7 +148,7 @@ def _draw_rail(
 def _draw_roller(
     rail: UInt8[np.ndarray, "R W 3"], mask: Bool[np.ndarray, "R W"], center: Float[np.ndarray, "2"]
 ) -> None:
-    """The drum that the groundline runs over."""
+    """Draw the drum that the groundline runs over into `rail`, and add it to `mask`."""
     x, y = np.round(center).astype(int).tolist()
     covered = mask.astype(np.uint8)
     for half, colour in ((30, (40, 42, 44)), (24, (92, 96, 98)), (10, (150, 154, 156))):

@@ -1,4 +1,4 @@
-"""Filming a scene: pictures, label masks and boxes, frame by frame. The truth is not made here."""
+"""The frames of a scene: pictures, label masks and boxes. The truth is not made here."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,29 +12,26 @@ from stream_dmr.simulation.rail_scene import RailScene, Visit
 from stream_dmr.simulation.render import Patch, draw_fish_patch, frame_window, paste
 from stream_dmr.simulation.simulated_fish import PosedFish
 
-_BACKDROP, _FRAME, _SENSOR = (
-    8,
-    9,
-    10,
-)  # streams of random numbers; the scene and the skin have the others
-_GAFF_FROM, _GAFF_UNTIL = 0.36, 0.66  # of a fish's visit
+# Keys of independent streams of random numbers; `rail_scene` and `skin` have the others.
+_BACKDROP, _FRAME, _SENSOR = 8, 9, 10
+_GAFF_FROM, _GAFF_UNTIL = 0.36, 0.66  # of a fish's visit; chosen
 _NOISE_MARGIN_PX = 256
-_MIN_BOX_PIXELS = 30  # fewer are too few to be called seen
+_MIN_BOX_PIXELS = 30  # a fish with fewer visible pixels has no box; chosen
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VisibleBox:
-    """What can be seen of one fish in one frame; the box is tight around its visible mask."""
+    """The tight box around the visible mask of one fish in one frame."""
 
     frame_index: int
     track_id: int
     xywh_px: tuple[int, int, int, int]
-    visible_fraction: float  # of its silhouette: neither hidden nor outside the picture
+    visible_fraction: float  # of its silhouette's pixels: not hidden, not outside the picture
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FilmedFrame:
-    """One frame of the film with its annotations."""
+    """One frame with its annotations."""
 
     frame_index: int
     image: UInt8[np.ndarray, "H W 3"]
@@ -43,23 +40,23 @@ class FilmedFrame:
 
 
 def film(scene: RailScene) -> Iterator[FilmedFrame]:
-    """Film a scene, frame by frame from 1; the same scene gives the same frames."""
+    """The frames of a scene, from 1; the same scene gives the same frames."""
     camera = scene.calibration.camera
     backdrop = Backdrop(
         np.random.default_rng((scene.seed, _BACKDROP)), width=camera.width, height=camera.height
     )
     noise = _draw_sensor_noise(scene)
     for frame_index in range(1, scene.num_frames + 1):
-        yield _shoot(scene, backdrop, noise, frame_index)
+        yield _render_frame(scene, backdrop, noise, frame_index)
 
 
-def _shoot(
+def _render_frame(
     scene: RailScene, backdrop: Backdrop, noise: Int16[np.ndarray, "A B 3"], frame_index: int
 ) -> FilmedFrame:
     rng = np.random.default_rng((scene.seed, _FRAME, frame_index))
     image = backdrop.draw(frame_index)
     labels = np.zeros(image.shape[:2], np.uint16)
-    pixels_in_all: dict[int, int] = {}
+    num_pixels: dict[int, int] = {}
     visits = scene.visits_at(frame_index)
     posed = {visit.fish.track_id: scene.pose(visit, frame_index) for visit in visits}
     # Far ones first, so that near ones cover them.
@@ -69,25 +66,25 @@ def _shoot(
         mask = ragged(patch.mask, rng, amplitude_px=scene.preset.ragged_px)
         rows, columns, inside = frame_window(patch, image.shape[1], image.shape[0])
         labels[rows, columns][mask[inside]] = track_id
-        pixels_in_all[track_id] = int(mask.sum())
+        num_pixels[track_id] = int(mask.sum())
     for visit in visits:
         labels[_draw_gaff(scene, visit, posed[visit.fish.track_id], image, frame_index)] = 0
     return FilmedFrame(
         frame_index=frame_index,
         image=_expose(image, rng, noise),
         labels=labels,
-        boxes=_boxes(labels, pixels_in_all, frame_index),
+        boxes=_boxes(labels, num_pixels, frame_index),
     )
 
 
 def ragged(
     mask: Bool[np.ndarray, "H W"], rng: np.random.Generator, *, amplitude_px: float
 ) -> Bool[np.ndarray, "H W"]:
-    """Shift the outline in and out by smooth noise of this standard deviation, as segmenters do."""
+    """Shift the outline by smooth noise of this standard deviation, like a segmenter's errors."""
     if amplitude_px == 0.0:
         return mask
     inside = mask.astype(np.uint8)
-    # To the outline, which runs half a pixel beside the outermost pixel centres.
+    # Distance to the outline, which lies half a pixel beyond the outermost pixel centres.
     depth = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - 0.5
     distance = np.where(mask, depth, 0.5 - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5))
     shift = cv2.GaussianBlur(rng.standard_normal(mask.shape, np.float32), (0, 0), 4.0)
@@ -102,7 +99,7 @@ def _draw_fish(
     backdrop: Backdrop,
     frame_index: int,
 ) -> Patch:
-    """Line, fish and hook into the picture."""
+    """Draw line, fish and hook into the picture; return the fish's patch."""
     camera, preset = scene.calibration.camera, scene.preset
     mouth_px, center_px = camera.project(posed.keypoints)[:2]
     patch = draw_fish_patch(posed, camera=camera, seed=scene.seed)
@@ -114,7 +111,7 @@ def _draw_fish(
 
 
 def _center_before(scene: RailScene, visit: Visit, frame_index: int) -> Float[np.ndarray, "2"]:
-    """Where the center was a frame ago; in the first frame, where it is."""
+    """Pixel of the center keypoint one frame ago; in the first frame, of this frame."""
     earlier = scene.pose(visit, max(frame_index - 1, visit.first_frame))
     return scene.calibration.camera.project(earlier.keypoints)[1]
 
@@ -126,7 +123,7 @@ def _draw_gaff(
     image: UInt8[np.ndarray, "H W 3"],
     frame_index: int,
 ) -> Bool[np.ndarray, "H W"]:
-    """The gaff reaches across the fish for about a third of its visit; the pixels it covers."""
+    """Draw the gaff across a gaffed fish, for a third of its visit; return the covered pixels."""
     progress = visit.progress(frame_index)
     if not visit.is_gaffed or progress is None or not _GAFF_FROM <= progress <= _GAFF_UNTIL:
         return np.zeros(image.shape[:2], bool)
@@ -140,11 +137,11 @@ def _draw_gaff(
 
 
 def _boxes(
-    labels: UInt16[np.ndarray, "H W"], pixels_in_all: dict[int, int], frame_index: int
+    labels: UInt16[np.ndarray, "H W"], num_pixels: dict[int, int], frame_index: int
 ) -> list[VisibleBox]:
-    """Tight boxes of what is visible; a pixel spans one unit, from its index to the next."""
+    """Tight boxes of the visible masks; a pixel extends from its index to the next."""
     boxes = []
-    for track_id, pixels in sorted(pixels_in_all.items()):
+    for track_id, pixels in sorted(num_pixels.items()):
         visible = (labels == track_id).astype(np.uint8)
         seen = int(cv2.countNonZero(visible))
         if seen >= _MIN_BOX_PIXELS:
@@ -161,9 +158,9 @@ def _boxes(
 
 
 def _draw_sensor_noise(scene: RailScene) -> Int16[np.ndarray, "A B 3"]:
-    """One picture of noise, larger than the frames, which each frame is to cut at random.
+    """Noise in grey levels, larger than the frames; every frame takes a random window of it.
 
-    Noise of its own for every frame would take longer than all the rest.
+    Independent noise for every frame would take longer than all the rest.
     """
     rng = np.random.default_rng((scene.seed, _SENSOR))
     camera = scene.calibration.camera
@@ -175,7 +172,7 @@ def _draw_sensor_noise(scene: RailScene) -> Int16[np.ndarray, "A B 3"]:
 def _expose(
     image: UInt8[np.ndarray, "H W 3"], rng: np.random.Generator, noise: Int16[np.ndarray, "A B 3"]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The picture with the sensor's noise in it."""
+    """The picture with sensor noise added."""
     height, width = image.shape[:2]
     y, x = rng.integers(_NOISE_MARGIN_PX, size=2)
     return cv2.add(image, noise[y : y + height, x : x + width], dtype=cv2.CV_8U)

@@ -1,4 +1,7 @@
-"""How a fish moves while it is in sight: hauled up past the camera, swaying, turning, bending."""
+"""Poses of a fish over time: hauled up past the camera, swaying, turning and bending.
+
+Amplitudes and rates were chosen by eye.
+"""
 
 import numpy as np
 from jaxtyping import Float
@@ -11,20 +14,20 @@ FPS = 15
 _TRAVEL_MM = 1850.0  # from the middle of the picture to its lower or upper edge
 _OFF_PLANE_MM = 10.0  # standard deviation of the center keypoint's distance from the plane
 _MAX_OFF_PLANE_MM = 25.0
-_ORDER_SIZES = np.array([1.0, 0.6, 0.3])  # C-bend, S-bend, and one finer
-_ROW_SIZES = np.array([0.0, 1.0, 0.45])  # flatfish bend through their thickness above all
+_ORDER_SIZES = np.array([1.0, 0.6, 0.3])  # of sin(k pi s): C-bend, S-bend, third order
+_ROW_SIZES = np.array([0.0, 1.0, 0.45])  # flatfish bend mostly through their thickness
 
 
 def draw_poses(
     rng: np.random.Generator, preset: Preset, *, lane_mm: float, num_frames: int
 ) -> list[HangingPose]:
-    """Poses of one fish for each frame of its passage, smooth in time; `lane_mm` is its X."""
+    """A pose for each frame of one fish's visit, smooth in time; `lane_mm` is its world X."""
     seconds = np.arange(num_frames) / FPS
     bends = _draw_bends(rng, preset, seconds)
     turned_over = np.pi * (rng.random() < preset.blind_side_share)
-    yaw = turned_over + np.radians(preset.yaw_deg) * _wander(rng, seconds, (), fastest_hz=0.8)
-    sway = np.radians(preset.sway_deg) * _wander(rng, seconds, (), fastest_hz=0.6)
-    tilt = np.radians(preset.tilt_deg) * _wander(rng, seconds, (), fastest_hz=0.6)
+    yaw = turned_over + np.radians(preset.yaw_deg) * _smooth_noise(rng, seconds, (), fastest_hz=0.8)
+    sway = np.radians(preset.sway_deg) * _smooth_noise(rng, seconds, (), fastest_hz=0.6)
+    tilt = np.radians(preset.tilt_deg) * _smooth_noise(rng, seconds, (), fastest_hz=0.6)
     centers = _draw_path(rng, seconds, lane_mm=lane_mm)
     return [
         HangingPose(
@@ -37,7 +40,7 @@ def draw_poses(
 def draw_still_pose(
     rng: np.random.Generator, preset: Preset, *, center_world_mm: Float[np.ndarray, "3"]
 ) -> HangingPose:
-    """One pose out of the middle of a passage, its center moved here but as far off the plane."""
+    """One pose from the middle of a visit; only its distance from the plane is not moved."""
     pose = draw_poses(rng, preset, lane_mm=0.0, num_frames=15)[7]
     center = center_world_mm + np.array([0.0, 0.0, pose.center_world_mm[2]])
     return HangingPose(
@@ -52,13 +55,15 @@ def draw_still_pose(
 def _draw_bends(
     rng: np.random.Generator, preset: Preset, seconds: Float[np.ndarray, "T"]
 ) -> Float[np.ndarray, "T 3 K"]:
-    """Curvature coefficients over time; the most bent frame turns by 70 to 100 % of the preset."""
+    """Curvature coefficients over time; the maximum total bend is 70 to 100 % of the preset's."""
     sizes = _ROW_SIZES[:, None] * _ORDER_SIZES
-    posture = rng.standard_normal(sizes.shape)  # kept throughout, beside what moves
-    bends = sizes * (posture + _wander(rng, seconds, sizes.shape, fastest_hz=1.2))
+    posture = rng.standard_normal(sizes.shape)  # the constant part
+    bends = sizes * (posture + _smooth_noise(rng, seconds, sizes.shape, fastest_hz=1.2))
     peak = max(total_bend_rad(frame) for frame in bends)
     bends *= np.radians(preset.max_bend_deg) * rng.uniform(0.7, 1.0) / peak
-    twist = np.radians(preset.max_twist_deg) * np.tanh(_wander(rng, seconds, (), fastest_hz=0.8))
+    twist = np.radians(preset.max_twist_deg) * np.tanh(
+        _smooth_noise(rng, seconds, (), fastest_hz=0.8)
+    )
     bends[:, 0, 0] = twist * np.pi / 2  # sin(pi s) integrates to 2 / pi
     return bends
 
@@ -66,16 +71,20 @@ def _draw_bends(
 def _draw_path(
     rng: np.random.Generator, seconds: Float[np.ndarray, "T"], *, lane_mm: float
 ) -> Float[np.ndarray, "T 3"]:
-    """Up through the picture, slower in its middle, drifting sideways, close to the plane."""
+    """World positions (mm) of the center: up through the picture, slower in its middle."""
     progress = np.linspace(-1.0, 1.0, len(seconds))
-    drift = rng.uniform(-120.0, 120.0) * progress + 40.0 * _wander(rng, seconds, (), fastest_hz=0.7)
+    drift = rng.uniform(-120.0, 120.0) * progress + 40.0 * _smooth_noise(
+        rng, seconds, (), fastest_hz=0.7
+    )
     climb = -_TRAVEL_MM * (0.45 * progress + 0.55 * progress**3)
-    off = _OFF_PLANE_MM * (rng.standard_normal() + 0.5 * _wander(rng, seconds, (), fastest_hz=0.7))
+    off = _OFF_PLANE_MM * (
+        rng.standard_normal() + 0.5 * _smooth_noise(rng, seconds, (), fastest_hz=0.7)
+    )
     off = off.clip(-_MAX_OFF_PLANE_MM, _MAX_OFF_PLANE_MM)
     return np.stack([lane_mm + drift, climb, off], axis=-1)
 
 
-def _wander(
+def _smooth_noise(
     rng: np.random.Generator,
     seconds: Float[np.ndarray, "T"],
     shape: tuple[int, ...],

@@ -1,4 +1,4 @@
-"""How hard a simulated scene is."""
+"""Difficulty of a simulated scene."""
 
 from dataclasses import dataclass
 
@@ -7,19 +7,22 @@ from stream_dmr.errors import UserError
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """The difficulty of a scene; angles of the motion are standard deviations."""
+    """Amplitudes of motion and of image errors; yaw, sway and tilt are standard deviations.
+
+    The values of the presets are chosen.
+    """
 
     max_bend_deg: float  # total turning of the body from head to tail
     max_twist_deg: float  # total twist from head to tail
     yaw_deg: float
     sway_deg: float
     tilt_deg: float
-    blind_side_share: float  # of the fish that show their pale side
+    blind_side_share: float  # fraction of the fish that show their blind side
     lane_mm: float  # sideways distance between the fish of a group
-    gaff_every: int  # every how many fish the gaff comes; 0: never
-    ragged_px: float  # how far the masks' outlines are off, standard deviation
+    gaff_every: int  # every n-th fish is gaffed; 0: none
+    ragged_px: float  # error of the masks' outlines, standard deviation
     defocus_px: float
-    exposure_frames: float  # shutter time as a share of the frame time: motion blur
+    exposure_frames: float  # shutter time over frame time: motion blur
     noise_levels: float  # sensor noise, grey levels
 
 

@@ -1,4 +1,4 @@
-"""A scene at the rail: one camera, one reference plane, and fish that come and go."""
+"""A scene at the rail: one camera, one reference plane, and the visits of fish."""
 
 from dataclasses import dataclass
 
@@ -18,12 +18,13 @@ from stream_dmr.simulation.simulated_fish import (
 )
 
 WIDTH, HEIGHT = 1280, 960
-_GROUP = 3  # fish that follow each other closely; then nothing hangs on the line for a while
-_GROUP_SLOTS = 5.0
-_VISIT_SLOTS = 2.4
-_MARGIN_SLOTS = 0.4
+# Time runs in slots; these were chosen so that fish overlap in groups, with empty frames between.
+_GROUP = 3  # fish in a group, one slot apart
+_GROUP_SLOTS = 5.0  # from the first fish of a group to the first of the next
+_VISIT_SLOTS = 2.4  # of one fish
+_MARGIN_SLOTS = 0.4  # before the first and after the last fish
 
-# Streams of random numbers: what one part draws must not change what another one sees.
+# Keys of independent streams of random numbers, so that no part changes another's numbers.
 _CALIBRATION, _FISH, _VIEW = range(3)
 
 
@@ -37,11 +38,11 @@ class Visit:
     is_gaffed: bool
 
     def pose_at(self, frame_index: int) -> HangingPose:
-        """How the fish hangs in a frame of its visit."""
+        """The pose in a frame of the visit."""
         return self.poses[frame_index - self.first_frame]
 
     def progress(self, frame_index: int) -> float | None:
-        """From 0 (it comes) to 1 (it leaves); None while it isn't there."""
+        """From 0 (first frame of the visit) to 1 (last frame); None outside of it."""
         passed = frame_index - self.first_frame
         if not 0 <= passed < len(self.poses):
             return None
@@ -50,7 +51,7 @@ class Visit:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RailScene:
-    """Everything that is true of a simulated clip, before anything is drawn."""
+    """The ground truth of a simulated clip."""
 
     seed: int
     preset: Preset
@@ -59,7 +60,7 @@ class RailScene:
     visits: list[Visit]
 
     def visits_at(self, frame_index: int) -> list[Visit]:
-        """The fish on the line in a frame, by track id."""
+        """The visits in progress in a frame, by track id."""
         return [visit for visit in self.visits if visit.progress(frame_index) is not None]
 
     def pose(self, visit: Visit, frame_index: int) -> PosedFish:
@@ -69,10 +70,10 @@ class RailScene:
 
 
 def make_scene(*, num_fish: int, num_frames: int, preset: str, seed: int) -> RailScene:
-    """Draw a scene; equal arguments give equal scenes. Track ids count from 1.
+    """A random scene; equal arguments give equal scenes. Track ids count from 1.
 
-    Up to three fish are in sight together; the first and the last frames, and those between
-    groups of three, show none.
+    Up to three fish are in the picture together; the first and last frames, and those between
+    groups of three, are empty.
     """
     chosen = find_preset(preset)
     return RailScene(
@@ -88,7 +89,7 @@ def make_scene(*, num_fish: int, num_frames: int, preset: str, seed: int) -> Rai
 
 
 def draw_calibration(rng: np.random.Generator) -> Calibration:
-    """A camera of some 1300 px focal length and a tilted plane about 5 m away."""
+    """A random camera of about 1300 px focal length, and a tilted plane about 5 m away."""
     focal = rng.uniform(1250.0, 1350.0)
     K = np.array(
         [
@@ -116,7 +117,7 @@ class SimulatedView:
 
     @property
     def length_mm(self) -> float:
-        """The true length."""
+        """The fish's true length."""
         return self.posed.fish.length_mm
 
     @property
@@ -126,7 +127,7 @@ class SimulatedView:
 
 
 def draw_view(*, preset: str, seed: int) -> SimulatedView:
-    """A random fish, wholly inside the picture; `render.draw_mask` gives its exact mask."""
+    """A random fish inside the picture; `render.draw_mask` gives its exact mask."""
     rng = np.random.default_rng((seed, _VIEW))
     calibration = draw_calibration(rng)
     place = np.array([rng.uniform(-900.0, 900.0), rng.uniform(-500.0, 500.0), 0.0])
@@ -138,7 +139,7 @@ def draw_view(*, preset: str, seed: int) -> SimulatedView:
 
 
 def _draw_visit(index: int, *, num_fish: int, num_frames: int, preset: Preset, seed: int) -> Visit:
-    """The fish number `index` and when it comes; time runs in slots, one for every fish."""
+    """Fish number `index` (from 0), when it comes, and its poses."""
     rng = np.random.default_rng((seed, _FISH, index))
     last_start = _start_slot(num_fish - 1)
     frames_per_slot = num_frames / (last_start + _VISIT_SLOTS + 2 * _MARGIN_SLOTS)

@@ -1,4 +1,4 @@
-"""Drawing a body: a z-buffer with exact pixel centres, a textured skin, light, and blur."""
+"""Rendering of a body: a z-buffer with exact pixel centres, a textured skin, light, and blur."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,13 +14,13 @@ from stream_dmr.simulation.simulated_fish import PosedFish
 from stream_dmr.simulation.skin import draw_skin
 
 _TOWARDS_LIGHT = np.array([-0.35, -0.75, -0.56])  # camera frame: from above, behind the camera
-_AMBIENT = 0.5
-_MARGIN_PX = 24  # room around a patch for blur and ragged outlines
+_AMBIENT = 0.5  # of the light; this and the direction are chosen
+_MARGIN_PX = 24  # around a patch, for blur and ragged outlines
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Patch:
-    """One fish drawn into its own small picture, which may reach beyond the frame."""
+    """One rendered fish in a small picture of its own, which may extend beyond the frame."""
 
     left: int  # frame pixel (x, y) of the patch's pixel [0, 0]
     top: int
@@ -31,7 +31,7 @@ class Patch:
 def draw_mask(
     vertices_camera: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], *, camera: Camera
 ) -> Bool[np.ndarray, "H W"]:
-    """The exact silhouette of a mesh: those pixels of the frame whose centres it covers.
+    """The exact silhouette of a mesh: the pixels of the frame whose centres it covers.
 
     Lens distortion acts on the vertices, so faces should be small. Depths must be positive.
     """
@@ -44,7 +44,7 @@ def draw_mask(
 
 
 def draw_fish_patch(posed: PosedFish, *, camera: Camera, seed: int) -> Patch:
-    """Draw one fish with its skin, which `seed` and the track id choose, and light from above."""
+    """One fish with light from above and its skin, which depends on `seed` and track id."""
     pixels = camera.project(posed.vertices)
     low = np.floor(pixels.min(axis=0)).astype(int) - _MARGIN_PX
     width, height = np.ceil(pixels.max(axis=0)).astype(int) + _MARGIN_PX + 1 - low
@@ -75,7 +75,7 @@ def paste(
     defocus_px: float,
     motion_px: Float[np.ndarray, "2"],
 ) -> None:
-    """Blend a patch into the frame as the lens (defocus) and the shutter (motion) smear it."""
+    """Blend a patch into the frame, blurred by the lens (defocus) and the shutter (motion)."""
     layers = np.dstack([patch.colour, patch.mask.astype(np.float32)])
     layers = cv2.GaussianBlur(layers, (0, 0), max(defocus_px, 0.3))
     layers = cv2.filter2D(layers, -1, _motion_kernel(motion_px))
@@ -107,7 +107,7 @@ def _sample(
     values: Float32[np.ndarray, "H W A"],
     shows_eyes: Bool[np.ndarray, "H W"],
 ) -> Float32[np.ndarray, "H W 3"]:
-    """The skin's colour where each pixel lies on the body."""
+    """The skin's colour at each pixel."""
     along = values[..., 0] * (skin.shape[1] - 1) / 1.03  # the lobes of the tail reach past 1
     across = (values[..., 1] + 1) / 2 * (skin.shape[2] - 1)
     eyed, blind = (cv2.remap(side, across, along, cv2.INTER_LINEAR) for side in skin)
@@ -115,7 +115,7 @@ def _sample(
 
 
 def _motion_kernel(motion_px: Float[np.ndarray, "2"]) -> Float32[np.ndarray, "K K"]:
-    """A line as long as the way the fish goes while the shutter is open, at most the margin."""
+    """Line kernel of the motion during the exposure, limited to the margin."""
     reach = motion_px / 2 * min(1.0, _MARGIN_PX / (np.linalg.norm(motion_px) + 1e-9))
     half = int(np.ceil(np.abs(reach).max()))
     kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
@@ -128,9 +128,9 @@ def _motion_kernel(motion_px: Float[np.ndarray, "2"]) -> Float32[np.ndarray, "K 
 def vertex_normals(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "V 3"]:
-    """Unit vectors, from the faces around each vertex; larger faces weigh more."""
+    """Unit normals (V, 3), averaged over the adjacent faces with their areas as weights."""
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    of_faces = np.cross(b - a, c - a)  # as long as twice the face's area: larger faces weigh more
+    of_faces = np.cross(b - a, c - a)  # length: twice the face's area
     normals = np.zeros_like(vertices)
     for corner in range(3):
         np.add.at(normals, faces[:, corner], of_faces)
@@ -146,7 +146,7 @@ def rasterize(
     width: int,
     height: int,
 ) -> tuple[Int[np.ndarray, "H W"], Float32[np.ndarray, "H W A"]]:
-    """The nearest face at each pixel centre (-1: none) and the vertex attributes there."""
+    """Nearest face at each pixel centre (-1: none), and the vertex attributes there."""
     nearest = np.full((height, width), np.inf)
     face = np.full((height, width), -1, np.int64)
     values = np.zeros((height, width, attributes.shape[1]), np.float32)
@@ -157,7 +157,7 @@ def rasterize(
 @njit(cache=True)
 @no_type_check  # a type checker's wrapper can't be compiled
 def _fill(pixels, depths, faces, attributes, nearest, face, values):
-    """Fill each triangle by its barycentric coordinates at the pixel centres in its box."""
+    """Z-buffer of each triangle, by barycentric coordinates at the pixel centres in its box."""
     height, width = nearest.shape
     for f in range(len(faces)):
         i, j, k = faces[f]

@@ -9,16 +9,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-CENTER_ARC = 0.51  # where along the body the center keypoint lies
-JOINT_ARCS = (0.33, 0.66)  # bend points that a template made from this body names
+CENTER_ARC = 0.51  # position of the center keypoint along the body
+JOINT_ARCS = (0.33, 0.66)  # joints of the template that is made from this body
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedBody:
-    """Proportions of one fish, all as fractions of its length.
+    """Proportions of one fish, as fractions of its length.
 
-    The default is the mean halibut: a rhombic outline with its long fins included, 0.38 broad and
-    0.10 thick, with a narrow peduncle and an emarginate tail fin.
+    The default is a mean halibut: a rhombic outline including its long fins, 0.38 broad and 0.10
+    thick (sources: `template/body_forms.toml`), with a narrow peduncle and an
+    emarginate tail fin.
     """
 
     half_width: float = 0.19
@@ -32,12 +33,12 @@ class SimulatedBody:
     fin_half_thickness: float = 0.004
 
     def half_width_at(self, s: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
-        """Half the breadth of the outline at s, fins included; `half_width` at `widest_at`."""
+        """Half the breadth of the outline at s including fins; `half_width` at `widest_at`."""
         flesh = self.half_width * _bump(s, peak=self.widest_at, end=0.92, power=0.8)
         flare = np.clip((s - self.tail_from) / (1.0 - self.tail_from), 0.0, 1.0) ** 1.2
         peduncle = self.peduncle_half_width * _smooth_step((s - 0.6) / 0.2)
         tail = peduncle + (self.tail_half_width - self.peduncle_half_width) * flare
-        return (flesh**6 + tail**6) ** (1 / 6)  # a maximum without a corner
+        return (flesh**6 + tail**6) ** (1 / 6)  # a smooth maximum
 
     def half_thickness_at(self, s: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
         """Half the thickness in the middle of the section at s."""
@@ -50,8 +51,8 @@ class SimulatedBody:
     ) -> Float[np.ndarray, "*N 3"]:
         """Points (s, y, z) of the surface; the angle (rad) runs around the section at s.
 
-        Sections thin out towards both edges, as the long fins do, and those of the tail fin are
-        bowed backwards into its two lobes.
+        Sections become thin towards both edges, like the long fins, and those of the tail fin are
+        curved backwards into its two lobes.
         """
         across = np.cos(angle)
         through = np.sign(np.sin(angle)) * np.abs(np.sin(angle)) ** 1.5
@@ -76,7 +77,7 @@ class StraightBody:
 
 
 def draw_body(rng: np.random.Generator) -> SimulatedBody:
-    """An individual: 5 % (standard deviation) in width, 10 % in thickness, and in its landmarks."""
+    """A random individual: 5 % standard deviation in width, 10 % in thickness (chosen)."""
     vary = rng.standard_normal(5).clip(-2.0, 2.0)
     return replace(
         HALIBUT,
@@ -91,8 +92,8 @@ def draw_body(rng: np.random.Generator) -> SimulatedBody:
 def straight_body(body: SimulatedBody, *, num_rings: int = 60, num_sides: int = 24) -> StraightBody:
     """The straight body: rings from snout to tail, denser at the snout, closed at both ends.
 
-    `num_sides` is even: the last ring is zipped along the edge of the tail fin, so that the fork
-    stays open.
+    `num_sides` is even: opposite points of the last ring are joined along the edge of the tail
+    fin, so that the fork stays open.
     """
     s = np.linspace(0.0, 1.0, num_rings + 1)[1:] ** 1.3
     angle = 2 * np.pi * np.arange(num_sides) / num_sides
@@ -110,7 +111,7 @@ def keypoints(arcs: tuple[float, ...] = (0.0, CENTER_ARC, 1.0)) -> Float[np.ndar
 
 
 def _faces(num_rings: int, num_sides: int) -> Int[np.ndarray, "F 3"]:
-    """Fan at the snout (vertex 0), quads between the rings, zip along the edge of the tail fin."""
+    """Fan at the snout (vertex 0), quads between the rings, a seam along the tail fin's edge."""
     ring = 1 + np.arange(num_rings * num_sides).reshape(num_rings, num_sides)
     after = np.roll(ring, -1, axis=1)
     snout = np.stack([np.zeros_like(ring[0]), after[0], ring[0]], axis=-1)
@@ -119,13 +120,13 @@ def _faces(num_rings: int, num_sides: int) -> Int[np.ndarray, "F 3"]:
     last, k = ring[-1], np.arange(num_sides // 2)
     upper, upper_after = last[k], last[k + 1]
     lower, lower_after = last[-k], last[-k - 1]
-    zipped = np.concatenate(
+    seam = np.concatenate(
         [
             np.stack([upper, upper_after, lower_after], axis=-1)[:-1],  # the last one has no area
             np.stack([upper, lower_after, lower], axis=-1)[1:],  # nor has the first one
         ]
     )
-    return np.concatenate([snout, *sides, zipped])
+    return np.concatenate([snout, *sides, seam])
 
 
 def _bump(

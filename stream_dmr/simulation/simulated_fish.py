@@ -1,4 +1,4 @@
-"""One simulated fish: who it is, how it hangs in one frame, and the body that follows from both."""
+"""One simulated fish: the individual, its pose in one frame, and its posed body."""
 
 from dataclasses import dataclass
 
@@ -36,21 +36,23 @@ class SimulatedFish:
 class HangingPose:
     """How a fish hangs in one frame."""
 
-    bends: Float[np.ndarray, "3 K"]  # see `spine.curvature`
+    bends: Float[np.ndarray, "3 K"]  # see `center_line.curvature`
     yaw_rad: float  # about the vertical; 0 shows the side with the eyes, pi the blind side
     sway_rad: float  # about the line of sight, as a pendulum
     tilt_rad: float  # towards and away from the camera
-    center_world_mm: Float[np.ndarray, "3"]  # of the center keypoint; [2] is its way off the plane
+    center_world_mm: Float[
+        np.ndarray, "3"
+    ]  # of the center keypoint; [2] is its distance from the plane
 
     @property
     def total_bend_rad(self) -> float:
-        """How far the body's tangent turns from head to tail."""
+        """Total turning of the body's tangent from head to tail."""
         return total_bend_rad(self.bends)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PosedFish:
-    """A fish in one frame, in the camera frame in mm: the truth, before anything is drawn."""
+    """A fish in one frame, in the camera frame in mm: the ground truth."""
 
     fish: SimulatedFish
     vertices: Float[np.ndarray, "V 3"]
@@ -74,7 +76,7 @@ class PosedFish:
 
 
 def draw_fish(rng: np.random.Generator, *, track_id: int) -> SimulatedFish:
-    """A random halibut of 500 to 1000 mm; most are nearer to the lower end, as in a catch."""
+    """A random halibut of 500 to 1000 mm, from a beta(1.8, 3) distribution (chosen; mean 690)."""
     body = draw_body(rng)
     length_mm = 500.0 + 500.0 * float(rng.beta(1.8, 3.0))
     return SimulatedFish(
@@ -83,30 +85,30 @@ def draw_fish(rng: np.random.Generator, *, track_id: int) -> SimulatedFish:
 
 
 def pose_fish(fish: SimulatedFish, pose: HangingPose, *, calibration: Calibration) -> PosedFish:
-    """Bend the fish, hang it up and bring it into the camera frame."""
-    spine = _in_camera(_hang(fish, pose), calibration.plane)
+    """The fish in this pose, in the camera frame."""
+    line = _in_camera(_hang(fish, pose), calibration.plane)
     return PosedFish(
         fish=fish,
-        vertices=spine.place(fish.mesh.points),
-        midline=spine.points,
-        keypoints=spine.place(keypoints()),
+        vertices=line.place(fish.mesh.points),
+        midline=line.points,
+        keypoints=line.place(keypoints()),
     )
 
 
 def _hang(fish: SimulatedFish, pose: HangingPose) -> CenterLine:
     """The centre line in the world frame: its centroid under the hook, then yaw, tilt and sway."""
-    spine = bend_center_line(pose.bends, length_mm=fish.length_mm)
-    middle = spine.frames[len(spine.frames) // 2]
-    spine = spine.moved(middle.T, np.zeros(3))
+    line = bend_center_line(pose.bends, length_mm=fish.length_mm)
+    middle = line.frames[len(line.frames) // 2]
+    line = line.moved(middle.T, np.zeros(3))
     # Gravity pulls the centroid under the head, where the hook is.
-    down = spine.points.mean(axis=0) - spine.points[0]
+    down = line.points.mean(axis=0) - line.points[0]
     align = Rotation.align_vectors([[1.0, 0.0, 0.0]], [down])[0]
     swing = Rotation.from_euler("ZXY", [pose.sway_rad, pose.tilt_rad, pose.yaw_rad])
     rotation = swing.as_matrix() @ _WORLD_FROM_HANGING @ align.as_matrix()
-    turned = spine.moved(rotation, np.zeros(3))
+    turned = line.moved(rotation, np.zeros(3))
     center = turned.place(keypoints())[1]
     return turned.moved(np.eye(3), pose.center_world_mm - center)
 
 
-def _in_camera(spine_world: CenterLine, plane: ReferencePlane) -> CenterLine:
-    return spine_world.moved(plane.rotation, plane.translation_mm)
+def _in_camera(line_world: CenterLine, plane: ReferencePlane) -> CenterLine:
+    return line_world.moved(plane.rotation, plane.translation_mm)

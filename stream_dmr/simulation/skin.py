@@ -1,4 +1,7 @@
-"""The skin of a simulated halibut: a mottled side with the eyes, and a pale blind side."""
+"""The skin of a simulated halibut: a mottled eyed side and a pale blind side.
+
+Colours and marks were chosen by eye.
+"""
 
 import cv2
 import numpy as np
@@ -7,7 +10,7 @@ from jaxtyping import Float, Float32
 _ALONG, _ACROSS = 384, 160  # texture pixels from snout to tail, and across the broad side
 _EYED_BGR = np.array([62.0, 82.0, 92.0], np.float32)
 _BLIND_BGR = np.array([205.0, 214.0, 218.0], np.float32)
-_SKIN = 7  # stream of random numbers; the scene has the others
+_SKIN = 7  # key of a stream of random numbers; `rail_scene` and `film` have the others
 
 
 def draw_skin(*, seed: int, track_id: int) -> Float32[np.ndarray, "2 S Y 3"]:
@@ -20,7 +23,9 @@ def noise(
     rng: np.random.Generator, height: int, width: int, *, grain_px: tuple[float, float]
 ) -> Float32[np.ndarray, "H W"]:
     """Smooth noise of unit variance with a grain of this size along x and along y."""
-    shrink = max(1, int(min(grain_px) / 3))  # coarse grain is blurred small, which is much faster
+    shrink = max(
+        1, int(min(grain_px) / 3)
+    )  # coarse noise is blurred at low resolution, which is faster
     white = rng.standard_normal((height // shrink + 1, width // shrink + 1), dtype=np.float32)
     smooth = cv2.GaussianBlur(white, (0, 0), grain_px[0] / shrink, sigmaY=grain_px[1] / shrink)
     smooth = cv2.resize(smooth, (width, height), interpolation=cv2.INTER_CUBIC)
@@ -45,7 +50,7 @@ def _blind_side(rng: np.random.Generator) -> Float32[np.ndarray, "S Y 3"]:
     tone = 1 + 0.035 * _noise(rng, 12.0) + 0.02 * _noise(rng, 2.0)
     tone *= 1 - 0.10 * (1 - _fins(s, y)) - 0.2 * _arc(s, y, 0.215)
     side = tone[..., None] * _BLIND_BGR
-    blood = np.clip(_noise(rng, 9.0) - 1.3, 0.0, 1.0)[..., None]  # flushed, as hauled fish are
+    blood = np.clip(_noise(rng, 9.0) - 1.3, 0.0, 1.0)[..., None]  # red blotches, as on hauled fish
     side *= 1 - blood * np.array([0.22, 0.20, 0.02], np.float32)
     return np.clip(side, 8, 255).astype(np.float32)
 
@@ -57,7 +62,7 @@ def _grid() -> tuple[Float32[np.ndarray, "S 1"], Float32[np.ndarray, "1 Y"]]:
 
 
 def _noise(rng: np.random.Generator, grain: float) -> Float32[np.ndarray, "S Y"]:
-    # On the body the texture is about as dense across as along, where the body is broad.
+    # The texture is about as dense across as along where the body is broad.
     return noise(rng, _ALONG, _ACROSS, grain_px=(grain, grain))
 
 
@@ -84,6 +89,6 @@ def _arc(
 
 def _draw_eye(side: Float[np.ndarray, "S Y 3"], s: float, y: float) -> None:
     center = (round((y + 1) / 2 * (_ACROSS - 1)), round(s / 1.03 * (_ALONG - 1)))
-    # Wider across: the head is narrow there and the texture is stretched over its breadth.
+    # Wider across, since the texture is compressed there: the head is narrow.
     cv2.ellipse(side, center, (11, 5), 0, 0, 360, (70, 105, 110), -1, cv2.LINE_AA)
     cv2.ellipse(side, center, (6, 3), 0, 0, 360, (12, 12, 14), -1, cv2.LINE_AA)

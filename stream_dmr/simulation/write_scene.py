@@ -17,7 +17,7 @@ from stream_dmr.simulation.pose_sequence import FPS
 from stream_dmr.simulation.rail_scene import RailScene, make_scene
 from stream_dmr.simulation.simulated_body import HALIBUT, JOINT_ARCS, keypoints, straight_body
 
-_MAX_FISH = 65535  # what a 16-bit mask can tell apart
+_MAX_FISH = 65535  # the largest id of a 16-bit mask
 
 TRUTH_FRAMES_COLUMNS = (
     "frame_index",
@@ -38,8 +38,8 @@ def simulate(out: Path, *, num_fish: int, num_frames: int, preset: str, seed: in
     pixels with lens distortion, arc, bending), and `species.ply` with `species.toml`, the mean
     body as a template. Equal arguments write equal masks and truth to the last bit.
 
-    Raises UserError for counts, a preset or a seed that can't be, OutputError where `out` can't
-    be written to.
+    Raises UserError for counts, a preset or a seed out of range, OutputError where `out` can't be
+    written to.
     """
     _check(num_fish=num_fish, num_frames=num_frames, seed=seed)
     scene = make_scene(num_fish=num_fish, num_frames=num_frames, preset=preset, seed=seed)
@@ -51,7 +51,7 @@ def simulate(out: Path, *, num_fish: int, num_frames: int, preset: str, seed: in
         _write_film(out, scene)
     except OSError as error:
         raise OutputError(
-            f"{out}: expected a folder to write the simulated scene to, got: {error}; "
+            f"{out}: expected a folder for the simulated scene, got: {error}; "
             "choose another --out or free some space"
         ) from error
 
@@ -69,7 +69,7 @@ def write_species(out: Path) -> None:
 
 
 def encode_mask(labels: UInt16[np.ndarray, "H W"], *, num_fish: int) -> bytes:
-    """Track ids as a PNG: 8-bit where they fit, else 16-bit."""
+    """Track ids as a PNG: 8-bit if they fit, otherwise 16-bit."""
     pixels = labels.astype(np.uint8) if num_fish <= 255 else labels
     _, encoded = cv2.imencode(".png", pixels)
     return encoded.tobytes()
@@ -85,7 +85,7 @@ def _check(*, num_fish: int, num_frames: int, seed: int) -> None:
 
 
 def _empty_masks(folder: Path) -> None:
-    """Make the folder; masks of an earlier, longer clip would label frames that aren't there."""
+    """Make the folder, and delete masks of an earlier clip, which may have been longer."""
     folder.mkdir(parents=True, exist_ok=True)
     for path in folder.iterdir():
         if re.fullmatch(r"\d{6}\.png", path.name):
@@ -133,7 +133,7 @@ def _write_film(out: Path, scene: RailScene) -> None:
         with (out / "boxes.txt").open("w", encoding="utf-8") as boxes:
             for shot in film(scene):
                 video.write(shot.image)
-                # Unlike imwrite, write_bytes says what went wrong.
+                # Unlike cv2.imwrite, write_bytes raises an error that says what went wrong.
                 png = encode_mask(shot.labels, num_fish=len(scene.visits))
                 (out / "masks" / f"{shot.frame_index:06d}.png").write_bytes(png)
                 boxes.writelines(map(_mot_line, shot.boxes))

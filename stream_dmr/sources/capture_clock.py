@@ -1,19 +1,19 @@
-"""When a frame of a live source was taken, whatever the stream's and the system's clocks do.
+"""Capture times of live sources, robust to steps of the stream's and the system's clocks.
 
-Three clocks, kept apart: the system's wall clock, which may be stepped; its monotonic clock, which
-is not; and the stream's own timestamps, which space frames exactly but may jump or begin again.
+Three clocks: the system's wall clock, which may be stepped; its monotonic clock, which is not; and
+the stream's own timestamps, which space frames exactly but may jump or begin again.
 """
 
-_LARGEST_ERROR_NS = 1_000_000_000  # the stream's time further off than this is another time
-_SLEW = 1024  # frames over which a camera whose clock runs a little fast or slow is followed
+_MAX_DELAY_NS = 1_000_000_000  # chosen: a stream time further behind arrival is a new time base
+_SLEW_FRAMES = 1024  # chosen: drift of the camera's clock is followed with this time constant
 
 
 class CaptureClock:
     """Capture times in ns since 1970: strictly increasing, and near the time of arrival.
 
-    The wall clock is read once, at the start; from then on time passes as the monotonic clock says.
-    Frames are spaced by the stream's timestamps as long as these put them no more than 1 s before
-    their arrival, and never after it; else their arrival counts. Pure: all clocks are arguments.
+    The wall clock is read once, at the start; after that, the monotonic clock counts. Frames are
+    spaced by the stream's timestamps as long as these lie at most 1 s before the arrival, and not
+    after it; otherwise the time base is set again from the arrival. All clocks are arguments.
     """
 
     def __init__(self, *, wall_ns: int, monotonic_ns: int, after_ns: int = 0) -> None:
@@ -24,18 +24,18 @@ class CaptureClock:
         self._last_ns = after_ns
 
     def stamp(self, *, monotonic_ns: int, stream_ns: int | None) -> int:
-        """The capture time of a frame that arrived now; `stream_ns` None: it says none itself."""
+        """Capture time of a frame that arrived now; `stream_ns` None: it has no timestamp."""
         arrival_ns = monotonic_ns + self._capture_from_monotonic
         time_ns = arrival_ns if stream_ns is None else self._follow(stream_ns, arrival_ns)
         self._last_ns = max(time_ns, self._last_ns + 1)
         return self._last_ns
 
     def reconnected(self) -> None:
-        """Forget the stream's timestamps: a new connection may count from anywhere."""
+        """Set the time base again with the next frame: a new connection may count from anywhere."""
         self._capture_from_stream = None
 
     def wall_step_ns(self, *, wall_ns: int, monotonic_ns: int) -> int:
-        """How far the wall clock was stepped since the last call (or the start)."""
+        """By how much the wall clock was stepped since the last call (or the start), ns."""
         step_ns = wall_ns - monotonic_ns - self._wall_from_monotonic
         self._wall_from_monotonic += step_ns
         return step_ns
@@ -44,8 +44,8 @@ class CaptureClock:
         if self._capture_from_stream is None:
             self._capture_from_stream = arrival_ns - stream_ns
         error_ns = arrival_ns - (stream_ns + self._capture_from_stream)
-        if error_ns < 0 or error_ns > _LARGEST_ERROR_NS:  # no frame is taken after it arrived
+        if error_ns < 0 or error_ns > _MAX_DELAY_NS:  # no frame is taken after it arrived
             self._capture_from_stream = arrival_ns - stream_ns
         else:
-            self._capture_from_stream += error_ns // _SLEW
+            self._capture_from_stream += error_ns // _SLEW_FRAMES
         return stream_ns + self._capture_from_stream

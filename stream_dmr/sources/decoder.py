@@ -1,4 +1,4 @@
-"""Decoding in a process of its own: what breaks the decoder doesn't break the measurement."""
+"""Decoding in a child process: a crash of the decoder does not end the measurement."""
 
 import json
 import mmap
@@ -22,11 +22,11 @@ _PROGRAM = Path(__file__).with_name("decoder_process.py")
 
 
 class DecodingError(Exception):
-    """The decoder gives no more pictures; the message says why, for people."""
+    """The decoder gives no more pictures; the message says why."""
 
 
 class ResizedError(DecodingError):
-    """The next picture has another size: `width` x `height` px."""
+    """The next picture has another size than the first: `width` x `height` px."""
 
     def __init__(self, *, width: int, height: int) -> None:
         super().__init__(f"pictures of {width}x{height} px came")
@@ -35,23 +35,27 @@ class ResizedError(DecodingError):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DecodedPicture:
-    """One decoded picture, with the time in ms that the container or stream gives it."""
+    """One decoded picture."""
 
-    milliseconds: float
+    milliseconds: float  # timestamp of the container or stream, as OpenCV gives it
     image: UInt8[np.ndarray, "H W 3"]  # BGR
 
 
 class Decoder:
-    """Pictures of one video, stream or camera, in order; memory is shared with the process."""
+    """Pictures of one video, stream or camera, in order, from a child process.
+
+    Pictures come through shared memory, what is said about them as lines of JSON through a pipe;
+    see `decoder_process`.
+    """
 
     def __init__(self, address: str) -> None:
-        """Start decoding a path, an address or a camera's index; the first `read` tells of it."""
+        """Start decoding a path, an address or a camera's index; errors come with `read`."""
         self.width = self.height = 0  # px, known after the first picture, as are these:
-        self.fps = 0.0  # as the container says; 0, NaN or nonsense where it doesn't
-        self.promised = 0.0  # frames, likewise
+        self.fps = 0.0  # as the container says; 0, NaN or impossible where it doesn't
+        self.promised = 0.0  # number of frames, likewise
         self._reading = Lock()
         self._slots: np.ndarray | None = None
-        self._text = b""
+        self._received = b""  # of the pipe, not yet a whole line
         self._memory = os.memfd_create("pictures")  # nameless: nothing is left after a crash
         self._process = subprocess.Popen(
             [sys.executable, "-P", str(_PROGRAM), address, str(self._memory)],
@@ -60,14 +64,14 @@ class Decoder:
             stderr=subprocess.DEVNULL,
             bufsize=0,
             pass_fds=[self._memory],
-            start_new_session=True,  # Ctrl-C is for us alone
+            start_new_session=True,  # Ctrl-C must not reach the decoder
         )
 
     def read(self, *, timeout_s: float) -> DecodedPicture | None:
         """Wait for the next picture; None at the end.
 
-        Raises DecodingError where none comes for `timeout_s`, where the process has died, or
-        (ResizedError) where the next picture has another size.
+        Raises DecodingError where none comes for `timeout_s` or the process has died, and
+        ResizedError where the next picture has another size.
         """
         with self._reading:
             return self._read(timeout_s)
@@ -83,52 +87,54 @@ class Decoder:
             if self._memory >= 0:
                 os.close(self._memory)
                 self._memory = -1
-            self._text, self._slots = b"", None
+            self._received, self._slots = b"", None
 
     def _read(self, timeout_s: float) -> DecodedPicture | None:
-        until = time.monotonic() + timeout_s
-        while (said := self._hear(until)) is not None:
-            if "shape" in said:
-                self._begin(said)
-            elif "resized" in said:
-                height, width = said["resized"][:2]
+        deadline_s = time.monotonic() + timeout_s
+        while (message := self._receive(deadline_s)) is not None:
+            if "shape" in message:
+                self._map_slots(message)
+            elif "resized" in message:
+                height, width = message["resized"][:2]
                 raise ResizedError(width=width, height=height)
-            elif "slot" in said:
-                return self._take(said)
+            elif "slot" in message:
+                return self._copy_picture(message)
             else:
                 return None
         if self._slots is None:
             return None  # it could not be opened, holds no picture, or was closed
         status = self._process.wait()
-        raise DecodingError(f"the decoder broke down (status {status})")
+        raise DecodingError(f"the decoder crashed (status {status})")
 
-    def _begin(self, said: dict[str, Any]) -> None:
-        self.height, self.width = said["shape"][:2]
-        self.fps, self.promised = said["fps"], said["promised"]
+    def _map_slots(self, message: dict[str, Any]) -> None:
+        """Map the shared memory, of which the child now says how large it is."""
+        self.height, self.width = message["shape"][:2]
+        self.fps, self.promised = message["fps"], message["promised"]
         size = NUM_SLOTS * self.height * self.width * 3
         shared = mmap.mmap(self._memory, size)
         self._slots = np.frombuffer(shared, np.uint8).reshape(-1, self.height, self.width, 3)
 
-    def _take(self, said: dict[str, Any]) -> DecodedPicture:
+    def _copy_picture(self, message: dict[str, Any]) -> DecodedPicture:
+        """Copy a picture out of its slot, and return the slot to the child."""
         assert self._slots is not None
         assert self._process.stdin is not None
-        image = self._slots[said["slot"]].copy()
-        with suppress(BrokenPipeError):  # it died since; the next read says so
-            self._process.stdin.write(bytes([said["slot"]]))
-        return DecodedPicture(milliseconds=said["milliseconds"], image=image)
+        image = self._slots[message["slot"]].copy()
+        with suppress(BrokenPipeError):  # the child has died; the next read raises
+            self._process.stdin.write(bytes([message["slot"]]))
+        return DecodedPicture(milliseconds=message["milliseconds"], image=image)
 
-    def _hear(self, until: float) -> dict[str, Any] | None:
-        """The next line; None where the process has ended."""
+    def _receive(self, deadline_s: float) -> dict[str, Any] | None:
+        """The child's next message; None where it has ended. Raises DecodingError if too late."""
         assert self._process.stdout is not None
-        while b"\n" not in self._text:
+        while b"\n" not in self._received:
             if self._process.stdout.closed:
                 return None
-            patience_s = max(0.0, until - time.monotonic())
-            if not select.select([self._process.stdout], [], [], patience_s)[0]:
+            timeout_s = max(0.0, deadline_s - time.monotonic())
+            if not select.select([self._process.stdout], [], [], timeout_s)[0]:
                 raise DecodingError("no picture came for too long")
             data = os.read(self._process.stdout.fileno(), 1 << 16)
             if not data:
                 return None
-            self._text += data
-        line, _, self._text = self._text.partition(b"\n")
+            self._received += data
+        line, _, self._received = self._received.partition(b"\n")
         return json.loads(line)

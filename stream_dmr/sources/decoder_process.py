@@ -1,10 +1,10 @@
-"""The program that decodes: a process of its own, since a broken bitstream can take it down.
+"""The decoding program, a process of its own, since a damaged bitstream can crash the decoder.
 
     python -P decoder_process.py ADDRESS MEMORY_FD
 
-Pictures go into slots of the shared memory, a line of JSON about each to stdout; the number of a
-slot comes back on stdin once its picture was taken. It ends when stdin does. Nothing of ours is
-imported here: it has to start quickly.
+Each picture goes into a slot of the shared memory, and a line of JSON about it to stdout; the
+slot's number comes back as one byte on stdin when the picture was copied. The process ends with
+stdin. Nothing of stream_dmr is imported here, so that it starts quickly.
 """
 
 import json
@@ -21,25 +21,25 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
 import cv2
 import numpy as np
 
-NUM_SLOTS = 3
+NUM_SLOTS = 3  # one is written, one waits, one is copied
 
 
 def main(address: str, memory: int) -> None:
     """Decode to the end of the source, or of stdin."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # who started us says when it is over
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process by closing stdin
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     cv2.setNumThreads(1)
     free: SimpleQueue[int] = SimpleQueue()
     for slot in range(NUM_SLOTS):
         free.put(slot)
-    threading.Thread(target=_take_back, args=(free,), daemon=True).start()
+    threading.Thread(target=_collect_free_slots, args=(free,), daemon=True).start()
     capture = _open(address)
     is_read, image = capture.read()
     if not is_read or image.ndim != 3 or image.dtype != np.uint8:
         return
-    slots = _share(image.shape, memory)
-    _say(
+    slots = _map_slots(image.shape, memory)
+    _send(
         shape=image.shape,
         fps=capture.get(cv2.CAP_PROP_FPS),
         promised=capture.get(cv2.CAP_PROP_FRAME_COUNT),
@@ -48,9 +48,9 @@ def main(address: str, memory: int) -> None:
         milliseconds = capture.get(cv2.CAP_PROP_POS_MSEC)
         slot = free.get()
         np.copyto(slots[slot], image)
-        _say(slot=slot, milliseconds=milliseconds)
+        _send(slot=slot, milliseconds=milliseconds)
         is_read, image = capture.read(image)
-    _say(resized=image.shape) if is_read else _say(end=True)
+    _send(resized=image.shape) if is_read else _send(end=True)
 
 
 def _open(address: str) -> cv2.VideoCapture:
@@ -59,19 +59,19 @@ def _open(address: str) -> cv2.VideoCapture:
     return cv2.VideoCapture(address, cv2.CAP_FFMPEG)
 
 
-def _share(shape: tuple[int, ...], memory: int) -> np.ndarray:
+def _map_slots(shape: tuple[int, ...], memory: int) -> np.ndarray:
     size = NUM_SLOTS * int(np.prod(shape))
     os.ftruncate(memory, size)
     return np.frombuffer(mmap.mmap(memory, size), np.uint8).reshape(NUM_SLOTS, *shape)
 
 
-def _take_back(free: "SimpleQueue[int]") -> None:
+def _collect_free_slots(free: "SimpleQueue[int]") -> None:
     while number := os.read(0, 1):
         free.put(number[0])
     os._exit(0)
 
 
-def _say(**facts: object) -> None:
+def _send(**facts: object) -> None:
     os.write(1, json.dumps(facts).encode() + b"\n")
 
 

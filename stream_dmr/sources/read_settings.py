@@ -18,29 +18,29 @@ class ReadFramesSettings(Settings):
         default=20.0,
         ge=0.1,
         le=3600,
-        description="a camera or decoder that gives no frame for so long is started anew, s",
+        description="a camera or decoder that gives no frame for this long is restarted, s",
     )
     connect_s: float = Field(
         default=6.0,
         ge=0.1,
         le=3600,
-        description="how long a camera may take to a first frame; more than between key frames, s",
+        description="longest wait for a camera's first frame; more than between two key frames, s",
     )
     retry_s: float = Field(
         default=3.0,
         ge=0.1,
         le=3600,
-        description="the longest pause between two attempts to reach a lost camera, s",
+        description="longest pause between two attempts to reconnect to a camera, s",
     )
     live_queue: int = Field(
         default=15,
         ge=1,
         le=1000,
-        description="frames of a live source that may wait, say a second's; where more come, the "
+        description="frames of a live source that may wait, about one second; when full, the "
         "oldest is dropped",
     )
     clips_wait_s: float = Field(
         default=30.0,
         ge=0,
-        description="a folder of clips ends when no new clip came for so long, s; at sea 1e9",
+        description="a folder of clips ends when no new clip came for this long, s; at sea 1e9",
     )

@@ -54,7 +54,7 @@ def test_evaluation_pairs_by_track_and_names_the_rest(tmp_path):
 
 def test_fish_of_other_numbers_are_refused(tmp_path):
     truth = write(tmp_path, "b.csv", "track_id,length_mm\n101,700\n102,800\n")
-    with pytest.raises(UserError, match=r"\(101, 102\), got others \(1, 2, 4, 9\); number them"):
+    with pytest.raises(UserError, match=r"\(101, 102\), got others \(1, 2, 4, 9\); use the same"):
         evaluate(write(tmp_path, "a.csv", LENGTHS), truth)
 
 
@@ -112,7 +112,7 @@ def test_an_interval_may_reach_below_zero(tmp_path):
         ("track_id,length_mm\n1,nan\n", "line 2: expected length_mm as a number or empty"),
         ("track_id,length_mm\n1,-5\n", "line 2: expected length_mm above 0, got -5"),
         ("track_id,length_mm\nx,700\n", "line 2: expected a whole number as track_id, got 'x'"),
-        ("track_id,length_mm\n1,7\n1,8\n", "line 3: expected one row a fish, got track 1 again"),
+        ("track_id,length_mm\n1,7\n1,8\n", "line 3: expected one row per fish, got track 1 again"),
     ],
 )
 def test_bad_tables_are_refused_in_one_line(tmp_path, truth, message):

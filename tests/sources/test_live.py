@@ -177,7 +177,7 @@ def test_a_decoder_that_breaks_down_ends_a_file_with_a_warning(tmp_path: Path):
         if frame.frame_index == 3:
             os.kill(video._decoder._process.pid, signal.SIGKILL)
     assert 3 <= len(frames) < 12  # what was decoded before
-    assert "a.avi: the decoder broke down (status -9) after frame" in video.warnings[0]
+    assert "a.avi: the decoder crashed (status -9) after frame" in video.warnings[0]
 
 
 def test_a_decoder_that_hangs_is_given_up(tmp_path: Path):
