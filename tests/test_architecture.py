@@ -28,7 +28,7 @@ ROOMS = [
     "stream_dmr.review",
     "stream_dmr.report",
     "stream_dmr.batch",
-    "stream_dmr.replay",
+    "stream_dmr.replaying",
     "stream_dmr.watch",
     "stream_dmr.web",
     "stream_dmr.running",
@@ -103,7 +103,7 @@ WHO_KNOWS = {
     "ray": ["stream_dmr.batch"],
     "stream_dmr.nodes": [
         "stream_dmr.running",
-        "stream_dmr.replay",
+        "stream_dmr.replaying",
         "stream_dmr.batch",
         "stream_dmr.nodes",
     ],

@@ -59,8 +59,8 @@ def replay(
 ) -> None:
     """Compute a recording anew from one stage on, with its own inputs or with others."""
     from stream_dmr.cli.display import RunDisplay, print_check, print_fish, print_timings
-    from stream_dmr.replay.replay import ReplayRequest
-    from stream_dmr.replay.replay import replay as replay_recording
+    from stream_dmr.replaying.replay import ReplayRequest
+    from stream_dmr.replaying.replay import replay as replay_recording
 
     request = ReplayRequest(
         recordings=recordings,

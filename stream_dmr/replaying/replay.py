@@ -18,9 +18,9 @@ from stream_dmr.recording.messages.selection import WHOLE, Part
 from stream_dmr.recording.reading.frame_images import SourcePictures
 from stream_dmr.recording.reading.reader import Recording, open_recordings
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.replay.comparator import Judge, Mismatch, Scribe
-from stream_dmr.replay.recorded_files import find_crop_files, inputs_with
-from stream_dmr.replay.recorded_messages import Playback, Tape
+from stream_dmr.replaying.comparator import Judge, Mismatch, Scribe
+from stream_dmr.replaying.recorded_files import find_crop_files, inputs_with
+from stream_dmr.replaying.recorded_messages import Playback, Tape
 from stream_dmr.results.tables import Tables
 from stream_dmr.running.config import Config, load_config, parse_config, to_toml
 from stream_dmr.running.measure_source import later_nodes, resume

@@ -7,7 +7,7 @@ import pytest
 
 from stream_dmr.errors import UserError
 from stream_dmr.recording.messages.run_inputs import InputFile
-from stream_dmr.replay.recorded_files import CropFiles, find_crop_files, inputs_with
+from stream_dmr.replaying.recorded_files import CropFiles, find_crop_files, inputs_with
 from tests.support.command import invoke
 from tests.support.reading import read_header
 from tests.support.tiny_clip import write_clip

@@ -9,8 +9,8 @@ from stream_dmr.messages import Frame, LengthEstimate, Message
 from stream_dmr.recording.messages.record import Record, as_recorded
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.settings import RecordingSettings
-from stream_dmr.replay.difference import Difference, differences
-from stream_dmr.replay.recorded_messages import Tape
+from stream_dmr.replaying.difference import Difference, differences
+from stream_dmr.replaying.recorded_messages import Tape
 
 
 class Mismatch(NamedTuple):

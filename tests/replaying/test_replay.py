@@ -17,7 +17,7 @@ from stream_dmr.recording.messages.codec import decode
 from stream_dmr.recording.messages.selection import Part
 from stream_dmr.recording.messages.topics import TOPICS
 from stream_dmr.recording.reading.reader import messages, open_recordings
-from stream_dmr.replay.difference import differences
+from stream_dmr.replaying.difference import differences
 from tests.support.command import invoke, rows
 from tests.support.tiny_clip import write_clip
 
