@@ -22,7 +22,7 @@ from stream_dmr.camera import frame_from_crop
 from stream_dmr.messages import FishCrop, Frame, Message
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.settings import RecordingSettings
-from stream_dmr.results.tables import Tables
+from stream_dmr.results.frames_table import FramesTable
 from tests.support.recorded_run import HEIGHT, WIDTH, header, run
 
 NUM_FRAMES, RATE_HZ = 90, 30
@@ -68,8 +68,8 @@ def main() -> None:
 def _measure(messages: list[Message], settings: RecordingSettings) -> Cost:
     with tempfile.TemporaryDirectory() as folder:
         wait, start, cpu = 0.0, time.perf_counter(), time.process_time()
-        tables = Tables(Path(folder))
-        with Recorder(Path(folder), header(), settings, sinks=[tables]) as recorder:
+        frames = FramesTable(Path(folder))
+        with Recorder(Path(folder), header(), settings, sinks=[frames]) as recorder:
             for message in messages:
                 if isinstance(message, Frame):
                     due = start + message.frame_index / RATE_HZ

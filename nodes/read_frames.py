@@ -1,6 +1,7 @@
 """ReadFrames, the first stage: frames in order from a file, folder, camera or stream."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 from stream_dmr.messages import Frame
 from stream_dmr.sources.open_source import open_source
@@ -13,10 +14,16 @@ class ReadFrames:
     def __init__(self, source: str, settings: ReadFramesSettings) -> None:
         """Raises SourceError where nothing can be read from `source`."""
         self.source = open_source(source, settings)
+        self._offset = 0
+
+    def number_after(self, frame_index: int) -> None:
+        """Number the frames on after those of earlier runs; call it before the iteration."""
+        self._offset = frame_index
 
     def __iter__(self) -> Iterator[Frame]:
         """Raises SourceError where a frame doesn't fit those before it."""
-        return iter(self.source)
+        for frame in self.source:
+            yield replace(frame, frame_index=frame.frame_index + self._offset)
 
     def close(self) -> None:
         """Release the file or device; the iteration ends."""

@@ -19,9 +19,9 @@ from stream_dmr.errors import OutputError
 from stream_dmr.recording.reading.reader import open_recordings
 from stream_dmr.results.finished_fish import FishResult, read_fish
 from stream_dmr.results.fish_table import FISH_TABLE, arrow_schema, fish_record
+from stream_dmr.results.frames_table import FRAMES_COLUMNS
 from stream_dmr.results.provenance import add_files
 from stream_dmr.results.store import NAME as DATABASE
-from stream_dmr.results.tables import FRAMES_COLUMNS
 from stream_dmr.results.verdicts import read_verdicts
 from stream_dmr.running.config import parse_config
 

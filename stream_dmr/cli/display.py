@@ -10,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from stream_dmr.evaluation.compare import Distributions, Evaluation, distribution_rows, summary_rows
-from stream_dmr.messages import LengthEstimate
+from stream_dmr.messages import LengthEstimate, Message
 from stream_dmr.replaying.replay import ReplaySummary
 from stream_dmr.running.measure_source import RunSummary
 from stream_dmr.running.run_observer import RunObserver
@@ -36,7 +36,8 @@ class RunDisplay(RunObserver):
         )
         self._task = self._progress.add_task("measuring", total=None, rate=0.0, num_fish=0)
         self._num_frames: int | None = None
-        self._num_done = self._num_fish = 0
+        self._num_done = 0
+        self._fish = set[int]()  # track ids
         self._warned: set[str] = set()
         self._began = self._last_line = time.monotonic()
 
@@ -73,12 +74,13 @@ class RunDisplay(RunObserver):
         if self._progress.disable and now - self._last_line >= _LINE_EVERY_S:
             self._last_line = now
             of = "" if self._num_frames is None else f" of {self._num_frames}"
-            print_line = f"frame {self._num_done}{of}, {rate:.1f} frames/s, {self._num_fish} fish"
+            print_line = f"frame {self._num_done}{of}, {rate:.1f} frames/s, {len(self._fish)} fish"
             self._console.print(print_line)
 
-    def fish_seen(self, num_fish: int) -> None:  # noqa: D102
-        self._num_fish = num_fish
-        self._progress.update(self._task, num_fish=num_fish)
+    def take(self, message: Message) -> None:  # noqa: D102
+        if isinstance(message, LengthEstimate):
+            self._fish.add(message.track_id)
+            self._progress.update(self._task, num_fish=len(self._fish))
 
 
 def print_fish(fish: Sequence[LengthEstimate]) -> None:

@@ -21,9 +21,10 @@ from stream_dmr.recording.recorder import Recorder
 from stream_dmr.replaying.comparator import Judge, Mismatch, Scribe
 from stream_dmr.replaying.recorded_files import find_crop_files, inputs_with
 from stream_dmr.replaying.recorded_messages import Playback, Tape
-from stream_dmr.results.tables import Tables
+from stream_dmr.results.frames_table import FramesTable
+from stream_dmr.results.lengths_table import write_lengths
 from stream_dmr.running.config import Config, load_config, parse_config, to_toml
-from stream_dmr.running.measure_source import later_nodes, resume
+from stream_dmr.running.measure_source import continue_tracks, later_nodes
 from stream_dmr.running.pipeline import Node, StageCounters, run_chain
 from stream_dmr.running.run_folder import prepare_folder
 from stream_dmr.running.run_observer import RunObserver
@@ -94,7 +95,7 @@ def replay(
         frames, nodes = _chain(
             request, recording.header, tape, config, template, calibration, stack, first
         )
-        resume(nodes, carried)
+        continue_tracks(nodes, carried)
         recorder = None
         if request.out is not None:
             prepare_folder(request.out, overwrite=request.overwrite)
@@ -104,7 +105,7 @@ def replay(
                     request.out,
                     header,
                     config.recording,
-                    sinks=[Tables(request.out)],
+                    sinks=[FramesTable(request.out)],
                     in_one_thread=is_light,
                 )
             )
@@ -123,6 +124,8 @@ def replay(
             stop=stop,
             in_one_thread=is_light,
         )
+    if request.out is not None:
+        write_lengths(request.out / "lengths.csv", scribe.final)
     if judge is not None:
         judge.finish()
     for line in (*recording.warnings, *tape.notes):

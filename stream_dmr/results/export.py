@@ -25,9 +25,10 @@ from stream_dmr.recording.settings import RecordingSettings
 from stream_dmr.results.finished_fish import database_of, read_fish, read_runs
 from stream_dmr.results.fish_table import fish_record, write_csv, write_parquet
 from stream_dmr.results.fisheries import FisheriesSettings
+from stream_dmr.results.frames_table import FramesTable
+from stream_dmr.results.lengths_table import write_lengths
 from stream_dmr.results.provenance import read_origin, seal_files
 from stream_dmr.results.run_facts import run_facts
-from stream_dmr.results.tables import Tables
 
 MeshFormat = Literal["ply", "glb"]
 TableFormat = Literal["csv", "parquet"]
@@ -96,10 +97,13 @@ class Export:
 
     def tables(self, out: Path, *, format: TableFormat) -> list[Path]:
         """Write lengths and frames (keypoints, one row a fish and frame) into `out`, as `run`."""
-        tables = Tables(make_folder(out))
+        frames, finished = FramesTable(make_folder(out)), list[LengthEstimate]()
         for message in self._messages(LocalizedFish, LengthEstimate):
-            tables.write(make_record(message, RecordingSettings()))
-        tables.close()
+            frames.write(make_record(message, RecordingSettings()))
+            if isinstance(message, LengthEstimate) and message.is_final:
+                finished.append(message)
+        frames.close()
+        write_lengths(out / "lengths.csv", finished)
         paths = [out / "lengths.csv", out / "frames.csv"]
         paths = paths if format == "csv" else [_as_parquet(path) for path in paths]
         self._written += paths

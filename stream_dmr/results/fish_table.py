@@ -9,7 +9,7 @@ from typing import Any
 from stream_dmr.files import writing_to
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.fisheries import FisheriesSettings, derive
-from stream_dmr.results.tables import seconds
+from stream_dmr.results.table_cells import seconds
 from stream_dmr.results.verdicts import Review
 from stream_dmr.template.template import Template
 

@@ -26,12 +26,13 @@ from stream_dmr.results.finished_fish import (
     read_runs,
     read_stored,
 )
+from stream_dmr.results.frames_table import FRAMES_COLUMNS, frames_row
+from stream_dmr.results.lengths_table import LENGTHS_COLUMNS, lengths_row
 from stream_dmr.results.provenance import NAME as PROVENANCE
 from stream_dmr.results.provenance import lines_sha256, read_provenance, verdicts_sum
 from stream_dmr.results.run_facts import run_facts
 from stream_dmr.results.store import NAME as DATABASE
 from stream_dmr.results.store import RunFacts
-from stream_dmr.results.tables import FRAMES_COLUMNS, LENGTHS_COLUMNS, frames_row, lengths_row
 from stream_dmr.results.verdicts import Verdict, read_verdicts
 
 _MADE_BY = ("config_sha256", "calibration_sha256", "template_sha256")

@@ -1,4 +1,4 @@
-"""What a run is asked for, read and checked before the first frame."""
+"""Reads and checks everything that a run needs, before the first frame."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ from stream_dmr.template.template import Template, load_template
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """A request whose every file was read and found sound, and the open source."""
+    """A request with its files read and checked, and the open source."""
 
     request: RunRequest
     config: Config
@@ -29,21 +29,21 @@ class Inputs:
 
     @property
     def source(self) -> Source:
-        """Where frames come from."""
+        """The source of the frames."""
         return self.reader.source
 
     @property
     def is_endless(self) -> bool:
-        """A camera, or a folder that grows."""
+        """True for cameras and growing folders, see `Source`."""
         return self.source.is_endless
 
     @property
-    def goes_on(self) -> bool:
-        """After the results that are in the folder already."""
+    def resumes(self) -> bool:
+        """True where the run continues after the results that are in its folder."""
         return (self.request.resume or self.is_endless) and not self.request.overwrite
 
     def header(self) -> RunHeader:
-        """What the recording says of this run."""
+        """The header of this run's recording."""
         file = self.request.calibration
         return RunHeader(
             source=self.source.name,
@@ -75,9 +75,9 @@ class Inputs:
 
 
 def checked_inputs(request: RunRequest) -> Inputs:
-    """Read what a run needs; the caller closes the reader.
+    """Read and check the files of a request; the caller closes the reader.
 
-    Raises a UserError where anything of it is wrong.
+    Raises a UserError where one of them is wrong.
     """
     config = load_config(request.config)
     template = load_template(request.template)

@@ -1,8 +1,8 @@
-"""A run: inputs checked, outputs opened, and every frame through the chain."""
+"""Measures the fish of a source, from the check of its inputs to the closed outputs."""
 
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,44 +10,47 @@ from stream_dmr.camera import Calibration
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.fitting.compile_kernels import rehearse
 from stream_dmr.fitting.fitter import Fitter
-from stream_dmr.messages import LengthEstimate, LocalizedFish
+from stream_dmr.messages import LengthEstimate, LocalizedFish, Message
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.nodes.localize import Localize
 from stream_dmr.nodes.smooth_length import SmoothLength
 from stream_dmr.running.config import Config
-from stream_dmr.running.error_policy import DriftWatch, Tolerance, go_on
+from stream_dmr.running.drift_alarms import DriftAlarms
+from stream_dmr.running.error_policy import ErrorPolicy
 from stream_dmr.running.inputs import Inputs, checked_inputs
 from stream_dmr.running.outputs import Outputs, open_outputs
 from stream_dmr.running.pipeline import Node, StageCounters, run_chain
-from stream_dmr.running.result_writer import Tally
+from stream_dmr.running.result_writer import ResultWriter
+from stream_dmr.running.resume import resume_source
 from stream_dmr.running.run_folder import RESULTS, SEGMENTED
-from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.running.run_observer import RunObserver, RunTotals
 from stream_dmr.running.run_request import RunRequest
+from stream_dmr.running.track_numbering import TrackNumbering
 from stream_dmr.template.template import Template
 
-_MOST_LAST_FISH = 100  # that a source without an end is summed up by; the store has them all
+_MAX_SUMMARY_FISH = 100  # of an endless run, for the table at its end; the store has all fish
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunSummary:
-    """How a run went."""
+    """The results of a run."""
 
-    fish: Sequence[LengthEstimate]  # final, by track id; of an endless source the last ones
+    fish: Sequence[LengthEstimate]  # final, by track id; of an endless source the last 100
     num_frames: int  # that went through the whole chain
     elapsed_s: float
     counters: Sequence[StageCounters]
-    files: Sequence[Path]  # the results
+    files: Sequence[Path]  # names of segments as a pattern
 
 
 def measure_source(
     request: RunRequest, *, stop: threading.Event, observer: RunObserver | None = None
 ) -> RunSummary:
-    """Turn a clip into fish lengths, with every stage recorded in `request.out`.
+    """Measure the fish of a source, with every stage recorded in `request.out`.
 
     All inputs are checked before the first frame; setting `stop` ends the run soon, with valid
-    results of what was done. Raises a UserError where an input is wrong, also in the middle of
-    the source; everything computed before is kept then, and a note of the exception says where.
+    results of the frames so far. Raises a UserError where an input is wrong, also in the middle of
+    the source; what was computed before is kept, and a note of the exception says where.
     """
     observer = observer or RunObserver()
     inputs = checked_inputs(request)
@@ -61,8 +64,8 @@ def measure_source(
             )
             rehearse(fitter)
         with open_outputs(inputs, observer) as outputs:
-            resume(nodes, outputs.left)
-            _say_what_matters(inputs, outputs, observer)
+            continue_tracks(nodes, outputs.interrupted)
+            _report_start(inputs, outputs, observer)
             observer.begin(inputs.source.num_frames)
             return _run_chain(inputs, nodes, outputs, observer, stop=stop)
     finally:
@@ -71,7 +74,7 @@ def measure_source(
             observer.warn(line)
 
 
-def _say_what_matters(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> None:
+def _report_start(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> None:
     for repair in outputs.repairs:
         observer.warn(repair.line)
     if outputs.recorder.live_address is not None:
@@ -100,7 +103,7 @@ def _nodes(inputs: Inputs) -> list[Node]:
 def later_nodes(
     config: Config, *, template: Template, calibration: Calibration | None
 ) -> list[Node]:
-    """The nodes that a crop passes, from the fit to the length."""
+    """The nodes after CropFish: fit, localization, length."""
     return [
         FitMesh(
             config.fit_mesh,
@@ -117,9 +120,9 @@ def _records_covariance(config: Config) -> bool:
     return config.recording.meshes == "vertices"
 
 
-def resume(nodes: Sequence[Node], left: Iterable[LocalizedFish]) -> None:
-    """Let a chain's last node finish what an earlier recording left of fish in view."""
-    for fish in left:
+def continue_tracks(nodes: Sequence[Node], interrupted: Iterable[LocalizedFish]) -> None:
+    """Give a chain's last node the frames of fish that an earlier recording has."""
+    for fish in interrupted:
         nodes[-1].step(fish)
 
 
@@ -131,35 +134,30 @@ def _run_chain(
     *,
     stop: threading.Event,
 ) -> RunSummary:
-    request, store = inputs.request, outputs.store
-    has_no_ids = not (request.boxes or request.masks)
-    tally = Tally(
-        outputs.recorder,
-        store,
-        observer,
-        numbers_frames_on=inputs.is_endless and has_no_ids,
-        keeps=_MOST_LAST_FISH if inputs.is_endless else None,
-        clips=go_on(inputs.source, store, on_notice=observer.warn),
-        left=outputs.left,
-        drift=DriftWatch(store, inputs.config.drift, on_notice=observer.warn)
-        if inputs.is_endless and inputs.calibration is not None
-        else None,
-    )
-    began = time.perf_counter()
-    tolerance = Tolerance(is_endless=inputs.is_endless, on_notice=observer.warn)
+    request, began = inputs.request, time.perf_counter()
+    numbering = TrackNumbering(after=outputs.store.before.track_id)
+    writer = _result_writer(inputs, outputs, on_notice=observer.warn)
+    policy = ErrorPolicy(is_endless=inputs.is_endless, on_notice=observer.warn)
+    totals = RunTotals(max_fish=_MAX_SUMMARY_FISH if inputs.is_endless else None)
 
-    def frame_done() -> None:
-        tolerance.frame_done()
-        tally.frame_done()
+    def on_message(message: Message) -> Message:
+        message = writer.write(numbering.number(message))
+        totals.take(message)
+        observer.take(message)
+        return message
+
+    def on_frame() -> None:
+        for receiver in (policy, writer, totals, observer):
+            receiver.frame_done()
 
     try:
         counters = run_chain(
             inputs.reader,
             nodes,
-            on_message=tally.record,
-            on_frame=frame_done,
+            on_message=on_message,
+            on_frame=on_frame,
             on_start=observer.attach,
-            on_failure=tolerance.allows,
+            on_failure=policy.continues_after,
             stop=stop,
         )
     except UserError as error:
@@ -167,9 +165,31 @@ def _run_chain(
             error.add_note(f"what was computed before is kept in {request.out}")
         raise
     return RunSummary(
-        fish=sorted(tally.final, key=lambda estimate: estimate.track_id),
-        num_frames=tally.num_frames,
+        fish=totals.fish(),
+        num_frames=totals.num_frames,
         elapsed_s=time.perf_counter() - began,
         counters=counters,
         files=[request.out / name for name in (SEGMENTED if inputs.is_endless else RESULTS)],
+    )
+
+
+def _result_writer(
+    inputs: Inputs, outputs: Outputs, *, on_notice: Callable[[str], None]
+) -> ResultWriter:
+    """The writer of a run; its source is made to continue after earlier runs."""
+    store = outputs.store
+    clips = resume_source(inputs.source, store, on_notice=on_notice)
+    if inputs.is_endless and inputs.request.boxes is None and inputs.request.masks is None:
+        inputs.reader.number_after(store.before.frame_index)  # annotations count from the start
+    has_drift_alarms = inputs.is_endless and inputs.calibration is not None
+    return ResultWriter(
+        store,
+        outputs.lengths,
+        outputs.recorder,
+        clips=clips,
+        interrupted=outputs.interrupted,
+        drift=DriftAlarms(store, inputs.config.drift, on_notice=on_notice)
+        if has_drift_alarms
+        else None,
+        on_notice=on_notice,
     )

@@ -9,11 +9,11 @@ from stream_dmr.messages import LengthEstimate
 from stream_dmr.recording.messages.codec import decode
 from stream_dmr.recording.reading.reader import open_recordings
 from stream_dmr.recording.segments.recover import recover
+from stream_dmr.results.lengths_table import write_lengths
 from stream_dmr.results.run_facts import run_facts
 from stream_dmr.results.store import NAME, LengthStore, require_free
 from stream_dmr.results.store_rows import read_estimates
 from stream_dmr.results.store_schema import open_database
-from stream_dmr.results.tables import write_lengths
 
 FROM_RECORDING = "taken over from the recording"
 

@@ -1,111 +1,90 @@
-"""What a run does with every message beside passing it on: numbers, stores, records, counts it."""
+"""Writes what a run's chain gives: lengths into the store, every message into the recording."""
 
 from collections import Counter, defaultdict, deque
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
 from statistics import median
 
 from stream_dmr.messages import FishCrop, Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.recording.recorder import Recorder
+from stream_dmr.results.lengths_table import LengthsTable
 from stream_dmr.results.store import LengthStore
-from stream_dmr.running.error_policy import DriftWatch
-from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.running.drift_alarms import DriftAlarms
 
 INTERRUPTED = "interrupted by a restart, finished with what was recorded; it may count twice"
 
 
-class Tally:
-    """Takes every message of the chain, in the thread of its stage.
+class ResultWriter:
+    """Writes every message of the chain, called in the thread of its stage.
 
-    A finished fish goes to the store before anything else is done with it, so that no failure of
-    what follows can lose it. After an earlier run in the same folder, ids go on where that one
-    stopped; frames as well where the source has no end and no annotations count its frames.
+    A finished fish goes to the store first, so that no failure of what follows can lose it.
     """
 
     def __init__(
         self,
-        recorder: Recorder,
         store: LengthStore,
-        observer: RunObserver,
+        lengths: LengthsTable,
+        recorder: Recorder,
         *,
-        numbers_frames_on: bool,
-        keeps: int | None = None,
         clips: Mapping[str, int] | None = None,
-        left: Sequence[LocalizedFish] = (),
-        drift: DriftWatch | None = None,
+        interrupted: Sequence[LocalizedFish] = (),
+        drift: DriftAlarms | None = None,
+        on_notice: Callable[[str], None],
     ) -> None:
-        """`keeps`: of the finished fish, so many of the last ones; of weeks at sea not all.
+        """`clips`: frames done of each clip before; None where the source has no clips.
 
-        `clips`: the source is a folder of clips, of which so many frames were done before.
-
-        `left`: frames of fish that a crash interrupted, and that this run finishes.
+        `interrupted`: frames of fish that a crash interrupted, and that this run finishes.
         """
-        self.final: deque[LengthEstimate] = deque(maxlen=keeps)
-        self.num_frames = 0
-        self._drift = drift
-        self._ious: defaultdict[int, list[float]] = defaultdict(list)  # of the open tracks
-        self._left = {fish.track_id for fish in left}
-        for fish in left:
-            self._take_iou(fish)
-        self._recorder = recorder
-        self._store = store
-        self._observer = observer
-        self._first_id = store.before.track_id
-        self._first_frame = store.before.frame_index if numbers_frames_on else 0
+        self._store, self._lengths, self._recorder = store, lengths, recorder
+        self._drift, self._on_notice = drift, on_notice
         self._clips = None if clips is None else Counter(clips)
-        self._in_flight: deque[str] = deque()  # the clips of frames that are in the chain
-        self._track_ids: set[int] = set()
+        self._clips_in_chain: deque[str] = deque()  # of the frames that are in the chain, in order
+        self._interrupted = {fish.track_id for fish in interrupted}
+        self._ious: defaultdict[int, list[float]] = defaultdict(list)  # by track, while it is open
+        for fish in interrupted:
+            self._take_iou(fish)
 
-    def record(self, message: Message) -> Message:
-        """Return the message as the next stage is to get it."""
+    def write(self, message: Message) -> Message:
+        """Write a message; returns it as the next stage must get it, see `Recorder.write`."""
         match message:
-            case Frame(frame_index=index):
-                message = replace(message, frame_index=index + self._first_frame)
-                if self._drift is not None:
-                    self._drift.take_frame(message)
-                self._in_flight.append(message.source)
-                self._store.frame_passed(
-                    frame_index=message.frame_index, timestamp_ns=message.timestamp_ns
-                )
-            case FishCrop(track_id=track_id):
-                message = replace(message, track_id=track_id + self._first_id)
+            case Frame():
+                self._take_frame(message)
+            case FishCrop():
                 self._store.reserve_track(message.track_id)
             case LocalizedFish():
                 self._take_iou(message)
             case LengthEstimate(is_final=True):
-                self._finish(message)
-                self._observer.fish_finished(message)
+                self._store_fish(message)
             case _:
                 pass
         if self._store.trouble:
-            self._observer.warn(
-                f"{self._store.path}: {self._store.trouble}; lengths wait in memory"
-            )
+            self._on_notice(f"{self._store.path}: {self._store.trouble}; lengths wait in memory")
         message = self._recorder.write(message)
-        self._observer.take(message)
-        if isinstance(message, LengthEstimate):
-            self._track_ids.add(message.track_id)
-            self._observer.fish_seen(len(self._track_ids))
+        if isinstance(message, LengthEstimate) and message.is_final:
+            self._lengths.add(message)
         return message
+
+    def frame_done(self) -> None:
+        """Take note that a frame has left the last stage: its clip is measured so far."""
+        if self._clips is not None:
+            clip = self._clips_in_chain.popleft()
+            self._clips[clip] += 1
+            self._store.clip_progress(clip, frames_done=self._clips[clip])
+
+    def _take_frame(self, frame: Frame) -> None:
+        if self._clips is not None:
+            self._clips_in_chain.append(frame.source)
+        if self._drift is not None:
+            self._drift.take_frame(frame)
+        self._store.frame_passed(frame_index=frame.frame_index, timestamp_ns=frame.timestamp_ns)
 
     def _take_iou(self, fish: LocalizedFish) -> None:
         if fish.accepted and fish.iou is not None:
             self._ious[fish.track_id].append(fish.iou)
 
-    def _finish(self, estimate: LengthEstimate) -> None:
-        accepted = self._ious.pop(estimate.track_id, [])
-        iou = median(accepted) if accepted else None
+    def _store_fish(self, estimate: LengthEstimate) -> None:
+        ious = self._ious.pop(estimate.track_id, [])
+        iou = median(ious) if ious else None
         flags = [] if self._drift is None else self._drift.take_fish(iou, estimate.timestamp_ns)
-        if estimate.track_id in self._left:
+        if estimate.track_id in self._interrupted:
             flags.append(INTERRUPTED)
         self._store.add(estimate, iou=iou, flags=flags)
-        self.final.append(estimate)
-
-    def frame_done(self) -> None:
-        """Count a frame that has left the last stage."""
-        self.num_frames += 1
-        clip = self._in_flight.popleft()
-        if self._clips is not None:
-            self._clips[clip] += 1
-            self._store.clip_progress(clip, frames_done=self._clips[clip])
-        self._observer.frame_done()

@@ -1,17 +1,14 @@
-"""The folder of a run: checked and made ready before it, consistent after it."""
+"""The folder of a run, checked and made ready before the run."""
 
 import itertools
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from stream_dmr.errors import OutputError
 from stream_dmr.recording.files import STEM
 from stream_dmr.recording.segments.recover import Repair, recover
 from stream_dmr.results.provenance import NAME as PROVENANCE
-from stream_dmr.results.store import LengthStore, require_free
-from stream_dmr.results.tables import write_lengths
+from stream_dmr.results.store import require_free
 
 RESULTS = (
     *("lengths.db", "lengths.csv", "frames.csv", "recording.mcap", "recording.rrd"),
@@ -64,34 +61,3 @@ def _set_aside(recording: Path) -> None:
         if not aside.exists():
             recording.rename(aside)
             return
-
-
-@contextmanager
-def consistent_csv(
-    path: Path,
-    store: LengthStore,
-    *,
-    resume: bool,
-    on_refusal: Callable[[str], None] | None = None,
-) -> Iterator[None]:
-    """Begin and end with what the store holds: a crash between the two loses a row of neither.
-
-    With `on_refusal`, that is told what the disk refuses, instead of an exception: the store has
-    the lengths, and the next run writes the table, as it does where the store has trouble itself.
-    """
-
-    def write() -> None:
-        try:
-            if not store.trouble:
-                write_lengths(path, store.estimates())
-        except OutputError as error:
-            if on_refusal is None:
-                raise
-            on_refusal(str(error))
-
-    if resume:
-        write()
-    try:
-        yield
-    finally:
-        write()

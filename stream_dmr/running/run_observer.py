@@ -1,5 +1,7 @@
-"""Who is told how a run goes: its display, its log, its status page."""
+"""The interface by which a run shows how it goes: to a display, a log, a status page."""
 
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +14,7 @@ from stream_dmr.sources.source import Source
 
 @dataclass(frozen=True, kw_only=True)
 class OpenRun:
-    """What there is to see of a run beside its messages."""
+    """What can be observed of a run beside its messages."""
 
     config: Config
     source: Source
@@ -21,36 +23,50 @@ class OpenRun:
 
 
 class RunObserver:
-    """Is told how a run goes, from its threads; this one doesn't listen."""
+    """Is called as a run goes on, from the run's threads. This base class ignores all of it."""
 
-    address: str | None = None  # where it shows the run, once that is open
+    address: str | None = None  # where it shows the run, once `open` has been called
 
     def warn(self, line: str) -> None:
-        """Something the user should know, once each."""
+        """The user should know this; the same line may come again."""
 
     def serving(self, address: str) -> None:
-        """The view can be watched there from now on."""
+        """The view can be watched at `address` from now on."""
 
     def open(self, run: OpenRun) -> None:
-        """The inputs are fine, and there is where the results go; raises a UserError to refuse."""
+        """Inputs and outputs are open; raise a UserError to refuse the run."""
 
     def attach(self, chain: Chain) -> None:
-        """The chain and its counters, before its first frame."""
+        """The chain with its counters is about to take its first frame."""
 
     def close(self) -> None:
         """The run is over, however it ended. Idempotent."""
 
     def begin(self, num_frames: int | None) -> None:
-        """The inputs are fine and the chain starts."""
+        """Measuring starts; `num_frames` is as the source promises, None where it doesn't."""
+
+    def take(self, message: Message) -> None:
+        """A stage has given a message; this is how the next stage gets it."""
 
     def frame_done(self) -> None:
         """A frame has left the last stage."""
 
-    def fish_seen(self, num_fish: int) -> None:
-        """So many fish were seen so far."""
 
-    def fish_finished(self, estimate: LengthEstimate) -> None:
-        """The track of a fish has ended, and its length is in the store."""
+class RunTotals(RunObserver):
+    """Counts frames and keeps the finished fish, for the summary at the end."""
 
-    def take(self, message: Message) -> None:
-        """A message of some stage, as the next one gets it."""
+    def __init__(self, *, max_fish: int | None) -> None:
+        """`max_fish`: only so many of the last fish are kept; None: all."""
+        self.num_frames = 0
+        self._fish: deque[LengthEstimate] = deque(maxlen=max_fish)
+
+    def take(self, message: Message) -> None:  # noqa: D102
+        if isinstance(message, LengthEstimate) and message.is_final:
+            self._fish.append(message)
+
+    def frame_done(self) -> None:  # noqa: D102
+        self.num_frames += 1
+
+    def fish(self) -> Sequence[LengthEstimate]:
+        """The final estimates by track id."""
+        return sorted(self._fish, key=lambda estimate: estimate.track_id)

@@ -6,7 +6,7 @@ import sys
 import time
 from typing import Any
 
-from stream_dmr.messages import LengthEstimate
+from stream_dmr.messages import LengthEstimate, Message
 from stream_dmr.running.run_observer import RunObserver
 
 _SAME_S = 60.0  # the same line once in so long, with how often it came meanwhile
@@ -79,7 +79,11 @@ class Journal(RunObserver):
             self._said_s = now_s
             self._say(logging.INFO, "progress", frames=self._num_frames)
 
-    def fish_finished(self, estimate: LengthEstimate) -> None:  # noqa: D102
+    def take(self, message: Message) -> None:  # noqa: D102
+        if isinstance(message, LengthEstimate) and message.is_final:
+            self._log_fish(message)
+
+    def _log_fish(self, estimate: LengthEstimate) -> None:
         self._say(
             logging.INFO,
             "fish",

@@ -1,6 +1,6 @@
 """Watching a run: its state, the server that shows it, and the watchdog."""
 
-from stream_dmr.messages import LengthEstimate, Message
+from stream_dmr.messages import Message
 from stream_dmr.running.pipeline import Chain
 from stream_dmr.running.run_observer import OpenRun, RunObserver
 from stream_dmr.watch.server import WatchServer
@@ -64,9 +64,3 @@ class Watch(RunObserver):
         if self._state is not None:
             self._state.frame_done()
         self._observer.frame_done()
-
-    def fish_seen(self, num_fish: int) -> None:  # noqa: D102
-        self._observer.fish_seen(num_fish)
-
-    def fish_finished(self, estimate: LengthEstimate) -> None:  # noqa: D102
-        self._observer.fish_finished(estimate)

@@ -41,7 +41,7 @@ from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.rerun.view_geometry import place
 from stream_dmr.recording.segments.segments import open_segments
 from stream_dmr.recording.settings import RecordingSettings
-from stream_dmr.results.tables import Tables
+from stream_dmr.results.frames_table import FramesTable
 from tests.support.reading import read_header, read_messages, read_metadata
 from tests.support.recorded_run import assert_same, header, run, template
 from tests.support.vulkan import needs_vulkan
@@ -209,15 +209,15 @@ def test_two_threads_write_whole_records(tmp_path: Path, messages: list[Message]
 
 
 def test_every_sink_is_closed_where_one_fails(tmp_path: Path, messages: list[Message]):
-    recorder = Recorder(tmp_path, header(), RecordingSettings(), sinks=[Tables(tmp_path)])
+    recorder = Recorder(tmp_path, header(), RecordingSettings(), sinks=[FramesTable(tmp_path)])
     for message in messages:
         recorder.write(message)
     (tmp_path / "recording.mcap").mkdir()  # so that the rename fails
     with pytest.raises(OutputError, match=r"recording\.mcap"):
         recorder.close()
     recorder.close()
-    rows = (tmp_path / "lengths.csv").read_text().splitlines()
-    assert len(rows) == 1 + 2
+    rows = (tmp_path / "frames.csv").read_text().splitlines()
+    assert len(rows) == 1 + len(only(messages, LocalizedFish))
     assert len(payloads(tmp_path / "recording.rrd", "/messages/fit")) == len(
         only(messages, FittedMesh)
     )

@@ -18,7 +18,7 @@ from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.segments.retention import Retention
 from stream_dmr.recording.segments.segments import open_segments
 from stream_dmr.recording.settings import RecordingSettings
-from stream_dmr.results.tables import Tables
+from stream_dmr.results.frames_table import FramesTable
 from tests.recording.test_segments import read_by_others, write_clips
 from tests.support.command import invoke, rows
 from tests.support.reading import read_messages
@@ -54,7 +54,7 @@ def segment_of(message: Message) -> int:
 def recorded(tmp_path_factory: pytest.TempPathFactory, messages: list[Message]) -> Path:
     out = tmp_path_factory.mktemp("recorded")
     files = partial(open_segments, on_notice=pytest.fail)
-    with Recorder(out, header(), SETTINGS, sinks=[Tables(out)], files=files) as recorder:
+    with Recorder(out, header(), SETTINGS, sinks=[FramesTable(out)], files=files) as recorder:
         for message in messages:
             recorder.write(message)
     (out / "lengths.db").write_bytes(b"the lengths")
@@ -169,9 +169,9 @@ def test_recording_goes_on_when_there_is_room_again(disk: Path, messages: list[M
     notices: list[str] = []
     files = partial(open_segments, on_notice=notices.append)
     settings = SETTINGS.model_copy(update={"rrd": False})
-    tables = Tables(disk, is_endless=True)
+    table = FramesTable(disk, is_endless=True)
     recorder = Recorder(
-        disk, header(), settings, sinks=[tables], files=files, on_refusal=notices.append
+        disk, header(), settings, sinks=[table], files=files, on_refusal=notices.append
     )
     frames_csv = disk / "frames.csv"
     with recorder:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish
+from stream_dmr.results.lengths_table import lengths_row
 from stream_dmr.results.store_rows import read_estimates
 from stream_dmr.results.store_schema import open_database
-from stream_dmr.results.tables import lengths_row
 from stream_dmr.running.config import load_config, to_toml
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_folder import RESULTS
@@ -263,27 +263,3 @@ def test_a_run_stopped_at_any_frame_leaves_valid_results(tmp_path: Path, num_fra
     if num_frames:
         assert [fish.track_id for fish in summary.fish] == [1, 2]
         assert all(fish.is_final for fish in summary.fish)
-
-
-def test_of_a_source_without_an_end_only_the_last_fish_stay_in_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """Weeks of fish are in the store, and in the tables; the summary of a run has room for some."""
-    monkeypatch.setattr("stream_dmr.running.measure_source._MOST_LAST_FISH", 1)
-    clip, clips, out = tmp_path / "clip", tmp_path / "clips", tmp_path / "out"
-    write_clip(clip, fish=[[1, 2]] * 6)
-    config = clip / "quick.toml"
-    config.write_text(config.read_text() + "\n[read_frames]\nclips_wait_s = 0.0\n")
-    clips.mkdir()
-    (clip / "video.mp4").rename(clips / "1.mp4")
-    request = RunRequest(
-        source=str(clips),
-        masks=clip / "masks",
-        calibration=clip / "calibration.yaml",
-        template=str(clip / "tiny.ply"),
-        config=config,
-        out=out,
-    )
-    summary = measure_source(request, stop=threading.Event())
-    assert len(summary.fish) == 1
-    assert len((out / "lengths.csv").read_text().splitlines()) == 1 + 2

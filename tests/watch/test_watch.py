@@ -253,7 +253,7 @@ def test_the_log_is_json_and_says_nothing_too_often(
     journal = Journal()
     final = next(m for m in recorded_messages(3) if isinstance(m, LengthEstimate))
     for track_id in (1, 2):
-        journal.fish_finished(replace(final, track_id=track_id, is_final=True))
+        journal.take(replace(final, track_id=track_id, is_final=True))
     for second in range(130):
         now.s = float(second)
         journal.warn("the camera is lost")

@@ -1,0 +1,111 @@
+"""lengths.csv: one row a finished fish, an export of lengths.db."""
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from contextlib import closing, suppress
+from pathlib import Path
+
+from stream_dmr.csv_file import CsvFile
+from stream_dmr.errors import OutputError
+from stream_dmr.files import rename_durably, writing_to
+from stream_dmr.messages import LengthEstimate
+from stream_dmr.results.store import LengthStore
+from stream_dmr.results.table_cells import number, numbers, seconds
+
+LENGTHS_COLUMNS = [
+    *("track_id", "length_mm", "length_std_mm", "ci95_low_mm", "ci95_high_mm"),
+    *("frames_seen", "frames_used", "first_frame", "last_frame", "first_time", "last_time"),
+    "status",
+]
+
+
+class LengthsTable:
+    """lengths.csv of a run, while it goes on.
+
+    It begins (with `resume`) and ends as a whole export of the store, so that no crash loses a row
+    of either; meanwhile each finished fish is appended.
+    """
+
+    def __init__(
+        self,
+        out_dir: Path,
+        store: LengthStore,
+        *,
+        resume: bool = False,
+        on_refusal: Callable[[str], None] | None = None,
+    ) -> None:
+        """Raises OutputError where the disk refuses the table.
+
+        With `on_refusal` that gets the reason instead, here and later: a refused row is tried again
+        with the next one, and the whole table at the end and by the next run.
+        """
+        self._path, self._store, self._on_refusal = out_dir / "lengths.csv", store, on_refusal
+        self._waiting: deque[LengthEstimate] = deque()
+        if resume:
+            self._export()
+        self._rows = CsvFile(
+            self._path, LENGTHS_COLUMNS, resume=resume, retry_open=on_refusal is not None
+        )
+
+    def add(self, estimate: LengthEstimate) -> None:
+        """Append the row of a final estimate."""
+        self._waiting.append(estimate)
+        try:
+            while self._waiting:
+                self._rows.add(lengths_row(self._waiting[0]))
+                self._waiting.popleft()
+        except OutputError as error:
+            self._refuse(error)
+
+    def close(self) -> None:
+        """Write the table anew from the store. Idempotent."""
+        self._rows.close()
+        self._export()
+
+    def _export(self) -> None:
+        if self._store.trouble:  # its file lacks fish; the next run exports them
+            return
+        try:
+            write_lengths(self._path, self._store.estimates())
+        except OutputError as error:
+            self._refuse(error)
+
+    def _refuse(self, error: OutputError) -> None:
+        if self._on_refusal is None:
+            raise error
+        self._on_refusal(str(error))
+
+
+def write_lengths(path: Path, estimates: Iterable[LengthEstimate]) -> None:
+    """Write lengths.csv anew and durably; at any moment the old or the new one is there whole.
+
+    Raises OutputError where the disk refuses it.
+    """
+    draft = path.with_suffix(".csv.part")
+    try:
+        with closing(CsvFile(draft, LENGTHS_COLUMNS)) as table, writing_to(path):
+            for estimate in estimates:
+                table.add(lengths_row(estimate))
+            table.sync()
+            rename_durably(draft, path)
+    except BaseException:
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)
+        raise
+
+
+def lengths_row(estimate: LengthEstimate) -> list[str]:
+    """The cells of a final estimate; times in seconds, exact to the nanosecond."""
+    return [
+        str(estimate.track_id),
+        number(estimate.length_mm),
+        number(estimate.length_std_mm),
+        *numbers(estimate.ci95_mm, 2),
+        str(estimate.frames_seen),
+        str(estimate.frames_used),
+        str(estimate.first_frame),
+        str(estimate.last_frame),
+        seconds(estimate.first_timestamp_ns),
+        seconds(estimate.last_timestamp_ns),
+        estimate.status,
+    ]

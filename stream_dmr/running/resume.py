@@ -1,0 +1,42 @@
+"""Continues a run where an earlier one in the same folder ended or was interrupted."""
+
+from collections.abc import Callable, Sequence
+
+from stream_dmr.errors import RecordingError
+from stream_dmr.messages import LocalizedFish
+from stream_dmr.recording.reading.reader import open_recordings
+from stream_dmr.recording.segments.open_tracks import unfinished
+from stream_dmr.recording.segments.recover import Repair
+from stream_dmr.results.store import LengthStore
+from stream_dmr.sources.source import ResumePoint, Source
+
+
+def resume_source(
+    source: Source, store: LengthStore, *, on_notice: Callable[[str], None]
+) -> dict[str, int] | None:
+    """Let a source begin after what earlier runs measured.
+
+    Returns the frames done of each unfinished clip, None where the source has no clips.
+    """
+    done, frames_done = store.clips_before()
+    after_ns = store.resume_after_ns() if source.is_live else store.before.timestamp_ns
+    source.listen(on_notice)
+    source.resume(
+        ResumePoint(after_ns=after_ns, clips_done=frozenset(done), frames_done=frames_done)
+    )
+    return frames_done if source.has_clips else None
+
+
+def interrupted_tracks(
+    repairs: Sequence[Repair], store: LengthStore, *, on_notice: Callable[[str], None]
+) -> list[LocalizedFish]:
+    """The frames of fish that were in view at a crash, from the recordings repaired after it."""
+    torn = [repair.path for repair in repairs if repair.path.suffix == ".mcap"]
+    if not torn:
+        return []
+    finished = {estimate.track_id for estimate in store.estimates()}
+    try:
+        return list(unfinished(open_recordings(torn), finished=finished))
+    except RecordingError as error:
+        on_notice(f"fish that were in view at the crash can't be finished: {error}")
+        return []
