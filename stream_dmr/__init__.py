@@ -1,5 +1,16 @@
 """Lengths of hooked, bent fish from one calibrated camera.
 
+::
+
+    import stream_dmr as sd
+
+    run = sd.measure("haul.mp4", calibration="calibration.yaml", out="haul")
+    for fish in run.fish:  # typed rows; pandas.DataFrame(run.fish) is a table
+        print(fish.track_id, fish.length_mm, fish.status)
+    for message in sd.open("haul", [sd.LocalizedFish]):  # every stage is recorded
+        print(message.frame_index, message.bending_ratio)
+    again = sd.replay("haul", first="localize", calibration="new.yaml", out="haul-again")
+
 Conventions, valid everywhere in this package:
 
 Camera frame
@@ -23,4 +34,55 @@ Suffixes
     `_mm _px _s _ns _rad`; `num_*` for counts, `is_*` for predicates.
 """
 
-__version__ = "0.1.0"
+import importlib
+from typing import TYPE_CHECKING
+
+from stream_dmr.version import __version__
+
+if TYPE_CHECKING:
+    from stream_dmr.api.functions import RecordedRun, Run, measure, open, replay
+    from stream_dmr.api.table_rows import FishRow, FrameRow
+    from stream_dmr.errors import UserError
+    from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish
+    from stream_dmr.simulation import DEMO_SCENE
+
+__all__ = [
+    "DEMO_SCENE",
+    "FishCrop",
+    "FishRow",
+    "FittedMesh",
+    "Frame",
+    "FrameRow",
+    "LengthEstimate",
+    "LocalizedFish",
+    "RecordedRun",
+    "Run",
+    "UserError",
+    "__version__",
+    "measure",
+    "open",
+    "replay",
+]
+
+_MODULES = {
+    **dict.fromkeys(("RecordedRun", "Run", "measure", "open", "replay"), "api.functions"),
+    **dict.fromkeys(("FishRow", "FrameRow"), "api.table_rows"),
+    **dict.fromkeys(
+        ("FishCrop", "FittedMesh", "Frame", "LengthEstimate", "LocalizedFish"), "messages"
+    ),
+    "UserError": "errors",
+    "DEMO_SCENE": "simulation",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Import what is asked for when it is asked for (PEP 562): the import alone stays cheap."""
+    if name not in _MODULES:
+        raise AttributeError(f"module 'stream_dmr' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"stream_dmr.{_MODULES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

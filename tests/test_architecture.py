@@ -24,7 +24,9 @@ NODES = [CropFish, FitMesh, Localize, SmoothLength]
 # From the top down, as in the design: a module belongs to the room with the longest name that it
 # begins with, and imports from its own room and those below.
 ROOMS = [
+    "stream_dmr",  # the names that `import stream_dmr` offers
     "stream_dmr.cli",
+    "stream_dmr.api",
     "stream_dmr.review",
     "stream_dmr.report",
     "stream_dmr.batch",
@@ -86,7 +88,7 @@ ROOMS = [
     "stream_dmr.geometry",
     "stream_dmr.settings",
     "stream_dmr.errors",
-    "stream_dmr",
+    "stream_dmr.version",
 ]
 WITHOUT_MODULES = ["stream_dmr.recording", "stream_dmr.fitting", "stream_dmr.segmentation"]
 WHO_KNOWS = {

@@ -9,8 +9,8 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from stream_dmr import __version__
 from stream_dmr.errors import UserError
+from stream_dmr.version import __version__
 
 COLUMNS = ("video", "calibration", "boxes", "masks", "vessel", "trip", "haul")
 _FILES = COLUMNS[:4]

@@ -9,7 +9,6 @@ from typing import Annotated
 
 import typer
 
-from stream_dmr import __version__
 from stream_dmr.cli.batch import batch
 from stream_dmr.cli.calibrate import calibrate
 from stream_dmr.cli.demo import demo
@@ -23,6 +22,7 @@ from stream_dmr.cli.run import run
 from stream_dmr.cli.train import train
 from stream_dmr.cli.view import convert, view
 from stream_dmr.errors import UserError
+from stream_dmr.version import __version__
 
 app = typer.Typer(
     name="stream-dmr",

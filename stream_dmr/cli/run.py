@@ -1,6 +1,5 @@
 """`stream-dmr run`: the main job."""
 
-import re
 import signal
 import sys
 from contextlib import nullcontext
@@ -14,8 +13,8 @@ from stream_dmr.cli.support import (
     TemplateOption,
     command_line,
     stop_on_signals,
-    without_password,
 )
+from stream_dmr.running.run_request import RunRequest, default_out
 
 if TYPE_CHECKING:
     from stream_dmr.running.measure_source import RunSummary
@@ -74,7 +73,6 @@ def run(
     with stop_on_signals() as stop:
         from stream_dmr.cli.display import RunDisplay
         from stream_dmr.running.measure_source import measure_source
-        from stream_dmr.running.run_request import RunRequest
         from stream_dmr.watch.journal import Journal
         from stream_dmr.watch.watch import Watch
 
@@ -111,13 +109,3 @@ def _print_summary(summary: "RunSummary", out: Path, *, timings: bool) -> None:
     rate = summary.num_frames / summary.elapsed_s
     print(f"{summary.num_frames} frames in {summary.elapsed_s:.1f} s, {rate:.1f} frames/s")
     print(f"results in {out}: {', '.join(path.name for path in summary.files)}")
-
-
-def default_out(source: str) -> Path:
-    """runs/ and the name of the source, made fit for a folder's name."""
-    if source.isdecimal() and not Path(source).exists():
-        return Path("runs") / f"camera-{source}"
-    if "://" in source:
-        address = without_password(source).split("://", 1)[1]
-        return Path("runs") / re.sub(r"[^A-Za-z0-9._-]+", "-", address).strip("-")
-    return Path("runs") / Path(source).resolve().stem

@@ -1,6 +1,5 @@
 """What several commands need: the command as typed, and signals that end a run gently."""
 
-import re
 import shlex
 import signal
 import sys
@@ -12,6 +11,8 @@ from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from stream_dmr.running.run_request import without_password
 
 if TYPE_CHECKING:
     from stream_dmr.recording.messages.selection import Part
@@ -32,11 +33,6 @@ TimeOption = Annotated[
 TrackOption = Annotated[
     list[int] | None, typer.Option("--track", help="Only this fish; may be repeated.")
 ]
-
-
-def without_password(text: str) -> str:
-    """An address without the password in it."""
-    return re.sub(r"(?<=://)[^/\s]*@", "", text)
 
 
 def command_line() -> str:

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from stream_dmr import __version__
 from stream_dmr.camera import crop_from_frame
 from stream_dmr.report.album import Album, Shot
 from stream_dmr.report.gather import FrameRow, Track
 from stream_dmr.report.gathered import Report
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.fish_table import fish_record
+from stream_dmr.version import __version__
 
 _PER_RUN = ("source", "command")  # of the facts; the rest stand in the exports too
 _CODE = ("table.js", "plots.js", "detail.js", "review.js", "page.js")

@@ -9,13 +9,13 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from stream_dmr import __version__
 from stream_dmr.errors import OutputError
 from stream_dmr.files import rename_durably, sha256_of, writing_to
 from stream_dmr.results.finished_fish import database_of, fish_by_run, read_runs
 from stream_dmr.results.store import NAME as DATABASE
 from stream_dmr.results.store import RunFacts
 from stream_dmr.results.verdicts import Verdict, read_verdicts
+from stream_dmr.version import __version__
 
 NAME = "provenance.json"
 

@@ -2,9 +2,9 @@
 
 from hashlib import sha256
 
-from stream_dmr import __version__
 from stream_dmr.recording.messages.header import RunHeader
 from stream_dmr.results.store import RunFacts
+from stream_dmr.version import __version__
 
 
 def run_facts(header: RunHeader, *, vessel: str = "", trip: str = "", haul: str = "") -> RunFacts:

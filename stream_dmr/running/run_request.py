@@ -1,6 +1,8 @@
 """What a user asks of a run."""
 
-from dataclasses import dataclass
+import re
+import shlex
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 
@@ -22,3 +24,28 @@ class RunRequest:
     vessel: str = ""  # where the fish come from, for the exports
     trip: str = ""
     haul: str = ""
+
+
+def default_out(source: str) -> Path:
+    """runs/ and the name of the source, made fit for a folder's name."""
+    if source.isdecimal() and not Path(source).exists():
+        return Path("runs") / f"camera-{source}"
+    if "://" in source:
+        address = without_password(source).split("://", 1)[1]
+        return Path("runs") / re.sub(r"[^A-Za-z0-9._-]+", "-", address).strip("-")
+    return Path("runs") / Path(source).resolve().stem
+
+
+def without_password(text: str) -> str:
+    """An address without the password in it."""
+    return re.sub(r"(?<=://)[^/\s]*@", "", text)
+
+
+def command_of(request: RunRequest) -> RunRequest:
+    """The request with the command that would do the same."""
+    arguments = ["stream-dmr", "run"]
+    for field in fields(request):
+        value = getattr(request, field.name)
+        if value != field.default:
+            arguments += [f"--{field.name}"] if value is True else [f"--{field.name}", str(value)]
+    return replace(request, command=without_password(shlex.join(arguments)))

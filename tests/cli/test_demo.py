@@ -19,6 +19,7 @@ def test_a_fish_without_a_length_is_noticed(
     assert "800.0" in capsys.readouterr().out
 
 
+@pytest.mark.slow  # `make demo` is part of CI
 def test_demo_measures_the_embedded_scene_from_its_video_again_and_again(tmp_path: Path):
     out = tmp_path / "out"
     out.mkdir()

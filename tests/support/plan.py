@@ -31,7 +31,9 @@ class Plan(NamedTuple):
 
 def room_name(module: str) -> str:
     """The package that a module lies in; the modules beside the packages are one room."""
-    first = module.removeprefix("stream_dmr").removeprefix(".").partition(".")[0]
+    if module == "stream_dmr":
+        return module
+    first = module.removeprefix("stream_dmr.").partition(".")[0]
     return first if first and (PACKAGE / first).is_dir() else _GROUND
 
 
@@ -106,7 +108,7 @@ def _description(room: str) -> str:
     if room == _GROUND:
         loose = [file.stem for file in sorted(PACKAGE.glob("*.py")) if file.stem != "__init__"]
         return ", ".join(loose)
-    file = PACKAGE / room / "__init__.py"
+    file = PACKAGE / ("" if room == "stream_dmr" else room) / "__init__.py"
     text = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8")))
     assert text, f"{file}: expected a docstring, got none; say in one line what the room does"
     return text.splitlines()[0].rstrip(".").replace("`", "")

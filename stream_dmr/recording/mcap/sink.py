@@ -18,7 +18,6 @@ from mcap.records import DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
-from stream_dmr import __version__
 from stream_dmr.errors import OutputError
 from stream_dmr.files import TransactionalFile, rename_durably, sync_path
 from stream_dmr.messages import Frame, LocalizedFish
@@ -26,6 +25,7 @@ from stream_dmr.recording.messages.header import RunHeader
 from stream_dmr.recording.messages.record import Record
 from stream_dmr.recording.messages.schema import schema_bytes
 from stream_dmr.recording.messages.topics import CARRIED, RUN, SEGMENT, SPANS, TOPICS
+from stream_dmr.version import __version__
 
 PART = ".part"  # after the name of a file that is not closed yet
 _CHUNK_BYTES = 256 * 1024

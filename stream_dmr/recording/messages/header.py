@@ -8,12 +8,12 @@ from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from stream_dmr import __version__
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import RecordingError
 from stream_dmr.recording.messages.codec import CODEC_VERSION, decode, encode
 from stream_dmr.recording.messages.run_inputs import RunInputs
 from stream_dmr.template.template import Template
+from stream_dmr.version import __version__
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "torch", "scipy", "numba", "mcap", "rerun-sdk")
 

@@ -7,11 +7,11 @@ from pathlib import Path
 from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.records import Message as McapMessage
 
-from stream_dmr import __version__
 from stream_dmr.files import TransactionalFile
 from stream_dmr.recording.mcap.file import whole_records
 from stream_dmr.recording.mcap.sink import new_writer
 from stream_dmr.recording.messages.topics import RUN
+from stream_dmr.version import __version__
 
 REWRITTEN = ".rewritten"  # after the name of a file in work
 Edit = Callable[[str, bytes], bytes | None]

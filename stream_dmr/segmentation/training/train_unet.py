@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from stream_dmr import __version__
 from stream_dmr.errors import ModelError, OutputError
 from stream_dmr.segmentation.network.unet_weights import SHIPPED, load_weights
 from stream_dmr.segmentation.training.annotated_samples import Cut, draw_own, load_own_fish
@@ -21,6 +20,7 @@ from stream_dmr.segmentation.training.train_settings import TrainSettings
 from stream_dmr.segmentation.training.training_plots import draw_curve, draw_worst
 from stream_dmr.segmentation.training.training_sample import Sample
 from stream_dmr.segmentation.training.unet_trainer import Scores, Training
+from stream_dmr.version import __version__
 
 _UNSEEN = 10  # times smaller than the bank to learn from is the one to check on
 

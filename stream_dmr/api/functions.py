@@ -1,0 +1,215 @@
+"""What `import stream_dmr` offers: measure a source, replay a recording, read either."""
+
+import logging
+import threading
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import Literal, get_args
+
+from stream_dmr.api.table_rows import FishRow, FrameRow, read_rows
+from stream_dmr.camera import Calibration
+from stream_dmr.csv_file import rotated_files
+from stream_dmr.messages import Message
+from stream_dmr.recording.messages.selection import Part
+from stream_dmr.recording.reading.reader import messages, open_recordings
+from stream_dmr.replaying.replay import ReplayRequest
+from stream_dmr.replaying.replay import replay as replay_recordings
+from stream_dmr.running.measure_source import measure_source
+from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.running.run_request import RunRequest, command_of, default_out
+from stream_dmr.template.template import Template
+from stream_dmr.watch.watch import Watch
+
+Location = str | PathLike[str]
+Stage = Literal["crop", "fit", "localize", "smooth"]
+
+
+@dataclass(frozen=True)
+class Run:
+    """The results in a folder, of `measure`, `replay` or `stream-dmr run`. Tables are read once."""
+
+    out: Path
+
+    def __init__(self, out: Location) -> None:
+        """Opens the folder; what is missing in it is said where it is asked for."""
+        object.__setattr__(self, "out", Path(out))
+
+    @cached_property
+    def fish(self) -> list[FishRow]:
+        """Every finished fish, as in lengths.csv. UserError where that can't be read."""
+        return read_rows(self.out / "lengths.csv", FishRow)
+
+    @cached_property
+    def frames(self) -> list[FrameRow]:
+        """Every fish in every frame, as in frames.csv. UserError where that can't be read."""
+        path = self.out / "frames.csv"
+        return [row for table in (*rotated_files(path), path) for row in read_rows(table, FrameRow)]
+
+    def messages(
+        self, kinds: Collection[type[Message]] | None = None, *, tracks: Collection[int] = ()
+    ) -> Iterator[Message]:
+        """The recorded messages, as `open` gives them."""
+        return iter(open(self.out, kinds, tracks=tracks))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedRun:
+    """A recording: iterate over it for its messages, as often as you like."""
+
+    paths: Sequence[Path]
+    kinds: Collection[type[Message]]
+    part: Part
+    calibration: Calibration | None  # None: there are no millimetres
+    template: Template
+    config_toml: str  # every setting of the run
+
+    def __iter__(self) -> Iterator[Message]:
+        """The messages of each kind in the order in which they were made.
+
+        A frame recorded by reference has an image of shape (0, 0, 3). RecordingError where the
+        recording is damaged; what a crash cut off is logged as a warning, and the rest read.
+        """
+        recording = open_recordings(self.paths)
+        for message, _ in messages(recording, self.kinds, self.part):
+            yield message
+        for line in recording.warnings:
+            _LOGGER.warning(line)
+
+
+def measure(
+    source: Location | int,
+    *,
+    out: Location | None = None,
+    calibration: Location | None = None,
+    boxes: Location | None = None,
+    masks: Location | None = None,
+    template: Location = RunRequest.template,
+    config: Location | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    live: bool = False,
+    vessel: str = "",
+    trip: str = "",
+    haul: str = "",
+    observer: RunObserver | None = None,
+    stop: threading.Event | None = None,
+) -> Run:
+    """Measure the fish of a video, a folder of pictures, an address or a camera, as `run` does.
+
+    `out` is runs/ and the source's name by default. Without `calibration` there are shapes and
+    pixels, no millimetres. Setting `stop` ends the run early, with what was measured so far.
+    Warnings are logged (logger "stream_dmr"), or told to `observer`. Raises a UserError, in one
+    line, where an input is wrong.
+    """
+    request = RunRequest(
+        source=str(source),
+        out=default_out(str(source)) if out is None else Path(out),
+        calibration=_path(calibration),
+        boxes=_path(boxes),
+        masks=_path(masks),
+        template=str(template),
+        config=_path(config),
+        overwrite=overwrite,
+        resume=resume,
+        live=live,
+        vessel=vessel,
+        trip=trip,
+        haul=haul,
+    )
+    measure_source(
+        command_of(request),
+        stop=stop or threading.Event(),
+        observer=Watch(observer or LoggingObserver()),
+    )
+    return Run(request.out)
+
+
+def replay(
+    recordings: Location | Sequence[Location],
+    *,
+    out: Location,
+    first: Stage = "fit",
+    calibration: Location | None = None,
+    template: Location | None = None,
+    config: Location | None = None,
+    tracks: Collection[int] = (),
+    time_s: tuple[float, float] | None = None,
+    overwrite: bool = False,
+    observer: RunObserver | None = None,
+    stop: threading.Event | None = None,
+) -> Run:
+    """Compute a recording anew from the stage `first` on, as `stream-dmr replay` does.
+
+    `recordings`: files, folders of runs or of segments, in order. What is None is as it was
+    recorded; `tracks` and `time_s` (from, to, capture time) take a part of it. Raises a UserError
+    where an input is wrong.
+    """
+    request = ReplayRequest(
+        recordings=_paths(recordings),
+        first=first,
+        config=_path(config),
+        calibration=_path(calibration),
+        template=None if template is None else str(template),
+        part=Part.of_seconds(time_s, frozenset(tracks) or None),
+        out=Path(out),
+        overwrite=overwrite,
+    )
+    replay_recordings(
+        request, stop=stop or threading.Event(), observer=observer or LoggingObserver()
+    )
+    return Run(out)
+
+
+def open(
+    recordings: Location | Sequence[Location],
+    kinds: Collection[type[Message]] | None = None,
+    *,
+    tracks: Collection[int] = (),
+    time_s: tuple[float, float] | None = None,
+) -> RecordedRun:
+    """Open a recording (.mcap, .rrd), the folder of a run, or several in order, for iteration.
+
+    `kinds`: only these messages, such as [LengthEstimate]; `tracks`, `time_s`: only these fish and
+    this capture time (from, to). RecordingError where it can't be read.
+    """
+    paths = _paths(recordings)
+    header = open_recordings(paths).header
+    return RecordedRun(
+        paths=paths,
+        kinds=get_args(Message) if kinds is None else kinds,
+        part=Part.of_seconds(time_s, frozenset(tracks) or None),
+        calibration=header.calibration,
+        template=header.template,
+        config_toml=header.config_toml,
+    )
+
+
+_LOGGER = logging.getLogger("stream_dmr")
+
+
+class LoggingObserver(RunObserver):
+    """Logs the warnings of a run, each once."""
+
+    def __init__(self) -> None:
+        """Has logged nothing yet."""
+        self._logged: set[str] = set()
+
+    def warn(self, line: str) -> None:  # noqa: D102
+        if line not in self._logged:
+            self._logged.add(line)
+            _LOGGER.warning(line)
+
+    def serving(self, address: str) -> None:  # noqa: D102
+        _LOGGER.info("watch it with: %s", address)
+
+
+def _path(location: Location | None) -> Path | None:
+    return None if location is None else Path(location)
+
+
+def _paths(locations: Location | Sequence[Location]) -> list[Path]:
+    several = [locations] if isinstance(locations, str | PathLike) else locations
+    return [Path(location) for location in several]
