@@ -12,7 +12,8 @@ import pytest
 
 import stream_dmr as sd
 from stream_dmr.api.table_rows import read_rows
-from stream_dmr.results.tables import FRAMES_COLUMNS, LENGTHS_COLUMNS
+from stream_dmr.results.frames_table import FRAMES_COLUMNS
+from stream_dmr.results.lengths_table import LENGTHS_COLUMNS
 from stream_dmr.running.run_request import RunRequest, command_of
 from tests.support.command import invoke, rows
 from tests.support.fish_run import FISH
