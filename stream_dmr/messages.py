@@ -17,22 +17,26 @@ from jaxtyping import Bool, Float, Int, UInt8
 from stream_dmr.camera import Camera
 
 
-def _freeze(message: object) -> None:
-    """Make the arrays and mappings of a frozen dataclass read-only."""
-    for field in fields(message):  # type: ignore[arg-type]
-        value = getattr(message, field.name)
-        if isinstance(value, np.ndarray) and value.flags.writeable:
-            value = value.view()
-            value.flags.writeable = False
-        elif isinstance(value, dict):
-            value = MappingProxyType(dict(value))
-        else:
-            continue
-        object.__setattr__(message, field.name, value)
+class _ReadOnly:
+    """A frozen dataclass whose arrays and mappings are read-only as well."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        for field in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray) and value.flags.writeable:
+                value = value.view()
+                value.flags.writeable = False
+            elif isinstance(value, dict):
+                value = MappingProxyType(dict(value))
+            else:
+                continue
+            object.__setattr__(self, field.name, value)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Frame:
+class Frame(_ReadOnly):
     """One picture of the source."""
 
     frame_index: int
@@ -40,8 +44,14 @@ class Frame:
     image: UInt8[np.ndarray, "H W 3"]  # BGR
     source: str  # file name or address, for people
 
-    def __post_init__(self) -> None:
-        _freeze(self)
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FishMessage(_ReadOnly):
+    """What each message of one fish in one frame begins with."""
+
+    frame_index: int
+    timestamp_ns: int  # capture time
+    track_id: int
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -58,24 +68,18 @@ class CropQuality:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class FishEnds:
+class FishEnds(_ReadOnly):
     """Where a segmenter sees the snout and the fork of the tail, and how sure it is."""
 
     head_px: Float[np.ndarray, "2"]  # crop pixels
     tail_px: Float[np.ndarray, "2"]
     confidence: float  # probability that they are not the other way round, 0.5 to 1
 
-    def __post_init__(self) -> None:
-        _freeze(self)
-
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class FishCrop:
+class FishCrop(FishMessage):
     """One fish cut out of one frame, through an ideal pinhole camera of its own."""
 
-    frame_index: int
-    timestamp_ns: int
-    track_id: int
     bbox_xyxy_px: Float[np.ndarray, "4"]  # half-open, frame pixels
     image: UInt8[np.ndarray, "S S 3"] | None  # BGR, lens distortion removed; None: not recorded
     mask: Bool[np.ndarray, "S S"]  # all False where nothing was segmented
@@ -83,9 +87,6 @@ class FishCrop:
     frame_camera: Camera  # with crop_camera it gives the exact crop-to-frame pixel map
     quality: CropQuality
     ends: FishEnds | None = None  # None where nobody looked for them
-
-    def __post_init__(self) -> None:
-        _freeze(self)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -114,7 +115,7 @@ class SolverReport:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class FittedShape:
+class FittedShape(_ReadOnly):
     """The deformed template in the orientation of the camera, at a relative scale.
 
     The camera stands in the origin, so the coordinates project through the crop's K as they are;
@@ -131,33 +132,24 @@ class FittedShape:
     covariance: Float[np.ndarray, "P P"] | None  # of `parameters`; None: not asked for
     length_std_ratio: float  # std of the arc length, as a fraction of it
 
-    def __post_init__(self) -> None:
-        _freeze(self)
-
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class FittedMesh:
+class FittedMesh(FishMessage):
     """The fit of one crop, or why there is none."""
 
-    frame_index: int
-    timestamp_ns: int
-    track_id: int
     shape: FittedShape | None  # None where `refusal` says why
     report: SolverReport | None  # None where no solver ran
     quality: CropQuality
-    refusal: str  # "" when fitted
+    refusal: str  # "" when fitted, else a Reason
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class LocalizedFish:
+class LocalizedFish(FishMessage):
     """One fish of one frame in millimetres, accepted or refused with its reason.
 
     Without a calibration the millimetres are None and the pixels and the bending ratio remain.
     """
 
-    frame_index: int
-    timestamp_ns: int
-    track_id: int
     keypoints_px: Float[np.ndarray, "3 2"] | None  # head, center, tail
     keypoints_mm: Float[np.ndarray, "3 3"] | None  # the same in the camera frame
     midline_mm: Float[np.ndarray, "M 3"] | None
@@ -166,39 +158,33 @@ class LocalizedFish:
     length_std_mm: float | None
     iou: float | None
     accepted: bool  # may this frame count towards the fish's length?
-    reason: str  # "" when accepted, else why not
-
-    def __post_init__(self) -> None:
-        _freeze(self)
+    reason: str  # "" when accepted, else a Reason
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class LengthEstimate:
-    """What is known of one fish's length so far; `is_final` once its track has ended."""
+class LengthEstimate(FishMessage):
+    """What is known of one fish's length so far; `is_final` once its track has ended.
 
-    frame_index: int  # of the LocalizedFish that this estimate follows
-    timestamp_ns: int
-    track_id: int
+    Frame and time are those of the LocalizedFish that it follows.
+    """
+
     is_frame_used: bool  # did that frame pass every gate, the filter's own included?
-    frame_reason: str  # "" when used, else why not
+    frame_reason: str  # "" when used, else a Reason
     length_mm: float | None  # None until there are enough good frames
     length_std_mm: float | None
     ci95_mm: Float[np.ndarray, "2"] | None  # low, high
     frames_seen: int
     frames_used: int
-    refused: Mapping[str, int]  # reason -> number of frames
+    refused: Mapping[str, int]  # Reason -> number of frames
     first_frame: int
     last_frame: int
     first_timestamp_ns: int
     last_timestamp_ns: int
-    status: str  # "measured" | "measuring" | why there is no length
+    status: str  # "measured", "measuring", or a Reason why there is no length
     is_final: bool
     smoothed_frames: Int[np.ndarray, "N"]  # frame indices of the RTS series, empty until final
     smoothed_mm: Float[np.ndarray, "N"]
     smoothed_std_mm: Float[np.ndarray, "N"]
-
-    def __post_init__(self) -> None:
-        _freeze(self)
 
 
 Message = Frame | FishCrop | FittedMesh | LocalizedFish | LengthEstimate

@@ -84,6 +84,7 @@ ROOMS = [
     "stream_dmr.files",
     "stream_dmr.compiled",
     "stream_dmr.messages",
+    "stream_dmr.reasons",
     "stream_dmr.camera",
     "stream_dmr.geometry",
     "stream_dmr.settings",

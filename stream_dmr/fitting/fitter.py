@@ -22,6 +22,7 @@ from stream_dmr.fitting.target import Target
 from stream_dmr.fitting.uncertainty import covariance, length_std_ratio
 from stream_dmr.fitting.warm_start import recentered
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms, SolverReport
+from stream_dmr.reasons import Reason
 from stream_dmr.template.template import Template
 
 # Without a calibration, fish are taken to hang square to the camera.
@@ -81,7 +82,7 @@ class Fitter:
         """
         refusal = self._refusal(crop)
         if refusal:
-            return Fit(_message(crop, None, None, refusal), None)
+            return Fit(_message(crop, refusal=refusal), None)
         began = time.perf_counter_ns()
         target = self.target(crop)
         solution, is_cold = self._solve(target, warm)
@@ -101,10 +102,10 @@ class Fitter:
         if _is_finite(solution) and self._settings.scans_sizes:
             sized, size_std = self._scanner.expected(target, solution)
         if not _is_finite(sized):
-            return Fit(_message(crop, None, None, "fit diverged"), None)
+            return Fit(_message(crop, refusal=Reason.FIT_DIVERGED), None)
         shape = self._shape(target, sized, crop, size_std)
         report = self._report(solution, is_cold=is_cold, since_ns=since_ns)
-        return Fit(_message(crop, shape, report, ""), solution.parameters)
+        return Fit(_message(crop, shape, report), solution.parameters)
 
     def _report(self, solution: Solution, *, is_cold: bool, since_ns: int) -> SolverReport:
         return SolverReport(
@@ -117,13 +118,13 @@ class Fitter:
             elapsed_ns=time.perf_counter_ns() - since_ns,
         )
 
-    def _refusal(self, crop: FishCrop) -> str:
+    def _refusal(self, crop: FishCrop) -> Reason | None:
         area = int(crop.mask.sum())
         if area == 0:
-            return "no mask"
+            return Reason.NO_MASK
         if crop.mask.all():
-            return "mask fills the crop"  # it has no edge to fit to
-        return "mask too small" if area < self._settings.min_mask_px else ""
+            return Reason.MASK_FILLS_CROP
+        return Reason.MASK_TOO_SMALL if area < self._settings.min_mask_px else None
 
     def _solve(self, target: Target, warm: Float[np.ndarray, "P"] | None) -> tuple[Solution, bool]:
         """The warm fit if it is good, else a cold one where that is clearly better.
@@ -178,7 +179,11 @@ def _is_finite(solution: Solution) -> bool:
 
 
 def _message(
-    crop: FishCrop, shape: FittedShape | None, report: SolverReport | None, refusal: str
+    crop: FishCrop,
+    shape: FittedShape | None = None,
+    report: SolverReport | None = None,
+    *,
+    refusal: Reason | None = None,
 ) -> FittedMesh:
     return FittedMesh(
         frame_index=crop.frame_index,
@@ -187,5 +192,5 @@ def _message(
         shape=shape,
         report=report,
         quality=crop.quality,
-        refusal=refusal,
+        refusal=refusal or "",
     )

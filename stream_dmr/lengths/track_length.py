@@ -17,16 +17,8 @@ from stream_dmr.lengths.kalman import (
     SmoothLengthSettings,
     run_filter,
 )
-from stream_dmr.localization.localize import NO_CALIBRATION
 from stream_dmr.messages import LengthEstimate, LocalizedFish
-
-OUTLIER = "outlier"
-LONG_ENOUGH = "measured long enough"
-TRACK_ENDED = "track has ended"
-
-MEASURED = "measured"
-UNCERTAIN = "too uncertain"  # its frames contradict each other, or none of them knows
-MEASURING = "measuring"
+from stream_dmr.reasons import MEASURED, MEASURING, Reason, with_counts
 
 _STD_PER_CI95 = NormalDist().inv_cdf(0.975)  # 1.96
 
@@ -71,7 +63,7 @@ class TrackLength:
         self._seen += 1
         self._refusal = fish.reason
         if fish.accepted and len(self._measurements) >= self._settings.max_frames:
-            self._refusal = LONG_ENOUGH
+            self._refusal = Reason.LONG_ENOUGH
         if self._refusal:
             self._refused[self._refusal] += 1
         else:
@@ -101,8 +93,8 @@ class TrackLength:
 
     def _estimate(self, *, is_final: bool) -> LengthEstimate:
         used = self._filter.frames if self._filter else []
-        outliers = Counter({OUTLIER: len(self._measurements) - len(used)})
-        reason = self._refusal or ("" if used[-1:] == [self._last.frame_index] else OUTLIER)
+        outliers = Counter({Reason.OUTLIER: len(self._measurements) - len(used)})
+        reason = self._refusal or ("" if used[-1:] == [self._last.frame_index] else Reason.OUTLIER)
         length_mm, std_mm, ci95_mm = self._result(len(used))
         smoothed_mm, smoothed_std_mm = self._smoothed() if is_final else (np.zeros(0),) * 2
         return LengthEstimate(
@@ -156,15 +148,15 @@ class TrackLength:
         return np.sqrt(variance * self._filter.design_effect + shared)
 
     def _status(self, num_used: int, *, is_measured: bool, is_final: bool) -> str:
-        if NO_CALIBRATION in self._refused:
-            return NO_CALIBRATION
+        if Reason.NO_CALIBRATION in self._refused:
+            return Reason.NO_CALIBRATION
         if not is_final:
             return MEASURING
         if is_measured:
             return MEASURED
         if num_used >= self._settings.min_frames:
-            return UNCERTAIN
-        return f"too few good frames ({num_used} of {self._settings.min_frames})"
+            return Reason.TOO_UNCERTAIN
+        return with_counts(Reason.TOO_FEW_FRAMES, num_used, self._settings.min_frames)
 
 
 def late_estimate(fish: LocalizedFish) -> LengthEstimate:
@@ -174,18 +166,18 @@ def late_estimate(fish: LocalizedFish) -> LengthEstimate:
         timestamp_ns=fish.timestamp_ns,
         track_id=fish.track_id,
         is_frame_used=False,
-        frame_reason=TRACK_ENDED,
+        frame_reason=Reason.TRACK_ENDED,
         length_mm=None,
         length_std_mm=None,
         ci95_mm=None,
         frames_seen=1,
         frames_used=0,
-        refused={TRACK_ENDED: 1},
+        refused={Reason.TRACK_ENDED: 1},
         first_frame=fish.frame_index,
         last_frame=fish.frame_index,
         first_timestamp_ns=fish.timestamp_ns,
         last_timestamp_ns=fish.timestamp_ns,
-        status=TRACK_ENDED,
+        status=Reason.TRACK_ENDED,
         is_final=False,
         smoothed_frames=np.zeros(0, dtype=np.int64),
         smoothed_mm=np.zeros(0),

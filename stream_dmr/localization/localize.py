@@ -14,19 +14,8 @@ from pydantic import Field
 from stream_dmr.camera import Calibration, ReferencePlane
 from stream_dmr.geometry import bending_ratio
 from stream_dmr.messages import CropQuality, FittedMesh, FittedShape, LocalizedFish
+from stream_dmr.reasons import Reason
 from stream_dmr.settings import Settings
-
-NO_CALIBRATION = "no calibration"
-TOUCHES_BORDER = "touches border"
-MOSTLY_HIDDEN = "mostly hidden"
-POOR_FIT = "poor fit"
-UNSURE_MASK = "unsure mask"
-UNCERTAIN = "uncertain"
-TURNED_AWAY = "turned away"
-PLANE_BEHIND = "plane behind camera"  # or parallel to the center's ray
-KEYPOINTS_COINCIDE = "keypoints coincide"
-END_ON = "seen end-on"  # head or tail points straight at the camera or away from it
-KEYPOINTS_DISAGREE = "keypoints disagree"  # the lines of eq. (8) and (12) meet on the wrong side
 
 _MIN_ANGLE_RAD = 1e-3  # between two lines, for their intersection to mean anything
 
@@ -73,7 +62,11 @@ class LocalizeSettings(Settings):
 
 
 class Unlocatable(Exception):
-    """This shape has no place in millimetres; the message is the short reason why."""
+    """This shape has no place in millimetres, for this reason."""
+
+    def __init__(self, reason: Reason) -> None:
+        super().__init__(reason)
+        self.reason = reason
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -95,7 +88,7 @@ def center_on_plane(ray: Float[np.ndarray, "3"], plane: ReferencePlane) -> Float
     with np.errstate(divide="ignore"):
         depth_mm = float(plane.depth_mm(ray[None])[0])
     if not (np.isfinite(depth_mm) and depth_mm > 0):
-        raise Unlocatable(PLANE_BEHIND)
+        raise Unlocatable(Reason.PLANE_BEHIND_CAMERA)
     return depth_mm * ray
 
 
@@ -113,14 +106,14 @@ def intersect(
     """
     size = np.linalg.norm(direction)
     if size == 0:
-        raise Unlocatable(KEYPOINTS_COINCIDE)
+        raise Unlocatable(Reason.KEYPOINTS_COINCIDE)
     along_ray, along_body = ray / np.linalg.norm(ray), direction / size
     if np.linalg.norm(np.cross(along_ray, along_body)) < np.sin(_MIN_ANGLE_RAD):
-        raise Unlocatable(END_ON)
+        raise Unlocatable(Reason.SEEN_END_ON)
     # m * along_ray - a * along_body = C', three equations for two unknowns
     m, a = np.linalg.lstsq(np.column_stack([along_ray, -along_body]), center_mm, rcond=None)[0]
     if m <= 0 or a <= 0:
-        raise Unlocatable(KEYPOINTS_DISAGREE)
+        raise Unlocatable(Reason.KEYPOINTS_DISAGREE)
     return (m * along_ray + center_mm + a * along_body) / 2
 
 
@@ -162,10 +155,10 @@ def locate(shape: FittedShape, calibration: Calibration, settings: LocalizeSetti
     """
     numbers = (shape.keypoints, shape.keypoints_px, shape.midline)
     if not all(np.isfinite(array).all() for array in numbers):
-        raise Unlocatable(POOR_FIT)
+        raise Unlocatable(Reason.POOR_FIT)
     ratio = bend(shape)
     if ratio is None:
-        raise Unlocatable(KEYPOINTS_COINCIDE)
+        raise Unlocatable(Reason.KEYPOINTS_COINCIDE)
     keypoints_mm = locate_keypoints(shape.keypoints, shape.keypoints_px, calibration)
     chord_mm = float(np.linalg.norm(keypoints_mm[0] - keypoints_mm[2]))
     length_mm = chord_mm * ratio if settings.bending else chord_mm
@@ -214,18 +207,20 @@ def slant(keypoints_mm: Float[np.ndarray, "3 3"]) -> float:
     return float(np.arcsin(min(along / np.linalg.norm(head - tail) / np.linalg.norm(center), 1.0)))
 
 
-def quality_refusal(shape: FittedShape, quality: CropQuality, settings: LocalizeSettings) -> str:
-    """Name the first gate that a frame fails, a short fixed reason; "" where it passes all."""
+def quality_refusal(
+    shape: FittedShape, quality: CropQuality, settings: LocalizeSettings
+) -> Reason | None:
+    """The first gate that a frame fails; None where it passes all."""
     # "not >=" rather than "<", so that NaN fails
     checks = {
-        TOUCHES_BORDER: settings.refuse_border and quality.touches_border,
-        MOSTLY_HIDDEN: not quality.visible_fraction >= settings.min_visible_fraction,
-        UNSURE_MASK: quality.mask_confidence is not None
+        Reason.TOUCHES_BORDER: settings.refuse_border and quality.touches_border,
+        Reason.MOSTLY_HIDDEN: not quality.visible_fraction >= settings.min_visible_fraction,
+        Reason.UNSURE_MASK: quality.mask_confidence is not None
         and not quality.mask_confidence >= settings.min_mask_confidence,
-        POOR_FIT: not shape.iou >= settings.min_iou,
-        UNCERTAIN: not 0 <= shape.length_std_ratio <= settings.max_length_std_ratio,
+        Reason.POOR_FIT: not shape.iou >= settings.min_iou,
+        Reason.UNCERTAIN: not 0 <= shape.length_std_ratio <= settings.max_length_std_ratio,
     }
-    return next((reason for reason, failed in checks.items() if failed), "")
+    return next((reason for reason, failed in checks.items() if failed), None)
 
 
 def localize(
@@ -238,18 +233,20 @@ def localize(
     if mesh.shape is None:
         return _message(mesh, mesh.refusal)
     if calibration is None:
-        return _message(mesh, NO_CALIBRATION)
+        return _message(mesh, Reason.NO_CALIBRATION)
     reason = quality_refusal(mesh.shape, mesh.quality, settings)
     try:
         location = locate(mesh.shape, calibration, settings)
         if location.slant_rad > settings.max_slant_rad:
-            reason = reason or TURNED_AWAY
+            reason = reason or Reason.TURNED_AWAY
         return _message(mesh, reason, location)
     except Unlocatable as problem:
-        return _message(mesh, reason or str(problem))
+        return _message(mesh, reason or problem.reason)
 
 
-def _message(mesh: FittedMesh, reason: str, location: Location | None = None) -> LocalizedFish:
+def _message(
+    mesh: FittedMesh, reason: str | None, location: Location | None = None
+) -> LocalizedFish:
     shape = mesh.shape
     return LocalizedFish(
         frame_index=mesh.frame_index,
@@ -262,6 +259,6 @@ def _message(mesh: FittedMesh, reason: str, location: Location | None = None) ->
         length_mm=None if location is None else location.length_mm,
         length_std_mm=None if location is None else location.length_std_mm,
         iou=None if shape is None else shape.iou,
-        accepted=reason == "",
-        reason=reason,
+        accepted=not reason,
+        reason=reason or "",
     )

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
+from stream_dmr.reasons import without_counts
 from stream_dmr.running.pipeline import Chain
 from stream_dmr.sources.source import Source
 
@@ -158,6 +159,6 @@ class RunState:
 
     def _finish(self, estimate: LengthEstimate) -> None:
         self.finished.append(estimate)
-        self.num_fish[estimate.status.split(" (")[0]] += 1
+        self.num_fish[without_counts(estimate.status)] += 1
         self._finished_s.append(time.monotonic())
         self._lengths_mm.pop(estimate.track_id, None)

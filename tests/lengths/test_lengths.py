@@ -15,14 +15,12 @@ from stream_dmr.lengths.kalman import (
     weighted_median,
 )
 from stream_dmr.lengths.track_length import (
-    LONG_ENOUGH,
-    OUTLIER,
     TrackLength,
     late_estimate,
     measurement_of,
 )
-from stream_dmr.localization.localize import NO_CALIBRATION
 from stream_dmr.messages import LocalizedFish
+from stream_dmr.reasons import Reason
 
 seeds = st.integers(0, 2**32 - 1)
 OPEN_GATE = 1 - 1e-15
@@ -144,7 +142,7 @@ def test_an_outlier_is_gated_wherever_it_stands(where, wrong_mm):
     frames = [frame(i, z) for i, z in enumerate(rng.normal(700, 10, 12), start=1)]
     frames[where] = frame(where + 1, wrong_mm, std_mm=wrong_mm / 70)
     final = run(frames)[-1]
-    assert dict(final.refused) == {OUTLIER: 1}
+    assert dict(final.refused) == {Reason.OUTLIER: 1}
     assert where + 1 not in final.smoothed_frames
     assert final.length_mm == pytest.approx(700, abs=10)
 
@@ -154,14 +152,14 @@ def test_a_bad_start_is_overruled_as_soon_as_the_good_frames_are_more():
     estimates = run(frames)
     assert [e.length_mm for e in estimates[:2]] == [None, None]
     assert estimates[-1].length_mm == pytest.approx(705, abs=5)
-    assert dict(estimates[-1].refused) == {OUTLIER: 2}
+    assert dict(estimates[-1].refused) == {Reason.OUTLIER: 2}
 
 
 def test_outlier_is_named_in_its_own_frame_and_the_next_one_is_used():
     frames = [frame(i, 700.0 + i % 3) for i in range(1, 9)]
     frames[6] = frame(7, 400.0)
     estimates = run(frames)
-    assert (estimates[6].is_frame_used, estimates[6].frame_reason) == (False, OUTLIER)
+    assert (estimates[6].is_frame_used, estimates[6].frame_reason) == (False, Reason.OUTLIER)
     assert (estimates[7].is_frame_used, estimates[7].frame_reason) == (True, "")
     assert (estimates[7].frames_seen, estimates[7].frames_used) == (8, 7)
 
@@ -267,9 +265,9 @@ def test_too_few_good_frames_give_no_length_and_say_why():
 
 
 def test_no_calibration_is_the_status():
-    final = run([frame(i, None, reason=NO_CALIBRATION) for i in (1, 2)])[-1]
-    assert (final.status, final.length_mm) == (NO_CALIBRATION, None)
-    assert dict(final.refused) == {NO_CALIBRATION: 2}
+    final = run([frame(i, None, reason=Reason.NO_CALIBRATION) for i in (1, 2)])[-1]
+    assert (final.status, final.length_mm) == (Reason.NO_CALIBRATION, None)
+    assert dict(final.refused) == {Reason.NO_CALIBRATION: 2}
 
 
 def test_reasons_are_counted_and_add_up():
@@ -277,7 +275,7 @@ def test_reasons_are_counted_and_add_up():
     frames += [frame(8, 690.0, reason="touches border"), frame(9, None, reason="no mask")]
     frames += [frame(10, 691.0, reason="touches border"), frame(11, 1300.0)]
     final = run(frames)[-1]
-    assert dict(final.refused) == {"touches border": 2, "no mask": 1, OUTLIER: 1}
+    assert dict(final.refused) == {"touches border": 2, "no mask": 1, Reason.OUTLIER: 1}
     assert final.frames_used + sum(final.refused.values()) == final.frames_seen == 11
     assert (final.first_frame, final.last_frame) == (1, 11)
     assert (final.first_timestamp_ns, final.last_timestamp_ns) == (40_000_000, 440_000_000)
@@ -297,7 +295,7 @@ def test_a_long_track_stops_measuring_but_not_counting():
     frames = [frame(i, 700.0 + i % 5) for i in range(1, 301)]
     final = run(frames, max_frames=200)[-1]
     assert (final.frames_seen, final.frames_used) == (300, 200)
-    assert dict(final.refused) == {LONG_ENOUGH: 100}
+    assert dict(final.refused) == {Reason.LONG_ENOUGH: 100}
 
 
 @settings(max_examples=20)

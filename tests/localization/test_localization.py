@@ -7,16 +7,6 @@ from scipy.spatial.transform import Rotation
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.geometry import arc_length
 from stream_dmr.localization.localize import (
-    END_ON,
-    KEYPOINTS_COINCIDE,
-    KEYPOINTS_DISAGREE,
-    MOSTLY_HIDDEN,
-    NO_CALIBRATION,
-    PLANE_BEHIND,
-    POOR_FIT,
-    TOUCHES_BORDER,
-    UNCERTAIN,
-    UNSURE_MASK,
     LocalizeSettings,
     Unlocatable,
     intersect,
@@ -24,6 +14,7 @@ from stream_dmr.localization.localize import (
 )
 from stream_dmr.messages import CropQuality, FittedMesh, FittedShape, LossTerms
 from stream_dmr.nodes.localize import Localize
+from stream_dmr.reasons import Reason
 
 GOOD = CropQuality(touches_border=False, visible_fraction=1.0, sharpness=9.0, mask_area_px=1e4)
 
@@ -176,7 +167,7 @@ def test_head_along_the_cameras_ray_is_refused(sign):
     midline = np.stack([center * (1 + 0.1 * sign), center + 30.0, center + np.array([200.0, 0, 0])])
     mesh = make_mesh(make_shape(midline, center, calibration.camera))
     fish = localized(mesh, calibration)
-    assert (fish.accepted, fish.reason, fish.length_mm) == (False, END_ON, None)
+    assert (fish.accepted, fish.reason, fish.length_mm) == (False, Reason.SEEN_END_ON, None)
     assert fish.bending_ratio is not None
 
 
@@ -187,7 +178,7 @@ def test_keypoint_at_the_center_is_refused():
         [center, center + np.array([100.0, 10, 0]), center + np.array([200.0, 0, 0])]
     )
     fish = localized(make_mesh(make_shape(midline, center, calibration.camera)), calibration)
-    assert (fish.reason, fish.length_mm) == (KEYPOINTS_COINCIDE, None)
+    assert (fish.reason, fish.length_mm) == (Reason.KEYPOINTS_COINCIDE, None)
 
 
 def test_closed_midline_is_refused():
@@ -195,7 +186,11 @@ def test_closed_midline_is_refused():
     center = np.array([0.0, 0.0, 2500.0])
     midline = center + np.array([[100.0, 0, 0], [0, 50, 0], [100.0, 0, 0]])
     fish = localized(make_mesh(make_shape(midline, center, calibration.camera)), calibration)
-    assert (fish.reason, fish.length_mm, fish.bending_ratio) == (KEYPOINTS_COINCIDE, None, None)
+    assert (fish.reason, fish.length_mm, fish.bending_ratio) == (
+        Reason.KEYPOINTS_COINCIDE,
+        None,
+        None,
+    )
 
 
 @pytest.mark.parametrize(
@@ -210,11 +205,11 @@ def test_plane_out_of_sight_is_refused(rotation_rad, translation_mm):
         translation_mm=np.array(translation_mm, np.float64),
     )
     fish = localized(mesh, Calibration(camera=camera, plane=plane))
-    assert (fish.accepted, fish.reason, fish.length_mm) == (False, PLANE_BEHIND, None)
+    assert (fish.accepted, fish.reason, fish.length_mm) == (False, Reason.PLANE_BEHIND_CAMERA, None)
 
 
 def test_lines_that_meet_on_the_wrong_side_are_refused():
-    with pytest.raises(Unlocatable, match=KEYPOINTS_DISAGREE):
+    with pytest.raises(Unlocatable, match=Reason.KEYPOINTS_DISAGREE):
         intersect(np.array([0.1, 0, 1.0]), np.array([0.0, 0, 1000]), np.array([-1.0, 0, 0]))
 
 
@@ -226,7 +221,7 @@ def test_a_fit_that_is_not_finite_is_refused(field):
     values[field] = np.where(np.arange(values[field].size) == 0, np.nan, values[field].ravel())
     values[field] = values[field].reshape(getattr(shape, field).shape)
     fish = localized(make_mesh(FittedShape(**values)), calibration)
-    assert (fish.accepted, fish.reason, fish.length_mm) == (False, POOR_FIT, None)
+    assert (fish.accepted, fish.reason, fish.length_mm) == (False, Reason.POOR_FIT, None)
     assert fish.length_std_mm is None
 
 
@@ -239,15 +234,15 @@ def quality(**changes):
     ("changes", "shape_changes", "reason"),
     [
         ({}, {}, ""),
-        ({"touches_border": True}, {}, TOUCHES_BORDER),
-        ({"visible_fraction": 0.69}, {}, MOSTLY_HIDDEN),
-        ({"visible_fraction": np.nan}, {}, MOSTLY_HIDDEN),
-        ({"mask_confidence": 0.69}, {}, UNSURE_MASK),
-        ({"mask_confidence": np.nan}, {}, UNSURE_MASK),
-        ({}, {"iou": 0.84}, POOR_FIT),
-        ({}, {"iou": np.nan}, POOR_FIT),
-        ({}, {"std_ratio": 0.21}, UNCERTAIN),
-        ({"touches_border": True}, {"iou": 0.1}, TOUCHES_BORDER),
+        ({"touches_border": True}, {}, Reason.TOUCHES_BORDER),
+        ({"visible_fraction": 0.69}, {}, Reason.MOSTLY_HIDDEN),
+        ({"visible_fraction": np.nan}, {}, Reason.MOSTLY_HIDDEN),
+        ({"mask_confidence": 0.69}, {}, Reason.UNSURE_MASK),
+        ({"mask_confidence": np.nan}, {}, Reason.UNSURE_MASK),
+        ({}, {"iou": 0.84}, Reason.POOR_FIT),
+        ({}, {"iou": np.nan}, Reason.POOR_FIT),
+        ({}, {"std_ratio": 0.21}, Reason.UNCERTAIN),
+        ({"touches_border": True}, {"iou": 0.1}, Reason.TOUCHES_BORDER),
     ],
 )
 def test_gates_name_the_first_reason_and_keep_the_millimetres(changes, shape_changes, reason):
@@ -262,7 +257,7 @@ def test_gates_name_the_first_reason_and_keep_the_millimetres(changes, shape_cha
 def test_a_fit_without_uncertainty_is_uncertain_and_has_no_std(std_ratio):
     calibration = make_calibration()
     fish = localized(straight_fish(calibration, std_ratio=std_ratio), calibration)
-    assert (fish.reason, fish.length_std_mm) == (UNCERTAIN, None)
+    assert (fish.reason, fish.length_std_mm) == (Reason.UNCERTAIN, None)
 
 
 def test_border_gate_can_be_switched_off():
@@ -334,7 +329,7 @@ def test_a_poor_fit_is_less_certain(iou, std_ratio):
 def test_without_calibration_pixels_and_bending_remain():
     mesh = straight_fish(make_calibration())
     (fish,) = Localize(LocalizeSettings(), calibration=None).step(mesh)
-    assert (fish.accepted, fish.reason) == (False, NO_CALIBRATION)
+    assert (fish.accepted, fish.reason) == (False, Reason.NO_CALIBRATION)
     assert fish.length_mm is fish.length_std_mm is fish.keypoints_mm is fish.midline_mm is None
     assert fish.bending_ratio == pytest.approx(1.0)
     np.testing.assert_array_equal(fish.keypoints_px, mesh.shape.keypoints_px)

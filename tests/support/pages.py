@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from stream_dmr import messages
+from stream_dmr.reasons import Reason
 from stream_dmr.recording.messages.topics import topics_table
 from stream_dmr.running.config import Config
 from tests.support.plan import draw_plan, read_plan
@@ -17,6 +18,7 @@ from tests.support.plan import draw_plan, read_plan
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 BEGIN = "<!-- begin of what `make docs` writes -->\n"
 END = "<!-- end of what `make docs` writes -->\n"
+_REMEDY_PAGES = {"train the network": "train.md", "calibrate": "calibration.md"}
 _BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 
 
@@ -56,13 +58,17 @@ def _message_tables() -> Iterator[str]:
     """For each class of messages.py its fields, their types, and the comments on them."""
     source = Path(messages.__file__).read_text(encoding="utf-8")
     lines = source.splitlines()
+    rows_of: dict[str, list[tuple[str, ...]]] = {}
     for node in ast.parse(source).body:
         if isinstance(node, ast.ClassDef):
-            rows = [
+            inherited = [row for base in node.bases for row in rows_of[ast.unparse(base)]]
+            rows = rows_of[node.name] = inherited + [
                 (f"`{ast.unparse(field.target)}`", _type(field), _comment(lines, field))
                 for field in node.body
                 if isinstance(field, ast.AnnAssign)
             ]
+            if not rows or node.name == "FishMessage":  # nothing of its own goes anywhere
+                continue
             text = (ast.get_docstring(node) or "").splitlines()[0]
             yield f"**{node.name}**: {text}\n\n" + _markdown(["field", "type", ""], iter(rows))
 
@@ -82,6 +88,19 @@ def _comment(lines: list[str], field: ast.AnnAssign) -> str:
     return " ".join(line.strip(" #") for line in lines[before : field.lineno - 1])
 
 
+def reasons_table() -> str:
+    """One row for each reason, below what it refuses."""
+    rows = list[tuple[str, ...]]()
+    for reason in Reason:
+        if not rows or rows[-1][-1] != reason.subject:
+            rows.append((f"**{reason.subject}**", "", "", reason.subject))
+        remedy = reason.remedy
+        for words, page in _REMEDY_PAGES.items():
+            remedy = remedy.replace(words, f"[{words}]({page})")
+        rows.append((f"`{reason}`", reason.explanation, remedy, reason.subject))
+    return _markdown(["reason", "meaning", "what to do"], (row[:3] for row in rows))
+
+
 def _markdown(head: list[str], rows: Iterator[tuple[str, ...]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
     escaped = ([cell.replace("|", "\\|") for cell in cells] for cells in lines)
@@ -92,6 +111,7 @@ WHOLE: dict[str, Callable[[], str]] = {"images/plan.svg": lambda: draw_plan(read
 TABLES: dict[str, Callable[[], str]] = {
     "settings.md": settings_tables,
     "files.md": files_tables,
+    "troubleshooting.md": reasons_table,
 }
 
 

@@ -5,8 +5,8 @@ from collections.abc import Collection, Iterator
 from functools import partial
 from itertools import chain
 
-from stream_dmr.lengths.track_length import TRACK_ENDED
 from stream_dmr.messages import LengthEstimate, LocalizedFish
+from stream_dmr.reasons import Reason
 from stream_dmr.recording.messages.codec import decode, encode
 from stream_dmr.recording.messages.record import Record
 from stream_dmr.recording.reading.reader import Recording
@@ -26,7 +26,7 @@ class Carried:
             case LocalizedFish(track_id=track_id):
                 self._tracks.setdefault(track_id, deque(maxlen=_MOST_FRAMES)).append(record)
             case LengthEstimate() as estimate:
-                if estimate.is_final or estimate.frame_reason == TRACK_ENDED:
+                if estimate.is_final or estimate.frame_reason == Reason.TRACK_ENDED:
                     self._tracks.pop(estimate.track_id, None)
             case _:
                 pass
