@@ -41,6 +41,8 @@ def _is_same(a: object, b: object) -> bool:
         return struct.pack("d", a) == struct.pack("d", b)
     if isinstance(a, Mapping) and isinstance(b, Mapping):
         return dict(a) == dict(b)
+    if isinstance(a, str) and isinstance(b, str):
+        return a == b  # a Reason is its text
     return type(a) is type(b) and a == b
 
 
@@ -55,5 +57,5 @@ def _shown(value: object, other: object) -> str:
         count = np.count_nonzero(differs.reshape(-1, value.itemsize).any(axis=1))
         where = "".join(f"[{int(i)}]" for i in entry)
         return f"{where} {value.ravel()[first]!r} ({count} of {value.size} differ)"
-    text = repr(value)
+    text = repr(str(value) if isinstance(value, str) else value)
     return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
