@@ -18,17 +18,17 @@ test-slow: $(STAMP)  ## the long ones, and those on material outside the reposit
 	$(BIN)/pytest -n 2 --dist worksteal --hypothesis-profile new
 
 bench: $(STAMP)  ## the fit beside other renderers, and the chain: docs/research/fit-speed.md, six minutes
-	$(BIN)/python benchmarks/solvers.py
+	$(BIN)/python -m benchmarks.fit_speed
 
 table1: $(STAMP)  ## Table 1 of the paper on simulated fish: docs/research/table1.md; FISH=60 for a quick look
-	cd benchmarks && ../$(BIN)/python -m table1 $(if $(FISH),--fish $(FISH)) \
+	$(BIN)/python -m benchmarks.table1 $(if $(FISH),--fish $(FISH)) \
 		$(if $(ROWS),--rows $(ROWS)) $(if $(AGAIN),--again)
 
 faults: $(STAMP)  ## all that goes wrong at sea: docs/research/crashes.md, two hours; FAULTS="--only clock"
-	$(BIN)/python benchmarks/reliability/faults.py $(FAULTS)
+	$(BIN)/python -m benchmarks.reliability.faults $(FAULTS)
 
 soak: $(STAMP)  ## an hour of a looped live stream; SOAK="--minutes 5" for less
-	$(BIN)/python benchmarks/reliability/soak.py $(SOAK)
+	$(BIN)/python -m benchmarks.reliability.soak $(SOAK)
 
 check: $(STAMP)  ## style and types
 	$(BIN)/ruff format --check .

@@ -15,11 +15,14 @@ ROOT = Path(__file__).resolve().parents[1]
 @pytest.mark.slow
 def test_nothing_is_lost_by_kills_power_cuts_losses_and_mutants():
     require_server()
-    program = ROOT / "benchmarks" / "reliability" / "faults.py"
     counts = ["--kills", "3", "--cuts", "40", "--losses", "6", "--mutants", "120"]
     counts += ["--writes", "30", "--overload-s", "15"]
     outcome = subprocess.run(
-        [sys.executable, str(program), *counts], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "benchmarks.reliability.faults", *counts],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert outcome.returncode == 0, outcome.stderr
     rows = [json.loads(line) for line in outcome.stdout.splitlines()]

@@ -1,6 +1,6 @@
 """The wall clock stepped by an hour, forth and back, while a camera is measured, and a restart.
 
-python benchmarks/reliability/clock_steps.py     # loads disturb.c into itself
+python -m benchmarks.reliability.clock_steps     # loads disturb.c into itself
 """
 
 import argparse
@@ -13,7 +13,7 @@ import threading
 from itertools import pairwise
 from pathlib import Path
 
-from failing_writes import build
+from benchmarks.reliability.failing_writes import build
 
 HOUR_NS = 3600 * 10**9
 _STEPS_NS = [0, HOUR_NS, -HOUR_NS, 0, -HOUR_NS]  # off the true time; the last one at the restart
@@ -26,7 +26,7 @@ def clock_steps(folder: Path) -> dict[str, object]:
     library = build(folder)
     if library is None:
         return {"skipped": "needs a C compiler: apt install gcc"}
-    command = [sys.executable, __file__, "--folder", str(folder)]
+    command = [sys.executable, "-m", "benchmarks.reliability.clock_steps", "--folder", str(folder)]
     environment = os.environ | {"LD_PRELOAD": str(library), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True, text=True)
     return json.loads(done.stdout.splitlines()[-1])
@@ -37,8 +37,9 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--folder", type=Path, required=True)
     folder = parser.parse_args().folder
-    from measured import QUICK, Camera, free_port, write_pictures
-    from small_scene import write_small_scene
+    from benchmarks.reliability.camera_run import QUICK, write_pictures
+    from benchmarks.reliability.small_scene import write_small_scene
+    from tests.support.camera import Camera, free_port
 
     scene = write_small_scene(folder / "scene")
     (folder / "pictures").mkdir()
@@ -93,8 +94,7 @@ def measure(folder: Path, address: str, steps_ns: list[int]) -> list[str]:
 
 def figures_of(out: Path) -> dict[str, object]:
     """Whether times and numbers only go on, from segment to segment."""
-    from kills import messages
-
+    from benchmarks.reliability.kills import messages
     from stream_dmr.messages import Frame
 
     segments = [

@@ -8,11 +8,11 @@ import threading
 from pathlib import Path
 
 import cv2
-from failing_writes import FAILING_FRAMES, Case
-from kills import messages, unreadable_ones
-from measured import QUICK
-from small_scene import write_crossing_fish, write_small_scene
 
+from benchmarks.reliability.camera_run import QUICK
+from benchmarks.reliability.failing_writes import FAILING_FRAMES, Case
+from benchmarks.reliability.kills import messages, unreadable_ones
+from benchmarks.reliability.small_scene import write_crossing_fish, write_small_scene
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import Frame
 from stream_dmr.recording.segments.recover import recover
@@ -25,8 +25,16 @@ _CONFIG = QUICK.replace("[watch]\nport = {port}\n", "").replace(
     "connect_s = 20.0", "clips_wait_s = 0.1"
 )
 _FOLDER = Path()
-_LIBRARY = ctypes.CDLL(None)
-_LIBRARY.disturb_writes.argtypes = [ctypes.c_char_p, ctypes.c_long, ctypes.c_long, ctypes.c_int]
+
+
+def disturb_writes(folder: Path, *, first: int, count: int, error: int) -> None:
+    """Let so many writes below `folder` fail with an errno, from the first-th on; 0: none.
+
+    The function is that of disturb.c, which failing_writes builds and loads before the C library.
+    """
+    call = ctypes.CDLL(None).disturb_writes
+    call.argtypes = [ctypes.c_char_p, ctypes.c_long, ctypes.c_long, ctypes.c_int]
+    call(bytes(folder), first, count, error)
 
 
 def prepare(folder: Path) -> None:
@@ -56,7 +64,7 @@ class Healing(RunObserver):
         self.num_frames += 1
         self._frames_left -= 1
         if self._frames_left == 0:
-            _LIBRARY.disturb_writes(bytes(_FOLDER / "out"), 1, 0, 0)
+            disturb_writes(_FOLDER / "out", first=1, count=0, error=0)
 
 
 def measure(case: Case) -> dict:
@@ -73,13 +81,13 @@ def measure(case: Case) -> dict:
     )
     count = {"once": 1}.get(case.mode, 1 << 40) if case.at else 0
     observer, refused = Healing(case), ""
-    _LIBRARY.disturb_writes(bytes(out), case.at, count, case.error)
+    disturb_writes(out, first=case.at, count=count, error=case.error)
     try:
         measure_source(request, stop=threading.Event(), observer=observer)
     except OutputError as error:
         refused = str(error)
-    writes = _LIBRARY.disturb_seen()
-    _LIBRARY.disturb_writes(bytes(out), 1, 0, 0)
+    writes = ctypes.CDLL(None).disturb_seen()
+    disturb_writes(out, first=1, count=0, error=0)
     parts = [path.name for path in out.glob("*.part*") if path.suffix != ".damaged"]
     list(recover(out))
     return {

@@ -1,6 +1,6 @@
 """A measurement whose Nth write fails: with ENOSPC or EIO, once, for a while, or from then on.
 
-python benchmarks/reliability/failing_writes.py --cases 300     # loads disturb.c into itself
+    python -m benchmarks.reliability.failing_writes --cases 300     # loads disturb.c into itself
 
 Each case is a whole run over a folder of clips, in a fork of a process in which all is imported.
 """
@@ -53,7 +53,15 @@ def failing_writes(folder: Path, *, cases: int) -> dict[str, object]:
     library = build(folder)
     if library is None:
         return {"skipped": "needs a C compiler: apt install gcc"}
-    command = [sys.executable, __file__, "--cases", str(cases), "--folder", str(folder)]
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.reliability.failing_writes",
+        "--cases",
+        str(cases),
+        "--folder",
+        str(folder),
+    ]
     environment = os.environ | {"LD_PRELOAD": str(library), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True, text=True)
     return json.loads(done.stdout.splitlines()[-1])
@@ -67,20 +75,20 @@ def main() -> None:
     parser.add_argument("--at", type=int, default=None, help="this one case alone")
     parser.add_argument("--mode", choices=_MODES, default="once")
     parser.add_argument("--error", default="ENOSPC")
-    asked = parser.parse_args()
-    folder = asked.folder or Path(tempfile.mkdtemp(prefix="failing-writes-"))
+    arguments = parser.parse_args()
+    folder = arguments.folder or Path(tempfile.mkdtemp(prefix="failing-writes-"))
     if not hasattr(ctypes.CDLL(None), "disturb_writes"):
         folder.mkdir(exist_ok=True)
         os.environ["LD_PRELOAD"] = str(build(folder))
-        os.execv(sys.executable, [sys.executable, *sys.argv])
-    import failing_run
+        os.execv(sys.executable, sys.orig_argv)
+    from benchmarks.reliability import failing_run
 
     failing_run.prepare(folder)
     whole = failing_run.measure(Case(at=0))
-    if asked.at is not None:
-        chosen = [Case(at=asked.at, error=getattr(errno, asked.error), mode=asked.mode)]
+    if arguments.at is not None:
+        chosen = [Case(at=arguments.at, error=getattr(errno, arguments.error), mode=arguments.mode)]
     else:
-        chosen = cases_over(whole["writes"], asked.cases)
+        chosen = cases_over(whole["writes"], arguments.cases)
     figures = Counter[str]()
     broken: list[str] = []
     for case in chosen:
@@ -105,7 +113,7 @@ def cases_over(num_writes: int, count: int) -> list[Case]:
 
 def in_a_fork(case: Case) -> dict:
     """What came of a case; `said` alone where it hung or broke down."""
-    import failing_run
+    from benchmarks.reliability import failing_run
 
     fork = multiprocessing.get_context("fork")
     ours, theirs = fork.Pipe()

@@ -1,6 +1,6 @@
 """`make faults`: all that goes wrong at sea, and what comes of it; prints a line of JSON each.
 
-python benchmarks/reliability/faults.py --only losses clock       # these two; all where left out
+python -m benchmarks.reliability.faults --only losses clock       # these two; all where left out
 """
 
 import argparse
@@ -12,7 +12,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from measured import ROOT
+
+from benchmarks.reliability.camera_run import ROOT
 
 
 def main() -> None:
@@ -22,10 +23,10 @@ def main() -> None:
     for name, count in COUNTS.items():
         parser.add_argument(f"--{name}", type=int, default=count)
     parser.add_argument("--kill-minutes", type=float, default=1e9, help="as many as fit")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="faults-"))
-    for name in asked.only:
-        for test, figures in FAULTS[name](folder / name, asked):
+    for name in arguments.only:
+        for test, figures in FAULTS[name](folder / name, arguments):
             print(json.dumps({"test": test} | dict(figures)), flush=True)
     shutil.rmtree(folder)
 
@@ -33,58 +34,58 @@ def main() -> None:
 Found = Iterator[tuple[str, Mapping[str, object]]]
 
 
-def cuts(folder: Path, asked: argparse.Namespace) -> Found:
+def cuts(folder: Path, arguments: argparse.Namespace) -> Found:
     """Power cuts."""
-    from power import power_cuts, power_cuts_of_recordings
+    from benchmarks.reliability.power_cuts import power_cuts, power_cuts_of_recordings
 
-    yield "power cuts", power_cuts(folder / "store", count=asked.cuts)
-    yield "power cuts of recordings", power_cuts_of_recordings(folder / "out", count=asked.cuts)
+    yield "power cuts", power_cuts(folder / "store", count=arguments.cuts)
+    yield "power cuts of recordings", power_cuts_of_recordings(folder / "out", count=arguments.cuts)
 
 
-def losses(folder: Path, asked: argparse.Namespace) -> Found:
+def losses(folder: Path, arguments: argparse.Namespace) -> Found:
     """Lost cameras, and streams that count from 0 again."""
-    from losses import losses, restarts
+    from benchmarks.reliability.camera_losses import losses, restarts
 
-    restarted = asked.losses // 6  # one of six kinds
+    restarted = arguments.losses // 6  # one of six kinds
     yield "timestamps back at 0", restarts(folder / "restarts", count=restarted)
     pictures = grey_pictures(folder / "grey")
-    yield "camera losses", losses(pictures, count=asked.losses - restarted)
+    yield "camera losses", losses(pictures, count=arguments.losses - restarted)
 
 
 def clock(folder: Path, _: argparse.Namespace) -> Found:
     """A wall clock that is set."""
-    from clock_steps import clock_steps
+    from benchmarks.reliability.clock_steps import clock_steps
 
     yield "clock steps", clock_steps(folder)
 
 
-def writes(folder: Path, asked: argparse.Namespace) -> Found:
+def writes(folder: Path, arguments: argparse.Namespace) -> Found:
     """A disk that refuses."""
-    from failing_writes import failing_writes
+    from benchmarks.reliability.failing_writes import failing_writes
 
-    yield "failing writes", failing_writes(folder, cases=asked.writes)
+    yield "failing writes", failing_writes(folder, cases=arguments.writes)
 
 
-def overload(folder: Path, asked: argparse.Namespace) -> Found:
+def overload(folder: Path, arguments: argparse.Namespace) -> Found:
     """A camera that is too fast."""
-    from overload import overload
+    from benchmarks.reliability.overload import overload
 
-    yield "overload", overload(folder, seconds=asked.overload_s)
+    yield "overload", overload(folder, seconds=arguments.overload_s)
 
 
-def mutants(folder: Path, asked: argparse.Namespace) -> Found:
+def mutants(folder: Path, arguments: argparse.Namespace) -> Found:
     """Inputs that are wrong."""
-    from fuzz import fuzz
+    from benchmarks.reliability.mutated_inputs import mutate_inputs
 
-    for row in fuzz(folder, ROOT, count=asked.mutants):
+    for row in mutate_inputs(folder, ROOT, count=arguments.mutants):
         yield "mutants", row
 
 
-def kills(folder: Path, asked: argparse.Namespace) -> Found:
+def kills(folder: Path, arguments: argparse.Namespace) -> Found:
     """Kills, at any moment."""
-    from kills import kills
+    from benchmarks.reliability.kills import kills
 
-    yield "kill -9", kills(folder, count=asked.kills, minutes=asked.kill_minutes)
+    yield "kill -9", kills(folder, count=arguments.kills, minutes=arguments.kill_minutes)
 
 
 FAULTS: dict[str, Callable[[Path, argparse.Namespace], Found]] = {

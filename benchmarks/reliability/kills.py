@@ -13,9 +13,9 @@ from typing import TypeVar
 
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
-from measured import QUICK, Measurement
-from small_scene import write_small_scene
 
+from benchmarks.reliability.camera_run import QUICK, Measurement
+from benchmarks.reliability.small_scene import write_small_scene
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import FishCrop, Frame, LengthEstimate, LocalizedFish
 from stream_dmr.recording.messages.codec import decode

@@ -6,15 +6,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 
-from measured import QUICK, Camera, free_port, write_pictures
-from small_scene import write_small_scene
-from soak import metrics_of
-
+from benchmarks.reliability.camera_run import QUICK, write_pictures
+from benchmarks.reliability.small_scene import write_small_scene
+from benchmarks.reliability.soak import metrics_of
 from stream_dmr.messages import LocalizedFish, Message
 from stream_dmr.running.measure_source import RunSummary, measure_source
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.running.run_request import RunRequest
 from stream_dmr.watch.watch import Watch
+from tests.support.camera import Camera, free_port
 
 _TIMES = 3
 

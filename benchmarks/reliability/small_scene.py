@@ -4,7 +4,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from measured import ROOT  # noqa: F401
 
 from stream_dmr.calibration.calibration_file import save_calibration
 from tests.support.tiny_clip import HEIGHT, WIDTH, calibration, write_template

@@ -1,6 +1,6 @@
 """`make soak`: a looped live stream for an hour; what grows, and what is dropped.
 
-python benchmarks/reliability/soak.py --minutes 60 --fps 15 [--scene FOLDER]
+    python -m benchmarks.reliability.soak --minutes 60 --fps 15 [--scene FOLDER]
 
 The stream is 1280 x 960 and shows two fish in every frame, unless another scene is given.
 """
@@ -9,19 +9,16 @@ import argparse
 import itertools
 import json
 import shutil
-import sys
 import tempfile
 import time
 import urllib.request
 from pathlib import Path
 
 import numpy as np
-from measured import ROOT, Measurement, resources
 from prometheus_client.parser import text_string_to_metric_families
 
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-from chain import write_clip
+from benchmarks.fit_speed.chain_speed import write_clip
+from benchmarks.reliability.camera_run import Measurement, resources
 
 _WARM_UP = 1 / 3  # of the time, that counts for nothing: memory fills up for twenty minutes
 _EVERY_S = 5.0
@@ -34,20 +31,20 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--fps", type=int, default=15)
     parser.add_argument("--scene", type=Path)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="soak-"))
-    scene = asked.scene or folder / "scene"
-    if not asked.scene:
+    scene = arguments.scene or folder / "scene"
+    if not arguments.scene:
         scene.mkdir()
         write_clip(scene, num_frames=60, num_fish=2)
-    run = Measurement(folder, scene, fps=asked.fps)
+    run = Measurement(folder, scene, fps=arguments.fps)
     run.camera.start()
     run.start()
     assert run.process is not None
     try:
         run.wait_for("begin")
         began, samples = time.monotonic(), []
-        while (now := time.monotonic() - began) < 60 * asked.minutes:
+        while (now := time.monotonic() - began) < 60 * arguments.minutes:
             samples.append({"s": now} | resources(run.process.pid))
             time.sleep(_EVERY_S)
         metrics = metrics_of(run.port)
@@ -55,7 +52,7 @@ def main() -> None:
         run.process.terminate()
         run.process.wait()
         run.camera.lose()
-    print(json.dumps(figures_of(samples, metrics, asked.minutes, asked.fps)), flush=True)
+    print(json.dumps(figures_of(samples, metrics, arguments.minutes, arguments.fps)), flush=True)
     shutil.rmtree(folder)
 
 

@@ -1,1 +1,1 @@
-"""Table 1 of the paper, whole: every method on the same simulated fish. See __main__.py."""
+"""Table 1 of the paper: every method on the same simulated fish. See __main__.py."""

@@ -19,9 +19,9 @@ import multiprocessing
 import time
 from pathlib import Path
 
-from table1 import report, results
-from table1.fish import FISH_PER_SCENE
-from table1.methods import METHODS, make_method, measure_scene
+from benchmarks.table1 import cached_results, tables
+from benchmarks.table1.filmed_scene import FISH_PER_SCENE
+from benchmarks.table1.methods import METHODS, make_method, measure_scene
 
 ALL_FISH = 738
 DOCS = Path(__file__).parents[2] / "docs"
@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("--rows", default=",".join(METHODS), help=f"some of {', '.join(METHODS)}")
     parser.add_argument("--again", action="store_true", help="measure these rows anew")
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--cache", type=Path, default=results.CACHE)
+    parser.add_argument("--cache", type=Path, default=cached_results.CACHE)
     arguments = parser.parse_args()
     wanted = arguments.rows.split(",")
     if unknown := set(wanted) - set(METHODS):
@@ -43,22 +43,21 @@ def main() -> None:
     scenes = range(math.ceil(arguments.fish / FISH_PER_SCENE))
     if arguments.again:
         for method in wanted:
-            results.forget(method, cache=arguments.cache)
+            cached_results.forget(method, cache=arguments.cache)
     _measure_missing(scenes, wanted, arguments.processes, arguments.cache)
-    rows: dict[str, list[results.Fish]] = {}
+    rows: dict[str, list[cached_results.Fish]] = {}
     for method in METHODS:
-        rows |= results.load(method, scenes, cache=arguments.cache)
-        print(
-            f"{method}: measured up to {results.age_hours(method, cache=arguments.cache):.1f} h ago"
-        )
-    found = report.evaluations(rows)
-    text = report.markdown(found)
+        rows |= cached_results.load(method, scenes, cache=arguments.cache)
+        hours = cached_results.age_hours(method, cache=arguments.cache)
+        print(f"{method}: measured up to {hours:.1f} h ago")
+    found = tables.evaluations(rows)
+    text = tables.markdown(found)
     print(f"\n{text}\n")
     if "dmr" in rows:
-        print("worst of ours:", *report.worst(rows["dmr"]), sep="\n  ")
+        print("worst of ours:", *tables.worst(rows["dmr"]), sep="\n  ")
     if len(scenes) * FISH_PER_SCENE >= ALL_FISH and set(report.TITLES) <= set(found):
-        report.write(PAGE, text)
-        report.plot(found, DOCS / "images")
+        tables.write(PAGE, text)
+        tables.plot(found, DOCS / "images")
         print(f"written to {PAGE}")
 
 
@@ -66,7 +65,9 @@ def _measure_missing(scenes: range, wanted: list[str], processes: int, cache: Pa
     """Scene by scene, since filming is shared by all methods."""
     tasks = []
     for scene in scenes:
-        missing = [method for method in wanted if not results.is_saved(method, scene, cache=cache)]
+        missing = [
+            method for method in wanted if not cached_results.is_saved(method, scene, cache=cache)
+        ]
         if missing:
             tasks.append((scene, missing, cache))
     if any("bfs" in methods for _, methods, _ in tasks):

@@ -11,12 +11,12 @@ from jaxtyping import Bool, Float
 from numba import njit
 from scipy.spatial.transform import Rotation
 
+from benchmarks.table1.filmed_scene import FilmedScene
+from benchmarks.table1.frame_lengths import fitted_mesh, measure_frames, unfitted
+from benchmarks.table1.silhouettes import DISTANCE, HEIGHT, PX_PER_STD, WIDTH, Database, pack, posed
 from stream_dmr.evaluation.length_tables import LengthRow
 from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.template.template import Template
-from table1.fish import Haul
-from table1.frames import fitted_mesh, measure_frames, unfitted
-from table1.silhouettes import DISTANCE, HEIGHT, PX_PER_STD, WIDTH, Database, pack, posed
 
 ROWS = ("bfs", "bfs-flat")
 _BLUR_PX = 0.8  # a bitmap's pixel is about two of the crop's
@@ -29,9 +29,9 @@ class BruteForce:
         self._template = template
         self._database = database
 
-    def measure(self, haul: Haul) -> dict[str, dict[int, LengthRow]]:
+    def measure(self, filmed: FilmedScene) -> dict[str, dict[int, LengthRow]]:
         """Lengths by row and track id."""
-        return measure_frames(haul, self.fit, ROWS)
+        return measure_frames(filmed, self.fit, ROWS)
 
     def fit(self, crop: FishCrop) -> FittedMesh:
         """The entry of the database that is most like the mask."""

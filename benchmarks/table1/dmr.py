@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from benchmarks.table1.filmed_scene import FilmedScene
 from stream_dmr.evaluation.length_tables import LengthRow
 from stream_dmr.localization.localize import LocalizeSettings
 from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish, Message
@@ -11,7 +12,6 @@ from stream_dmr.running.config import Config
 from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.running.pipeline import Node
 from stream_dmr.template.template import Template
-from table1.fish import Haul
 
 ROWS = ("dmr", "dmr-flat")
 PAPER_ROWS = ("paper", "paper-flat")
@@ -25,11 +25,11 @@ class Dmr:
     def __init__(self, template: Template) -> None:
         self._template = template
 
-    def measure(self, haul: Haul) -> dict[str, dict[int, LengthRow]]:
+    def measure(self, filmed: FilmedScene) -> dict[str, dict[int, LengthRow]]:
         """Lengths by row and track id, as `stream-dmr run` gives them."""
-        crops = [sighting.crop for frame in haul.frames for sighting in frame]
+        crops = [sighting.crop for frame in filmed.frames for sighting in frame]
         measured = {}
-        for row, nodes in zip(ROWS, _fit_once({}, self._template, haul, crops), strict=True):
+        for row, nodes in zip(ROWS, _fit_once({}, self._template, filmed, crops), strict=True):
             estimates = [m for m in nodes if isinstance(m, LengthEstimate) and m.is_final]
             measured[row] = {estimate.track_id: _row(estimate) for estimate in estimates}
         return measured
@@ -41,12 +41,12 @@ class Paper:
     def __init__(self, template: Template) -> None:
         self._template = template
 
-    def measure(self, haul: Haul) -> dict[str, dict[int, LengthRow]]:
+    def measure(self, filmed: FilmedScene) -> dict[str, dict[int, LengthRow]]:
         """Lengths by row and track id."""
         measured = {}
-        located = _fit_once(_PAPER, self._template, haul, chosen_crops(haul))
+        located = _fit_once(_PAPER, self._template, filmed, chosen_crops(filmed))
         for row, messages in zip(PAPER_ROWS, located, strict=True):
-            lengths_mm: dict[int, list[float]] = {track_id: [] for track_id in haul.truth_mm}
+            lengths_mm: dict[int, list[float]] = {track_id: [] for track_id in filmed.truth_mm}
             for fish in messages:
                 if isinstance(fish, LocalizedFish) and fish.accepted:
                     lengths_mm[fish.track_id].append(fish.length_mm or np.nan)
@@ -57,11 +57,11 @@ class Paper:
         return measured
 
 
-def chosen_crops(haul: Haul) -> list[FishCrop]:
+def chosen_crops(filmed: FilmedScene) -> list[FishCrop]:
     """At most PAPER_FRAMES of each fish, in order: whole ones, not too much hidden."""
     gates = LocalizeSettings()
     usable: dict[int, list[FishCrop]] = {}
-    for sighting in (sighting for frame in haul.frames for sighting in frame):
+    for sighting in (sighting for frame in filmed.frames for sighting in frame):
         quality = sighting.crop.quality
         if not quality.touches_border and quality.visible_fraction >= gates.min_visible_fraction:
             usable.setdefault(sighting.crop.track_id, []).append(sighting.crop)
@@ -74,14 +74,17 @@ def chosen_crops(haul: Haul) -> list[FishCrop]:
 
 
 def _fit_once(
-    changes: dict[str, dict[str, str]], template: Template, haul: Haul, crops: Iterable[Message]
+    changes: dict[str, dict[str, str]],
+    template: Template,
+    filmed: FilmedScene,
+    crops: Iterable[Message],
 ) -> tuple[list[Message], list[Message]]:
     """Everything that the nodes say after the fit, with bending and without."""
     bent, flat = (
         later_nodes(
             Config.model_validate(changes | {"localize": {"bending": bending}}),
             template=template,
-            calibration=haul.calibration,
+            calibration=filmed.calibration,
         )
         for bending in (True, False)
     )

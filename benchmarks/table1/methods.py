@@ -4,36 +4,35 @@ from collections.abc import Callable
 from functools import cache as cached
 from pathlib import Path
 
-from targets import species_template
-
+from benchmarks.fit_speed.targets import species_template
+from benchmarks.table1 import cached_results, stereo
+from benchmarks.table1.bfs import BruteForce
+from benchmarks.table1.dmr import Dmr, Paper
+from benchmarks.table1.filmed_scene import FilmedScene, film_passages, table_scene
+from benchmarks.table1.monopose import MonoPose
+from benchmarks.table1.plate import Plate
+from benchmarks.table1.silhouettes import open_database
 from stream_dmr.evaluation.length_tables import LengthRow
-from table1 import results, stereo
-from table1.bfs import BruteForce
-from table1.dmr import Dmr, Paper
-from table1.fish import Haul, table_scene, watch
-from table1.monopose import MonoPose
-from table1.plate import Plate
-from table1.silhouettes import open_database
 
 METHODS = ("stereo", "monopose", "bfs", "dmr", "paper")
 LOG2_DATABASE = 20  # a million entries
 
-Measure = Callable[[Haul], dict[str, dict[int, LengthRow]]]
+Measure = Callable[[FilmedScene], dict[str, dict[int, LengthRow]]]
 
 
 def measure_scene(task: tuple[int, list[str], Path]) -> int:
     """Film one scene, measure it by these methods, keep what they say; the scene's number."""
     scene, methods, cache = task
-    haul = watch(table_scene(scene), with_second="stereo" in methods)
+    filmed = film_passages(table_scene(scene), with_second="stereo" in methods)
     for method in methods:
-        measured = make_method(method, cache)(haul)
-        results.save(method, scene, haul.truth_mm, measured, cache=cache)
+        measured = make_method(method, cache)(filmed)
+        cached_results.save(method, scene, filmed.truth_mm, measured, cache=cache)
     return scene
 
 
 @cached
 def make_method(method: str, cache: Path, log2_database: int = LOG2_DATABASE) -> Measure:
-    """What a method does with a haul; all of them get the species' mean shape."""
+    """What a method does with a filmed; all of them get the species' mean shape."""
     template = species_template()
     match method:
         case "stereo":

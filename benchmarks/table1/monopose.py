@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
+from benchmarks.table1.filmed_scene import FilmedScene
+from benchmarks.table1.frame_lengths import fitted_mesh, measure_frames, unfitted
+from benchmarks.table1.plate import Plate, draw, pose
 from stream_dmr.evaluation.length_tables import LengthRow
 from stream_dmr.fitting.distance_map import signed_distance
 from stream_dmr.fitting.target import mask_contour
 from stream_dmr.messages import FishCrop, FittedMesh
-from table1.fish import Haul
-from table1.frames import fitted_mesh, measure_frames, unfitted
-from table1.plate import Plate, draw, pose
 
 ROWS = ("monopose", "monopose-flat")
 _BENDS_RAD = np.radians([-120.0, -80.0, -40.0, 0.0, 40.0, 80.0, 120.0])
@@ -38,9 +38,9 @@ class MonoPose:
     def __init__(self, plate: Plate) -> None:
         self._plate = plate
 
-    def measure(self, haul: Haul) -> dict[str, dict[int, LengthRow]]:
+    def measure(self, filmed: FilmedScene) -> dict[str, dict[int, LengthRow]]:
         """Lengths by row and track id."""
-        return measure_frames(haul, self.fit, ROWS)
+        return measure_frames(filmed, self.fit, ROWS)
 
     def fit(self, crop: FishCrop) -> FittedMesh:
         """The plate that fills the mask best."""

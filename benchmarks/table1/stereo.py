@@ -11,13 +11,13 @@ it is.
 import numpy as np
 from jaxtyping import Float
 
+from benchmarks.table1.filmed_scene import BASELINE_MM, FilmedScene
+from benchmarks.table1.frame_lengths import medians
+from benchmarks.table1.mask_midline import midline_of
 from stream_dmr.evaluation.length_tables import LengthRow
 from stream_dmr.geometry import arc_length, arc_lengths
 from stream_dmr.localization.localize import LocalizeSettings
 from stream_dmr.messages import FishCrop
-from table1.fish import BASELINE_MM, Haul
-from table1.frames import medians
-from table1.midline import midline_of
 
 ROWS = ("stereo",)
 _GATES = LocalizeSettings()  # the same frames may count as for the other rows
@@ -30,10 +30,10 @@ _LEAST_WEIGHT = 2.0  # below this the depths are guesses
 _ROUNDS = 3  # reweighted, so that a few wrong matches don't bend the fish
 
 
-def measure(haul: Haul) -> dict[str, dict[int, LengthRow]]:
+def measure(filmed: FilmedScene) -> dict[str, dict[int, LengthRow]]:
     """Lengths by row and track id: the median over the frames where both views are good."""
-    lengths_mm: dict[int, list[float]] = {track_id: [] for track_id in haul.truth_mm}
-    for frame in haul.frames:
+    lengths_mm: dict[int, list[float]] = {track_id: [] for track_id in filmed.truth_mm}
+    for frame in filmed.frames:
         for sighting in frame:
             if sighting.pair is None or not all(map(_is_good, sighting.pair)):
                 continue

@@ -17,7 +17,7 @@ from stream_dmr.segmentation.tracking.observation import Observation
 
 IMPOSSIBLE = 1e6  # cost of an assignment that is ruled out; above any sum of real costs
 
-# Chosen on simulated crossings (benchmarks/tracking.py) by IDF1; see docs/segmentation.md.
+# Chosen on simulated crossings by IDF1; see docs/research/tracking.md.
 _MAX_DISTANCE = 1.5  # lengths between the predicted and the observed center
 _POSITION_STD = 0.25  # lengths
 _LOG_LENGTH_STD = 0.3  # fish turn and bend

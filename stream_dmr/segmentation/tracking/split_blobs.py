@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from stream_dmr.segmentation.detection.detector import Candidate, whole_pixels
 from stream_dmr.segmentation.tracking.observation import oriented_extent
 
-# Chosen on simulated scenes (seeds 900 to 903) and crossings; see docs/segmentation.md.
+# Chosen on simulated scenes (seeds 900 to 903) and crossings; see docs/research/tracking.md.
 _MIN_VISIBLE_FRACTION = 0.6  # of a predicted silhouette inside the blob; below, the fish is absent
 _MATCH_RADIUS = 0.1  # fish lengths between a pixel and the predicted silhouette that it belongs to
 _MIN_MATCH_RADIUS_PX = 2.0

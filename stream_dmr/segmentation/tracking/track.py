@@ -12,8 +12,8 @@ from stream_dmr.segmentation.tracking.observation import Observation, fraction_i
 from stream_dmr.segmentation.tracking.occlusion import IMPOSSIBLE, TrackSnapshot
 from stream_dmr.segmentation.tracking.split_blobs import PredictedSilhouette
 
-# Chosen on simulated scenes and crossings (benchmarks/tracking.py) by IDF1 and fish counted; see
-# docs/segmentation.md. Lengths are fractions of the fish's size, so that any zoom will do.
+# Chosen on simulated scenes and crossings by IDF1 and fish counted; see docs/research/tracking.md.
+# Lengths are fractions of the fish's size, so that any zoom will do.
 _POSITION_STD = 0.08  # of a candidate's center
 _SPEED_STD = 0.5  # of a new fish, per frame
 _ACCELERATION_STD = 0.06  # per frame squared

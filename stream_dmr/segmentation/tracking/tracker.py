@@ -20,8 +20,7 @@ from stream_dmr.segmentation.tracking.split_blobs import split_merged_blob
 from stream_dmr.segmentation.tracking.track import Track, TrackedCandidate
 from stream_dmr.settings import Settings
 
-# Chosen on simulated scenes and crossings (benchmarks/tracking.py) by IDF1 and fish counted; see
-# docs/segmentation.md.
+# Chosen on simulated scenes and crossings by IDF1 and fish counted; see docs/research/tracking.md.
 _MIN_MERGED_FRACTION = 0.55  # of a fish's predicted box inside a candidate that contains the fish
 _MIN_MERGED_AREA_RATIO = 1.3  # of a merged blob over the largest fish in it
 _MAX_OVERLAP_OF_NEW = 0.3  # of a new candidate inside a followed fish's box; above, it is a part

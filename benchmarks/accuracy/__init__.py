@@ -1,0 +1,1 @@
+"""How accurate lengths are on simulated scenes, and what limits it."""

@@ -1,0 +1,1 @@
+"""What recordings cost, and whether a replay repeats them."""

@@ -1,0 +1,1 @@
+"""What goes wrong at sea, provoked: `make faults`, `make soak`."""

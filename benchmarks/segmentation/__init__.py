@@ -1,0 +1,1 @@
+"""How well fish are found, followed and segmented."""
