@@ -7,9 +7,10 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
-from stream_dmr.results.tables import FRAMES_COLUMNS, LENGTHS_COLUMNS
 
 from stream_dmr.results.fish_table import FISH_TABLE
+from stream_dmr.results.frames_table import FRAMES_COLUMNS
+from stream_dmr.results.lengths_table import LENGTHS_COLUMNS
 from stream_dmr.results.store_schema import open_database
 from stream_dmr.results.verdicts import Verdict
 from tests.support.pages import pages
