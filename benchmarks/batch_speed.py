@@ -79,7 +79,7 @@ def jobs_of(manifest: Path, rows: Sequence[Mapping[str, object]]) -> list[Job]:
                 "vessel": "demo",
                 "trip": number,
             }
-            writer.writerow(row | of_all)
+            writer.writerow({**row, **of_all})
     return read_manifest(manifest, config=None, template=str(DEMO_SCENE / "species.ply"))
 
 
@@ -124,7 +124,7 @@ def main() -> None:
     parser.add_argument("--workers", nargs="+", type=int, default=[1, 2])
     parser.add_argument("--rounds", type=int, default=1, help="of all, in turn; then medians")
     arguments = parser.parse_args()
-    rates = defaultdict[tuple[str, str, int], list[float]](list)
+    speeds = defaultdict[tuple[str, str, int], list[float]](list)
     with tempfile.TemporaryDirectory() as folder:
         works = list(backlogs(Path(folder), arguments.videos))
         kinds = list(product(works, arguments.engines, arguments.workers))
@@ -132,8 +132,9 @@ def main() -> None:
             if work.name == "raw" and (name, workers) != ("local", 1):
                 continue  # one video keeps one worker busy, wherever
             out = Path(folder) / f"{work.name}-{name}-{workers}-{number}"
-            rates[work.name, name, workers].append(measure(name, workers, work, out))
-    for (what, name, workers), found in rates.items():
+            speed = measure(name, workers, work, out)
+            speeds[work.name, name, workers].append(speed)
+    for (what, name, workers), found in speeds.items():
         print(f"{what}, {name}, {workers} workers: median {median(found):.2f} frames/s")
 
 

@@ -55,7 +55,7 @@ def main() -> None:
     print(f"\n{text}\n")
     if "dmr" in rows:
         print("worst of ours:", *tables.worst(rows["dmr"]), sep="\n  ")
-    if len(scenes) * FISH_PER_SCENE >= ALL_FISH and set(report.TITLES) <= set(found):
+    if len(scenes) * FISH_PER_SCENE >= ALL_FISH and set(tables.TITLES) <= set(found):
         tables.write(PAGE, text)
         tables.plot(found, DOCS / "images")
         print(f"written to {PAGE}")
