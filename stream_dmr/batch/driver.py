@@ -15,6 +15,7 @@ from stream_dmr.batch.dataset import publish, withdraw_others
 from stream_dmr.batch.engine import Engine
 from stream_dmr.batch.layout import (
     DONE,
+    OUTCOME_COLUMNS,
     VIDEO_COLUMNS,
     VIDEO_FOLDERS,
     VIDEOS,
@@ -124,9 +125,8 @@ class _BatchResults:
 
 def _result_cells(outcome: Outcome | None) -> tuple[object, ...]:
     if outcome is None:
-        return (WAITING, "", "", "", "")
-    numbers = (outcome.num_frames, outcome.num_fish, outcome.elapsed_s)
-    return (outcome.status, outcome.reason, *numbers)
+        return (WAITING, *[""] * (len(OUTCOME_COLUMNS) - 1))
+    return tuple(getattr(outcome, name) for name in OUTCOME_COLUMNS.values())
 
 
 def _remove_unfinished(out: Path) -> None:

@@ -11,8 +11,15 @@ VIDEOS = "videos.csv"  # the outcome of each video
 VIDEO_FOLDERS = "videos"
 OUTCOME = "outcome.json"  # the outcome of one video, in its folder
 TABLE_KINDS = ("fish", "frames")  # tables of the data set
-RESULT_COLUMNS = ("status", "reason", "frames", "fish", "elapsed_s")
-VIDEO_COLUMNS = ("name", "video", "vessel", "trip", "haul", *RESULT_COLUMNS)
+# Columns of VIDEOS and the fields of an Outcome that they hold.
+OUTCOME_COLUMNS = {
+    "status": "status",
+    "reason": "reason",
+    "frames": "num_frames",
+    "fish": "num_fish",
+    "elapsed_s": "elapsed_s",
+}
+VIDEO_COLUMNS = ("name", "video", "vessel", "trip", "haul", *OUTCOME_COLUMNS)
 DONE, FAILED, WAITING = "done", "failed", "waiting"
 
 

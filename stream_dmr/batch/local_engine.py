@@ -13,7 +13,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import IO
 
-from stream_dmr.batch.layout import FAILED
 from stream_dmr.batch.manifest import Job
 from stream_dmr.batch.measure_video import Outcome, read_outcome
 from stream_dmr.batch.progress import BatchProgress, OnProgress
@@ -102,11 +101,13 @@ class _Worker:
                 break
             on_progress(float(line))
         if is_finished:
-            return read_outcome(job, self._out) or _failed(job, "its files changed meanwhile")
+            return read_outcome(job, self._out) or Outcome.failed(
+                job, job.key, "its files changed meanwhile"
+            )
         code = self._end()
         if self._stop.is_set():
             return None
-        return _failed(job, f"its process ended ({code}): {self._end_of_stderr()}")
+        return Outcome.failed(job, job.key, f"its process ended ({code}): {self._end_of_stderr()}")
 
     def _start(self) -> subprocess.Popen[str]:
         self._errors.truncate(0)
@@ -133,7 +134,3 @@ class _Worker:
         size = self._errors.seek(0, os.SEEK_END)
         self._errors.seek(max(0, size - _MAX_STDERR_BYTES))
         return " ".join(self._errors.read().decode(errors="replace").split())
-
-
-def _failed(job: Job, reason: str) -> Outcome:
-    return Outcome(name=job.name, key=job.key, status=FAILED, reason=reason)

@@ -33,6 +33,11 @@ class Outcome:
     num_fish: int = 0
     elapsed_s: float = 0.0
 
+    @classmethod
+    def failed(cls, job: Job, key: str, reason: str) -> "Outcome":
+        """Of a video that could not be measured."""
+        return cls(name=job.name, key=key, status=FAILED, reason=reason)
+
 
 def read_outcome(job: Job, out: Path) -> Outcome | None:
     """The outcome of a job from an earlier call; None where it has none or its inputs changed."""
@@ -68,7 +73,7 @@ def measure_video(job: Job, out: Path, *, on_progress: OnProgress = lambda share
         )
     except UserError as error:
         shutil.rmtree(folder, ignore_errors=True)
-        outcome = Outcome(name=job.name, key=key, status=FAILED, reason=str(error))
+        outcome = Outcome.failed(job, key, str(error))
     finish_folder(folder, target, outcome)
     return outcome
 

@@ -8,7 +8,6 @@ from importlib import import_module  # Ray is an extra: type checks pass without
 from pathlib import Path
 from typing import Any
 
-from stream_dmr.batch.layout import FAILED
 from stream_dmr.batch.manifest import Job
 from stream_dmr.batch.measure_video import Outcome, measure_video
 from stream_dmr.batch.progress import BatchProgress
@@ -76,8 +75,7 @@ class RayEngine:
             return Outcome(**self._ray.get(task))
         except self._ray.exceptions.RayError as error:
             last_line = str(error).strip().splitlines()[-1]
-            reason = f"on Ray: {last_line}"
-            return Outcome(name=job.name, key=job.key, status=FAILED, reason=reason)
+            return Outcome.failed(job, job.key, f"on Ray: {last_line}")
 
 
 def measure_on_worker(job: dict[str, Any], out: str) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from stream_dmr.batch.layout import (
     DONE,
     OUTCOME,
-    RESULT_COLUMNS,
+    OUTCOME_COLUMNS,
     TABLE_KINDS,
     VIDEO_FOLDERS,
     VIDEOS,
@@ -20,7 +20,6 @@ from stream_dmr.files import sha256_of
 from stream_dmr.results.verify import Change, verify
 
 Finding = tuple[Path, str]  # a file, and what is wrong with it
-_OUTCOME_FIELDS = ("status", "reason", "num_frames", "num_fish", "elapsed_s")
 
 
 def verify_all(folder: Path) -> tuple[list[Change], int]:
@@ -49,11 +48,11 @@ def _check_row(out: Path, row: Mapping[str, str]) -> Iterator[Finding]:
     folder = out / VIDEO_FOLDERS / row["name"]
     try:
         outcome = json.loads((folder / OUTCOME).read_text(encoding="utf-8"))
-        expected = [str(outcome[name]) for name in _OUTCOME_FIELDS]
+        expected = {column: str(outcome[name]) for column, name in OUTCOME_COLUMNS.items()}
     except (OSError, ValueError, KeyError, TypeError) as error:
         yield folder / OUTCOME, f"damaged: {error!r}"
         return
-    for column, was in zip(RESULT_COLUMNS, expected, strict=True):
+    for column, was in expected.items():
         if row[column] != was:
             what = f"{row['name']}: {column} is {row[column] or 'blank'}, {OUTCOME} says {was}"
             yield out / VIDEOS, what
