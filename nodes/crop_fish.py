@@ -1,6 +1,7 @@
 """CropFish: every fish of a frame, cut out through an ideal camera of its own."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from stream_dmr.camera import Camera
 from stream_dmr.messages import FishCrop, Frame
@@ -8,6 +9,7 @@ from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
 from stream_dmr.segmentation.masks.cropping import crop_fish
 from stream_dmr.segmentation.masks.open_segmenter import open_segmenter
 from stream_dmr.segmentation.tracking.fish_finder import FishFinder
+from stream_dmr.segmentation.tracking.track_numbering import TrackNumbering
 
 
 class CropFish:
@@ -18,17 +20,22 @@ class CropFish:
     ) -> None:
         """Raises ModelError where the model that `settings.segmenter` names cannot be used."""
         self._finder = finder
+        self._numbering = TrackNumbering(keeps_source_ids=finder.knows_ids)
         self._segmenter = open_segmenter(settings.segmenter)
         self._settings = settings
         self._camera = camera
+
+    def number_after(self, track_id: int) -> None:
+        """Number the fish on after those of earlier runs; call it before the first frame."""
+        self._numbering.resume_after(track_id)
 
     def step(self, frame: Frame, /) -> list[FishCrop]:
         """The fish of one frame, by id. Raises AnnotationError for an unusable mask."""
         if self._camera is None:
             height, width = frame.image.shape[:2]
             self._camera = Camera.nominal(width=width, height=height)
-        crops = [
-            crop_fish(
+        crops = {
+            detection.source_id: crop_fish(
                 frame,
                 detection,
                 frame_camera=self._camera,
@@ -36,8 +43,12 @@ class CropFish:
                 segmenter=self._segmenter,
             )
             for detection in self._finder.detect(frame)
+        }
+        fish = [
+            replace(crops[source_id], track_id=self._numbering.track_id(source_id))
+            for source_id in self._finder.confirm(crops)
         ]
-        return self._finder.admit(crops)
+        return sorted(fish, key=lambda crop: crop.track_id)
 
     def tick(self, timestamp_ns: int, /) -> Sequence[FishCrop]:
         """No output: crops do not wait for time to pass."""

@@ -1,5 +1,6 @@
 """Masks to fit: simulated fish, frame after frame, and bodies that the template matches exactly."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -140,13 +141,14 @@ def _crop(scene: RailScene, visit: Visit, frame_index: int, *, size: int) -> Fis
     camera = scene.calibration.camera
     posed = scene.pose(visit, frame_index)
     mask = draw_mask(posed.vertices, posed.faces, camera=camera)
-    detection = Detection(track_id=1, bbox_xyxy_px=_box(mask), visible_fraction=1.0, mask=mask)
+    detection = Detection(source_id=1, bbox_xyxy_px=_box(mask), visible_fraction=1.0, mask=mask)
     image = np.zeros((*mask.shape, 3), np.uint8)
     frame = Frame(frame_index=frame_index, timestamp_ns=0, image=image, source="simulation")
     settings = CropFishSettings(crop_size_px=size)
-    return crop_fish(
+    crop = crop_fish(
         frame, detection, frame_camera=camera, settings=settings, segmenter=GrabCutSegmenter()
     )
+    return replace(crop, track_id=1)
 
 
 def _box(mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "4"]:

@@ -119,7 +119,7 @@ def _crops(
     )
     for box in shot.boxes:
         detection = Detection(
-            track_id=box.track_id,
+            source_id=box.track_id,
             bbox_xyxy_px=_corners(box.xywh_px),
             mask=shot.labels == box.track_id,
             visible_fraction=box.visible_fraction,
@@ -131,7 +131,7 @@ def _crops(
             settings=settings,
             segmenter=GrabCutSegmenter(),  # not arguments: the mask is given
         )
-        yield box.track_id, crop
+        yield box.track_id, replace(crop, track_id=box.track_id)
 
 
 def _corners(xywh_px: tuple[int, int, int, int]) -> Float[np.ndarray, "4"]:

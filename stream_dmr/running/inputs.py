@@ -24,7 +24,7 @@ class Inputs:
     config: Config
     template: Template
     calibration: Calibration | None
-    detections: FishFinder
+    finder: FishFinder
     reader: ReadFrames
 
     @property
@@ -82,7 +82,7 @@ def checked_inputs(request: RunRequest) -> Inputs:
     config = load_config(request.config)
     template = load_template(request.template)
     calibration = None if request.calibration is None else load_calibration(request.calibration)
-    detections = open_finder(
+    finder = open_finder(
         boxes=request.boxes,
         masks=request.masks,
         detect=config.detect_fish,
@@ -94,7 +94,7 @@ def checked_inputs(request: RunRequest) -> Inputs:
         config=config,
         template=template,
         calibration=calibration,
-        detections=detections,
+        finder=finder,
         reader=reader,
     )
     if calibration is not None:

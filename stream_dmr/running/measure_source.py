@@ -26,7 +26,6 @@ from stream_dmr.running.resume import resume_source
 from stream_dmr.running.run_folder import RESULTS, SEGMENTED
 from stream_dmr.running.run_observer import RunObserver, RunTotals
 from stream_dmr.running.run_request import RunRequest
-from stream_dmr.running.track_numbering import TrackNumbering
 from stream_dmr.template.template import Template
 
 _MAX_SUMMARY_FISH = 100  # of an endless run, for the table at its end; the store has all fish
@@ -55,7 +54,11 @@ def measure_source(
     observer = observer or RunObserver()
     inputs = checked_inputs(request)
     try:
-        nodes = _nodes(inputs)
+        crop_fish = _crop_fish(inputs)
+        nodes = [
+            crop_fish,
+            *later_nodes(inputs.config, template=inputs.template, calibration=inputs.calibration),
+        ]
         if inputs.is_endless:  # no frame of a camera shall wait for a compiler
             fitter = Fitter(
                 inputs.template,
@@ -64,13 +67,14 @@ def measure_source(
             )
             rehearse(fitter)
         with open_outputs(inputs, observer) as outputs:
+            crop_fish.number_after(outputs.store.before.track_id)
             continue_tracks(nodes, outputs.interrupted)
             _report_start(inputs, outputs, observer)
             observer.begin(inputs.source.num_frames)
             return _run_chain(inputs, nodes, outputs, observer, stop=stop)
     finally:
         inputs.reader.close()
-        for line in (*inputs.source.warnings, *inputs.detections.warnings):
+        for line in (*inputs.source.warnings, *inputs.finder.warnings):
             observer.warn(line)
 
 
@@ -90,14 +94,9 @@ def _report_start(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> No
         )
 
 
-def _nodes(inputs: Inputs) -> list[Node]:
-    calibration = inputs.calibration
-    camera = None if calibration is None else calibration.camera
-    crop_fish = CropFish(inputs.config.crop_fish, camera=camera, finder=inputs.detections)
-    return [
-        crop_fish,
-        *later_nodes(inputs.config, template=inputs.template, calibration=calibration),
-    ]
+def _crop_fish(inputs: Inputs) -> CropFish:
+    camera = None if inputs.calibration is None else inputs.calibration.camera
+    return CropFish(inputs.config.crop_fish, camera=camera, finder=inputs.finder)
 
 
 def later_nodes(
@@ -135,13 +134,12 @@ def _run_chain(
     stop: threading.Event,
 ) -> RunSummary:
     request, began = inputs.request, time.perf_counter()
-    numbering = TrackNumbering(after=outputs.store.before.track_id)
     writer = _result_writer(inputs, outputs, on_notice=observer.warn)
     policy = ErrorPolicy(is_endless=inputs.is_endless, on_notice=observer.warn)
     totals = RunTotals(max_fish=_MAX_SUMMARY_FISH if inputs.is_endless else None)
 
     def on_message(message: Message) -> Message:
-        message = writer.write(numbering.number(message))
+        message = writer.write(message)
         totals.take(message)
         observer.take(message)
         return message

@@ -193,7 +193,7 @@ def test_masks_alone_give_the_boxes(tmp_path):
     cv2.imwrite(str(tmp_path / "000001.png"), labels_of(id3=(4, 1, 7, 5), id1=(0, 0, 2, 2)))
     annotations = open_annotated_fish(boxes=None, masks=tmp_path)
     first, second = annotations.detect(frame_at(1))
-    assert (first.track_id, second.track_id) == (1, 3)
+    assert (first.source_id, second.source_id) == (1, 3)
     assert list(second.bbox_xyxy_px) == [4, 1, 7, 5]
     assert second.visible_fraction == 1.0
     assert second.mask.sum() == 12
@@ -219,8 +219,8 @@ def test_boxes_choose_among_the_masks_and_mismatches_are_told(tmp_path):
     )
     annotations = open_annotated_fish(boxes=boxes, masks=tmp_path)
     first, second = annotations.detect(frame_at(1))
-    assert (first.track_id, first.visible_fraction, first.mask.sum()) == (1, 0.5, 4)
-    assert (second.track_id, second.mask.any()) == (2, False)
+    assert (first.source_id, first.visible_fraction, first.mask.sum()) == (1, 0.5, 4)
+    assert (second.source_id, second.mask.any()) == (2, False)
     [kept] = annotations.detect(frame_at(2))
     assert not kept.mask.any()
     assert annotations.warnings == [
@@ -229,6 +229,12 @@ def test_boxes_choose_among_the_masks_and_mismatches_are_told(tmp_path):
         "boxes: ids 2 are in no mask, so have no outline",
         "masks: ids 3 have no box, so were left out",
     ]
+
+
+def test_boxes_without_ids_beside_masks_are_refused(tmp_path):
+    boxes = boxes_file(tmp_path, "1,-1,0,0,3,3,1\n")
+    with pytest.raises(AnnotationError, match="expected the ids of --masks"):
+        open_annotated_fish(boxes=boxes, masks=tmp_path)
 
 
 def test_neither_boxes_nor_masks():

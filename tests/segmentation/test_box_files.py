@@ -137,5 +137,5 @@ def test_boxes_with_ids_are_taken_as_they_are_and_others_are_followed(tmp_path):
     for f in range(1, 9):
         found = followed.detect(Frame(frame_index=f, timestamp_ns=f, image=image, source=""))
         expected = [(1, [10 * f, 20, 10 * f + 50, 50])]
-        assert [(d.track_id, list(d.bbox_xyxy_px)) for d in found] == expected
+        assert [(d.source_id, list(d.bbox_xyxy_px)) for d in found] == expected
         assert all(d.mask is None for d in found)

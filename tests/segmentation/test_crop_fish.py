@@ -39,7 +39,7 @@ def detection_of(mask, *, box=None):
     if box is None:
         box = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
     return Detection(
-        track_id=1, bbox_xyxy_px=np.array(box, np.float64), mask=mask, visible_fraction=1.0
+        source_id=1, bbox_xyxy_px=np.array(box, np.float64), mask=mask, visible_fraction=1.0
     )
 
 
@@ -324,7 +324,7 @@ class Painter:
 
 def segmented(picture, box, camera, **knobs):
     detection = Detection(
-        track_id=1, bbox_xyxy_px=np.array(box, np.float64), mask=None, visible_fraction=1.0
+        source_id=1, bbox_xyxy_px=np.array(box, np.float64), mask=None, visible_fraction=1.0
     )
     painter = Painter()
     crop = crop_fish(
@@ -405,7 +405,7 @@ def test_what_is_found_beyond_the_frame_does_not_count():
             return SegmentedFish(probability=np.ones(image.shape[:2], np.float32), ends=None)
 
     detection = Detection(
-        track_id=1, bbox_xyxy_px=np.array([0.0, 0, 50, 60]), mask=None, visible_fraction=1.0
+        source_id=1, bbox_xyxy_px=np.array([0.0, 0, 50, 60]), mask=None, visible_fraction=1.0
     )
     frame = grey_frame(camera, 255)
     crop = crop_fish(

@@ -15,6 +15,7 @@ from stream_dmr.segmentation.detection.detector import Candidate
 from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
 from stream_dmr.segmentation.masks.cropping import crop_fish
 from stream_dmr.segmentation.segmenter import SegmentedFish, Segmenter
+from stream_dmr.segmentation.tracking.track_numbering import TrackNumbering
 from stream_dmr.segmentation.tracking.tracked_fish import TrackedFish, TrackFishSettings
 
 WIDTH, HEIGHT = 640, 480
@@ -77,12 +78,13 @@ def follow(
     """The fish of each frame; `only`: frames that arrive, as a live source drops some."""
     script = Script(frames)
     fish = TrackedFish(script, TrackFishSettings.model_validate({"min_track_frames": 1, **knobs}))
+    numbering = TrackNumbering(keeps_source_ids=fish.knows_ids)
     camera = Camera.nominal(width=WIDTH, height=HEIGHT)
     found = {}
     for i in only or range(1, len(frames) + 1):
         frame = Frame(frame_index=i, timestamp_ns=i, image=script.picture(i), source="script")
-        crops = [
-            crop_fish(
+        crops = {
+            detection.source_id: crop_fish(
                 frame,
                 detection,
                 frame_camera=camera,
@@ -90,10 +92,14 @@ def follow(
                 segmenter=segmenter or WholeBox(confidence),
             )
             for detection in fish.detect(frame)
-        ]
+        }
         found[i] = [
-            Found(crop.track_id, crop.bbox_xyxy_px, crop.quality.visible_fraction)
-            for crop in fish.admit(crops)
+            Found(
+                numbering.track_id(number),
+                crops[number].bbox_xyxy_px,
+                crops[number].quality.visible_fraction,
+            )
+            for number in fish.confirm(crops)
         ]
     return found
 

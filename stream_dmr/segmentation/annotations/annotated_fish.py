@@ -1,32 +1,37 @@
 """Fish by the boxes and masks that annotation files give for each frame."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Integer
 
-from stream_dmr.errors import UserError
+from stream_dmr.errors import AnnotationError, UserError
 from stream_dmr.messages import FishCrop, Frame
-from stream_dmr.segmentation.annotations.annotated_box import AnnotatedBox
+from stream_dmr.segmentation.annotations.annotated_box import UNKNOWN_ID, AnnotatedBox
 from stream_dmr.segmentation.annotations.box_files import load_boxes
 from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
 from stream_dmr.segmentation.detection.fish_detection import Detection
 
 
 def open_annotated_fish(*, boxes: Path | None, masks: Path | None) -> "AnnotatedFish":
-    """Open a boxes file, a masks folder, or both.
+    """Open a boxes file, a masks folder, or both; the boxes must have ids.
 
-    Raises AnnotationError where one cannot be read, UserError where neither is given.
+    Raises AnnotationError where one cannot be read or boxes with masks have no ids, UserError where
+    neither is given.
     """
     if boxes is None and masks is None:
         raise UserError(
             "expected boxes or masks of the fish, got neither; give --boxes, --masks or both"
         )
-    return AnnotatedFish(
-        boxes=None if boxes is None else load_boxes(boxes),
-        masks=None if masks is None else MaskFolder(masks),
-    )
+    by_frame = None if boxes is None else load_boxes(boxes)
+    for box in (box for found in (by_frame or {}).values() for box in found):
+        if box.track_id == UNKNOWN_ID:
+            raise AnnotationError(
+                f"{boxes}: expected the ids of --masks, got boxes without ids; add the ids, or "
+                "leave out --boxes: the masks give boxes as well"
+            )
+    return AnnotatedFish(boxes=by_frame, masks=None if masks is None else MaskFolder(masks))
 
 
 class AnnotatedFish:
@@ -55,7 +60,7 @@ class AnnotatedFish:
         labels = self._labels(frame, is_expected=bool(boxes))
         return [
             Detection(
-                track_id=box.track_id,
+                source_id=box.track_id,
                 bbox_xyxy_px=box.bbox_xyxy_px,
                 mask=self._mask(frame, box, labels),
                 visible_fraction=box.visibility,
@@ -63,8 +68,13 @@ class AnnotatedFish:
             for box in boxes
         ]
 
-    def admit(self, crops: Iterable[FishCrop]) -> list[FishCrop]:
-        """All crops: every annotated object is a fish."""
+    @property
+    def knows_ids(self) -> bool:
+        """True: files say which fish is which."""
+        return True
+
+    def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:
+        """All ids: every annotated object is a fish."""
         return list(crops)
 
     @property
@@ -124,12 +134,12 @@ class AnnotatedFish:
 def _detections_of(labels: Integer[np.ndarray, "H W"]) -> list[Detection]:
     """One detection per id in a label picture, with its tightest box."""
     detections = []
-    for track_id in _ids(labels):
-        mask = labels == track_id
+    for source_id in _ids(labels):
+        mask = labels == source_id
         columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
         box = np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.float64)
         detections.append(
-            Detection(track_id=track_id, bbox_xyxy_px=box, mask=mask, visible_fraction=1.0)
+            Detection(source_id=source_id, bbox_xyxy_px=box, mask=mask, visible_fraction=1.0)
         )
     return detections
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 class Detection:
     """One fish seen in one frame."""
 
-    track_id: int
+    source_id: int  # of its annotation file or of the tracker, the same in each frame
     bbox_xyxy_px: Float[np.ndarray, "4"]  # half-open, frame pixels
     # Of the frame's size, all False for an empty mask; None: the segmenter is to find it.
     mask: Bool[np.ndarray, "H W"] | None

@@ -8,6 +8,8 @@ from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
 from stream_dmr.segmentation.masks.masked_crop import FrameView, crop_given_mask, crop_segmented
 from stream_dmr.segmentation.segmenter import Segmenter
 
+NOT_NUMBERED = 0  # track ids begin with 1
+
 
 def crop_fish(
     frame: Frame,
@@ -17,9 +19,10 @@ def crop_fish(
     settings: CropFishSettings,
     segmenter: Segmenter,
 ) -> FishCrop:
-    """One fish, seen through a crop camera around its box and its mask.
+    """One fish, seen through a crop camera around its box and its mask; not numbered yet.
 
-    Where the detection has no mask, the segmenter finds it in the crop.
+    Where the detection has no mask, the segmenter finds it in the crop. Whether it is a fish shows
+    in the mask, so only then `TrackNumbering` gives it a `track_id`.
     """
     view = FrameView(image=frame.image, camera=frame_camera, settings=settings)
     if detection.mask is None:
@@ -29,7 +32,7 @@ def crop_fish(
     return FishCrop(
         frame_index=frame.frame_index,
         timestamp_ns=frame.timestamp_ns,
-        track_id=detection.track_id,
+        track_id=NOT_NUMBERED,
         bbox_xyxy_px=detection.bbox_xyxy_px,
         image=crop.image,
         mask=crop.mask,

@@ -4,7 +4,7 @@ A motion blob that misses the tail, or includes a piece of line, mostly does so 
 frame. The offset between box and mask of frame t - 1 is therefore applied in frame t.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
@@ -40,7 +40,7 @@ class BoxCorrector:
         limits = [width, height, width, height]
         return [
             Detection(
-                track_id=track,
+                source_id=track,
                 bbox_xyxy_px=np.clip(box + self._offsets_px.get(track, 0.0), 0.0, limits),
                 mask=None,
                 visible_fraction=visible[track],
@@ -48,11 +48,11 @@ class BoxCorrector:
             for track, box in boxes.items()
         ]
 
-    def update(self, crops: Iterable[FishCrop]) -> None:
-        """Replace the offsets by those of this frame's confident masks."""
+    def update(self, crops: Mapping[int, FishCrop]) -> None:
+        """Replace the offsets by those of this frame's confident masks, by track number."""
         self._offsets_px = {
-            crop.track_id: _offset_px(self._boxes[crop.track_id], mask_bbox_in_frame(crop))
-            for crop in crops
+            track: _offset_px(self._boxes[track], mask_bbox_in_frame(crop))
+            for track, crop in crops.items()
             if (crop.quality.mask_confidence or 0.0) > _MIN_MASK_CONFIDENCE
         }
 

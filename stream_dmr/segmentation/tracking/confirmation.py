@@ -44,33 +44,32 @@ class ConfirmationSettings(Settings):
 
 
 class FishConfirmation:
-    """Assigns fish ids, from 1 in the order of confirmation; none is used twice."""
+    """Decides which tracks are fish; a confirmed one stays confirmed."""
 
     def __init__(self, settings: ConfirmationSettings) -> None:
         self._settings = settings
-        self._fish_ids: dict[int, int] = {}  # by track number
+        self._confirmed: set[int] = set()  # track numbers
         self._num_clear_frames: Counter[int] = Counter()  # of unconfirmed tracks
 
-    def update(self, crop: FishCrop) -> int | None:
-        """Take a track's crop of one frame into account; returns its fish id once confirmed.
+    def update(self, number: int, crop: FishCrop) -> bool:
+        """Take a track's crop of one frame into account; returns True once it is confirmed.
 
-        `crop.track_id` is the track's number. A confirmed fish keeps its id outside the zone. A
-        crop without `mask_confidence` (a given mask) counts as clearly seen.
+        A confirmed fish remains one outside the zone. A crop without `mask_confidence` (a given
+        mask) counts as clearly seen.
         """
-        number = crop.track_id
-        if number not in self._fish_ids:
+        if number not in self._confirmed:
             confidence = crop.quality.mask_confidence
             if confidence is None or confidence >= self._settings.min_mask_confidence:
                 self._num_clear_frames[number] += 1
                 if len(self._num_clear_frames) > _MAX_UNCONFIRMED_TRACKS:
                     del self._num_clear_frames[min(self._num_clear_frames)]
-            if not self._is_confirmed_by(crop):
-                return None
-            self._fish_ids[number] = len(self._fish_ids) + 1
+            if not self._is_confirmed_by(number, crop):
+                return False
+            self._confirmed.add(number)
             del self._num_clear_frames[number]
-        return self._fish_ids[number]
+        return True
 
-    def _is_confirmed_by(self, crop: FishCrop) -> bool:
+    def _is_confirmed_by(self, number: int, crop: FishCrop) -> bool:
         width, height = crop.frame_camera.width, crop.frame_camera.height
         x0, y0, x1, y1 = crop.bbox_xyxy_px.tolist()
         left, top, right, bottom = self._settings.zone
@@ -78,6 +77,4 @@ class FishConfirmation:
             left * width <= (x0 + x1) / 2 <= right * width
             and top * height <= (y0 + y1) / 2 <= bottom * height
         )
-        return is_in_zone and (
-            self._num_clear_frames[crop.track_id] >= self._settings.min_track_frames
-        )
+        return is_in_zone and self._num_clear_frames[number] >= self._settings.min_track_frames

@@ -1,6 +1,6 @@
 """The source of a run's fish: annotation files, or detection and tracking in the video itself."""
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -16,7 +16,7 @@ from stream_dmr.segmentation.tracking.tracked_fish import TrackedFish, TrackFish
 
 @runtime_checkable
 class FishFinder(Protocol):
-    """Finds the fish of each frame: `detect` before the crops are cut, then `admit`."""
+    """Finds the fish of each frame: `detect` before the crops are cut, then `confirm`."""
 
     @property
     def warnings(self) -> list[str]:
@@ -27,8 +27,13 @@ class FishFinder(Protocol):
         """What may be fish in one frame. Raises AnnotationError for an unusable mask."""
         ...
 
-    def admit(self, crops: Iterable[FishCrop]) -> list[FishCrop]:
-        """Those of the frame's crops that show fish, with the fish's ids."""
+    @property
+    def knows_ids(self) -> bool:
+        """True where `source_id` is the id that somebody gave the fish."""
+        ...
+
+    def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:
+        """Those of the frame's detections that are fish; `crops` and results by `source_id`."""
         ...
 
 

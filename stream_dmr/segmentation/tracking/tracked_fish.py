@@ -1,7 +1,6 @@
 """Fish found in the video alone: detected in every frame, tracked, and confirmed by their masks."""
 
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Mapping
 
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.detection.detector import Detector
@@ -31,15 +30,15 @@ class TrackedFish:
         visible = {one.track_number: one.visible_fraction for one in tracked}
         return self._corrector.correct(boxes, visible, frame)
 
-    def admit(self, crops: Iterable[FishCrop]) -> list[FishCrop]:
-        """The crops of confirmed fish, with fish ids instead of track numbers, ordered by id."""
-        crops = list(crops)
+    @property
+    def knows_ids(self) -> bool:
+        """False: track numbers also count what turns out to be no fish."""
+        return False
+
+    def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:
+        """The track numbers of confirmed fish; `crops` are those of all detections of the frame."""
         self._corrector.update(crops)
-        ids = [self._confirmation.update(crop) for crop in crops]
-        fish = [
-            replace(crop, track_id=i) for i, crop in zip(ids, crops, strict=True) if i is not None
-        ]
-        return sorted(fish, key=lambda crop: crop.track_id)
+        return [track for track, crop in crops.items() if self._confirmation.update(track, crop)]
 
     @property
     def warnings(self) -> list[str]:
