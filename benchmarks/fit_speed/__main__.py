@@ -2,7 +2,7 @@
 
     python -m benchmarks.fit_speed [--targets N] [--dry]
 
-Five minutes. Peers are in the extra `bench`; what can't be imported is named and left out.
+Six minutes. DEODR is among the development packages; where it can't be imported, it is left out.
 """
 
 import argparse

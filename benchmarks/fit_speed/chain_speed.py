@@ -18,7 +18,7 @@ from stream_dmr.simulation.rail_scene import HEIGHT, WIDTH, make_scene
 from stream_dmr.simulation.write_scene import encode_mask, write_species
 
 NUM_FISH = 3
-_MOSTLY = 0.9  # of each fish is in view, as in the middle of a passage
+_MIN_VISIBLE_FRACTION = 0.9  # of each fish is in view, as in the middle of a passage
 RECORDINGS = {
     "both recordings (default)": {},
     ".mcap alone": {"rrd": False},
@@ -75,7 +75,7 @@ def measure(clip: Path, recording: dict[str, bool]) -> Rate:
 
 
 def _shows_all(shot: FilmedFrame, num_fish: int) -> bool:
-    visible = [box for box in shot.boxes if box.visible_fraction >= _MOSTLY]
+    visible = [box for box in shot.boxes if box.visible_fraction >= _MIN_VISIBLE_FRACTION]
     return len(visible) == num_fish
 
 

@@ -29,7 +29,7 @@ def losses(pictures: Path, *, count: int) -> dict[str, object]:
     camera = Camera("--jpegs", str(pictures), "--fps", "15")
     camera.start()
     watched = Watched(reached(camera.address))
-    took_s: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    durations_s: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for number, kind in zip(range(count), itertools.cycle(KINDS), strict=False):
         watched.take(5)
         reconnects = watched.stream.counts.reconnects
@@ -38,12 +38,12 @@ def losses(pictures: Path, *, count: int) -> dict[str, object]:
         while watched.stream.counts.reconnects == reconnects:
             watched.take(1)
         watched.take(1)
-        took_s[kind].append(time.monotonic() - back_s)
+        durations_s[kind].append(time.monotonic() - back_s)
         if number == min(2 * len(KINDS), count - 1):
             watched.begin()
     figures = watched.end()
     camera.lose()
-    slowest = {kind: round(max(times), 1) for kind, times in took_s.items() if times}
+    slowest = {kind: round(max(times), 1) for kind, times in durations_s.items() if times}
     return {"losses": count, "frames again after s, most": slowest} | figures
 
 

@@ -49,7 +49,7 @@ def prepare(folder: Path) -> None:
     (folder / "config.toml").write_text(config)
 
 
-class Healing(RunObserver):
+class RestoringObserver(RunObserver):
     """Lets writes work again after some frames."""
 
     def __init__(self, case: Case) -> None:
@@ -80,7 +80,7 @@ def measure(case: Case) -> dict:
         config=_FOLDER / "config.toml",
     )
     count = {"once": 1}.get(case.mode, 1 << 40) if case.at else 0
-    observer, refused = Healing(case), ""
+    observer, refused = RestoringObserver(case), ""
     disturb_writes(out, first=case.at, count=count, error=case.error)
     try:
         measure_source(request, stop=threading.Event(), observer=observer)

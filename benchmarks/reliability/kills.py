@@ -34,7 +34,7 @@ def kills(
     scene = write_small_scene(folder / "scene")
     until_s = time.monotonic() + 60 * minutes
     series = [
-        Series(
+        KilledMeasurement(
             folder / str(number),
             scene,
             count=(count + number) // side_by_side,
@@ -59,7 +59,7 @@ def kills(
     return figures
 
 
-class Series:
+class KilledMeasurement:
     """One measurement, killed and started again."""
 
     def __init__(

@@ -118,10 +118,10 @@ def mutate_inputs(
     (sandbox / "out").mkdir(parents=True)
     os.chdir(sandbox)  # so that no relative path leads to anything of ours
     for kind in kinds:
-        yield _fuzz_one(folder, kind, max(2, round(count * kind.share)), seed)
+        yield _mutate_one(folder, kind, max(2, round(count * kind.share)), seed)
 
 
-def _fuzz_one(folder: Path, kind: Input, count: int, seed: int) -> dict[str, object]:
+def _mutate_one(folder: Path, kind: Input, count: int, seed: int) -> dict[str, object]:
     rng, original = random.Random(f"{seed} {kind.name}"), kind.original.read_bytes()
     place = folder / "in"
     place.mkdir(exist_ok=True)

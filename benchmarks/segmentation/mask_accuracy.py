@@ -30,7 +30,7 @@ from stream_dmr.segmentation.network.unet_weights import SHIPPED
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
 
-_LEAST_PX = 64  # of a true mask in its crop
+_MIN_MASK_PX = 64  # of a true mask in its crop
 _SHOWN, _PER_ROW = 36, 12  # crops on the sheet: the worst third, the others at random
 
 
@@ -49,7 +49,7 @@ def crops_of(scene: Path, segmenter: str) -> Iterator[tuple[FishCrop, Bool[np.nd
             x, y = frame_from_crop_map(crop.crop_camera, frame_camera=crop.frame_camera)
             grey = (labels == crop.track_id) * np.uint8(255)
             truth = cv2.remap(grey, x, y, cv2.INTER_LINEAR) > 127
-            if np.count_nonzero(truth) >= _LEAST_PX:
+            if np.count_nonzero(truth) >= _MIN_MASK_PX:
                 yield crop, truth
     source.close()
 

@@ -40,7 +40,7 @@ from stream_dmr.simulation.write_scene import simulate
 from stream_dmr.template.template import load_template
 
 
-class Ran(NamedTuple):
+class ChainResult(NamedTuple):
     """One run of the chain."""
 
     crops: list[FishCrop]
@@ -83,7 +83,7 @@ def measure(scene: Path, arguments: argparse.Namespace) -> Row:
     )
 
 
-def chain(scene: Path, path: Path | None, template: str, *, given: bool) -> Ran:
+def chain(scene: Path, path: Path | None, template: str, *, given: bool) -> ChainResult:
     """The nodes as `run` assembles them, without a recording."""
     config = load_config(path)
     calibration = load_calibration(scene / "calibration.yaml")
@@ -95,7 +95,7 @@ def chain(scene: Path, path: Path | None, template: str, *, given: bool) -> Ran:
     )
     crop_fish = CropFish(config.crop_fish, camera=calibration.camera, finder=finder)
     later = later_nodes(config, template=load_template(template), calibration=calibration)
-    ran = Ran([], [], [])
+    ran = ChainResult([], [], [])
 
     def note(message: Message) -> Message:
         if isinstance(message, FishCrop):

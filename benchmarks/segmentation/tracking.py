@@ -24,7 +24,7 @@ from stream_dmr.simulation.presets import PRESETS
 from stream_dmr.simulation.rail_scene import RailScene, Visit, make_scene
 
 _SWING_MM = 700.0  # of each fish to either side
-_LEAST_VISIBLE = 0.3  # a fish of which less is to be seen is nobody's to find
+_MIN_VISIBLE_FRACTION = 0.3  # a fish of which less is to be seen is nobody's to find
 
 
 class Outcome(NamedTuple):
@@ -71,7 +71,7 @@ def measure(scene: RailScene) -> Outcome:
             {
                 box.track_id: np.add(box.xywh_px, [0, 0, *box.xywh_px[:2]])
                 for box in shot.boxes
-                if box.visible_fraction >= _LEAST_VISIBLE
+                if box.visible_fraction >= _MIN_VISIBLE_FRACTION
             }
         )
         found.append({crop.track_id: crop.bbox_xyxy_px for crop in node.step(frame)})

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 THRESHOLDS = np.arange(0.05, 0.99, 0.05)  # of IoU, over which HOTA is a mean
-_SAME = 0.5  # IoU from which on IDF1 takes two boxes for one
+_MATCH_IOU = 0.5  # IoU from which on IDF1 takes two boxes for one
 
 Boxes = Mapping[int, np.ndarray]  # id -> left, top, right, bottom, px
 
@@ -34,27 +34,36 @@ def score(truth: Sequence[Boxes], found: Sequence[Boxes]) -> Score:
         for t, f, pair in zip(truth, found, pairs, strict=True)
     ]
     size = (len(rows), len(columns))
-    lives = (_lives([f[0] for f in frames], size[0]), _lives([f[1] for f in frames], size[1]))
-    return Score(idf1=_idf1(frames, size, lives), hota=_hota(frames, size, lives))
+    track_lengths = (
+        _track_lengths([f[0] for f in frames], size[0]),
+        _track_lengths([f[1] for f in frames], size[1]),
+    )
+    return Score(idf1=_idf1(frames, size, track_lengths), hota=_hota(frames, size, track_lengths))
 
 
-def _idf1(frames: list, size: tuple[int, int], lives: tuple[np.ndarray, np.ndarray]) -> float:
+def _idf1(
+    frames: list, size: tuple[int, int], track_lengths: tuple[np.ndarray, np.ndarray]
+) -> float:
     """2 IDTP / (all true boxes + all found boxes), with the best pairing of whole tracks."""
     together = np.zeros(size)
     for truth, found, similarity in frames:
-        together[np.ix_(truth, found)] += similarity >= _SAME
+        together[np.ix_(truth, found)] += similarity >= _MATCH_IOU
     pairing = linear_sum_assignment(together, maximize=True)
-    return float(2 * together[pairing].sum() / max(lives[0].sum() + lives[1].sum(), 1))
+    return float(
+        2 * together[pairing].sum() / max(track_lengths[0].sum() + track_lengths[1].sum(), 1)
+    )
 
 
-def _hota(frames: list, size: tuple[int, int], lives: tuple[np.ndarray, np.ndarray]) -> float:
+def _hota(
+    frames: list, size: tuple[int, int], track_lengths: tuple[np.ndarray, np.ndarray]
+) -> float:
     """The mean over thresholds of sqrt(DetA AssA), eq. (7) to (10)."""
     overlap = np.zeros(size)
     for truth, found, similarity in frames:
         either = similarity.sum(0, keepdims=True) + similarity.sum(1, keepdims=True) - similarity
         share = np.divide(similarity, either, out=np.zeros_like(similarity), where=either > 0)
         overlap[np.ix_(truth, found)] += share
-    lived = lives[0][:, None] + lives[1]
+    lived = track_lengths[0][:, None] + track_lengths[1]
     alignment = overlap / np.maximum(lived - overlap, 1e-12)
     matches = np.zeros((len(THRESHOLDS), *size))
     for truth, found, similarity in frames:
@@ -62,13 +71,13 @@ def _hota(frames: list, size: tuple[int, int], lives: tuple[np.ndarray, np.ndarr
         for row, column in zip(*pairing, strict=True):
             matches[:, truth[row], found[column]] += similarity[row, column] >= THRESHOLDS
     hits = matches.sum(axis=(1, 2))
-    detection = hits / np.maximum(lives[0].sum() + lives[1].sum() - hits, 1)
+    detection = hits / np.maximum(track_lengths[0].sum() + track_lengths[1].sum() - hits, 1)
     jaccard = matches / np.maximum(lived - matches, 1)
     association = (matches * jaccard).sum(axis=(1, 2)) / np.maximum(hits, 1)
     return float(np.sqrt(detection * association).mean())
 
 
-def _lives(ids: list[np.ndarray], count: int) -> np.ndarray:
+def _track_lengths(ids: list[np.ndarray], count: int) -> np.ndarray:
     """In how many frames each track has a box."""
     return np.bincount(np.concatenate([*ids, np.zeros(0, int)]), minlength=count)
 

@@ -27,7 +27,9 @@ FISH_PER_SCENE = 18  # 41 scenes, each with a camera and a plane of its own, are
 FRAMES_PER_SCENE = 151  # 12 of them for each fish
 BASELINE_MM = 800.0
 FIRST_SEED = 738_000
-_SECOND_FILM = 1_000_000  # added to the seed: the second camera's masks have errors of their own
+_SECOND_CAMERA_SEED = (
+    1_000_000  # added to the seed: the second camera's masks have errors of their own
+)
 _CHAIN = CropFishSettings()
 _STEREO = CropFishSettings(crop_size_px=256)  # about the frame's own resolution
 
@@ -60,7 +62,7 @@ def table_scene(index: int) -> RailScene:
 def film_passages(scene: RailScene, *, with_second: bool) -> FilmedScene:
     """Film a scene; `with_second` by both cameras, which takes twice as long."""
     first = scene.calibration
-    second = replace(scene, calibration=_beside(first), seed=scene.seed + _SECOND_FILM)
+    second = replace(scene, calibration=_beside(first), seed=scene.seed + _SECOND_CAMERA_SEED)
     if with_second:
         shots = zip(film(scene), film(second), strict=True)
     else:

@@ -12,13 +12,15 @@ from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.localization.localize import LocalizeSettings, localize
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms
 
-_FEWEST = SmoothLengthSettings().min_frames  # as many good frames as our own rows need
+_MIN_FRAMES = SmoothLengthSettings().min_frames  # as many good frames as our own rows need
 
 
 def medians(lengths_mm: Mapping[int, Sequence[float]]) -> dict[int, LengthRow]:
     """The median of each fish's frames: hardly moved by the frames that go wrong."""
     return {
-        track_id: LengthRow(length_mm=float(np.median(frames)) if len(frames) >= _FEWEST else None)
+        track_id: LengthRow(
+            length_mm=float(np.median(frames)) if len(frames) >= _MIN_FRAMES else None
+        )
         for track_id, frames in lengths_mm.items()
     }
 

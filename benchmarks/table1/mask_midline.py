@@ -15,9 +15,9 @@ _NUM_STATIONS = 41
 _NUM_POINTS = 65
 _DEGREE = 4  # of the curve: a C, an S and a little more
 _ROUNDS = 4
-_UNSURE_END = 0.06  # of the length at each end, where slices are no slices of the body
+_UNCERTAIN_END = 0.06  # of the length at each end, where slices are no slices of the body
 _STEP_PX = 0.5
-_FEWEST = 12  # stations that a curve needs
+_MIN_STATIONS = 12  # stations that a curve needs
 
 
 def midline_of(mask: Bool[np.ndarray, "S S"]) -> Float[np.ndarray, "M 2"] | None:
@@ -58,8 +58,8 @@ def _recentered(
     normals = np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
     middles = _slice_middles(soft, stations, normals)
     t = np.linspace(0.0, 1.0, _NUM_STATIONS)
-    is_sure = np.isfinite(middles) & (t >= _UNSURE_END) & (t <= 1 - _UNSURE_END)
-    if is_sure.sum() < _FEWEST:
+    is_sure = np.isfinite(middles) & (t >= _UNCERTAIN_END) & (t <= 1 - _UNCERTAIN_END)
+    if is_sure.sum() < _MIN_STATIONS:
         return None
     found = stations[is_sure] + middles[is_sure, None] * normals[is_sure]
     t = t[is_sure]

@@ -25,8 +25,8 @@ _MATCH_STD = 1e-3  # of a disparity: a midline is off by some 0.9 px of 1300 in 
 _MATCHES_AN_EDGE = 3.0  # neighbouring matches that share one error of the edge
 _SHAPE_STDS = (0.3, 0.12, 0.02)  # slope, C and S bend in depth: amplitudes, of the body's length
 _END_WEIGHT = 0.3  # of a matched end, beside 1 for all matches that share an error
-_UNSURE_END = 0.05  # of the midline; there the ends themselves are matched
-_LEAST_WEIGHT = 2.0  # below this the depths are guesses
+_UNCERTAIN_END = 0.05  # of the midline; there the ends themselves are matched
+_MIN_WEIGHT = 2.0  # below this the depths are guesses
 _ROUNDS = 3  # reweighted, so that a few wrong matches don't bend the fish
 
 
@@ -87,7 +87,7 @@ def _disparities(
     at = np.concatenate([s, [0.0, 1.0]])
     values = np.concatenate([found, ours[[0, -1], 0] - theirs[[0, -1], 0]])
     weights = np.concatenate([weights / _MATCHES_AN_EDGE, [_END_WEIGHT] * 2])
-    if weights.sum() < _LEAST_WEIGHT:
+    if weights.sum() < _MIN_WEIGHT:
         return None
     middle = float(weights @ values / weights.sum())
     design = np.polynomial.legendre.legvander(2 * at - 1, len(_SHAPE_STDS))
@@ -110,7 +110,7 @@ def _row_matches(
     ours_steep, theirs_steep = _steepness(ours), _steepness(theirs)
     place = np.linspace(0.0, 1.0, len(theirs))
     found, weights = np.zeros(len(ours)), np.zeros(len(ours))
-    for n in np.flatnonzero((s > _UNSURE_END) & (s < 1 - _UNSURE_END)):
+    for n in np.flatnonzero((s > _UNCERTAIN_END) & (s < 1 - _UNCERTAIN_END)):
         above = theirs[:, 1] < ours[n, 1]
         crossings = np.flatnonzero(above[1:] != above[:-1])
         if len(crossings) == 0:
