@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from stream_dmr.camera import Calibration
 from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.tracks import TrackFitter
 from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.template.template import Template
@@ -21,10 +22,16 @@ class FitMesh:
         *,
         template: Template,
         calibration: Calibration | None,
+        candidates: CandidateShapes | None = None,
         with_covariance: bool = False,
     ) -> None:
+        """Each fish gets that of the `candidates` which its masks prefer."""
         self._tracks = TrackFitter(
-            template, settings, calibration=calibration, with_covariance=with_covariance
+            template,
+            settings,
+            calibration=calibration,
+            candidates=candidates,
+            with_covariance=with_covariance,
         )
 
     def step(self, crop: FishCrop, /) -> list[FittedMesh]:

@@ -131,6 +131,11 @@ class FittedShape(_ReadOnly):
     losses: LossTerms
     covariance: Float[np.ndarray, "P P"] | None  # of `parameters`; None: not asked for
     length_std_ratio: float  # std of the arc length, as a fraction of it
+    # Which of the run's candidate shapes the template was given; None: its own.
+    candidate: int | None = None
+    # Std of the arc length since the fish's shape isn't known exactly, as a fraction: an error that
+    # all frames of a fish share. None: an older recording, or a solver that can't tell.
+    shape_std_ratio: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -159,6 +164,7 @@ class LocalizedFish(FishMessage):
     iou: float | None
     accepted: bool  # may this frame count towards the fish's length?
     reason: str  # "" when accepted, else a Reason
+    shape_std_ratio: float | None = None  # FittedShape's
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -25,7 +25,7 @@ from stream_dmr.camera import Calibration
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.normal_equations import normal_equations, prior_loss
 from stream_dmr.fitting.contour.problem import Problem
-from stream_dmr.fitting.mesh_levels import Bodies
+from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import LOG_SIZE
 from stream_dmr.fitting.size.scanner import SCATTER
 from stream_dmr.fitting.tracks import TrackFitter
@@ -61,7 +61,7 @@ def walk(problem, start, spread, nat, steps, thin, rng):  # type: ignore[no-unty
 class Sampler:
     """What `SizeScanner.expected` tells of the size, by sampling."""
 
-    def __init__(self, tracks: TrackFitter, bodies: Bodies, config: Config) -> None:
+    def __init__(self, tracks: TrackFitter, bodies: MeshLevels, config: Config) -> None:
         self._fitter, self._settings = tracks.fitter, config.fit_mesh
         self._body = bodies.coarse
         self._rng = np.random.default_rng(1)
@@ -83,7 +83,7 @@ def errors_of(task: tuple[str, int]) -> np.ndarray:
     filmed = film_passages(scene_of(task), with_second=False)
     template = species_template()
     tracks = TrackFitter(template, CONFIG.fit_mesh, calibration=filmed.calibration)
-    sampler = Sampler(tracks, Bodies.of(template, max_faces=CONFIG.fit_mesh.max_faces), CONFIG)
+    sampler = Sampler(tracks, MeshLevels.of(template, max_faces=CONFIG.fit_mesh.max_faces), CONFIG)
     errors = []
     for track_id, track in tracks_of(filmed).items():
         fits = [(crop, tracks.fit(crop)) for crop in track]

@@ -29,7 +29,7 @@ from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.contour.solver import ContourSolver
 from stream_dmr.fitting.distance_map import signed_distance
 from stream_dmr.fitting.fitter import Fitter
-from stream_dmr.fitting.mesh_levels import Bodies
+from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.paper.adam import AdamSolver
 from stream_dmr.fitting.parameters import LOG_SIZE
 from stream_dmr.fitting.settings import FitMeshSettings
@@ -74,7 +74,7 @@ class Setup:
     def __init__(self, template: Template) -> None:
         self.template = template
         self.settings = FitMeshSettings()
-        self.bodies = Bodies.of(template, max_faces=self.settings.max_faces)
+        self.bodies = MeshLevels.of(template, max_faces=self.settings.max_faces)
         self.body = self.bodies.fine
 
     def fitter(self, pair: FramePair) -> Fitter:

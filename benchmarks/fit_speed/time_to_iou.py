@@ -20,7 +20,7 @@ from stream_dmr.fitting.cold_start import cold_starts
 from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.contour.solver import ContourSolver
 from stream_dmr.fitting.fitter import Fitter
-from stream_dmr.fitting.mesh_levels import Bodies
+from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.paper import adam
 from stream_dmr.fitting.paper.adam import AdamSolver
 from stream_dmr.fitting.settings import FitMeshSettings
@@ -75,7 +75,7 @@ class SolverComparison:
 
     def __init__(self, template: Template) -> None:
         self._template = template
-        self._bodies = Bodies.of(template, max_faces=FitMeshSettings().max_faces)
+        self._bodies = MeshLevels.of(template, max_faces=FitMeshSettings().max_faces)
         patient = FitMeshSettings(solver="adam", adam_iterations=CAP, tolerance=1e-12)
         self._adam = AdamSolver(template, patient)
         self._deodr = None

@@ -29,7 +29,7 @@ class Job:
     trip: str = ""
     haul: str = ""
     config: str = ""
-    template: str = "halibut"
+    template: str = "auto"
 
     @property
     def key(self) -> str:

@@ -40,7 +40,7 @@ def batch(
     workers: Annotated[
         int, typer.Option(help="Videos at a time, with local.", show_default="one a core")
     ] = 0,
-    template: TemplateOption = "halibut",
+    template: TemplateOption = "auto",
     config: ConfigOption = None,
 ) -> None:
     """Measure every video of a manifest, each as `run` does; call it again to go on.
@@ -52,11 +52,11 @@ def batch(
         from stream_dmr.batch.driver import run_batch
         from stream_dmr.batch.manifest import read_manifest
         from stream_dmr.batch.progress import duration
+        from stream_dmr.fitting.shape.candidates import load_shapes
         from stream_dmr.running.config import load_config
-        from stream_dmr.template.template import load_template
 
         load_config(config)
-        load_template(template)
+        load_shapes(template)  # refuses what it can't read before any video
         jobs = read_manifest(manifest, config=config, template=template)
         with _engine(engine, workers, address, gpus) as where:
             summary = run_batch(

@@ -57,13 +57,25 @@ class RunDisplay(RunObserver):
             self._warned.add(line)
             self._console.print(f"warning: {line}", markup=False)
 
+    def notice(self, line: str) -> None:  # noqa: D102
+        self._console.print(line, markup=False)
+
+    def stage(self, line: str) -> None:  # noqa: D102
+        self._num_done, self._began = 0, time.monotonic()
+        self._progress.reset(self._task, description=line, rate=0.0)
+        self._progress.start()
+        if self._progress.disable and time.monotonic() - self._last_line >= _LINE_EVERY_S:
+            self._last_line = time.monotonic()
+            self._console.print(line, markup=False)
+
     def serving(self, address: str) -> None:  # noqa: D102
         self._console.print(f"watch it with: {address}", markup=False)
 
     def begin(self, num_frames: int | None) -> None:  # noqa: D102
         self._num_frames = num_frames
         self._began = self._last_line = time.monotonic()
-        self._progress.update(self._task, total=num_frames)
+        self._num_done = 0
+        self._progress.reset(self._task, description="measuring", total=num_frames)
         self._progress.start()
 
     def frame_done(self) -> None:  # noqa: D102

@@ -1,11 +1,19 @@
-"""`stream-dmr learn-template`: the proportions of one's own stock, from what was recorded of it."""
+"""`stream-dmr learn-template`: the shapes of one's own stock, from what was recorded of it."""
 
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stream_dmr.cli.support import warn
+from stream_dmr.cli.support import ConfigOption, warn
+
+if TYPE_CHECKING:
+    from stream_dmr.messages import FishCrop
+    from stream_dmr.recording.reading.reader import Recording
+
+_IDS = 1_000_000  # between the fish of one recording and those of the next
 
 
 def learn_template(
@@ -14,70 +22,64 @@ def learn_template(
     ],
     out: Annotated[Path, typer.Option(help="The mesh to write, .ply; a .toml comes beside it.")],
     template: Annotated[
-        str | None, typer.Option(help="Template to start from; else the first recording's own.")
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="A config.toml instead of the first recording's own.")
-    ] = None,
+        str, typer.Option(help="What to start from: auto, a body form, or a mesh with its TOML.")
+    ] = "auto",
+    config: ConfigOption = None,
 ) -> None:
-    """Learn outline and thickness of a species from the masks of recorded fish, without labels.
+    """Learn the mean shape of a stock from the masks of its own fish.
 
-    A template that is 10 % too wide reads all lengths some percent wrong. Frames in which a fish is
-    whole and little bent show its outline; dozens of fish show their species'. Then measure, or
-    replay, with --template OUT.
+    `run --template auto` does the same for one video. Of a mixed catch every stock is written:
+    OUT, OUT-2, ... Measure other videos with --template OUT.
     """
     from rich.progress import Progress
 
-    from stream_dmr.camera import Calibration
-    from stream_dmr.errors import OutputError
-    from stream_dmr.fitting.shape.learn import ROUNDS, learn, well_seen
-    from stream_dmr.localization.localize import localize
-    from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
-    from stream_dmr.recording.reading.reader import messages, open_recordings
+    from stream_dmr.errors import OutputError, TemplateError
+    from stream_dmr.fitting.learn_shapes import learn_shapes
+    from stream_dmr.fitting.shape.candidates import load_shapes, mesh_form
+    from stream_dmr.fitting.shape.describe import describe
+    from stream_dmr.recording.reading.reader import open_recordings
     from stream_dmr.running.config import load_config, parse_config
-    from stream_dmr.template.template import load_template, save_template
+    from stream_dmr.running.shape_pass import save_stocks
 
     if out.suffix != ".ply":
         raise OutputError(f"--out {out}: expected a name that ends in .ply")
     opened = [open_recordings([path]) for path in recordings]
     header = opened[0].header
-    base = header.template if template is None else load_template(template)
+    mesh, forms = load_shapes(template)
+    forms = forms or mesh_form(mesh)
     settings = (
         parse_config(header.config_toml, where=f"{recordings[0]}: its config.toml")
         if config is None
         else load_config(config)
     )
-    crops = [
-        (
-            (message for message, _ in messages(one, [FishCrop]) if isinstance(message, FishCrop)),
-            one.header.calibration,
-        )
-        for one in opened
-    ]
-
-    def localized(mesh: FittedMesh, calibration: Calibration | None) -> LocalizedFish:
-        return localize(mesh, settings=settings.localize, calibration=calibration)
-
     with Progress(transient=True) as progress:
-        reading = progress.add_task("looking for fish that are seen well", total=None)
-        samples = well_seen(crops, base, settings.fit_mesh, localized)
-        progress.remove_task(reading)
-        task = progress.add_task("learning", total=ROUNDS)
-        learnt = learn(
-            base,
-            samples,
+        task = progress.add_task("looking for fish that are seen whole", total=None)
+        stocks = learn_shapes(
+            _crops(opened),
+            mesh,
+            forms,
             settings.fit_mesh,
-            progress=lambda done: progress.update(task, completed=done),
+            calibration=header.calibration,
+            progress=lambda step: progress.update(task, description=step),
+        )
+    warn([line for one in opened for line in one.warnings])
+    if stocks is None:
+        raise TemplateError(
+            "learn-template: expected fish that are seen whole, found none; give more recordings"
         )
     names = ", ".join(path.name for path in recordings)
-    save_template(
-        learnt.template,
-        out,
-        comment=f"learnt from {learnt.num_fish} fish, {learnt.num_frames} frames of {names}",
-    )
-    warn([line for one in opened for line in one.warnings])
-    before, after = learnt.iou
-    print(f"{learnt.num_fish} fish, {learnt.num_frames} frames that are whole and little bent")
-    print(f"IoU with their masks: {before:.3f} before, {after:.3f} with what was learnt")
-    print(f"sizes change by {100 * learnt.size_change:+.1f} % (median)")
-    print(f"{out}: measure with --template {out}")
+    for path in save_stocks(mesh, stocks, out, source=names):
+        print(f"{path}: measure with --template {path}")
+    for line in describe(forms, stocks):
+        print(line)
+
+
+def _crops(recordings: "list[Recording]") -> "Iterator[FishCrop]":
+    """The crops of all, with ids of their own."""
+    from stream_dmr.messages import FishCrop
+    from stream_dmr.recording.reading.reader import messages
+
+    for number, recording in enumerate(recordings):
+        for message, _ in messages(recording, [FishCrop]):
+            if isinstance(message, FishCrop):
+                yield replace(message, track_id=message.track_id + number * _IDS)

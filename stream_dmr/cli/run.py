@@ -36,7 +36,7 @@ def run(
         Path | None,
         typer.Option(help="Folder of %06d.png from 1; a pixel's value is the fish's id."),
     ] = None,
-    template: TemplateOption = "halibut",
+    template: TemplateOption = "auto",
     config: ConfigOption = None,
     out: Annotated[
         Path | None,

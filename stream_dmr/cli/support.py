@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 TemplateOption = Annotated[
     str,
     typer.Option(
-        help="The body form: halibut, cod, salmon, bream, tuna, pike, eel, or a mesh with its TOML "
+        help="auto: the shape of the fish themselves. Or the body form that they probably have "
+        "(halibut, cod, salmon, bream, tuna, pike, eel), or a mesh of the species with its TOML "
         "beside it."
     ),
 ]

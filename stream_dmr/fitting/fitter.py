@@ -12,10 +12,13 @@ from stream_dmr.fitting.cold_start import cold_starts
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.outline import project
 from stream_dmr.fitting.contour.problem import Problem
-from stream_dmr.fitting.contour.solver import ContourSolver
+from stream_dmr.fitting.contour.solver import ContourSolver, loss_of
 from stream_dmr.fitting.heading import is_turned
-from stream_dmr.fitting.mesh_levels import Bodies
+from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.shape.candidates import Candidate
+from stream_dmr.fitting.shape.length_std import freed, shape_std_ratio
+from stream_dmr.fitting.shape.space import TRUNK, directions, individual_covariance, reshaped
 from stream_dmr.fitting.size.scanner import SizeScanner
 from stream_dmr.fitting.solver import Solution, Solver
 from stream_dmr.fitting.target import Target
@@ -33,6 +36,16 @@ _TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
 _CLEAR_GAIN = 0.01
 
 
+class Solved(NamedTuple):
+    """The likeliest fit of one crop, or why there is none."""
+
+    target: Target | None
+    solution: Solution | None
+    is_cold: bool
+    refusal: Reason | None
+    since_ns: int
+
+
 class Fit(NamedTuple):
     """What came of one crop."""
 
@@ -48,21 +61,31 @@ class Fitter:
         template: Template,
         settings: FitMeshSettings,
         *,
+        index: int | None = None,
+        candidate: Candidate | None = None,
         plane_normal: Float[np.ndarray, "3"] | None = None,
         with_covariance: bool = False,
     ) -> None:
         """`plane_normal`, in the camera frame, is of the plane that fish hang in, if known.
 
-        `with_covariance`: fits carry that of their parameters.
+        With a `candidate`, the template is given that shape, and breadth is as free as it is
+        unknown; fits say its `index`. `with_covariance`: fits carry that of their parameters.
         """
         normal = _TOWARD_CAMERA if plane_normal is None else plane_normal
-        self._plane_normal = np.ascontiguousarray(normal)
+        self._index = index
+        self._shape_covariance = individual_covariance()
+        if candidate is not None:
+            template = reshaped(template, candidate.coefficients)
+            settings = freed(settings, float(TRUNK @ candidate.covariance @ TRUNK))
+            self._shape_covariance += candidate.covariance
+        self.plane_normal = np.ascontiguousarray(normal)
         self._template = template
         self._settings = settings
         self._with_covariance = with_covariance
-        self._bodies = Bodies.of(template, max_faces=settings.max_faces)
+        self._bodies = MeshLevels.of(template, max_faces=settings.max_faces)
         self._solver = self._make_solver()
         self._scanner = SizeScanner(self._bodies, settings)
+        self._directions = directions(self._bodies.coarse)
 
     def _make_solver(self) -> Solver:
         if self._settings.solver == "contour":
@@ -73,31 +96,38 @@ class Fitter:
 
     def target(self, crop: FishCrop) -> Target:
         """What is fitted to of a crop."""
-        return Target.from_crop(crop, plane_normal=self._plane_normal)
+        return Target.from_crop(crop, plane_normal=self.plane_normal)
 
     def fit(self, crop: FishCrop, warm: Float[np.ndarray, "P"] | None) -> Fit:
         """Fit the template to a crop's mask, starting from `best` of the frame before.
 
         What can't be fitted comes back with its reason in `refusal`.
         """
-        refusal = self._refusal(crop)
+        return self.answer(crop, self.solve(crop, warm))
+
+    def solve(self, crop: FishCrop, warm: Float[np.ndarray, "P"] | None) -> Solved:
+        """The first half of `fit`: the likeliest pose."""
+        refusal, began = self._refusal(crop), time.perf_counter_ns()
         if refusal:
-            return Fit(_message(crop, refusal=refusal), None)
-        began = time.perf_counter_ns()
+            return Solved(None, None, False, refusal, began)
         target = self.target(crop)
         solution, is_cold = self._solve(target, warm)
-        return self._answer(crop, target, solution, is_cold=is_cold, since_ns=began)
+        return Solved(target, solution, is_cold, None, began)
 
-    def _answer(
-        self,
-        crop: FishCrop,
-        target: Target,
-        solution: Solution,
-        *,
-        is_cold: bool,
-        since_ns: int,
-    ) -> Fit:
-        """The message of a fit, at the size that is to be expected of it."""
+    def nats(self, solved: Solved) -> float:
+        """Negative log likelihood and prior of a solution, by which shapes can be compared."""
+        if solved.target is None or solved.solution is None:
+            return float("nan")
+        problem = Problem.from_settings(
+            self._settings, self._bodies.fine, solved.target, with_smoothness=False
+        )
+        return loss_of(problem, solved.solution.parameters) / self._settings.nat
+
+    def answer(self, crop: FishCrop, solved: Solved) -> Fit:
+        """The second half: the message, at the size that is to be expected of the fish."""
+        target, solution, is_cold, refusal, since_ns = solved
+        if target is None or solution is None:
+            return Fit(_message(crop, refusal=refusal), None)
         sized, size_std = solution, None
         if _is_finite(solution) and self._settings.scans_sizes:
             sized, size_std = self._scanner.expected(target, solution)
@@ -168,7 +198,16 @@ class Fitter:
             losses=LossTerms(**dict(zip(LossTerms.__slots__, terms.tolist(), strict=True))),
             covariance=spread if self._with_covariance else None,
             length_std_ratio=size_std,
+            candidate=self._index,
+            shape_std_ratio=self._shape_std(target, parameters),
         )
+
+    def _shape_std(self, target: Target, parameters: Float[np.ndarray, "P"]) -> float | None:
+        """None for the paper's solver and blend, which scan no sizes."""
+        if not self._settings.scans_sizes:
+            return None
+        problem = self._problem(self._bodies.coarse, target.coarse())
+        return shape_std_ratio(problem, parameters, self._directions, self._shape_covariance)
 
     def _problem(self, body: Body, target: Target) -> Problem:
         return Problem.from_settings(self._settings, body, target, with_smoothness=True)

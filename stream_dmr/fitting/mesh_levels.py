@@ -11,7 +11,7 @@ _COARSE_FACES = 600
 _PLACES_PER_SEGMENT = 4
 
 
-class Bodies(NamedTuple):
+class MeshLevels(NamedTuple):
     """One template three times; those that need no simplifying are the same."""
 
     whole: Body  # the template's own mesh, which is recorded
@@ -19,7 +19,7 @@ class Bodies(NamedTuple):
     coarse: Body  # what poses and sizes are compared with, on half the resolution
 
     @classmethod
-    def of(cls, template: Template, *, max_faces: int) -> "Bodies":
+    def of(cls, template: Template, *, max_faces: int) -> "MeshLevels":
         """`max_faces` of the fine one."""
         whole = Body.from_template(template)
 

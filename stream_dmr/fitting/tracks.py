@@ -1,4 +1,7 @@
-"""Fits along tracks: each begins where the frame before ended, its head where that one's was."""
+"""Fits along tracks: each begins where the frame before ended, its head where that one's was.
+
+Of several candidate shapes a fish is given the one that its first good frames prefer.
+"""
 
 from dataclasses import dataclass, field, replace
 
@@ -6,19 +9,27 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.camera import Calibration
-from stream_dmr.fitting.fitter import Fitter
+from stream_dmr.fitting.fitter import Fit, Fitter, Solved
 from stream_dmr.fitting.heading import HeadMemory
 from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.template.template import Template
+
+_DECIDING_FRAMES = 3  # good ones: each takes a fit of every candidate
+# What one frame may say against a candidate, nats: its mask may be wrong.
+_MOST_AGAINST = 8.0
+_MIN_VISIBLE = 0.9  # of a frame that decides
 
 
 @dataclass(kw_only=True, slots=True)
 class _Track:
     """What the next frame of a track is told."""
 
+    against: Float[np.ndarray, "N"]  # nats against each candidate
+    num_decided: int = 0  # frames that have said so
     seen_ns: int = 0
-    best: Float[np.ndarray, "P"] | None = None  # parameters of the last good fit
+    best: dict[int, Float[np.ndarray, "P"]] = field(default_factory=dict)  # last good fits
     head: HeadMemory = field(default_factory=HeadMemory)
 
 
@@ -31,26 +42,42 @@ class TrackFitter:
         settings: FitMeshSettings,
         *,
         calibration: Calibration | None,
+        candidates: CandidateShapes | None = None,
         with_covariance: bool = False,
     ) -> None:
-        """Fish hang in the plane of the calibration, if there is one."""
+        """Fish hang in the plane of the calibration, if there is one.
+
+        `candidates` are shapes of the template; without any it has its own.
+        """
         normal = None if calibration is None else calibration.plane.rotation[:, 2]
-        self.fitter = Fitter(
-            template, settings, plane_normal=normal, with_covariance=with_covariance
-        )
-        self._least_iou = settings.cold_below_iou
+        shapes = [(None, None)] if candidates is None else list(enumerate(candidates))
+        self.fitters = [
+            Fitter(
+                template,
+                settings,
+                index=index,
+                candidate=candidate,
+                plane_normal=normal,
+                with_covariance=with_covariance,
+            )
+            for index, candidate in shapes
+        ]
+        shares = np.ones(1) if candidates is None else candidates.shares
+        self._unlikely = -np.log(shares)  # nats
+        self._settings = settings
         self._tracks: dict[int, _Track] = {}
 
     def fit(self, crop: FishCrop) -> FittedMesh:
         """Fit one crop; a poor fit, or one of half a fish, warms no other."""
-        track = self._tracks.setdefault(crop.track_id, _Track())
+        track = self._tracks.setdefault(crop.track_id, _Track(against=self._unlikely.copy()))
         track.seen_ns = crop.timestamp_ns
         weighed = replace(crop, ends=track.head.weigh(crop.ends))
-        fitted, best = self.fitter.fit(weighed, track.best)
+        fitted, best = self._fit(weighed, track)
         if fitted.shape is not None:
             track.head.follow(fitted.shape.keypoints_px)
-            if fitted.shape.iou >= self._least_iou and not crop.quality.touches_border:
-                track.best = best
+            is_good = fitted.shape.iou >= self._settings.cold_below_iou
+            if best is not None and is_good and not crop.quality.touches_border:
+                track.best[fitted.shape.candidate or 0] = best
         return fitted
 
     def forget(self, *, before_ns: int) -> None:
@@ -58,3 +85,25 @@ class TrackFitter:
         for track_id, track in list(self._tracks.items()):
             if track.seen_ns < before_ns:
                 del self._tracks[track_id]
+
+    def _fit(self, crop: FishCrop, track: _Track) -> Fit:
+        chosen = int(np.argmin(track.against))
+        if len(self.fitters) == 1 or track.num_decided >= _DECIDING_FRAMES:
+            return self.fitters[chosen].fit(crop, track.best.get(chosen))
+        solved = [fitter.solve(crop, track.best.get(n)) for n, fitter in enumerate(self.fitters)]
+        self._decide(track, crop, solved)
+        chosen = int(np.argmin(track.against))
+        for n, one in enumerate(solved):  # all begin the next frame where they ended in this one
+            if one.solution is not None and one.solution.iou >= self._settings.cold_below_iou:
+                track.best[n] = one.solution.parameters
+        return self.fitters[chosen].answer(crop, solved[chosen])
+
+    def _decide(self, track: _Track, crop: FishCrop, solved: list[Solved]) -> None:
+        """Count what a frame of the whole fish says against each candidate."""
+        if crop.quality.touches_border or crop.quality.visible_fraction < _MIN_VISIBLE:
+            return
+        pairs = zip(self.fitters, solved, strict=True)
+        nats = np.array([fitter.nats(one) for fitter, one in pairs])
+        if np.isfinite(nats).all():
+            track.against += np.minimum(nats - nats.min(), _MOST_AGAINST)
+            track.num_decided += 1

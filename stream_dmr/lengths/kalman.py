@@ -67,6 +67,7 @@ class Measurement:
     timestamp_ns: int
     length_mm: float
     std_ratio: float  # std over length
+    shape_std_ratio: float = 0.0  # of an error that all frames of the fish share
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -261,4 +261,5 @@ def _message(
         iou=None if shape is None else shape.iou,
         accepted=not reason,
         reason=reason or "",
+        shape_std_ratio=None if shape is None else shape.shape_std_ratio,
     )

@@ -6,17 +6,20 @@ from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from stream_dmr.calibration.calibration_file import load_calibration
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
+from stream_dmr.fitting.learn_shapes import learn_shapes
+from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.recording.messages.header import RunHeader
 from stream_dmr.recording.messages.selection import WHOLE, Part
 from stream_dmr.recording.reading.frame_images import SourcePictures
-from stream_dmr.recording.reading.reader import Recording, open_recordings
+from stream_dmr.recording.reading.reader import Recording, messages, open_recordings
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.replaying.comparator import Judge, Mismatch, Scribe
 from stream_dmr.replaying.recorded_files import find_crop_files, inputs_with
@@ -29,7 +32,7 @@ from stream_dmr.running.pipeline import Node, StageCounters, run_chain
 from stream_dmr.running.run_folder import prepare_folder
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.segmentation.tracking.fish_finder import open_finder
-from stream_dmr.template.template import Template, load_template
+from stream_dmr.template.template import Template
 
 STAGES: dict[str, type[Message]] = {
     "crop": FishCrop,
@@ -37,6 +40,13 @@ STAGES: dict[str, type[Message]] = {
     "localize": LocalizedFish,
     "smooth": LengthEstimate,
 }
+
+
+class _Shapes(NamedTuple):
+    """The mesh of a run and the shapes that its fish may have."""
+
+    template: Template
+    candidates: CandidateShapes | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +94,7 @@ def replay(
     observer = observer or RunObserver()
     recording = open_recordings(request.recordings)
     _refuse_impossible(request, recording)
-    config, template, calibration = _inputs(request, recording.header)
+    config, shapes, calibration = _inputs(request, recording)
     tape = Tape(recording, request.part)
     order = [*STAGES.values()]
     first = order.index(STAGES[request.first])
@@ -93,13 +103,13 @@ def replay(
     carried = _carried(request, tape)
     with ExitStack() as stack:
         frames, nodes = _chain(
-            request, recording.header, tape, config, template, calibration, stack, first
+            request, recording.header, tape, config, shapes, calibration, stack, first
         )
         continue_tracks(nodes, carried)
         recorder = None
         if request.out is not None:
             prepare_folder(request.out, overwrite=request.overwrite)
-            header = _header(request, recording.header, config, template, calibration)
+            header = _header(request, recording.header, config, shapes, calibration)
             recorder = stack.enter_context(
                 Recorder(
                     request.out,
@@ -163,19 +173,26 @@ def _refuse_impossible(request: ReplayRequest, recording: Recording) -> None:
 
 
 def _inputs(
-    request: ReplayRequest, header: RunHeader
-) -> tuple[Config, Template, Calibration | None]:
-    """As recorded, but for what the user gives."""
+    request: ReplayRequest, recording: Recording
+) -> tuple[Config, _Shapes, Calibration | None]:
+    """As recorded, but for what the user gives; `auto` learns from the recording's crops."""
+    header = recording.header
     config = (
         load_config(request.config)
         if request.config is not None
         else parse_config(header.config_toml, where="the recording's config.toml")
     )
-    template = header.template if request.template is None else load_template(request.template)
     calibration = header.calibration
     if request.calibration is not None:
         calibration = load_calibration(request.calibration)
-    return config, template, calibration
+    if request.template is None:
+        return config, _Shapes(header.template, header.candidates), calibration
+    template, candidates = load_shapes(request.template)
+    if request.template == AUTO and candidates is not None:
+        crops = (crop for crop, _ in messages(recording, [FishCrop]) if isinstance(crop, FishCrop))
+        stocks = learn_shapes(crops, template, candidates, config.fit_mesh, calibration=calibration)
+        candidates = stocks or candidates
+    return config, _Shapes(template, candidates), calibration
 
 
 def _carried(request: ReplayRequest, tape: Tape) -> list[LocalizedFish]:
@@ -197,7 +214,7 @@ def _header(
     request: ReplayRequest,
     recorded: RunHeader,
     config: Config,
-    template: Template,
+    shapes: _Shapes,
     calibration: Calibration | None,
 ) -> RunHeader:
     file, is_cut_anew = request.calibration, request.first == "crop"
@@ -212,7 +229,8 @@ def _header(
         source=recorded.source,
         command=request.command,
         config_toml=to_toml(config),
-        template=template,
+        template=shapes.template,
+        candidates=shapes.candidates,
         calibration=calibration,
         calibration_file=recorded.calibration_file if file is None else file.read_bytes(),
         inputs=inputs,
@@ -224,13 +242,15 @@ def _chain(
     header: RunHeader,
     tape: Tape,
     config: Config,
-    template: Template,
+    shapes: _Shapes,
     calibration: Calibration | None,
     stack: ExitStack,
     first: int,
 ) -> tuple[Iterable[Frame], list[Node]]:
     """The frames and the nodes; what is only needed for a new recording is left out without one."""
-    computed = later_nodes(config, template=template, calibration=calibration)
+    computed = later_nodes(
+        config, template=shapes.template, candidates=shapes.candidates, calibration=calibration
+    )
     if first == 0:
         camera = None if calibration is None else calibration.camera
         files = find_crop_files(

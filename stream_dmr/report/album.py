@@ -53,7 +53,7 @@ def make_album(
     Without `source`, the one that the recorded command names is tried. Fish whose pictures are
     nowhere are drawn by their masks. Raises SourceError where a given `source` is another one.
     """
-    meshes = Meshes(recording.header.template)
+    meshes = Meshes(recording.header.template, recording.header.candidates)
     waiting: defaultdict[int, list[tuple[int, View]]] = defaultdict(list)
     for track_id, track in tracks.items():
         for view in track.views:

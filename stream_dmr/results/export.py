@@ -60,7 +60,7 @@ class Export:
         long.
         """
         template = self._recording.header.template
-        restored, count = Meshes(template), 0
+        restored, count = Meshes(template, self._recording.header.candidates), 0
         for fit, fish in _pairs(self._messages(FittedMesh, LocalizedFish)):
             shape = restored.with_vertices(fit).shape
             vertices = None if shape is None else place(shape, fish)[0]

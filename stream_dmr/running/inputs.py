@@ -6,14 +6,16 @@ from pathlib import Path
 from stream_dmr.calibration.calibration_file import load_calibration, require_size
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
+from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.recording.messages.header import RunHeader
 from stream_dmr.recording.messages.run_inputs import InputFile, RunInputs
 from stream_dmr.running.config import Config, load_config, to_toml
+from stream_dmr.running.kept_crops import KeptCrops
 from stream_dmr.running.run_request import RunRequest
 from stream_dmr.segmentation.tracking.fish_finder import FishFinder, open_finder
 from stream_dmr.sources.source import Source
-from stream_dmr.template.template import Template, load_template
+from stream_dmr.template.template import Template
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,9 +25,11 @@ class Inputs:
     request: RunRequest
     config: Config
     template: Template
+    candidates: CandidateShapes | None  # None: the template's own shape
     calibration: Calibration | None
     finder: FishFinder
     reader: ReadFrames
+    crops: KeptCrops | None = None  # of the whole source, where its fish were found before
 
     @property
     def source(self) -> Source:
@@ -50,6 +54,7 @@ class Inputs:
             command=self.request.command,
             config_toml=to_toml(self.config),
             template=self.template,
+            candidates=self.candidates,
             calibration=self.calibration,
             calibration_file=b"" if file is None else file.read_bytes(),
             inputs=self._given(),
@@ -80,7 +85,7 @@ def checked_inputs(request: RunRequest) -> Inputs:
     Raises a UserError where one of them is wrong.
     """
     config = load_config(request.config)
-    template = load_template(request.template)
+    template, candidates = load_shapes(request.template)
     calibration = None if request.calibration is None else load_calibration(request.calibration)
     finder = open_finder(
         boxes=request.boxes,
@@ -93,6 +98,7 @@ def checked_inputs(request: RunRequest) -> Inputs:
         request=request,
         config=config,
         template=template,
+        candidates=candidates,
         calibration=calibration,
         finder=finder,
         reader=reader,

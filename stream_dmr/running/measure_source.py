@@ -10,6 +10,7 @@ from stream_dmr.camera import Calibration
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.fitting.compile_kernels import rehearse
 from stream_dmr.fitting.fitter import Fitter
+from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.messages import LengthEstimate, LocalizedFish, Message
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
@@ -23,9 +24,10 @@ from stream_dmr.running.outputs import Outputs, open_outputs
 from stream_dmr.running.pipeline import Node, StageCounters, run_chain
 from stream_dmr.running.result_writer import ResultWriter
 from stream_dmr.running.resume import resume_source
-from stream_dmr.running.run_folder import RESULTS, SEGMENTED
+from stream_dmr.running.run_folder import LEARNT, RESULTS, SEGMENTED
 from stream_dmr.running.run_observer import RunObserver, RunTotals
 from stream_dmr.running.run_request import RunRequest
+from stream_dmr.running.shape_pass import save_stocks, with_learnt_shapes
 from stream_dmr.template.template import Template
 
 _MAX_SUMMARY_FISH = 100  # of an endless run, for the table at its end; the store has all fish
@@ -55,9 +57,15 @@ def measure_source(
     inputs = checked_inputs(request)
     try:
         crop_fish = _crop_fish(inputs)
+        inputs = with_learnt_shapes(inputs, crop_fish, stop=stop, observer=observer)
         nodes = [
-            crop_fish,
-            *later_nodes(inputs.config, template=inputs.template, calibration=inputs.calibration),
+            inputs.crops or crop_fish,
+            *later_nodes(
+                inputs.config,
+                template=inputs.template,
+                candidates=inputs.candidates,
+                calibration=inputs.calibration,
+            ),
         ]
         if inputs.is_endless:  # no frame of a camera shall wait for a compiler
             fitter = Fitter(
@@ -69,6 +77,13 @@ def measure_source(
         with open_outputs(inputs, observer) as outputs:
             crop_fish.number_after(outputs.store.before.track_id)
             continue_tracks(nodes, outputs.interrupted)
+            if inputs.candidates is not None and inputs.candidates.are_learnt:
+                save_stocks(
+                    inputs.template,
+                    inputs.candidates,
+                    request.out / LEARNT,
+                    source=inputs.source.name,
+                )
             _report_start(inputs, outputs, observer)
             observer.begin(inputs.source.num_frames)
             return _run_chain(inputs, nodes, outputs, observer, stop=stop)
@@ -100,13 +115,18 @@ def _crop_fish(inputs: Inputs) -> CropFish:
 
 
 def later_nodes(
-    config: Config, *, template: Template, calibration: Calibration | None
+    config: Config,
+    *,
+    template: Template,
+    calibration: Calibration | None,
+    candidates: CandidateShapes | None = None,
 ) -> list[Node]:
     """The nodes after CropFish: fit, localization, length."""
     return [
         FitMesh(
             config.fit_mesh,
             template=template,
+            candidates=candidates,
             calibration=calibration,
             with_covariance=_records_covariance(config),
         ),

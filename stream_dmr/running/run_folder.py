@@ -14,6 +14,7 @@ RESULTS = (
     *("lengths.db", "lengths.csv", "frames.csv", "recording.mcap", "recording.rrd"),
     PROVENANCE,
 )
+LEARNT = "template.ply"  # what a run learnt of its fish's shape, with its TOML; -2, ... beside it
 SEGMENTED = ("lengths.db", "lengths.csv", "frames.csv", f"{STEM}-*")  # of a source without an end
 
 
@@ -26,13 +27,7 @@ def prepare_folder(
     results of an earlier run; `overwrite` removes those instead, `resume` keeps them. With `waits`
     there may be room later. Returns what was done about recordings that a crash left unfinished.
     """
-    earlier = [out / name for name in RESULTS if (out / name).exists()]
-    earlier += sorted(out.glob(f"{STEM}-*"))
-    if earlier and not overwrite and not resume:
-        raise OutputError(
-            f"{out}: expected a folder without results, found {earlier[0].name} of an earlier run; "
-            "choose another --out, or add --resume or --overwrite"
-        )
+    earlier = refuse_earlier(out, is_fine=overwrite or resume)
     try:
         out.mkdir(parents=True, exist_ok=True)
         require_free(out)
@@ -52,6 +47,18 @@ def prepare_folder(
             f"{out}: expected a folder to write to, got: {error.strerror}; choose another --out"
         ) from error
     return repairs
+
+
+def refuse_earlier(out: Path, *, is_fine: bool) -> list[Path]:
+    """Results of an earlier run in a folder; raises OutputError for them unless that `is_fine`."""
+    earlier = [out / name for name in RESULTS if (out / name).exists()]
+    earlier += sorted(out.glob(f"{STEM}-*"))
+    if earlier and not is_fine:
+        raise OutputError(
+            f"{out}: expected a folder without results, found {earlier[0].name} of an earlier run; "
+            "choose another --out, or add --resume or --overwrite"
+        )
+    return earlier
 
 
 def _set_aside(recording: Path) -> None:

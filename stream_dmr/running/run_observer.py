@@ -30,6 +30,12 @@ class RunObserver:
     def warn(self, line: str) -> None:
         """The user should know this; the same line may come again."""
 
+    def stage(self, line: str) -> None:
+        """What is being done before the first frame is measured, and how far it is."""
+
+    def notice(self, line: str) -> None:
+        """Something worth knowing that is no reason to worry."""
+
     def serving(self, address: str) -> None:
         """The view can be watched at `address` from now on."""
 

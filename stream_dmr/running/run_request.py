@@ -15,7 +15,7 @@ class RunRequest:
     calibration: Path | None = None
     boxes: Path | None = None
     masks: Path | None = None
-    template: str = "halibut"  # name of a bundled one, or a path
+    template: str = "auto"  # or the name of a body form, or a path
     config: Path | None = None
     overwrite: bool = False  # replace the results of an earlier run in `out`
     resume: bool = False  # go on after them; a live source always does

@@ -54,6 +54,12 @@ class Watch(RunObserver):
             self._state.warn(line)
         self._observer.warn(line)
 
+    def stage(self, line: str) -> None:  # noqa: D102
+        self._observer.stage(line)
+
+    def notice(self, line: str) -> None:  # noqa: D102
+        self._observer.notice(line)
+
     def serving(self, address: str) -> None:  # noqa: D102
         self._observer.serving(address)
 

@@ -34,7 +34,7 @@ from stream_dmr.fitting.contour.normal_equations import (
 from stream_dmr.fitting.contour.problem import Options, Problem
 from stream_dmr.fitting.contour.solver import ContourSolver, mirror
 from stream_dmr.fitting.fitter import Fitter
-from stream_dmr.fitting.mesh_levels import Bodies
+from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.paper.skinning import Parameters, Rig, rest_parameters, rotation_matrices
 from stream_dmr.fitting.parameters import LOG_SIZE, NUM_PER_JOINT, NUM_ROOT, Priors, rest_vector
 from stream_dmr.fitting.settings import FitMeshSettings
@@ -310,7 +310,7 @@ class TestMirror:
         flat = rest_parameters(2)
         flat[0, :3], flat[0, 5] = torch.as_tensor(root.as_rotvec()), np.log(0.25)
         target = target_of(flat, plane_normal=np.ascontiguousarray(normal))
-        solver = ContourSolver(Bodies(BODY, BODY, BODY), SETTINGS)
+        solver = ContourSolver(MeshLevels(BODY, BODY, BODY), SETTINGS)
         for start in (flat[0].numpy(), mirror(flat[0].numpy())):
             found = solver.refine(target, start)
             along = Rotation.from_rotvec(found.parameters[:3]).as_matrix()[:, 0]

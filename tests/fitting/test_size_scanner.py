@@ -11,7 +11,7 @@ from stream_dmr.fitting.contour.levenberg_marquardt import NEAR, evaluate, minim
 from stream_dmr.fitting.contour.normal_equations import prior_loss
 from stream_dmr.fitting.contour.problem import Options, Problem
 from stream_dmr.fitting.contour.solver import ContourSolver
-from stream_dmr.fitting.mesh_levels import Bodies
+from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import LOG_SIZE, rest_vector
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.size.density import mean_and_std
@@ -24,7 +24,7 @@ from tests.support.batches import PLANE_NORMAL, crops_of_poses, moved
 OFFSETS = np.linspace(-0.3, 0.3, 13)
 FIVE = np.array([-0.1, -0.04, 0.0, 0.04, 0.1])
 BODY = Body.from_template(load_template("halibut"))
-BODIES = Bodies(BODY, BODY, BODY)
+BODIES = MeshLevels(BODY, BODY, BODY)
 SETTINGS = FitMeshSettings()
 
 

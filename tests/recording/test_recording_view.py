@@ -126,7 +126,7 @@ def test_vertices_are_made_again_from_parameters(clip: Path):
     for one, other in zip(lean, whole, strict=True):
         assert isinstance(one, FittedMesh)
         assert isinstance(other, FittedMesh)
-        again = Meshes(template).with_vertices(one).shape
+        again = Meshes(template, None).with_vertices(one).shape
         assert again is not None
         assert other.shape is not None
         np.testing.assert_allclose(again.vertices, other.shape.vertices, rtol=0, atol=1e-12)

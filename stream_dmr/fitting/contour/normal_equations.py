@@ -69,17 +69,30 @@ def normal_equations(
     body, kind, lambdas = problem.body, problem.kind, problem.lambdas
     visible = visible_rim(rendering)
     moved = rim_slopes(problem, parameters, rendering.points, visible.edges)
-    count = len(visible.edges) + len(problem.target.contour)
-    residuals = Residuals(np.empty((count, len(parameters))), np.empty(count), np.zeros(count))
-    _rim_rows(problem.target, rendering.pixels, visible, moved, residuals)
-    _contour_rows(problem.target, rendering.pixels, visible, moved, residuals)
-    H, g = weighted_squares(residuals)
+    H, g = weighted_squares(contour_residuals(problem.target, rendering.pixels, visible, moved))
     regularise(problem, parameters, H, g)
     if lambdas[NORMAL] > 0 or lambdas[LAPLACIAN] > 0:
         g += smoothness_slope(
             body, kind, parameters, rendering.points, lambdas[NORMAL], lambdas[LAPLACIAN]
         )
     return H, g
+
+
+@compiled
+def contour_residuals(
+    target: Target,
+    pixels: Float[np.ndarray, "V 2"],
+    visible: VisibleRim,
+    moved: RimSlopes,
+) -> Residuals:
+    """Distances between rim and contour, both ways, with their slopes to what `moved` has."""
+    count = len(visible.edges) + len(target.contour)
+    residuals = Residuals(
+        np.empty((count, moved.slopes.shape[2])), np.empty(count), np.zeros(count)
+    )
+    _rim_rows(target, pixels, visible, moved, residuals)
+    _contour_rows(target, pixels, visible, moved, residuals)
+    return residuals
 
 
 @compiled
@@ -120,7 +133,17 @@ def rim_slopes(
     edges: Int[np.ndarray, "E 2"],
 ) -> RimSlopes:
     """Slopes of the pixels of these edges' vertices."""
-    row_of = np.full(problem.body.num_vertices, -1, np.int64)
+    row_of, chosen = rim_vertices(problem.body.num_vertices, edges)
+    slopes = jacobian(problem.body, problem.kind, parameters, chosen)
+    return RimSlopes(row_of, pixel_slopes(points, chosen, slopes, problem.target))
+
+
+@compiled
+def rim_vertices(
+    num_vertices: int, edges: Int[np.ndarray, "E 2"]
+) -> tuple[Int[np.ndarray, "V"], Int[np.ndarray, "C"]]:
+    """`RimSlopes.row_of` of every vertex, and the vertices in the order of these rows."""
+    row_of = np.full(num_vertices, -1, np.int64)
     chosen = np.empty(2 * len(edges), np.int64)
     count = 0
     for r in range(len(edges)):
@@ -130,9 +153,7 @@ def rim_slopes(
                 row_of[v] = count
                 chosen[count] = v
                 count += 1
-    chosen = chosen[:count]
-    slopes = jacobian(problem.body, problem.kind, parameters, chosen)
-    return RimSlopes(row_of, _pixel_slopes(points, chosen, slopes, problem.target))
+    return row_of, chosen[:count]
 
 
 @compiled
@@ -163,7 +184,7 @@ def visible_rim(rendering: Rendering) -> VisibleRim:
 
 
 @compiled
-def _pixel_slopes(
+def pixel_slopes(
     points: Float[np.ndarray, "N 3"],
     chosen: Int[np.ndarray, "C"],
     slopes: Float[np.ndarray, "C 3 P"],

@@ -14,7 +14,7 @@ from stream_dmr.fitting.contour.levenberg_marquardt import (
 )
 from stream_dmr.fitting.contour.normal_equations import prior_loss
 from stream_dmr.fitting.contour.problem import Options, Problem
-from stream_dmr.fitting.mesh_levels import Bodies
+from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import ROOT_ROTATION, joints_of
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution, rank
@@ -28,7 +28,7 @@ _NUM_FINISHED = 2
 class ContourSolver:
     """Levenberg-Marquardt on contour residuals, judged by the paper's L_rec."""
 
-    def __init__(self, bodies: Bodies, settings: FitMeshSettings) -> None:
+    def __init__(self, bodies: MeshLevels, settings: FitMeshSettings) -> None:
         self._body, self._coarse = bodies.fine, bodies.coarse
         self._settings = settings
 
@@ -50,7 +50,7 @@ class ContourSolver:
         coarse = Problem.from_settings(
             self._settings, self._coarse, target.coarse(), with_smoothness=False
         )
-        likely = sorted(starts, key=lambda start: _loss(coarse, start))
+        likely = sorted(starts, key=lambda start: loss_of(coarse, start))
         found = [self.refine(target, likely.pop(0))]
         for iterations, most in _ROUNDS:
             rough = [self._rough(coarse, start, iterations) for start in likely[:most]]
@@ -74,8 +74,8 @@ class ContourSolver:
         return solution_of(minimise(problem, start, nothing, options))
 
 
-def _loss(problem: Problem, parameters: Float[np.ndarray, "P"]) -> float:
-    """L_rec with the priors, without the mesh's smoothness."""
+def loss_of(problem: Problem, parameters: Float[np.ndarray, "P"]) -> float:
+    """L_rec with the priors, without the mesh's smoothness: shapes differ in that at rest."""
     terms = evaluate(problem, parameters, False).terms
     return float(terms @ problem.lambdas) + prior_loss(problem, parameters)
 

@@ -12,7 +12,7 @@ from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.levenberg_marquardt import NEAR, minimise
 from stream_dmr.fitting.contour.problem import Options, Problem
 from stream_dmr.fitting.contour.solver import solution_of
-from stream_dmr.fitting.mesh_levels import Bodies
+from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import LOG_SIZE
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.size.density import mean_and_std
@@ -25,7 +25,7 @@ _OFFSETS = np.array([-0.2, -0.1, -0.04, 0.0, 0.04, 0.1, 0.2])
 # How much the room of poses around a fit counts beside its loss: 1 would be a Laplace integral over
 # them, 0 the profile likelihood. A flat pose has more room by its curvature than it has in truth,
 # since what it would see of its slant is of second order. Between them, by our simulated scenes.
-_ROOM = 0.5
+LOG_VOLUME_WEIGHT = 0.5
 # The std of a frame's error, as a share of the density's, which is as wide as its priors are; what
 # slant, bend and misfit hide has parts of its own (localize.py). By 10,000 simulated frames.
 SCATTER = 0.5
@@ -36,7 +36,7 @@ _HOPELESS = 8.0
 class SizeScanner:
     """Tries the sizes of one template."""
 
-    def __init__(self, bodies: Bodies, settings: FitMeshSettings) -> None:
+    def __init__(self, bodies: MeshLevels, settings: FitMeshSettings) -> None:
         self._body, self._coarse, self._settings = bodies.fine, bodies.coarse, settings
         self._options = Options(settings.scan_iterations, settings.tolerance, NEAR)
 
@@ -46,7 +46,7 @@ class SizeScanner:
         problem = self._problem(self._coarse, target.coarse())
         scan = scan_sizes(problem, start, _OFFSETS, _HOPELESS * nat, self._options)
         tried = np.isfinite(scan.losses)
-        nats = scan.losses[tried] / nat + _ROOM * scan.log_volumes[tried]
+        nats = scan.losses[tried] / nat + LOG_VOLUME_WEIGHT * scan.log_volumes[tried]
         mean, std = mean_and_std(_OFFSETS[tried], nats)
         nearest = np.argmin(np.where(tried, np.abs(_OFFSETS - mean), np.inf))
         guess = scan.parameters[nearest] + (mean - _OFFSETS[nearest]) * scan.next_steps[nearest]

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import RecordingError
+from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.recording.messages.codec import CODEC_VERSION, decode, encode
 from stream_dmr.recording.messages.run_inputs import RunInputs
 from stream_dmr.template.template import Template
@@ -26,6 +27,7 @@ class RunHeader:
     command: str  # as typed
     config_toml: str
     template: Template
+    candidates: CandidateShapes | None = None  # None: fish have the template's own shape
     calibration: Calibration | None = None
     calibration_file: bytes = b""  # the user's file as it was; empty where there is none
     inputs: RunInputs | None = None  # None: recorded before these were
@@ -59,6 +61,8 @@ class RunHeader:
     def attachments(self) -> dict[str, bytes]:
         """Name -> content. The .pb ones are exact and for replay, the others are for people too."""
         files = {"config.toml": self.config_toml.encode(), "template.pb": encode(self.template)}
+        if self.candidates is not None:
+            files["shapes.pb"] = encode(self.candidates)
         if self.calibration is not None:
             files["calibration.pb"] = encode(self.calibration)
             files["calibration.yaml"] = self.calibration_file
@@ -70,12 +74,13 @@ class RunHeader:
 
         KeyError where a part is missing, RecordingError where one is damaged.
         """
-        calibration = attachments.get("calibration.pb")
+        calibration, shapes = attachments.get("calibration.pb"), attachments.get("shapes.pb")
         header = cls(
             source=metadata["source"],
             command=metadata["command"],
             config_toml=attachments["config.toml"].decode(),
             template=decode(Template, attachments["template.pb"]),
+            candidates=None if shapes is None else decode(CandidateShapes, shapes),
             calibration=None if calibration is None else decode(Calibration, calibration),
             calibration_file=attachments.get("calibration.yaml", b""),
             inputs=RunInputs.from_metadata(metadata),

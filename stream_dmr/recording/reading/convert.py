@@ -36,7 +36,7 @@ def convert(
     recorded one, OutputError where `rrd` can't be written.
     """
     opened = open_recordings([recording])
-    meshes = Meshes(opened.header.template)
+    meshes = Meshes(opened.header.template, opened.header.candidates)
     pictures = RecordedPictures(opened, part) if frames is None else SourcePictures(frames)
     unfinished = rrd.with_name(f"{rrd.name}.part")
     with closing(RerunSink(unfinished, opened.header, settings)) as sink:

@@ -4,15 +4,20 @@ from dataclasses import replace
 
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.deformation import KINDS, deform
+from stream_dmr.fitting.shape.candidates import CandidateShapes
+from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.messages import FittedMesh, FittedShape
 from stream_dmr.template.template import Template
 
 
 class Meshes:
-    """Deforms one template."""
+    """Deforms one template, in the shapes that the fish of its run were given."""
 
-    def __init__(self, template: Template) -> None:
-        self._body = Body.from_template(template)
+    def __init__(self, template: Template, candidates: CandidateShapes | None) -> None:
+        shapes = (
+            [] if candidates is None else [reshaped(template, c.coefficients) for c in candidates]
+        )
+        self._bodies = [Body.from_template(shape) for shape in shapes or [template]]
 
     def with_vertices(self, fit: FittedMesh) -> FittedMesh:
         """The fit, its vertices made again where it lacks them, exact but for rounding."""
@@ -22,8 +27,9 @@ class Meshes:
         return replace(fit, shape=self._deformed(shape, KINDS[report.deformation]))
 
     def _deformed(self, shape: FittedShape, kind: int) -> FittedShape:
-        points = deform(self._body, kind, shape.parameters)
-        v = self._body.num_vertices
+        body = self._bodies[shape.candidate or 0]
+        points = deform(body, kind, shape.parameters)
+        v = body.num_vertices
         # Where the fit stands along the ray of its crop: its keypoints, which are recorded, say.
         anchor = (shape.keypoints - points[v : v + 3]).mean(axis=0)
         return replace(shape, vertices=points[:v] + anchor)

@@ -1,0 +1,54 @@
+"""Learns the shapes of fish from their crops, for `run`, `replay` and `learn-template`."""
+
+from collections.abc import Callable, Iterable
+
+from stream_dmr.camera import Calibration
+from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.shape.candidates import CandidateShapes
+from stream_dmr.fitting.shape.samples import (
+    FRAMES_PER_FISH,
+    FishSamples,
+    Sample,
+    evenly,
+    good_crops,
+)
+from stream_dmr.fitting.shape.stocks import learn_stocks
+from stream_dmr.fitting.tracks import TrackFitter
+from stream_dmr.messages import FishCrop
+from stream_dmr.template.template import Template
+
+_MIN_IOU = 0.85  # of a fit that tells of a shape
+
+
+def learn_shapes(
+    crops: Iterable[FishCrop],
+    template: Template,
+    forms: CandidateShapes,
+    settings: FitMeshSettings,
+    *,
+    calibration: Calibration | None,
+    progress: Callable[[str], None] = lambda step: None,
+) -> CandidateShapes | None:
+    """The stocks that these fish are of; None where none of them is seen whole.
+
+    `crops` in the order of their capture; of each fish some that are far apart are fitted, with
+    each of the `forms` until one is chosen.
+    """
+    tracks = TrackFitter(
+        template,
+        settings.model_copy(update={"scan_iterations": 0}),  # shapes need no sizes
+        calibration=calibration,
+        candidates=forms,
+    )
+    fish: list[FishSamples] = []
+    for chosen in good_crops(crops):
+        fits = [(crop, shape) for crop in chosen if (shape := tracks.fit(crop).shape) is not None]
+        samples = [Sample(crop, shape.parameters) for crop, shape in fits if shape.iou >= _MIN_IOU]
+        if samples:
+            candidate = fits[-1][1].candidate or 0  # the last one is decided by all before it
+            fish.append(
+                FishSamples(chosen[0].track_id, candidate, evenly(samples, FRAMES_PER_FISH))
+            )
+            progress(f"{len(fish)} fish looked at")
+    normal = tracks.fitters[0].plane_normal
+    return learn_stocks(template, forms, fish, settings, plane_normal=normal, progress=progress)

@@ -1,0 +1,156 @@
+"""The space of shapes: how outline and thickness of fish differ from a template.
+
+A shape has W coefficients: logs of factors on the half breadth at `BREADTH_KNOTS`, on the side
+y > 0 and on the side y < 0, logs of factors on the thickness at `THICKNESS_KNOTS`, and how much
+further the lobes of the tail reach past its middle (body lengths). Zeros are the template itself;
+between knots the logs are linear. Length, midline, joints and keypoints are the template's.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.fitting.body import Body, bind_to_midline
+from stream_dmr.geometry import arc_lengths
+from stream_dmr.template.template import Template
+
+# Places along the midline, 0 at the snout and 1 at the tail keypoint: those of the tables in
+# template/body_forms.toml, at which a body form can be any other one exactly.
+BREADTH_KNOTS = np.array([0.03, 0.10, 0.20, 0.32, 0.45, 0.58, 0.70, 0.80, 0.87, 0.91, 0.96, 1.0])
+THICKNESS_KNOTS = np.array([0.1, 0.4, 0.8])  # a silhouette says little of it: head, trunk, peduncle
+_NUM_SIDE, _NUM_THICKNESS = len(BREADTH_KNOTS), len(THICKNESS_KNOTS)
+LEFT, RIGHT = slice(0, _NUM_SIDE), slice(_NUM_SIDE, 2 * _NUM_SIDE)
+BREADTH = slice(0, 2 * _NUM_SIDE)
+THICKNESS = slice(BREADTH.stop, BREADTH.stop + _NUM_THICKNESS)
+LOBES = THICKNESS.stop
+NUM_COEFFICIENTS = LOBES + 1
+_TAIL_FROM = 0.9  # where the tail's fin begins
+
+# The mean log breadth of the trunk, between head and peduncle, as a row over the coefficients.
+TRUNK = np.zeros(NUM_COEFFICIENTS)
+TRUNK[2:8] = TRUNK[_NUM_SIDE + 2 : _NUM_SIDE + 8] = 1 / 12
+
+# How far a stock may be from the body form that it is most like, as standard deviations. Chosen
+# wide: congeners in FishBase differ in body depth by about a tenth, in their fins by more.
+_KNOT_STD = 0.5  # of a knot alone; of the whole breadth together about a tenth
+_CURVATURE_STD = 0.2  # of second differences along a side: outlines are smooth
+_SIDES_STD = 0.1  # of one side against the other
+_THICKNESS_STD, _THICKNESS_STEP_STD = 0.3, 0.15
+_LOBES_STD = 0.02  # body lengths
+# How far individuals are from their stock: the breadth by 5 % and the thickness by 10 %, as the
+# spread of condition factors says (weight goes with their product; Froese, J. Appl. Ichthyol. 22,
+# 241 (2006) finds 10 to 15 % in weight at a length), single places of the outline by 3 % more.
+_INDIVIDUAL_BREADTH_STD, _INDIVIDUAL_THICKNESS_STD = 0.05, 0.1
+_INDIVIDUAL_KNOT_STD, _INDIVIDUAL_LOBES_STD = 0.03, 0.005
+
+
+def directions(body: Body) -> Float[np.ndarray, "V 3 W"]:
+    """Slopes of a body's rest vertices (body lengths) to the coefficients, at the body itself."""
+    place_of = body.place_of[: body.num_vertices]
+    place = ((body.segments + body.fractions) / (len(body.midline) - 1))[place_of]
+    offsets = body.points[: body.num_vertices] - body.places[place_of]
+    slopes = np.zeros((len(offsets), 3, NUM_COEFFICIENTS))
+    across = offsets[:, 1:2] * _hats(place, BREADTH_KNOTS)
+    is_left = offsets[:, 1:2] > 0
+    slopes[:, 1, LEFT], slopes[:, 1, RIGHT] = across * is_left, across * ~is_left
+    slopes[:, 2, THICKNESS] = offsets[:, 2:3] * _hats(place, THICKNESS_KNOTS)
+    slopes[:, 0, LOBES] = _lobe_share(place, offsets)
+    return slopes
+
+
+def reshaped(template: Template, coefficients: Float[np.ndarray, "W"]) -> Template:
+    """The template in another shape."""
+    place, feet = _feet(template)
+    offsets = template.rest_vertices - feet
+    breadth = _hats(place, BREADTH_KNOTS)
+    logs = np.where(offsets[:, 1] > 0, breadth @ coefficients[LEFT], breadth @ coefficients[RIGHT])
+    moved = offsets * np.exp(
+        np.column_stack(
+            [
+                np.zeros(len(offsets)),
+                logs,
+                _hats(place, THICKNESS_KNOTS) @ coefficients[THICKNESS],
+            ]
+        )
+    )
+    moved[:, 0] += coefficients[LOBES] * _lobe_share(place, offsets)
+    total_per_fork = template.total_per_fork
+    if total_per_fork is not None:
+        total_per_fork = max(total_per_fork + float(coefficients[LOBES]), 1.0)
+    return replace(template, rest_vertices=feet + moved, total_per_fork=total_per_fork)
+
+
+def coefficients_of(other: Template, template: Template) -> Float[np.ndarray, "W"]:
+    """The coefficients that make one mesh of rings another one of the same rings.
+
+    Both as template/make_bundled.py makes them. Raises ValueError for other meshes.
+    """
+    if other.rest_vertices.shape != template.rest_vertices.shape:
+        raise ValueError("expected two meshes of the same rings, got others")
+    place, feet = _feet(template)
+    ours, theirs = template.rest_vertices - feet, other.rest_vertices - feet
+    coefficients = np.zeros(NUM_COEFFICIENTS)
+    for part, axis, sign, knots in (
+        (LEFT, 1, 1, BREADTH_KNOTS),
+        (RIGHT, 1, -1, BREADTH_KNOTS),
+        (THICKNESS, 2, 1, THICKNESS_KNOTS),
+    ):
+        is_on_side = sign * ours[:, axis] > 1e-3 * np.abs(ours[:, axis]).max()
+        order = np.argsort(place[is_on_side])
+        logs = np.log(theirs[is_on_side, axis] / ours[is_on_side, axis])
+        coefficients[part] = np.interp(knots, place[is_on_side][order], logs[order])
+    reach = _lobe_share(place, ours)
+    coefficients[LOBES] = (theirs[:, 0] - ours[:, 0]) @ reach / max(reach @ reach, 1e-12)
+    return coefficients
+
+
+def form_precision() -> Float[np.ndarray, "W W"]:
+    """Inverse covariance of a stock about the body form that it is most like."""
+    unit = np.eye(NUM_COEFFICIENTS)
+    left, right = unit[LEFT], unit[RIGHT]
+    parts = [
+        np.diff(left, 2, axis=0) / _CURVATURE_STD,
+        np.diff(right, 2, axis=0) / _CURVATURE_STD,
+        (left - right) / _SIDES_STD,
+        unit[BREADTH] / _KNOT_STD,
+        unit[THICKNESS] / _THICKNESS_STD,
+        np.diff(unit[THICKNESS], axis=0) / _THICKNESS_STEP_STD,
+        unit[LOBES:] / _LOBES_STD,
+    ]
+    rows = np.concatenate(parts)
+    return rows.T @ rows
+
+
+def individual_covariance() -> Float[np.ndarray, "W W"]:
+    """Covariance of individuals about their stock."""
+    single = np.zeros(NUM_COEFFICIENTS)
+    single[BREADTH] = single[THICKNESS] = _INDIVIDUAL_KNOT_STD**2
+    single[LOBES] = _INDIVIDUAL_LOBES_STD**2
+    covariance = np.diag(single)
+    covariance[BREADTH, BREADTH] += _INDIVIDUAL_BREADTH_STD**2
+    covariance[THICKNESS, THICKNESS] += _INDIVIDUAL_THICKNESS_STD**2
+    return covariance
+
+
+def _feet(template: Template) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V 3"]]:
+    """Of each vertex its place along the midline, 0 to 1, and the point of the midline there."""
+    points, midline = template.rest_vertices, template.midline
+    segments, fractions = bind_to_midline(points, midline)
+    feet = midline[segments] + fractions[:, None] * np.diff(midline, axis=0)[segments]
+    arc = arc_lengths(midline)
+    return (arc[segments] + fractions * np.diff(arc)[segments]) / arc[-1], feet
+
+
+def _hats(place: Float[np.ndarray, "V"], knots: Float[np.ndarray, "K"]) -> Float[np.ndarray, "V K"]:
+    """Weights of the knots at each place: linear between two knots, constant past the ends."""
+    return np.stack([np.interp(place, knots, row) for row in np.eye(len(knots))], axis=1)
+
+
+def _lobe_share(
+    place: Float[np.ndarray, "V"], offsets: Float[np.ndarray, "V 3"]
+) -> Float[np.ndarray, "V"]:
+    """How far each vertex goes with the lobes: squared distance from the tail's middle, 0 to 1."""
+    across, is_tail = np.abs(offsets[:, 1]), place > _TAIL_FROM
+    reach = across / max(across[is_tail].max(initial=0.0), 1e-9)
+    return np.where(is_tail, np.minimum(reach, 1.0) ** 2, 0.0)

@@ -1,0 +1,182 @@
+"""The stocks of a catch: groups of fish of one mean shape, learnt from frames of them all.
+
+Fish are grouped by the body form that each one's masks prefer. Two groups are one stock unless
+their masks tell them apart by more than the parameters that a second shape costs (Akaike's
+criterion). Then every fish is looked at again with each stock's shape, and the stocks are learnt
+once more from their own.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.fitting.cold_start import cold_starts
+from stream_dmr.fitting.contour.solver import ContourSolver
+from stream_dmr.fitting.mesh_levels import MeshLevels
+from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.shape.candidates import Candidate, CandidateShapes
+from stream_dmr.fitting.shape.samples import FishSamples
+from stream_dmr.fitting.shape.space import NUM_COEFFICIENTS, form_precision, reshaped
+from stream_dmr.fitting.shape.stock import PosedTarget, Stock, StockFitter
+from stream_dmr.fitting.target import Target
+from stream_dmr.template.template import Template
+
+# The frames of a fish, far apart, say as much of its shape as two independent ones.
+_FRAMES_WORTH = 2.0
+# What one fish may say at most for or against parting two groups, nats: a mask may be wrong.
+_MOST_FOR, _MOST_AGAINST = 20.0, -6.0
+
+
+class _Group:
+    """Fish that share a shape, and the body form that it is near to."""
+
+    def __init__(self, form: Candidate, frames: list[PosedTarget], stock: Stock) -> None:
+        self.form, self.frames, self.stock = form, frames, stock
+
+    @property
+    def num_fish(self) -> int:
+        """How many fish."""
+        return len(self.stock.nats)
+
+    @property
+    def num_effective(self) -> float:
+        """How many of the shape's coefficients its fish determine rather than the prior."""
+        return NUM_COEFFICIENTS - float(np.trace(self.stock.covariance @ form_precision()))
+
+
+def learn_stocks(
+    template: Template,
+    forms: CandidateShapes,
+    fish: Sequence[FishSamples],
+    settings: FitMeshSettings,
+    *,
+    plane_normal: Float[np.ndarray, "3"],
+    progress: Callable[[str], None] = lambda step: None,
+) -> CandidateShapes | None:
+    """The stocks that these fish are of, the largest first; None where there are no fish."""
+    if not fish:
+        return None
+    learner = _StockLearner(template, settings, plane_normal)
+    groups = learner.by_form(list(forms), fish)
+    progress(f"{len(fish)} fish of {len(groups)} body forms")
+    groups = learner.merged(groups)
+    groups = learner.looked_at_again(groups)
+    progress(f"{len(groups)} stocks")
+    total = sum(group.num_fish for group in groups)
+    return CandidateShapes.of(
+        [
+            Candidate(
+                group.form.name,
+                group.stock.coefficients,
+                group.stock.covariance,
+                group.num_fish / total,
+            )
+            for group in sorted(groups, key=lambda group: -group.num_fish)
+        ],
+        are_learnt=True,
+    )
+
+
+class _StockLearner:
+    def __init__(
+        self,
+        template: Template,
+        settings: FitMeshSettings,
+        plane_normal: Float[np.ndarray, "3"],
+    ) -> None:
+        self._template, self._settings = template, settings
+        self._plane_normal = np.ascontiguousarray(plane_normal)
+        self._fitter = StockFitter(template, settings)
+
+    def by_form(self, forms: Sequence[Candidate], fish: Sequence[FishSamples]) -> list[_Group]:
+        """One group of each form that any fish was fitted with."""
+        frames: dict[int, list[PosedTarget]] = {}
+        for one in fish:
+            frames.setdefault(one.candidate, []).extend(
+                PosedTarget(
+                    one.track_id,
+                    Target.from_crop(sample.crop, plane_normal=self._plane_normal),
+                    sample.pose,
+                )
+                for sample in one.samples
+            )
+        return [
+            self._learn(forms[n], group, forms[n].coefficients)
+            for n, group in sorted(frames.items())
+        ]
+
+    def merged(self, groups: list[_Group]) -> list[_Group]:
+        """Join the two groups that are most alike, until all that are left differ."""
+        joined: dict[tuple[_Group, _Group], _Group] = {}
+        while len(groups) > 1:
+            groups = sorted(groups, key=lambda group: -group.num_fish)
+            pairs = [(a, b) for n, a in enumerate(groups) for b in groups[n + 1 :]]
+            for a, b in pairs:
+                if (a, b) not in joined:
+                    joined[a, b] = self._learn(
+                        a.form, _copies(a.frames + b.frames), a.stock.coefficients
+                    )
+            a, b = min(pairs, key=lambda pair: _reason_to_part(*pair, joined[pair]))
+            if _reason_to_part(a, b, joined[a, b]) > 0:
+                break
+            groups = [joined[a, b], *(group for group in groups if group not in (a, b))]
+        return groups
+
+    def looked_at_again(self, groups: list[_Group]) -> list[_Group]:
+        """Each fish in the group whose shape its masks prefer; poses sought anew, stocks learnt."""
+        searches = [self._search(group.stock.coefficients) for group in groups]
+        shapes = [group.stock.coefficients for group in groups]
+        shares = np.log([group.num_fish for group in groups])
+        frames: list[list[PosedTarget]] = [[] for _ in groups]
+        by_fish: dict[int, list[PosedTarget]] = {}
+        for frame in (frame for group in groups for frame in group.frames):
+            by_fish.setdefault(frame.fish, []).append(frame)
+        for found in by_fish.values():
+            options = [[search(frame) for frame in found] for search in searches]
+            nats = [
+                list(self._fitter.nats(_copies(option), shape).values())
+                for option, shape in zip(options, shapes, strict=True)
+            ]
+            best = int(np.argmin(_FRAMES_WORTH * np.mean(nats, axis=1) - shares))
+            frames[best] += options[best]
+        return [
+            self._learn(group.form, own, group.stock.coefficients, with_volumes=True)
+            for group, own in zip(groups, frames, strict=True)
+            if own
+        ]
+
+    def _learn(
+        self,
+        form: Candidate,
+        frames: list[PosedTarget],
+        start: Float[np.ndarray, "W"],
+        *,
+        with_volumes: bool = False,
+    ) -> _Group:
+        stock = self._fitter.fit(frames, form.coefficients, start, with_volumes=with_volumes)
+        return _Group(form, frames, stock)
+
+    def _search(self, coefficients: Float[np.ndarray, "W"]) -> Callable[[PosedTarget], PosedTarget]:
+        """Seeks the pose of a frame from cold, with a template of this shape."""
+        template = reshaped(self._template, coefficients)
+        solver = ContourSolver(
+            MeshLevels.of(template, max_faces=self._settings.max_faces), self._settings
+        )
+
+        def search(frame: PosedTarget) -> PosedTarget:
+            found = solver.search(frame.target, cold_starts(frame.target, template))
+            return PosedTarget(frame.fish, frame.target, found.parameters)
+
+        return search
+
+
+def _copies(frames: Sequence[PosedTarget]) -> list[PosedTarget]:
+    return [PosedTarget(frame.fish, frame.target, frame.pose) for frame in frames]
+
+
+def _reason_to_part(a: _Group, b: _Group, both: _Group) -> float:
+    """Nats by which masks prefer two shapes to one, less the parameters of the smaller group."""
+    apart = a.stock.nats | b.stock.nats
+    gains = [_FRAMES_WORTH * (both.stock.nats[fish] - nats) for fish, nats in apart.items()]
+    return float(np.clip(gains, _MOST_AGAINST, _MOST_FOR).sum()) - b.num_effective

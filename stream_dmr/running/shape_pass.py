@@ -1,0 +1,73 @@
+"""A first pass over a source, for the shapes of its fish, before any of them is measured.
+
+Of `--template auto`, and only of sources with an end: what the last fish taught counts for the
+first one too.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from threading import Event
+
+from stream_dmr.fitting.learn_shapes import learn_shapes
+from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes
+from stream_dmr.fitting.shape.describe import describe
+from stream_dmr.fitting.shape.space import reshaped
+from stream_dmr.nodes.crop_fish import CropFish
+from stream_dmr.nodes.read_frames import ReadFrames
+from stream_dmr.running.inputs import Inputs
+from stream_dmr.running.kept_crops import keep_crops
+from stream_dmr.running.run_folder import refuse_earlier
+from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.template.template import Template, save_template
+
+
+def with_learnt_shapes(
+    inputs: Inputs, crop_fish: CropFish, *, stop: Event, observer: RunObserver
+) -> Inputs:
+    """The inputs with the stocks of the source's own fish, and its crops.
+
+    As they are where nothing is to be learnt: a template was named, the source has no end, or an
+    earlier run is taken up again, whose fish were measured by other shapes.
+    """
+    config, candidates = inputs.config.fit_mesh, inputs.candidates
+    can_learn = config.solver == "contour" and config.deformation == "spine"
+    if candidates is None or inputs.request.template != AUTO or inputs.resumes or not can_learn:
+        return inputs
+    refuse_earlier(inputs.request.out, is_fine=inputs.request.overwrite)  # before the work
+    observer.stage("finding the fish, for their shapes")
+    crops = keep_crops(
+        inputs.reader, crop_fish, inputs.config.recording, stop=stop, on_frame=observer.frame_done
+    )
+    inputs.reader.close()
+    reader = ReadFrames(inputs.request.source, inputs.config.read_frames)
+    inputs = replace(inputs, reader=reader, crops=crops)
+    if stop.is_set():
+        return inputs
+    stocks = learn_shapes(
+        crops,
+        inputs.template,
+        candidates,
+        config,
+        calibration=inputs.calibration,
+        progress=lambda step: observer.stage(f"learning their shapes: {step}"),
+    )
+    if stocks is None:
+        observer.warn("no fish was seen whole: each is measured as the body form it is most like")
+        return inputs
+    for line in describe(candidates, stocks):
+        observer.notice(line)
+    return replace(inputs, candidates=stocks)
+
+
+def save_stocks(
+    template: Template, stocks: CandidateShapes, path: Path, *, source: str
+) -> list[Path]:
+    """Write the mesh of each stock, the largest to `path`, others beside it. Raises OutputError."""
+    paths = [path, *(path.with_stem(f"{path.stem}-{n}") for n in range(2, len(stocks) + 1))]
+    for stock, one in zip(stocks, paths, strict=True):
+        save_template(
+            replace(reshaped(template, stock.coefficients), name=stock.name),
+            one,
+            comment=f"the mean shape of {stock.share:.0%} of the fish of {source}",
+        )
+    return paths
