@@ -24,7 +24,7 @@ from stream_dmr.segmentation.annotations.annotated_fish import open_annotated_fi
 from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
 from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map
 from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
-from stream_dmr.segmentation.network.unet import SIZE_PX
+from stream_dmr.segmentation.network.unet_interface import SIZE_PX
 from stream_dmr.segmentation.network.unet_segmenter import UNetSegmenter
 from stream_dmr.segmentation.network.unet_weights import SHIPPED
 from stream_dmr.sources.open_source import open_source

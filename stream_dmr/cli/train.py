@@ -31,21 +31,21 @@ def train(
     config: Annotated[Path | None, typer.Option(help="A config.toml; [train] is read.")] = None,
     device: Annotated[Device, typer.Option(help="Where to compute.")] = "cpu",
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on after the last epoch of the training in --out.")
+        bool,
+        typer.Option("--resume", help="Continue the training in --out after its last epoch."),
     ] = False,
 ) -> None:
-    """Teach the network that finds masks, on simulated pictures or on your own as well.
+    """Train the network that finds masks, on simulated pictures or on your own as well.
 
     Writes unet.pt, scores.json, curve.png and worst.png into --out after every epoch; use the
-    weights by [crop_fish] segmenter = "OUT/unet.pt". Ctrl-C ends it; --resume goes on.
+    weights by [crop_fish] segmenter = "OUT/unet.pt". Ctrl-C ends it; --resume continues.
     """
     if (images is None) != (masks is None):
         raise typer.BadParameter("--images and --masks belong together: give both or neither")
     with stop_on_signals() as stop:
+        from stream_dmr.cli.train_display import TrainDisplay
         from stream_dmr.running.config import load_config
-        from stream_dmr.segmentation.training.train_display import TrainDisplay
-        from stream_dmr.segmentation.training.train_unet import TrainRequest
-        from stream_dmr.segmentation.training.train_unet import train as train_network
+        from stream_dmr.segmentation.training.train_unet import TrainRequest, train_unet
 
         settings = load_config(config).train
         request = TrainRequest(
@@ -59,12 +59,12 @@ def train(
             command=command_line(),
         )
         with TrainDisplay(settings) as display:
-            best = train_network(request, stop=stop, observer=display)
+            best = train_unet(request, stop=stop, observer=display)
     if best is not None:
         print(f"best: epoch {best.epoch}, mean IoU {best.iou:.3f}; {out / 'unet.pt'}")
     if stop.signal_number:
         print(
-            f"stopped by {signal.Signals(stop.signal_number).name}; --resume goes on",
+            f"stopped by {signal.Signals(stop.signal_number).name}; --resume continues",
             file=sys.stderr,
         )
         raise typer.Exit(128 + stop.signal_number)

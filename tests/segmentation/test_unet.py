@@ -7,10 +7,12 @@ from hypothesis import strategies as st
 from stream_dmr.errors import ModelError
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.detection.unet_detector import UNetDetector
-from stream_dmr.segmentation.network.box_coverage import box_picture, crop_around, jitter
-from stream_dmr.segmentation.network.unet import ENDS_STRIDE, UNet, normalise
-from stream_dmr.segmentation.network.unet_segmenter import UNetSegmenter, _find_ends, _fuse
+from stream_dmr.segmentation.network.fish_ends import find_ends
+from stream_dmr.segmentation.network.unet import UNet, normalise
+from stream_dmr.segmentation.network.unet_interface import ENDS_STRIDE, box_coverage
+from stream_dmr.segmentation.network.unet_segmenter import UNetSegmenter
 from stream_dmr.segmentation.network.unet_weights import SHIPPED, load_weights, save_weights
+from stream_dmr.segmentation.training.box_crops import crop_affine, jitter_box
 from stream_dmr.segmentation.training.unet_losses import (
     ends_are_right,
     ends_loss,
@@ -26,7 +28,7 @@ sides = st.floats(1, 150)
 
 @given(numbers, numbers, sides, sides)
 def test_a_box_picture_covers_the_area_of_the_box(x, y, w, h):
-    picture = box_picture(np.array([x, y, x + w, y + h]), size=128)
+    picture = box_coverage(np.array([x, y, x + w, y + h]), size=128)
     seen = max(0.0, min(x + w, 128) - max(x, 0)) * max(0.0, min(y + h, 128) - max(y, 0))
     assert picture.sum() == pytest.approx(seen, abs=0.05)
     assert picture.min() >= 0
@@ -35,7 +37,7 @@ def test_a_box_picture_covers_the_area_of_the_box(x, y, w, h):
 
 @given(numbers, numbers, sides, sides, st.floats(0, 0.5))
 def test_a_crop_leaves_its_margin_around_the_longer_side(x, y, w, h, margin):
-    crop = crop_around(np.array([x, y, x + w, y + h]), margin=margin, size=64)
+    crop = crop_affine(np.array([x, y, x + w, y + h]), margin=margin, size=64)
     low, high = (crop[:, :2] @ np.array([[x, x + w], [y, y + h]]) + crop[:, 2:]).T
     edges = np.concatenate([low, 63 - high])  # to the first and last pixel centres
     assert edges.min() == pytest.approx(64 * margin / (1 + 2 * margin) - 0.5, abs=1e-6)
@@ -45,7 +47,7 @@ def test_a_crop_leaves_its_margin_around_the_longer_side(x, y, w, h, margin):
 @given(st.integers(0, 10**6), numbers, numbers, sides, sides)
 def test_a_jittered_box_stays_in_its_limits_and_is_a_box(seed, x, y, w, h):
     limits = np.array([x - 1, y - 1, x + w + 1, y + h + 1])
-    moved = jitter(np.random.default_rng(seed), np.array([x, y, x + w, y + h]), limits=limits)
+    moved = jitter_box(np.random.default_rng(seed), np.array([x, y, x + w, y + h]), limits=limits)
     assert (moved[:2] >= limits[:2]).all()
     assert (moved[2:] <= limits[2:]).all()
     assert (moved[2:] > moved[:2]).all()
@@ -76,12 +78,15 @@ def test_masks_have_the_size_of_the_input_and_ends_a_quarter_of_it():
 
 
 @torch.no_grad()
-def test_normalisation_folded_into_convolutions_changes_nothing():
+def test_inference_gives_what_the_trained_network_gives():
     network = random_network()
     images, boxes = inputs()
     x = normalise(torch.from_numpy(images).float(), torch.from_numpy(boxes))
-    for plain, fused in zip(network(x), _fuse(network)(x), strict=True):
-        torch.testing.assert_close(fused, plain, rtol=1e-3, atol=1e-3)
+    mask_logits, ends_logits = network(x)
+    probability, log_ends = UNetSegmenter(network).segment_batch(images, boxes)
+    np.testing.assert_allclose(probability, torch.sigmoid(mask_logits), atol=1e-3)
+    expected = torch.log_softmax(ends_logits.flatten(2), dim=2).numpy()
+    np.testing.assert_allclose(log_ends.reshape(expected.shape), expected, rtol=1e-3, atol=1e-3)
     assert any(isinstance(m, torch.nn.BatchNorm2d) for m in network.modules())  # still trainable
 
 
@@ -107,7 +112,7 @@ places = st.tuples(st.floats(3, 28), st.floats(3, 28))
 @given(places, places, st.sampled_from([0.5, 1.0, 2.0]))
 def test_ends_are_found_between_the_cells(head, tail, scale):
     maps = np.stack([blob(32, *head), blob(32, *tail)])
-    ends = _find_ends(maps, scale=scale)
+    ends = find_ends(maps, scale=scale)
     expected = ((np.array([head, tail]) + 0.5) * ENDS_STRIDE) / scale - 0.5
     apart = np.linalg.norm(np.subtract(head, tail))
     if apart > 5:
@@ -120,7 +125,7 @@ def test_ends_are_found_between_the_cells(head, tail, scale):
 def test_the_likelier_way_round_is_chosen_by_its_odds(head_here, tail_here):
     here, there = blob(32, 5, 16), blob(32, 26, 16)
     maps = [np.logaddexp(here + np.log(p), there + np.log(1 - p)) for p in (head_here, tail_here)]
-    ends = _find_ends(np.stack(maps).astype(np.float32), scale=1.0)
+    ends = find_ends(np.stack(maps).astype(np.float32), scale=1.0)
     odds = head_here * (1 - tail_here) / (tail_here * (1 - head_here))
     assert ends.confidence == pytest.approx(
         max(odds, 1 / odds) / (1 + max(odds, 1 / odds)), abs=0.01

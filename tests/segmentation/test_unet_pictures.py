@@ -5,21 +5,24 @@ import numpy as np
 import pytest
 
 from stream_dmr.errors import AnnotationError
-from stream_dmr.segmentation.training.annotated_images import read_annotated
-from stream_dmr.segmentation.training.annotated_samples import draw_own, load_own_fish
+from stream_dmr.segmentation.training.annotated_images import read_annotated_images
+from stream_dmr.segmentation.training.annotated_samples import (
+    draw_annotated_sample,
+    load_fish_cutouts,
+)
+from stream_dmr.segmentation.training.draw_sample import draw_sample
 from stream_dmr.segmentation.training.fish_patches import PATCH_PX, draw_fish_patch
-from stream_dmr.segmentation.training.patch_bank import Bank, load_or_make_bank, make_bank
+from stream_dmr.segmentation.training.patch_bank import PatchBank, load_or_make_bank, make_bank
 from stream_dmr.segmentation.training.random_backgrounds import BACKGROUND_PX, draw_background
-from stream_dmr.segmentation.training.scene_composition import draw_sample
-from stream_dmr.segmentation.training.training_sample import Sample
+from stream_dmr.segmentation.training.training_sample import TrainingSample
 
 
 @pytest.fixture(scope="module")
-def bank() -> Bank:
+def bank() -> PatchBank:
     return make_bank(num_fish=12, num_backgrounds=4, seed=5, progress=lambda: None)
 
 
-def assert_equal(one: Sample, other: Sample):
+def assert_equal(one: TrainingSample, other: TrainingSample):
     for name in ("image", "mask", "in_box", "ends_px"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
@@ -117,18 +120,18 @@ def vessel(tmp_path):
 
 
 def test_own_fish_are_cut_out_whole_and_checked_apart(vessel):
-    learnt, held_back = load_own_fish(vessel / "images", vessel / "masks")
-    assert (len(learnt), len(held_back)) == (6, 1)
-    for cut in (*learnt, *held_back):
+    training, validation = load_fish_cutouts(vessel / "images", vessel / "masks")
+    assert (len(training), len(validation)) == (6, 1)
+    for cut in (*training, *validation):
         inside = cut[..., 3] > 0
         assert not inside[[0, -1]].any()
         assert cut[..., :3][inside].mean() > 1.8 * cut[..., :3][~inside].mean()
 
 
 def test_a_turned_crop_turns_the_mask_along(vessel):
-    _, [cut] = load_own_fish(vessel / "images", vessel / "masks")
+    _, [cut] = load_fish_cutouts(vessel / "images", vessel / "masks")
     for seed in range(20):
-        sample = draw_own(np.random.default_rng(seed), cut)
+        sample = draw_annotated_sample(np.random.default_rng(seed), cut)
         bright = cv2.GaussianBlur(sample.image, (0, 0), 2).mean(axis=2)
         inside = sample.mask > 0.5
         assert bright[inside].mean() > bright[~inside].mean() + 20
@@ -179,13 +182,13 @@ def test_coco_masks_are_the_ones_written(vessel, kind):
         return {"size": list(mask.shape), "counts": packed(runs) if kind == "packed" else runs}
 
     file = coco(vessel, [segmentation(mask) for mask in masks])
-    for annotated, mask in zip(read_annotated(vessel / "images", file), masks, strict=True):
+    for annotated, mask in zip(read_annotated_images(vessel / "images", file), masks, strict=True):
         np.testing.assert_array_equal(annotated.masks[0], mask > 0)
 
 
 def refusal(images, masks):
     with pytest.raises(AnnotationError) as caught:
-        load_own_fish(images, masks)
+        load_fish_cutouts(images, masks)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -205,7 +208,7 @@ def test_images_and_masks_that_do_not_match_are_refused(vessel):
     for path in masks.iterdir():
         cv2.imwrite(str(path), np.zeros((120, 160), np.uint8))
     cv2.imwrite(str(masks / "haul-3.png"), np.zeros((120, 160), np.uint8))
-    assert "0 fish to learn from" in refusal(images, masks)
+    assert "0 fish to train on" in refusal(images, masks)
 
 
 def test_coco_files_that_are_none_are_refused(vessel):

@@ -9,7 +9,7 @@ from stream_dmr.cli.main import app
 from stream_dmr.errors import ModelError, OutputError
 from stream_dmr.segmentation.network.unet_weights import SHIPPED, load_weights
 from stream_dmr.segmentation.training.train_settings import TrainSettings
-from stream_dmr.segmentation.training.train_unet import TrainObserver, TrainRequest, train
+from stream_dmr.segmentation.training.train_unet import TrainObserver, TrainRequest, train_unet
 
 TINY = TrainSettings(
     epochs=2,
@@ -34,7 +34,7 @@ def never():
 def trained(tmp_path_factory):
     """A whole training of two epochs, and its best scores."""
     out = tmp_path_factory.mktemp("trained")
-    return out, train(request(out), stop=never())
+    return out, train_unet(request(out), stop=never())
 
 
 def history(out):
@@ -57,16 +57,16 @@ class StopAfterFirst(TrainObserver):
     def __init__(self):
         self.stop = threading.Event()
 
-    def checked(self, scores, *, is_best):
+    def epoch_done(self, scores, *, is_best):
         self.stop.set()
 
 
 def test_a_resumed_training_is_the_one_that_was_not_stopped(trained, tmp_path):
     whole, best = trained
     observer = StopAfterFirst()
-    train(request(tmp_path), stop=observer.stop, observer=observer)
+    train_unet(request(tmp_path), stop=observer.stop, observer=observer)
     assert len(history(tmp_path)) == 1
-    assert train(request(tmp_path, resume=True), stop=never()) == best
+    assert train_unet(request(tmp_path, resume=True), stop=never()) == best
     assert history(tmp_path) == history(whole)
     one, other = (load_weights(out / "unet.pt").state_dict() for out in (whole, tmp_path))
     for name, value in one.items():
@@ -75,7 +75,7 @@ def test_a_resumed_training_is_the_one_that_was_not_stopped(trained, tmp_path):
 
 def test_training_ends_where_nothing_improves(trained, tmp_path):
     still = TINY.model_copy(update={"learning_rate": 1e-12, "epochs": 9, "patience": 1})
-    train(request(tmp_path, settings=still, init=trained[0] / "unet.pt"), stop=never())
+    train_unet(request(tmp_path, settings=still, init=trained[0] / "unet.pt"), stop=never())
     merits = [epoch["iou"] for epoch in history(tmp_path)]
     assert len(merits) < 9
     assert merits[-1] <= max(merits[:-1])
@@ -83,7 +83,7 @@ def test_training_ends_where_nothing_improves(trained, tmp_path):
 
 def test_fine_tuning_never_ends_with_worse_weights_than_it_began_with(tmp_path):
     wild = TINY.model_copy(update={"learning_rate": 0.1, "epochs": 1})
-    best = train(request(tmp_path, settings=wild, init=SHIPPED), stop=never())
+    best = train_unet(request(tmp_path, settings=wild, init=SHIPPED), stop=never())
     start, spoilt = history(tmp_path)
     assert best.epoch == start["epoch"] == 0
     assert start["loss"] is None
@@ -91,7 +91,7 @@ def test_fine_tuning_never_ends_with_worse_weights_than_it_began_with(tmp_path):
     one, other = (load_weights(path).state_dict() for path in (SHIPPED, tmp_path / "unet.pt"))
     for name, value in one.items():
         np.testing.assert_array_equal(value.numpy(), other[name].numpy())
-    train(request(tmp_path, settings=wild, resume=True, init=SHIPPED), stop=never())
+    train_unet(request(tmp_path, settings=wild, resume=True, init=SHIPPED), stop=never())
     assert len(history(tmp_path)) == 2  # it was over
     assert (tmp_path / "worst.png").exists()
 
@@ -99,15 +99,15 @@ def test_fine_tuning_never_ends_with_worse_weights_than_it_began_with(tmp_path):
 def test_what_cannot_be_is_refused_before_anything_is_learnt(trained, tmp_path):
     out, _ = trained
     with pytest.raises(OutputError, match=r"last\.pt of an earlier one"):
-        train(request(out), stop=never())
+        train_unet(request(out), stop=never())
     with pytest.raises(ModelError, match="expected the checkpoint"):
-        train(request(tmp_path / "new", resume=True), stop=never())
+        train_unet(request(tmp_path / "new", resume=True), stop=never())
     other = TINY.model_copy(update={"learning_rate": 1e-3})
     with pytest.raises(ModelError, match="of the same settings"):
-        train(request(out, settings=other, resume=True), stop=never())
+        train_unet(request(out, settings=other, resume=True), stop=never())
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="expected a folder"):
-        train(request(tmp_path / "file"), stop=never())
+        train_unet(request(tmp_path / "file"), stop=never())
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ class UNetDetector:
             _MULTIPLE_PX * max(1, round(side * scale / _MULTIPLE_PX)) for side in (width, height)
         ]
         small = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
-        probability = self._segmenter.look(small)
+        probability = self._segmenter.segment_all(small)
         fish = cv2.resize(probability, (width, height), interpolation=cv2.INTER_LINEAR)
         least = _LEAST_PX * width * height / (size[0] * size[1])
         return [_candidate(shape, fish) for shape in _shapes(fish > 0.5, least)]

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from stream_dmr.segmentation.segmenter import SegmentedFish
 
-# Chosen on textured ellipses and the simulated `realistic` scene, by mask IoU and time.
+# Chosen by hand.
 _CONTEXT = 0.2  # of the box's longer side: the ring around it that shows the background
 _WORKING_PX = 256  # of the longer side: finer costs much time and moves the outline little
 _MIN_SIDE_PX = 12  # below, GrabCut's two mixtures of 5 Gaussians have too few pixels

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-# Chosen by the look of simulated masks that gaffs and lines cut in two.
+# Chosen by hand.
 _MIN_PART_RATIO = 0.05  # of the largest part's area: a tail behind a gaff stays, specks go
 _MAX_HOLE_RATIO = 0.01  # of the mask's area: pinholes are noise, larger ones an object in front
 

@@ -1,7 +1,8 @@
 """A U-Net small enough for two CPU cores (paper, Sec. 2; Ronneberger et al., MICCAI 2015).
 
-Its first convolution already halves the picture, so that no layer works at full size; the last one
-gives four values per cell, which are the four pixels of that cell.
+Its first convolution already halves the input, so that no layer works at full size; the last one
+gives four values per cell, which are the four pixels of that cell. The widths were chosen for 15 ms
+a crop on one core: 0.65 million weights take 5 ms (docs/segmentation.md, "Speed").
 """
 
 import torch
@@ -9,14 +10,13 @@ from jaxtyping import Float, Float32
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pixel_shuffle
 
-SIZE_PX = 128  # width and height of the input
-ENDS_STRIDE = 4  # crop pixels per cell of the maps of head and tail
 _WIDTHS = (24, 40, 64, 96)  # channels at 1/2, 1/4, 1/8 and 1/16 of the size
 _DEPTHS = (0, 1, 1, 2)  # residual blocks on the way down
+_MIN_SPREAD = 4.0  # grey levels: noise of a uniform image is not amplified
 
 
 class UNet(nn.Module):
-    """A crop and its box in; the fish's mask, and where its head and tail are, out."""
+    """From a crop and its box to the fish's mask and the positions of its head and tail."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -33,7 +33,10 @@ class UNet(nn.Module):
     def forward(
         self, inputs: Float[Tensor, "B 4 H W"]
     ) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B 2 h w"]]:
-        """Logits of the mask at the input's size, and of head and tail at a quarter of it."""
+        """Logits of the mask at the input's size, and of head and tail at a quarter of it.
+
+        `inputs` are from `normalise`; h and w are H and W over ENDS_STRIDE.
+        """
         x = self.stem(inputs)
         levels = [x]
         for down in self.down:
@@ -50,19 +53,19 @@ class UNet(nn.Module):
 def normalise(
     images: Float32[Tensor, "B H W 3"], in_box: Float32[Tensor, "B H W"]
 ) -> Float32[Tensor, "B 4 H W"]:
-    """What the network gets: BGR pictures (0 to 255) freed of colour cast and contrast, the box.
+    """The network's input from BGR images (0 to 255) and the fraction of each pixel in the box.
 
-    Each channel's mean goes and the picture's overall spread is set to one, so that neither the
-    water's colour nor the exposure matters.
+    Each channel's mean is subtracted and the image's overall spread set to one, so that neither
+    the water's colour nor the exposure matters.
     """
     centred = images - images.mean(dim=(1, 2), keepdim=True)
     spread = centred.square().mean(dim=(1, 2, 3), keepdim=True).sqrt()
-    channels = torch.cat([centred / (spread + 4.0), in_box[..., None] - 0.5], dim=3)
-    return channels.permute(0, 3, 1, 2)  # channels_last in memory, as the convolutions like it
+    channels = torch.cat([centred / (spread + _MIN_SPREAD), in_box[..., None] - 0.5], dim=3)
+    return channels.permute(0, 3, 1, 2)  # channels_last in memory, the faster layout
 
 
 class _Residual(nn.Module):
-    """Two convolutions beside a way straight through."""
+    """Two convolutions with a skip connection."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -74,7 +77,7 @@ class _Residual(nn.Module):
 
 
 def _convolve(channels: int, width: int, *, kernel: int = 3, stride: int = 1) -> nn.Sequential:
-    """Convolution, batch normalisation, ReLU; an even kernel keeps halving free of shifts."""
+    """Convolution, batch normalisation, ReLU; an even kernel halves without a shift."""
     padding = (kernel - 1) // 2
     return nn.Sequential(
         nn.Conv2d(channels, width, kernel, stride, padding, bias=False),

@@ -1,10 +1,12 @@
-"""The U-Net at work: crops and boxes in, probabilities and ends out."""
+"""Run the U-Net on crops and boxes. This is where a run imports torch.
+
+`masks.open_segmenter` and `detection.open_detector` import this module only where the
+configuration asks for the network.
+"""
 
 import copy
-import math
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
-from itertools import permutations
 from pathlib import Path
 
 import cv2
@@ -14,27 +16,25 @@ from jaxtyping import Float, Float32, UInt8
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from stream_dmr.messages import FishEnds
-from stream_dmr.segmentation.network.box_coverage import box_picture
-from stream_dmr.segmentation.network.unet import ENDS_STRIDE, SIZE_PX, UNet, normalise
+from stream_dmr.segmentation.network.fish_ends import find_ends
+from stream_dmr.segmentation.network.unet import UNet, normalise
+from stream_dmr.segmentation.network.unet_interface import SIZE_PX, box_coverage
 from stream_dmr.segmentation.network.unet_weights import load_weights
 from stream_dmr.segmentation.segmenter import SegmentedFish
 
-_LEAST_APART = 3.0  # cells between head and tail
-_PEAK_REACH = 2  # cells around a map's peak whose mean says where it is between the cells
-
 
 class UNetSegmenter:
-    """A `Segmenter` that also sees the fish's ends."""
+    """A `Segmenter` that also locates the fish's ends."""
 
     def __init__(self, network: UNet, *, device: str = "cpu") -> None:
+        """`network` stays as it is: a copy is optimised for inference."""
         self._device = torch.device(device)
-        network = _fuse(network.eval()).to(self._device)
+        network = _without_batch_norm(network.eval()).to(self._device)
         self._network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     @classmethod
     def load(cls, path: Path, *, device: str = "cpu") -> "UNetSegmenter":
-        """Raises ModelError where the weights can't be used."""
+        """Raises ModelError where the weights cannot be used."""
         return cls(load_weights(path), device=device)
 
     def segment(
@@ -43,19 +43,19 @@ class UNetSegmenter:
         """The fish in a box, half-open in pixels of the crop `image` (BGR) of any size."""
         size = len(image)
         scale = SIZE_PX / size
-        in_box = box_picture(bbox_xyxy_px * scale, size=SIZE_PX)
+        in_box = box_coverage(bbox_xyxy_px * scale, size=SIZE_PX)
         with _one_thread():
             probability, ends = self.segment_batch(_resize(image, SIZE_PX)[None], in_box[None])
         return SegmentedFish(
             probability=np.clip(_resize(probability[0], size), 0, 1),
-            ends=_find_ends(ends[0], scale=scale),
+            ends=find_ends(ends[0], scale=scale),
         )
 
-    def look(self, picture: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
-        """Probabilities of being any fish; H and W are multiples of 16."""
+    def segment_all(self, image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
+        """Probability of each pixel to be any fish; H and W are multiples of SIZE_MULTIPLE_PX."""
         with _one_thread():
-            nowhere = np.ones(picture.shape[:2], np.float32)
-            return self.segment_batch(picture[None], nowhere[None])[0][0]
+            no_box = np.ones(image.shape[:2], np.float32)
+            return self.segment_batch(image[None], no_box[None])[0][0]
 
     @torch.inference_mode()
     def segment_batch(
@@ -63,8 +63,8 @@ class UNetSegmenter:
     ) -> tuple[Float32[np.ndarray, "B H W"], Float32[np.ndarray, "B 2 h w"]]:
         """Probabilities of fish, and log probabilities of head and tail at a quarter of the size.
 
-        H and W are multiples of 16; the network was taught at 128. A picture whose `in_boxes` (see
-        `boxes.box_picture`) is 1 everywhere has no box: then every fish in it is found.
+        H and W are multiples of SIZE_MULTIPLE_PX. `in_boxes` are from `box_coverage`; where it is 1
+        everywhere, all fish in the image are found.
         """
         pictures = torch.from_numpy(images).to(self._device).float()
         boxes = torch.from_numpy(in_boxes).to(self._device)
@@ -74,10 +74,10 @@ class UNetSegmenter:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Compute with one thread: the layers are too small to share, and the other stages want cores.
+def _one_thread() -> Generator[None]:
+    """Compute with one thread: the layers are too small to share, and other stages need the cores.
 
-    With two threads and a busy machine a crop took 55 ms of processor time instead of 7.
+    With two threads on a busy machine a crop took 55 ms of processor time instead of 7.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -87,58 +87,15 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _find_ends(maps: Float32[np.ndarray, "2 s s"], *, scale: float) -> FishEnds:
-    """The likeliest two places, in crop pixels; `scale` is network pixels per crop pixel.
-
-    `maps` are log probabilities of head and tail. The odds against the two being the other way
-    round are p_h(H) p_t(T) / (p_h(T) p_t(H)).
-    """
-    cells = [cell for one in maps for cell in _peaks(one)]
-    value, head, tail = max(
-        (float(maps[0][h] + maps[1][t]), h, t)
-        for h, t in permutations(cells, 2)
-        if math.dist(h, t) >= _LEAST_APART
-    )
-    log_odds = min(value - float(maps[0][tail] + maps[1][head]), 50.0)
-    places = np.array([_refine(maps[0], head), _refine(maps[1], tail)])
-    head_px, tail_px = ((places + 0.5) * ENDS_STRIDE) / scale - 0.5
-    confidence = 1 / (1 + math.exp(-log_odds))
-    return FishEnds(head_px=head_px, tail_px=tail_px, confidence=confidence)
-
-
-def _peaks(log_probability: Float32[np.ndarray, "s s"]) -> list[tuple[int, int]]:
-    """Row and column of the highest cell, and of the highest one away from it."""
-    rows, columns = np.indices(log_probability.shape)
-    first = divmod(int(log_probability.argmax()), len(log_probability))
-    is_near = np.hypot(rows - first[0], columns - first[1]) < _LEAST_APART
-    second = divmod(int(np.where(is_near, -np.inf, log_probability).argmax()), len(is_near))
-    return [first, second]
-
-
-def _refine(
-    log_probability: Float32[np.ndarray, "s s"], cell: tuple[int, int]
-) -> Float[np.ndarray, "2"]:
-    """Column and row of a peak between the cells: the mean of those around it."""
-    row, column = cell
-    top, left = max(0, row - _PEAK_REACH), max(0, column - _PEAK_REACH)
-    around = log_probability[top : row + _PEAK_REACH + 1, left : column + _PEAK_REACH + 1]
-    weights = np.exp((around - around.max()).astype(np.float64))
-    rows, columns = np.indices(weights.shape)
-    total = weights.sum()
-    return np.array(
-        [left + (columns * weights).sum() / total, top + (rows * weights).sum() / total]
-    )
-
-
 def _resize(picture: np.ndarray, size: int) -> np.ndarray:
-    """A square picture in another size; pixel edges stay where they are, not pixel centres."""
+    """A square picture in another size; pixel edges stay where they are, not pixel centers."""
     if len(picture) == size:
         return picture
-    way = cv2.INTER_AREA if len(picture) > size else cv2.INTER_LINEAR
-    return cv2.resize(picture, (size, size), interpolation=way)
+    interpolation = cv2.INTER_AREA if len(picture) > size else cv2.INTER_LINEAR
+    return cv2.resize(picture, (size, size), interpolation=interpolation)
 
 
-def _fuse(network: UNet) -> UNet:
+def _without_batch_norm(network: UNet) -> UNet:
     """A copy with each batch normalisation folded into the convolution before it."""
     network = copy.deepcopy(network)
     for module in list(network.modules()):

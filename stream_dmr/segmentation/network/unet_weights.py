@@ -1,4 +1,4 @@
-"""The network's weights as a file: the ones that ship, and those that a user trains."""
+"""The network's weights as a file: those that are shipped, and those that a user trains."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ _FORMAT = "stream-dmr unet 1"  # a new number where the network's layers change
 
 
 def save_weights(network: UNet, path: Path) -> None:
-    """Write the weights in half precision, whose error is far below what the mask feels."""
+    """Write the weights in half precision, whose rounding error is 0.05 % at most."""
     state = {
         name: value.half() if value.is_floating_point() else value
         for name, value in network.state_dict().items()
@@ -23,7 +23,7 @@ def save_weights(network: UNet, path: Path) -> None:
 def load_weights(path: Path) -> UNet:
     """The network with these weights, in evaluation mode on the CPU.
 
-    Raises ModelError where the file can't be read or isn't one that `save_weights` wrote.
+    Raises ModelError where the file cannot be read or is not one that `save_weights` wrote.
     """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -31,13 +31,13 @@ def load_weights(path: Path) -> UNet:
         raise ModelError(
             f"{path}: expected the weights of a U-Net, got: {error.strerror}"
         ) from error
-    except Exception as error:  # torch raises many kinds for bytes that are not its own
+    except Exception as error:  # torch raises errors of many kinds for foreign bytes
         raise ModelError(
             f"{path}: expected weights written by `stream-dmr train`, got another kind of file"
         ) from error
     if not isinstance(content, dict) or content.get("format") != _FORMAT:
         raise ModelError(
-            f"{path}: expected weights in the format '{_FORMAT}', got others; train them anew"
+            f"{path}: expected weights in the format '{_FORMAT}', got others; train them again"
         )
     network = UNet()
     try:
@@ -48,8 +48,8 @@ def load_weights(path: Path) -> UNet:
         network.load_state_dict(state)
     except Exception as error:  # keys or shapes of another network, or no tensors at all
         raise ModelError(
-            f"{path}: expected the layers of this version's network, got others; train them anew"
+            f"{path}: expected the layers of this version's network, got others; train them again"
         ) from error
     if not all(bool(value.isfinite().all()) for value in state.values()):
-        raise ModelError(f"{path}: expected finite weights, got NaN or infinity; train them anew")
+        raise ModelError(f"{path}: expected finite weights, got NaN or infinity; train them again")
     return network.eval()

@@ -1,4 +1,4 @@
-"""A user's masks, one fish at a time: label pictures named like the images, or COCO's JSON."""
+"""A user's images with the masks of their fish: label pictures, or COCO's JSON."""
 
 import json
 from collections.abc import Iterator
@@ -12,11 +12,11 @@ from jaxtyping import Bool, UInt8
 
 from stream_dmr.errors import AnnotationError
 
-_IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
+_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Annotated:
+class AnnotatedImage:
     """One image with the masks of its fish."""
 
     path: Path
@@ -24,15 +24,17 @@ class Annotated:
     masks: list[Bool[np.ndarray, "H W"]]
 
 
-def read_annotated(images: Path, masks: Path) -> Iterator[Annotated]:
-    """The annotated images in the order of their names.
+def read_annotated_images(images: Path, masks: Path) -> Iterator[AnnotatedImage]:
+    """The annotated images, ordered by name.
 
-    `masks` is a folder with STEM.png for each image, whose values are the ids of fish and 0 is
-    none, or a COCO file. Raises AnnotationError where images and masks don't fit together.
+    `masks` is a folder with STEM.png for each image, whose pixel values are fish ids and 0 is
+    background, or a COCO file. Raises AnnotationError where images and masks do not match.
     """
     if not images.is_dir():
         raise AnnotationError(f"{images}: expected a folder of images, found none there")
-    paths = {path.name: path for path in sorted(images.iterdir()) if path.suffix.lower() in _IMAGES}
+    paths = {
+        path.name: path for path in sorted(images.iterdir()) if path.suffix.lower() in _SUFFIXES
+    }
     if not paths:
         raise AnnotationError(f"{images}: expected images (.png, .jpg, .tif, .bmp), found none")
     if masks.is_dir():
@@ -43,12 +45,12 @@ def read_annotated(images: Path, masks: Path) -> Iterator[Annotated]:
         raise AnnotationError(f"{masks}: expected a folder of PNG masks or a COCO .json")
 
 
-def _read_folder(paths: dict[str, Path], masks: Path) -> Iterator[Annotated]:
-    lacking = [path.name for path in paths.values() if not (masks / f"{path.stem}.png").exists()]
-    if lacking:
+def _read_folder(paths: dict[str, Path], masks: Path) -> Iterator[AnnotatedImage]:
+    missing = [path.name for path in paths.values() if not (masks / f"{path.stem}.png").exists()]
+    if missing:
         raise AnnotationError(
             f"{masks}: expected a mask for each of {len(paths)} images, found none for "
-            f"{len(lacking)}, the first of them {lacking[0]}; a mask is named like its image, .png"
+            f"{len(missing)}, the first of them {missing[0]}; a mask is named like its image, .png"
         )
     for path in paths.values():
         image, mask = _read_image(path), masks / f"{path.stem}.png"
@@ -57,10 +59,10 @@ def _read_folder(paths: dict[str, Path], masks: Path) -> Iterator[Annotated]:
             raise AnnotationError(f"{mask}: expected a PNG of one channel, the ids of fish")
         _check_size(mask, labels.shape, image)
         ids = np.unique(labels[labels > 0]).tolist()
-        yield Annotated(path=path, image=image, masks=[labels == one for one in ids])
+        yield AnnotatedImage(path=path, image=image, masks=[labels == one for one in ids])
 
 
-def _read_coco(paths: dict[str, Path], file: Path) -> Iterator[Annotated]:
+def _read_coco(paths: dict[str, Path], file: Path) -> Iterator[AnnotatedImage]:
     pictures, annotations = _parse_coco(file)
     for picture in pictures:
         name = Path(str(picture["file_name"])).name
@@ -71,7 +73,7 @@ def _read_coco(paths: dict[str, Path], file: Path) -> Iterator[Annotated]:
             raise AnnotationError(f"{file}: expected {name} among the images, found it not there")
         image = _read_image(paths[name])
         masks = [_decode(one, file, image.shape[:2]) for one in found]
-        yield Annotated(path=paths[name], image=image, masks=masks)
+        yield AnnotatedImage(path=paths[name], image=image, masks=masks)
 
 
 def _parse_coco(file: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
@@ -94,13 +96,16 @@ def _parse_coco(file: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]
 def _decode(
     annotation: dict[str, Any], file: Path, shape: tuple[int, ...]
 ) -> Bool[np.ndarray, "H W"]:
-    """A mask from polygons (x, y, ... from the picture's corner) or from run lengths."""
-    what = annotation["segmentation"]
+    """A mask from polygons (x, y, ... from the image's corner) or from run lengths.
+
+    COCO's runs go down the columns and begin with background.
+    """
+    segmentation = annotation["segmentation"]
     try:
-        if isinstance(what, dict):
-            counts = what["counts"]
+        if isinstance(segmentation, dict):
+            counts = segmentation["counts"]
             runs = _unpack(counts) if isinstance(counts, str) else counts
-            if sum(runs) != shape[0] * shape[1] or list(what["size"]) != list(shape):
+            if sum(runs) != shape[0] * shape[1] or list(segmentation["size"]) != list(shape):
                 raise AnnotationError(
                     f"{file}: expected a mask of {shape[1]}x{shape[0]} px, got one of another size "
                     f"(annotation {annotation.get('id')})"
@@ -108,7 +113,7 @@ def _decode(
             values = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
             return np.ascontiguousarray(values.reshape(shape[1], shape[0]).T)
         canvas = np.zeros(shape, np.uint8)
-        corners = [np.array(ring, np.float64).reshape(-1, 2) - 0.5 for ring in what]
+        corners = [np.array(ring, np.float64).reshape(-1, 2) - 0.5 for ring in segmentation]
         cv2.fillPoly(canvas, [np.round(ring * 16).astype(np.int32) for ring in corners], 1, shift=4)
         return canvas > 0
     except (ValueError, TypeError, KeyError):
@@ -119,7 +124,10 @@ def _decode(
 
 
 def _unpack(text: str) -> list[int]:
-    """COCO's compressed run lengths: 5 bits a character, differences from the last but one."""
+    """COCO's compressed run lengths: 5 bits a character, differences to the last run but one.
+
+    After `rleFrString` of the COCO API (github.com/cocodataset/cocoapi, common/maskApi.c).
+    """
     runs: list[int] = []
     value = shift = 0
     for byte in text.encode("ascii"):

@@ -1,4 +1,4 @@
-"""Random fish by themselves: small pictures with transparency, heads to the left."""
+"""Random fish as small pictures with transparency, heads to the left."""
 
 from dataclasses import dataclass
 
@@ -6,56 +6,61 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from stream_dmr.segmentation.training.random_fish import Posed, Shape, draw_shape, pose_shape
+from stream_dmr.segmentation.training.random_fish import (
+    FishShape,
+    PosedFish,
+    draw_shape,
+    pose_shape,
+)
 from stream_dmr.segmentation.training.random_skins import ALONG_END, draw_skin_pair
 from stream_dmr.simulation.render import rasterize, vertex_normals
 from stream_dmr.simulation.skin import noise
 
-PATCH_PX = 160
-_FINE = 2  # samples per pixel and axis while drawing
-_RIM_PX = 4
+PATCH_PX = 160  # somewhat larger than a crop, 128 px
+_OVERSAMPLING = 2  # samples per pixel and axis while drawing
+_RIM_PX = 4  # transparent margin for the interpolation at the edges
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FishPatch:
-    """One fish by itself."""
+    """One fish on a transparent background."""
 
     bgra: UInt8[np.ndarray, "P P 4"]  # colour times coverage, and coverage
-    ends_px: Float[np.ndarray, "2 2"]  # snout, and the fork of the tail
+    ends_px: Float[np.ndarray, "2 2"]  # snout and fork of the tail, x, y
 
 
 def draw_fish_patch(rng: np.random.Generator) -> FishPatch:
-    """A fish of random species, pose, skin and light that fills its patch."""
+    """A fish of random shape, pose, skin and light that fills its patch."""
     shape = draw_shape(rng)
     posed = pose_shape(rng, shape)
-    pixels, ends = _fill_patch(posed)
-    coverage, colour = _draw(rng, shape, posed, pixels)
+    pixels, ends = _fit_to_patch(posed)
+    coverage, colour = _shade(rng, shape, posed, pixels)
     fine = np.dstack([colour, coverage])
     small = cv2.resize(fine, (PATCH_PX, PATCH_PX), interpolation=cv2.INTER_AREA)
     small = np.clip(np.round(small * [1, 1, 1, 255]), 0, 255)
-    return FishPatch(bgra=small.astype(np.uint8), ends_px=(ends + 0.5) / _FINE - 0.5)
+    return FishPatch(bgra=small.astype(np.uint8), ends_px=(ends + 0.5) / _OVERSAMPLING - 0.5)
 
 
-def _fill_patch(posed: Posed) -> tuple[Float[np.ndarray, "V 2"], Float[np.ndarray, "2 2"]]:
-    """Pixels of vertices and ends in the finely sampled patch."""
-    seen = posed.vertices[:, :2] / posed.vertices[:, 2:]
-    low, high = seen.min(axis=0), seen.max(axis=0)
-    side = PATCH_PX * _FINE
-    scale = (side - 2 * _RIM_PX * _FINE) / (high - low).max()
+def _fit_to_patch(posed: PosedFish) -> tuple[Float[np.ndarray, "V 2"], Float[np.ndarray, "2 2"]]:
+    """Pixels of vertices and ends in the oversampled patch, by perspective projection."""
+    projected = posed.vertices[:, :2] / posed.vertices[:, 2:]
+    low, high = projected.min(axis=0), projected.max(axis=0)
+    side = PATCH_PX * _OVERSAMPLING
+    scale = (side - 2 * _RIM_PX * _OVERSAMPLING) / (high - low).max()
     shift = (side - 1) / 2 - scale * (low + high) / 2
     ends = posed.ends[:, :2] / posed.ends[:, 2:]
-    return seen * scale + shift, ends * scale + shift
+    return projected * scale + shift, ends * scale + shift
 
 
-def _draw(
-    rng: np.random.Generator, shape: Shape, posed: Posed, pixels: Float[np.ndarray, "V 2"]
+def _shade(
+    rng: np.random.Generator, shape: FishShape, posed: PosedFish, pixels: Float[np.ndarray, "V 2"]
 ) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W 3"]]:
-    """Coverage (0 or 1), and colour where it is 1."""
+    """Coverage (0 or 1), and BGR colour where it is 1, in the oversampled patch."""
     normals = vertex_normals(posed.vertices, shape.faces)
     shade, gloss = _draw_light(rng, normals)
     shade = np.where(shape.is_fin, shade * rng.uniform(0.55, 1.25), shade)
     attributes = np.column_stack([shape.texture, shade, gloss]).astype(np.float32)
-    side = PATCH_PX * _FINE
+    side = PATCH_PX * _OVERSAMPLING
     face, values = rasterize(
         pixels, posed.vertices[:, 2], shape.faces, attributes, width=side, height=side
     )
@@ -74,7 +79,7 @@ def _draw(
 def _draw_light(
     rng: np.random.Generator, normals: Float[np.ndarray, "V 3"]
 ) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:
-    """Diffuse shade and gloss (Blinn, SIGGRAPH 1977) under one lamp somewhere before the fish."""
+    """Diffuse shade and gloss of each vertex (Blinn, SIGGRAPH 1977) under one random lamp."""
     lamp = rng.normal([0.0, -0.3, -1.0], [0.7, 0.7, 0.3])
     lamp /= np.linalg.norm(lamp)
     ambient = rng.uniform(0.3, 0.9)

@@ -1,4 +1,7 @@
-"""Light, weather and camera: what happens to a picture without moving a fish in it."""
+"""Weather, optics and sensor: random changes of a picture that move no outline in it.
+
+The ranges were chosen by hand.
+"""
 
 import cv2
 import numpy as np
@@ -7,8 +10,8 @@ from jaxtyping import Float32, UInt8
 Picture = Float32[np.ndarray, "S S 3"]  # BGR, 0 to 255
 
 
-def weather(rng: np.random.Generator, picture: Picture) -> Picture:
-    """Shadow, haze, glare, spray and foam, each in some pictures; two in five have none."""
+def add_weather(rng: np.random.Generator, picture: Picture) -> Picture:
+    """Shadow, haze, glare, spray and drops, each in some pictures; 40 % have none."""
     size = len(picture)
     if rng.random() < 0.4:
         return picture
@@ -28,12 +31,12 @@ def weather(rng: np.random.Generator, picture: Picture) -> Picture:
     return picture
 
 
-def photograph(rng: np.random.Generator, picture: Picture) -> UInt8[np.ndarray, "S S 3"]:
-    """Optics, sensor, processing and compression; by a good camera for two in five."""
+def simulate_camera(rng: np.random.Generator, picture: Picture) -> UInt8[np.ndarray, "S S 3"]:
+    """Optics, sensor, processing and compression of a random camera; 40 % are good ones."""
     is_good = rng.random() < 0.4
-    picture = _tone(rng, np.clip(_smear(rng, picture), 0, 255))
+    picture = _develop(rng, np.clip(_blur(rng, picture), 0, 255))
     if not is_good and rng.random() < 0.4:
-        picture = _lose_detail(rng, picture)
+        picture = _enlarge(rng, picture)
     if rng.random() < 0.7:
         level = rng.uniform(0.3, 2.5 if is_good else 8.0)
         grain = (level * rng.standard_normal(picture.shape, np.float32)).astype(np.float32)
@@ -42,25 +45,25 @@ def photograph(rng: np.random.Generator, picture: Picture) -> UInt8[np.ndarray, 
         picture = picture + grain
     if rng.random() < 0.2:
         blurred = cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.8, 2.0))
-        picture = picture + rng.uniform(0.3, 1.2) * (picture - blurred)  # sharpened by the camera
+        picture = picture + rng.uniform(0.3, 1.2) * (picture - blurred)  # unsharp masking
     pixels = np.clip(np.round(picture), 0, 255).astype(np.uint8)
     worst = 60 if is_good else 15
     return _compress(pixels, int(rng.integers(worst, 96))) if rng.random() < 0.6 else pixels
 
 
-def motion_kernel(rng: np.random.Generator, reach: float) -> Float32[np.ndarray, "K K"]:
-    """A straight smear of this length in pixels, in any direction."""
-    half = int(np.ceil(reach / 2))
+def motion_kernel(rng: np.random.Generator, length_px: float) -> Float32[np.ndarray, "K K"]:
+    """Convolution kernel of a straight motion blur in a random direction; it sums to 1."""
+    half = int(np.ceil(length_px / 2))
     kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
     angle = rng.uniform(0.0, np.pi)
-    way = reach / 2 * np.array([np.cos(angle), np.sin(angle)])
+    half_blur = length_px / 2 * np.array([np.cos(angle), np.sin(angle)])
     for part in np.linspace(-1.0, 1.0, 4 * half + 1):
-        column, row = np.round(half + part * way).astype(int)
+        column, row = np.round(half + part * half_blur).astype(int)
         kernel[row, column] += 1.0
     return kernel / kernel.sum()
 
 
-def _smear(rng: np.random.Generator, picture: Picture) -> Picture:
+def _blur(rng: np.random.Generator, picture: Picture) -> Picture:
     if rng.random() < 0.5:
         picture = cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.3, 1.4))
     if rng.random() < 0.15:
@@ -68,7 +71,7 @@ def _smear(rng: np.random.Generator, picture: Picture) -> Picture:
     return picture
 
 
-def _tone(rng: np.random.Generator, picture: Picture) -> Picture:
+def _develop(rng: np.random.Generator, picture: Picture) -> Picture:
     """Exposure, contrast curve, white balance and saturation."""
     picture = 255 * (picture / 255) ** np.float32(np.exp(rng.normal(0.0, 0.25)))
     picture = picture * np.exp(rng.normal(0.0, 0.12, 3)).astype(np.float32)
@@ -79,8 +82,8 @@ def _tone(rng: np.random.Generator, picture: Picture) -> Picture:
     return np.clip(low + picture * np.float32((high - low) / 255), 0, 255)
 
 
-def _lose_detail(rng: np.random.Generator, picture: Picture) -> Picture:
-    """A fish that was small in its frame, enlarged."""
+def _enlarge(rng: np.random.Generator, picture: Picture) -> Picture:
+    """Shrink and enlarge, as for a fish that was small in its frame."""
     size = len(picture)
     small = max(16, round(size / rng.uniform(1.0, 3.5)))
     shrunken = cv2.resize(picture, (small, small), interpolation=cv2.INTER_AREA)
@@ -107,7 +110,7 @@ def _glare(rng: np.random.Generator, size: int) -> Float32[np.ndarray, "S S"]:
 
 
 def _draw_drops(rng: np.random.Generator, picture: Picture) -> None:
-    """Drops on the way or on the lens: small, bright, half transparent."""
+    """Drops in the air or on the lens, drawn in place: small, bright, half transparent."""
     for _ in range(rng.integers(5, 60)):
         x, y = rng.integers(0, len(picture), 2)
         radius = int(rng.integers(0, 3))

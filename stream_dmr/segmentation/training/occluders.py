@@ -1,7 +1,7 @@
-"""What comes between the camera and a fish: poles, gloves, ropes, edges, lines.
+"""Random objects between the camera and a fish: poles, gloves, ropes, edges, lines.
 
-Everything is a set of polygons in scene units (one is the fish's length, the fish in the middle),
-so that it can be drawn into any crop.
+Each is a set of polygons in scene units (fish lengths, the fish at the origin), so that it can be
+drawn into any crop. The ranges were chosen by hand.
 """
 
 from dataclasses import dataclass
@@ -11,27 +11,27 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-_SUBPIXEL = 4  # bits of OpenCV's `shift`
+_SUBPIXEL_BITS = 4  # of OpenCV's `shift`: coordinates in sixteenths of a pixel
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Occluder:
-    """Opaque shapes of one colour, later ones over earlier ones."""
+    """Opaque polygons in tones of one colour, later ones over earlier ones."""
 
     polygons: list[Float[np.ndarray, "_ 2"]]  # scene units
-    tones: list[float]  # of each polygon, as a factor of the colour
+    tones: list[float]  # factor of the colour, per polygon
     colour: Float[np.ndarray, "3"]  # BGR
-    hides: bool  # its pixels are not fish; a line is too thin for that
+    hides: bool  # its pixels are not fish; False for lines, too thin to matter
 
 
 def draw_occluders(rng: np.random.Generator) -> list[Occluder]:
-    """None for most fish, else one or two."""
+    """No occluder in 59 % of all scenes, else mostly one."""
     chances = {_draw_pole: 0.26, _draw_glove: 0.10, _draw_rope: 0.06, _draw_edge: 0.05}
     return [draw(rng) for draw, chance in chances.items() if rng.random() < chance]
 
 
 def draw_line(rng: np.random.Generator, start: Float[np.ndarray, "2"]) -> Occluder:
-    """A fishing line from here up, out of sight; half of them with a hook."""
+    """A fishing line from a point upwards, out of the picture; half of them with a hook."""
     angle = np.radians(rng.normal(-90.0, 12.0))
     end = start + 3.0 * np.array([np.cos(angle), np.sin(angle)])
     width = rng.uniform(0.004, 0.02)
@@ -45,14 +45,14 @@ def draw_line(rng: np.random.Generator, start: Float[np.ndarray, "2"]) -> Occlud
 def draw_into(
     occluder: Occluder, crop_from_scene: Float[np.ndarray, "2 3"], *, size: int
 ) -> tuple[Float32[np.ndarray, "S S"], Float32[np.ndarray, "S S"]]:
-    """How much of each crop pixel it covers (0 to 1), and the tone there."""
+    """The covered fraction of each crop pixel (0 to 1), and the tone there."""
     covered = np.zeros((size, size), np.float32)
     tones = np.ones((size, size), np.float32)
     for polygon, tone in zip(occluder.polygons, occluder.tones, strict=True):
         points = polygon @ crop_from_scene[:, :2].T + crop_from_scene[:, 2]
-        fixed = np.round(np.clip(points, -2000, 2000) * (1 << _SUBPIXEL)).astype(np.int32)
+        fixed = np.round(np.clip(points, -2000, 2000) * (1 << _SUBPIXEL_BITS)).astype(np.int32)
         canvas = np.zeros((size, size), np.uint8)
-        cv2.fillPoly(canvas, [fixed], 255, cv2.LINE_AA, _SUBPIXEL)
+        cv2.fillPoly(canvas, [fixed], 255, cv2.LINE_AA, _SUBPIXEL_BITS)
         part = canvas.astype(np.float32) / np.float32(255)
         covered = np.maximum(covered, part)
         tones += part * (np.float32(tone) - tones)
@@ -60,11 +60,11 @@ def draw_into(
 
 
 def _draw_pole(rng: np.random.Generator) -> Occluder:
-    """A gaff: a pole, lit along its middle, whose hook lies somewhere on the fish."""
+    """A gaff: a pole, lit along its middle, with its tip on or near the fish."""
     tip = rng.normal(0.0, 0.2, 2)
     angle = rng.uniform(0.0, 2 * np.pi)
     width = rng.uniform(0.02, 0.09)
-    bars, tones = _lit_bar(rng, tip, tip + 3.0 * _towards(angle), width)
+    bars, tones = _lit_bar(rng, tip, tip + 3.0 * _direction(angle), width)
     if rng.random() < 0.7:
         hook = _hook(rng, tip, angle, radius=rng.uniform(0.04, 0.09), width=0.3 * width)
         bars, tones = bars + hook, tones + [rng.uniform(0.7, 1.6)] * len(hook)
@@ -72,31 +72,33 @@ def _draw_pole(rng: np.random.Generator) -> Occluder:
 
 
 def _draw_glove(rng: np.random.Generator) -> Occluder:
-    """A hand that holds the fish: an arm, a palm, three to five fingers."""
+    """A gloved hand on the fish: an arm, a palm, three to five fingers."""
     palm = rng.normal(0.0, 0.28, 2)
     angle = rng.uniform(0.0, 2 * np.pi)
     size = rng.uniform(0.06, 0.16)
-    polygons = [_bar(palm, palm + 3.0 * _towards(angle), 1.5 * size, 2.2 * size)]
+    polygons = [_bar(palm, palm + 3.0 * _direction(angle), 1.5 * size, 2.2 * size)]
     polygons.append(_blob(rng, palm, size))
     for spread in np.linspace(-0.9, 0.9, rng.integers(3, 6)):
         bend = angle + np.pi + spread + rng.normal(0.0, 0.1)
-        tip = palm + rng.uniform(1.2, 2.4) * size * _towards(bend)
+        tip = palm + rng.uniform(1.2, 2.4) * size * _direction(bend)
         polygons.append(_bar(palm, tip, 0.55 * size, 0.4 * size))
     tones = rng.uniform(0.8, 1.2, len(polygons)).tolist()
     return Occluder(polygons=polygons, tones=tones, colour=_colour(rng), hides=True)
 
 
 def _draw_rope(rng: np.random.Generator) -> Occluder:
-    middle, reach = rng.normal(0.0, 0.3, 2), 3.0 * _towards(rng.uniform(0.0, np.pi))
-    bars, tones = _lit_bar(rng, middle - reach, middle + reach, rng.uniform(0.03, 0.08))
+    """A rope straight across the picture."""
+    """A rope straight across the picture."""
+    center, half = rng.normal(0.0, 0.3, 2), 3.0 * _direction(rng.uniform(0.0, np.pi))
+    bars, tones = _lit_bar(rng, center - half, center + half, rng.uniform(0.03, 0.08))
     return Occluder(polygons=bars, tones=tones, colour=_colour(rng), hides=True)
 
 
 def _draw_edge(rng: np.random.Generator) -> Occluder:
     """A rail, a crate or a shoulder that covers one side."""
-    out = _towards(rng.uniform(0.0, 2 * np.pi))
-    near = out * rng.uniform(0.05, 0.5)
-    wall = _bar(near, near + 3.0 * out, 5.0, 5.0)
+    outwards = _direction(rng.uniform(0.0, 2 * np.pi))
+    near = outwards * rng.uniform(0.05, 0.5)
+    wall = _bar(near, near + 3.0 * outwards, 5.0, 5.0)
     return Occluder(polygons=[wall], tones=[1.0], colour=_colour(rng), hides=True)
 
 
@@ -106,7 +108,7 @@ def _lit_bar(
     end: Float[np.ndarray, "2"],
     width: float,
 ) -> tuple[list[Float[np.ndarray, "_ 2"]], list[float]]:
-    """A round bar: darker at its sides, with a line of light; one in four is flat."""
+    """A round bar: darker at its sides, with a highlight; 25 % are flat."""
     shares = [1.0, rng.uniform(0.45, 0.8), rng.uniform(0.1, 0.3)]
     tones = np.cumprod([rng.uniform(0.5, 1.0), rng.uniform(1.1, 1.9), rng.uniform(1.0, 1.5)])
     if rng.random() < 0.25:
@@ -122,14 +124,14 @@ def _hook(
     radius: float,
     width: float,
 ) -> list[Float[np.ndarray, "_ 2"]]:
-    """A bent wire that begins here, on the far side of a bar that goes off at this angle."""
+    """A bent wire that begins at `at`, opposite to a bar that leaves at `angle`."""
     turns = angle + np.pi + np.linspace(-0.4, 2.6, 9) * rng.choice([-1.0, 1.0])
     arc = radius * np.column_stack([np.cos(turns), np.sin(turns)])
     arc = arc - arc[0] + at
     return [_bar(a, b, width, width) for a, b in pairwise(arc)]
 
 
-def _towards(angle: float) -> Float[np.ndarray, "2"]:
+def _direction(angle: float) -> Float[np.ndarray, "2"]:
     return np.array([np.cos(angle), np.sin(angle)])
 
 
@@ -151,7 +153,7 @@ def _blob(rng: np.random.Generator, center: np.ndarray, size: float) -> Float[np
 
 
 def _colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
-    """Wood, skin, steel, orange and blue gloves, or any other."""
+    """BGR of wood, skin, steel, orange and blue gloves, or any other."""
     known = np.array(
         [[84, 122, 160], [130, 150, 200], [165, 168, 168], [30, 110, 230], [170, 110, 40]]
     )

@@ -1,4 +1,4 @@
-"""The fish and backgrounds that training pictures are put together from, drawn once and kept."""
+"""The simulated fish and backgrounds that training pictures are composed of, cached in a file."""
 
 import os
 import tempfile
@@ -12,24 +12,26 @@ from jaxtyping import Float32, UInt8
 from stream_dmr.segmentation.training.fish_patches import PATCH_PX, draw_fish_patch
 from stream_dmr.segmentation.training.random_backgrounds import BACKGROUND_PX, draw_background
 
-BANK_VERSION = 2
-"""Part of the file's name; raise it when fish or backgrounds are drawn otherwise."""
+_BANK_VERSION = 2  # part of the file's name; raised when fish or backgrounds are drawn differently
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Bank:
-    """Parts of pictures."""
+class PatchBank:
+    """Fish patches and backgrounds."""
 
     fish: UInt8[np.ndarray, "F P P 4"]  # BGR times coverage, and coverage; head to the left
-    ends_px: Float32[np.ndarray, "F 2 2"]  # snout and fork of the tail in the fish's patch
+    ends_px: Float32[np.ndarray, "F 2 2"]  # snout and fork of the tail, x, y in the fish's patch
     backgrounds: UInt8[np.ndarray, "G B B 3"]
 
 
 def make_bank(
     *, num_fish: int, num_backgrounds: int, seed: int, progress: Callable[[], None]
-) -> Bank:
-    """Draw a bank, some 20 ms an item; `progress` is called after each. Equal seeds give equals."""
-    bank = Bank(
+) -> PatchBank:
+    """Draw a bank; `progress` is called after each item (about 20 ms).
+
+    Equal seeds give equal banks.
+    """
+    bank = PatchBank(
         fish=np.empty((num_fish, PATCH_PX, PATCH_PX, 4), np.uint8),
         ends_px=np.empty((num_fish, 2, 2), np.float32),
         backgrounds=np.empty((num_backgrounds, BACKGROUND_PX, BACKGROUND_PX, 3), np.uint8),
@@ -46,17 +48,17 @@ def make_bank(
 
 def load_or_make_bank(
     folder: Path, *, num_fish: int, num_backgrounds: int, seed: int, progress: Callable[[], None]
-) -> Bank:
-    """The bank of these numbers from `folder`, which it is written to where it isn't there yet."""
-    path = folder / f"bank-{BANK_VERSION}-{num_fish}-{num_backgrounds}-{seed}.npz"
+) -> PatchBank:
+    """The bank of these numbers from its file in `folder`; drawn and written if missing."""
+    path = folder / f"bank-{_BANK_VERSION}-{num_fish}-{num_backgrounds}-{seed}.npz"
     if path.exists():
         with np.load(path) as arrays:
-            return Bank(**arrays)
+            return PatchBank(**arrays)
     bank = make_bank(
         num_fish=num_fish, num_backgrounds=num_backgrounds, seed=seed, progress=progress
     )
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(dir=folder, suffix=".npz", delete=False) as file:
         np.savez(file, fish=bank.fish, ends_px=bank.ends_px, backgrounds=bank.backgrounds)
-    os.replace(file.name, path)  # another process sees all of it or nothing
+    os.replace(file.name, path)  # atomic: other processes never read half a file
     return bank

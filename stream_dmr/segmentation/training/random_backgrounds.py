@@ -1,4 +1,7 @@
-"""Random surroundings: sea, murk, rock, deck, table, steel, clutter, or two of them."""
+"""Random backgrounds: sea, murk, rock, deck, table, steel, clutter, or two of them.
+
+The ranges were chosen by hand.
+"""
 
 from collections.abc import Callable
 
@@ -8,18 +11,18 @@ from jaxtyping import Float, UInt8
 
 from stream_dmr.simulation.skin import noise
 
-BACKGROUND_PX = 256
+BACKGROUND_PX = 256  # width and height; twice a crop, so that each crop is another piece
 
 Picture = Float[np.ndarray, "B B 3"]
 Layer = Float[np.ndarray, "B B"]
 
 
 def draw_background(rng: np.random.Generator) -> UInt8[np.ndarray, "B B 3"]:
-    """One picture, BGR; in a fifth of them two kinds meet at an edge."""
+    """One picture, BGR; in 20 % two kinds meet at an edge."""
     picture = _draw_one(rng)
     if rng.random() < 0.2:
-        other, beyond = _draw_one(rng), _half_plane(rng)[..., None]
-        picture = picture + beyond * (other - picture)
+        other, share = _draw_one(rng), _half_plane(rng)[..., None]
+        picture = picture + share * (other - picture)
     if rng.random() < 0.15:
         _draw_net(rng, picture)
     picture *= _draw_illumination(rng)[..., None]
@@ -35,7 +38,7 @@ def _draw_one(rng: np.random.Generator) -> Picture:
 
 
 def _draw_sea(rng: np.random.Generator) -> Picture:
-    """Waves with crests, a colour for each height, foam on the highest."""
+    """Waves coloured by their height, with foam on the crests."""
     grain = rng.uniform(2.0, 14.0)
     stretch = rng.uniform(1.2, 3.5)
     ridged = 1 - np.abs(_noise(rng, stretch * grain, grain))
@@ -50,7 +53,7 @@ def _draw_sea(rng: np.random.Generator) -> Picture:
 
 
 def _draw_murk(rng: np.random.Generator) -> Picture:
-    """Clouds of two or three colours, as of sea out of focus or of water seen through."""
+    """Clouds of three colours, as of sea out of focus or of turbid water."""
     colours = [_water_colour(rng) * rng.uniform(0.3, 1.3) for _ in range(3)]
     picture = np.zeros((BACKGROUND_PX, BACKGROUND_PX, 3)) + colours[0]
     for colour in colours[1:]:
@@ -64,7 +67,7 @@ def _draw_murk(rng: np.random.Generator) -> Picture:
 def _draw_rock(rng: np.random.Generator) -> Picture:
     """Layers with hard, lit edges: rock, weed, wood, coral."""
     main = _any_colour(rng)
-    is_gaudy = rng.random() < 0.35
+    is_colourful = rng.random() < 0.35
     picture = main * rng.uniform(0.2, 0.8) + np.zeros((BACKGROUND_PX, BACKGROUND_PX, 1))
     for _ in range(rng.integers(2, 7)):
         grain = rng.uniform(4.0, 30.0)
@@ -76,7 +79,7 @@ def _draw_rock(rng: np.random.Generator) -> Picture:
         tone = tone + rng.uniform(0.0, 0.3) * _noise(rng, 1.5, 1.5)
         own = (
             _any_colour(rng)
-            if is_gaudy
+            if is_colourful
             else main * rng.uniform(0.4, 1.5) * rng.uniform(0.8, 1.2, 3)
         )
         colour = own * np.clip(tone, 0.2, 2.5)[..., None]
@@ -136,14 +139,16 @@ def _draw_clutter(rng: np.random.Generator) -> Picture:
 
 
 def _draw_shape(rng: np.random.Generator, picture: Picture, colour: np.ndarray) -> None:
+    """An ellipse, a bar lit along its middle, or a polygon, drawn in place."""
+    """An ellipse, a bar lit along its middle, or a polygon, drawn in place."""
     center = rng.integers(0, BACKGROUND_PX, 2)
     size = rng.uniform(6.0, 90.0)
-    match rng.integers(4):
+    match int(rng.integers(4)):
         case 0:
             axes = (round(size), round(size * rng.uniform(0.2, 1.0)))
-            turn = float(rng.uniform(0, 180))
+            angle_deg = float(rng.uniform(0, 180))
             cv2.ellipse(
-                picture, center.tolist(), axes, turn, 0, 360, colour.tolist(), -1, cv2.LINE_AA
+                picture, center.tolist(), axes, angle_deg, 0, 360, colour.tolist(), -1, cv2.LINE_AA
             )
         case 1:
             other = rng.integers(0, BACKGROUND_PX, 2)
@@ -159,6 +164,8 @@ def _draw_shape(rng: np.random.Generator, picture: Picture, colour: np.ndarray) 
 
 
 def _draw_net(rng: np.random.Generator, picture: Picture) -> None:
+    """A net of slanted meshes, drawn in place."""
+    """A net of slanted meshes, drawn in place."""
     mesh, width = int(rng.integers(10, 50)), int(rng.integers(1, 4))
     slope = int(rng.integers(-BACKGROUND_PX, BACKGROUND_PX))
     colour = _any_colour(rng).tolist()
@@ -168,26 +175,32 @@ def _draw_net(rng: np.random.Generator, picture: Picture) -> None:
 
 
 def _half_plane(rng: np.random.Generator) -> Layer:
+    """1 on one side of a random, slightly wavy edge, 0 on the other."""
+    """1 on one side of a random, slightly wavy edge, 0 on the other."""
     y, x = np.mgrid[:BACKGROUND_PX, :BACKGROUND_PX] - BACKGROUND_PX / 2
     angle = rng.choice([0.0, np.pi / 2, rng.uniform(0, 2 * np.pi)])
-    beyond = x * np.cos(angle) + y * np.sin(angle) - rng.uniform(-80.0, 80.0)
-    beyond = beyond + rng.uniform(0.0, 6.0) * _noise(rng, 12.0, 12.0)
-    return np.clip(beyond / rng.uniform(1.0, 4.0) + 0.5, 0.0, 1.0).astype(np.float32)
+    distance_px = x * np.cos(angle) + y * np.sin(angle) - rng.uniform(-80.0, 80.0)
+    distance_px = distance_px + rng.uniform(0.0, 6.0) * _noise(rng, 12.0, 12.0)
+    return np.clip(distance_px / rng.uniform(1.0, 4.0) + 0.5, 0.0, 1.0).astype(np.float32)
 
 
 def _draw_illumination(rng: np.random.Generator) -> Layer:
+    """Brightness factors that change linearly across the picture."""
+    """Brightness factors that change linearly across the picture."""
     y, x = (np.mgrid[:BACKGROUND_PX, :BACKGROUND_PX] / BACKGROUND_PX - 0.5).astype(np.float32)
     slope = rng.normal(0.0, 0.35, 2)
     return np.clip(1 + slope[0] * x + slope[1] * y, 0.3, 1.7).astype(np.float32)
 
 
 def _water_colour(rng: np.random.Generator) -> np.ndarray:
-    """Blue to green to grey, any brightness."""
+    """BGR from blue to green to grey, of any brightness."""
     hue, saturation = rng.uniform(70.0, 125.0), rng.uniform(10.0, 220.0)
     return _from_hsv(hue, saturation, rng.uniform(50.0, 230.0))
 
 
 def _any_colour(rng: np.random.Generator) -> np.ndarray:
+    """BGR of any hue; low saturations are more frequent."""
+    """BGR of any hue; low saturations are more frequent."""
     return _from_hsv(rng.uniform(0.0, 180.0), 255 * rng.beta(1.0, 1.8), rng.uniform(20.0, 240.0))
 
 

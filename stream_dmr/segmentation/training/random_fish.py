@@ -1,7 +1,8 @@
-"""Fish of random species in random poses, as meshes: what the network learns its outlines from.
+"""Fish of random shape in random poses, as meshes, whose outlines the network is trained on.
 
-The bodies are the simulator's, drawn far beyond its halibut: flat and round, slim and deep, with
-separate fins, an uneven back and belly, and tails from cut straight to deeply forked.
+The bodies are the simulator's, with proportions far beyond its halibut: flat and round, slim and
+deep, with separate fins, unequal back and belly, and tails from truncate to deeply forked. The
+ranges were chosen by hand.
 """
 
 from dataclasses import dataclass
@@ -14,31 +15,31 @@ from stream_dmr.simulation.center_line import CenterLine, bend_center_line, tota
 from stream_dmr.simulation.simulated_body import SimulatedBody, straight_body
 
 _RINGS, _SIDES = 40, 20  # of the body's mesh
-_ORDER_SIZES = np.array([1.0, 0.6, 0.3])  # C-bend, S-bend, and one finer
-_FIN_COLUMNS, _FIN_ROWS = 9, 3
+_BEND_SIZES = np.array([1.0, 0.6, 0.3])  # of C-bend, S-bend, and the next order
+_FIN_COLUMNS, _FIN_ROWS = 9, 3  # of a fin's mesh
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Shape:
+class FishShape:
     """A straight fish as a mesh, in body lengths (see `simulation.simulated_body`)."""
 
     points: Float[np.ndarray, "V 3"]
-    texture: Float[np.ndarray, "V 2"]  # along (0 to 1.03) and across (-1 to 1) the skin
+    texture: Float[np.ndarray, "V 2"]  # along (0 to ALONG_END) and across (-1 to 1) the skin
     is_fin: Bool[np.ndarray, "V"]
     faces: Int[np.ndarray, "F 3"]
     is_flatfish: bool
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Posed:
-    """A fish in front of the camera, in body lengths; x right, y down, z away."""
+class PosedFish:
+    """A fish in front of the camera, in body lengths; x right, y down, z away from the camera."""
 
     vertices: Float[np.ndarray, "V 3"]
-    ends: Float[np.ndarray, "2 3"]  # snout, and the fork of the tail
+    ends: Float[np.ndarray, "2 3"]  # snout and fork of the tail
 
 
-def draw_shape(rng: np.random.Generator) -> Shape:
-    """The straight body of one fish of a species of its own."""
+def draw_shape(rng: np.random.Generator) -> FishShape:
+    """The straight body of a random fish: 45 % flatfish, the others round."""
     is_flatfish = bool(rng.random() < 0.45)
     body = _draw_flat(rng) if is_flatfish else _draw_round(rng)
     mesh = straight_body(body, num_rings=_RINGS, num_sides=_SIDES)
@@ -50,7 +51,7 @@ def draw_shape(rng: np.random.Generator) -> Shape:
         points.append(sheet)
         texture.append(colour)
     is_fin = np.arange(sum(map(len, points))) >= len(mesh.points)
-    return Shape(
+    return FishShape(
         points=_deform(rng, np.concatenate(points)),
         texture=np.concatenate(texture),
         is_fin=is_fin,
@@ -59,20 +60,20 @@ def draw_shape(rng: np.random.Generator) -> Shape:
     )
 
 
-def pose_shape(rng: np.random.Generator, shape: Shape) -> Posed:
-    """Bent, twisted and turned at random, its head to the left; mostly broad side on."""
+def pose_shape(rng: np.random.Generator, shape: FishShape) -> PosedFish:
+    """Bend, twist and turn a fish at random, head to the left, mostly with its broad side seen."""
     spine = bend_center_line(_draw_bends(rng, shape.is_flatfish), length_mm=1.0)
     middle = spine.frames[len(spine.frames) // 2]
     about_axis = rng.choice([0.0, np.pi]) + np.radians(rng.normal(0.0, 22.0))
     if rng.random() < 0.25:
-        about_axis = rng.uniform(0.0, 2 * np.pi)  # edge on, or from above
+        about_axis = rng.uniform(0.0, 2 * np.pi)  # seen edge-on, or from above
     towards = np.radians(np.clip(rng.normal(0.0, 25.0), -65.0, 65.0))
     turn = Rotation.from_euler("YX", [towards, about_axis]).as_matrix() @ middle.T
     spine = spine.moved(turn, np.zeros(3))
     centre = spine.points.mean(axis=0)
     distance = np.array([0.0, 0.0, rng.uniform(2.5, 12.0)])
     spine = spine.moved(np.eye(3), distance - centre)
-    return Posed(vertices=spine.place(shape.points), ends=_ends(spine))
+    return PosedFish(vertices=spine.place(shape.points), ends=_ends(spine))
 
 
 def _ends(spine: CenterLine) -> Float[np.ndarray, "2 3"]:
@@ -110,7 +111,7 @@ def _draw_round(rng: np.random.Generator) -> SimulatedBody:
 def _draw_fins(
     rng: np.random.Generator, body: SimulatedBody
 ) -> list[tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 2"]]]:
-    """Thin sheets on back (y < 0) and belly: points, and where on the skin their colour is."""
+    """Thin fins on back (y < 0) and belly: points, and texture coordinates of their colour."""
     fins = []
     for side in (-1.0, 1.0):
         start = rng.uniform(0.2, 0.45)
@@ -142,7 +143,7 @@ def _draw_fin(
 
 
 def _deform(rng: np.random.Generator, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    """Blunter or more pointed at the snout; back and belly of different depth."""
+    """Make the snout blunter or more pointed, and back and belly of different depth."""
     s, y, z = points.T
     s = np.maximum(s, 0.0) ** rng.uniform(0.8, 1.3)
     y = y * (1 + rng.uniform(-0.25, 0.25) * np.sign(y))
@@ -151,12 +152,17 @@ def _deform(rng: np.random.Generator, points: Float[np.ndarray, "N 3"]) -> Float
 
 
 def _draw_bends(rng: np.random.Generator, is_flatfish: bool) -> Float[np.ndarray, "3 K"]:
-    """Curvature of a body that turns by 0 to 120 degrees from head to tail, mostly by less."""
+    """Bends of a body that turns by 0 to 120 degrees in all from head to tail, mostly by less.
+
+    Rows: twist, bend in the thin direction, bend in the broad one; columns: orders.
+    """
     in_broad_side = 0.45 if is_flatfish else 0.6
-    sizes = np.array([0.0, 1.0, in_broad_side])[:, None] * _ORDER_SIZES
+    sizes = np.array([0.0, 1.0, in_broad_side])[:, None] * _BEND_SIZES
     bends = sizes * rng.standard_normal(sizes.shape)
     bends *= np.radians(120.0) * rng.beta(1.0, 2.0) / max(total_bend_rad(bends), 1e-6)
-    twist_deg = rng.normal(0.0, 80.0 if rng.random() < 0.35 else 12.0)  # 80: the tail edge on
+    twist_deg = rng.normal(
+        0.0, 80.0 if rng.random() < 0.35 else 12.0
+    )  # 80: the tail is seen edge-on
     bends[:, 0][0] = np.radians(twist_deg) * np.pi / 2
     return bends
 

@@ -1,4 +1,8 @@
-"""Random skins: any colour, mottled, spotted, barred or striped; with eyes, gills and fin rays."""
+"""Random skins: any colour, mottled, spotted, barred or striped; with eyes, gills and fin rays.
+
+Textures of shape (S, Y, 3), BGR: rows from snout to tail, columns from back to belly. The ranges
+were chosen by hand.
+"""
 
 import cv2
 import numpy as np
@@ -8,7 +12,7 @@ from stream_dmr.simulation.skin import noise
 
 _ALONG, _ACROSS = 256, 96  # texture pixels from snout to tail, and from back to belly
 ALONG_END = 1.03  # body lengths at the texture's last row: the tail's lobes reach past the fork
-_HEADS_BGR = np.array(  # browns, greys, olive, silver, gold, red, blue-grey, black, white
+_BASE_COLOURS_BGR = np.array(  # browns, greys, olive, silver, gold, red, blue-grey, black, white
     [
         *([62, 82, 92], [90, 100, 105], [45, 75, 70], [190, 195, 190], [70, 140, 175]),
         *([75, 85, 170], [140, 120, 90], [30, 32, 35], [215, 220, 222]),
@@ -29,8 +33,10 @@ def draw_skin_pair(
 
 
 def _draw_side(rng: np.random.Generator, *, is_countershaded: bool) -> Float32[np.ndarray, "S Y 3"]:
+    """One side of a fish; a countershaded one is pale below."""
+    """One side of a fish; a countershaded one is pale below."""
     s, y = _grid()
-    colour = _HEADS_BGR[rng.integers(len(_HEADS_BGR))] * rng.uniform(0.6, 1.3)
+    colour = _BASE_COLOURS_BGR[rng.integers(len(_BASE_COLOURS_BGR))] * rng.uniform(0.6, 1.3)
     colour = colour * rng.uniform(0.8, 1.2, 3)
     side = np.broadcast_to(colour, (_ALONG, _ACROSS, 3)).astype(np.float32)
     if is_countershaded and rng.random() < 0.85:
@@ -48,6 +54,8 @@ def _draw_side(rng: np.random.Generator, *, is_countershaded: bool) -> Float32[n
 
 
 def _draw_blind_side(rng: np.random.Generator) -> Float32[np.ndarray, "S Y 3"]:
+    """The pale lower side of a flatfish, with red spots."""
+    """The pale lower side of a flatfish, with red spots."""
     s, y = _grid()
     colour = np.array([205.0, 214.0, 218.0]) * rng.uniform(0.75, 1.1) * rng.uniform(0.93, 1.07, 3)
     tone = 1 + rng.uniform(0.2, 1.0) * _draw_mottling(rng)
@@ -57,6 +65,8 @@ def _draw_blind_side(rng: np.random.Generator) -> Float32[np.ndarray, "S Y 3"]:
 
 
 def _draw_mottling(rng: np.random.Generator) -> Float[np.ndarray, "S Y"]:
+    """Noise of three grain sizes, around 0."""
+    """Noise of three grain sizes, around 0."""
     sizes = rng.uniform(0.0, 1.0, 3) * [0.30, 0.22, 0.18]
     grains = (rng.uniform(9.0, 22.0), rng.uniform(3.0, 8.0), rng.uniform(0.8, 2.0))
     return sum(
@@ -68,9 +78,9 @@ def _draw_mottling(rng: np.random.Generator) -> Float[np.ndarray, "S Y"]:
 def _draw_pattern(
     rng: np.random.Generator, s: Float[np.ndarray, "S 1"], y: Float[np.ndarray, "1 Y"]
 ) -> Float[np.ndarray, "S Y"]:
-    """Nothing, spots, bars across, stripes along, or streaks."""
+    """Spots, bars across, stripes along, streaks, or nothing (one in three), around 0."""
     strength = rng.uniform(-0.6, 0.6)
-    match rng.integers(6):
+    match int(rng.integers(6)):
         case 0:
             return strength * np.clip(_noise(rng, rng.uniform(2.0, 6.0)) - 1.0, 0.0, 1.0)
         case 1:
@@ -81,29 +91,34 @@ def _draw_pattern(
             return 0.5 * strength * waves * np.ones_like(s)
         case 3:
             grain = (rng.uniform(1.0, 3.0), rng.uniform(8.0, 20.0))
-            grain = grain if rng.random() < 0.5 else grain[::-1]
+            grain = grain if rng.random() < 0.5 else (grain[1], grain[0])
             return 0.4 * strength * noise(rng, _ALONG, _ACROSS, grain_px=grain)
-    return np.zeros((_ALONG, _ACROSS))
+        case _:
+            return np.zeros((_ALONG, _ACROSS))
 
 
 def _draw_marks(
     rng: np.random.Generator, s: Float[np.ndarray, "S 1"], y: Float[np.ndarray, "1 Y"]
 ) -> Float[np.ndarray, "S Y"]:
-    """Gill cover, lateral line, breast fin, fringing fins, rays of the tail: as factors of tone."""
+    """Gill cover, lateral line, pectoral fin, fringing fins, tail with its rays: as factors."""
     gill = np.exp(-(((s - rng.uniform(0.17, 0.27) + 0.05 * y**2) / 0.008) ** 2)) * (abs(y) < 0.8)
     arch = rng.uniform(0.0, 0.3) * np.exp(-(((s - 0.30) / 0.06) ** 2))
     line = np.exp(-(((y - arch - rng.uniform(-0.2, 0.1)) / 0.03) ** 2)) * ((s > 0.2) & (s < 0.9))
-    breast_s, breast_y = rng.uniform(0.26, 0.36), rng.uniform(0.0, 0.5)
-    breast = ((s - breast_s) / 0.06) ** 2 + ((y - breast_y - 1.5 * (s - breast_s)) / 0.12) ** 2 < 1
+    pectoral_s, pectoral_y = rng.uniform(0.26, 0.36), rng.uniform(0.0, 0.5)
+    pectoral = ((s - pectoral_s) / 0.06) ** 2 + (
+        (y - pectoral_y - 1.5 * (s - pectoral_s)) / 0.12
+    ) ** 2 < 1
     fringe = (abs(y) > rng.uniform(0.7, 0.9)) & (s > 0.2) & (s < 0.86)
     tail = s > rng.uniform(0.86, 0.93)
     rays = 0.1 * (np.sin(rng.uniform(25, 60) * y) > 0) * tail
     weights = rng.uniform(-0.15, 0.4, 5) * (rng.random(5) < 0.75)
-    marks = zip(weights, (gill, line, breast, fringe, tail), strict=True)
+    marks = zip(weights, (gill, line, pectoral, fringe, tail), strict=True)
     return 1 - sum((weight * mark for weight, mark in marks), rays)
 
 
 def _draw_eyes(rng: np.random.Generator, is_round: bool) -> list[tuple[float, float]]:
+    """Places (s, y) of the eyes on one side: one of a round fish, both of a flatfish."""
+    """Places (s, y) of the eyes on one side: one of a round fish, both of a flatfish."""
     if is_round:
         return [(rng.uniform(0.06, 0.12), rng.uniform(-0.6, -0.1))]
     first = rng.uniform(0.06, 0.1)
@@ -118,7 +133,7 @@ def _draw_eye(
 ) -> None:
     center = (round((y + 1) / 2 * (_ACROSS - 1)), round(s / ALONG_END * (_ALONG - 1)))
     size = rng.uniform(0.6, 1.4)
-    # Wider across: the head is narrow there and the texture is stretched over its breadth.
+    # Wider across: the head is narrow, so the texture is compressed there.
     white, pupil = (round(8 * size), round(4 * size)), (round(5 * size), round(2.5 * size))
     iris = rng.uniform(30, 230, 3).tolist()
     cv2.ellipse(side, center, white, 0, 0, 360, iris, -1, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""`stream-dmr train`: from what the user asks for to weights, scores and pictures in a folder."""
+"""`stream-dmr train`: weights, scores and pictures of a training in a folder."""
 
 import json
 import threading
@@ -12,79 +12,81 @@ import torch
 
 from stream_dmr.errors import ModelError, OutputError
 from stream_dmr.segmentation.network.unet_weights import SHIPPED, load_weights
-from stream_dmr.segmentation.training.annotated_samples import Cut, draw_own, load_own_fish
-from stream_dmr.segmentation.training.patch_bank import Bank, load_or_make_bank
-from stream_dmr.segmentation.training.sample_dataset import Draw, Pictures
-from stream_dmr.segmentation.training.scene_composition import draw_sample
+from stream_dmr.segmentation.training.annotated_samples import (
+    Cutout,
+    draw_annotated_sample,
+    load_fish_cutouts,
+)
+from stream_dmr.segmentation.training.draw_sample import draw_sample
+from stream_dmr.segmentation.training.patch_bank import PatchBank, load_or_make_bank
+from stream_dmr.segmentation.training.sample_dataset import Draw, SampleDataset
 from stream_dmr.segmentation.training.train_settings import TrainSettings
-from stream_dmr.segmentation.training.training_plots import draw_curve, draw_worst
-from stream_dmr.segmentation.training.training_sample import Sample
-from stream_dmr.segmentation.training.unet_trainer import Scores, Training
+from stream_dmr.segmentation.training.training_plots import draw_training_curve, draw_worst_masks
+from stream_dmr.segmentation.training.training_sample import TrainingSample
+from stream_dmr.segmentation.training.unet_trainer import EpochScores, UNetTrainer
 from stream_dmr.version import __version__
 
-_UNSEEN = 10  # times smaller than the bank to learn from is the one to check on
+_VALIDATION_BANK_DIVISOR = 10  # of the training bank's size: the validation bank's
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainRequest:
-    """What the user asks for."""
+    """The options of `stream-dmr train`."""
 
     out: Path
     settings: TrainSettings
-    images: Path | None = None  # of the user's vessel, with `masks`; None: simulated ones alone
+    images: Path | None = None  # the user's, given with `masks`; None: simulated ones alone
     masks: Path | None = None
-    init: Path | None = (
-        None  # weights to start from; None: the shipped ones for `images`, else none
-    )
-    device: str = "cpu"
+    init: Path | None = None  # initial weights; None: the shipped ones with `images`, else random
+    device: str = "cpu"  # or "cuda"
     resume: bool = False
-    command: str = ""  # as typed, for the scores
+    command: str = ""  # as typed, for scores.json
 
 
 class TrainObserver:
-    """Is told how the training goes; this one shows nothing."""
+    """Receives the progress of a training; this one ignores it."""
 
-    def drawing(self, num_done: int, num_all: int) -> None:
-        """So many parts of simulated pictures are drawn."""
+    def patches_drawn(self, num_done: int, num_all: int) -> None:
+        """The bank of simulated fish and backgrounds has `num_done` of `num_all` items."""
 
-    def learning(self, num_crops: int) -> None:
-        """So many crops more were learnt from."""
+    def crops_trained(self, num_crops: int) -> None:
+        """Another `num_crops` were trained on."""
 
-    def checked(self, scores: Scores, *, is_best: bool) -> None:
-        """An epoch is over."""
+    def epoch_done(self, scores: EpochScores, *, is_best: bool) -> None:
+        """An epoch was trained and validated."""
 
 
-def train(
+def train_unet(
     request: TrainRequest, *, stop: threading.Event, observer: TrainObserver | None = None
-) -> Scores | None:
-    """Teach the U-Net; returns the best scores, None where `stop` came before any.
+) -> EpochScores | None:
+    """Train the U-Net; returns the best scores, None where `stop` was set before any.
 
-    Fine-tuning counts the weights that it begins with as epoch 0: it never ends with worse ones.
+    Fine-tuning counts its initial weights as epoch 0, so it never ends with worse ones.
 
     Writes `unet.pt` (the best weights), `last.pt` (to resume from), `scores.json`, `curve.png` and
     `worst.png` into `request.out`, after every epoch. Raises a UserError where an input is wrong,
-    before anything is learnt.
+    before anything is trained.
     """
     observer = observer or TrainObserver()
     training = _prepare(request)
-    draw, check = _sources(request, observer)
-    validation = Pictures(
-        check, size=request.settings.validation_crops, seed=(request.settings.seed, 0)
+    draw, draw_validation = _sources(request, observer)
+    validation = SampleDataset(
+        draw_validation, size=request.settings.validation_crops, seed=(request.settings.seed, 0)
     )
     began = time.monotonic()
     if training.is_fine_tuning and not training.history:
-        observer.checked(training.check_start(validation), is_best=True)
+        observer.epoch_done(training.check_start(validation), is_best=True)
         _write_report(request, training, validation, elapsed_s=time.monotonic() - began)
     while not training.is_over and not stop.is_set():
-        scores = training.run_epoch(draw, validation, stop=stop, progress=observer.learning)
+        scores = training.run_epoch(draw, validation, stop=stop, progress=observer.crops_trained)
         if scores is None:
             break
-        observer.checked(scores, is_best=scores.merit == training.best)
+        observer.epoch_done(scores, is_best=scores.iou == training.best)
         _write_report(request, training, validation, elapsed_s=time.monotonic() - began)
-    return max(training.history, key=lambda scores: scores.merit, default=None)
+    return max(training.history, key=lambda scores: scores.iou, default=None)
 
 
-def _prepare(request: TrainRequest) -> Training:
+def _prepare(request: TrainRequest) -> UNetTrainer:
     if request.device == "cuda" and not torch.cuda.is_available():
         raise ModelError(
             "--device cuda: expected a CUDA device, found none that PyTorch can use; "
@@ -104,7 +106,7 @@ def _prepare(request: TrainRequest) -> Training:
             f"{request.out}: expected a folder to write to, got: {error.strerror}; "
             "choose another --out"
         ) from error
-    training = Training(
+    training = UNetTrainer(
         settings=request.settings,
         device=torch.device(request.device),
         out=request.out,
@@ -118,68 +120,74 @@ def _prepare(request: TrainRequest) -> Training:
 
 
 def _sources(request: TrainRequest, observer: TrainObserver) -> tuple[Draw, Draw]:
-    """What draws the pictures to learn from, and those to check on."""
+    """The functions that draw training and validation examples."""
     if request.images is None or request.masks is None:
-        simulated = _Simulated(_bank(request, observer))
-        return simulated, _Simulated(_bank(request, observer, is_unseen=True))
-    learnt, held_back = load_own_fish(request.images, request.masks)
-    simulated = _Simulated(_bank(request, observer))
-    return _Mixed(simulated, learnt, request.settings.own_share), _Own(held_back)
+        simulated = _SimulatedSource(_bank(request, observer))
+        return simulated, _SimulatedSource(_bank(request, observer, is_validation=True))
+    training, validation = load_fish_cutouts(request.images, request.masks)
+    simulated = _SimulatedSource(_bank(request, observer))
+    return _MixedSource(simulated, training, request.settings.own_share), _AnnotatedSource(
+        validation
+    )
 
 
-def _bank(request: TrainRequest, observer: TrainObserver, *, is_unseen: bool = False) -> Bank:
+def _bank(
+    request: TrainRequest, observer: TrainObserver, *, is_validation: bool = False
+) -> PatchBank:
     settings = request.settings
     counts = (settings.bank_fish, settings.bank_backgrounds)
-    num_fish, num_backgrounds = (max(1, n // _UNSEEN) for n in counts) if is_unseen else counts
+    num_fish, num_backgrounds = (
+        (max(1, n // _VALIDATION_BANK_DIVISOR) for n in counts) if is_validation else counts
+    )
     done = 0
 
     def progress() -> None:
         nonlocal done
         done += 1
-        observer.drawing(done, num_fish + num_backgrounds)
+        observer.patches_drawn(done, num_fish + num_backgrounds)
 
     return load_or_make_bank(
         request.out / "cache",
         num_fish=num_fish,
         num_backgrounds=num_backgrounds,
-        seed=settings.seed + is_unseen,
+        seed=settings.seed + is_validation,
         progress=progress,
     )
 
 
 @dataclass(frozen=True)
-class _Simulated:
-    """Classes, not closures: worker processes get them sent."""
+class _SimulatedSource:
+    """A class, not a closure: worker processes receive it pickled."""
 
-    bank: Bank
+    bank: PatchBank
 
-    def __call__(self, rng: np.random.Generator) -> Sample:
+    def __call__(self, rng: np.random.Generator) -> TrainingSample:
         return draw_sample(rng, self.bank)
 
 
 @dataclass(frozen=True)
-class _Own:
-    cuts: Sequence[Cut]
+class _AnnotatedSource:
+    cutouts: Sequence[Cutout]
 
-    def __call__(self, rng: np.random.Generator) -> Sample:
-        return draw_own(rng, self.cuts[int(rng.integers(len(self.cuts)))])
+    def __call__(self, rng: np.random.Generator) -> TrainingSample:
+        return draw_annotated_sample(rng, self.cutouts[int(rng.integers(len(self.cutouts)))])
 
 
 @dataclass(frozen=True)
-class _Mixed:
-    simulated: _Simulated
-    cuts: Sequence[Cut]
+class _MixedSource:
+    simulated: _SimulatedSource
+    cutouts: Sequence[Cutout]
     own_share: float
 
-    def __call__(self, rng: np.random.Generator) -> Sample:
+    def __call__(self, rng: np.random.Generator) -> TrainingSample:
         is_own = rng.random() < self.own_share
-        return _Own(self.cuts)(rng) if is_own else self.simulated(rng)
+        return _AnnotatedSource(self.cutouts)(rng) if is_own else self.simulated(rng)
 
 
 def _write_report(
-    request: TrainRequest, training: Training, validation: Pictures, *, elapsed_s: float
+    request: TrainRequest, training: UNetTrainer, validation: SampleDataset, *, elapsed_s: float
 ) -> None:
-    best = max(training.history, key=lambda scores: scores.merit)
+    best = max(training.history, key=lambda scores: scores.iou)
     report = {
         "version": __version__,
         "command": request.command,
@@ -191,6 +199,6 @@ def _write_report(
         "history": [asdict(scores) for scores in training.history],
     }
     (request.out / "scores.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
-    draw_curve(training.history, request.out / "curve.png")
+    draw_training_curve(training.history, request.out / "curve.png")
     if best is training.history[-1]:
-        draw_worst(training, validation, request.out / "worst.png")
+        draw_worst_masks(training, validation, request.out / "worst.png")

@@ -1,4 +1,4 @@
-"""Pictures of a training: how loss and scores went, and the masks that came out worst."""
+"""Pictures of a training: the course of loss and scores, and the worst masks."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -8,24 +8,24 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from stream_dmr.segmentation.training.sample_dataset import Pictures
-from stream_dmr.segmentation.training.training_sample import Sample
-from stream_dmr.segmentation.training.unet_trainer import Scores, Training
+from stream_dmr.segmentation.training.sample_dataset import SampleDataset
+from stream_dmr.segmentation.training.training_sample import TrainingSample
+from stream_dmr.segmentation.training.unet_trainer import EpochScores, UNetTrainer
 
 _NUM_WORST = 32
 _PER_ROW = 8
 _WIDTH, _HEIGHT, _EDGE = 720, 400, 48  # px of the curve
 _TRUE_BGR, _FOUND_BGR = (80, 220, 80), (60, 60, 255)
-_INK, _GRID = (60, 60, 60), (225, 225, 225)
+_TEXT, _GRID = (60, 60, 60), (225, 225, 225)
 
 
-def draw_curve(history: Sequence[Scores], path: Path) -> None:
-    """Scores from 0 to 1 over the epochs, and the loss as a share of its highest value."""
+def draw_training_curve(history: Sequence[EpochScores], path: Path) -> None:
+    """Write scores from 0 to 1 over the epochs, and the loss relative to its highest value."""
     canvas = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
     for tenth in range(0, 11, 2):
         left, right = _place(0.0, tenth / 10), _place(1.0, tenth / 10)
         cv2.line(canvas, left, right, _GRID, 1)
-        _write(canvas, f"{tenth / 10:.1f}", (8, left[1] + 4), _INK)
+        _write(canvas, f"{tenth / 10:.1f}", (8, left[1] + 4), _TEXT)
     highest = max((scores.loss for scores in history if scores.loss is not None), default=1.0)
     curves = {
         "mean IoU": ([s.iou for s in history], (180, 90, 0)),
@@ -42,12 +42,12 @@ def draw_curve(history: Sequence[Scores], path: Path) -> None:
         for one, other in pairwise(points):
             cv2.line(canvas, one, other, colour, 2)
         _write(canvas, name, (_EDGE + 170 * index, 18), colour)
-    _write(canvas, f"{history[-1].epoch} epochs", (_WIDTH - 110, _HEIGHT - 12), _INK)
+    _write(canvas, f"{history[-1].epoch} epochs", (_WIDTH - 110, _HEIGHT - 12), _TEXT)
     cv2.imwrite(str(path), canvas)
 
 
-def draw_worst(training: Training, validation: Pictures, path: Path) -> None:
-    """The validation pictures of least IoU; green: the true mask, red: the one found."""
+def draw_worst_masks(training: UNetTrainer, validation: SampleDataset, path: Path) -> None:
+    """Write the validation pictures of least IoU; green: true outline, red: found one."""
     ious = training.ious
     worst = np.argsort(ious.numpy())[:_NUM_WORST].tolist()
     samples = [validation[index] for index in worst]
@@ -61,7 +61,9 @@ def draw_worst(training: Training, validation: Pictures, path: Path) -> None:
     cv2.imwrite(str(path), np.vstack(rows))
 
 
-def _tile(sample: Sample, found: Bool[np.ndarray, "S S"], iou: float) -> UInt8[np.ndarray, "T S 3"]:
+def _tile(
+    sample: TrainingSample, found: Bool[np.ndarray, "S S"], iou: float
+) -> UInt8[np.ndarray, "T S 3"]:
     """The picture, and below it the same with both outlines."""
     drawn = sample.image.copy()
     for mask, colour in ((sample.mask > 0.5, _TRUE_BGR), (found, _FOUND_BGR)):
@@ -72,6 +74,7 @@ def _tile(sample: Sample, found: Bool[np.ndarray, "S S"], iou: float) -> UInt8[n
 
 
 def _place(along: float, value: float) -> tuple[int, int]:
+    """Pixel of a point of the plot; `along` and `value` from 0 to 1."""
     x = _EDGE + along * (_WIDTH - 2 * _EDGE)
     y = _HEIGHT - _EDGE + 12 - value * (_HEIGHT - 2 * _EDGE)
     return round(x), round(y)

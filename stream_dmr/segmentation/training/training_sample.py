@@ -1,4 +1,4 @@
-"""One training example."""
+"""One training example: a crop with its true mask."""
 
 from dataclasses import dataclass
 
@@ -7,10 +7,10 @@ from jaxtyping import Float32, UInt8
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Sample:
-    """A crop with the truth about it."""
+class TrainingSample:
+    """A crop with its true mask and ends, at the network's input size."""
 
     image: UInt8[np.ndarray, "S S 3"]  # BGR
-    mask: Float32[np.ndarray, "S S"]  # how much of each pixel is fish, 0 to 1
-    in_box: Float32[np.ndarray, "S S"]  # all 1: no box, every fish is wanted
-    ends_px: Float32[np.ndarray, "2 2"] | None  # head and tail, perhaps outside; None: not known
+    mask: Float32[np.ndarray, "S S"]  # fraction of each pixel that is fish, 0 to 1
+    in_box: Float32[np.ndarray, "S S"]  # see `box_coverage`; all 1: the mask is of all fish
+    ends_px: Float32[np.ndarray, "2 2"] | None  # head and tail, may lie outside; None: unknown

@@ -1,4 +1,4 @@
-"""Teaching the U-Net: epochs, checks on pictures it never learns, checkpoints, the best weights."""
+"""Train the U-Net: epochs, validation, checkpoints, and the best weights."""
 
 import math
 import threading
@@ -16,9 +16,15 @@ from torch.optim.swa_utils import AveragedModel
 from stream_dmr.errors import ModelError, UserError
 from stream_dmr.segmentation.network.unet import UNet, normalise
 from stream_dmr.segmentation.network.unet_weights import save_weights
-from stream_dmr.segmentation.training.sample_dataset import Batch, Draw, Pictures, collate, load
+from stream_dmr.segmentation.training.sample_dataset import (
+    Batch,
+    Draw,
+    SampleDataset,
+    collate_samples,
+    load_batches,
+)
 from stream_dmr.segmentation.training.train_settings import TrainSettings
-from stream_dmr.segmentation.training.training_sample import Sample
+from stream_dmr.segmentation.training.training_sample import TrainingSample
 from stream_dmr.segmentation.training.unet_losses import (
     ends_are_right,
     ends_loss,
@@ -26,31 +32,29 @@ from stream_dmr.segmentation.training.unet_losses import (
     mask_loss,
 )
 
-_AVERAGE = 0.995  # most of the running average of the weights that a step leaves as it was
-_WARM_UP = 0.04  # of all steps
-_FINE_TUNING = 0.3  # of the learning rate, where training starts from weights
+# Chosen by hand, as usual for networks of this size.
+_AVERAGE_DECAY = 0.995  # highest decay per step of the running average of the weights
+_WARM_UP = 0.04  # fraction of all steps in which the learning rate rises
+_FINE_TUNING_RATE = 0.3  # factor of the learning rate where training starts from weights
+_WEIGHT_DECAY = 1e-4
+_MAX_GRADIENT_NORM = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scores:
-    """How well the network does on the validation pictures after an epoch."""
+class EpochScores:
+    """Scores on the validation pictures after an epoch."""
 
-    epoch: int  # 0: of the weights that fine-tuning began with
-    loss: float | None  # of the training pictures, mean over the epoch; None for epoch 0
-    iou: float  # mean over the pictures
-    iou_p10: float  # one picture in ten is below
-    # Share of the fish whose head is found at the head; None where nobody said where it is.
+    epoch: int  # from 1; 0: of the weights that fine-tuning began with
+    loss: float | None  # mean over the epoch's training pictures; None for epoch 0
+    iou: float  # mean over the pictures; the best weights are those with the highest
+    iou_p10: float  # 10th percentile over the pictures
+    # Fraction of the fish whose head is found at the head; None where the true ends are unknown.
     ends_right: float | None
-
-    @property
-    def merit(self) -> float:
-        """What the best weights are chosen by."""
-        return self.iou
 
 
 @dataclass
-class Training:
-    """A network being taught; `last.pt` in the folder holds all of it."""
+class UNetTrainer:
+    """A network in training; the checkpoint `last.pt` in the folder `out` holds its whole state."""
 
     settings: TrainSettings
     device: torch.device
@@ -60,7 +64,7 @@ class Training:
     def __post_init__(self) -> None:
         torch.manual_seed(self.settings.seed)
         self.network = UNet()
-        self.history: list[Scores] = []
+        self.history: list[EpochScores] = []
         self.ious = torch.empty(0)  # of each validation picture, after the last epoch
         self.best = -math.inf
 
@@ -70,10 +74,10 @@ class Training:
             self.network = network
         self.network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.averaged = AveragedModel(self.network, avg_fn=_average, use_buffers=True)
-        self.optimizer = torch.optim.AdamW(self.network.parameters(), weight_decay=1e-4)
+        self.optimizer = torch.optim.AdamW(self.network.parameters(), weight_decay=_WEIGHT_DECAY)
 
     def resume(self) -> None:
-        """Go on after the last whole epoch. Raises ModelError where that can't be."""
+        """Continue after the last whole epoch. Raises ModelError without a matching checkpoint."""
         self.begin(None)
         path = self.out / "last.pt"
         if not path.exists():
@@ -87,41 +91,42 @@ class Training:
         self.network.load_state_dict(state["network"])
         self.averaged.load_state_dict(state["averaged"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self.history = [Scores(**scores) for scores in state["history"]]
-        self.best = max(scores.merit for scores in self.history)
+        self.history = [EpochScores(**scores) for scores in state["history"]]
+        self.best = max(scores.iou for scores in self.history)
 
     @property
     def is_over(self) -> bool:
-        """Whether all epochs have gone by, or too many without anything better."""
+        """True after all epochs, or after too many without a better IoU."""
         if self._epoch >= self.settings.epochs:
             return True
-        merits = [scores.merit for scores in self.history]
-        return (
-            bool(merits) and len(merits) - 1 - merits.index(max(merits)) >= self.settings.patience
-        )
+        ious = [scores.iou for scores in self.history]
+        return bool(ious) and len(ious) - 1 - ious.index(max(ious)) >= self.settings.patience
 
     @property
     def _epoch(self) -> int:
-        """The last one."""
+        """The last epoch done."""
         return self.history[-1].epoch if self.history else 0
 
-    def check_start(self, validation: Pictures) -> Scores:
-        """Score the weights that fine-tuning begins with: none that are worse are kept."""
+    def check_start(self, validation: SampleDataset) -> EpochScores:
+        """Score the weights that fine-tuning begins with, so that no worse ones are kept."""
         return self._check_and_keep(validation, epoch=0, loss=None)
 
     def run_epoch(
         self,
         draw: Draw,
-        validation: Pictures,
+        validation: SampleDataset,
         *,
         stop: threading.Event,
         progress: Callable[[int], None],
-    ) -> Scores | None:
-        """Teach for one epoch and check; None where `stop` broke in, and then nothing is kept."""
+    ) -> EpochScores | None:
+        """Train for one epoch and validate. None where `stop` was set; then nothing is kept.
+
+        `progress` is called with the number of crops after each step.
+        """
         settings, epoch = self.settings, self._epoch + 1
-        pictures = Pictures(draw, size=settings.crops_per_epoch, seed=(settings.seed, epoch))
+        pictures = SampleDataset(draw, size=settings.crops_per_epoch, seed=(settings.seed, epoch))
         losses = []
-        batches = load(pictures, batch_size=settings.batch_size, workers=settings.workers)
+        batches = load_batches(pictures, batch_size=settings.batch_size, workers=settings.workers)
         for step, batch in enumerate(batches):
             if stop.is_set():
                 return None
@@ -130,9 +135,11 @@ class Training:
             progress(len(batch[0]))
         return self._check_and_keep(validation, epoch=epoch, loss=sum(losses) / len(losses))
 
-    def _check_and_keep(self, validation: Pictures, *, epoch: int, loss: float | None) -> Scores:
+    def _check_and_keep(
+        self, validation: SampleDataset, *, epoch: int, loss: float | None
+    ) -> EpochScores:
         self.ious, right = self.check(validation)
-        scores = Scores(
+        scores = EpochScores(
             epoch=epoch,
             loss=loss,
             iou=float(self.ious.mean()),
@@ -143,22 +150,23 @@ class Training:
         return scores
 
     @torch.no_grad()
-    def check(self, validation: Pictures) -> tuple[Tensor, float | None]:
-        """IoU of each validation picture, and the share of heads found at the head."""
+    def check(self, validation: SampleDataset) -> tuple[Tensor, float | None]:
+        """IoU of each validation picture, and the fraction of heads found at the head."""
         self.averaged.eval()
-        ious, right, asked = [], 0, 0
-        for batch in load(validation, batch_size=self.settings.batch_size, workers=0):
+        ious, num_right, num_known = [], 0, 0
+        for batch in load_batches(validation, batch_size=self.settings.batch_size, workers=0):
             mask_logits, ends_logits, masks, ends_px = self._forward(self.averaged, batch)
             ious.append(mask_iou(mask_logits, masks).cpu())
-            is_right, is_asked = ends_are_right(ends_logits, ends_px)
-            right, asked = right + int((is_right & is_asked).sum()), asked + int(is_asked.sum())
-        return torch.cat(ious), right / asked if asked else None
+            is_right, is_known = ends_are_right(ends_logits, ends_px)
+            num_right += int((is_right & is_known).sum())
+            num_known += int(is_known.sum())
+        return torch.cat(ious), num_right / num_known if num_known else None
 
     @torch.no_grad()
-    def predict(self, samples: list[Sample]) -> Bool[np.ndarray, "B S S"]:
-        """The masks that the averaged weights find."""
+    def predict(self, samples: list[TrainingSample]) -> Bool[np.ndarray, "B S S"]:
+        """The masks that the averaged weights find in some examples."""
         self.averaged.eval()
-        mask_logits, *_ = self._forward(self.averaged, collate(samples))
+        mask_logits, *_ = self._forward(self.averaged, collate_samples(samples))
         return (mask_logits > 0).cpu().numpy()
 
     def _forward(self, network: torch.nn.Module, batch: Batch) -> Iterator[Tensor]:
@@ -173,7 +181,7 @@ class Training:
         loss = mask_loss(mask_logits, masks) + ends_loss(ends_logits, ends_px)
         self.optimizer.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
         self.optimizer.step()
         self.averaged.update_parameters(self.network)
         value = float(loss.detach())
@@ -185,16 +193,16 @@ class Training:
         return value
 
     def _set_rate(self, part: float) -> None:
-        """Up in a straight line, then down along a cosine; `part` of the training is done."""
-        peak = self.settings.learning_rate * (_FINE_TUNING if self.is_fine_tuning else 1.0)
+        """Linear warm-up, then cosine decay; `part` is the fraction of the training done."""
+        peak = self.settings.learning_rate * (_FINE_TUNING_RATE if self.is_fine_tuning else 1.0)
         rise = min(1.0, (part + 1e-3) / _WARM_UP)
         for group in self.optimizer.param_groups:
             group["lr"] = peak * rise * 0.5 * (1 + math.cos(math.pi * min(1.0, part)))
 
-    def _keep(self, scores: Scores) -> None:
+    def _keep(self, scores: EpochScores) -> None:
         self.history.append(scores)
-        if scores.merit > self.best:
-            self.best = scores.merit
+        if scores.iou > self.best:
+            self.best = scores.iou
             network = self.averaged.module
             assert isinstance(network, UNet)
             save_weights(network, self.out / "unet.pt")
@@ -205,12 +213,12 @@ class Training:
             "optimizer": self.optimizer.state_dict(),
             "history": [asdict(scores) for scores in self.history],
         }
-        unfinished = self.out / "last.pt.part"
-        torch.save(state, unfinished)
-        unfinished.replace(self.out / "last.pt")  # a crash leaves the one before
+        partial = self.out / "last.pt.part"
+        torch.save(state, partial)
+        partial.replace(self.out / "last.pt")  # atomic: a crash leaves the previous one
 
     def _identity(self) -> dict[str, Any]:
-        """What a resumed run must share with the one before."""
+        """The settings that a resumed run must share with the one before."""
         return {
             **self.settings.model_dump(exclude={"workers", "patience"}),
             "tuned": self.is_fine_tuning,
@@ -218,7 +226,7 @@ class Training:
 
 
 def _average(old: Tensor, new: Tensor, num_averaged: Tensor | int) -> Tensor:
-    """Nearly the plain mean of the first steps, later an exponential one: no start lingers on."""
+    """Exponential average whose decay rises from 0.1, so that the initial weights are forgotten."""
     steps = float(num_averaged)
-    keep = min(_AVERAGE, (1 + steps) / (10 + steps))
+    keep = min(_AVERAGE_DECAY, (1 + steps) / (10 + steps))
     return torch.lerp(new, old, keep) if old.is_floating_point() else new

@@ -1,4 +1,4 @@
-"""What the terminal shows of a training."""
+"""Progress of a training on the terminal."""
 
 from types import TracebackType
 
@@ -7,11 +7,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from stream_dmr.segmentation.training.train_settings import TrainSettings
 from stream_dmr.segmentation.training.train_unet import TrainObserver
-from stream_dmr.segmentation.training.unet_trainer import Scores
+from stream_dmr.segmentation.training.unet_trainer import EpochScores
 
 
 class TrainDisplay(TrainObserver):
-    """A bar per task on a terminal, a line per epoch everywhere; all of it on stderr."""
+    """A progress bar per task on a terminal, a line per epoch everywhere; all on stderr."""
 
     def __init__(self, settings: TrainSettings) -> None:
         self._console = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -39,17 +39,17 @@ class TrainDisplay(TrainObserver):
     ) -> None:
         self._progress.stop()
 
-    def drawing(self, num_done: int, num_all: int) -> None:  # noqa: D102
-        is_under_way = num_done < num_all
+    def patches_drawn(self, num_done: int, num_all: int) -> None:  # noqa: D102
+        is_unfinished = num_done < num_all
         self._progress.update(
-            self._drawing, completed=num_done, total=num_all, visible=is_under_way
+            self._drawing, completed=num_done, total=num_all, visible=is_unfinished
         )
 
-    def learning(self, num_crops: int) -> None:  # noqa: D102
+    def crops_trained(self, num_crops: int) -> None:  # noqa: D102
         self._progress.update(self._epoch, advance=num_crops)
 
-    def checked(self, scores: Scores, *, is_best: bool) -> None:  # noqa: D102
-        loss = "to begin with" if scores.loss is None else f"loss {scores.loss:.3f}"
+    def epoch_done(self, scores: EpochScores, *, is_best: bool) -> None:  # noqa: D102
+        loss = "before training" if scores.loss is None else f"loss {scores.loss:.3f}"
         heads = "" if scores.ends_right is None else f", heads right {scores.ends_right:.2f}"
         self._console.print(
             f"epoch {scores.epoch}/{self._settings.epochs}: {loss}, IoU {scores.iou:.3f}"

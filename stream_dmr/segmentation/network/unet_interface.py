@@ -1,0 +1,20 @@
+"""What the U-Net takes and gives, as sizes: everything about it that needs no torch."""
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+SIZE_PX = 128  # width and height of the crops that it is trained on
+SIZE_MULTIPLE_PX = 16  # of its input's width and height: it halves the input four times
+ENDS_STRIDE = 4  # input pixels per cell of the maps of head and tail
+
+
+def box_coverage(bbox_xyxy_px: Float[np.ndarray, "4"], *, size: int) -> Float32[np.ndarray, "S S"]:
+    """The fraction of each pixel inside a box, 0 to 1; the box is half-open, in crop pixels.
+
+    This is the network's fourth channel, which tells it which of several fish is asked for.
+    """
+    starts = np.arange(size)
+    x0, y0, x1, y1 = bbox_xyxy_px
+    columns = np.clip(np.minimum(starts + 1, x1) - np.maximum(starts, x0), 0.0, 1.0)
+    rows = np.clip(np.minimum(starts + 1, y1) - np.maximum(starts, y0), 0.0, 1.0)
+    return np.outer(rows, columns).astype(np.float32)
