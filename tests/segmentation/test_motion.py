@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stream_dmr.messages import Frame
-from stream_dmr.segmentation.detection.background_model import Background
-from stream_dmr.segmentation.detection.blobs import fish_shapes
+from stream_dmr.segmentation.detection.background_model import BackgroundModel
+from stream_dmr.segmentation.detection.blobs import fish_blobs
 from stream_dmr.segmentation.detection.camera_motion import CameraMotion, compose
 from stream_dmr.segmentation.detection.detector import Candidate
 from stream_dmr.segmentation.detection.motion_detector import MotionDetector, MotionSettings
@@ -75,22 +75,22 @@ def test_the_background_is_judged_and_learnt_as_its_formulas_say(seed: int):
     """The compiled arithmetic against the same in plain arrays."""
     rng = np.random.default_rng(seed)
     first, second, third = (rng.uniform(0, 255, (3, 24, 32)).astype(np.float32) for _ in range(3))
-    background = Background(first, memory_frames=5.0)
+    background = BackgroundModel(first, memory_frames=5.0)
     background.learn(second, background.distance(second), np.ones((24, 32), np.float32))
-    away = third - background.mean - background._shift
-    bb, gg, rr, bg, br, gr = background._inverse
+    away = third - background.mean - background._light
+    bb, gg, rr, bg, br, gr = background._precision
     inverse = np.array([[bb, bg, br], [bg, gg, gr], [br, gr, rr]])
-    expected = np.einsum("ihw,ijhw,jhw->hw", away, inverse, away) / background._habit
+    expected = np.einsum("ihw,ijhw,jhw->hw", away, inverse, away) / background._variance_ratio
     distance = background.distance(third)
     np.testing.assert_allclose(distance, expected, rtol=2e-3)
     rate = rng.choice([0.0, 0.5, 1.0], (24, 32)).astype(np.float32)
     speed = rate * np.maximum(1 / (background._age + 1), 1 / 5)
-    excess = np.clip(distance * background._habit / 3, 1, 8)
-    habit = background._habit + speed * (excess - background._habit)
+    excess = np.clip(distance * background._variance_ratio / 3, 1, 8)
+    habit = background._variance_ratio + speed * (excess - background._variance_ratio)
     mean = background.mean + speed * (third - background.mean)
     age = background._age + (rate > 0)
     background.learn(third, distance, rate)
-    for found, wanted in ((background.mean, mean), (background._habit, habit)):
+    for found, wanted in ((background.mean, mean), (background._variance_ratio, habit)):
         np.testing.assert_allclose(found, wanted, rtol=1e-4)
     np.testing.assert_array_equal(background._age, age)
 
@@ -181,7 +181,7 @@ def test_a_box_found_in_a_small_picture_is_where_the_fish_is_in_the_frame():
 def drawn(draw: Callable[[np.ndarray], object]) -> list[np.ndarray]:
     picture = np.zeros((360, 480), np.uint8)
     draw(picture)
-    return fish_shapes(picture > 0, min_length_px=15.0, max_length_px=340.0)
+    return fish_blobs(picture > 0, min_length_px=15.0, max_length_px=340.0)
 
 
 def test_lines_poles_and_specks_are_no_fish():

@@ -52,6 +52,11 @@ def frame_of(width: int, height: int) -> Frame:
     return Frame(frame_index=1, timestamp_ns=0, image=image, source="test")
 
 
+def to_input(letterbox: Letterbox, boxes: np.ndarray) -> np.ndarray:
+    """Boxes of the frame as boxes of the input: where a detector sees them."""
+    return boxes * np.tile(letterbox.scale, 2) + np.tile(letterbox.offset, 2)
+
+
 def middle_and_size(box: np.ndarray) -> np.ndarray:
     return np.concatenate([(box[:2] + box[2:]) / 2, box[2:] - box[:2]])
 
@@ -75,12 +80,12 @@ def outputs_of(layout: str, boxes: np.ndarray) -> list[np.ndarray]:
 
 @given(sides, sides, st.tuples(sides, sides), st.data())
 def test_boxes_come_back_exactly(width: int, height: int, inner: tuple[int, int], data):
-    letterbox = Letterbox.of(frame_size=(width, height), input_size=inner)
+    letterbox = Letterbox.from_sizes(frame_size=(width, height), input_size=inner)
     box_from_xywh = st.tuples(st.floats(0, width), st.floats(0, height))
     box = np.array([[*data.draw(box_from_xywh), *data.draw(box_from_xywh)]])
-    there = letterbox.to_input(box)
+    there = to_input(letterbox, box)
     np.testing.assert_allclose(letterbox.to_frame(there), box, atol=1e-9 * max(width, height))
-    whole = letterbox.to_input(np.array([[0.0, 0.0, width, height]]))[0]
+    whole = to_input(letterbox, np.array([[0.0, 0.0, width, height]]))[0]
     np.testing.assert_allclose(whole, [*letterbox.offset, *(letterbox.offset + letterbox.resized)])
     assert (whole[:2] >= 0).all()
     assert (whole[2:] <= np.add(inner, 1e-9)).all()
@@ -93,10 +98,10 @@ def test_a_picture_lands_where_the_boxes_say(width: int, height: int, side: int,
     y0 = data.draw(st.integers(0, height - 60))
     image = np.zeros((height, width, 3), np.uint8)
     image[y0 : y0 + 60, x0 : x0 + 60] = 255
-    letterbox = Letterbox.of(frame_size=(width, height), input_size=(side, side))
+    letterbox = Letterbox.from_sizes(frame_size=(width, height), input_size=(side, side))
     picture = letterbox.apply(image)
     assert picture.shape == (side, side, 3)
-    truth = letterbox.to_input(np.array([[x0, y0, x0 + 60, y0 + 60]], float))[0]
+    truth = to_input(letterbox, np.array([[x0, y0, x0 + 60, y0 + 60]], float))[0]
     weight = np.maximum(picture[..., 0].astype(float) - 114, 0)  # the bars are grey
     rows, columns = np.indices(weight.shape)
     middle = [(weight * axis).sum() / weight.sum() + 0.5 for axis in (columns, rows)]
@@ -107,10 +112,10 @@ def test_a_picture_lands_where_the_boxes_say(width: int, height: int, side: int,
 @pytest.mark.parametrize("layout", ["yolo", "yolov5", "yolo-nms", "detr", "rt-detr"])
 @pytest.mark.parametrize("size", [(640, 480), (300, 1000), (1280, 960)])
 def test_every_family_gives_the_box_in_the_frame(tmp_path, layout: str, size: tuple[int, int]):
-    letterbox = Letterbox.of(frame_size=size, input_size=(INPUT, INPUT))
+    letterbox = Letterbox.from_sizes(frame_size=size, input_size=(INPUT, INPUT))
     truth = np.array([[30.0, 50.0, 130.0, 210.0], [150.5, 220.25, 290.75, 300.5]])
     filling = np.array([[0.0, 0.0, 0.5, 0.5]] * 40)  # padding, too small for a fish
-    boxes = letterbox.to_input(np.concatenate([truth, filling]))
+    boxes = to_input(letterbox, np.concatenate([truth, filling]))
     model = write_model(tmp_path / "model.onnx", outputs_of(layout, boxes))
     detector = open_detector(DetectFishSettings(detector=str(model), onnx_layout=layout))
     found = sorted(detector.find(frame_of(*size)), key=lambda c: c.bbox_xyxy_px[0])

@@ -1,4 +1,4 @@
-"""Which of the moving shapes in a picture may be fish: not the line, nor a gaff reaching in."""
+"""Select the moving blobs that may be fish, without the lines and gaffs connected to them."""
 
 from collections.abc import Iterator
 
@@ -6,28 +6,29 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-_POLE = 1 / 50  # of the longer side: what is thinner all along may be a gaff or a line
-_BODY = 3.0  # squares of a pole's width: a smaller thick part is a knee of something thin
-_TAIL = 0.35  # of its body's length that a fish's tail and snout may add
-_THICKNESS = 0.06  # of its length: fish seen edge-on are thicker on average
-_FEW_PX = 3.5
+# Chosen on simulated scenes (seeds 900 to 903) and the trout clip; see docs/research/raw-video.md.
+_POLE_WIDTH = 1 / 50  # of the longer side; what is thinner throughout may be a gaff or a line
+_MIN_BODY_AREA = 3.0  # pole widths squared; a smaller thick part is a bend of a thin object
+_MAX_END_LENGTH = 0.35  # of the thick part's length, that tail and snout may add
+_MIN_THICKNESS = 0.06  # mean thickness over length; fish seen edge-on are thicker
+_MIN_THICKNESS_PX = 3.5
 
 
-def fish_shapes(
+def fish_blobs(
     moving: Bool[np.ndarray, "H W"], *, min_length_px: float, max_length_px: float
 ) -> list[Bool[np.ndarray, "H W"]]:
-    """The connected shapes that may be fish, rid of poles and lines that they hang together with.
+    """The connected components that may be fish, without connected poles and lines.
 
-    A thin shape that reaches the edge of the picture is a pole or a line; a thin one inside may be
-    a fish seen edge-on.
+    A thin component that reaches the edge of the picture is a pole or a line; a thin one inside may
+    be a fish seen edge-on.
     """
-    pole = max(3, round(_POLE * max(moving.shape))) | 1
-    shapes = []
-    for shape in _components(moving):
-        shape = _without_poles(shape, pole)
-        if shape is not None and _may_be_fish(shape, min_length_px, max_length_px):
-            shapes.append(shape)
-    return shapes
+    pole_px = max(3, round(_POLE_WIDTH * max(moving.shape))) | 1
+    blobs = [_without_poles(blob, pole_px) for blob in _components(moving)]
+    return [
+        blob
+        for blob in blobs
+        if blob is not None and _may_be_fish(blob, min_length_px, max_length_px)
+    ]
 
 
 def _components(mask: Bool[np.ndarray, "H W"]) -> Iterator[Bool[np.ndarray, "H W"]]:
@@ -36,28 +37,28 @@ def _components(mask: Bool[np.ndarray, "H W"]) -> Iterator[Bool[np.ndarray, "H W
         yield labels == label
 
 
-def _without_poles(shape: Bool[np.ndarray, "H W"], pole_px: int) -> Bool[np.ndarray, "H W"] | None:
-    """The thick part of a shape with what a fish's ends may add; None where only a pole is."""
-    x, y, w, h = cv2.boundingRect(shape.view(np.uint8))
-    part = np.pad(shape[y : y + h, x : x + w], pole_px).astype(np.uint8)
+def _without_poles(blob: Bool[np.ndarray, "H W"], pole_px: int) -> Bool[np.ndarray, "H W"] | None:
+    """The thick part of a blob with a fish's thin ends; None for a mere pole or line."""
+    x, y, w, h = cv2.boundingRect(blob.view(np.uint8))
+    region = np.pad(blob[y : y + h, x : x + w], pole_px).astype(np.uint8)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (pole_px, pole_px))
-    body = cv2.morphologyEx(part, cv2.MORPH_OPEN, kernel)
-    body = _largest(body)
-    if np.count_nonzero(body) < _BODY * pole_px**2:
-        height, width = shape.shape
-        touches = min(x, y, width - x - w, height - y - h) <= 1
-        return None if touches else shape
-    reach = round(_TAIL * max(cv2.boundingRect(body)[2:]))
-    if max(w, h) <= max(cv2.boundingRect(body)[2:]) + reach:
-        return shape
-    for _ in range(max(1, reach // 2)):  # grow within the shape: back to the ends, no further
-        body = cv2.bitwise_and(cv2.dilate(body, np.ones((3, 3), np.uint8)), part)
-    fish = np.zeros_like(shape)
+    body = _largest_component(cv2.morphologyEx(region, cv2.MORPH_OPEN, kernel))
+    if np.count_nonzero(body) < _MIN_BODY_AREA * pole_px**2:
+        height, width = blob.shape
+        touches_edge = min(x, y, width - x - w, height - y - h) <= 1
+        return None if touches_edge else blob
+    body_px = max(cv2.boundingRect(body)[2:])
+    end_px = round(_MAX_END_LENGTH * body_px)
+    if max(w, h) <= body_px + end_px:
+        return blob
+    for _ in range(max(1, end_px // 2)):  # grow within the blob: back to the ends, no further
+        body = cv2.bitwise_and(cv2.dilate(body, np.ones((3, 3), np.uint8)), region)
+    fish = np.zeros_like(blob)
     fish[y : y + h, x : x + w] = body[pole_px:-pole_px, pole_px:-pole_px] > 0
     return fish
 
 
-def _largest(mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+def _largest_component(mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
     if count < 3:
         return mask
@@ -65,12 +66,11 @@ def _largest(mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     return (labels == largest).astype(np.uint8)
 
 
-def _may_be_fish(
-    shape: Bool[np.ndarray, "H W"], min_length_px: float, max_length_px: float
-) -> bool:
-    points = cv2.findNonZero(shape.view(np.uint8))
-    length = max(cv2.minAreaRect(points)[1]) + 1
-    thickness = len(points) / length
-    return min_length_px <= length <= max_length_px and thickness >= max(
-        _THICKNESS * length, _FEW_PX
+def _may_be_fish(blob: Bool[np.ndarray, "H W"], min_length_px: float, max_length_px: float) -> bool:
+    """True where length and mean thickness (area over length) are those of a fish."""
+    points = cv2.findNonZero(blob.view(np.uint8))
+    length_px = max(cv2.minAreaRect(points)[1]) + 1
+    thickness_px = len(points) / length_px
+    return min_length_px <= length_px <= max_length_px and thickness_px >= max(
+        _MIN_THICKNESS * length_px, _MIN_THICKNESS_PX
     )

@@ -1,4 +1,4 @@
-"""Which detector a name in the configuration means."""
+"""Open the detector that `[detect_fish] detector` names."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from stream_dmr.settings import Settings
 
 
 class DetectorSettings(Settings):
-    """The part of `[detect_fish]` that says who looks for fish."""
+    """The part of `[detect_fish]` that names the detector."""
 
     detector: str = Field(
         default="motion",
@@ -26,7 +26,7 @@ class UNetDetectorSettings(Settings):
     """The part of `[detect_fish]` that the detector "unet" reads."""
 
     unet_working_px: int = Field(
-        default=256, ge=64, le=2048, description="longer side of the picture the network sees, px"
+        default=256, ge=64, le=2048, description="longer side of the network's input, px"
     )
 
 
@@ -35,9 +35,10 @@ class DetectFishSettings(OnnxSettings, UNetDetectorSettings, MotionSettings, Det
 
 
 def open_detector(settings: DetectFishSettings) -> Detector:
-    """The detector of `[detect_fish] detector`: a name, or a path to weights or to an ONNX file.
+    """The detector of a name, or of a path to weights (.pt) or to an ONNX file.
 
-    Raises ModelError for another name, and where the file can't be used.
+    Torch is imported only where the U-Net is asked for. Raises ModelError for an unknown name, and
+    where the file cannot be used.
     """
     if settings.detector == "motion":
         return MotionDetector(settings)

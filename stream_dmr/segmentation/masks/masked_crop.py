@@ -22,7 +22,7 @@ from stream_dmr.segmentation.masks.mask_cleaning import clean_mask
 from stream_dmr.segmentation.segmenter import Segmenter
 
 # Chosen on simulated scenes: a fish whose tail the detector had missed was read 20 % long without
-# a second crop; see docs/research/raw-video.md.
+# a second crop; see docs/method.md.
 _MIN_SAME_BOX_IOU = 0.85  # of the mask's box and the given one; below, the crop is cut again
 _MAX_CROPS = 3
 

@@ -54,6 +54,7 @@ def fraction_inside(box: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) 
 
 def oriented_extent(shape: Bool[np.ndarray, "H W"]) -> tuple[float, float]:
     """Width and length of the smallest rotated rectangle around a shape, px; zeros if empty."""
-    points = cv2.findNonZero(shape.view(np.uint8))
-    sides = (0.0, 0.0) if points is None else cv2.minAreaRect(points)[1]
+    if not shape.any():
+        return 0.0, 0.0
+    sides = cv2.minAreaRect(cv2.findNonZero(shape.view(np.uint8)))[1]
     return min(sides), max(sides)

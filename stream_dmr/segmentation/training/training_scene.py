@@ -1,7 +1,7 @@
 """Random scenes to train on: a fish, others before and behind it, occluders, the frame's edge.
 
 The distributions were chosen by hand, stage by stage, by what the network still missed; see
-docs/segmentation.md, "The weights that ship".
+docs/research/network-weights.md.
 """
 
 from dataclasses import dataclass, replace

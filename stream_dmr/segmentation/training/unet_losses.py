@@ -9,7 +9,7 @@ from stream_dmr.segmentation.network.unet_interface import ENDS_STRIDE
 
 _THIN_PX = 5  # wider than a tail seen edge-on
 # Added to the weight 1 of every pixel. Without it IoU on the foreign `realistic` scene was 0.918
-# instead of 0.930 (docs/segmentation.md, "The weights that ship").
+# instead of 0.930 (docs/research/network-weights.md).
 _THIN_WEIGHT = 4.0
 _ENDS_SPREAD = 1.0  # standard deviation of the target's blob, cells
 _ENDS_WEIGHT = 0.08  # of the ends' loss beside the mask's: chosen by hand: the mask matters more
