@@ -1,11 +1,10 @@
 """Measures one video of a batch: its folder appears complete, or not at all."""
 
 import json
-import shlex
 import shutil
 import threading
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from stream_dmr.batch.dataset import write_tables
@@ -17,7 +16,7 @@ from stream_dmr.files import rename_durably
 from stream_dmr.results.provenance import add_files
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_observer import RunObserver
-from stream_dmr.running.run_request import RunRequest
+from stream_dmr.running.run_request import RunRequest, command_of
 from stream_dmr.watch.watch import Watch
 
 
@@ -61,7 +60,7 @@ def measure_video(job: Job, out: Path, *, on_progress: OnProgress = lambda share
     shutil.rmtree(folder, ignore_errors=True)
     try:
         observer = Watch(_ProgressObserver(on_progress))
-        summary = measure_source(request_of(job, folder), stop=threading.Event(), observer=observer)
+        summary = measure_source(request_of(job, out), stop=threading.Event(), observer=observer)
         write_tables(folder, job)
         outcome = Outcome(
             name=job.name,
@@ -88,27 +87,24 @@ def finish_folder(folder: Path, target: Path, outcome: Outcome) -> None:
 
 
 def request_of(job: Job, out: Path) -> RunRequest:
-    """The run that measures a video, as a user would have asked for it."""
-
-    def path(text: str) -> Path | None:
-        return Path(text) if text else None
-
-    options = {"source": job.video, "calibration": job.calibration, "boxes": job.boxes}
-    options |= {"masks": job.masks, "template": job.template, "config": job.config}
-    words = [word for key, value in options.items() if value for word in (f"--{key}", value)]
-    return RunRequest(
+    """The run that measures a video of the batch in `out`, with its command as a user types it."""
+    request = RunRequest(
         source=job.video,
-        out=out,
-        calibration=path(job.calibration),
-        boxes=path(job.boxes),
-        masks=path(job.masks),
+        out=results_folder(job, out),
+        calibration=_path(job.calibration),
+        boxes=_path(job.boxes),
+        masks=_path(job.masks),
         template=job.template,
-        config=path(job.config),
-        command=shlex.join(["stream-dmr", "run", *words]),
+        config=_path(job.config),
         vessel=job.vessel,
         trip=job.trip,
         haul=job.haul,
     )
+    return replace(command_of(request), out=unfinished_folder(job, out))
+
+
+def _path(text: str) -> Path | None:
+    return Path(text) if text else None
 
 
 class _ProgressObserver(RunObserver):

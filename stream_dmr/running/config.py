@@ -1,4 +1,4 @@
-"""config.toml: one table per node, each knob typed; unknown keys and wrong values are refused.
+"""config.toml: one typed table per node and room; unknown keys and wrong values are refused.
 
 `python -m stream_dmr.running.config > config.toml` writes the file with every default.
 """
@@ -37,7 +37,7 @@ _BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 
 
 class Config(Settings):
-    """All settings of a run; each table belongs to the node of its name."""
+    """All settings; each table belongs to the node or room of its name."""
 
     read_frames: ReadFramesSettings = Field(
         default_factory=ReadFramesSettings, description="from a video, folder or camera to frames"
@@ -85,10 +85,10 @@ class Config(Settings):
 
 
 def load_config(path: Path | str | None) -> Config:
-    """Read a config.toml; None gives the defaults.
+    """The settings of a config.toml; None gives the defaults.
 
-    Raises ConfigError, with one line on the first problem, where the file can't be read, is no
-    TOML, or holds an unknown table or key, a wrong type or a value out of range.
+    Raises ConfigError, one line on the first problem, where the file can't be read, is no TOML, or
+    holds an unknown table or key, a wrong type or a value out of range.
     """
     if path is None:
         return Config()
@@ -101,7 +101,7 @@ def load_config(path: Path | str | None) -> Config:
 
 
 def parse_config(text: str, *, where: str) -> Config:
-    """Read the text of a config.toml; `where` names it in errors, which are `load_config`'s."""
+    """The settings in the text of a config.toml; raises ConfigErrors that begin with `where`."""
     try:
         return Config.model_validate(tomllib.loads(text))
     except ValidationError as error:
@@ -111,7 +111,7 @@ def parse_config(text: str, *, where: str) -> Config:
 
 
 def to_toml(config: Config) -> str:
-    """Write a config as the text of a config.toml that `load_config` reads back as equal."""
+    """The text of a config.toml that `load_config` reads back as an equal config."""
     return _HEADER + "".join(_table_lines(config))
 
 
@@ -150,7 +150,7 @@ def _toml_value(value: object) -> str:
 
 
 def _explain(problem: ErrorDetails) -> str:
-    """Say in one line where a value is wrong, what was expected, and what came."""
+    """One line: where a value is wrong, what was expected, what was received."""
     table, *keys = (str(part) for part in problem["loc"])
     if problem["type"] == "extra_forbidden":
         return f" [{table}]: {_unknown_key(table, keys[0])}" if keys else _unknown_table(problem)
@@ -199,7 +199,7 @@ def _expected(field: FieldInfo, problem: ErrorDetails) -> str:
 
 
 def _toml_name(value: object) -> str:
-    """Name a received value by TOML's words."""
+    """A received value in TOML's terms."""
     match value:
         case bool():
             return str(value).lower()

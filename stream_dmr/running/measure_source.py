@@ -24,7 +24,7 @@ from stream_dmr.running.outputs import Outputs, open_outputs
 from stream_dmr.running.pipeline import Node, StageCounters, run_chain
 from stream_dmr.running.result_writer import ResultWriter
 from stream_dmr.running.resume import resume_source
-from stream_dmr.running.run_folder import LEARNT, RESULTS, SEGMENTED
+from stream_dmr.running.run_folder import ENDLESS_RESULTS, LEARNT, RESULTS
 from stream_dmr.running.run_observer import RunObserver, RunTotals
 from stream_dmr.running.run_request import RunRequest
 from stream_dmr.running.shape_pass import save_stocks, with_learnt_shapes
@@ -187,7 +187,7 @@ def _run_chain(
         num_frames=totals.num_frames,
         elapsed_s=time.perf_counter() - began,
         counters=counters,
-        files=[request.out / name for name in (SEGMENTED if inputs.is_endless else RESULTS)],
+        files=[request.out / name for name in (ENDLESS_RESULTS if inputs.is_endless else RESULTS)],
     )
 
 

@@ -1,6 +1,6 @@
 """Opens and closes everything that a run writes to."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -35,7 +35,7 @@ class Outputs:
 
 
 @contextmanager
-def open_outputs(inputs: Inputs, observer: RunObserver) -> Iterator[Outputs]:
+def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
     """Open everything that a run writes to; it is closed in the reverse order.
 
     Raises OutputError where the folder can't be written to, or holds an earlier run's results. An
@@ -52,7 +52,9 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Iterator[Outputs]:
     )
     with suppress(OSError, OutputError):  # it tries again while the run goes on
         retention.make_room()
-    repairs = prepare_folder(out, overwrite=request.overwrite, resume=resume, waits=is_endless)
+    repairs = prepare_folder(
+        out, overwrite=request.overwrite, resume=resume, waits_for_room=is_endless
+    )
     header = inputs.header()
     facts = run_facts(header, vessel=request.vessel, trip=request.trip, haul=request.haul)
     with ExitStack() as stack:

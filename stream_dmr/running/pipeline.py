@@ -1,14 +1,13 @@
-"""Chains the nodes: one thread each, bounded queues between them, shutdown, counters.
+"""Runs the chain of nodes: one thread each, bounded queues between them, shutdown, counters.
 
-A frame travels as one batch: what a stage makes of it goes on to the next stage together, and the
-stage's `tick` follows it. So the order within a stage is the order of the source, whatever the
-threads do, and a shutdown cuts between frames.
+All messages of a frame travel together as one batch, and each stage's `tick` follows the batch. So
+every stage works in the order of the source, and a shutdown cuts between frames.
 """
 
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -16,50 +15,49 @@ from typing import Any, Protocol, runtime_checkable
 
 from stream_dmr.messages import Frame, Message
 
-_QUEUE_FRAMES = 2  # between two stages: enough to keep both busy, few enough to stop soon
+_QUEUE_FRAMES = 2  # between two stages; chosen: both stay busy, and a stop drops few frames
 _POLL_S = 0.1  # how soon a waiting stage notices that the chain stops
-_DONE = {True: "processed", False: "dropped"}
-_SOURCE_GRACE_S = 1.0  # a camera that hangs in a read is left behind after this
+_SOURCE_GRACE_S = 1.0  # then the thread of a camera that hangs in a read is abandoned
 
 
 @runtime_checkable
 class Node(Protocol):
-    """A stage of the chain: holds its per-track state, does no I/O, never reads a wall clock."""
+    """A stage of the chain: it holds the state of each track, does no I/O and reads no clock."""
 
     def step(self, message: Any, /) -> Sequence[Message]:
-        """Take one message of the stage before; return what follows from it, in order.
+        """Take one message of the stage before; return the messages that follow from it.
 
-        Each node names its own type; `tests/test_architecture.py` checks that they fit together.
+        Each node declares its own type; `tests/test_architecture.py` checks that they fit.
         """
         ...
 
     def tick(self, timestamp_ns: int, /) -> Sequence[Message]:
-        """Take note that a frame has passed, fish in it or not: time-outs are decided here."""
+        """A frame has passed, with fish or without: return what times out by it."""
         ...
 
     def close(self) -> Sequence[Message]:
-        """Take note that the stream has ended: return what is still owed."""
+        """The stream has ended: return what remains."""
         ...
 
 
 @dataclass(kw_only=True)
 class StageCounters:
-    """What one stage did; at the end, frames in = processed + dropped + failed."""
+    """The work of one stage; at the end, frames in = processed + dropped + failed."""
 
     stage: str
     frames_in: int = 0
     frames_processed: int = 0
-    frames_dropped: int = 0  # not begun, or not finished, when the chain was stopped
-    frames_failed: int = 0  # an exception in some part of it; what came before it went on
+    frames_dropped: int = 0  # not begun, or not finished, at a stop
+    frames_failed: int = 0  # with an exception; messages made before it went on
     messages_in: int = 0
     messages_out: int = 0
-    busy_s: float = 0.0  # from taking a frame to passing it on; waiting for a core included
-    cpu_s: float = 0.0  # of the stage's own thread; what libraries do in threads of theirs is not
+    busy_s: float = 0.0  # from taking a frame to passing it on; wall time
+    cpu_s: float = 0.0  # of the stage's own thread, without those of libraries
 
 
 @dataclass(kw_only=True)
 class _Batch:
-    """What one stage made of one frame; without `timestamp_ns`: of the end of the stream."""
+    """The messages of one stage for one frame, or (`timestamp_ns` None) for the end."""
 
     timestamp_ns: int | None
     messages: list[Message] = field(default_factory=list)
@@ -81,15 +79,17 @@ def run_chain(
 ) -> list[StageCounters]:
     """Run every frame of `source` through `nodes`; return the counters of source and nodes.
 
-    `on_message` takes every message of every stage, in the stage's order and in its thread, and
-    returns what the next stage gets: a recorder returns what a replay will read. `on_frame` is
-    called when a frame has left the last stage. Setting `stop` ends the chain soon: the busiest
-    stage and those before it drop what they have not begun, those after it finish what they were
-    given, and every node is closed. An exception ends the chain in the same way, at the stage
-    where it happened, and is raised here; but where `on_failure` says true of it, only what the
-    node was doing is lost. `on_start` gets the chain, to be watched while it runs.
-    `in_one_thread` gives the same, and three times as fast where no stage is busy outside of Python
-    for long: its threads would only stand in each other's way.
+    `on_message` takes every message of every stage, in the stage's order and thread, and returns
+    the message that the next stage gets: a recorder returns what a replay will read. `on_frame` is
+    called when a frame has left the last stage; `on_start` gets the chain, to observe it.
+
+    Setting `stop` ends the chain soon: the busiest stage and those before it drop the frames that
+    they have not begun, the stages after it finish theirs, and every node is closed. An exception
+    ends the chain in the same way at its stage, and is raised here; where `on_failure` (stage name,
+    exception) returns True, only the node's current work is lost.
+
+    `in_one_thread` gives the same results. It is three times as fast where all stages are Python,
+    whose threads exclude each other.
     """
     chain = Chain(
         source, nodes, on_message=on_message, on_frame=on_frame, on_failure=on_failure, stop=stop
@@ -99,7 +99,7 @@ def run_chain(
 
 
 class Chain:
-    """One run: stage 0 is the source, stage k the k-th node. May be watched from any thread."""
+    """One run: stage 0 is the source, stage k the k-th node. Counters may be read at any time."""
 
     def __init__(
         self,
@@ -130,12 +130,12 @@ class Chain:
         return [inbox.qsize() for inbox in self._inboxes]
 
     def longest_busy_s(self) -> float:
-        """How long the slowest node has had the frame (or its fish) that it is working on."""
+        """The longest time that a node has been working on its current frame."""
         now = time.perf_counter()
         return max((now - s for s in self._busy_since[1:] if s is not None), default=0.0)
 
     def run(self) -> list[StageCounters]:
-        """Run to the end, once; what `run_chain` says."""
+        """Run to the end, once; see `run_chain`."""
         threads = [threading.Thread(target=self._run_source, name="source", daemon=True)]
         threads += [
             threading.Thread(target=self._run_node, args=(stage,), name=f"stage-{stage}")
@@ -160,7 +160,7 @@ class Chain:
         return self.counters
 
     def run_in_line(self) -> list[StageCounters]:
-        """The same in this thread alone."""
+        """Run to the end in this thread alone; see `run_chain`."""
         try:
             frames = iter(self._source)
             while self._failure is None and (batch := self._read(frames)) is not None:
@@ -203,12 +203,12 @@ class Chain:
         node = self._nodes[stage - 1]
         while (batch := self._take(stage)) is not None and batch.timestamp_ns is not None:
             self._pass_on(stage, self._process(stage, node, batch))
-        # Messages that the stage before owed at its end, then our own end.
+        # The last messages of the stage before, then our own end.
         ending = batch or _Batch(timestamp_ns=None)
         self._pass_on(stage, self._process(stage, node, ending, close=True))
 
     def _process(self, stage: int, node: Node, batch: _Batch, *, close: bool = False) -> _Batch:
-        """Step through a batch, then tick or close. What came before an exception still goes on."""
+        """Step through a batch, then tick or close; messages made before an exception go on."""
         made, is_done = _Batch(timestamp_ns=batch.timestamp_ns), True
         with self._busy(stage):
             for message in batch.messages:
@@ -220,19 +220,20 @@ class Chain:
                 is_whole = not self._is_cut(stage)
                 if is_whole:
                     is_done &= self._attempt(stage, partial(node.tick, batch.timestamp_ns), made)
-                self._count(stage, "failed" if not is_done else _DONE[is_whole])
+                outcome = "processed" if is_whole else "dropped"
+                self._count(stage, outcome if is_done else "failed")
                 if is_whole and stage == len(self._nodes):
-                    self._attempt(stage, self._say_done, made)
+                    self._attempt(stage, self._frame_done, made)
             if close:
                 self._attempt(stage, node.close, made)
         return made
 
-    def _say_done(self) -> Sequence[Message]:
+    def _frame_done(self) -> Sequence[Message]:
         self._on_frame()
         return ()
 
     def _attempt(self, stage: int, work: Callable[[], Sequence[Message]], made: _Batch) -> bool:
-        """Do a part of a frame's work; false where that failed, which may end the chain."""
+        """Do a part of a frame's work; False where it failed, which may end the chain."""
         try:
             self._emit(stage, work(), made)
         except BaseException as error:
@@ -250,7 +251,7 @@ class Chain:
             setattr(counters, name, getattr(counters, name) + frames)
 
     def _count_leftovers(self) -> None:
-        """Frames that were handed to a stage which was to take no more."""
+        """Count the frames that wait before stages that take no more."""
         for stage, inbox in enumerate(self._inboxes, start=1):
             with inbox.mutex:
                 left = sum(batch.timestamp_ns is not None for batch in inbox.queue)
@@ -262,7 +263,7 @@ class Chain:
             self.counters[stage].messages_out += 1
 
     def _take(self, stage: int) -> _Batch | None:
-        """Wait for the next batch of a stage; None once it has to drop what waits."""
+        """Wait for the next batch of a stage; None once the stage drops what waits."""
         while not self._is_cut(stage):
             try:
                 return self._inboxes[stage - 1].get(timeout=_POLL_S)
@@ -271,7 +272,7 @@ class Chain:
         return None
 
     def _pass_on(self, stage: int, batch: _Batch) -> None:
-        """Hand a batch to the next stage, unless that one no longer takes any."""
+        """Hand a batch to the next stage, or count it as dropped where that takes no more."""
         while stage < len(self._nodes) and not self._is_cut(stage + 1):
             try:
                 return self._inboxes[stage].put(batch, timeout=_POLL_S)
@@ -288,7 +289,7 @@ class Chain:
             self._cut = max(self._cut, stage)
 
     def _is_cut(self, stage: int) -> bool:
-        """Say whether the chain is ending and this stage drops what it has not begun."""
+        """True where the chain is ending and this stage drops what it has not begun."""
         if self._stop.is_set() and not self._is_stopped:
             with self._lock:
                 self._is_stopped = True
@@ -297,7 +298,7 @@ class Chain:
         return stage <= self._cut
 
     def _busiest_stage(self) -> int:
-        """Find the stage with the most work so far, what it has in hand included."""
+        """The stage that has been busy longest, its current frame included."""
         now = time.perf_counter()
         busy = [
             counters.busy_s + (0.0 if since is None else now - since)
@@ -306,8 +307,8 @@ class Chain:
         return busy.index(max(busy))
 
     @contextmanager
-    def _busy(self, stage: int) -> Iterator[None]:
-        """Count the time spent inside as work of a stage."""
+    def _busy(self, stage: int) -> Generator[None]:
+        """Count the time inside as work of a stage."""
         self._busy_since[stage] = began = time.perf_counter()
         cpu_began = time.thread_time()
         try:

@@ -1,4 +1,4 @@
-"""Makes the folder of a run whole after a crash, a power cut or a full disk."""
+"""Repairs the folder of a run after a crash, a power cut or a full disk."""
 
 from collections.abc import Iterator
 from contextlib import closing
@@ -19,9 +19,9 @@ FROM_RECORDING = "taken over from the recording"
 
 
 def recover_folder(folder: Path) -> Iterator[str]:
-    """Repair recordings and add lengths that only they hold; what was done, a line each.
+    """Repair recordings, add lengths that only they hold to lengths.db; yield a line for each.
 
-    Raises OutputError where that is no folder or another run is writing to it.
+    Raises OutputError where `folder` is no folder or another run is writing to it.
     """
     if not folder.is_dir():
         raise OutputError(f"{folder}: expected the folder of a run, found none; check the path")

@@ -15,17 +15,18 @@ RESULTS = (
     PROVENANCE,
 )
 LEARNT = "template.ply"  # what a run learnt of its fish's shape, with its TOML; -2, ... beside it
-SEGMENTED = ("lengths.db", "lengths.csv", "frames.csv", f"{STEM}-*")  # of a source without an end
+ENDLESS_RESULTS = ("lengths.db", "lengths.csv", "frames.csv", f"{STEM}-*")
+_PROBE_BYTES = 1 << 16  # that must fit on the disk at the start: more than the headers of all files
 
 
 def prepare_folder(
-    out: Path, *, overwrite: bool, resume: bool = False, waits: bool = False
+    out: Path, *, overwrite: bool, resume: bool = False, waits_for_room: bool = False
 ) -> list[Repair]:
-    """Make sure that results can be written to `out`, and that none are lost by it.
+    """Make sure that results can be written to `out`, and that no earlier ones are lost.
 
-    Raises OutputError where it is no folder, can't be written to, has no room, or holds the
-    results of an earlier run; `overwrite` removes those instead, `resume` keeps them. With `waits`
-    there may be room later. Returns what was done about recordings that a crash left unfinished.
+    Raises OutputError where it is no folder, can't be written to, has no room, or holds results of
+    an earlier run; `overwrite` removes those instead, `resume` keeps them. With `waits_for_room` a
+    full disk is no error. Returns the repairs of recordings that a crash left unfinished.
     """
     earlier = refuse_earlier(out, is_fine=overwrite or resume)
     try:
@@ -38,10 +39,10 @@ def prepare_folder(
         repairs = list(recover(out))
         for path in (out / f"{STEM}.mcap", out / f"{STEM}.rrd"):
             if path.exists():
-                _set_aside(path)
-        if not waits:
+                _rename_earlier(path)
+        if not waits_for_room:
             with tempfile.TemporaryFile(dir=out) as probe:
-                probe.write(bytes(1 << 16))
+                probe.write(bytes(_PROBE_BYTES))
     except OSError as error:
         raise OutputError(
             f"{out}: expected a folder to write to, got: {error.strerror}; choose another --out"
@@ -50,7 +51,7 @@ def prepare_folder(
 
 
 def refuse_earlier(out: Path, *, is_fine: bool) -> list[Path]:
-    """Results of an earlier run in a folder; raises OutputError for them unless that `is_fine`."""
+    """The results of an earlier run in a folder; raises OutputError for them unless `is_fine`."""
     earlier = [out / name for name in RESULTS if (out / name).exists()]
     earlier += sorted(out.glob(f"{STEM}-*"))
     if earlier and not is_fine:
@@ -61,10 +62,7 @@ def refuse_earlier(out: Path, *, is_fine: bool) -> list[Path]:
     return earlier
 
 
-def _set_aside(recording: Path) -> None:
-    """Give the recording of an earlier run a name of its own: recording-1.mcap, ..."""
-    for number in itertools.count(1):
-        aside = recording.with_stem(f"{recording.stem}-{number}")
-        if not aside.exists():
-            recording.rename(aside)
-            return
+def _rename_earlier(recording: Path) -> None:
+    """Rename the recording of an earlier run to recording-1.mcap, recording-2.mcap, ..."""
+    names = (recording.with_stem(f"{recording.stem}-{number}") for number in itertools.count(1))
+    recording.rename(next(name for name in names if not name.exists()))
