@@ -136,6 +136,9 @@ class FittedShape(_ReadOnly):
     # Std of the arc length since the fish's shape isn't known exactly, as a fraction: an error that
     # all frames of a fish share. None: an older recording, or a solver that can't tell.
     shape_std_ratio: float | None = None
+    # How far the body reaches beyond its center towards the reference plane, as a fraction of the
+    # arc length: half its thickness for a fish on its side. None: an older recording.
+    height_ratio: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

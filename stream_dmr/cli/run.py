@@ -3,6 +3,7 @@
 import signal
 import sys
 from contextlib import nullcontext
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,6 +19,13 @@ from stream_dmr.running.run_request import RunRequest, default_out
 
 if TYPE_CHECKING:
     from stream_dmr.running.measure_source import RunSummary
+
+
+class Pose(StrEnum):
+    """How fish are seen."""
+
+    HANGING = "hanging"
+    LYING = "lying"
 
 
 def run(
@@ -45,6 +53,13 @@ def run(
             show_default="runs/<name of the source>",
         ),
     ] = None,
+    pose: Annotated[
+        Pose, typer.Option(help="lying: the fish lie flat on the reference plane.")
+    ] = Pose.HANGING,
+    stills: Annotated[
+        bool,
+        typer.Option("--stills", help="Every picture stands for itself; one gives a length."),
+    ] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the results of an earlier run in --out.")
     ] = False,
@@ -83,6 +98,8 @@ def run(
             boxes=boxes,
             masks=masks,
             template=template,
+            pose=pose.value,
+            stills=stills,
             config=config,
             overwrite=overwrite,
             resume=resume,

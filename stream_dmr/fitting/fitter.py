@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.fitting.body import Body
@@ -15,10 +16,17 @@ from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.contour.solver import ContourSolver, loss_of
 from stream_dmr.fitting.heading import is_turned
 from stream_dmr.fitting.mesh_levels import MeshLevels
+from stream_dmr.fitting.parameters import ROOT_ROTATION
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.shape.candidates import Candidate
 from stream_dmr.fitting.shape.length_std import freed, shape_std_ratio
-from stream_dmr.fitting.shape.space import TRUNK, directions, individual_covariance, reshaped
+from stream_dmr.fitting.shape.space import (
+    TRUNK,
+    directions,
+    half_section,
+    individual_covariance,
+    reshaped,
+)
 from stream_dmr.fitting.size.scanner import SizeScanner
 from stream_dmr.fitting.solver import Solution, Solver
 from stream_dmr.fitting.target import Target
@@ -85,6 +93,7 @@ class Fitter:
         self._bodies = MeshLevels.of(template, max_faces=settings.max_faces)
         self._solver = self._make_solver()
         self._scanner = SizeScanner(self._bodies, settings)
+        self._half_section = half_section(template)
         self._directions = directions(self._bodies.coarse)
 
     def _make_solver(self) -> Solver:
@@ -200,6 +209,7 @@ class Fitter:
             length_std_ratio=size_std,
             candidate=self._index,
             shape_std_ratio=self._shape_std(target, parameters),
+            height_ratio=self._height_ratio(parameters),
         )
 
     def _shape_std(self, target: Target, parameters: Float[np.ndarray, "P"]) -> float | None:
@@ -208,6 +218,11 @@ class Fitter:
             return None
         problem = self._problem(self._bodies.coarse, target.coarse())
         return shape_std_ratio(problem, parameters, self._directions, self._shape_covariance)
+
+    def _height_ratio(self, parameters: Float[np.ndarray, "P"]) -> float:
+        """How far the elliptic section at the center reaches along the plane's normal."""
+        R = Rotation.from_rotvec(parameters[ROOT_ROTATION]).as_matrix()
+        return float(np.linalg.norm(self._half_section * (self.plane_normal @ R)[1:]))
 
     def _problem(self, body: Body, target: Target) -> Problem:
         return Problem.from_settings(self._settings, body, target, with_smoothness=True)

@@ -42,6 +42,10 @@ class LocalizeSettings(Settings):
     refuse_border: bool = Field(
         default=True, description="refuse frames whose mask touches the edge of the picture"
     )
+    rests_on_plane: bool = Field(
+        default=False,
+        description="fish lie on the reference plane, their midline half a thickness above it",
+    )
     plane_std_mm: float = Field(
         default=25.0, gt=0, description="std of the centers' distance from the plane, mm"
     )
@@ -160,6 +164,10 @@ def locate(shape: FittedShape, calibration: Calibration, settings: LocalizeSetti
     if ratio is None:
         raise Unlocatable(Reason.KEYPOINTS_COINCIDE)
     keypoints_mm = locate_keypoints(shape.keypoints, shape.keypoints_px, calibration)
+    if settings.rests_on_plane:
+        chord_mm = float(np.linalg.norm(keypoints_mm[0] - keypoints_mm[2]))
+        height_mm = (shape.height_ratio or 0.0) * chord_mm * ratio
+        keypoints_mm = raised(keypoints_mm, height_mm, calibration.plane)
     chord_mm = float(np.linalg.norm(keypoints_mm[0] - keypoints_mm[2]))
     length_mm = chord_mm * ratio if settings.bending else chord_mm
     slant_rad = slant(keypoints_mm)
@@ -181,6 +189,18 @@ def locate(shape: FittedShape, calibration: Calibration, settings: LocalizeSetti
         length_std_mm=std_mm if np.isfinite(std_mm) else None,
         slant_rad=slant_rad,
     )
+
+
+def raised(
+    keypoints_mm: Float[np.ndarray, "3 3"], height_mm: float, plane: ReferencePlane
+) -> Float[np.ndarray, "3 3"]:
+    """The keypoints of a fish that rests on the plane, its center above it by its own height.
+
+    Along its rays a fish of height h grows with its distance from the camera; at distance D of the
+    plane it would be h high. Nearer by its own height, d = D - h d / D, so d / D = 1 / (1 + h / D).
+    """
+    distance_mm = abs(float(plane.rotation[:, 2] @ plane.translation_mm))
+    return keypoints_mm / (1.0 + height_mm / distance_mm)
 
 
 def bend(shape: FittedShape) -> float | None:

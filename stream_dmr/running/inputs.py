@@ -10,6 +10,7 @@ from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.recording.messages.header import RunHeader
 from stream_dmr.recording.messages.run_inputs import InputFile, RunInputs
+from stream_dmr.running.conditions import lying, stills
 from stream_dmr.running.config import Config, load_config, to_toml
 from stream_dmr.running.kept_crops import KeptCrops
 from stream_dmr.running.run_request import RunRequest
@@ -85,6 +86,10 @@ def checked_inputs(request: RunRequest) -> Inputs:
     Raises a UserError where one of them is wrong.
     """
     config = load_config(request.config)
+    if request.pose == "lying":
+        config = lying(config)
+    if request.stills:
+        config = stills(config)
     template, candidates = load_shapes(request.template)
     calibration = None if request.calibration is None else load_calibration(request.calibration)
     finder = open_finder(

@@ -4,6 +4,7 @@ import re
 import shlex
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Literal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,6 +17,8 @@ class RunRequest:
     boxes: Path | None = None
     masks: Path | None = None
     template: str = "auto"  # or the name of a body form, or a path
+    pose: Literal["hanging", "lying"] = "hanging"  # lying: flat on the reference plane
+    stills: bool = False  # every picture stands for itself
     config: Path | None = None
     overwrite: bool = False  # replace the results of an earlier run in `out`
     resume: bool = False  # go on after them; a live source always does

@@ -27,6 +27,8 @@ LOBES = THICKNESS.stop
 NUM_COEFFICIENTS = LOBES + 1
 _TAIL_FROM = 0.9  # where the tail's fin begins
 
+_NEAR_CENTER = 0.1  # body lengths: some rings of any template
+
 # The mean log breadth of the trunk, between head and peduncle, as a row over the coefficients.
 TRUNK = np.zeros(NUM_COEFFICIENTS)
 TRUNK[2:8] = TRUNK[_NUM_SIDE + 2 : _NUM_SIDE + 8] = 1 / 12
@@ -79,6 +81,12 @@ def reshaped(template: Template, coefficients: Float[np.ndarray, "W"]) -> Templa
     if total_per_fork is not None:
         total_per_fork = max(total_per_fork + float(coefficients[LOBES]), 1.0)
     return replace(template, rest_vertices=feet + moved, total_per_fork=total_per_fork)
+
+
+def half_section(template: Template) -> Float[np.ndarray, "2"]:
+    """Half the breadth and half the thickness (body lengths) around the center keypoint."""
+    near = np.abs(template.rest_vertices[:, 0] - template.keypoints[1, 0]) < _NEAR_CENTER
+    return np.abs(template.rest_vertices[near, 1:] - template.keypoints[1, 1:]).max(axis=0)
 
 
 def coefficients_of(other: Template, template: Template) -> Float[np.ndarray, "W"]:

@@ -1,0 +1,42 @@
+"""What `--pose lying` and `--stills` say of a source, as settings; the user's own come first."""
+
+from typing import Any
+
+from stream_dmr.running.config import Config
+from stream_dmr.settings import Settings
+
+# Fish that lie on the reference plane, by table: they tilt by a few degrees at most, bend a little,
+# mostly within the plane, and are off it by what the plane itself was measured to.
+_LYING: dict[str, dict[str, Any]] = {
+    "fit_mesh": {"tilt_std_rad": 0.05, "bend_std_rad": 0.15, "twist_std_rad": 0.05},
+    "localize": {"rests_on_plane": True, "plane_std_mm": 3.0, "slant_std_rad": 0.03},
+}
+# Pictures that stand for themselves: none follows another, and one good one gives a length. Ten
+# seconds between them are more than anything in `[smooth_length]` remembers, but for the track.
+_STILLS: dict[str, dict[str, Any]] = {
+    "read_frames": {"images_fps": 0.1},
+    "detect_fish": {"detector": "unet"},  # nothing moves
+    "track_fish": {"min_track_frames": 1, "max_lost_frames": 0},
+    "smooth_length": {"min_frames": 1, "track_timeout_s": 1e9},
+}
+
+
+def lying(config: Config) -> Config:
+    """The settings for fish that lie on the reference plane."""
+    return _with(config, _LYING)
+
+
+def stills(config: Config) -> Config:
+    """The settings for pictures of which each stands for itself."""
+    return _with(config, _STILLS)
+
+
+def _with(config: Config, changes: dict[str, dict[str, Any]]) -> Config:
+    """With these values wherever the user has left the default."""
+    default = Config()
+    tables: dict[str, Settings] = {}
+    for name, values in changes.items():
+        table, usual = getattr(config, name), getattr(default, name)
+        free = {k: v for k, v in values.items() if getattr(table, k) == getattr(usual, k)}
+        tables[name] = table.model_copy(update=free)
+    return config.model_copy(update=tables)
