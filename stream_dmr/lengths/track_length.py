@@ -145,13 +145,13 @@ class TrackLength:
     ) -> Float[np.ndarray, "N"]:
         """Std from the filter's variance and from what frames of one fish have in common."""
         assert self._filter is not None
-        shared = (self._settings.common_std_ratio**2 + self._shape_variance()) * length_mm**2
+        shared = (self._settings.common_std_ratio * length_mm) ** 2
+        shared += (self._shape_std_ratio() * length_mm) ** 2
         return np.sqrt(variance * self._filter.design_effect + shared)
 
-    def _shape_variance(self) -> float:
-        """Of the log length, since the fish's own shape isn't known: frames in their mean."""
-        stds = [measurement.shape_std_ratio for measurement in self._measurements]
-        return float(np.mean(stds)) ** 2
+    def _shape_std_ratio(self) -> float:
+        """Of the log length, since the fish's own shape isn't known: the frames' mean."""
+        return float(np.mean([measurement.shape_std_ratio for measurement in self._measurements]))
 
     def _status(self, num_used: int, *, is_measured: bool, is_final: bool) -> str:
         if Reason.NO_CALIBRATION in self._refused:
