@@ -38,13 +38,13 @@ ROOMS = [
     "stream_dmr.results",
     "stream_dmr.recording.recorder",
     "stream_dmr.recording.segments",
-    "stream_dmr.recording.files",
-    "stream_dmr.recording.foxglove",
+    "stream_dmr.recording.segments.recording_files",
+    "stream_dmr.recording.mcap.foxglove_topics",
     "stream_dmr.recording.reading",
     "stream_dmr.recording.rerun",
     "stream_dmr.recording.mcap",
     "stream_dmr.recording.messages",
-    "stream_dmr.recording.settings",
+    "stream_dmr.recording.messages.recording_settings",
     "stream_dmr.recording",
     "stream_dmr.lengths",
     "stream_dmr.localization",
@@ -92,7 +92,7 @@ ROOMS = [
     "stream_dmr.errors",
     "stream_dmr.version",
 ]
-WITHOUT_MODULES = ["stream_dmr.recording", "stream_dmr.fitting", "stream_dmr.segmentation"]
+WITHOUT_MODULES = ["stream_dmr.fitting", "stream_dmr.segmentation"]
 WHO_KNOWS = {
     "av": ["stream_dmr.recording"],
     "mcap": ["stream_dmr.recording"],

@@ -22,11 +22,11 @@ import numpy as np
 
 from stream_dmr.calibration.calibration_file import save_calibration
 from stream_dmr.messages import Frame, LengthEstimate, Message
-from stream_dmr.recording.mcap.sink import McapSink
-from stream_dmr.recording.messages.codec import encode, reference
+from stream_dmr.recording.mcap.mcap_sink import McapSink
+from stream_dmr.recording.messages.codec import encode, stored_picture
 from stream_dmr.recording.messages.record import Record
 from stream_dmr.recording.messages.topics import TOPICS
-from stream_dmr.recording.reading.reader import Recording, messages, open_recordings
+from stream_dmr.recording.reading.open_recording import Recording, decoded_messages, open_recordings
 
 
 def main() -> None:
@@ -67,7 +67,7 @@ def cpu_s() -> float:
 
 def repeated(run: Recording, *, minutes: float) -> Iterator[Record]:
     """The records of a run, again and again."""
-    found = list(messages(run, list(TOPICS)))
+    found = list(decoded_messages(run, list(TOPICS)))
     times = sorted({message.timestamp_ns for message, _ in found if isinstance(message, Frame)})
     period_ns = times[-1] - times[0] + (times[-1] - times[0]) // (len(times) - 1)
     num_tracks = max(getattr(message, "track_id", 0) for message, _ in found)
@@ -75,7 +75,7 @@ def repeated(run: Recording, *, minutes: float) -> Iterator[Record]:
     for k in rounds:
         for message, payload in found:
             shifted = shift(message, frames=k * len(times), ns=k * period_ns, ids=k * num_tracks)
-            picture = reference(payload) if isinstance(message, Frame) else None
+            picture = stored_picture(payload) if isinstance(message, Frame) else None
             encoding = partial(encode, shifted, picture=picture)
             yield Record(message=shifted, whole=shifted, encoding=encoding)
 

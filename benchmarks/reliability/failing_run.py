@@ -15,7 +15,7 @@ from benchmarks.reliability.kills import messages, unreadable_ones
 from benchmarks.reliability.small_scene import write_crossing_fish, write_small_scene
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import Frame
-from stream_dmr.recording.segments.recover import recover
+from stream_dmr.recording.segments.repair import repair_recordings
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.running.run_request import RunRequest
@@ -89,7 +89,7 @@ def measure(case: Case) -> dict:
     writes = ctypes.CDLL(None).disturb_seen()
     disturb_writes(out, first=1, count=0, error=0)
     parts = [path.name for path in out.glob("*.part*") if path.suffix != ".damaged"]
-    list(recover(out))
+    list(repair_recordings(out))
     return {
         "writes": writes,
         "refused": refused,

@@ -19,8 +19,8 @@ from benchmarks.reliability.small_scene import write_small_scene
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import FishCrop, Frame, LengthEstimate, LocalizedFish
 from stream_dmr.recording.messages.codec import decode
-from stream_dmr.recording.reading.reader import open_recordings
-from stream_dmr.recording.segments.recover import recover
+from stream_dmr.recording.reading.open_recording import open_recordings
+from stream_dmr.recording.segments.repair import repair_recordings
 
 M = TypeVar("M", Frame, FishCrop, LocalizedFish, LengthEstimate)
 _STARTING, _RUNNING, _CUTTING = "while it starts", "while it measures", "while a segment ends"
@@ -82,7 +82,7 @@ class KilledMeasurement:
                 if time.monotonic() > until_s:
                     break
                 self._kill_once(number)
-            list(recover(self._run.out))
+            list(repair_recordings(self._run.out))
         finally:
             self._run.camera.lose()
         self._look()

@@ -6,12 +6,12 @@ import sqlite3
 from pathlib import Path
 
 from benchmarks.reliability.kills import unreadable_ones
-from stream_dmr.recording.mcap.sink import McapSink
+from stream_dmr.recording.mcap.mcap_sink import McapSink
 from stream_dmr.recording.messages.record import make_record
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.topics import TOPICS
-from stream_dmr.recording.reading.reader import open_recordings
-from stream_dmr.recording.segments.recover import recover
-from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.reading.open_recording import open_recordings
+from stream_dmr.recording.segments.repair import repair_recordings
 from tests.results.test_store import FACTS, LengthStore, fish
 from tests.support.recorded_run import header, run
 
@@ -69,7 +69,7 @@ def power_cuts_of_recordings(folder: Path, *, count: int, seed: int = 0) -> dict
         live, cut = folder / "live", folder / "cut"
         live.mkdir(parents=True)
         cut.mkdir()
-        sink = Watched(live / _NAME, header(), flush_s=0.01, number=1)
+        sink = Watched(live / _NAME, header(), flush_s=0.01, segment_number=1)
         for message in messages[: rng.randint(1, len(messages))]:
             sink.write(make_record(message, settings))
         (num_durable, size), part = sink.durable, f"{_NAME}.part"
@@ -78,7 +78,7 @@ def power_cuts_of_recordings(folder: Path, *, count: int, seed: int = 0) -> dict
         rubbish = rng.randbytes(rng.randint(0, 4096)) if rng.random() < 0.5 else b""
         (cut / part).write_bytes(data[:at] + rubbish)
         sink.close()
-        list(recover(cut))
+        list(repair_recordings(cut))
         checked: set[Path] = set()
         unreadable += unreadable_ones(cut, checked) or len(checked) != 1
         kept = list(open_recordings([cut / _NAME]).payloads(TOPICS)) if checked else []

@@ -13,10 +13,10 @@ from stream_dmr.api.table_rows import FishRow, FrameRow, read_rows
 from stream_dmr.camera import Calibration
 from stream_dmr.csv_file import rotated_files
 from stream_dmr.messages import Message
-from stream_dmr.recording.messages.selection import Part
-from stream_dmr.recording.reading.reader import messages, open_recordings
-from stream_dmr.replaying.replay import ReplayRequest
+from stream_dmr.recording.messages.selection import Selection
+from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
 from stream_dmr.replaying.replay import replay as replay_recordings
+from stream_dmr.replaying.replay_request import ReplayRequest
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.running.run_request import RunRequest, command_of, default_out
@@ -61,7 +61,7 @@ class RecordedRun:
 
     paths: Sequence[Path]
     kinds: Collection[type[Message]]
-    part: Part
+    selection: Selection
     calibration: Calibration | None  # None: there are no millimetres
     template: Template
     config_toml: str  # every setting of the run
@@ -73,7 +73,7 @@ class RecordedRun:
         recording is damaged; what a crash cut off is logged as a warning, and the rest read.
         """
         recording = open_recordings(self.paths)
-        for message, _ in messages(recording, self.kinds, self.part):
+        for message, _ in decoded_messages(recording, self.kinds, self.selection):
             yield message
         for line in recording.warnings:
             _LOGGER.warning(line)
@@ -153,7 +153,7 @@ def replay(
         config=_path(config),
         calibration=_path(calibration),
         template=None if template is None else str(template),
-        part=Part.of_seconds(time_s, frozenset(tracks) or None),
+        selection=Selection.from_seconds(time_s, frozenset(tracks) or None),
         out=Path(out),
         overwrite=overwrite,
     )
@@ -180,7 +180,7 @@ def open(
     return RecordedRun(
         paths=paths,
         kinds=get_args(Message) if kinds is None else kinds,
-        part=Part.of_seconds(time_s, frozenset(tracks) or None),
+        selection=Selection.from_seconds(time_s, frozenset(tracks) or None),
         calibration=header.calibration,
         template=header.template,
         config_toml=header.config_toml,

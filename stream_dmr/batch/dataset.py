@@ -16,7 +16,7 @@ from pyarrow import Table, parquet
 from stream_dmr.batch.layout import TABLE_KINDS, dataset_file
 from stream_dmr.batch.manifest import Job
 from stream_dmr.errors import OutputError
-from stream_dmr.recording.reading.reader import open_recordings
+from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.results.finished_fish import FishResult, read_fish
 from stream_dmr.results.fish_table import FISH_TABLE, arrow_schema, fish_record
 from stream_dmr.results.frames_table import FRAMES_COLUMNS

@@ -115,7 +115,7 @@ def print_check(summary: ReplaySummary) -> None:
     for item in found[:_MOST_SHOWN]:
         print(
             f"frame {item.frame_index}, fish {item.track_id}, {item.kind}, "
-            f"{item.difference.field}: recorded {item.difference.logged}, "
+            f"{item.difference.field}: recorded {item.difference.recorded}, "
             f"now {item.difference.computed}"
         )
     if len(found) > _MOST_SHOWN:

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from stream_dmr.cli.support import TimeOption, TrackOption, parse_part, warn
+from stream_dmr.cli.support import TimeOption, TrackOption, parse_selection, warn
 
 Meshes = Literal["ply", "glb"]
 Tables = Literal["csv", "parquet"]
@@ -46,7 +46,7 @@ def export(
     from stream_dmr.results.export import Export
     from stream_dmr.running.config import load_config, parse_config
 
-    exported = Export(recording, parse_part(time, track))
+    exported = Export(recording, parse_selection(time, track))
     exported.claim(out)
     if meshes:
         print(f"{out / 'meshes'}: {exported.meshes(out / 'meshes', format=meshes)} meshes")

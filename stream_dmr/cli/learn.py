@@ -11,7 +11,7 @@ from stream_dmr.cli.support import ConfigOption, warn
 
 if TYPE_CHECKING:
     from stream_dmr.messages import FishCrop
-    from stream_dmr.recording.reading.reader import Recording
+    from stream_dmr.recording.reading.open_recording import Recording
 
 _IDS = 1_000_000  # between the fish of one recording and those of the next
 
@@ -37,7 +37,7 @@ def learn_template(
     from stream_dmr.fitting.learn_shapes import learn_shapes
     from stream_dmr.fitting.shape.candidates import load_shapes, mesh_form
     from stream_dmr.fitting.shape.describe import describe
-    from stream_dmr.recording.reading.reader import open_recordings
+    from stream_dmr.recording.reading.open_recording import open_recordings
     from stream_dmr.running.config import load_config, parse_config
     from stream_dmr.running.shape_pass import save_stocks
 
@@ -77,9 +77,9 @@ def learn_template(
 def _crops(recordings: "list[Recording]") -> "Iterator[FishCrop]":
     """The crops of all, with ids of their own."""
     from stream_dmr.messages import FishCrop
-    from stream_dmr.recording.reading.reader import messages
+    from stream_dmr.recording.reading.open_recording import decoded_messages
 
     for number, recording in enumerate(recordings):
-        for message, _ in messages(recording, [FishCrop]):
+        for message, _ in decoded_messages(recording, [FishCrop]):
             if isinstance(message, FishCrop):
                 yield replace(message, track_id=message.track_id + number * _IDS)

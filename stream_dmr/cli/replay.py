@@ -9,7 +9,7 @@ from stream_dmr.cli.support import (
     TimeOption,
     TrackOption,
     command_line,
-    parse_part,
+    parse_selection,
     stop_on_signals,
 )
 
@@ -59,8 +59,8 @@ def replay(
 ) -> None:
     """Compute a recording anew from one stage on, with its own inputs or with others."""
     from stream_dmr.cli.display import RunDisplay, print_check, print_fish, print_timings
-    from stream_dmr.replaying.replay import ReplayRequest
     from stream_dmr.replaying.replay import replay as replay_recording
+    from stream_dmr.replaying.replay_request import ReplayRequest
 
     request = ReplayRequest(
         recordings=recordings,
@@ -71,7 +71,7 @@ def replay(
         source=source,
         boxes=boxes,
         masks=masks,
-        part=parse_part(time, track),
+        selection=parse_selection(time, track),
         out=out,
         overwrite=overwrite,
         check=check,

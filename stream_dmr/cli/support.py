@@ -15,7 +15,7 @@ import typer
 from stream_dmr.running.run_request import without_password
 
 if TYPE_CHECKING:
-    from stream_dmr.recording.messages.selection import Part
+    from stream_dmr.recording.messages.selection import Selection
 
 TemplateOption = Annotated[
     str,
@@ -47,12 +47,12 @@ def warn(lines: Iterable[str]) -> None:
         print(f"warning: {line}", file=sys.stderr)
 
 
-def parse_part(time: str | None, track: list[int] | None) -> "Part":
+def parse_selection(time: str | None, track: list[int] | None) -> "Selection":
     """The part of a recording that --time and --track ask for."""
-    from stream_dmr.recording.messages.selection import Part
+    from stream_dmr.recording.messages.selection import Selection
 
     time_s = None if time is None else _parse_time(time)
-    return Part.of_seconds(time_s, frozenset(track) if track else None)
+    return Selection.from_seconds(time_s, frozenset(track) if track else None)
 
 
 def _parse_time(text: str) -> tuple[float, float]:

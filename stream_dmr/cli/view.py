@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stream_dmr.cli.support import TimeOption, TrackOption, parse_part, warn
+from stream_dmr.cli.support import TimeOption, TrackOption, parse_selection, warn
 
 if TYPE_CHECKING:
-    from stream_dmr.recording.messages.selection import Part
+    from stream_dmr.recording.messages.selection import Selection
 
 _Source = Annotated[
     str | None,
@@ -46,7 +46,7 @@ def view(
 
     for number in (signal.SIGINT, signal.SIGTERM):  # the viewer's process must end with us
         signal.signal(number, lambda number, _: sys.exit(128 + number))
-    with _as_rrd(recording, source, parse_part(time, track)) as rrd:
+    with _as_rrd(recording, source, parse_selection(time, track)) as rrd:
         if screenshot is not None:
             viewer.screenshot(rrd, screenshot, frame_index=frame)
             print(screenshot)
@@ -75,16 +75,21 @@ def convert(
     rrd = out or (
         recording / "recording.rrd" if recording.is_dir() else recording.with_suffix(".rrd")
     )
-    _convert(recording, rrd, source, parse_part(time, track), full_size=full_size)
+    _convert(recording, rrd, source, parse_selection(time, track), full_size=full_size)
     print(rrd)
 
 
 def _convert(
-    recording: Path, rrd: Path, source: str | None, part: "Part", *, full_size: bool = False
+    recording: Path,
+    rrd: Path,
+    source: str | None,
+    selection: "Selection",
+    *,
+    full_size: bool = False,
 ) -> None:
     from stream_dmr.errors import RecordingError
-    from stream_dmr.recording.reading.convert import EVERY_FRAME
-    from stream_dmr.recording.reading.convert import convert as convert_recording
+    from stream_dmr.recording.reading.rrd_conversion import EVERY_FRAME
+    from stream_dmr.recording.reading.rrd_conversion import convert as convert_recording
     from stream_dmr.sources.open_source import open_source
     from stream_dmr.sources.read_settings import ReadFramesSettings
 
@@ -95,22 +100,24 @@ def _convert(
         frames = None
         if source is not None:
             frames = stack.enter_context(closing(open_source(source, ReadFramesSettings())))
-        lost = convert_recording(recording, rrd, frames=frames, settings=settings, part=part)
+        lost = convert_recording(
+            recording, rrd, frames=frames, settings=settings, selection=selection
+        )
     warn(lost)
 
 
 @contextmanager
-def _as_rrd(recording: str, source: str | None, part: "Part") -> Iterator[str]:
+def _as_rrd(recording: str, source: str | None, selection: "Selection") -> Iterator[str]:
     """An .rrd or address as it is; an .mcap, a part, and with a source, drawn anew."""
     if "://" in recording:
         yield recording
         return
     path = Path(recording)
     drawn = path / "recording.rrd" if path.is_dir() else path
-    if drawn.suffix == ".rrd" and drawn.is_file() and source is None and part.is_whole:
+    if drawn.suffix == ".rrd" and drawn.is_file() and source is None and selection.is_everything:
         yield str(drawn.resolve())
         return
     with tempfile.TemporaryDirectory() as folder:
         rrd = Path(folder) / "recording.rrd"
-        _convert(path, rrd, source, part)
+        _convert(path, rrd, source, selection)
         yield str(rrd)

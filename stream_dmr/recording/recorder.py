@@ -1,4 +1,4 @@
-"""Records a run: every message of every stage, to every sink."""
+"""Records a run: writes every message of every stage to every sink."""
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -11,22 +11,23 @@ from types import TracebackType
 from stream_dmr.errors import OutputError
 from stream_dmr.files import make_folder
 from stream_dmr.messages import Message
-from stream_dmr.recording.files import Flushing, OpenSinks, Sink, open_files
-from stream_dmr.recording.messages.header import RunHeader
 from stream_dmr.recording.messages.record import Record, make_record
-from stream_dmr.recording.rerun.live import LiveView
-from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
+from stream_dmr.recording.messages.run_header import RunHeader
+from stream_dmr.recording.messages.sink import BufferedSink, Sink, SinkFactory
+from stream_dmr.recording.rerun.live_view import LiveView
+from stream_dmr.recording.segments.recording_files import open_recording_files
 
-_QUEUE_MESSAGES = 64  # some 6 frames; where the disk can't keep up, the run waits: nothing is lost
-_SHORTEST_PAUSE_S = 0.05
+_MAX_QUEUED = 64  # messages, some six frames; where the disk can't keep up, the run waits
+_MIN_PAUSE_S = 0.05  # between two looks for what is due, whatever `flush_s` says
 
 
 class Recorder:
     """Writes recording.mcap and .rrd, or segments of them, into one folder.
 
-    A thread of its own encodes and writes, so that measuring waits for no disk. Thread-safe; the
-    messages of one stage must come in their order. Raises OutputError where the folder can't be
-    written to: here, at the next `write`, or at `close`.
+    It encodes and writes in a thread of its own, so that measuring does not wait for the disk.
+    Thread-safe; the messages of one stage must come in their order. Raises OutputError where the
+    folder can't be written to: at once, at the next `write`, or at `close`.
     """
 
     def __init__(
@@ -37,27 +38,26 @@ class Recorder:
         *,
         live: bool = False,
         sinks: Sequence[Sink] = (),
-        files: OpenSinks = open_files,
+        files: SinkFactory = open_recording_files,
         on_refusal: Callable[[str], None] | None = None,
         in_one_thread: bool = False,
     ) -> None:
-        """With `live`, the view is served as well, at `live_address`.
+        """Open all sinks: `sinks`, which get each record first, then those that `files` opens.
 
-        Each of `sinks` gets every record as well, before the recording does, and is closed with it.
-        `files` opens those of the recording: `open_files` or, for a run without an end,
-        `open_segments`. With `on_refusal`, that is told what the disk refuses, instead of an
-        exception, and each sink is tried again with what follows: measuring goes on. With
-        `in_one_thread` that of the caller does it all, as in `run_chain`.
+        `files` is `open_recording_files` or, for a source without an end, `open_segments`. With
+        `live` the view is served as well, at `live_address`. `on_refusal` is called with what the
+        disk refuses, instead of an exception, and the sink is tried again with the next record.
+        With `in_one_thread` everything is written in the caller's thread.
         """
         self.live_address: str | None = None
         self._on_refusal = on_refusal
         self._settings = settings
         self._sinks: list[Sink] = [*sinks]
-        self._refused: list[Sink] = []
+        self._failed_sinks: list[Sink] = []
         self._failure: BaseException | None = None
         self._lock = Lock()
-        self._queue: Queue[Record | None] = Queue(_QUEUE_MESSAGES)
-        self._thread = Thread(target=self._write_all, name="recorder", daemon=True)
+        self._queue: Queue[Record | None] = Queue(_MAX_QUEUED)
+        self._thread = Thread(target=self._write_queued, name="recorder", daemon=True)
         self._in_one_thread, self._is_open = in_one_thread, True
         with ExitStack() as undo:
             undo.callback(self._close_sinks)
@@ -71,11 +71,11 @@ class Recorder:
             self._thread.start()
 
     def write(self, message: Message) -> Message:
-        """Record a message; returns it as a replay will read it back.
+        """Record a message and return it as a replay will read it.
 
-        Hand the returned message on to the next stage: only then does a replay repeat the run
-        exactly. With a lossy picture setting its pixels are those that the recording holds, and
-        what is not recorded it lacks; only a frame by reference keeps its pixels.
+        The next stage must get the returned message: only then does a replay repeat the run
+        exactly. It has the recording's pixels where pictures are lossy, and lacks what is not
+        recorded; only a frame by reference keeps its own pixels.
         """
         if not self._is_open:
             raise ValueError("the recorder is closed")
@@ -84,7 +84,7 @@ class Recorder:
         return record.message
 
     def put(self, record: Record) -> None:
-        """Record a message as it is encoded already."""
+        """Record a message that is encoded already."""
         if self._in_one_thread:
             self._write_to_all(record)
         else:
@@ -92,9 +92,9 @@ class Recorder:
         self._raise_failure()
 
     def close(self) -> None:
-        """Write what is waiting and close every sink, also where another one fails. Idempotent.
+        """Write what is queued and close every sink, also where another one fails. Idempotent.
 
-        A failure that was not yet raised is raised then.
+        Raises the first failure that was not raised yet.
         """
         if self._is_open:
             self._is_open = False
@@ -115,15 +115,15 @@ class Recorder:
     ) -> None:
         self.close()
 
-    def _write_all(self) -> None:
-        """What is kept for a moment is written then, also where nothing follows it."""
-        pause_s = max(self._settings.flush_s, _SHORTEST_PAUSE_S)
+    def _write_queued(self) -> None:
+        """Write queued records; where none comes, let the sinks flush what they have buffered."""
+        pause_s = max(self._settings.flush_s, _MIN_PAUSE_S)
         while True:
             try:
                 record = self._queue.get(timeout=pause_s)
             except Empty:
                 for sink in self._sinks:
-                    if isinstance(sink, Flushing):
+                    if isinstance(sink, BufferedSink):
                         self._try(sink, sink.flush_due)
                 continue
             if record is None:
@@ -136,11 +136,11 @@ class Recorder:
             self._try(sink, partial(sink.write, record))
 
     def _try(self, sink: Sink, write: Callable[[], None]) -> None:
-        """Let one sink write; once it has failed, never again.
+        """Let one sink write; without `on_refusal`, one that failed is not tried again.
 
-        The others go on: where the pictures no longer have room, the lengths still may.
+        The others go on: where there is no room for pictures, there may still be for lengths.
         """
-        if sink in self._refused:
+        if sink in self._failed_sinks:
             return
         try:
             write()
@@ -148,13 +148,12 @@ class Recorder:
             if self._on_refusal is not None:
                 self._on_refusal(str(error))
                 return
-            self._refused.append(sink)
-            self._fail(error)
-        except Exception as error:  # whatever it is, the run must hear of it
-            self._refused.append(sink)
-            self._fail(error)
+            self._fail(sink, error)
+        except Exception as error:  # whatever it is, the run must be told
+            self._fail(sink, error)
 
-    def _fail(self, error: BaseException) -> None:
+    def _fail(self, sink: Sink, error: BaseException) -> None:
+        self._failed_sinks.append(sink)
         with self._lock:
             self._failure = self._failure or error
 
@@ -167,9 +166,9 @@ class Recorder:
     def _close_sinks(self) -> None:
         with ExitStack() as stack:
             for sink in self._sinks:
-                stack.callback(self._close_one, sink)
+                stack.callback(self._close_sink, sink)
 
-    def _close_one(self, sink: Sink) -> None:
+    def _close_sink(self, sink: Sink) -> None:
         try:
             sink.close()
         except OutputError as error:

@@ -1,4 +1,4 @@
-"""What two messages of one type differ in, to the last bit."""
+"""The fields in which two messages of one type differ, compared to the last bit."""
 
 import struct
 from collections.abc import Iterator, Mapping
@@ -7,31 +7,30 @@ from typing import NamedTuple
 
 import numpy as np
 
-# The one field of all messages that no replay can repeat.
-UNREPEATABLE = {"elapsed_ns"}
-_MOST_SHOWN = 60  # characters of a value
+UNREPEATABLE = {"elapsed_ns"}  # wall clock: the one field that no replay can repeat
+_MAX_SHOWN = 60  # characters of a value, so that both fit in a line
 
 
 class Difference(NamedTuple):
     """One field of one message."""
 
-    field: str  # "shape.losses.iou"
-    logged: str
+    field: str  # its path, such as "shape.losses.iou"
+    recorded: str
     computed: str
 
 
-def differences(logged: object, computed: object, *, field: str = "") -> Iterator[Difference]:
-    """Every field in which two values differ. Numbers are equal when their bits are: NaN is NaN."""
-    if is_dataclass(logged) and type(logged) is type(computed):
-        for part in fields(logged):
+def differences(recorded: object, computed: object, *, field: str = "") -> Iterator[Difference]:
+    """Every field in which two values differ. Numbers are equal if their bits are, also NaN."""
+    if is_dataclass(recorded) and type(recorded) is type(computed):
+        for part in fields(recorded):
             if part.name not in UNREPEATABLE:
                 yield from differences(
-                    getattr(logged, part.name),
+                    getattr(recorded, part.name),
                     getattr(computed, part.name),
                     field=f"{field}.{part.name}".lstrip("."),
                 )
-    elif not _is_same(logged, computed):
-        yield Difference(field, _shown(logged, computed), _shown(computed, logged))
+    elif not _is_same(recorded, computed):
+        yield Difference(field, _shown(recorded, computed), _shown(computed, recorded))
 
 
 def _is_same(a: object, b: object) -> bool:
@@ -47,7 +46,7 @@ def _is_same(a: object, b: object) -> bool:
 
 
 def _shown(value: object, other: object) -> str:
-    """A value in a line; of arrays of one shape, the first entry that differs."""
+    """A value as one line; of arrays of one shape the first entry that differs."""
     if isinstance(value, np.ndarray) and isinstance(other, np.ndarray):
         if value.shape != other.shape or value.dtype != other.dtype:
             return f"{value.dtype} array of shape {value.shape}"
@@ -58,4 +57,4 @@ def _shown(value: object, other: object) -> str:
         where = "".join(f"[{int(i)}]" for i in entry)
         return f"{where} {value.ravel()[first]!r} ({count} of {value.size} differ)"
     text = repr(str(value) if isinstance(value, str) else value)
-    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."

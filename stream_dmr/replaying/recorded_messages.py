@@ -1,112 +1,116 @@
-"""The recorded messages, and the nodes that give them instead of computing them."""
+"""The recorded messages, and nodes that return them instead of computing them."""
 
 from collections.abc import Iterator, Sequence
 
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LocalizedFish, Message
 from stream_dmr.recording.messages.codec import decode
-from stream_dmr.recording.messages.selection import WHOLE, Part
-from stream_dmr.recording.reading.frame_images import RecordedPictures, Restorer, is_as_seen
-from stream_dmr.recording.reading.reader import Recording, messages
+from stream_dmr.recording.messages.selection import EVERYTHING, Selection
+from stream_dmr.recording.reading.frame_images import (
+    FrameRestorer,
+    RecordedPictures,
+    has_original_pixels,
+)
+from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
 
 
-class Tape:
-    """The recorded messages of each kind, in their order."""
+class RecordedMessages:
+    """The selected messages of a recording, type by type, each in their order."""
 
-    def __init__(self, recording: Recording, part: Part = WHOLE) -> None:
+    def __init__(self, recording: Recording, selection: Selection = EVERYTHING) -> None:
         self._recording = recording
-        self._part = part
+        self._selection = selection
         self.notes: list[str] = []  # what the user should know of this replay
-        self._payloads: dict[int, bytes] = {}  # of messages on their way to a new recording
+        self._payloads: dict[int, bytes] = {}  # by id() of messages on their way through the chain
 
     @property
     def ends_early(self) -> bool:
-        """Whether more followed than was recorded."""
+        """True where the run went on after the end of the recording."""
         return self._recording.ends_early
 
-    def carried(self) -> list[LocalizedFish]:
-        """The frames, before this recording, of fish that were in view when it began.
+    def carried_over(self) -> list[LocalizedFish]:
+        """The frames from before the recording of the tracks that were open when it began.
 
-        A part in time begins without them.
+        None of a selection in time, which begins without them.
         """
-        if self._part.time_ns is not None:
+        if self._selection.time_ns is not None:
             return []
-        fish = [decode(LocalizedFish, payload) for payload in self._recording.carried()]
-        return [message for message in fish if self._part.has(message)]
+        fish = [decode(LocalizedFish, payload) for payload in self._recording.carried_over()]
+        return [message for message in fish if self._selection.includes(message)]
 
-    def messages(self, kind: type[Message], *, keep: bool = True) -> Iterator[Message]:
-        """Those of the wanted tracks and times."""
-        for message, payload in messages(self._recording, [kind], self._part):
-            if keep:
+    def of_type(self, kind: type[Message], *, keep_payloads: bool = True) -> Iterator[Message]:
+        """The messages of one type; `payload` gives the encoding of each that was kept."""
+        for message, payload in decoded_messages(self._recording, [kind], self._selection):
+            if keep_payloads:
                 self._payloads[id(message)] = payload
             yield message
 
     def frames(self) -> Iterator[Frame]:
-        """The frames, without pictures where they were recorded by reference."""
-        for message in self.messages(Frame):
+        """The frames, without images where they were recorded by reference."""
+        for message in self.of_type(Frame):
             assert isinstance(message, Frame)
             yield message
 
-    def pictures(
-        self, found: Restorer | None, *, exact: bool, missing_source: str
+    def frames_with_images(
+        self, restorer: FrameRestorer | None, *, exact: bool, missing_source: str
     ) -> Iterator[Frame]:
-        """The frames with their pictures, `found` or as the recording holds them.
+        """The frames with the images of `restorer`, or with those that the recording holds.
 
-        Raises RecordingError where it holds none, and, with `exact`, where they are not to the
-        last bit those that the run went on from; without it, `notes` says so. `missing_source` says
-        why the source was not found.
+        Raises RecordingError where it holds none (`missing_source` says why the source was not
+        found) and, with `exact`, where they are not the very pixels that the run continued with;
+        without `exact`, `notes` says so.
         """
-        found = found or RecordedPictures(self._recording, self._part)
+        restorer = restorer or RecordedPictures(self._recording, self._selection)
         for frame in self.frames():
             payload = self._payloads.pop(id(frame))
-            whole = found.restore(frame, payload)
-            if whole.image.size == 0:
+            restored = restorer.restore(frame, payload)
+            if restored.image.size == 0:
                 raise RecordingError(
                     f"--from crop: the recording refers to its source's pictures: {missing_source}"
                 )
-            if not is_as_seen(whole, payload):
-                self._note_for_the_eye(exact=exact)
-            self._payloads[id(whole)] = payload
-            yield whole
+            if not has_original_pixels(restored, payload):
+                self._note_lossy_pictures(exact=exact)
+            self._payloads[id(restored)] = payload
+            yield restored
 
-    def _note_for_the_eye(self, *, exact: bool) -> None:
-        line = "the recording's pictures are for the eye, the run saw better ones"
+    def _note_lossy_pictures(self, *, exact: bool) -> None:
+        line = "the recording's pictures are for viewing, the run used better ones"
         if exact:
             raise RecordingError(f"--from crop --check: {line}; give --source")
-        note = f"{line}: crops come out a little otherwise; --source would mend that"
+        note = f"{line}: crops differ a little; give --source to avoid that"
         if note not in self.notes:
             self.notes.append(note)
 
     def payload(self, message: Message) -> bytes:
-        """The encoding of a message that came from here; once."""
+        """The encoding of a message that came from here; only once."""
         return self._payloads.pop(id(message))
 
 
-class Playback:
-    """In place of a node: gives the messages that it gave when it was recorded."""
+class PlaybackNode:
+    """Takes the place of a node and returns the messages that the node returned in the run."""
 
-    def __init__(self, tape: Tape, kind: type[Message]) -> None:
-        self._messages = tape.messages(kind)
+    def __init__(self, recorded: RecordedMessages, kind: type[Message]) -> None:
+        self._messages = recorded.of_type(kind)
         self._next = next(self._messages, None)
 
     def step(self, message: Frame | FishCrop | FittedMesh, /) -> Sequence[Message]:
-        """Give all of a frame, or that of one fish of it."""
-        given: list[Message] = []
+        """The recorded messages of a frame, or that of one fish in a frame."""
+        recorded: list[Message] = []
         while self._next is not None and self._next.frame_index <= message.frame_index:
             if self._next.frame_index == message.frame_index:
                 if not isinstance(message, Frame) and self._track_id() != message.track_id:
                     break
-                given.append(self._next)
+                recorded.append(self._next)
             self._next = next(self._messages, None)
-        return given
+        return recorded
 
     def _track_id(self) -> int:
         return getattr(self._next, "track_id", 0)
 
     def tick(self, timestamp_ns: int, /) -> Sequence[Message]:
-        """Nothing but what was recorded."""
+        """Nothing: `step` returns everything that was recorded."""
         return ()
 
     def close(self) -> Sequence[Message]:
-        """Nothing but what was recorded."""
+        """Nothing: `step` returns everything that was recorded."""
         return ()

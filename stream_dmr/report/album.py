@@ -11,9 +11,9 @@ from jaxtyping import Float, UInt8
 
 from stream_dmr.camera import Camera
 from stream_dmr.errors import SourceError
-from stream_dmr.recording.reading.reader import Recording
-from stream_dmr.recording.rerun.meshes import Meshes
-from stream_dmr.recording.rerun.view_geometry import place
+from stream_dmr.recording.reading.open_recording import Recording
+from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
+from stream_dmr.recording.view.view_geometry import place_fit
 from stream_dmr.report.gather import Track, View
 from stream_dmr.report.pictures import (
     Outlines,
@@ -53,7 +53,7 @@ def make_album(
     Without `source`, the one that the recorded command names is tried. Fish whose pictures are
     nowhere are drawn by their masks. Raises SourceError where a given `source` is another one.
     """
-    meshes = Meshes(recording.header.template, recording.header.candidates)
+    meshes = MeshRebuilder(recording.header.template, recording.header.candidates)
     waiting: defaultdict[int, list[tuple[int, View]]] = defaultdict(list)
     for track_id, track in tracks.items():
         for view in track.views:
@@ -81,7 +81,10 @@ def _frames(
 
 
 def _shot(
-    view: View, meshes: Meshes, recording: Recording, frame: UInt8[np.ndarray, "H W 3"] | None
+    view: View,
+    meshes: MeshRebuilder,
+    recording: Recording,
+    frame: UInt8[np.ndarray, "H W 3"] | None,
 ) -> Shot:
     crop, fit = view.decoded(meshes)
     shape = fit.shape
@@ -90,7 +93,7 @@ def _shot(
     picture = picture_of(crop, frame, size=_LARGE_PX)
     size = crop.mask.shape[0]
     small = cv2.resize(picture, (2 * _THUMB_PX,) * 2, interpolation=cv2.INTER_AREA)
-    vertices, _, midline = place(shape, view.row.fish)
+    vertices, _, midline = place_fit(shape, view.row.fish)
     return Shot(
         view=view,
         crop_camera=crop.crop_camera,

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 
 from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate, LocalizedFish
 from stream_dmr.recording.messages.codec import decode
-from stream_dmr.recording.messages.selection import WHOLE, Part
-from stream_dmr.recording.reading.reader import Recording, messages
-from stream_dmr.recording.rerun.meshes import Meshes
+from stream_dmr.recording.messages.selection import EVERYTHING, Selection
+from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
+from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
 
 Key = tuple[int, int]  # frame index, track id
 
@@ -33,7 +33,7 @@ class View:
         """Better views are larger: used ones first, then those that the mesh fits best."""
         return self.row.estimate.is_frame_used, self.row.fish.iou or 0.0
 
-    def decoded(self, meshes: Meshes) -> tuple[FishCrop, FittedMesh]:
+    def decoded(self, meshes: MeshRebuilder) -> tuple[FishCrop, FittedMesh]:
         """Crop and fit, the fit with its vertices."""
         return decode(FishCrop, self.crop), meshes.with_vertices(decode(FittedMesh, self.fit))
 
@@ -55,21 +55,25 @@ class Track:
         del self.views[keep:]
 
 
-def gather(recording: Recording, *, part: Part = WHOLE, keep: int = 3) -> dict[int, Track]:
+def gather(
+    recording: Recording, *, selection: Selection = EVERYTHING, keep: int = 3
+) -> dict[int, Track]:
     """Every track of a recording with its `keep` best views. Raises RecordingError."""
     tracks: dict[int, Track] = {}
-    for row, crop, fit in _rows(recording, part):
+    for row, crop, fit in _rows(recording, selection):
         tracks.setdefault(row.fish.track_id, Track()).take(row, crop, fit, keep=keep)
     return tracks
 
 
 def _rows(
-    recording: Recording, part: Part
+    recording: Recording, selection: Selection
 ) -> Iterator[tuple[FrameRow, bytes | None, bytes | None]]:
     """Each fish in each frame, with the encodings of its crop and its fit."""
     crops, fits = dict[Key, bytes](), dict[Key, bytes]()
     located = dict[Key, LocalizedFish]()
-    for message, payload in messages(recording, (FishCrop, FittedMesh, *_LENGTHS), part):
+    for message, payload in decoded_messages(
+        recording, (FishCrop, FittedMesh, *_LENGTHS), selection
+    ):
         key = message.frame_index, getattr(message, "track_id", 0)
         match message:
             case FishCrop():

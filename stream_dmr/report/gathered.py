@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from stream_dmr.recording.reading.reader import Recording
+from stream_dmr.recording.reading.open_recording import Recording
 from stream_dmr.report.album import Album
 from stream_dmr.report.gather import Track
 from stream_dmr.results.finished_fish import FishResult

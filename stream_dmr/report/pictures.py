@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from stream_dmr.camera import Camera, crop_from_frame
 from stream_dmr.messages import FishCrop, FittedShape, Frame
-from stream_dmr.recording.messages.selection import WHOLE
+from stream_dmr.recording.messages.selection import EVERYTHING
 from stream_dmr.recording.reading.frame_images import RecordedPictures, SourcePictures
-from stream_dmr.recording.reading.reader import Recording, messages
+from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
 from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
@@ -93,7 +93,7 @@ def frames_of(
     SourceError where the source is not the recorded one.
     """
     with closing(_Pictures(recording, source)) as pictures:
-        for message, payload in messages(recording, [Frame], WHOLE):
+        for message, payload in decoded_messages(recording, [Frame], EVERYTHING):
             if message.frame_index in wanted and isinstance(message, Frame):
                 frame = pictures.restorer.restore(message, payload)
                 if frame.image.size:
@@ -112,7 +112,7 @@ class _Pictures:
     def __init__(self, recording: Recording, source: str | None) -> None:
         self._source = None if source is None else open_source(source, ReadFramesSettings())
         self.restorer = (
-            RecordedPictures(recording, WHOLE)
+            RecordedPictures(recording, EVERYTHING)
             if self._source is None
             else SourcePictures(self._source)
         )

@@ -6,7 +6,7 @@ from pathlib import Path
 from stream_dmr.batch.layout import DONE, FAILED, VIDEO_FOLDERS, VIDEOS, read_videos
 from stream_dmr.errors import UserError
 from stream_dmr.files import make_folder, writing_to
-from stream_dmr.recording.reading.reader import open_recordings
+from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.report.album import make_album
 from stream_dmr.report.gather import gather
 from stream_dmr.report.gathered import Report

@@ -14,14 +14,14 @@ from stream_dmr.camera import crop_from_frame, frame_from_crop
 from stream_dmr.errors import OutputError
 from stream_dmr.files import make_folder, writing_to
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
-from stream_dmr.recording.messages.codec import reference
-from stream_dmr.recording.messages.pictures import Picture
+from stream_dmr.recording.messages.codec import stored_picture
+from stream_dmr.recording.messages.picture_codec import EncodedPicture
 from stream_dmr.recording.messages.record import make_record
-from stream_dmr.recording.messages.selection import WHOLE, Part
-from stream_dmr.recording.reading.reader import messages, open_recordings
-from stream_dmr.recording.rerun.meshes import Meshes
-from stream_dmr.recording.rerun.view_geometry import place
-from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
+from stream_dmr.recording.messages.selection import EVERYTHING, Selection
+from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
+from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
+from stream_dmr.recording.view.view_geometry import place_fit
 from stream_dmr.results.finished_fish import database_of, read_fish, read_runs
 from stream_dmr.results.fish_table import fish_record, write_csv, write_parquet
 from stream_dmr.results.fisheries import FisheriesSettings
@@ -37,10 +37,10 @@ TableFormat = Literal["csv", "parquet"]
 class Export:
     """A recording, or a part of it, for other programs. Raises RecordingError and OutputError."""
 
-    def __init__(self, recording: Path, part: Part = WHOLE) -> None:
+    def __init__(self, recording: Path, selection: Selection = EVERYTHING) -> None:
         self._path = recording
         self._recording = open_recordings([recording])
-        self._part = part
+        self._selection = selection
         self._written: list[Path] = []
 
     @property
@@ -60,10 +60,10 @@ class Export:
         long.
         """
         template = self._recording.header.template
-        restored, count = Meshes(template, self._recording.header.candidates), 0
+        restored, count = MeshRebuilder(template, self._recording.header.candidates), 0
         for fit, fish in _pairs(self._messages(FittedMesh, LocalizedFish)):
             shape = restored.with_vertices(fit).shape
-            vertices = None if shape is None else place(shape, fish)[0]
+            vertices = None if shape is None else place_fit(shape, fish)[0]
             if vertices is None:
                 continue
             folder = make_folder(out / f"fish-{fit.track_id}")
@@ -82,9 +82,11 @@ class Export:
         listed too.
         """
         images, annotations = list[dict[str, Any]](), list[dict[str, Any]]()
-        for message, payload in messages(self._recording, (Frame, FishCrop), self._part):
+        for message, payload in decoded_messages(
+            self._recording, (Frame, FishCrop), self._selection
+        ):
             if isinstance(message, Frame):
-                images.append(_image(message.frame_index, reference(payload)))
+                images.append(_image(message.frame_index, stored_picture(payload)))
             elif isinstance(message, FishCrop):
                 annotations.append(_annotation(message, number=len(annotations) + 1))
         categories = [{"id": 1, "name": "fish"}]
@@ -114,7 +116,7 @@ class Export:
         template = self._recording.header.template
         records = [
             fish_record(fish, template, settings)
-            for fish in read_fish(self._path, self._recording, self._part)
+            for fish in read_fish(self._path, self._recording, self._selection)
         ]
         write = write_csv if format == "csv" else write_parquet
         path = write(make_folder(out) / "fish", records)
@@ -137,7 +139,7 @@ class Export:
         return seal_files(out, self._written, runs=runs, origin=str(self._path))
 
     def _messages(self, *kinds: type[Message]) -> Iterator[Message]:
-        for message, _ in messages(self._recording, kinds, self._part):
+        for message, _ in decoded_messages(self._recording, kinds, self._selection):
             yield message
 
 
@@ -187,7 +189,7 @@ def _extent(crop: FishCrop) -> tuple[int, int, int, int]:
     return int(x0), int(y0), int(x1), int(y1)
 
 
-def _image(frame_index: int, picture: Picture) -> dict[str, Any]:
+def _image(frame_index: int, picture: EncodedPicture) -> dict[str, Any]:
     name, size = f"{frame_index:06d}.png", {"width": picture.width, "height": picture.height}
     return {"id": frame_index, "file_name": name, **size}
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.recording.messages.run_inputs import RunInputs
-from stream_dmr.recording.messages.selection import WHOLE, Part
-from stream_dmr.recording.reading.reader import Recording, messages
+from stream_dmr.recording.messages.selection import EVERYTHING, Selection
+from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
 from stream_dmr.results.run_facts import run_facts
 from stream_dmr.results.store import NAME, RunFacts
 from stream_dmr.results.store_rows import read_estimates
@@ -44,7 +44,9 @@ def database_of(path: Path) -> Path | None:
     return database if path.is_dir() and database.is_file() else None
 
 
-def read_fish(path: Path, recording: Recording, part: Part = WHOLE) -> list[FishResult]:
+def read_fish(
+    path: Path, recording: Recording, selection: Selection = EVERYTHING
+) -> list[FishResult]:
     """The fish of a folder by its lengths.db, or by the recording where it has none.
 
     Raises OutputError or RecordingError where they can't be read.
@@ -55,10 +57,11 @@ def read_fish(path: Path, recording: Recording, part: Part = WHOLE) -> list[Fish
         return [
             one
             for one in fish
-            if part.has(one.estimate) and part.has_time(one.estimate.last_timestamp_ns)
+            if selection.includes(one.estimate)
+            and selection.includes_time(one.estimate.last_timestamp_ns)
         ]
     facts = run_facts(recording.header)
-    found = (message for message, _ in messages(recording, [LengthEstimate], part))
+    found = (message for message, _ in decoded_messages(recording, [LengthEstimate], selection))
     return [
         FishResult(estimate=estimate, facts=facts, run_id="")
         for estimate in found

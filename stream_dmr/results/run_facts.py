@@ -2,7 +2,7 @@
 
 from hashlib import sha256
 
-from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.results.store import RunFacts
 from stream_dmr.version import __version__
 

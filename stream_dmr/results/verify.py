@@ -17,8 +17,8 @@ from stream_dmr.csv_file import rotated_files
 from stream_dmr.errors import OutputError, RecordingError, UserError
 from stream_dmr.files import sha256_of
 from stream_dmr.messages import LengthEstimate, LocalizedFish
-from stream_dmr.recording.messages.selection import WHOLE
-from stream_dmr.recording.reading.reader import messages, open_recordings
+from stream_dmr.recording.messages.selection import EVERYTHING
+from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
 from stream_dmr.results.finished_fish import (
     FishResult,
     database_of,
@@ -175,7 +175,7 @@ def _recording(
                 if getattr(of_run, name, None) != getattr(made, name):
                     yield Change(path, f"{name} is {getattr(made, name)}, no run in {DATABASE} has")
         waiting: dict[tuple[int, int], LocalizedFish] = {}
-        for message, _ in messages(recording, [LocalizedFish, LengthEstimate], WHOLE):
+        for message, _ in decoded_messages(recording, [LocalizedFish, LengthEstimate], EVERYTHING):
             key = message.frame_index, getattr(message, "track_id", 0)
             if isinstance(message, LocalizedFish):
                 waiting[key] = message

@@ -18,7 +18,7 @@ from stream_dmr.evaluation.length_errors import EvaluateSettings
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.localization.localize import LocalizeSettings
-from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.results.fisheries import FisheriesSettings
 from stream_dmr.running.run_settings import DriftSettings, WatchSettings
 from stream_dmr.segmentation.detection.open_detector import DetectFishSettings

@@ -8,7 +8,7 @@ from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
 from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
 from stream_dmr.nodes.read_frames import ReadFrames
-from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.run_inputs import InputFile, RunInputs
 from stream_dmr.running.conditions import lying, stills
 from stream_dmr.running.config import Config, load_config, to_toml

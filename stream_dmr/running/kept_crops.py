@@ -10,7 +10,7 @@ from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.recording.messages.codec import decode, encode
 from stream_dmr.recording.messages.record import make_record
-from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.running.pipeline import run_chain
 
 _IN_MEMORY = 1 << 26  # bytes of crops: some 100,000 masks; more are kept on the disk

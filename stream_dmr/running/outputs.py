@@ -7,11 +7,11 @@ from functools import partial
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LocalizedFish
-from stream_dmr.recording.files import open_files
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.recording.segments.recover import Repair
+from stream_dmr.recording.segments.recording_files import open_recording_files
+from stream_dmr.recording.segments.repair import Repair
 from stream_dmr.recording.segments.retention import Retention
-from stream_dmr.recording.segments.segments import open_segments
+from stream_dmr.recording.segments.rotation import open_segments
 from stream_dmr.results.frames_table import FramesTable
 from stream_dmr.results.lengths_table import LengthsTable
 from stream_dmr.results.provenance import sealed
@@ -47,11 +47,11 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
     retention = Retention(
         out,
         free_bytes=round(config.recording.keep_free_gb * 1e9) if is_endless else 0,
-        marked=partial(flagged_fish, out),
+        flagged=partial(flagged_fish, out),
         on_notice=observer.warn,
     )
     with suppress(OSError, OutputError):  # it tries again while the run goes on
-        retention.make_room()
+        retention.free_space()
     repairs = prepare_folder(
         out, overwrite=request.overwrite, resume=resume, waits_for_room=is_endless
     )
@@ -73,9 +73,9 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
             config.recording,
             live=request.live,
             sinks=[FramesTable(out, resume=resume, is_endless=is_endless)],
-            files=partial(open_segments, left=interrupted, on_notice=observer.warn)
+            files=partial(open_segments, interrupted=interrupted, on_notice=observer.warn)
             if is_endless
-            else open_files,
+            else open_recording_files,
             on_refusal=on_refusal,
         )
         stack.enter_context(recorder)

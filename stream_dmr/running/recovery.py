@@ -7,8 +7,8 @@ from pathlib import Path
 from stream_dmr.errors import OutputError, RecordingError
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.recording.messages.codec import decode
-from stream_dmr.recording.reading.reader import open_recordings
-from stream_dmr.recording.segments.recover import recover
+from stream_dmr.recording.reading.open_recording import open_recordings
+from stream_dmr.recording.segments.repair import repair_recordings
 from stream_dmr.results.lengths_table import write_lengths
 from stream_dmr.results.run_facts import run_facts
 from stream_dmr.results.store import NAME, LengthStore, require_free
@@ -26,7 +26,7 @@ def recover_folder(folder: Path) -> Iterator[str]:
     if not folder.is_dir():
         raise OutputError(f"{folder}: expected the folder of a run, found none; check the path")
     require_free(folder)
-    for repair in recover(folder):
+    for repair in repair_recordings(folder):
         yield repair.line
     if (folder / NAME).exists():
         for path in sorted(folder.glob("*.mcap")):

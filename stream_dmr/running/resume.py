@@ -4,9 +4,9 @@ from collections.abc import Callable, Sequence
 
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import LocalizedFish
-from stream_dmr.recording.reading.reader import open_recordings
-from stream_dmr.recording.segments.open_tracks import unfinished
-from stream_dmr.recording.segments.recover import Repair
+from stream_dmr.recording.reading.open_recording import open_recordings
+from stream_dmr.recording.segments.open_tracks import unfinished_frames
+from stream_dmr.recording.segments.repair import Repair
 from stream_dmr.results.store import LengthStore
 from stream_dmr.sources.source import ResumePoint, Source
 
@@ -36,7 +36,7 @@ def interrupted_tracks(
         return []
     finished = {estimate.track_id for estimate in store.estimates()}
     try:
-        return list(unfinished(open_recordings(torn), finished=finished))
+        return list(unfinished_frames(open_recordings(torn), finished=finished))
     except RecordingError as error:
         on_notice(f"fish that were in view at the crash can't be finished: {error}")
         return []

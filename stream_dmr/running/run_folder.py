@@ -5,8 +5,8 @@ import tempfile
 from pathlib import Path
 
 from stream_dmr.errors import OutputError
-from stream_dmr.recording.files import STEM
-from stream_dmr.recording.segments.recover import Repair, recover
+from stream_dmr.recording.segments.recording_files import STEM
+from stream_dmr.recording.segments.repair import Repair, repair_recordings
 from stream_dmr.results.provenance import NAME as PROVENANCE
 from stream_dmr.results.store import require_free
 
@@ -36,7 +36,7 @@ def prepare_folder(
             for path in (*earlier, *out.glob(f"{STEM}.*")):
                 for leftover in ("", "-wal", "-shm"):  # of a database after a crash
                     path.with_name(path.name + leftover).unlink(missing_ok=True)
-        repairs = list(recover(out))
+        repairs = list(repair_recordings(out))
         for path in (out / f"{STEM}.mcap", out / f"{STEM}.rrd"):
             if path.exists():
                 _rename_earlier(path)

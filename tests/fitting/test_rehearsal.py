@@ -15,7 +15,8 @@ from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.compile_kernels import rehearse
 from stream_dmr.fitting.settings import FitMeshSettings
-from stream_dmr.replaying.replay import ReplayRequest, replay
+from stream_dmr.replaying.replay import replay
+from stream_dmr.replaying.replay_request import ReplayRequest
 from stream_dmr.fitting.paper.skinning import Rig
 from stream_dmr.template.template import load_template
 

@@ -31,16 +31,17 @@ from stream_dmr.messages import (
     LossTerms,
     Message,
 )
-from stream_dmr.recording.files import OpenSinks, open_files
-from stream_dmr.recording.mcap.sink import McapSink
-from stream_dmr.recording.messages.codec import CODEC_VERSION, decode, reference
-from stream_dmr.recording.messages.header import RunHeader
-from stream_dmr.recording.messages.pictures import checksum
+from stream_dmr.recording.mcap.mcap_sink import McapSink
+from stream_dmr.recording.messages.codec import CODEC_VERSION, decode, stored_picture
+from stream_dmr.recording.messages.picture_codec import checksum
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
+from stream_dmr.recording.messages.run_header import RunHeader
+from stream_dmr.recording.messages.sink import SinkFactory
 from stream_dmr.recording.messages.topics import FOXGLOVE_TOPICS, TOPICS, topics_table
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.recording.rerun.view_geometry import place
-from stream_dmr.recording.segments.segments import open_segments
-from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.segments.recording_files import open_recording_files
+from stream_dmr.recording.segments.rotation import open_segments
+from stream_dmr.recording.view.view_geometry import place_fit
 from stream_dmr.results.frames_table import FramesTable
 from tests.support.reading import read_header, read_messages, read_metadata
 from tests.support.recorded_run import assert_same, header, run, template
@@ -114,7 +115,7 @@ def test_a_frame_by_reference_keeps_its_pixels_for_the_run_and_its_checksum_for_
     handed_on = record(tmp_path, messages)
     assert_all_same(only(handed_on, Frame), only(messages, Frame))
     with (tmp_path / "recording.mcap").open("rb") as stream:
-        frames = [reference(m.data) for _, _, m in make_reader(stream).iter_messages("/frame")]
+        frames = [stored_picture(m.data) for _, _, m in make_reader(stream).iter_messages("/frame")]
     expected = [checksum(frame.image) for frame in messages if isinstance(frame, Frame)]
     assert [picture.crc32 for picture in frames] == expected
 
@@ -162,9 +163,9 @@ def test_a_flush_leaves_all_messages_so_far_readable_in_the_part(
     assert found == [message.timestamp_ns for message in messages]
 
 
-@pytest.mark.parametrize("files", [open_files, partial(open_segments, on_notice=print)])
+@pytest.mark.parametrize("files", [open_recording_files, partial(open_segments, on_notice=print)])
 def test_what_nothing_follows_is_flushed_all_the_same(
-    tmp_path: Path, messages: list[Message], files: OpenSinks
+    tmp_path: Path, messages: list[Message], files: SinkFactory
 ):
     """A camera may stall, and the power fail meanwhile."""
     settings = EXACT.model_copy(update={"flush_s": 0.3})
@@ -302,7 +303,7 @@ def test_a_flipped_byte_in_a_message_is_found(tmp_path: Path, messages: list[Mes
 def test_a_recording_of_a_newer_codec_is_refused(
     tmp_path: Path, messages: list[Message], monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("stream_dmr.recording.messages.header.CODEC_VERSION", 99)
+    monkeypatch.setattr("stream_dmr.recording.messages.run_header.CODEC_VERSION", 99)
     record(tmp_path, messages)
     with pytest.raises(RecordingError, match="codec version 99"):
         list(read_messages(tmp_path / "recording.mcap"))
@@ -367,20 +368,22 @@ def test_a_placed_mesh_lies_on_its_fish():
         covariance=np.zeros((1, 1)),
         length_std_ratio=0.0,
     )
-    vertices, _, _ = place(shape, fish)
+    vertices, _, _ = place_fit(shape, fish)
     np.testing.assert_allclose(vertices, vertices_mm, rtol=0, atol=1e-9)
     unplaced = next(m for m in run(1, calibrated=False) if isinstance(m, LocalizedFish))
-    _, _, midline = place(shape, unplaced)
+    _, _, midline = place_fit(shape, unplaced)
     assert arc_length(midline) == pytest.approx(1.0)
 
 
 def test_the_documented_topics_are_the_real_ones():
-    text = (Path(__file__).parents[2] / "docs" / "recording.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "files.md").read_text()
     assert topics_table() in text
 
 
 def test_rerun_and_its_global_stream_stay_untouched_by_a_reader():
-    code = "import sys, stream_dmr.recording.reading.reader; sys.exit('rerun' in sys.modules)"
+    code = (
+        "import sys, stream_dmr.recording.reading.open_recording; sys.exit('rerun' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
@@ -389,7 +392,7 @@ def test_recording_leaves_no_global_rerun_stream(tmp_path: Path):
         "import sys; from pathlib import Path; import rerun as rr\n"
         "from tests.support.recorded_run import header, template\n"
         "from stream_dmr.recording.recorder import Recorder\n"
-        "from stream_dmr.recording.settings import RecordingSettings\n"
+        "from stream_dmr.recording.messages.recording_settings import RecordingSettings\n"
         f"Recorder(Path({str(tmp_path)!r}), header(), RecordingSettings()).close()\n"
         "assert rr.get_global_data_recording() is None"
     )

@@ -29,7 +29,7 @@ from stream_dmr.recording.messages.codec import (
     decode,
     encode,
 )
-from stream_dmr.recording.messages.pictures import compress
+from stream_dmr.recording.messages.picture_codec import compress
 from stream_dmr.recording.messages.schema import parse_proto, proto_class
 from stream_dmr.template.template import Template
 from tests.support.recorded_run import assert_same, calibration, template

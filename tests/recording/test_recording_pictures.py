@@ -14,14 +14,14 @@ from hypothesis.extra.numpy import arrays
 
 from stream_dmr.errors import ConfigError, RecordingError
 from stream_dmr.messages import FishCrop, Frame, Message
-from stream_dmr.recording.mcap.video import H264Topic, decode_video
+from stream_dmr.recording.mcap.h264_topic import H264Topic, decode_video
 from stream_dmr.recording.messages.record import make_record
-from stream_dmr.recording.messages.selection import WHOLE, Part
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
+from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.messages.topics import KEY_FRAME_NS
-from stream_dmr.recording.reading.frame_images import RecordedPictures, is_as_seen
-from stream_dmr.recording.reading.reader import messages, open_recordings
+from stream_dmr.recording.reading.frame_images import RecordedPictures, has_original_pixels
+from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.recording.settings import RecordingSettings
 from tests.support.reading import read_messages
 from tests.support.recorded_run import FRAME_NS, assert_same, header, run
 
@@ -45,10 +45,10 @@ def record(out: Path, given_: list[Message], settings: RecordingSettings) -> lis
         return [recorder.write(message) for message in given_]
 
 
-def restored(path: Path, part: Part = WHOLE) -> Iterator[tuple[Frame, bytes]]:
+def restored(path: Path, selection: Selection = EVERYTHING) -> Iterator[tuple[Frame, bytes]]:
     opened = open_recordings([path / "recording.mcap"])
-    pictures = RecordedPictures(opened, part)
-    for frame, payload in messages(opened, [Frame], part):
+    pictures = RecordedPictures(opened, selection)
+    for frame, payload in decoded_messages(opened, [Frame], selection):
         assert isinstance(frame, Frame)
         yield pictures.restore(frame, payload), payload
 
@@ -80,8 +80,8 @@ def test_pictures_for_the_eye_are_not_what_the_run_goes_on_from(
     for one, other in zip(record(tmp_path, [*made], settings), made, strict=True):
         assert_same(one, other)
     for (frame, payload), original in zip(restored(tmp_path), made, strict=True):
-        assert not is_as_seen(frame, payload)
-        assert is_as_seen(original, payload)
+        assert not has_original_pixels(frame, payload)
+        assert has_original_pixels(original, payload)
         assert cv2.PSNR(frame.image, original.image) > 25
 
 
@@ -89,10 +89,10 @@ def test_a_picture_in_the_middle_of_the_video_is_found(tmp_path: Path):
     made = frames(90)
     record(tmp_path, [*made], H264.model_copy(update={"flush_s": 1e-9}))  # many small chunks
     wanted = made[50:53]
-    part = Part(time_ns=(wanted[0].timestamp_ns, wanted[-1].timestamp_ns + 1))
+    selection = Selection(time_ns=(wanted[0].timestamp_ns, wanted[-1].timestamp_ns + 1))
     opened = open_recordings([tmp_path])
-    assert 30 < len(list(opened.video(replace(part, lead_ns=KEY_FRAME_NS)))) < 40
-    for (frame, _), original in zip(restored(tmp_path, part), wanted, strict=True):
+    assert 30 < len(list(opened.video(replace(selection, lead_ns=KEY_FRAME_NS)))) < 40
+    for (frame, _), original in zip(restored(tmp_path, selection), wanted, strict=True):
         assert cv2.PSNR(frame.image, original.image) > 25
 
 
@@ -134,7 +134,7 @@ def test_damaged_video_is_refused_or_decoded_but_never_crashes(position: int, fl
 
 def test_without_ffmpeg_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     record(tmp_path, [*frames(2)], H264)
-    monkeypatch.delitem(sys.modules, "stream_dmr.recording.mcap.video")
+    monkeypatch.delitem(sys.modules, "stream_dmr.recording.mcap.h264_topic")
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(ConfigError, match=r"pip install 'stream-dmr\[h264\]'"):
         Recorder(tmp_path / "b", header(), H264)

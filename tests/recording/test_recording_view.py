@@ -16,14 +16,14 @@ from rerun.chunk import RrdReader
 
 from stream_dmr.errors import SourceError
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LocalizedFish, Message
-from stream_dmr.recording.messages.pictures import checksum
+from stream_dmr.recording.messages.picture_codec import checksum
 from stream_dmr.recording.messages.record import make_record
-from stream_dmr.recording.reading.convert import convert
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
+from stream_dmr.recording.reading.rrd_conversion import convert
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.recording.rerun.live import LiveView
-from stream_dmr.recording.rerun.meshes import Meshes
-from stream_dmr.recording.rerun.view_geometry import halved, view_factor
-from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.rerun.live_view import LiveView
+from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
+from stream_dmr.recording.view.view_geometry import shrink_by_halves, view_factor
 from stream_dmr.results.export import mask_in_frame, run_lengths
 from tests.support.command import invoke, rows
 from tests.support.reading import read_header, read_messages
@@ -82,7 +82,7 @@ def test_stages_that_run_ahead_do_not_mix_up_frames(tmp_path: Path):
 
 @given(st.integers(1, 4000), st.integers(1, 4000), st.integers(64, 2000))
 def test_the_view_is_as_large_as_it_may_be(width: int, height: int, most: int):
-    factor = view_factor(width, height, most=most)
+    factor = view_factor(width, height, most_px=most)
     assert factor.bit_count() == 1
     assert width % factor == height % factor == 0
     is_odd = (width | height) // factor % 2 == 1
@@ -92,7 +92,7 @@ def test_the_view_is_as_large_as_it_may_be(width: int, height: int, most: int):
 
 def test_halving_takes_means():
     image = np.arange(4 * 8 * 3, dtype=np.uint8).reshape(4, 8, 3)
-    half = halved(image, most=4)
+    half = shrink_by_halves(image, most_px=4)
     assert half.shape == (2, 4, 3)
     expected = image.reshape(2, 2, 4, 2, 3).astype(float).mean(axis=(1, 3))
     assert np.abs(half - expected).max() <= 0.5
@@ -126,7 +126,7 @@ def test_vertices_are_made_again_from_parameters(clip: Path):
     for one, other in zip(lean, whole, strict=True):
         assert isinstance(one, FittedMesh)
         assert isinstance(other, FittedMesh)
-        again = Meshes(template, None).with_vertices(one).shape
+        again = MeshRebuilder(template, None).with_vertices(one).shape
         assert again is not None
         assert other.shape is not None
         np.testing.assert_allclose(again.vertices, other.shape.vertices, rtol=0, atol=1e-12)

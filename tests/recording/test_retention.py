@@ -11,13 +11,13 @@ import pytest
 
 from stream_dmr.files import free_bytes
 from stream_dmr.messages import FishCrop, Frame, Message
-from stream_dmr.recording.messages.codec import reference
+from stream_dmr.recording.messages.codec import stored_picture
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.topics import TOPICS
-from stream_dmr.recording.reading.reader import open_recordings
+from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.segments.retention import Retention
-from stream_dmr.recording.segments.segments import open_segments
-from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.segments.rotation import open_segments
 from stream_dmr.results.frames_table import FramesTable
 from tests.recording.test_segments import read_by_others, write_clips
 from tests.support.command import invoke, rows
@@ -69,8 +69,8 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 def make_room(folder: Path, *, free: int, marked: set[int]) -> list[str]:
     notices: list[str] = []
-    retention = Retention(folder, free_bytes=free, marked=lambda: marked, on_notice=notices.append)
-    retention.make_room()
+    retention = Retention(folder, free_bytes=free, flagged=lambda: marked, on_notice=notices.append)
+    retention.free_space()
     retention.close()
     return notices
 
@@ -119,12 +119,12 @@ def test_what_is_left_of_a_segment_is_what_it_was(recorded: Path, disk: Path):
         assert_same(one, other)
     assert list(read_messages(out, [FishCrop])) == []
     frames = [(path, open_recordings([path]).payloads([Frame])) for path in (recorded, out)]
-    checksums = [[reference(data).crc32 for _, data in payloads] for _, payloads in frames]
+    checksums = [[stored_picture(data).crc32 for _, data in payloads] for _, payloads in frames]
     assert checksums[0] == checksums[1]
     for path in sorted(out.glob("*.mcap")):
         assert read_by_others(path)
         before = open_recordings([recorded / path.name])
-        assert list(open_recordings([path]).carried()) == list(before.carried())
+        assert list(open_recordings([path]).carried_over()) == list(before.carried_over())
         assert path.stat().st_size < 0.5 * (recorded / path.name).stat().st_size
 
 

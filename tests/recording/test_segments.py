@@ -19,12 +19,12 @@ from mcap.reader import make_reader
 
 from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.recording.messages.codec import decode
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.topics import TOPICS
-from stream_dmr.recording.reading.reader import open_recordings
+from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.recording.segments.recover import recover
-from stream_dmr.recording.segments.segments import open_segments
-from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.segments.repair import repair_recordings
+from stream_dmr.recording.segments.rotation import open_segments
 from stream_dmr.running.result_writer import INTERRUPTED
 from tests.running.test_run_signals import start, wait_for_rows
 from tests.support.command import invoke, rows
@@ -115,7 +115,7 @@ def test_segments_hold_every_message_once_and_are_cut_between_frames(
 def test_a_segment_carries_the_fish_that_are_in_view(whole: Path, messages: list[Message]):
     for path in sorted(whole.glob("*.mcap")):
         first = min(m.frame_index for m in read_messages(path, [Frame]))
-        carried = [decode(LocalizedFish, data) for data in open_recordings([path]).carried()]
+        carried = [decode(LocalizedFish, data) for data in open_recordings([path]).carried_over()]
         expected = [m for m in messages if isinstance(m, LocalizedFish) and m.frame_index < first]
         expected.sort(key=lambda m: (m.track_id, m.frame_index))
         assert len(carried) == len(expected)
@@ -127,7 +127,7 @@ def test_what_a_crash_left_is_made_whole(torn: Path, tmp_path: Path, messages: l
     folder = Path(shutil.copytree(torn, tmp_path / "out"))
     assert names(folder) == ["recording-000001.mcap.part", "recording-000002.mcap.part"]
     before = [list(read_messages(path)) for path in sorted(folder.iterdir())]
-    repairs = list(recover(folder))
+    repairs = list(repair_recordings(folder))
     assert names(folder) == ["recording-000001.mcap", "recording-000002.mcap"]
     assert all("left unfinished by a crash" in repair.line for repair in repairs)
     for repair, expected in zip(repairs, before, strict=True):
@@ -136,7 +136,7 @@ def test_what_a_crash_left_is_made_whole(torn: Path, tmp_path: Path, messages: l
         for one, other in zip(expected, found, strict=True):
             assert_same(one, other)
         assert len(read_by_others(repair.path)) >= len(found)
-    assert list(recover(folder)) == []
+    assert list(repair_recordings(folder)) == []
 
 
 @settings(max_examples=40)
@@ -148,7 +148,7 @@ def test_any_beginning_of_a_recording_is_made_whole_or_set_aside(
     part = folder / "recording-000001.mcap.part"
     data = (torn / part.name).read_bytes()
     part.write_bytes(data[: round(share * len(data))] + rubbish)
-    (repair,) = recover(folder)
+    (repair,) = repair_recordings(folder)
     assert "left unfinished" in repair.line
     if repair.path.suffix == ".mcap":
         assert read_by_others(repair.path) is not None
@@ -164,14 +164,14 @@ def test_any_beginning_of_a_recording_is_made_whole_or_set_aside(
 def test_a_recording_that_was_only_begun_is_set_aside(torn: Path, tmp_path: Path, size: int):
     part = tmp_path / "recording-000001.mcap.part"
     part.write_bytes((torn / part.name).read_bytes()[:size])
-    list(recover(tmp_path))
+    list(repair_recordings(tmp_path))
     assert names(tmp_path) == ["recording-000001.mcap.part.damaged"]
 
 
 def test_a_repair_replaces_no_recording(torn: Path, tmp_path: Path):
     folder = Path(shutil.copytree(torn, tmp_path / "out"))
     (folder / "recording-000001.mcap").write_bytes(b"precious")
-    repair = next(recover(folder))
+    repair = next(repair_recordings(folder))
     assert repair.path.name == "recording-000001-1.mcap"
     assert (folder / "recording-000001.mcap").read_bytes() == b"precious"
 

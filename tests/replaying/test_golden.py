@@ -10,8 +10,9 @@ import pytest
 
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.recording.messages.codec import decode
-from stream_dmr.recording.reading.reader import Recording, open_recordings
-from stream_dmr.replaying.replay import ReplayRequest, replay
+from stream_dmr.recording.reading.open_recording import Recording, open_recordings
+from stream_dmr.replaying.replay import replay
+from stream_dmr.replaying.replay_request import ReplayRequest
 
 GOLDEN = Path(__file__).parents[2] / "recordings" / "golden" / "recording.mcap"
 # Relative, of the lengths, where another processor or library rounds the last bits otherwise. A

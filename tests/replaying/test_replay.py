@@ -14,9 +14,9 @@ from stream_dmr.calibration.calibration_file import load_calibration, save_calib
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish
 from stream_dmr.recording.messages.codec import decode
-from stream_dmr.recording.messages.selection import Part
+from stream_dmr.recording.messages.selection import Selection
 from stream_dmr.recording.messages.topics import TOPICS
-from stream_dmr.recording.reading.reader import messages, open_recordings
+from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
 from stream_dmr.replaying.difference import differences
 from tests.support.command import invoke, rows
 from tests.support.tiny_clip import write_clip
@@ -121,24 +121,26 @@ def test_a_part_in_time_is_read_alone(run):
     times = [decode(LocalizedFish, p).timestamp_ns for _, p in whole.payloads([LocalizedFish])]
     low, high = times[3], times[8]
     for name in FORMATS:
-        part = open_recordings([folder / name]).payloads([LocalizedFish], Part(time_ns=(low, high)))
-        found = [decode(LocalizedFish, p).timestamp_ns for _, p in part]
+        selection = open_recordings([folder / name]).payloads(
+            [LocalizedFish], Selection(time_ns=(low, high))
+        )
+        found = [decode(LocalizedFish, p).timestamp_ns for _, p in selection]
         assert found == [t for t in times if low <= t < high]
 
 
 def test_a_fish_is_read_by_the_index(run):
     """Only the time in which it was seen is read, and the other fish of that time are left out."""
     recording = open_recordings([run[0]])
-    part = Part(tracks=frozenset({3}))
+    selection = Selection(tracks=frozenset({3}))
     frames = [
-        decode(Frame, payload).frame_index for _, payload in recording.payloads([Frame], part)
+        decode(Frame, payload).frame_index for _, payload in recording.payloads([Frame], selection)
     ]
     assert frames == [5, 6, 7]
     kinds = (FittedMesh, LengthEstimate)
-    read = [message for message, _ in messages(recording, kinds, part)]
+    read = [message for message, _ in decoded_messages(recording, kinds, selection)]
     assert read
     assert all(message.track_id == 3 for message in read)
-    everything = [message for message, _ in messages(recording, kinds)]
+    everything = [message for message, _ in decoded_messages(recording, kinds)]
     assert len(read) == sum(message.track_id == 3 for message in everything)
 
 
@@ -161,12 +163,12 @@ class TestDamage:
         self, run, tmp_path_factory, seed
     ):
         path = _flipped(run[0] / "recording.mcap", tmp_path_factory.mktemp("flip"), seed)
-        part = Part(tracks=frozenset({2}))
+        selection = Selection(tracks=frozenset({2}))
         with suppress(RecordingError):
             recording = open_recordings([path])
-            found = list(recording.payloads(TOPICS, part))
+            found = list(recording.payloads(TOPICS, selection))
             assert recording.warnings or found == list(
-                open_recordings([run[0]]).payloads(TOPICS, part)
+                open_recordings([run[0]]).payloads(TOPICS, selection)
             )
 
     @settings(max_examples=2, deadline=None)  # a process each; more in the slow test
@@ -263,7 +265,7 @@ class TestDifferences:
         )
         found = {item.field: item for item in differences(mesh, other)}
         assert set(found) == {"shape.keypoints", "shape.iou"}
-        assert found["shape.keypoints"].logged.startswith("[1][2]")
+        assert found["shape.keypoints"].recorded.startswith("[1][2]")
         assert "1 of 9 differ" in found["shape.keypoints"].computed
         assert found["shape.iou"].computed == "0.5"
 

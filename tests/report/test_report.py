@@ -10,7 +10,7 @@ import pytest
 
 from stream_dmr.errors import SourceError
 from stream_dmr.messages import FittedMesh, LocalizedFish
-from stream_dmr.recording.reading.reader import messages, open_recordings
+from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
 from stream_dmr.report.album import make_album
 from stream_dmr.report.gather import gather
 from stream_dmr.report.page import _script
@@ -38,7 +38,7 @@ def test_the_best_views_are_the_best_of_all(out: Path):
     recording = open_recordings([out])
     tracks = gather(recording, keep=2)
     ious: dict[int, list[float]] = {}
-    for fish, _ in messages(recording, [LocalizedFish]):
+    for fish, _ in decoded_messages(recording, [LocalizedFish]):
         assert isinstance(fish, LocalizedFish)
         assert fish.iou is not None
         ious.setdefault(fish.track_id, []).append(fish.iou)
@@ -56,7 +56,7 @@ def test_outlines_lie_on_the_mask_and_on_the_mesh(out: Path):
     album = make_album(tracks, recording)
     fits = {
         (fit.track_id, fit.frame_index): fit
-        for fit, _ in messages(recording, [FittedMesh])
+        for fit, _ in decoded_messages(recording, [FittedMesh])
         if isinstance(fit, FittedMesh)
     }
     for track_id, shots in album.items():

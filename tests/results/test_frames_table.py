@@ -9,7 +9,7 @@ import pytest
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate, LocalizedFish, Message
 from stream_dmr.recording.messages.record import make_record
-from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.results.frames_table import FramesTable
 from tests.support.recorded_run import run
 from tests.support.small_disk import file_size_limit

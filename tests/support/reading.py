@@ -5,9 +5,9 @@ from pathlib import Path
 
 from stream_dmr.messages import Message
 from stream_dmr.recording.messages.codec import decode
-from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.topics import TOPICS
-from stream_dmr.recording.reading.reader import open_recordings
+from stream_dmr.recording.reading.open_recording import open_recordings
 
 
 def read_header(path: Path) -> RunHeader:

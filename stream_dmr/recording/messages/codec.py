@@ -1,4 +1,4 @@
-"""Message <-> bytes: one typed, versioned encoding per message type, exact to the last bit.
+"""Encodes messages to bytes and back: one versioned encoding per type, exact to the last bit.
 
 The schema is `messages.proto`; a dataclass and its protobuf message have the same field names.
 """
@@ -16,8 +16,8 @@ from google.protobuf.message import Message as Proto
 from stream_dmr import messages
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.errors import RecordingError
-from stream_dmr.recording.messages.pictures import (
-    Picture,
+from stream_dmr.recording.messages.picture_codec import (
+    EncodedPicture,
     checksum,
     compress,
     compress_mask,
@@ -26,10 +26,10 @@ from stream_dmr.recording.messages.pictures import (
 from stream_dmr.recording.messages.schema import proto_class
 
 CODEC_VERSION = 3
-"""Raised when a file written from now on would be read wrongly by an older reader.
+"""Increased when an older reader would read a new file wrongly.
 
 2: a crop may lack its picture, a fit its vertices and covariance.
-3: the JPEG of a frame may not be what the run saw.
+3: the JPEG of a frame may not be what the run used.
 """
 
 T = TypeVar("T")
@@ -44,7 +44,7 @@ _DATACLASSES: dict[str, type] = {
         *(Camera, ReferencePlane, Calibration),
     )
 }
-_MOST_PX = 1 << 28  # of a picture; damaged bytes must not ask for all memory
+_MAX_PIXELS = 1 << 28  # 16384 x 16384; damaged bytes must not allocate all memory
 _SCALARS = {
     FieldDescriptor.TYPE_BOOL: bool,
     FieldDescriptor.TYPE_DOUBLE: float,
@@ -54,7 +54,7 @@ _SCALARS = {
 }
 
 
-def encode(message: object, *, picture: Picture | None = None) -> bytes:
+def encode(message: object, *, picture: EncodedPicture | None = None) -> bytes:
     """The bytes of a message (or of any other dataclass in `messages.proto`).
 
     `picture` replaces the message's `image`; without it the image is written as PNG, exact.
@@ -65,9 +65,10 @@ def encode(message: object, *, picture: Picture | None = None) -> bytes:
 
 
 def decode(kind: type[T], data: bytes) -> T:
-    """The message of type `kind` that `encode` wrote; RecordingError where the bytes are not one.
+    """The message of type `kind` that `encode` wrote.
 
-    The image of a Frame recorded by reference has the shape (0, 0, 3).
+    The image of a Frame recorded by reference has the shape (0, 0, 3). Raises RecordingError where
+    the bytes are no such message.
     """
     proto = proto_class(kind.__name__)()
     try:
@@ -79,15 +80,15 @@ def decode(kind: type[T], data: bytes) -> T:
     return _build(kind, proto)
 
 
-def reference(frame: bytes) -> Picture:
-    """How the picture of an encoded Frame was recorded, for finding it again in the source."""
+def stored_picture(frame: bytes) -> EncodedPicture:
+    """The recorded picture of an encoded Frame as it is stored: format, size, checksum, bytes."""
     proto: Any = proto_class("Frame")()
     proto.ParseFromString(frame)
     return _picture(proto.image)
 
 
 def without_picture(frame: bytes) -> bytes:
-    """The same encoded Frame by reference: size and checksum stay, the pixels go."""
+    """The same encoded Frame by reference: without its pixels, with their size and checksum."""
     proto: Any = proto_class("Frame")()
     proto.ParseFromString(frame)
     picture = _picture(proto.image)
@@ -99,7 +100,7 @@ def without_picture(frame: bytes) -> bytes:
 
 
 def check_version(version: int) -> None:
-    """Raise RecordingError for a recording written by a newer codec than this one."""
+    """Raise RecordingError for a recording that a newer codec wrote."""
     if version > CODEC_VERSION:
         raise RecordingError(
             f"the recording has codec version {version}, newer than {CODEC_VERSION}, the newest "
@@ -107,7 +108,7 @@ def check_version(version: int) -> None:
         )
 
 
-def _fill(proto: Proto, value: object, picture: Picture | None = None) -> None:
+def _fill(proto: Proto, value: object, picture: EncodedPicture | None = None) -> None:
     for field in proto.DESCRIPTOR.fields:
         item = getattr(value, field.name)
         if field.name == "image" and item is not None:
@@ -127,8 +128,8 @@ def _set(proto: Proto, field: Any, item: Any) -> None:
         return
     inner.SetInParent()
     if field.message_type.name == "Picture":
-        item = item if isinstance(item, Picture) else compress_mask(item)
-        for part in fields(Picture):
+        item = item if isinstance(item, EncodedPicture) else compress_mask(item)
+        for part in fields(EncodedPicture):
             setattr(inner, part.name, getattr(item, part.name))
     elif is_dataclass(item):
         _fill(inner, item)
@@ -140,7 +141,7 @@ def _set(proto: Proto, field: Any, item: Any) -> None:
 
 def _build(kind: type[T], proto: Proto) -> T:
     built = kind(**{field.name: _get(proto, field) for field in _fields(kind)})
-    if isinstance(built, Camera) and not 0 < built.width * built.height <= _MOST_PX:
+    if isinstance(built, Camera) and not 0 < built.width * built.height <= _MAX_PIXELS:
         raise RecordingError(
             f"the recording has pictures of {built.width}x{built.height} px: it is damaged"
         )
@@ -174,8 +175,10 @@ def _get(proto: Proto, field: Any) -> Any:
     return _build(_DATACLASSES[name], inner)
 
 
-def _picture(proto: Any) -> Picture:
-    return Picture(**{part.name: getattr(proto, part.name) for part in fields(Picture)})
+def _picture(proto: Any) -> EncodedPicture:
+    return EncodedPicture(
+        **{part.name: getattr(proto, part.name) for part in fields(EncodedPicture)}
+    )
 
 
 def _array(proto: Any) -> np.ndarray:

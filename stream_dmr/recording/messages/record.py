@@ -6,9 +6,9 @@ from functools import cached_property, partial
 
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, Message
 from stream_dmr.recording.messages.codec import encode
-from stream_dmr.recording.messages.pictures import checksum, compress, decompress
+from stream_dmr.recording.messages.picture_codec import checksum, compress, decompress
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.topics import TOPICS, Topic
-from stream_dmr.recording.settings import RecordingSettings
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -19,22 +19,29 @@ class Record:
     whole: Message  # with what the recording leaves out: for drawing
     encoding: Callable[[], bytes]
 
+    @classmethod
+    def of_payload(
+        cls, message: Message, payload: bytes, *, whole: Message | None = None
+    ) -> "Record":
+        """A message that was recorded before, with the encoding that it had."""
+        return cls(message=message, whole=whole or message, encoding=partial(bytes, payload))
+
     @cached_property
     def payload(self) -> bytes:
-        """As `codec.encode` gives it."""
+        """The bytes that `codec.encode` gives."""
         return self.encoding()
 
     @property
     def topic(self) -> Topic:
-        """Where it belongs."""
+        """Where the message lies in each kind of recording."""
         return TOPICS[type(self.message)]
 
 
 def make_record(message: Message, settings: RecordingSettings) -> Record:
-    """What is recorded of a message: parts may be left out, pictures may be lossy.
+    """The record of a message: parts may be left out and pictures may be lossy.
 
-    Where a replay starts from a lossy picture, the run goes on from it too. That of a frame is
-    only for the eye where the crops are kept: then a replay starts from those.
+    Where a replay starts from a lossy picture, the run continues from it too. The picture of a
+    frame is only for viewing where crops are kept, since a replay then starts from those.
     """
     if isinstance(message, Frame):
         return _record_frame(message, settings)
@@ -54,16 +61,22 @@ def make_record(message: Message, settings: RecordingSettings) -> Record:
     )
 
 
+def as_recorded(message: Message, settings: RecordingSettings) -> Message:
+    """The message that a recording gives back: what a replay compares with and continues from."""
+    return make_record(message, settings).message
+
+
 def _record_frame(frame: Frame, settings: RecordingSettings) -> Record:
-    """A frame by reference, and one for the eye, keeps its pixels on its way through the run."""
+    """A frame by reference or with a picture for viewing keeps its own pixels in the run."""
     if settings.frames != "jpeg":
         encoding = partial(_encode_by_reference, frame)
     elif settings.crops != "none":
-        encoding = partial(_encode_for_the_eye, frame, settings.jpeg_quality)
+        encoding = partial(_encode_for_viewing, frame, settings.jpeg_quality)
     else:
         picture = compress(frame.image, format="jpeg", jpeg_quality=settings.jpeg_quality)
-        seen = replace(frame, image=decompress(picture))
-        return Record(message=seen, whole=frame, encoding=partial(encode, seen, picture=picture))
+        decoded = replace(frame, image=decompress(picture))
+        encoding = partial(encode, decoded, picture=picture)
+        return Record(message=decoded, whole=frame, encoding=encoding)
     return Record(message=frame, whole=frame, encoding=encoding)
 
 
@@ -71,11 +84,6 @@ def _encode_by_reference(frame: Frame) -> bytes:
     return encode(frame, picture=compress(frame.image, format="reference"))
 
 
-def _encode_for_the_eye(frame: Frame, jpeg_quality: int) -> bytes:
+def _encode_for_viewing(frame: Frame, jpeg_quality: int) -> bytes:
     picture = compress(frame.image, format="jpeg", jpeg_quality=jpeg_quality)
     return encode(frame, picture=replace(picture, crc32=checksum(frame.image)))
-
-
-def as_recorded(message: Message, settings: RecordingSettings) -> Message:
-    """The message that a recording gives back: what a replay compares with, and goes on from."""
-    return make_record(message, settings).message

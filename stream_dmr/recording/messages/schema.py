@@ -1,6 +1,7 @@
-"""Reads `messages.proto` into protobuf classes, so that installing needs no protoc.
+"""Parses `messages.proto` into protobuf classes, so that installing needs no protoc.
 
-It knows just what that file uses: flat messages of scalars, messages, `optional` and `repeated`.
+It understands only what that file uses: flat messages of scalars, messages, `optional` and
+`repeated`.
 """
 
 import re
@@ -17,7 +18,7 @@ from google.protobuf.descriptor_pb2 import (
 from google.protobuf.message import Message as Proto
 
 PACKAGE = "stream_dmr"
-_FILE = "stream_dmr/recording/messages.proto"
+_FILE = "stream_dmr/recording/messages.proto"  # its name inside recordings; must not change
 _SCALARS = {
     "bool": FieldDescriptorProto.TYPE_BOOL,
     "bytes": FieldDescriptorProto.TYPE_BYTES,
@@ -41,7 +42,7 @@ def schema_bytes() -> bytes:
 
 
 def parse_proto(text: str) -> FileDescriptorProto:
-    """The descriptor of a .proto text; ValueError names the first line that isn't understood."""
+    """The descriptor of a .proto text. ValueError names the first line that can't be parsed."""
     file = FileDescriptorProto(name=_FILE, package=PACKAGE, syntax="proto3")
     message = None
     for number, raw in enumerate(text.splitlines(), start=1):
@@ -55,7 +56,7 @@ def parse_proto(text: str) -> FileDescriptorProto:
         elif message is not None and (match := _FIELD.fullmatch(line)):
             _add_field(message, *match.groups())
         else:
-            raise ValueError(f"messages.proto, line {number}: not understood: {raw!r}")
+            raise ValueError(f"messages.proto, line {number}: can't be parsed: {raw!r}")
     return file
 
 
@@ -67,7 +68,7 @@ def _add_field(message: DescriptorProto, label: str, kind: str, name: str, numbe
         field.type = _SCALARS[kind]
     else:
         field.type, field.type_name = field.TYPE_MESSAGE, f".{PACKAGE}.{kind}"
-    if label == "optional ":  # protoc's own way: a oneof of one, so that presence is known
+    if label == "optional ":  # as protoc does: a oneof of one field, so that presence is known
         field.proto3_optional, field.oneof_index = True, len(message.oneof_decl)
         message.oneof_decl.add(name=f"_{name}")
 

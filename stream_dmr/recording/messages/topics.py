@@ -24,6 +24,7 @@ class Topic:
         return f"messages{self.topic}"
 
 
+# Entity paths in the .rrd.
 FRAME, MASKS = "scene/camera/frame", "scene/camera/masks"
 BOX, OUTLINE = "scene/camera/fish/{id}/box", "scene/camera/fish/{id}/outline"
 MESH = "scene/fish/{id}/mesh"
@@ -33,14 +34,14 @@ FRAME_LENGTH, LENGTH = "length/{id}/frame", "length/{id}/estimate"
 IOU, BENDING, FIT_MS = "iou/{id}", "bending/{id}", "fit_ms/{id}"
 LOG, REFUSALS, RESULTS = "log", "log/refusals", "log/lengths"
 CAMERA, PLANE = "scene/camera", "scene/plane"  # static, from the header
+FISH_ROOTS = ("scene/camera/fish", "scene/fish")  # cleared by every new frame
 END = "messages/end"  # the last row of a whole .rrd: how many messages each payload path has
-# Metadata records of an .mcap: of the run; of one of several files, with its `number`; of one that
-# a crash left unfinished; of one whose pictures and masks went to make room.
+# Metadata records of an .mcap: of the run; of one of several segments, with its `number`; of a file
+# that was repaired after a crash; of one whose pictures and masks were removed to free disk space.
 RUN, SEGMENT, RECOVERED, THINNED = "run", "segment", "recovered", "thinned"
 SPANS = "tracks.json"  # attachment of a whole .mcap: each track's first and last capture time, ns
-KEY_FRAME_NS = 1_000_000_000  # of capture time, from one key frame of the video to the next
+KEY_FRAME_NS = 1_000_000_000  # capture time between key frames: a reader seeks back one second
 VIDEO = "/video"  # in the .mcap with frames = "h264": foxglove.CompressedVideo
-FISH_ROOTS = ("scene/camera/fish", "scene/fish")  # what a new frame clears
 
 TOPICS: dict[type[Message], Topic] = {
     row.message: row
@@ -58,8 +59,8 @@ TOPICS: dict[type[Message], Topic] = {
 }
 
 
-CARRIED = "/carried/localized"
-"""In a segment: of the fish that were in view at its beginning, what was seen before."""
+CARRIED_OVER = "/carried/localized"
+"""In a segment: the LocalizedFish from before it of the tracks that were open when it began."""
 
 FOXGLOVE_TOPICS = {
     "/foxglove/picture": "foxglove.CompressedImage",
@@ -69,11 +70,11 @@ FOXGLOVE_TOPICS = {
     "/foxglove/outlines": "foxglove.ImageAnnotations",
     "/foxglove/keypoints": "foxglove.ImageAnnotations",
 }
-"""In the .mcap, beside the messages, with `foxglove = true`: topic -> schema."""
+"""Topic -> schema, in the .mcap with `foxglove = true`."""
 
 
 def topics_table() -> str:
-    """The tables in `docs/files.md`, which `python -m` this module prints."""
+    """The Markdown tables of topics in `docs/files.md`; `python -m` this module prints them."""
     lines = ["| message | topic (.mcap) | schema | entities (.rrd) |", "|---|---|---|---|"]
     for row in TOPICS.values():
         entities = ", ".join(f"`{path}`" for path in row.entities)

@@ -1,4 +1,4 @@
-"""How a recording opens in Rerun: the layout of its views, the colours, and what never moves."""
+"""How a recording opens in Rerun: layout, colours, camera and reference plane."""
 
 import numpy as np
 import rerun as rr
@@ -8,18 +8,19 @@ from jaxtyping import Float, Int
 from stream_dmr.camera import Calibration, Camera
 from stream_dmr.recording.messages import topics
 from stream_dmr.recording.messages.topics import CAMERA, LOG, PLANE
-from stream_dmr.recording.rerun.palette import color
+from stream_dmr.recording.view.palette import color
 
 _GRID_MM = 100.0
 _GREY = (150, 160, 170, 90)
-_PICTURE_DEPTH = 0.25  # of the camera's picture in the scene, of the distance to the fish
-NOMINAL_DEPTH = 2.5  # of a fish without calibration, in body lengths: it fills half the picture
+# Depths, points of view and opacity are chosen by eye.
+_PICTURE_DEPTH = 0.25  # where the picture stands before the camera, as a share of the fish's depth
+NOMINAL_DEPTH = 2.5  # body lengths, without calibration: the fish fills half the picture
 RUN = "run"
 _THIN = rr.Radius.ui_points(1.2)
 _DOTS = rr.Radius.ui_points([5.5, 3.5, 3.5])  # head, center, tail: the large one is the head
 _WHITE = (255, 255, 255)
-# Where the 3D views are seen from: close enough to see how a fish is bent; and past the camera.
-# Without a calibration fish seem as far away as they are small.
+# Eye and target of the 3D views, in units of the fish's depth: near the fish, near a fish without a
+# calibration, and from behind the camera.
 _NEAR = np.array([[0.42, -0.18, 0.5], [0.0, 0.0, 0.92]])
 _RELATIVE = np.array([[0.35, -0.2, 0.0], [0.0, 0.0, 1.0]])
 _FAR = np.array([[0.7, -0.4, -0.05], [0.0, -0.02, 0.85]])
@@ -28,11 +29,11 @@ PICTURES = {
     topics.MASKS: rr.EncodedImage.from_fields(media_type="image/png", opacity=0.35, draw_order=1.0),
 }
 _LOG_COLUMNS = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
-_SEE_THROUGH = 150  # opacity of a mesh, of 255: the midline shows
+_MESH_OPACITY = 150  # of 255, so that the midline shows through
 
 
 def appearance(track_id: int, faces: Int[np.ndarray, "F 3"]) -> dict[str, rr.AsComponents]:
-    """What never changes of a fish, by entity path with `{id}` left open."""
+    """The static components of a track, by entity path with `{id}` left open."""
     tint, name = color(track_id), f"fish {track_id}"
     lines = rr.SeriesLines(
         names=[name, f"{name} low", f"{name} high"],
@@ -45,7 +46,7 @@ def appearance(track_id: int, faces: Int[np.ndarray, "F 3"]) -> dict[str, rr.AsC
         topics.OUTLINE: rr.LineStrips2D.from_fields(colors=[tint], radii=_THIN),
         topics.KEYPOINTS_2D: rr.Points2D.from_fields(colors=[_WHITE], radii=_DOTS),
         topics.MESH: rr.Mesh3D.from_fields(
-            triangle_indices=faces, albedo_factor=(*tint, _SEE_THROUGH)
+            triangle_indices=faces, albedo_factor=(*tint, _MESH_OPACITY)
         ),
         topics.KEYPOINTS_3D: rr.Points3D.from_fields(colors=[_WHITE], radii=_DOTS),
         topics.MIDLINE: rr.LineStrips3D.from_fields(colors=[_WHITE], radii=_THIN),
@@ -56,7 +57,7 @@ def appearance(track_id: int, faces: Int[np.ndarray, "F 3"]) -> dict[str, rr.AsC
 
 
 def blueprint(calibration: Calibration | None) -> rrb.Blueprint:
-    """The frame and the 3D scene above; length, IoU and the log of events below.
+    """The layout: frame and 3D scene above; length, IoU and the log of events below.
 
     Without a calibration there are no lengths, so the bending ratio takes their place.
     """
@@ -103,7 +104,7 @@ def _scene_view(
     *,
     eye: Float[np.ndarray, "2 3"],
 ) -> rrb.Spatial3DView:
-    """`eye` is where it stands and where it looks, in units of the fish's distance."""
+    """`eye` is the eye's position and target, in units of the fish's depth."""
     depth = NOMINAL_DEPTH if calibration is None else middle_mm(calibration)[2]
     unit = "relative" if calibration is None else "mm"
     return rrb.Spatial3DView(
@@ -118,11 +119,11 @@ def _scene_view(
 
 
 def log_camera(rec: rr.RecordingStream, camera: Camera, *, depth: float, factor: int) -> None:
-    """The camera, for all time, for fish that hang some `depth` away.
+    """Log the camera, static, for fish at a depth of some `depth` (mm, or body lengths).
 
-    `factor` is the number of frame pixels per pixel of the picture that is shown.
+    `factor` is the number of frame pixels per pixel of the shown picture.
     """
-    # Rerun counts pixels from the corner of the top-left one, we from its centre.
+    # Rerun's origin is the corner of the top-left pixel, ours its centre.
     shift = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
     pinhole = rr.Pinhole(
         image_from_camera=np.diag([1 / factor, 1 / factor, 1.0]) @ shift @ camera.K,
@@ -134,7 +135,7 @@ def log_camera(rec: rr.RecordingStream, camera: Camera, *, depth: float, factor:
 
 
 def log_plane(rec: rr.RecordingStream, calibration: Calibration) -> None:
-    """The reference plane as a grid of 100 mm, for all time."""
+    """Log the reference plane, static, as a grid of 100 mm or a multiple of it."""
     middle, camera, plane = middle_mm(calibration), calibration.camera, calibration.plane
     half = 0.6 * middle[2] * max(camera.width / camera.K[0, 0], camera.height / camera.K[1, 1])
     lines = _grid(plane.rotation.T @ (middle - plane.translation_mm), half)
@@ -145,7 +146,7 @@ def log_plane(rec: rr.RecordingStream, calibration: Calibration) -> None:
 
 
 def middle_mm(calibration: Calibration) -> Float[np.ndarray, "3"]:
-    """Where the camera's axis meets the plane, or the plane's origin where it doesn't."""
+    """Where the camera's axis meets the plane, mm; the plane's origin where it doesn't."""
     ray = np.array([[0.0, 0.0, 1.0]])
     depth = calibration.plane.depth_mm(ray)[0]
     if np.isfinite(depth) and depth > 0:
@@ -154,8 +155,10 @@ def middle_mm(calibration: Calibration) -> Float[np.ndarray, "3"]:
 
 
 def _grid(middle: Float[np.ndarray, "3"], half: float) -> Float[np.ndarray, "L 2 3"]:
-    """Lines of a square grid in world Z = 0, on multiples of its spacing."""
-    spacing = _GRID_MM * max(1.0, np.ceil(half / _GRID_MM / 20))  # 40 lines each way at most
+    """Start and end of the lines of a square grid at world Z = 0, on multiples of its spacing."""
+    spacing = _GRID_MM * max(
+        1.0, np.ceil(half / _GRID_MM / 20)
+    )  # at most 40 lines in each direction
     count = int(np.ceil(half / spacing))
     center = np.round(middle[:2] / spacing) * spacing
     offsets = np.arange(-count, count + 1) * spacing

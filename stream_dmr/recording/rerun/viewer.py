@@ -1,6 +1,6 @@
-"""Opens a recording in Rerun's own viewer: in a window, in a browser, or without a screen.
+"""Opens a recording in Rerun's viewer: in a window, in a browser, or without a screen.
 
-It is given as the absolute path of an .rrd, or as the address of a `LiveView`.
+`rrd` is the absolute path of an .rrd or the address of a `LiveView`.
 """
 
 import os
@@ -17,16 +17,16 @@ from rerun.experimental import ViewerClient
 
 from stream_dmr.errors import RecordingError
 from stream_dmr.files import writing_to
-from stream_dmr.recording.rerun.program import rerun_program
+from stream_dmr.recording.rerun.rerun_program import rerun_program
 
 WEB_MEMORY = "512MiB"  # of the server; what is older is dropped
 _VIEWER_MEMORY = "4GiB"
-_SETTLE_S, _MOST_SETTLES = 1.0, 15
+_SETTLE_S, _MAX_SETTLES = 1.0, 15  # a screenshot takes some 5 s; slower machines get 15
 _TERMINAL_COLORS = re.compile(r"\x1b\[[0-9;]*m")
 
 
 def show(rrd: str) -> None:
-    """Open `rrd` in a window; returns when that is closed."""
+    """Open `rrd` in a window and return when it is closed. Raises RecordingError."""
     with _running([rrd, "--port", "auto", "--memory-limit", _VIEWER_MEMORY]) as process:
         output = process.communicate()[0]
         if process.returncode:
@@ -39,18 +39,20 @@ def show(rrd: str) -> None:
 def serve(rrd: str, *, port: int) -> None:
     """Serve `rrd` and a viewer for browsers at 127.0.0.1, until interrupted.
 
-    Prints the address. Memory is bounded by WEB_MEMORY, and nobody outside this machine can see it.
+    Prints the address. Memory is bounded by WEB_MEMORY; other machines can't connect.
     """
     options = ["--serve-web", "--port", "auto", "--web-viewer-port", str(port)]
     with _running([rrd, *options, "--server-memory-limit", WEB_MEMORY]) as process:
         for line in process.stdout or ():
             if match := re.search(r"connect at (http\S+)", _TERMINAL_COLORS.sub("", line)):
                 print(f"{match[1]}\nstop with Ctrl-C", flush=True)
-        raise RecordingError(f"the viewer's server ended; is port {port} in use? choose another")
+        raise RecordingError(
+            f"the viewer's server ended; maybe port {port} is in use: choose another with --port"
+        )
 
 
 def screenshot(rrd: str, png: Path, *, frame_index: int) -> None:
-    """Open `rrd` at one frame in a viewer without a screen and save what it shows.
+    """Save what a viewer without a screen shows of `rrd` at one frame.
 
     Needs a Vulkan driver; a software one does (Debian: mesa-vulkan-drivers). Takes some 5 seconds.
     """
@@ -72,7 +74,7 @@ def _headless() -> Iterator[ViewerClient]:
 
 
 def _wait_for(process: subprocess.Popen[str]) -> None:
-    """Until the viewer runs, not only listens; RecordingError where it doesn't come up."""
+    """Wait until the viewer runs. Raises RecordingError where it doesn't."""
     lines = []
     for line in process.stdout or ():
         lines.append(line)
@@ -85,8 +87,8 @@ def _wait_for(process: subprocess.Popen[str]) -> None:
 
 
 def _go_to(viewer: ViewerClient, frame_index: int) -> None:
-    """Stop at a frame, as soon as enough is loaded for there to be frames."""
-    for _ in range(_MOST_SETTLES):
+    """Go to a frame as soon as frames are loaded. Raises RecordingError where there are none."""
+    for _ in range(_MAX_SETTLES):
         try:
             return viewer.set_time("frame", sequence=frame_index, play_state="paused")
         except ConnectionError:
@@ -95,10 +97,10 @@ def _go_to(viewer: ViewerClient, frame_index: int) -> None:
 
 
 def _settled_picture(viewer: ViewerClient) -> bytes:
-    """What the viewer shows once it has loaded and laid out: two looks that are the same."""
+    """PNG of the loaded view: of two equal consecutive screenshots."""
     time.sleep(_SETTLE_S)
     before = viewer.take_screenshot()
-    for _ in range(_MOST_SETTLES):
+    for _ in range(_MAX_SETTLES):
         time.sleep(_SETTLE_S)
         picture = viewer.take_screenshot()
         if picture == before:
@@ -109,9 +111,9 @@ def _settled_picture(viewer: ViewerClient) -> bytes:
 
 @contextmanager
 def _running(options: Sequence[str]) -> Iterator[subprocess.Popen[str]]:
-    """Rerun's program of this very environment, heard on this machine only; ends with us."""
+    """Run Rerun's program, listening on this machine only, until the context ends."""
     with (
-        TemporaryDirectory() as scratch,  # it leaves files behind
+        TemporaryDirectory() as scratch,  # for the files that it leaves behind
         subprocess.Popen(
             [rerun_program(), *options, "--bind", "127.0.0.1"],
             stdout=subprocess.PIPE,

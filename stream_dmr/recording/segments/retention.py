@@ -1,4 +1,4 @@
-"""Keeps room on the disk: old recordings go when it runs short, step by step, lengths never."""
+"""Frees disk space by deleting the oldest recordings, step by step; lengths are never deleted."""
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
@@ -10,24 +10,24 @@ from stream_dmr.csv_file import rotated_files
 from stream_dmr.errors import OutputError, RecordingError
 from stream_dmr.files import free_bytes, natural_order, rename_durably
 from stream_dmr.messages import FishCrop, Frame
-from stream_dmr.recording.files import STEM
-from stream_dmr.recording.mcap.file import McapFile
-from stream_dmr.recording.mcap.sink import PART
+from stream_dmr.recording.mcap.mcap_recording import McapRecording
+from stream_dmr.recording.mcap.mcap_sink import PART
+from stream_dmr.recording.mcap.rewrite import rewrite
 from stream_dmr.recording.messages.codec import without_picture
 from stream_dmr.recording.messages.topics import FOXGLOVE_TOPICS, THINNED, TOPICS, VIDEO
-from stream_dmr.recording.reading.rewrite import rewrite
-from stream_dmr.recording.rerun.file import is_closed
+from stream_dmr.recording.rerun.rrd_recording import is_closed
+from stream_dmr.recording.segments.recording_files import STEM
 
-_LEFT_OUT = {TOPICS[FishCrop].topic, VIDEO, *FOXGLOVE_TOPICS}
-_PERIOD_S = 5.0
+_THINNED_TOPICS = {TOPICS[FishCrop].topic, VIDEO, *FOXGLOVE_TOPICS}
+_PERIOD_S = 5.0  # chosen: a run writes some 10 MB in that time
 
 
 class Retention:
-    """Makes room in the folder of a run whenever less is free than is to be kept free.
+    """Frees space in the folder of a run whenever the disk has less than `free_bytes` left.
 
-    First go old tables of frames, whose rows the segments have, then the views, and pictures and
-    masks, of the oldest segments, then whole segments; those with a fish of `marked()` after all
-    others. What is being written is left alone.
+    Deleted first are old tables of frames, whose rows the segments have, then the views and the
+    pictures and masks of the oldest segments, then whole segments; segments with a track of
+    `flagged()` after all others. Files that are being written are kept.
     """
 
     def __init__(
@@ -35,29 +35,29 @@ class Retention:
         folder: Path,
         *,
         free_bytes: int,
-        marked: Callable[[], Collection[int]],
+        flagged: Callable[[], Collection[int]],
         on_notice: Callable[[str], None],
     ) -> None:
         self._folder, self._free_bytes = folder, free_bytes
-        self._marked, self._on_notice = marked, on_notice
-        self._known: dict[str, tuple[Collection[int], bool]] = {}  # tracks, is it thinned
+        self._flagged, self._on_notice = flagged, on_notice
+        self._known: dict[str, tuple[Collection[int], bool]] = {}  # by stem, see `_facts`
         self._stop = Event()
         self._thread = Thread(target=self._watch, name="retention", daemon=True)
 
     def start(self) -> None:
-        """Make room from now on, in a thread of its own."""
+        """Check the free space from now on, in a thread of its own."""
         self._thread.start()
 
     def close(self) -> None:
-        """Stop. Idempotent."""
+        """Stop the thread. Idempotent."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
 
-    def make_room(self) -> None:
-        """Take as many steps as are needed, or as there are.
+    def free_space(self) -> None:
+        """Delete until enough is free or nothing is left to delete.
 
-        Raises OSError or OutputError where the disk is not well.
+        Raises OSError or OutputError where the disk fails.
         """
         if not self._free_bytes or not self._folder.is_dir():
             return
@@ -75,36 +75,36 @@ class Retention:
     def _watch(self) -> None:
         while not self._stop.wait(_PERIOD_S):
             with suppress(OSError, OutputError):  # measuring goes on
-                self.make_room()
+                self.free_space()
 
     def _is_short(self) -> bool:
         return free_bytes(self._folder) < self._free_bytes
 
     def _steps(self) -> Iterator[str]:
-        """Do what makes room, one at a time, and name it."""
+        """Delete one thing at a time, and yield its name for the notice."""
         for table in rotated_files(self._folder / "frames.csv"):
             yield from self._remove(table, "the table of frames")
-        stems, marked = self._finished(), set(self._marked())
-        is_marked = {stem: bool(marked & set(self._facts(stem)[0])) for stem in stems}
-        for wanted in (False, True):
-            group = [stem for stem in stems if is_marked[stem] is wanted]
+        stems, flagged = self._finished_stems(), set(self._flagged())
+        has_flagged = {stem: bool(flagged & set(self._facts(stem)[0])) for stem in stems}
+        for flag in (False, True):
+            group = [stem for stem in stems if has_flagged[stem] is flag]
             for stem in group:
                 yield from self._remove(stem.with_suffix(".rrd"), "the view")
                 yield from self._thin(stem.with_suffix(".mcap"))
             for stem in group:
                 yield from self._remove(stem.with_suffix(".mcap"), "all")
 
-    def _finished(self) -> list[Path]:
-        """What is not being written, the oldest first, without suffix."""
+    def _finished_stems(self) -> list[Path]:
+        """Segments that are not being written, the oldest first, without suffix."""
         recordings = [*self._folder.glob(f"{STEM}-*.mcap"), *self._folder.glob(f"{STEM}-*.rrd")]
         stems = {path.with_suffix("") for path in recordings}
         return sorted((stem for stem in stems if not _is_open(stem)), key=natural_order)
 
     def _facts(self, stem: Path) -> tuple[Collection[int], bool]:
-        """The fish of a segment, and whether its pictures and masks are gone."""
+        """The track ids of a segment, and True where its pictures and masks are gone."""
         if stem.name not in self._known:
             try:
-                file = McapFile(stem.with_suffix(".mcap"))
+                file = McapRecording(stem.with_suffix(".mcap"))
                 self._known[stem.name] = file.tracks(), file.is_thinned
             except RecordingError:
                 self._known[stem.name] = (), True
@@ -116,12 +116,12 @@ class Retention:
             yield what
 
     def _thin(self, path: Path) -> Iterator[str]:
-        """Pictures and masks go; where there is no room to write the rest anew, nothing does."""
+        """Remove pictures and masks; without room for the copy, do nothing."""
         tracks, is_thinned = self._facts(path.with_suffix(""))
         if is_thinned:
             return
         with suppress(OSError):
-            copy, _ = rewrite(path, note=THINNED, edit=_thinned)
+            copy, _ = rewrite(path, note=THINNED, edit=_without_pictures)
             rename_durably(copy, path)
             self._known[path.stem] = tracks, True
             yield "pictures and masks"
@@ -134,7 +134,7 @@ def _is_open(stem: Path) -> bool:
     )
 
 
-def _thinned(topic: str, data: bytes) -> bytes | None:
-    if topic in _LEFT_OUT:
+def _without_pictures(topic: str, data: bytes) -> bytes | None:
+    if topic in _THINNED_TOPICS:
         return None
     return without_picture(data) if topic == TOPICS[Frame].topic else data

@@ -1,4 +1,4 @@
-"""The view of a run while it measures."""
+"""Serves the view of a run while it measures."""
 
 import socket
 import time
@@ -9,30 +9,30 @@ from threading import Event, Thread
 import rerun as rr
 
 from stream_dmr.errors import OutputError
-from stream_dmr.recording.messages.header import RunHeader
 from stream_dmr.recording.messages.record import Record
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
+from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.rerun.blueprint import blueprint
-from stream_dmr.recording.rerun.draw import Drawing
-from stream_dmr.recording.rerun.sink import log_run, new_stream
-from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.rerun.rrd_sink import log_run, new_stream
+from stream_dmr.recording.rerun.scene_drawing import SceneDrawing
 
-_PORT = 9876  # where Rerun's viewer looks first
-_MEMORY = "256MiB"  # of the server, for viewers that come late; what is older is dropped
-_QUEUE_MESSAGES = 128
+_PORT = 9876  # Rerun's default
+_MEMORY = "256MiB"  # of the server, for viewers that connect late; what is older is dropped
+_MAX_QUEUED = 128  # messages, some ten frames; beyond that messages are not shown
 _SEND_S = 0.2
-_CLOSE_S = 2.0  # a viewer that hangs is left behind after this
+_CLOSE_TIMEOUT_S = 2.0  # a viewer that hangs is not waited for any longer
 
 
 class LiveView:
     """Serves the view at `address`, on this machine only.
 
-    It can neither slow nor stop the run: what it has no time for is not shown, and where it
-    breaks, it is silent from there on.
+    It can neither slow down nor stop the run: messages that it has no time for are not shown, and
+    after an error of its own it shows nothing more.
     """
 
     def __init__(self, header: RunHeader, settings: RecordingSettings) -> None:
         self.num_dropped = 0
-        self._queue: Queue[Record] = Queue(_QUEUE_MESSAGES)
+        self._queue: Queue[Record] = Queue(_MAX_QUEUED)
         self._stop = Event()
         port = _free_port()
         self.address = f"rerun+http://127.0.0.1:{port}/proxy"
@@ -40,12 +40,12 @@ class LiveView:
         sink = rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=_MEMORY)
         self._rec.set_sinks(sink, default_blueprint=blueprint(header.calibration))
         log_run(self._rec, header)
-        self._drawing = Drawing(self._rec, header, settings)
+        self._drawing = SceneDrawing(self._rec, header, settings)
         self._thread = Thread(target=self._draw_all, name="live", daemon=True)
         self._thread.start()
 
     def write(self, record: Record) -> None:
-        """Show a record, if there is time for it."""
+        """Show a record if the queue has room for it."""
         try:
             self._queue.put_nowait(record)
         except Full:
@@ -54,7 +54,7 @@ class LiveView:
     def close(self) -> None:
         """Stop serving. Idempotent."""
         self._stop.set()
-        self._thread.join(_CLOSE_S)
+        self._thread.join(_CLOSE_TIMEOUT_S)
 
     def _draw_all(self) -> None:
         with suppress(Exception):
@@ -70,7 +70,7 @@ class LiveView:
 
 
 def _free_port() -> int:
-    """Rerun's own port, or any where that is taken."""
+    """Rerun's default port, or any free one. Raises OutputError where there is none."""
     for port in (_PORT, 0):
         with socket.socket() as probe, suppress(OSError):
             probe.bind(("127.0.0.1", port))

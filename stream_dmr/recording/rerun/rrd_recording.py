@@ -1,11 +1,10 @@
-"""Reads the messages back that an .rrd carries beside its view.
+"""Reads the messages that an .rrd carries beside its view.
 
-An .rrd has no checksum of its own, so each message and each part of the header has a CRC-32 beside
-it, the messages of each kind are numbered, and a last row says how many there are.
+An .rrd has no checksums, so each message and each part of the header has a CRC-32 beside it, the
+messages of each type are numbered, and a last row says how many there are.
 """
 
 import json
-import subprocess
 import warnings
 import zlib
 from collections.abc import Collection, Iterator
@@ -23,24 +22,24 @@ import pyarrow as pa
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import Message
 from stream_dmr.recording.messages.codec import check_version
-from stream_dmr.recording.messages.header import RunHeader
-from stream_dmr.recording.messages.selection import WHOLE, Part
+from stream_dmr.recording.messages.run_header import RunHeader
+from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.messages.topics import END, TOPICS
-from stream_dmr.recording.rerun.program import rerun_program
+from stream_dmr.recording.rerun.rerun_program import copy_readable_chunks
 
 _HEADER = "/messages/header/"
-_FOOTER_MAGIC = b"RRF2FOOT"  # in the last 16 bytes of a file that was closed
-_DAMAGE = (ValueError, RuntimeError, OSError, KeyError, TypeError, pa.ArrowException)
+_FOOTER_MAGIC = b"RRF2FOOT"  # in the last 16 bytes of every closed file, by experiment
+_DAMAGE_ERRORS = (ValueError, RuntimeError, OSError, KeyError, TypeError, pa.ArrowException)
 
-# By entity: number, capture time, encoding.
 Rows = dict[str, list[tuple[int, int, bytes]]]
+"""Entity path -> number, capture time in ns and encoding of each message."""
 
 
-class RrdFile:
-    """One .rrd with `rrd_messages`, in memory."""
+class RrdRecording:
+    """One .rrd with `rrd_messages`, in memory; the protocol is `Recording` of `open_recording`."""
 
     def __init__(self, path: Path) -> None:
-        """Raises RecordingError where it can't be read or holds no messages."""
+        """Read the file. Raises RecordingError where it can't be read or holds no messages."""
         self.path = path
         self.warnings: list[str] = []
         self._rows = _read_apart(path)
@@ -48,24 +47,24 @@ class RrdFile:
         self.header = self._read_header()
 
     def payloads(
-        self, kinds: Collection[type[Message]], part: Part = WHOLE
+        self, kinds: Collection[type[Message]], selection: Selection = EVERYTHING
     ) -> Iterator[tuple[type[Message], bytes]]:
-        """See `opened.Recording`; the kinds are mixed by capture time."""
+        """Type and encoding of the messages of `kinds`, merged by capture time."""
 
         def wanted(kind: type[Message]) -> Iterator[tuple[int, type[Message], bytes]]:
             for _, timestamp_ns, payload in self._rows.get(f"/{TOPICS[kind].payload}", ()):
-                if part.has_time(timestamp_ns):
+                if selection.includes_time(timestamp_ns):
                     yield timestamp_ns, kind, payload
 
         for _, kind, payload in merge(*map(wanted, kinds), key=itemgetter(0)):
             yield kind, payload
 
-    def carried(self) -> Iterator[bytes]:
-        """None: it is in the .mcap."""
+    def carried_over(self) -> Iterator[bytes]:
+        """Nothing: it is only in the .mcap."""
         return iter(())
 
-    def video(self, part: Part = WHOLE) -> Iterator[bytes]:
-        """None: it is in the .mcap."""
+    def video(self, selection: Selection = EVERYTHING) -> Iterator[bytes]:
+        """Nothing: it is only in the .mcap."""
         return iter(())
 
     def _check_end(self) -> None:
@@ -104,21 +103,21 @@ class RrdFile:
 
 
 def _read_apart(path: Path) -> Rows:
-    """Read in a process of its own: on some damaged files Rerun takes its process down."""
+    """Read in a process of its own: on some damaged files Rerun's reader crashes its process."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         try:
             return pool.submit(_read, path).result()
         except BrokenProcessPool as error:
             raise RecordingError(
-                f"{path}: damaged: Rerun's reader breaks down on it; replay the .mcap instead"
+                f"{path}: damaged: Rerun's reader crashes on it; replay the .mcap instead"
             ) from error
 
 
 def _read(path: Path) -> Rows:
     try:
         return _rows_in(path)
-    except _DAMAGE as error:
-        if path.is_file() and not is_closed(path) and (rows := _salvaged(path)):
+    except _DAMAGE_ERRORS as error:
+        if path.is_file() and not is_closed(path) and (rows := _read_readable_chunks(path)):
             return rows
         raise RecordingError(
             f"{path}: expected a whole recording (.rrd), but it can't be read: {error}"
@@ -130,7 +129,7 @@ def _rows_in(path: Path) -> Rows:
 
     rows: Rows = {}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that a torn file has no footer, we say ourselves
+        warnings.simplefilter("ignore")  # of a missing footer, which `RrdRecording.warnings` tells
         for chunk in RrdReader(str(path)).stream():
             entity = str(chunk.entity_path)
             if entity.startswith("/messages/"):
@@ -143,34 +142,25 @@ def _rows_in(path: Path) -> Rows:
 
 
 def is_closed(path: Path) -> bool:
-    """Whether an .rrd has its footer."""
+    """True where an .rrd has its footer."""
     with path.open("rb") as file:
         file.seek(max(path.stat().st_size - 16, 0))
         return _FOOTER_MAGIC in file.read()
 
 
-def _salvaged(path: Path) -> Rows:
-    """The whole part of a file that was not closed, of which Rerun's reader wants nothing."""
+def _read_readable_chunks(path: Path) -> Rows:
+    """The readable messages of a file that was not closed, which Rerun's reader refuses."""
     with TemporaryDirectory() as folder:
         whole = Path(folder) / "whole.rrd"
-        command = [
-            rerun_program(),
-            "rrd",
-            "filter",
-            "--continue-on-error",
-            str(path),
-            "-o",
-            str(whole),
-        ]
-        subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        copy_readable_chunks(path, whole)
         try:
             return _rows_in(whole)
-        except _DAMAGE:
+        except _DAMAGE_ERRORS:
             return {}
 
 
 def _rows_of(batch: pa.RecordBatch) -> Iterator[tuple[int, int, bytes]]:
-    """Numbers, times and encodings; those of the header, which is static, are 0."""
+    """Numbers, times and encodings; the header's rows are static: number and time 0."""
     times, numbers = [0] * batch.num_rows, [0] * batch.num_rows
     if "time" in batch.schema.names:
         times = batch.column("time").cast(pa.int64()).to_pylist()

@@ -1,4 +1,4 @@
-"""An .rrd: the view of a run, and, with `rrd_messages`, its messages as well."""
+"""Writes an .rrd: the view of a run and, with `rrd_messages`, its messages."""
 
 import json
 import time
@@ -8,22 +8,22 @@ from pathlib import Path
 import rerun as rr
 
 from stream_dmr.errors import OutputError
-from stream_dmr.recording.messages.header import RunHeader
 from stream_dmr.recording.messages.record import Record
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
+from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.topics import END
 from stream_dmr.recording.rerun.blueprint import RUN, blueprint
-from stream_dmr.recording.rerun.columns import blob
-from stream_dmr.recording.rerun.draw import Drawing
-from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.rerun.column_buffer import payload_columns
+from stream_dmr.recording.rerun.scene_drawing import SceneDrawing
 
 _HEADER = ["messages", "header"]
-_FLUSH_TIMEOUT_S = 30.0
+_FLUSH_TIMEOUT_S = 30.0  # chosen: a slow disk is waited for, a hanging one is not
 
 
-class RerunSink:
-    """Draws every record, through a stream of its own: Rerun's global one is left alone.
+class RrdSink:
+    """Draws every record into a stream of its own; Rerun's global stream is not touched.
 
-    Rerun says nothing of a full disk until it is flushed, so that comes every `flush_s`.
+    Rerun reports a full disk only when it is flushed, which is done every `flush_s`.
     """
 
     def __init__(self, path: Path, header: RunHeader, settings: RecordingSettings) -> None:
@@ -31,29 +31,29 @@ class RerunSink:
         self._flush_ns = int(settings.flush_s * 1e9)
         self._with_messages = settings.rrd_messages
         self._closed = False
-        self._counts: dict[str, int] = {}  # of the rows of the header, by entity
+        self._counts: dict[str, int] = {}  # rows of the header, by entity
         self._rec = new_stream()
         try:
             sink = rr.FileSink(str(path))
             self._rec.set_sinks(sink, default_blueprint=blueprint(header.calibration))
         except RuntimeError as error:
-            raise self._refusal(error) from error
-        self._drawing = Drawing(self._rec, header, settings)
+            raise self._output_error(error) from error
+        self._drawing = SceneDrawing(self._rec, header, settings)
         log_run(self._rec, header)
         if self._with_messages:
             self._log_header(header)
         self._flush()
 
     def write(self, record: Record) -> None:
-        """Draw one record; OutputError where the disk refuses it."""
+        """Draw one record. Raises OutputError where the disk refuses it, and closes the file."""
         self._drawing.draw(record)
         if self._with_messages:
-            self._drawing.keep(record)
+            self._drawing.add_payload(record)
         if time.monotonic_ns() >= self._flush_at_ns:
             self._flush()
 
     def close(self) -> None:
-        """Write what is buffered and the file's footer. Idempotent."""
+        """Write what is buffered and the file's footer. Idempotent. OutputError."""
         if self._closed:
             return
         self._closed = True
@@ -72,12 +72,14 @@ class RerunSink:
             self._counts["/".join(["", *_HEADER, name])] = 1
 
     def _log_end(self) -> None:
-        """How much there is, so that a reader knows when something is missing."""
-        messages = {f"/{path}": count for path, count in self._drawing.kept.items()}
+        """Log the number of messages, by which a reader knows when some are missing."""
+        messages = {f"/{path}": count for path, count in self._drawing.num_payloads.items()}
         self._log(END.split("/"), json.dumps(self._counts | messages).encode())
 
     def _log(self, path: Sequence[object], data: bytes) -> None:
-        self._rec.log([*path], rr.AnyValues(drop_untyped_nones=True, **blob(data)), static=True)
+        self._rec.log(
+            [*path], rr.AnyValues(drop_untyped_nones=True, **payload_columns(data)), static=True
+        )
 
     def _flush(self) -> None:
         self._drawing.send()
@@ -86,10 +88,10 @@ class RerunSink:
         except RuntimeError as error:
             self._closed = True
             self._rec.disconnect()
-            raise self._refusal(error) from error
+            raise self._output_error(error) from error
         self._flush_at_ns = time.monotonic_ns() + self._flush_ns
 
-    def _refusal(self, error: RuntimeError) -> OutputError:
+    def _output_error(self, error: RuntimeError) -> OutputError:
         return OutputError(
             f"{self.path}: expected a file with room to write to, got: {error}; "
             "make room or choose another --out"
@@ -97,7 +99,7 @@ class RerunSink:
 
 
 def new_stream() -> rr.RecordingStream:
-    """A stream in which nothing is known but what we say."""
+    """A Rerun stream without the timelines of logging time."""
     rec = rr.RecordingStream("stream-dmr")
     rec.set_log_time_enabled(False)
     rec.set_log_tick_enabled(False)
@@ -105,7 +107,7 @@ def new_stream() -> rr.RecordingStream:
 
 
 def log_run(rec: rr.RecordingStream, header: RunHeader) -> None:
-    """Who recorded this, from what, and with which settings, for people."""
+    """Log metadata and settings of the run as a document, for people."""
     rows = "\n".join(f"| {name} | `{value}` |" for name, value in header.metadata().items())
     text = f"| | |\n|---|---|\n{rows}\n\n```toml\n{header.config_toml}\n```"
     rec.log(RUN, rr.TextDocument(text, media_type="text/markdown"), static=True)

@@ -1,4 +1,4 @@
-"""What a recording needs beside its messages to be recomputed from."""
+"""The header of a recording: what is needed beside its messages to recompute the run."""
 
 import platform
 import zlib
@@ -39,11 +39,11 @@ class RunHeader:
 
     @cached_property
     def checksum(self) -> int:
-        """Of the attachments: runs with the same one had the same inputs but for the source."""
+        """CRC-32 of the attachments: equal for runs that differ only in source, boxes or masks."""
         return _checksum(self.attachments())
 
     def metadata(self) -> dict[str, str]:
-        """The record `run`: who wrote this, from what, and with which versions."""
+        """The metadata record `run`: the inputs, and the versions of what wrote the recording."""
         given = {} if self.inputs is None else self.inputs.metadata()
         return {
             "source": self.source,
@@ -59,7 +59,7 @@ class RunHeader:
         }
 
     def attachments(self) -> dict[str, bytes]:
-        """Name -> content. The .pb ones are exact and for replay, the others are for people too."""
+        """Name -> content. The .pb ones are exact, for replay; the others can be read by people."""
         files = {"config.toml": self.config_toml.encode(), "template.pb": encode(self.template)}
         if self.candidates is not None:
             files["shapes.pb"] = encode(self.candidates)
@@ -70,9 +70,9 @@ class RunHeader:
 
     @classmethod
     def from_parts(cls, metadata: dict[str, str], attachments: dict[str, bytes]) -> "RunHeader":
-        """The inverse of `metadata` and `attachments`, exact.
+        """The exact inverse of `metadata` and `attachments`.
 
-        KeyError where a part is missing, RecordingError where one is damaged.
+        Raises KeyError where a part is missing, RecordingError where one is damaged.
         """
         calibration, shapes = attachments.get("calibration.pb"), attachments.get("shapes.pb")
         header = cls(
@@ -92,7 +92,7 @@ class RunHeader:
 
 
 def _checksum(attachments: Mapping[str, bytes]) -> int:
-    """To tell whether all are there and as they were: readers by index check nothing else."""
+    """CRC-32 over names and contents: the mcap library checks no attachment when it reads one."""
     crc32 = 0
     for name, data in sorted(attachments.items()):
         crc32 = zlib.crc32(name.encode() + data, crc32)
@@ -100,7 +100,7 @@ def _checksum(attachments: Mapping[str, bytes]) -> int:
 
 
 def _cpu() -> str:
-    """The processor: another one may round the last bits of sines and sums otherwise."""
+    """The processor's name: another one may round the last bits of sines and sums differently."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""Rows for Rerun, sent many at a time: logged one by one they take several times as long."""
+"""Collects rows for Rerun and sends them together, which is several times as fast."""
 
 import zlib
 from collections import defaultdict
@@ -10,13 +10,15 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-_EPOCH_NS = 10**17  # timestamps above are since 1970 (this is 1973), below since the start
+# Timestamps above this (the year 1973) count from the Unix epoch, others from a file's start.
+_EPOCH_NS = 10**17
 
-_Values = np.ndarray | Sequence[Any]  # of one row and component: its instances
+_Values = np.ndarray | Sequence[Any]
+"""The instances of one component in one row."""
 
 
-class Columns:
-    """Collects rows of components by entity, at frame indices and capture times."""
+class ColumnBuffer:
+    """Rows of components by entity, each at a frame index and a capture time."""
 
     def __init__(self, rec: rr.RecordingStream) -> None:
         self._rec = rec
@@ -24,17 +26,17 @@ class Columns:
         self._moments: dict[tuple[str, type], list[tuple[int, int]]] = defaultdict(list)
 
     def add(self, path: str, archetype: Any, moment: tuple[int, int], **values: _Values) -> None:
-        """Put down one row; `moment` is its frame index and capture time.
+        """Add one row at `moment`, its frame index and capture time in ns.
 
-        `archetype` is Rerun's class, `values` are the instances of its components: the same names
-        in every row of an entity.
+        `archetype` is Rerun's class, `values` its components' instances: the same names in every
+        row of an entity.
         """
         self._rows[path, archetype].append(values)
         self._moments[path, archetype].append(moment)
 
     def send(self) -> None:
-        """Hand all rows over."""
-        # What is cleared at a moment must come before what is drawn at that moment.
+        """Send all rows to Rerun and forget them."""
+        # Entities are cleared before something is drawn at the same moment.
         for key in sorted(self._rows, key=lambda key: key[1] is not rr.Clear):
             path, archetype = key
             rows = self._rows[key]
@@ -48,8 +50,8 @@ class Columns:
         self._moments.clear()
 
 
-def blob(data: bytes) -> dict[str, np.ndarray]:
-    """Bytes with their CRC-32, since an .rrd has no checksum of its own."""
+def payload_columns(data: bytes) -> dict[str, np.ndarray]:
+    """The bytes and their CRC-32, since an .rrd has no checksums."""
     crc32 = np.array([zlib.crc32(data)], np.uint32)
     return {"payload": np.frombuffer(data, np.uint8), "crc32": crc32}
 
@@ -58,7 +60,7 @@ def _column(archetype: Any, name: str, rows: Sequence[_Values]) -> rr.ComponentC
     lengths = [len(row) for row in rows]
     if isinstance(rows[0], np.ndarray):
         values = np.concatenate(rows)
-        if archetype is rr.AnyValues:  # which takes arrays apart, number by number
+        if archetype is rr.AnyValues:  # which would split arrays into numbers
             return archetype.columns(**{name: _lists(values, lengths)})
     else:
         values = list(chain.from_iterable(rows))

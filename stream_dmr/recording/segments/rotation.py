@@ -1,4 +1,4 @@
-"""Recordings of a bounded length, one after the other, for a source without an end."""
+"""Records a source without an end in segments of bounded length, one after the other."""
 
 import re
 from collections.abc import Callable, Iterable
@@ -9,29 +9,30 @@ from threading import Thread
 from stream_dmr.errors import OutputError
 from stream_dmr.files import free_bytes
 from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish
-from stream_dmr.recording.files import STEM, FileSink, Flushing, Sink, open_files
-from stream_dmr.recording.mcap.sink import McapSink
-from stream_dmr.recording.messages.header import RunHeader
+from stream_dmr.recording.mcap.mcap_sink import McapSink
 from stream_dmr.recording.messages.record import Record
-from stream_dmr.recording.segments.open_tracks import Carried, carried_record
-from stream_dmr.recording.segments.recover import is_unfinished, repair
-from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
+from stream_dmr.recording.messages.run_header import RunHeader
+from stream_dmr.recording.messages.sink import BufferedSink, FileSink, Sink
+from stream_dmr.recording.segments.open_tracks import OpenTracks
+from stream_dmr.recording.segments.recording_files import STEM, open_recording_files
+from stream_dmr.recording.segments.repair import is_unfinished, repair_file
 
 _NUMBERED = re.compile(rf"{STEM}-(\d+)\..*")
-_RETRY_NS = 5_000_000_000  # of capture time, after the disk refused a new segment
-_FLOOR = 0.05  # of `keep_free_gb`: with less than that free, nothing but lengths is written
+_RETRY_NS = 5_000_000_000  # capture time after which a new segment is tried again
+_MIN_FREE_SHARE = 0.05  # of `keep_free_gb`: with less than that free only lengths are written
 _NO_ROOM = "hardly any room is left on the disk; nothing is recorded but lengths"
-_MOST_IN_FLIGHT = 16  # frames between the source and the end of the chain: fewer, in fact
+_MAX_IN_FLIGHT = 16  # frames between the source and the end of the chain; its queues hold fewer
 
 
-class Segments:
+class RotatingSink:
     """Writes recording-000001.mcap and .rrd, recording-000002.mcap and .rrd, ...
 
-    A cut comes between two frames. The stages are some frames apart, so for a moment two segments
-    are open: what belongs to frames from the cut on goes to the new one. A segment is complete
-    when the last stage has reached the cut; the fish in view are then carried over to the next.
-    What the disk refuses is told by `on_notice` and tried again with a new segment; what that
-    leaves unfinished is repaired once there is room for the next one.
+    A cut lies between two frames. The stages are some frames apart, so two segments are open for a
+    moment: messages of frames after the cut go to the new one. A segment is complete when the last
+    stage has reached the cut; the frames of open tracks are then carried over to the next one.
+    Where the disk refuses a write, `on_notice` is told and a new segment is tried; the unfinished
+    files are repaired once there is room for the next one.
     """
 
     def __init__(
@@ -40,48 +41,50 @@ class Segments:
         header: RunHeader,
         settings: RecordingSettings,
         *,
-        left: Iterable[LocalizedFish] = (),
+        interrupted: Iterable[LocalizedFish] = (),
         on_notice: Callable[[str], None],
     ) -> None:
-        """`left`: of the fish that an earlier run left unfinished, which this one finishes."""
+        """`interrupted`: frames of tracks that an earlier run left open and this one finishes."""
         self._out_dir, self._header, self._settings = out_dir, header, settings
         self._on_notice = on_notice
-        self._number = last_number(out_dir)
+        self._number = last_segment_number(out_dir)
         self._began_ns: int | None = None  # capture time of the first frame
         self._cut_ns: int | None = None  # of the first frame of `_next`
         self._retry_ns = 0
         self._now_ns = self._refused_ns = 0  # capture times: the last frame; the last refusal
         self._frames_since_cut = 0
-        self._carried, self._ahead = Carried(), list[Record]()
-        for fish in left:
-            self._carried.take(carried_record(fish))
-        self._torn: list[Path] = []
+        self._open_tracks, self._ahead = OpenTracks(), list[Record]()
+        for fish in interrupted:
+            self._open_tracks.add_earlier(fish)
+        self._unfinished: list[Path] = []
         self._repairs = Thread(target=self._repair, name="repairs")
         self._next: list[FileSink] = []
         self._open: list[FileSink] = self._try_next(0)
-        self._carry_to(self._open)
+        self._carry_over_to(self._open)
 
     def write(self, record: Record) -> None:
-        """Take one record; never raises OutputError."""
+        """Take one record. Never raises OutputError."""
         message = record.message
         if isinstance(message, Frame):
-            self._see(message)
+            self._take_frame(message)
         is_after = self._cut_ns is not None and message.timestamp_ns >= self._cut_ns
         if isinstance(message, LengthEstimate):
             if is_after and not message.is_final:
                 self._complete()
-            is_after = False  # a final one belongs where it was made, whenever its fish was seen
+            is_after = False  # a final one belongs to the segment in which its track ended
         if is_after:
             self._ahead.append(record)
         else:
-            self._carried.take(record)
+            self._open_tracks.add(record)
         sinks = self._next if is_after else self._open
         self._each(sinks, lambda sink: sink.write(record))
 
     def flush_due(self) -> None:
-        """Write what was kept long enough; never raises OutputError."""
+        """Write what was kept long enough. Never raises OutputError."""
         for sinks in (self._open, self._next):
-            self._each(sinks, lambda sink: sink.flush_due() if isinstance(sink, Flushing) else None)
+            self._each(
+                sinks, lambda sink: sink.flush_due() if isinstance(sink, BufferedSink) else None
+            )
 
     def close(self) -> None:
         """Close what is open. Idempotent."""
@@ -92,14 +95,14 @@ class Segments:
             self._repairs.join()
         self._repair()
 
-    def _see(self, frame: Frame) -> None:
+    def _take_frame(self, frame: Frame) -> None:
         """Cut before this frame if it is time; complete the segment before an earlier cut."""
         self._now_ns = frame.timestamp_ns
         if self._open and self._lacks_room():
-            self._give_up(frame.timestamp_ns)
+            self._stop_recording(frame.timestamp_ns)
         if self._cut_ns is not None:
             self._frames_since_cut += 1
-            if self._frames_since_cut >= _MOST_IN_FLIGHT:
+            if self._frames_since_cut >= _MAX_IN_FLIGHT:
                 self._complete()
         elif self._began_ns is None:
             self._began_ns = frame.timestamp_ns
@@ -120,24 +123,24 @@ class Segments:
             self._cut_ns, self._frames_since_cut = now_ns, 0
 
     def _complete(self) -> None:
-        """The last stage has reached the cut: end the segment before it.
+        """End the segment before the cut, once the last stage has reached that.
 
-        What is carried over is on the disk before that: one of the two always has a fish whole.
+        The next segment has the open tracks on the disk before: one of the two always has them.
         """
-        self._carry_to(self._next)
+        self._carry_over_to(self._next)
         self._close_all(self._open)
         self._open, self._next = self._next, []
         self._began_ns, self._cut_ns = self._cut_ns, None
         for record in self._ahead:
-            self._carried.take(record)
+            self._open_tracks.add(record)
         self._ahead.clear()
 
     def _lacks_room(self) -> bool:
-        """Whether lengths need what room is left on the disk."""
-        return free_bytes(self._out_dir) < _FLOOR * self._settings.keep_free_gb * 1e9
+        """True where the space that is left is kept for lengths."""
+        return free_bytes(self._out_dir) < _MIN_FREE_SHARE * self._settings.keep_free_gb * 1e9
 
-    def _give_up(self, now_ns: int) -> None:
-        """End what is open, while there is room to end it."""
+    def _stop_recording(self, now_ns: int) -> None:
+        """Close what is open while there is room for its end."""
         if self._cut_ns is not None:
             self._complete()
         self._close_all(self._open)
@@ -145,46 +148,48 @@ class Segments:
         self._on_notice(f"{self._out_dir}: {_NO_ROOM}")
 
     def _try_next(self, now_ns: int) -> list[FileSink]:
-        """Open the next segment; none where the disk refuses it."""
+        """The sinks of the next segment; none where the disk refuses them."""
         if self._lacks_room():
             self._retry_ns = now_ns + _RETRY_NS
             self._on_notice(f"{self._out_dir}: {_NO_ROOM}")
             return []
-        number = 1 + max(self._number, last_number(self._out_dir))  # a torn one keeps its own
+        number = 1 + max(
+            self._number, last_segment_number(self._out_dir)
+        )  # a torn one keeps its own
         stem = f"{STEM}-{number:06d}"
         try:
-            files = open_files(
-                self._out_dir, self._header, self._settings, stem=stem, number=number
+            files = open_recording_files(
+                self._out_dir, self._header, self._settings, stem=stem, segment_number=number
             )
         except OutputError as error:
             self._retry_ns = now_ns + _RETRY_NS
-            self._torn += self._out_dir.glob(f"{stem}.*")
+            self._unfinished += self._out_dir.glob(f"{stem}.*")
             self._on_notice(f"{error}; tried again in some seconds")
             return []
         self._number = number
-        if self._torn and not self._repairs.is_alive():
+        if self._unfinished and not self._repairs.is_alive():
             self._repairs = Thread(target=self._repair, name="repairs")
             self._repairs.start()
         return files
 
     def _repair(self) -> None:
-        """Make whole what a disk that was full left unfinished; it may take a while."""
-        torn, self._torn = self._torn, []
-        for path in filter(is_unfinished, torn):
-            repaired = repair(path, left_by="a disk that refused its end")
+        """Repair the files that a full disk left unfinished; this may take a while."""
+        unfinished, self._unfinished = self._unfinished, []
+        for path in filter(is_unfinished, unfinished):
+            repaired = repair_file(path, left_by="a disk that refused its end")
             self._on_notice(repaired.line)
             if repaired.path == path and is_unfinished(path):
-                self._torn.append(path)
+                self._unfinished.append(path)
 
-    def _carry_to(self, sinks: list[FileSink]) -> None:
-        def carry(sink: FileSink) -> None:
+    def _carry_over_to(self, sinks: list[FileSink]) -> None:
+        def carry_over(sink: FileSink) -> None:
             if isinstance(sink, McapSink):
-                sink.carry(self._carried.records())
+                sink.carry_over(self._open_tracks.records())
 
-        self._each(sinks, carry)
+        self._each(sinks, carry_over)
 
     def _each(self, sinks: list[FileSink], write: Callable[[FileSink], None]) -> None:
-        """Write to each; one that the disk refuses is over."""
+        """Write to each; one that the disk refuses is closed and given up."""
         for sink in [*sinks]:
             try:
                 write(sink)
@@ -196,7 +201,7 @@ class Segments:
                 self._on_notice(f"{error}; tried again with the next segment")
                 with suppress(OutputError):
                     sink.close()
-                self._torn += self._out_dir.glob(f"{sink.path.name}*")
+                self._unfinished += self._out_dir.glob(f"{sink.path.name}*")
 
     def _close_all(self, sinks: list[FileSink]) -> None:
         for sink in sinks:
@@ -204,7 +209,7 @@ class Segments:
                 sink.close()
             except OutputError as error:
                 self._on_notice(str(error))
-                self._torn += self._out_dir.glob(f"{sink.path.name}*")
+                self._unfinished += self._out_dir.glob(f"{sink.path.name}*")
         sinks.clear()
 
 
@@ -213,16 +218,16 @@ def open_segments(
     header: RunHeader,
     settings: RecordingSettings,
     *,
-    left: Iterable[LocalizedFish] = (),
+    interrupted: Iterable[LocalizedFish] = (),
     on_notice: Callable[[str], None],
 ) -> list[Sink]:
-    """`Segments`, where anything is recorded."""
+    """A `RotatingSink`, or nothing where the settings ask for no recording."""
     if not (settings.mcap or settings.rrd):
         return []
-    return [Segments(out_dir, header, settings, left=left, on_notice=on_notice)]
+    return [RotatingSink(out_dir, header, settings, interrupted=interrupted, on_notice=on_notice)]
 
 
-def last_number(out_dir: Path) -> int:
-    """Of the segments in a folder, whole or not; 0 where there are none."""
+def last_segment_number(out_dir: Path) -> int:
+    """The highest number of a segment in a folder, whole or not; 0 where there are none."""
     found = [_NUMBERED.fullmatch(path.name) for path in out_dir.iterdir()]
     return max((int(match[1]) for match in found if match), default=0)

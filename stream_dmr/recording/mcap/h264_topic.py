@@ -1,7 +1,7 @@
-"""H.264 for the eye: a tenth of the bytes of JPEGs, but not the pixels that the run saw.
+"""Frames as H.264 for viewing: a tenth of the bytes of JPEGs, not the pixels that the run used.
 
-One `foxglove.CompressedVideo` a frame: an access unit in Annex B with no pictures out of order, a
-key frame at least every second of capture time. Pictures of odd size get one more row or column.
+One `foxglove.CompressedVideo` per frame: an access unit in Annex B without reordered pictures, and
+a key frame at least every second of capture time. An odd width or height gets one more pixel.
 """
 
 from collections.abc import Iterable, Iterator
@@ -22,13 +22,13 @@ from stream_dmr.messages import Frame
 from stream_dmr.recording.messages.record import Record
 from stream_dmr.recording.messages.topics import KEY_FRAME_NS, VIDEO
 
-_PRESET = "superfast"  # half the time of "veryfast" for 10 % more bytes
-_BT601, _LIMITED = 5, 1  # FFmpeg's numbers of OpenCV's YUV, so that others show the right colours
-_SPS = 7  # NAL unit type; it comes before every key frame
+_PRESET = "superfast"  # measured: half the time of "veryfast" for 10 % more bytes
+_BT601, _LIMITED = 5, 1  # FFmpeg's AVCOL_SPC_BT470BG and AVCOL_RANGE_MPEG: OpenCV's YUV
+_SPS = 7  # NAL unit type of a sequence parameter set, which precedes every key frame
 
 
 class H264Topic:
-    """Encodes the frames of one file, in their order: its first picture needs no other."""
+    """Encodes the frames of one file in their order; its first picture is a key frame."""
 
     topics = {VIDEO: CompressedVideo}  # noqa: RUF012
 
@@ -39,7 +39,7 @@ class H264Topic:
         self._key_at_ns = 0
 
     def draw(self, record: Record) -> Iterator[tuple[str, Any]]:
-        """The video of a frame."""
+        """The CompressedVideo message of a frame."""
         frame = record.whole
         if isinstance(frame, Frame):
             video = CompressedVideo(data=self._encode(frame), format="h264", frame_id="camera")
@@ -47,7 +47,7 @@ class H264Topic:
             yield VIDEO, video
 
     def _encode(self, frame: Frame) -> bytes:
-        # OpenCV's conversion takes a sixth of FFmpeg's time and is nearer to the truth.
+        # Measured: OpenCV's conversion takes a sixth of FFmpeg's time and loses less.
         planes = cv2.cvtColor(_even(frame.image), cv2.COLOR_BGR2YUV_I420)
         picture = av.VideoFrame.from_ndarray(planes.astype(np.uint8, copy=False), format="yuv420p")
         if self._context is None:
@@ -63,12 +63,12 @@ class H264Topic:
 def decode_video(
     samples: Iterable[bytes],
 ) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
-    """Capture times and BGR pictures of CompressedVideo messages, from the first key frame on.
+    """Capture times in ns and BGR pictures of CompressedVideo messages, from the first key frame.
 
     Raises RecordingError where one can't be decoded.
     """
     context = av.CodecContext.create("h264", "r")
-    context.thread_count = 1  # else pictures come some frames late
+    context.thread_count = 1  # with more, pictures come out some frames late
     has_begun = False
     for sample in samples:
         try:
@@ -90,11 +90,11 @@ def _encoder(picture: av.VideoFrame, crf: int) -> VideoCodecContext:
     context.pix_fmt = "yuv420p"
     context.colorspace, context.color_range = _BT601, _LIMITED
     context.framerate = 30  # type: ignore[assignment]
-    context.gop_size = 1 << 20  # key frames come by the clock of the capture, not by number
+    context.gop_size = 1 << 20  # key frames follow the capture time, not the number of frames
     context.thread_count = 1
     context.options = {
         "preset": _PRESET,
-        "tune": "zerolatency",  # a picture in, its bytes out
+        "tune": "zerolatency",  # each picture is encoded at once
         "crf": str(crf),
         "forced-idr": "1",
         "x264-params": "scenecut=0:repeat-headers=1",

@@ -14,26 +14,27 @@ from PIL import Image
 
 from stream_dmr.errors import RecordingError
 
-_BLOCK_BYTES = 8 * 512
+_WORD_BYTES, _BLOCK_WORDS = 8, 512
+_BLOCK_BYTES = _WORD_BYTES * _BLOCK_WORDS  # part of the file format, see `checksum`
 
 Format = Literal["png", "png1", "jpeg", "reference"]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Picture:
-    """A compressed picture; its formats are described in `messages.proto`."""
+class EncodedPicture:
+    """A compressed picture; `messages.proto` describes its formats."""
 
     format: Format
     height: int
     width: int
     data: bytes  # empty for a reference
-    crc32: int = 0  # of the pixels that the run saw, see `checksum`; 0: those of `data`
+    crc32: int = 0  # `checksum` of the pixels that the run used; 0: those that `data` decodes to
 
 
 def compress(
     image: UInt8[np.ndarray, "H W 3"], *, format: Format, jpeg_quality: int = 95
-) -> Picture:
-    """A BGR picture as "png" (exact), "jpeg" or "reference" (its size and checksum)."""
+) -> EncodedPicture:
+    """A BGR picture as "png" (exact), "jpeg", or "reference" (only its size and checksum)."""
     if format == "reference":
         return _picture(format, image, b"", crc32=checksum(image))
     return _picture(format, image, _encoded(image, format, jpeg_quality))
@@ -43,20 +44,22 @@ def _encoded(image: UInt8[np.ndarray, "H W 3"], format: Format, jpeg_quality: in
     if format == "jpeg":
         parameters = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
     else:
-        # Level 1: on sensor noise the higher ones cost many times as much and gain 2 %.
+        # Level 1: on sensor noise higher levels take many times as long and save 2 %.
         parameters = [cv2.IMWRITE_PNG_COMPRESSION, 1]
     return cv2.imencode(f".{format}", image, parameters)[1].tobytes()
 
 
-def compress_mask(mask: Bool[np.ndarray, "H W"]) -> Picture:
-    """A mask as a PNG of one bit a pixel, exact."""
+def compress_mask(mask: Bool[np.ndarray, "H W"]) -> EncodedPicture:
+    """A mask as a PNG of one bit per pixel, exact."""
     grey = mask.astype(np.uint8) * np.uint8(255)
     data = cv2.imencode(".png", grey, [cv2.IMWRITE_PNG_BILEVEL, 1])[1].tobytes()
     return _picture("png1", mask, data)
 
 
-def paint(labels: UInt8[np.ndarray, "H W"], palette: Sequence[tuple[int, int, int]]) -> bytes:
-    """A PNG with the RGB colours 1, 2, ... of a palette for these labels, clear where 0."""
+def color_labels(
+    labels: UInt8[np.ndarray, "H W"], palette: Sequence[tuple[int, int, int]]
+) -> bytes:
+    """A PNG in which label k has the k-th RGB colour of a palette, and label 0 is transparent."""
     picture = Image.fromarray(labels)
     picture.putpalette([0, 0, 0, *chain.from_iterable(palette)])
     file = BytesIO()
@@ -64,7 +67,7 @@ def paint(labels: UInt8[np.ndarray, "H W"], palette: Sequence[tuple[int, int, in
     return file.getvalue()
 
 
-def decompress(picture: Picture) -> UInt8[np.ndarray, "H W 3"] | Bool[np.ndarray, "H W"]:
+def decompress(picture: EncodedPicture) -> UInt8[np.ndarray, "H W 3"] | Bool[np.ndarray, "H W"]:
     """The pixels: a mask for "png1", BGR otherwise, and of shape (0, 0, 3) for a reference.
 
     Raises RecordingError for bytes that aren't a picture of the size that was written.
@@ -83,21 +86,21 @@ def decompress(picture: Picture) -> UInt8[np.ndarray, "H W 3"] | Bool[np.ndarray
 
 
 def checksum(image: UInt8[np.ndarray, "H W 3"]) -> int:
-    """To tell whether a picture of the source is the recorded one.
+    """A checksum by which a picture of the source is known to be the recorded one.
 
-    CRC-32 of the sums, modulo 2^64, of the BGR bytes in blocks of 512 little-endian words, the
-    last one filled up with zeros: any one changed byte is found, in a fifth of the time that the
-    CRC of a whole picture takes.
+    CRC-32 of the sums, modulo 2^64, of the BGR bytes in blocks of 512 little-endian 64-bit words,
+    the last block filled with zeros. Any single changed byte changes it, and it takes a fifth of
+    the time of a CRC-32 over the whole picture.
     """
     data = image.reshape(-1)
     whole = len(data) // _BLOCK_BYTES * _BLOCK_BYTES
     rest = np.zeros(_BLOCK_BYTES, np.uint8)
     rest[: len(data) - whole] = data[whole:]
-    blocks = [block.view("<u8").reshape(-1, 512) for block in (data[:whole], rest)]
+    blocks = [block.view("<u8").reshape(-1, _BLOCK_WORDS) for block in (data[:whole], rest)]
     sums = np.concatenate([words.sum(axis=1, dtype="<u8") for words in blocks])
     return zlib.crc32(sums.tobytes())
 
 
-def _picture(format: Format, image: np.ndarray, data: bytes, *, crc32: int = 0) -> Picture:
+def _picture(format: Format, image: np.ndarray, data: bytes, *, crc32: int = 0) -> EncodedPicture:
     height, width = image.shape[:2]
-    return Picture(format=format, height=height, width=width, data=data, crc32=crc32)
+    return EncodedPicture(format=format, height=height, width=width, data=data, crc32=crc32)

@@ -1,4 +1,4 @@
-"""What Foxglove Studio draws: picture, camera, plane, meshes and keypoints in its own schemas.
+"""Topics that Foxglove Studio draws: picture, camera, plane, meshes and keypoints.
 
 Lengths are in metres there, and in body lengths without a calibration.
 """
@@ -19,20 +19,25 @@ from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import Calibration
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, Frame, LocalizedFish
-from stream_dmr.recording.messages.header import RunHeader
-from stream_dmr.recording.messages.pictures import compress
+from stream_dmr.recording.messages.picture_codec import compress
 from stream_dmr.recording.messages.record import Record
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
+from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.topics import FOXGLOVE_TOPICS
-from stream_dmr.recording.rerun.palette import color
-from stream_dmr.recording.rerun.throttle import Pace, Waiting
-from stream_dmr.recording.rerun.view_geometry import halved, outlines, place, view_factor
-from stream_dmr.recording.settings import RecordingSettings
+from stream_dmr.recording.view.frame_throttle import FrameThrottle, PendingItems
+from stream_dmr.recording.view.palette import color
+from stream_dmr.recording.view.view_geometry import (
+    outlines,
+    place_fit,
+    shrink_by_halves,
+    view_factor,
+)
 
 _CAMERA, _PLANE = "camera", "plane"
-_JPEG_QUALITY = 70
-_LIFETIME_NS = 2_000_000_000  # of a fish that is seen no more
+_JPEG_QUALITY = 70  # pictures are only for orientation
+_LIFETIME_NS = 2_000_000_000  # how long a fish is shown after its last message
 _M_PER_MM = 1e-3
-_OPACITY = 0.7
+_OPACITY = 0.7  # so that the midline shows through the mesh
 _SCHEMAS = {
     schema.DESCRIPTOR.full_name: schema
     for schema in (
@@ -42,8 +47,8 @@ _SCHEMAS = {
 }
 
 
-class FoxgloveView:
-    """Draws at most `view_rate_hz` frames a second, as the .rrd does."""
+class FoxgloveTopics:
+    """Shows at most `view_rate_hz` frames per second, as the .rrd does."""
 
     def __init__(self, header: RunHeader, settings: RecordingSettings) -> None:
         self.topics = {topic: _SCHEMAS[schema] for topic, schema in FOXGLOVE_TOPICS.items()}
@@ -51,16 +56,16 @@ class FoxgloveView:
         self._calibration = header.calibration
         self._most_px = settings.view_px
         self._factor = 1
-        self._pace = Pace(settings.view_rate_hz)
-        self._shapes = Waiting[FittedShape]()
+        self._throttle = FrameThrottle(settings.view_rate_hz)
+        self._shapes = PendingItems[FittedShape]()
 
     def draw(self, record: Record) -> Iterator[tuple[str, Any]]:
-        """Topics and messages that show a record."""
+        """The topics and protobuf messages that show a record."""
         message = record.whole
         if isinstance(message, Frame):
-            if self._pace.shows(message):
+            if self._throttle.shows(message):
                 yield from self._frame(message)
-        elif not self._pace.has_shown(message.frame_index):
+        elif not self._throttle.has_shown(message.frame_index):
             return
         elif isinstance(message, FishCrop):
             lines = [_points(self._in_view(line), message.track_id) for line in outlines(message)]
@@ -72,12 +77,12 @@ class FoxgloveView:
 
     def _frame(self, frame: Frame) -> Iterator[tuple[str, Any]]:
         height, width = frame.image.shape[:2]
-        self._factor = view_factor(width, height, most=self._most_px)
+        self._factor = view_factor(width, height, most_px=self._most_px)
         now = _time(frame.timestamp_ns)
         if self._calibration is not None:
             yield "/foxglove/camera", self._camera(self._calibration, now)
             yield "/foxglove/plane", _plane(self._calibration, now)
-        picture = halved(frame.image, most=self._most_px)
+        picture = shrink_by_halves(frame.image, most_px=self._most_px)
         jpeg = compress(picture, format="jpeg", jpeg_quality=_JPEG_QUALITY).data
         yield (
             "/foxglove/picture",
@@ -94,7 +99,7 @@ class FoxgloveView:
             yield "/foxglove/fish", self._scene(shape, fish)
 
     def _scene(self, shape: FittedShape, fish: LocalizedFish) -> SceneUpdate:
-        vertices, _, midline = place(shape, fish)
+        vertices, _, midline = place_fit(shape, fish)
         unit = 1.0 if fish.midline_mm is None else _M_PER_MM
         update = SceneUpdate()
         entity = update.entities.add(frame_id=_CAMERA, id=f"fish {fish.track_id}")
@@ -128,7 +133,7 @@ class FoxgloveView:
         )
 
     def _in_view(self, pixels: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
-        """Frame pixels in the picture that is shown, centres at integers in both."""
+        """Frame pixels as pixels of the shown picture; pixel centres are integers in both."""
         return (pixels + 0.5) / self._factor - 0.5
 
 

@@ -1,4 +1,4 @@
-"""Copies an .mcap record by record, into a file that any reader opens."""
+"""Copies an .mcap record by record into a complete file, which any reader opens."""
 
 from collections.abc import Callable, Iterable
 from contextlib import closing
@@ -8,20 +8,21 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.records import Message as McapMessage
 
 from stream_dmr.files import TransactionalFile
-from stream_dmr.recording.mcap.file import whole_records
-from stream_dmr.recording.mcap.sink import new_writer
+from stream_dmr.recording.mcap.mcap_recording import whole_records
+from stream_dmr.recording.mcap.mcap_sink import new_writer
 from stream_dmr.recording.messages.topics import RUN
 from stream_dmr.version import __version__
 
-REWRITTEN = ".rewritten"  # after the name of a file in work
+REWRITTEN = ".rewritten"  # suffix of a copy that is being written
 Edit = Callable[[str, bytes], bytes | None]
-"""Topic and message -> the message as it is to be, or None to leave it out."""
+"""Topic and encoded message -> the message to write, or None to leave it out."""
 
 
 def rewrite(path: Path, *, note: str, edit: Edit = lambda topic, data: data) -> tuple[Path, int]:
-    """Copy what is whole of a file beside it, durably; the copy and its number of messages.
+    """Copy the intact records of a file into a file beside it, durably.
 
-    A metadata record `note` says that it is one. Raises OSError where the disk refuses it.
+    A metadata record named `note` marks the copy. Returns its path and its number of messages.
+    Raises OSError where the disk refuses it.
     """
     copy = path.with_name(path.name + REWRITTEN)
     try:
@@ -35,7 +36,7 @@ def rewrite(path: Path, *, note: str, edit: Edit = lambda topic, data: data) -> 
 
 
 def _copy(records: Iterable[object], file: TransactionalFile, note: str, edit: Edit) -> int:
-    """Everything but the index, which the writer makes; the number of messages."""
+    """Copy everything but the index, which the writer makes; returns the number of messages."""
     writer, num_messages = new_writer(file), 0
     schemas, channels, topics = {0: 0}, dict[int, int](), dict[int, str]()
     for record in records:

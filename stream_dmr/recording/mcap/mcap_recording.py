@@ -1,8 +1,8 @@
-"""Reads a .mcap from its start to its end, also where the end is missing.
+"""Reads an .mcap, also one whose end is missing.
 
-Every byte is under a checksum: chunks have their own, and the data section has one over all of it,
-which is why a whole read is made in file order. A read of a part goes by the index instead, and is
-guarded by the checksums of the index and of the chunks that are read.
+Every byte is covered by a checksum: each chunk has one, and so has the data section as a whole,
+which is why everything is read in file order. A selection is read by the index instead, covered by
+the checksums of the index and of the chunks that are read.
 """
 
 import json
@@ -25,10 +25,10 @@ from zstandard import ZstdError
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import LocalizedFish, Message
 from stream_dmr.recording.messages.codec import check_version, decode
-from stream_dmr.recording.messages.header import RunHeader
-from stream_dmr.recording.messages.selection import WHOLE, Part, Spans
+from stream_dmr.recording.messages.run_header import RunHeader
+from stream_dmr.recording.messages.selection import EVERYTHING, Selection, Spans
 from stream_dmr.recording.messages.topics import (
-    CARRIED,
+    CARRIED_OVER,
     RECOVERED,
     RUN,
     SEGMENT,
@@ -38,21 +38,21 @@ from stream_dmr.recording.messages.topics import (
     VIDEO,
 )
 
-# What the mcap library lets through on damaged bytes; its CRC error is a ValueError.
-_DAMAGE = (
+# What the mcap library raises on damaged bytes; its CRC error is a ValueError.
+_DAMAGE_ERRORS = (
     *(McapError, ValueError, KeyError, IndexError, RuntimeError, struct.error, ZstdError),
     *(OverflowError, MemoryError, AttributeError, TypeError),
 )
-_CUT_OFF = (EndOfFile, struct.error)
-_FOOTER_BYTES = 1 + 8 + 8 + 8 + 4
-_LARGEST_RECORD = 1 << 30  # bytes; a damaged length must not ask for all memory
+_END_ERRORS = (EndOfFile, struct.error)
+_FOOTER_BYTES = 1 + 8 + 8 + 8 + 4  # opcode, record length, two offsets, CRC-32
+_MAX_RECORD_BYTES = 1 << 30  # a damaged length must not allocate all memory
 
 
-class McapFile:
-    """One .mcap."""
+class McapRecording:
+    """One .mcap, as the protocol `Recording` of `open_recording` describes it."""
 
     def __init__(self, path: Path) -> None:
-        """Raises RecordingError where not even the header can be read."""
+        """Read the header. Raises RecordingError where not even that can be read."""
         self.path = path
         self.warnings: list[str] = []
         self.metadata: dict[str, str] = {}
@@ -60,7 +60,7 @@ class McapFile:
         self.header = self._read_header()
 
     def tracks(self) -> Collection[int]:
-        """The ids of its fish, by the index where it has one."""
+        """The track ids in it, read from the index where it has one."""
         with self._open() as stream:
             if not _is_torn(stream) and _has_index(stream):
                 spans = _spans(stream, SeekingReader(stream, validate_crcs=True))
@@ -69,33 +69,35 @@ class McapFile:
         fish = (payload for _, payload in self.payloads([LocalizedFish]))
         return {decode(LocalizedFish, payload).track_id for payload in fish}
 
-    def carried(self) -> Iterator[bytes]:
-        """See `opened.Recording`."""
-        for _, message in self._messages([CARRIED], WHOLE) if self.is_segment else ():
+    def carried_over(self) -> Iterator[bytes]:
+        """The encoded LocalizedFish from before this segment of tracks that were open then."""
+        for _, message in self._messages([CARRIED_OVER], EVERYTHING) if self.is_segment else ():
             yield message.data
 
     def payloads(
-        self, kinds: Collection[type[Message]], part: Part = WHOLE
+        self, kinds: Collection[type[Message]], selection: Selection = EVERYTHING
     ) -> Iterator[tuple[type[Message], bytes]]:
-        """See `opened.Recording`. A torn file gives what is whole, and a warning."""
+        """Type and encoding of the messages of `kinds`; a torn file gives those that are whole."""
         topics = {TOPICS[kind].topic: kind for kind in kinds}
-        for topic, message in self._messages(topics, part):
+        for topic, message in self._messages(topics, selection):
             yield topics[topic], message.data
 
-    def video(self, part: Part = WHOLE) -> Iterator[bytes]:
-        """See `opened.Recording`."""
-        for _, message in self._messages([VIDEO], part):
+    def video(self, selection: Selection = EVERYTHING) -> Iterator[bytes]:
+        """The encoded CompressedVideo messages of `frames = "h264"`."""
+        for _, message in self._messages([VIDEO], selection):
             yield message.data
 
-    def _messages(self, topics: Collection[str], part: Part) -> Iterator[tuple[str, McapMessage]]:
+    def _messages(
+        self, topics: Collection[str], selection: Selection
+    ) -> Iterator[tuple[str, McapMessage]]:
         with self._open() as stream:
-            if part.is_whole or _is_torn(stream) or not _has_index(stream):
-                yield from self._in_order(stream, topics, part)
+            if selection.is_everything or _is_torn(stream) or not _has_index(stream):
+                yield from self._in_order(stream, topics, selection)
             else:
-                yield from _by_index(stream, topics, part)
+                yield from _by_index(stream, topics, selection)
 
     def _in_order(
-        self, stream: IO[bytes], topics: Collection[str], part: Part
+        self, stream: IO[bytes], topics: Collection[str], selection: Selection
     ) -> Iterator[tuple[str, McapMessage]]:
         is_torn, count = _is_torn(stream), 0
         wanted: dict[int, str] = {}  # topics by channel
@@ -108,9 +110,9 @@ class McapFile:
                 elif isinstance(record, McapMessage):
                     count += 1
                     topic = wanted.get(record.channel_id)
-                    if topic and part.has_time(record.log_time):
+                    if topic and selection.includes_time(record.log_time):
                         yield topic, record
-        except _CUT_OFF:
+        except _END_ERRORS:
             if not is_torn:
                 raise
         if is_torn:
@@ -132,7 +134,7 @@ class McapFile:
                         self._take(record)
                     elif isinstance(record, Attachment) and record.name != SPANS:
                         attachments[record.name] = record.data
-            except _CUT_OFF:
+            except _END_ERRORS:
                 pass
             try:
                 return RunHeader.from_parts(self.metadata, attachments)
@@ -164,7 +166,7 @@ class McapFile:
             ) from error
         except RecordingError as error:
             raise RecordingError(f"{self.path}: {error}") from error
-        except _DAMAGE as error:
+        except _DAMAGE_ERRORS as error:
             raise RecordingError(
                 f"{self.path}: expected a whole recording, got a damaged one ({error}); "
                 "what was read before the damage is sound"
@@ -172,35 +174,35 @@ class McapFile:
 
 
 def is_torn(path: Path) -> bool:
-    """Whether a file lacks its end."""
+    """True where a file lacks its end."""
     with path.open("rb") as stream:
         return _is_torn(stream)
 
 
 def _is_torn(stream: IO[bytes]) -> bool:
-    """Whether a file lacks the magic that closes it; back to its start."""
+    """True where a file lacks the magic bytes at its end; seeks back to the start."""
     size = stream.seek(0, 2)
     stream.seek(max(size - len(MCAP0_MAGIC), 0))
     end = stream.read()
     stream.seek(0)
-    is_only_begun = size < 2 * len(MCAP0_MAGIC)  # it begins with the same magic
+    is_only_begun = size < 2 * len(MCAP0_MAGIC)  # a file begins with the same bytes
     return is_only_begun or end != MCAP0_MAGIC
 
 
 def whole_records(path: Path) -> Iterator[object]:
-    """Every record before the end of a file, or before the first damage in it."""
-    with path.open("rb") as stream, suppress(*_DAMAGE, *_CUT_OFF):
+    """Every record of a file, up to its end or to the first damage in it."""
+    with path.open("rb") as stream, suppress(*_DAMAGE_ERRORS, *_END_ERRORS):
         yield from _records(stream)
 
 
 def _by_index(
-    stream: IO[bytes], topics: Collection[str], part: Part
+    stream: IO[bytes], topics: Collection[str], selection: Selection
 ) -> Iterator[tuple[str, McapMessage]]:
     stream.seek(-_FOOTER_BYTES - len(MCAP0_MAGIC), 2)
     _check_index(stream, _footer(stream))
     stream.seek(0)
     reader = SeekingReader(stream, validate_crcs=True)
-    first, last = part.within(_spans(stream, reader)).bounds_ns
+    first, last = selection.narrowed_to(_spans(stream, reader)).bounds_ns
     for _, channel, message in reader.iter_messages(
         list(topics), starting_at=first, ending_before=last, log_time_order=False
     ):
@@ -208,12 +210,12 @@ def _by_index(
 
 
 def _spans(stream: IO[bytes], reader: SeekingReader) -> Spans:
-    """When each fish was seen."""
+    """The first and last capture time of each track; empty where the file doesn't say."""
     summary = reader.get_summary()
     for index in summary.attachment_indexes if summary else ():
         if index.name == SPANS:
             stream.seek(index.offset)
-            record = stream.read(index.length)  # 9 bytes of head, content, CRC-32
+            record = stream.read(index.length)  # opcode and length (9 bytes), content, CRC-32
             if zlib.crc32(record[9:-4]) != int.from_bytes(record[-4:], "little"):
                 raise ValueError(f"the checksum of {SPANS} is wrong")
             text = record[-4 - index.data_size : -4]
@@ -222,7 +224,7 @@ def _spans(stream: IO[bytes], reader: SeekingReader) -> Spans:
 
 
 def _has_index(stream: IO[bytes]) -> bool:
-    """Not where a full disk left no room for one."""
+    """False where a full disk left no room for the index."""
     stream.seek(-_FOOTER_BYTES - len(MCAP0_MAGIC), 2)
     footer = _footer(stream)
     stream.seek(0)
@@ -230,7 +232,7 @@ def _has_index(stream: IO[bytes]) -> bool:
 
 
 def _footer(stream: IO[bytes]) -> Footer:
-    """The footer that stands here."""
+    """The footer at the stream's position."""
     opcode, _, *fields = struct.unpack("<BQQQI", stream.read(_FOOTER_BYTES))
     if opcode != Opcode.FOOTER:
         raise ValueError("it has no footer")
@@ -238,7 +240,7 @@ def _footer(stream: IO[bytes]) -> Footer:
 
 
 def _check_index(stream: IO[bytes], footer: Footer) -> None:
-    """The mcap library writes this checksum and never looks at it."""
+    """Compare the checksum of the index, which the mcap library writes and never checks."""
     if footer.summary_crc:
         place = stream.tell()
         stream.seek(footer.summary_start)
@@ -250,6 +252,6 @@ def _check_index(stream: IO[bytes], footer: Footer) -> None:
 
 def _records(stream: IO[bytes], *, emit_chunks: bool = False) -> Iterator[object]:
     reader = StreamReader(
-        stream, emit_chunks=emit_chunks, validate_crcs=True, record_size_limit=_LARGEST_RECORD
+        stream, emit_chunks=emit_chunks, validate_crcs=True, record_size_limit=_MAX_RECORD_BYTES
     )
     return reader.records

@@ -1,4 +1,4 @@
-"""Draws messages into a Rerun stream: entity paths are those of topics.py."""
+"""Draws messages into a Rerun stream, at the entity paths of topics.py."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -19,9 +19,10 @@ from stream_dmr.messages import (
     Message,
 )
 from stream_dmr.recording.messages import topics
-from stream_dmr.recording.messages.header import RunHeader
-from stream_dmr.recording.messages.pictures import compress, paint
+from stream_dmr.recording.messages.picture_codec import color_labels, compress
 from stream_dmr.recording.messages.record import Record
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
+from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.rerun.blueprint import (
     NOMINAL_DEPTH,
     PICTURES,
@@ -30,27 +31,26 @@ from stream_dmr.recording.rerun.blueprint import (
     log_plane,
     middle_mm,
 )
-from stream_dmr.recording.rerun.columns import Columns, blob
-from stream_dmr.recording.rerun.palette import PALETTE, color
-from stream_dmr.recording.rerun.throttle import Pace, Waiting
-from stream_dmr.recording.rerun.view_geometry import (
-    fill,
-    halved,
+from stream_dmr.recording.rerun.column_buffer import ColumnBuffer, payload_columns
+from stream_dmr.recording.view.frame_throttle import FrameThrottle, PendingItems
+from stream_dmr.recording.view.palette import PALETTE, color
+from stream_dmr.recording.view.view_geometry import (
+    fill_outlines,
     outlines,
-    place,
+    place_fit,
     shades,
+    shrink_by_halves,
     view_factor,
 )
-from stream_dmr.recording.settings import RecordingSettings
 
-_HALF_PIXEL = 0.5  # Rerun counts pixels from the corner of the top-left one, we from its centre
-_JPEG_QUALITY = 70
+_HALF_PIXEL = 0.5  # Rerun's origin is the corner of the top-left pixel, ours its centre
+_JPEG_QUALITY = 70  # pictures are only for orientation
 
 
-class Drawing:
-    """Draws a run: pictures and meshes at most `view_rate_hz` a second, plots for every frame.
+class SceneDrawing:
+    """Draws a run: pictures and meshes at most `view_rate_hz` times a second, plots every frame.
 
-    Rows wait until `send`.
+    Rows are kept until `send`.
     """
 
     def __init__(
@@ -59,16 +59,16 @@ class Drawing:
         self._rec = rec
         self._settings = settings
         self._faces = header.template.faces
-        self._columns = Columns(rec)
-        self._pace = Pace(settings.view_rate_hz)
-        self._boxes = Waiting[np.ndarray]()  # until it is known what the frame says of the fish
-        self._shapes = Waiting[FittedShape]()  # until they are placed
+        self._columns = ColumnBuffer(rec)
+        self._throttle = FrameThrottle(settings.view_rate_hz)
+        self._boxes = PendingItems[np.ndarray]()  # until their fish are localized
+        self._shapes = PendingItems[FittedShape]()  # until their fish are localized
         self._reasons: dict[int, str] = {}  # why each track's last frame was not used
         self._tracks: set[int] = set()
-        self.kept: Counter[str] = Counter()  # messages so far, by entity
+        self.num_payloads: Counter[str] = Counter()  # by entity
         self._factor: int | None = None  # frame pixels per pixel of the view
-        self._labels = np.zeros((0, 0), np.uint8)  # of the masks of frame `_labels_of` so far
-        self._labels_of = 0
+        self._labels = np.zeros((0, 0), np.uint8)  # masks so far of frame `_labels_frame`
+        self._labels_frame = 0
         self._no_masks = b""
         rec.log("scene", rr.ViewCoordinates.RDF, static=True)
         for path, what in PICTURES.items():
@@ -78,7 +78,7 @@ class Drawing:
             self._set_camera(header.calibration.camera, depth=middle_mm(header.calibration)[2])
 
     def draw(self, record: Record) -> None:
-        """Draw one message, what is not recorded of it included."""
+        """Draw one message, with the parts of it that are not recorded."""
         match record.whole:
             case Frame() as frame:
                 self._frame(frame)
@@ -91,42 +91,44 @@ class Drawing:
             case LengthEstimate() as estimate:
                 self._length(estimate)
 
-    def keep(self, record: Record) -> None:
-        """Put the encoded message beside the drawing, numbered, since Rerun sorts by time."""
+    def add_payload(self, record: Record) -> None:
+        """Add the encoded message to the stream, numbered, since Rerun sorts by time."""
         path = record.topic.payload
-        number = np.array([self.kept[path]], np.uint64)
-        self.kept[path] += 1
-        self._add(path, rr.AnyValues, record.message, number=number, **blob(record.payload))
+        number = np.array([self.num_payloads[path]], np.uint64)
+        self.num_payloads[path] += 1
+        self._add(
+            path, rr.AnyValues, record.message, number=number, **payload_columns(record.payload)
+        )
 
     def send(self) -> None:
-        """Hand what was drawn over to Rerun."""
+        """Send what was drawn to Rerun."""
         self._columns.send()
 
     def _set_camera(self, camera: Camera, *, depth: float) -> None:
-        self._factor = view_factor(camera.width, camera.height, most=self._settings.view_px)
+        self._factor = view_factor(camera.width, camera.height, most_px=self._settings.view_px)
         log_camera(self._rec, camera, depth=depth, factor=self._factor)
         size = (camera.height // self._factor, camera.width // self._factor)
         self._labels = np.zeros(size, np.uint8)
-        self._no_masks = paint(self._labels, PALETTE)
+        self._no_masks = color_labels(self._labels, PALETTE)
 
     def _frame(self, frame: Frame) -> None:
-        if not self._pace.shows(frame):
+        if not self._throttle.shows(frame):
             return
-        # Comes before the fish of its frame, so it may wipe the fish of the frame before.
+        # A frame comes before its fish, so the fish of the frame before are cleared here.
         for root in topics.FISH_ROOTS:
             self._add(root, rr.Clear, frame, is_recursive=[True])
         if self._labels.size:
             self._add(topics.MASKS, rr.EncodedImage, frame, blob=[self._no_masks])
         if frame.image.size:
-            picture = halved(frame.image, most=self._settings.view_px)
+            picture = shrink_by_halves(frame.image, most_px=self._settings.view_px)
             jpeg = compress(picture, format="jpeg", jpeg_quality=_JPEG_QUALITY)
             self._add(topics.FRAME, rr.EncodedImage, frame, blob=[jpeg.data])
 
     def _crop(self, crop: FishCrop) -> None:
         if self._factor is None:
             self._set_camera(crop.frame_camera, depth=NOMINAL_DEPTH)
-        self._introduce(crop.track_id)
-        if not self._pace.has_shown(crop.frame_index):
+        self._log_appearance(crop.track_id)
+        if not self._throttle.has_shown(crop.frame_index):
             return
         self._boxes.put(crop, crop.bbox_xyxy_px)
         strips = [self._in_view(line) for line in outlines(crop)]
@@ -134,12 +136,12 @@ class Drawing:
         self._mask(strips, crop)
 
     def _mask(self, strips: Sequence[Float[np.ndarray, "_ 2"]], crop: FishCrop) -> None:
-        """The masks of a frame so far: each replaces the one before it, of the same moment."""
-        if crop.frame_index != self._labels_of:
-            self._labels_of = crop.frame_index
+        """Draw the masks of a frame so far; it replaces the picture of the same moment."""
+        if crop.frame_index != self._labels_frame:
+            self._labels_frame = crop.frame_index
             self._labels = np.zeros_like(self._labels)
-        fill(self._labels, strips, label=crop.track_id % len(PALETTE) + 1)
-        self._add(topics.MASKS, rr.EncodedImage, crop, blob=[paint(self._labels, PALETTE)])
+        fill_outlines(self._labels, strips, label=crop.track_id % len(PALETTE) + 1)
+        self._add(topics.MASKS, rr.EncodedImage, crop, blob=[color_labels(self._labels, PALETTE)])
 
     def _fit(self, fit: FittedMesh) -> None:
         if fit.shape is not None:
@@ -155,7 +157,7 @@ class Drawing:
         if fish.accepted and fish.length_mm is not None:
             self._add(topics.FRAME_LENGTH, rr.Scalars, fish, scalars=[fish.length_mm])
         box = self._boxes.take(fish)
-        if not self._pace.has_shown(fish.frame_index):
+        if not self._throttle.has_shown(fish.frame_index):
             return
         if box is not None:
             self._box(box, fish)
@@ -166,17 +168,17 @@ class Drawing:
             self._body(shape, fish)
 
     def _box(self, bbox_xyxy_px: Float[np.ndarray, "4"], fish: LocalizedFish) -> None:
-        """The box, with what this frame says of the fish."""
+        """Draw the box, labelled with the frame's length or reason."""
         low, high = self._in_view(bbox_xyxy_px.reshape(2, 2) - _HALF_PIXEL)
         parts = {
             "centers": (low + high)[None] / 2,
             "half_sizes": (high - low)[None] / 2,
-            "labels": [f"fish {fish.track_id}: {_finding(fish)}"],
+            "labels": [f"fish {fish.track_id}: {_frame_result(fish)}"],
         }
         self._add(topics.BOX, rr.Boxes2D, fish, **parts)
 
     def _body(self, shape: FittedShape, fish: LocalizedFish) -> None:
-        vertices, keypoints, midline = place(shape, fish)
+        vertices, keypoints, midline = place_fit(shape, fish)
         if vertices is not None:
             vertices = vertices.astype(np.float32)
             parts = {"vertex_positions": vertices, "vertex_colors": shades(vertices, self._faces)}
@@ -187,7 +189,7 @@ class Drawing:
     def _length(self, estimate: LengthEstimate) -> None:
         track_id, reason = estimate.track_id, estimate.frame_reason
         if estimate.is_final:
-            self._event(topics.RESULTS, estimate, _verdict(estimate), rr.TextLogLevel.INFO)
+            self._event(topics.RESULTS, estimate, _fish_result(estimate), rr.TextLogLevel.INFO)
         elif reason and reason != self._reasons.get(track_id):
             text = f"not used from here on: {reason}"
             self._event(topics.REFUSALS, estimate, text, rr.TextLogLevel.WARN)
@@ -196,8 +198,8 @@ class Drawing:
             values = [estimate.length_mm, *estimate.ci95_mm]
             self._add(topics.LENGTH, rr.Scalars, estimate, scalars=values)
 
-    def _introduce(self, track_id: int) -> None:
-        """What never changes of a fish: once, for all time."""
+    def _log_appearance(self, track_id: int) -> None:
+        """Log colours and names of a track, once and static."""
         if track_id in self._tracks:
             return
         self._tracks.add(track_id)
@@ -218,17 +220,17 @@ class Drawing:
         self._columns.add(path, archetype, moment, **values)
 
     def _in_view(self, pixels: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
-        """Frame pixels as Rerun counts them in the picture of the view."""
+        """Frame pixels as Rerun's pixels of the shown picture."""
         return (pixels + _HALF_PIXEL) / (self._factor or 1)
 
 
-def _finding(fish: LocalizedFish) -> str:
+def _frame_result(fish: LocalizedFish) -> str:
     if not fish.accepted:
         return fish.reason
     return "fitted" if fish.length_mm is None else f"{fish.length_mm:.0f} mm"
 
 
-def _verdict(estimate: LengthEstimate) -> str:
+def _fish_result(estimate: LengthEstimate) -> str:
     frames = f"{estimate.frames_used} of {estimate.frames_seen} frames used"
     if estimate.length_mm is None:
         return f"no length ({estimate.status}), {frames}"

@@ -1,4 +1,4 @@
-"""Shapes and pictures as the view shows them."""
+"""Shapes and pictures as the views show them."""
 
 from collections.abc import Sequence
 
@@ -10,19 +10,20 @@ from stream_dmr.camera import frame_from_crop
 from stream_dmr.geometry import arc_length
 from stream_dmr.messages import FishCrop, FittedShape, LocalizedFish
 
-_LIGHT = np.array([0.3, -0.6, -0.742])  # toward it, in the camera frame: above, right, behind us
+# Chosen by eye. The unit vector points to the light: above, to the right of and behind the camera.
+_LIGHT = np.array([0.3, -0.6, -0.742])
 _AMBIENT = 0.25
 
 
-def place(
+def place_fit(
     shape: FittedShape, fish: LocalizedFish
 ) -> tuple[Float[np.ndarray, "V 3"] | None, Float[np.ndarray, "3 3"], Float[np.ndarray, "M 3"]]:
-    """Vertices, keypoints and midline of a fit where its fish hangs, in mm in the camera frame.
+    """Vertices, keypoints and midline of a fit at its localized place, mm in the camera frame.
 
-    Both are in the orientation of the camera, so a scale and a shift do it: the ratio of the
-    midlines' arcs, and center keypoint to center keypoint. Without millimetres the shape is scaled
-    about the camera to a body length of 1, which leaves its picture as it is. Vertices are None
-    where the shape has none.
+    Fit and camera frame have the same orientation, so a scale (the ratio of the midlines' arc
+    lengths) and a shift (center keypoint to center keypoint) suffice. Without millimetres the shape
+    is scaled about the camera to a body length of 1, which leaves its projection unchanged.
+    Vertices are None where the shape has none.
     """
     arc, vertices = arc_length(shape.midline), shape.vertices
     if fish.keypoints_mm is None or fish.midline_mm is None:
@@ -35,7 +36,7 @@ def place(
 
 
 def outlines(crop: FishCrop) -> list[Float[np.ndarray, "N 2"]]:
-    """Closed outlines of the mask, in frame pixels."""
+    """The outlines of the mask, each closed, in frame pixels."""
     contours, _ = cv2.findContours(
         crop.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE
     )
@@ -44,19 +45,19 @@ def outlines(crop: FishCrop) -> list[Float[np.ndarray, "N 2"]]:
     return [frame_from_crop(line.astype(float), **cameras) for line in closed]
 
 
-def fill(
+def fill_outlines(
     labels: UInt8[np.ndarray, "H W"], outlines: Sequence[Float[np.ndarray, "_ 2"]], *, label: int
 ) -> None:
-    """Write `label` inside closed outlines, which count pixels from the corner of the first."""
+    """Write `label` inside closed outlines, whose origin is the corner of the top-left pixel."""
     cv2.fillPoly(labels, [np.round(line - 0.5).astype(np.int32) for line in outlines], label)
 
 
 def shades(
     vertices: Float32[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> UInt8[np.ndarray, "V 3"]:
-    """Grey of each vertex, lit from above the camera: a third of the bytes of normals.
+    """Grey level of each vertex under a light above the camera: a third of the bytes of normals.
 
-    Normals are weighted by area, which is what cross products are.
+    A vertex's normal is the area-weighted mean of its faces' normals, the sum of cross products.
     """
     a, b, c = vertices[faces].transpose(1, 0, 2)
     weighted = np.repeat(np.cross(b - a, c - a), 3, axis=0)
@@ -68,21 +69,23 @@ def shades(
     return grey.astype(np.uint8)[:, None].repeat(3, axis=1)
 
 
-def view_factor(width: int, height: int, *, most: int) -> int:
-    """Frame pixels per pixel of the view: a power of two that divides the frame's size.
+def view_factor(width: int, height: int, *, most_px: int) -> int:
+    """Frame pixels per pixel of the view: a power of two that divides both sides of the frame.
 
-    The smallest with which no side is longer than `most`, so far as there is one.
+    The smallest with which no side is longer than `most_px`, or else the largest there is.
     """
     factor = 1
-    while max(width, height) > most * factor and not (width | height) // factor % 2:
+    while max(width, height) > most_px * factor and not (width | height) // factor % 2:
         factor *= 2
     return factor
 
 
-def halved(image: UInt8[np.ndarray, "H W 3"], *, most: int) -> UInt8[np.ndarray, "h w 3"]:
-    """The image as small as `view_factor` says, halved again and again, which is quick."""
+def shrink_by_halves(
+    image: UInt8[np.ndarray, "H W 3"], *, most_px: int
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The image at 1 / `view_factor` of its size, halved repeatedly, which is fast."""
     height, width = image.shape[:2]
-    for _ in range(view_factor(width, height, most=most).bit_length() - 1):
+    for _ in range(view_factor(width, height, most_px=most_px).bit_length() - 1):
         height, width = height // 2, width // 2
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     return image

@@ -1,4 +1,4 @@
-"""Vertices of fits that were recorded by their parameters."""
+"""Recomputes the vertices of fits that were recorded by their parameters."""
 
 from dataclasses import replace
 
@@ -10,8 +10,8 @@ from stream_dmr.messages import FittedMesh, FittedShape
 from stream_dmr.template.template import Template
 
 
-class Meshes:
-    """Deforms one template, in the shapes that the fish of its run were given."""
+class MeshRebuilder:
+    """Deforms the template of a recording, or its candidate shapes, by recorded parameters."""
 
     def __init__(self, template: Template, candidates: CandidateShapes | None) -> None:
         shapes = (
@@ -20,7 +20,7 @@ class Meshes:
         self._bodies = [Body.from_template(shape) for shape in shapes or [template]]
 
     def with_vertices(self, fit: FittedMesh) -> FittedMesh:
-        """The fit, its vertices made again where it lacks them, exact but for rounding."""
+        """The fit, with vertices computed where it lacks them: the original ones within 1e-12."""
         shape, report = fit.shape, fit.report
         if shape is None or report is None or shape.vertices is not None:
             return fit
@@ -30,6 +30,6 @@ class Meshes:
         body = self._bodies[shape.candidate or 0]
         points = deform(body, kind, shape.parameters)
         v = body.num_vertices
-        # Where the fit stands along the ray of its crop: its keypoints, which are recorded, say.
-        anchor = (shape.keypoints - points[v : v + 3]).mean(axis=0)
-        return replace(shape, vertices=points[:v] + anchor)
+        # The recorded keypoints say where the fit stands along the viewing ray of its crop.
+        offset = (shape.keypoints - points[v : v + 3]).mean(axis=0)
+        return replace(shape, vertices=points[:v] + offset)

@@ -1,0 +1,90 @@
+"""The inputs of a replay: those that are given, else the recorded ones."""
+
+from dataclasses import dataclass
+
+from stream_dmr.calibration.calibration_file import load_calibration
+from stream_dmr.camera import Calibration
+from stream_dmr.fitting.learn_shapes import learn_shapes
+from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
+from stream_dmr.messages import FishCrop
+from stream_dmr.recording.messages.run_header import RunHeader
+from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
+from stream_dmr.replaying.recorded_files import CropFiles, find_crop_files, inputs_with
+from stream_dmr.replaying.replay_request import ReplayRequest
+from stream_dmr.running.config import Config, load_config, parse_config, to_toml
+from stream_dmr.template.template import Template
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayInputs:
+    """What the nodes of a replay are made of."""
+
+    config: Config
+    template: Template
+    candidates: CandidateShapes | None  # the shapes that the fish may have; None: the template's
+    calibration: Calibration | None
+    files: CropFiles | None  # None where no crop is cut anew
+
+
+def read_inputs(request: ReplayRequest, recording: Recording) -> ReplayInputs:
+    """Read the given inputs and take the others from the recording. Raises a UserError."""
+    header = recording.header
+    if request.config is not None:
+        config = load_config(request.config)
+    else:
+        config = parse_config(header.config_toml, where="the recording's config.toml")
+    calibration = header.calibration
+    if request.calibration is not None:
+        calibration = load_calibration(request.calibration)
+    template, candidates = _shapes(request, recording, config, calibration)
+    files = None
+    if request.first == "crop":
+        files = find_crop_files(
+            header, source=request.source, boxes=request.boxes, masks=request.masks
+        )
+    return ReplayInputs(
+        config=config,
+        template=template,
+        candidates=candidates,
+        calibration=calibration,
+        files=files,
+    )
+
+
+def new_header(request: ReplayRequest, recorded: RunHeader, inputs: ReplayInputs) -> RunHeader:
+    """The header of the recording that the replay writes."""
+    calibration, is_cut_anew = request.calibration, inputs.files is not None
+    calibration_file = recorded.calibration_file
+    if calibration is not None:
+        calibration_file = calibration.read_bytes()
+    return RunHeader(
+        source=recorded.source,
+        command=request.command,
+        config_toml=to_toml(inputs.config),
+        template=inputs.template,
+        candidates=inputs.candidates,
+        calibration=inputs.calibration,
+        calibration_file=calibration_file,
+        inputs=inputs_with(
+            recorded.inputs,
+            source=request.source if is_cut_anew else None,
+            boxes=request.boxes if is_cut_anew else None,
+            masks=request.masks if is_cut_anew else None,
+            calibration=calibration,
+        ),
+    )
+
+
+def _shapes(
+    request: ReplayRequest, recording: Recording, config: Config, calibration: Calibration | None
+) -> tuple[Template, CandidateShapes | None]:
+    """Mesh and candidate shapes; `auto` learns those from the crops of the recording."""
+    if request.template is None:
+        return recording.header.template, recording.header.candidates
+    template, candidates = load_shapes(request.template)
+    if request.template == AUTO and candidates is not None:
+        messages = (message for message, _ in decoded_messages(recording, [FishCrop]))
+        crops = (message for message in messages if isinstance(message, FishCrop))
+        learnt = learn_shapes(crops, template, candidates, config.fit_mesh, calibration=calibration)
+        candidates = learnt or candidates
+    return template, candidates
