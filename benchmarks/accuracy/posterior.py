@@ -27,7 +27,7 @@ from stream_dmr.fitting.contour.normal_equations import normal_equations, prior_
 from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import LOG_SIZE
-from stream_dmr.fitting.size.scanner import SCATTER
+from stream_dmr.fitting.size.scanner import STD_SCALE
 from stream_dmr.fitting.tracks import TrackFitter
 from stream_dmr.localization.localize import localize
 from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
@@ -83,7 +83,9 @@ def errors_of(task: tuple[str, int]) -> np.ndarray:
     filmed = film_passages(scene_of(task), with_second=False)
     template = species_template()
     tracks = TrackFitter(template, CONFIG.fit_mesh, calibration=filmed.calibration)
-    sampler = Sampler(tracks, MeshLevels.of(template, max_faces=CONFIG.fit_mesh.max_faces), CONFIG)
+    sampler = Sampler(
+        tracks, MeshLevels.from_template(template, max_faces=CONFIG.fit_mesh.max_faces), CONFIG
+    )
     errors = []
     for track_id, track in tracks_of(filmed).items():
         fits = [(crop, tracks.fit(crop)) for crop in track]
@@ -111,7 +113,7 @@ def _lengths(
         mean, std = sampler.log_size(crop, shape.parameters)
         length_mm = fish.length_mm * np.exp(mean - shape.parameters[LOG_SIZE])
         others = (fish.length_std_mm / fish.length_mm) ** 2 - shape.length_std_ratio**2
-        variance = others + (SCATTER * std) ** 2
+        variance = others + (STD_SCALE * std) ** 2
         yield fish, replace(fish, length_mm=length_mm, length_std_mm=length_mm * variance**0.5)
 
 

@@ -74,7 +74,7 @@ class Setup:
     def __init__(self, template: Template) -> None:
         self.template = template
         self.settings = FitMeshSettings()
-        self.bodies = MeshLevels.of(template, max_faces=self.settings.max_faces)
+        self.bodies = MeshLevels.from_template(template, max_faces=self.settings.max_faces)
         self.body = self.bodies.fine
 
     def fitter(self, pair: FramePair) -> Fitter:
@@ -217,14 +217,14 @@ import time
 began = time.perf_counter()
 from benchmarks.fit_speed.targets import species_template
 from stream_dmr.fitting.fitter import Fitter
-from stream_dmr.fitting.compile_kernels import rehearse
+from stream_dmr.fitting.compile_kernels import compile_kernels
 from stream_dmr.fitting.parameters import LOG_SIZE
 from stream_dmr.fitting.settings import FitMeshSettings
 fitter = Fitter(species_template(), FitMeshSettings())
 ready = time.perf_counter()
-rehearse(fitter)
+compile_kernels(fitter)
 first = time.perf_counter()
-rehearse(fitter)
+compile_kernels(fitter)
 print(ready - began, first - ready, time.perf_counter() - first)
 """
 

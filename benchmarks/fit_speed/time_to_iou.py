@@ -75,7 +75,7 @@ class SolverComparison:
 
     def __init__(self, template: Template) -> None:
         self._template = template
-        self._bodies = MeshLevels.of(template, max_faces=FitMeshSettings().max_faces)
+        self._levels = MeshLevels.from_template(template, max_faces=FitMeshSettings().max_faces)
         patient = FitMeshSettings(solver="adam", adam_iterations=CAP, tolerance=1e-12)
         self._adam = AdamSolver(template, patient)
         self._deodr = None
@@ -107,7 +107,7 @@ class SolverComparison:
 
     def _problem(self, target: Target) -> Problem:
         return Problem.from_settings(
-            FitMeshSettings(), self._bodies.fine, target, with_smoothness=True
+            FitMeshSettings(), self._levels.fine, target, with_smoothness=True
         )
 
     def _from(
@@ -118,7 +118,7 @@ class SolverComparison:
 
         def by_contour(settings: FitMeshSettings) -> None:
             target = _target(pair)
-            _Watched(self._bodies, settings).refine(target, start(target))
+            _Watched(self._levels, settings).refine(target, start(target))
 
         def by_adam() -> None:
             target = _target(pair)
@@ -137,7 +137,7 @@ class SolverComparison:
         def by_contour() -> None:
             target = _target(pair)
             starts = cold_starts(target, self._template)
-            _Watched(self._bodies, FitMeshSettings()).search(target, starts)
+            _Watched(self._levels, FitMeshSettings()).search(target, starts)
 
         def by_adam() -> None:
             target = _target(pair)
@@ -170,7 +170,7 @@ class SolverComparison:
 
     def _known_start(self, target: Target) -> Float[np.ndarray, "P"] | None:
         """The first cold start that leads the contour solver to the goal."""
-        solver = _Watched(self._bodies, FitMeshSettings())
+        solver = _Watched(self._levels, FitMeshSettings())
         for start in cold_starts(target, self._template):
             try:
                 solver.refine(target, start)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.fitting.heading import is_turned
+from stream_dmr.fitting.heading import is_reversed
 from stream_dmr.fitting.parameters import (
     JOINT_ROTATION,
     LOG_SIZE,
@@ -52,7 +52,7 @@ def cold_starts(target: Target, template: Template) -> Float[np.ndarray, "B P"]:
     starts[:, LOG_SIZE] = np.log(length)
     joints = starts[:, NUM_ROOT:].reshape(len(bends), num_joints, NUM_PER_JOINT)
     joints[..., JOINT_ROTATION] = np.linspace(-0.5, 0.5, num_joints)[:, None] * axis[:, None]
-    return starts[~is_turned(starts, target.heading)]
+    return starts[~is_reversed(starts, target.heading)]
 
 
 def _moments(mask: Float[np.ndarray, "S S"]) -> tuple[Float[np.ndarray, "2"], float, float]:

@@ -1,6 +1,7 @@
-"""Two fits of a drawn fish, since numba makes machine code of a loop when it is first called.
+"""Compile the kernels before the first frame, by two fits of a drawn fish.
 
-That takes a minute on a new installation, in which a camera's frames would be lost.
+Numba compiles a kernel when it is first called. All of them take a minute on a new installation, in
+which a camera's frames would be lost.
 """
 
 import cv2
@@ -13,8 +14,8 @@ from stream_dmr.messages import CropQuality, FishCrop
 _SIZE_PX = 128
 
 
-def rehearse(fitter: Fitter) -> None:
-    """Fit once from cold and once from warm, and forget it."""
+def compile_kernels(fitter: Fitter) -> None:
+    """Fit a drawn fish once from cold and once from warm, which calls every kernel."""
     crop = _drawn_fish()
     fitter.fit(crop, fitter.fit(crop, None).best)
 

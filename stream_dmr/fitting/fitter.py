@@ -14,7 +14,7 @@ from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.outline import project
 from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.contour.solver import ContourSolver, loss_of
-from stream_dmr.fitting.heading import is_turned
+from stream_dmr.fitting.heading import is_reversed
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import ROOT_ROTATION
 from stream_dmr.fitting.settings import FitMeshSettings
@@ -90,15 +90,15 @@ class Fitter:
         self._template = template
         self._settings = settings
         self._with_covariance = with_covariance
-        self._bodies = MeshLevels.of(template, max_faces=settings.max_faces)
+        self._levels = MeshLevels.from_template(template, max_faces=settings.max_faces)
         self._solver = self._make_solver()
-        self._scanner = SizeScanner(self._bodies, settings)
+        self._scanner = SizeScanner(self._levels, settings)
         self._half_section = half_section(template)
-        self._directions = directions(self._bodies.coarse)
+        self._directions = directions(self._levels.coarse)
 
     def _make_solver(self) -> Solver:
         if self._settings.solver == "contour":
-            return ContourSolver(self._bodies, self._settings)
+            return ContourSolver(self._levels, self._settings)
         from stream_dmr.fitting.paper.adam import AdamSolver  # torch takes a second to import
 
         return AdamSolver(self._template, self._settings)
@@ -128,7 +128,7 @@ class Fitter:
         if solved.target is None or solved.solution is None:
             return float("nan")
         problem = Problem.from_settings(
-            self._settings, self._bodies.fine, solved.target, with_smoothness=False
+            self._settings, self._levels.fine, solved.target, with_smoothness=False
         )
         return loss_of(problem, solved.solution.parameters) / self._settings.nat
 
@@ -171,8 +171,8 @@ class Fitter:
         A warm start whose head is at the wrong end leads nowhere.
         """
         solution = None
-        if warm is not None and not is_turned(warm, target.heading):
-            start = recentered(self._problem(self._bodies.fine, target), warm)
+        if warm is not None and not is_reversed(warm, target.heading):
+            start = recentered(self._problem(self._levels.fine, target), warm)
             solution = self._solver.refine(target, start)
             if solution.iou >= self._settings.cold_below_iou:
                 return solution, False
@@ -185,8 +185,8 @@ class Fitter:
         self, target: Target, solution: Solution, crop: FishCrop, size_std: float | None
     ) -> FittedShape:
         """`size_std` of the log size, where it is known better than by the covariance."""
-        parameters, v = solution.parameters, self._bodies.whole.num_vertices
-        problem = self._problem(self._bodies.whole, target)
+        parameters, v = solution.parameters, self._levels.full.num_vertices
+        problem = self._problem(self._levels.full, target)
         terms, iou, rendering = evaluate(problem, parameters, True)
         points, spread = rendering.points, None
         if size_std is None or self._with_covariance:
@@ -216,7 +216,7 @@ class Fitter:
         """None for the paper's solver and blend, which scan no sizes."""
         if not self._settings.scans_sizes:
             return None
-        problem = self._problem(self._bodies.coarse, target.coarse())
+        problem = self._problem(self._levels.coarse, target.coarse())
         return shape_std_ratio(problem, parameters, self._directions, self._shape_covariance)
 
     def _height_ratio(self, parameters: Float[np.ndarray, "P"]) -> float:

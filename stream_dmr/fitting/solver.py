@@ -5,7 +5,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from stream_dmr.fitting.heading import TURNED, is_turned
+from stream_dmr.fitting.heading import REVERSED_LOSS, is_reversed
 from stream_dmr.fitting.target import Target
 
 
@@ -22,7 +22,7 @@ class Solution(NamedTuple):
 
 def rank(target: Target, solution: Solution) -> float:
     """L_rec as a search compares it: from afar a fit may turn round, whatever it began with."""
-    return solution.loss + TURNED * float(is_turned(solution.parameters, target.heading))
+    return solution.loss + REVERSED_LOSS * float(is_reversed(solution.parameters, target.heading))
 
 
 @runtime_checkable

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.distance_map import signed_distance
-from stream_dmr.fitting.heading import told
+from stream_dmr.fitting.heading import heading_from_ends
 from stream_dmr.messages import FishCrop
 
 _SMOOTHING_PX = 1.5  # of the staircase that pixels make of an edge; short beside any fin
@@ -39,7 +39,7 @@ class Target(NamedTuple):
             crop.crop_camera.K.copy(),  # see Body.from_template
             crop.crop_camera.middle_ray(),
             plane_normal,
-            told(crop.ends, crop.crop_camera),
+            heading_from_ends(crop.ends, crop.crop_camera),
             crop.mask.astype(np.float64),
             signed_distance(crop.mask),
             float(crop.mask.sum()),

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from stream_dmr.camera import Calibration
 from stream_dmr.fitting.fitter import Fit, Fitter, Solved
-from stream_dmr.fitting.heading import HeadMemory
+from stream_dmr.fitting.heading import HeadTracker
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.messages import FishCrop, FittedMesh
@@ -24,13 +24,13 @@ _MIN_VISIBLE = 0.9  # of a frame that decides
 
 @dataclass(kw_only=True, slots=True)
 class _Track:
-    """What the next frame of a track is told."""
+    """What the next frame of a track starts from."""
 
     against: Float[np.ndarray, "N"]  # nats against each candidate
     num_decided: int = 0  # frames that have said so
     seen_ns: int = 0
     best: dict[int, Float[np.ndarray, "P"]] = field(default_factory=dict)  # last good fits
-    head: HeadMemory = field(default_factory=HeadMemory)
+    head: HeadTracker = field(default_factory=HeadTracker)
 
 
 class TrackFitter:
@@ -71,10 +71,10 @@ class TrackFitter:
         """Fit one crop; a poor fit, or one of half a fish, warms no other."""
         track = self._tracks.setdefault(crop.track_id, _Track(against=self._unlikely.copy()))
         track.seen_ns = crop.timestamp_ns
-        weighed = replace(crop, ends=track.head.weigh(crop.ends))
+        weighed = replace(crop, ends=track.head.correct(crop.ends))
         fitted, best = self._fit(weighed, track)
         if fitted.shape is not None:
-            track.head.follow(fitted.shape.keypoints_px)
+            track.head.update(fitted.shape.keypoints_px)
             is_good = fitted.shape.iou >= self._settings.cold_below_iou
             if best is not None and is_good and not crop.quality.touches_border:
                 track.best[fitted.shape.candidate or 0] = best

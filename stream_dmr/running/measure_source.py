@@ -8,7 +8,7 @@ from pathlib import Path
 
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import OutputError, UserError
-from stream_dmr.fitting.compile_kernels import rehearse
+from stream_dmr.fitting.compile_kernels import compile_kernels
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.messages import LengthEstimate, LocalizedFish, Message
@@ -73,7 +73,7 @@ def measure_source(
                 inputs.config.fit_mesh,
                 with_covariance=_records_covariance(inputs.config),
             )
-            rehearse(fitter)
+            compile_kernels(fitter)
         with open_outputs(inputs, observer) as outputs:
             crop_fish.number_after(outputs.store.before.track_id)
             continue_tracks(nodes, outputs.interrupted)

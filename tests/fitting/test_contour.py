@@ -99,7 +99,7 @@ class TestRotation:
     @given(seed=seeds, angle=angles)
     def test_is_scipy_s(self, seed, angle):
         w = self.vector(seed, angle)
-        R, _ = rotation.rotation(w)
+        R, _ = rotation.rotation_and_jacobian(w)
         np.testing.assert_allclose(R, Rotation.from_rotvec(w).as_matrix(), atol=1e-11)
 
     @given(seed=seeds, angle=angles)
@@ -111,17 +111,17 @@ class TestRotation:
         for k in range(1, 60):
             term = term @ -cross / (k + 1)
             total = total + term
-        _, J = rotation.rotation(w)
+        _, J = rotation.rotation_and_jacobian(w)
         np.testing.assert_allclose(J, total, atol=1e-10)
 
     @given(seed=seeds, angle=angles)
     def test_right_jacobian_is_the_slope(self, seed, angle):
         """R(w + d) = R(w) exp(J_r d) to first order."""
         w = self.vector(seed, angle)
-        _, J = rotation.rotation(w)
+        _, J = rotation.rotation_and_jacobian(w)
         slopes = []
         for step in np.eye(3) * 1e-5:
-            ahead, behind = (rotation.rotation(w + s)[0] for s in (step, -step))
+            ahead, behind = (rotation.rotation_and_jacobian(w + s)[0] for s in (step, -step))
             slopes.append(Rotation.from_matrix(behind.T @ ahead).as_rotvec() / 2e-5)
         np.testing.assert_allclose(J, np.transpose(slopes), atol=1e-8)
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.levenberg_marquardt import NEAR, evaluate, minimise
+from stream_dmr.fitting.contour.levenberg_marquardt import WARM_DAMPING, evaluate, minimise
 from stream_dmr.fitting.contour.normal_equations import prior_loss
 from stream_dmr.fitting.contour.problem import Options, Problem
 from stream_dmr.fitting.contour.solver import ContourSolver
@@ -93,9 +93,9 @@ def known():
     return [(t, solver.refine(t, s), f) for t, s, f in zip(targets, starts, flats, strict=True)]
 
 
-def scanned(target, flat, *, hopeless=np.inf):
-    options = Options(4, SETTINGS.tolerance, NEAR)
-    return scan_sizes(problem_of(target), flat, FIVE, hopeless, options)
+def scanned(target, flat, *, max_excess=np.inf):
+    options = Options(4, SETTINGS.tolerance, WARM_DAMPING)
+    return scan_sizes(problem_of(target), flat, FIVE, max_excess, options)
 
 
 def problem_of(target):
@@ -111,7 +111,7 @@ def test_every_fit_of_a_scan_has_the_size_it_is_to_have(known):
 
 
 def test_where_sizes_are_likely_a_scan_is_nearly_as_good_as_a_long_fit(known):
-    held, options = only_size(len(rest_vector(2))), Options(30, SETTINGS.tolerance, NEAR)
+    held, options = only_size(len(rest_vector(2))), Options(30, SETTINGS.tolerance, WARM_DAMPING)
     for target, best, _ in known:
         _, losses, *_ = scanned(target, best.parameters)
         for offset, loss in zip(FIVE, losses, strict=True):
@@ -136,13 +136,13 @@ def loss_of(target, flat):
     return evaluate(problem, flat, False).terms @ problem.lambdas + prior_loss(problem, flat)
 
 
-def test_behind_a_hopeless_size_none_is_tried(known):
+def test_scan_ends_at_sizes_that_exceed_the_loss(known):
     for target, best, _ in known:
         _, everywhere, *_ = scanned(target, best.parameters)
-        hopeless = np.median(everywhere) - everywhere[2]
-        _, losses, *_ = scanned(target, best.parameters, hopeless=hopeless)
+        max_excess = np.median(everywhere) - everywhere[2]
+        _, losses, *_ = scanned(target, best.parameters, max_excess=max_excess)
         for outwards in (slice(2, None), slice(2, None, -1)):
-            ends = everywhere[outwards] >= everywhere[2] + hopeless
+            ends = everywhere[outwards] >= everywhere[2] + max_excess
             tried = np.append(True, ~np.logical_or.accumulate(ends)[:-1])
             expected = np.where(tried, everywhere[outwards], np.inf)
             np.testing.assert_array_equal(losses[outwards], expected)

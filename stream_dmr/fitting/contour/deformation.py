@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.linear_blend import blend_jacobian, blend_points, move_and_scale
-from stream_dmr.fitting.contour.rotation import rotation
+from stream_dmr.fitting.contour.rotation import rotation_and_jacobian
 from stream_dmr.fitting.contour.spine import spine_jacobian, spine_points
 from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION, ROOT_TRANSLATION
 
@@ -18,7 +18,7 @@ KINDS = {"spine": SPINE, "linear-blend": LINEAR_BLEND}
 def deform(body: Body, kind: int, parameters: Float[np.ndarray, "P"]) -> Float[np.ndarray, "N 3"]:
     """Deformed points, centered on the root, in units of the root's depth."""
     out = spine_points(body, parameters) if kind == SPINE else blend_points(body, parameters)
-    root, _ = rotation(parameters[ROOT_ROTATION])
+    root, _ = rotation_and_jacobian(parameters[ROOT_ROTATION])
     size = np.exp(parameters[LOG_SIZE])
     for n in range(len(out)):
         x, y, z = out[n, 0], out[n, 1], out[n, 2]

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.compiled import compiled
-from stream_dmr.fitting.contour.rotation import turn_slope
+from stream_dmr.fitting.contour.rotation import rotated_slope
 from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION, ROOT_TRANSLATION
 
 
 @compiled
-def factors(weight: Float[np.ndarray, "J 6"]) -> Float[np.ndarray, "J 3 3"]:
+def cholesky_factors(weight: Float[np.ndarray, "J 6"]) -> Float[np.ndarray, "J 3 3"]:
     """Cholesky factors L of each joint's Q, from its parameters."""
     L = np.zeros((len(weight), 3, 3))
     for j in range(len(weight)):
@@ -24,7 +24,7 @@ def factors(weight: Float[np.ndarray, "J 6"]) -> Float[np.ndarray, "J 3 3"]:
 
 
 @compiled
-def weights(
+def skinning_weights(
     place: Float[np.ndarray, "3"],
     joints: Float[np.ndarray, "J 3"],
     L: Float[np.ndarray, "J 3 3"],
@@ -83,7 +83,7 @@ def root_slope(
 
     A is overwritten.
     """
-    turn_slope(root, root_J, v, A)
+    rotated_slope(root, root_J, v, A)
     root_shift = parameters[ROOT_TRANSLATION]
     to_rotation, to_translation = out[:, ROOT_ROTATION], out[:, ROOT_TRANSLATION]
     for i in range(3):

@@ -18,7 +18,7 @@ SETTLED, STUCK, EXHAUSTED = 0, 1, 2
 STOP_REASONS = ("L_rec settled", "no step lowers L_rec", "iterations used up")
 
 # Damping at the start: near the answer the model is trusted, far from it less.
-NEAR, FAR = 1e-2, 1e-1
+WARM_DAMPING, COLD_DAMPING = 1e-2, 1e-1
 _GROWTH, _SHRINK = 10.0, 0.3
 _MOST_REFUSED = 3  # steps in a row, each ten times shorter: what is left to gain is pixel noise
 

@@ -5,8 +5,13 @@ from jaxtyping import Float, Int
 
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.joints import blend, factors, root_slope, weights
-from stream_dmr.fitting.contour.rotation import dot, rotation, turn, turn_slope
+from stream_dmr.fitting.contour.joints import blend, cholesky_factors, root_slope, skinning_weights
+from stream_dmr.fitting.contour.rotation import (
+    dot,
+    fill_rotation,
+    rotated_slope,
+    rotation_and_jacobian,
+)
 from stream_dmr.fitting.parameters import (
     JOINT_LOG_SCALE,
     JOINT_ROTATION,
@@ -25,14 +30,14 @@ from stream_dmr.fitting.parameters import (
 def blend_points(body: Body, parameters: Float[np.ndarray, "P"]) -> Float[np.ndarray, "N 3"]:
     """(sum_j W_j R_j) V of eq. (1)."""
     num_joints, joints = len(body.joints), joints_of(parameters)
-    L = factors(joints.weight)
+    L = cholesky_factors(joints.weight)
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
     turns = np.empty((num_joints, 3, 3))
     for j in range(num_joints):
-        turn(joints.rotation[j], turns[j])
+        fill_rotation(joints.rotation[j], turns[j])
     out = np.zeros_like(body.points)
     for n in range(len(out)):
-        weights(body.points[n], body.joints, L, W, dE)
+        skinning_weights(body.points[n], body.joints, L, W, dE)
         x, y, z = body.points[n, 0], body.points[n, 1], body.points[n, 2]
         for j in range(num_joints):
             for i in range(3):
@@ -46,11 +51,11 @@ def move_and_scale(
 ) -> None:
     """S_0 (sum_j W_j S_j) (T_0 + sum_j W_j T_j + V) of eq. (1), in place."""
     num_joints, joints = len(body.joints), joints_of(parameters)
-    L, S = factors(joints.weight), np.exp(joints.log_scale)
+    L, S = cholesky_factors(joints.weight), np.exp(joints.log_scale)
     root_shift = parameters[ROOT_TRANSLATION]
     W, dE, shift = np.empty(num_joints), np.empty((num_joints, 6)), np.empty(3)
     for n in range(len(out)):
-        weights(body.points[n], body.joints, L, W, dE)
+        skinning_weights(body.points[n], body.joints, L, W, dE)
         blend(W, joints.translation, shift)
         scale = size * dot(W, S)
         out[n, 0] = scale * (out[n, 0] + shift[0] + root_shift[0])
@@ -67,17 +72,17 @@ def blend_jacobian(
 ) -> None:
     """Slopes of chosen points to the parameters, into `out`."""
     num_joints, joints = len(body.joints), joints_of(parameters)
-    L, S = factors(joints.weight), np.exp(joints.log_scale)
-    root, root_J = rotation(parameters[ROOT_ROTATION])
+    L, S = cholesky_factors(joints.weight), np.exp(joints.log_scale)
+    root, root_J = rotation_and_jacobian(parameters[ROOT_ROTATION])
     size = np.exp(parameters[LOG_SIZE])
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
     shift, A, moved = np.empty(3), np.empty((3, 3)), np.empty(3)
     turns, turn_J = np.empty((num_joints, 3, 3)), np.empty((num_joints, 3, 3))
     for j in range(num_joints):
-        turns[j], turn_J[j] = rotation(joints.rotation[j])
+        turns[j], turn_J[j] = rotation_and_jacobian(joints.rotation[j])
     for c in range(len(chosen)):
         point = body.points[chosen[c]]
-        weights(point, body.joints, L, W, dE)
+        skinning_weights(point, body.joints, L, W, dE)
         blend(W, joints.translation, shift)
         scale = dot(W, S)
         v = np.zeros(3)
@@ -93,7 +98,7 @@ def blend_jacobian(
                 to_joint[:, JOINT_TRANSLATION],
             )
             to_weight = to_joint[:, JOINT_WEIGHT]
-            turn_slope(turns[j], turn_J[j], point, A)
+            rotated_slope(turns[j], turn_J[j], point, A)
             RA = root @ A
             Rv = root @ (turns[j] @ point - v)
             for i in range(3):

@@ -18,7 +18,7 @@ from stream_dmr.fitting.contour.deformation import jacobian
 from stream_dmr.fitting.contour.mesh_terms import smoothness_slope
 from stream_dmr.fitting.contour.outline import COVERED, Rendering, boundary_loss
 from stream_dmr.fitting.contour.problem import LAPLACIAN, NORMAL, SCALE, TRANSLATION, Problem
-from stream_dmr.fitting.contour.rotation import rotation, turn_slope
+from stream_dmr.fitting.contour.rotation import rotated_slope, rotation_and_jacobian
 from stream_dmr.fitting.parameters import (
     JOINT_LOG_SCALE,
     JOINT_ROTATION,
@@ -353,9 +353,9 @@ def regularise(
             _add_square(p, shift, 1.0, 2 * lambdas[TRANSLATION], H, g)
         scale = np.exp(joints.log_scale[j])
         _add_square(base + JOINT_LOG_SCALE, scale - 1.0, scale, 2 * lambdas[SCALE], H, g)
-    R, J = rotation(parameters[ROOT_ROTATION])
+    R, J = rotation_and_jacobian(parameters[ROOT_ROTATION])
     A = np.empty((3, 3))
-    turn_slope(R, J, np.array([1.0, 0.0, 0.0]), A)
+    rotated_slope(R, J, np.array([1.0, 0.0, 0.0]), A)
     n = problem.target.plane_normal
     tilt = n[0] * R[0, 0] + n[1] * R[1, 0] + n[2] * R[2, 0]
     slope = n @ A
@@ -368,7 +368,7 @@ def regularise(
 @compiled
 def prior_loss(problem: Problem, parameters: Float[np.ndarray, "P"]) -> float:
     """What the priors add to L_rec: half the weighted squares of tilt, bends and weights."""
-    R, _ = rotation(parameters[ROOT_ROTATION])
+    R, _ = rotation_and_jacobian(parameters[ROOT_ROTATION])
     n, priors = problem.target.plane_normal, problem.priors
     loss = 0.5 * priors.tilt * (n[0] * R[0, 0] + n[1] * R[1, 0] + n[2] * R[2, 0]) ** 2
     for p in range(NUM_ROOT, len(parameters)):

@@ -10,8 +10,12 @@ from jaxtyping import Float
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.deformation import SPINE, jacobian
-from stream_dmr.fitting.contour.joints import blend, factors, weights
-from stream_dmr.fitting.contour.rotation import dot, rotation, turn_and_slope
+from stream_dmr.fitting.contour.joints import blend, cholesky_factors, skinning_weights
+from stream_dmr.fitting.contour.rotation import (
+    dot,
+    fill_rotation_and_jacobian,
+    rotation_and_jacobian,
+)
 from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION, ROOT_TRANSLATION, joints_of
 
 
@@ -64,7 +68,7 @@ def _through_root(
     out: Float[np.ndarray, "P"],
 ) -> Float[np.ndarray, "V 3"]:
     """Slopes to the root's parameters into `out`; the forces as the body feels them."""
-    root, J = rotation(parameters[ROOT_ROTATION])
+    root, J = rotation_and_jacobian(parameters[ROOT_ROTATION])
     size, shift = np.exp(parameters[LOG_SIZE]), parameters[ROOT_TRANSLATION]
     to_rotation, to_translation = out[ROOT_ROTATION], out[ROOT_TRANSLATION]
     local, torque, q = np.empty_like(forces), np.zeros(3), np.empty(3)
@@ -145,16 +149,16 @@ def _through_joints(
     rotations, translations, rest_joints = joints.rotation, joints.translation, body.joints
     to_rotation, to_translation = to_joint.rotation, to_joint.translation
     to_scale, to_weight = to_joint.log_scale, to_joint.weight
-    L, S = factors(joints.weight), np.exp(joints.log_scale)
+    L, S = cholesky_factors(joints.weight), np.exp(joints.log_scale)
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
     omega, shift, back = np.empty(3), np.empty(3), np.empty(3)
     torque, spin = np.empty(3), np.empty(3)
     R, J, turned = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for u in range(len(places)):
-        weights(places[u], rest_joints, L, W, dE)
+        skinning_weights(places[u], rest_joints, L, W, dE)
         blend(W, rotations, omega)
         blend(W, translations, shift)
-        turn_and_slope(omega, R, J)
+        fill_rotation_and_jacobian(omega, R, J)
         scale = dot(W, S)
         for i in range(3):
             back[i] = R[0, i] * push[u, 0] + R[1, i] * push[u, 1] + R[2, i] * push[u, 2]

@@ -14,15 +14,15 @@ Matrix = Float[np.ndarray, "3 3"]
 
 
 @compiled
-def rotation(w: Vector) -> tuple[Matrix, Matrix]:
+def rotation_and_jacobian(w: Vector) -> tuple[Matrix, Matrix]:
     """Rotation matrix of a rotation vector, and its right Jacobian."""
     R, J = np.empty((3, 3)), np.empty((3, 3))
-    turn_and_slope(w, R, J)
+    fill_rotation_and_jacobian(w, R, J)
     return R, J
 
 
 @compiled
-def turn_and_slope(w: Vector, R: Matrix, J: Matrix) -> None:
+def fill_rotation_and_jacobian(w: Vector, R: Matrix, J: Matrix) -> None:
     """The same into R and J: loops must not allocate."""
     a, b, c = _sines(w)
     _fill(w, a, b, R)
@@ -30,7 +30,7 @@ def turn_and_slope(w: Vector, R: Matrix, J: Matrix) -> None:
 
 
 @compiled
-def turn(w: Vector, R: Matrix) -> None:
+def fill_rotation(w: Vector, R: Matrix) -> None:
     """The rotation matrix alone, into R."""
     a, b, _ = _sines(w)
     _fill(w, a, b, R)
@@ -60,7 +60,7 @@ def _fill(w: Vector, a: float, b: float, out: Matrix) -> None:
 
 
 @compiled
-def apply(R: Matrix, v: Vector, out: Vector) -> None:
+def multiply(R: Matrix, v: Vector, out: Vector) -> None:
     """R v into out: for three numbers faster than a call of BLAS."""
     for i in range(3):
         out[i] = R[i, 0] * v[0] + R[i, 1] * v[1] + R[i, 2] * v[2]
@@ -76,7 +76,7 @@ def dot(a: Float[np.ndarray, "N"], b: Float[np.ndarray, "N"]) -> float:
 
 
 @compiled
-def turn_slope(R: Matrix, J: Matrix, v: Vector, out: Matrix) -> None:
+def rotated_slope(R: Matrix, J: Matrix, v: Vector, out: Matrix) -> None:
     """Slope d(R v)/d omega = -R [v]x J_r into `out`."""
     for k in range(3):
         c0 = J[1, k] * v[2] - J[2, k] * v[1]

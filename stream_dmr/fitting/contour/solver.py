@@ -4,10 +4,10 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.fitting.contour.levenberg_marquardt import (
+    COLD_DAMPING,
     EXHAUSTED,
-    FAR,
-    NEAR,
     STOP_REASONS,
+    WARM_DAMPING,
     Minimum,
     evaluate,
     minimise,
@@ -61,10 +61,10 @@ class ContourSolver:
 
     def _finish(self, problem: Problem, start: Float[np.ndarray, "P"]) -> Solution:
         most = self._settings.contour_iterations
-        return self._minimise(problem, start, iterations=most, damping=NEAR)
+        return self._minimise(problem, start, iterations=most, damping=WARM_DAMPING)
 
     def _rough(self, problem: Problem, start: Float[np.ndarray, "P"], iterations: int) -> Solution:
-        return self._minimise(problem, start, iterations=iterations, damping=FAR)
+        return self._minimise(problem, start, iterations=iterations, damping=COLD_DAMPING)
 
     def _minimise(
         self, problem: Problem, start: Float[np.ndarray, "P"], *, iterations: int, damping: float

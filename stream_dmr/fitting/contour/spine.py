@@ -5,14 +5,14 @@ from jaxtyping import Float, Int
 
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.joints import blend, factors, root_slope, weights
+from stream_dmr.fitting.contour.joints import blend, cholesky_factors, root_slope, skinning_weights
 from stream_dmr.fitting.contour.rotation import (
-    apply,
     dot,
-    rotation,
-    turn,
-    turn_and_slope,
-    turn_slope,
+    fill_rotation,
+    fill_rotation_and_jacobian,
+    multiply,
+    rotated_slope,
+    rotation_and_jacobian,
 )
 from stream_dmr.fitting.parameters import (
     JOINT_LOG_SCALE,
@@ -32,7 +32,7 @@ def spine_points(body: Body, parameters: Float[np.ndarray, "P"]) -> Float[np.nda
     """Points swept along the bent midline, before the root's own motion."""
     num_joints, joints, places = len(body.joints), joints_of(parameters), body.places
     rotations, translations, rest_joints = joints.rotation, joints.translation, body.joints
-    L, S = factors(joints.weight), np.exp(joints.log_scale)
+    L, S = cholesky_factors(joints.weight), np.exp(joints.log_scale)
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
     blended = np.empty(3)
     nodes, _ = spine_nodes(body, parameters, L, False)
@@ -41,11 +41,11 @@ def spine_points(body: Body, parameters: Float[np.ndarray, "P"]) -> Float[np.nda
     bases = np.empty((len(body.places), 3))
     scales = np.empty(len(body.places))
     for u in range(len(body.places)):
-        weights(places[u], rest_joints, L, W, dE)
+        skinning_weights(places[u], rest_joints, L, W, dE)
         blend(W, rotations, blended)
-        turn(blended, turns[u])
+        fill_rotation(blended, turns[u])
         blend(W, translations, blended)
-        apply(turns[u], blended, bases[u])
+        multiply(turns[u], blended, bases[u])
         k, t = body.segments[u], body.fractions[u]
         for i in range(3):
             bases[u, i] += (1.0 - t) * nodes[k, i] + t * nodes[k + 1, i] - center[i]
@@ -71,11 +71,11 @@ def spine_jacobian(
     """Slopes of chosen points to the parameters, into `out`."""
     num_joints, joints, places = len(body.joints), joints_of(parameters), body.places
     rotations, translations, rest_joints = joints.rotation, joints.translation, body.joints
-    L, S = factors(joints.weight), np.exp(joints.log_scale)
+    L, S = cholesky_factors(joints.weight), np.exp(joints.log_scale)
     nodes, slopes = spine_nodes(body, parameters, L, True)
     middle = body.place_of[body.num_vertices + 1]
     center, center_slope = _at_place(body, nodes, middle), _at_place(body, slopes, middle)
-    root, root_J = rotation(parameters[ROOT_ROTATION])
+    root, root_J = rotation_and_jacobian(parameters[ROOT_ROTATION])
     size = np.exp(parameters[LOG_SIZE])
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
     omega, shift, off, o = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -90,16 +90,16 @@ def spine_jacobian(
     for c in range(len(chosen)):
         n = chosen[c]
         u = body.place_of[n]
-        weights(places[u], rest_joints, L, W, dE)
+        skinning_weights(places[u], rest_joints, L, W, dE)
         blend(W, rotations, omega)
         blend(W, translations, shift)
         scale = dot(W, S)
-        turn_and_slope(omega, R, J)
+        fill_rotation_and_jacobian(omega, R, J)
         for i in range(3):
             off[i] = body.points[n, i] - places[u, i]
             o[i] = scale * off[i] + shift[i]
-        turn_slope(R, J, o, A)
-        apply(R, off, Roff)
+        rotated_slope(R, J, o, A)
+        multiply(R, off, Roff)
         k, t = body.segments[u], body.fractions[u]
         for i in range(3):
             for p in range(NUM_PER_JOINT * num_joints):
@@ -117,7 +117,7 @@ def spine_jacobian(
                 blocks[i, j, JOINT_LOG_SCALE] += W[j] * S[j] * Roff[i]
                 for q in range(6):
                     to_weight[i, j, q] += W[j] * along[i] * dE[j, q]
-        apply(R, o, v)
+        multiply(R, o, v)
         for i in range(3):
             v[i] += (1.0 - t) * nodes[k, i] + t * nodes[k + 1, i] - center[i]
         root_slope(root, root_J, size, parameters, v, none, 1.0, out[c], A)
@@ -148,18 +148,18 @@ def spine_nodes(
     for k in range(count - 1):
         for i in range(3):
             middle[i] = (body.midline[k, i] + body.midline[k + 1, i]) / 2
-        weights(middle, rest_joints, L, W, dE)
+        skinning_weights(middle, rest_joints, L, W, dE)
         blend(W, rotations, omega)
         for i in range(3):
             step[i] = body.midline[k + 1, i] - body.midline[k, i]
-        turn(omega, R)
-        apply(R, step, Rd)
+        fill_rotation(omega, R)
+        multiply(R, step, Rd)
         for i in range(3):
             place[k + 1, i] = place[k, i] + Rd[i]
         if not with_slope:
             continue
-        turn_and_slope(omega, R, J)
-        turn_slope(R, J, step, A)
+        fill_rotation_and_jacobian(omega, R, J)
+        rotated_slope(R, J, step, A)
         slope[k + 1] = slope[k]
         for j in range(num_joints):
             for i in range(3):

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.deformation import jacobian
-from stream_dmr.fitting.contour.joints import blend, factors, weights
+from stream_dmr.fitting.contour.joints import blend, cholesky_factors, skinning_weights
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.normal_equations import (
     RimSlopes,
@@ -24,7 +24,7 @@ from stream_dmr.fitting.contour.normal_equations import (
     weighted_squares,
 )
 from stream_dmr.fitting.contour.problem import Problem
-from stream_dmr.fitting.contour.rotation import dot, rotation, turn
+from stream_dmr.fitting.contour.rotation import dot, fill_rotation, rotation_and_jacobian
 from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION, joints_of
 
 
@@ -68,16 +68,16 @@ def _carry(
 ) -> None:
     """Where directions at rest point in the deformed body, as `spine_points` carries offsets."""
     joints, num_joints = joints_of(parameters), len(body.joints)
-    L, S = factors(joints.weight), np.exp(joints.log_scale)
+    L, S = cholesky_factors(joints.weight), np.exp(joints.log_scale)
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
     blended, turned = np.empty(3), np.empty((3, 3))
-    root, _ = rotation(parameters[ROOT_ROTATION])
+    root, _ = rotation_and_jacobian(parameters[ROOT_ROTATION])
     size = np.exp(parameters[LOG_SIZE])
     for c in range(len(chosen)):
         n = chosen[c]
-        weights(body.places[body.place_of[n]], body.joints, L, W, dE)
+        skinning_weights(body.places[body.place_of[n]], body.joints, L, W, dE)
         blend(W, joints.rotation, blended)
-        turn(blended, turned)
+        fill_rotation(blended, turned)
         scale = size * dot(W, S)
         for i in range(3):
             for k in range(out.shape[2]):

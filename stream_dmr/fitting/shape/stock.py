@@ -20,9 +20,9 @@ from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve
 
 from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.levenberg_marquardt import NEAR, minimise
+from stream_dmr.fitting.contour.levenberg_marquardt import WARM_DAMPING, minimise
 from stream_dmr.fitting.contour.problem import Options, Problem
-from stream_dmr.fitting.contour.rotation import rotation
+from stream_dmr.fitting.contour.rotation import rotation_and_jacobian
 from stream_dmr.fitting.parameters import ROOT_ROTATION
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.shape.equations import shape_equations
@@ -49,7 +49,7 @@ _MAX_STEP = 0.25  # of a log factor in one round: directions are those of the sh
 _SETTLED = 0.01
 _MAX_SHIFT = 0.15  # by log volumes, which are known to first order only
 _PROBE = 0.05  # step of the finite difference of log volumes
-_POSE_OPTIONS = Options(6, 1e-5, NEAR)
+_POSE_OPTIONS = Options(6, 1e-5, WARM_DAMPING)
 
 
 @dataclass(eq=False)
@@ -196,7 +196,7 @@ def _roll_slope(pose: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
 
     The first row of the right Jacobian of SO(3): x is the body's axis (Sola et al., 2018, eq. 143).
     """
-    _, J = rotation(pose[ROOT_ROTATION])
+    _, J = rotation_and_jacobian(pose[ROOT_ROTATION])
     slope = np.zeros(len(pose))
     slope[ROOT_ROTATION] = J[0]
     return slope

@@ -161,7 +161,7 @@ class _StockLearner:
         """Seeks the pose of a frame from cold, with a template of this shape."""
         template = reshaped(self._template, coefficients)
         solver = ContourSolver(
-            MeshLevels.of(template, max_faces=self._settings.max_faces), self._settings
+            MeshLevels.from_template(template, max_faces=self._settings.max_faces), self._settings
         )
 
         def search(frame: PosedTarget) -> PosedTarget:

@@ -34,13 +34,13 @@ def scan_sizes(
     problem: Problem,
     start: Float[np.ndarray, "P"],
     offsets: Float[np.ndarray, "G"],
-    hopeless: float,
+    max_excess: float,
     options: Options,
 ) -> SizeScan:
     """Fit anew at each log size `start[LOG_SIZE] + offsets` (ascending, 0 among them).
 
     From the start outwards, each size from where its neighbour's fit is headed, and no further than
-    sizes whose loss is worse than the start's by `hopeless`.
+    sizes whose loss exceeds the start's by `max_excess`.
     """
     count, middle = len(offsets), np.argmin(np.abs(offsets))
     fits, next_steps = np.zeros((count, len(start))), np.zeros((count, len(start)))
@@ -48,13 +48,13 @@ def scan_sizes(
     fits[middle], losses[middle], log_volumes[middle], next_steps[middle] = fit_at_size(
         problem, start, options
     )
-    for way in (1, -1):
-        n = middle + way
-        while 0 <= n < count and losses[n - way] < losses[middle] + hopeless:
-            guess = fits[n - way] + (offsets[n] - offsets[n - way]) * next_steps[n - way]
+    for step in (1, -1):
+        n = middle + step
+        while 0 <= n < count and losses[n - step] < losses[middle] + max_excess:
+            guess = fits[n - step] + (offsets[n] - offsets[n - step]) * next_steps[n - step]
             guess[LOG_SIZE] = start[LOG_SIZE] + offsets[n]
             fits[n], losses[n], log_volumes[n], next_steps[n] = fit_at_size(problem, guess, options)
-            n += way
+            n += step
     return SizeScan(fits, losses, log_volumes, next_steps)
 
 

@@ -1,4 +1,4 @@
-"""What is rehearsed before a camera's first frame is all that its frames will call, and replays."""
+"""Every kernel that a run or a replay calls is compiled before a camera's first frame."""
 
 import subprocess
 import sys
@@ -13,7 +13,7 @@ from numba.core.dispatcher import Dispatcher
 from tests.support.shapes import crop_of, pose
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.fitting.fitter import Fitter
-from stream_dmr.fitting.compile_kernels import rehearse
+from stream_dmr.fitting.compile_kernels import compile_kernels
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.replaying.replay import replay
 from stream_dmr.replaying.replay_request import ReplayRequest
@@ -26,20 +26,20 @@ def compiled():
 
 template = load_template("cod")
 rig = Rig.from_template(template)
-rehearse(Fitter(load_template("halibut"), FitMeshSettings()))
-rehearsed = compiled()
-assert sum(rehearsed.values()) > 10, rehearsed
+compile_kernels(Fitter(load_template("halibut"), FitMeshSettings()))
+before = compiled()
+assert sum(before.values()) > 10, before
 node = FitMesh(FitMeshSettings(), template=template, calibration=None)
 for seed in (1, 1, 2):
     node.step(crop_of(pose(np.random.default_rng(seed), in_plane_rad=1.0), rig))
-assert compiled() == rehearsed, (compiled(), rehearsed)
+assert compiled() == before, (compiled(), before)
 golden = Path("recordings/golden/recording.mcap")
 replay(ReplayRequest(recordings=[golden], first="fit"), stop=threading.Event())
-assert compiled() == rehearsed, (compiled(), rehearsed)
+assert compiled() == before, (compiled(), before)
 """
 
 
-def test_after_it_nothing_is_compiled():
+def test_nothing_is_compiled_afterwards():
     """In a process of its own, where no other test has called a loop."""
     root = Path(__file__).resolve().parents[2]
     done = subprocess.run([sys.executable, "-c", CODE], cwd=root, capture_output=True, text=True)
