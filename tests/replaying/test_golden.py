@@ -36,7 +36,7 @@ def test_golden_recording_is_computed_again(first):
 
 
 def _is_made_here(recording: Recording) -> bool:
-    """By the same versions of everything, on the same kind of processor."""
+    """By the same versions of everything, and where numbers are rounded alike."""
     return recording.metadata == recording.header.metadata()
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import RecordingError
 from stream_dmr.fitting.shape.candidates import CandidateShapes
+from stream_dmr.recording.messages.arithmetic import arithmetic_checksum
 from stream_dmr.recording.messages.codec import CODEC_VERSION, decode, encode
 from stream_dmr.recording.messages.run_inputs import RunInputs
 from stream_dmr.template.template import Template
@@ -55,6 +56,7 @@ class RunHeader:
             "python": platform.python_version(),
             "platform": f"{platform.system()} {platform.machine()} {' '.join(platform.libc_ver())}",
             "cpu": _cpu(),
+            "arithmetic": arithmetic_checksum(),
             **{name: _version(name) for name in _LIBRARIES},
         }
 
