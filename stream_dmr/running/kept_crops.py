@@ -19,8 +19,9 @@ _IN_MEMORY = 1 << 26  # bytes of crops: some 100,000 masks; more are kept on the
 class KeptCrops:
     """The crops of a first pass: in place of CropFish, a node that gives them again."""
 
-    def __init__(self) -> None:
-        self._file: IO[bytes] = SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115, see `close`
+    def __init__(self, *, in_memory: int = _IN_MEMORY) -> None:
+        """Beyond so many bytes they go to the disk."""
+        self._file: IO[bytes] = SpooledTemporaryFile(in_memory)  # noqa: SIM115, see `close`
         self._places: dict[int, list[tuple[int, int]]] = {}  # of each frame: offsets and sizes
 
     def keep(self, crop: FishCrop) -> None:

@@ -1,0 +1,55 @@
+"""Fits along tracks with several candidate shapes: a fish is given the one its masks prefer."""
+
+import pytest
+
+from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.tracks import TrackFitter
+from tests.support.stocks import TEMPLATE, broader, candidates, fish_of, forms, tapered
+
+SETTINGS = FitMeshSettings(max_faces=600)
+
+
+def shapes_of(fitter, fish):
+    return [fitter.fit(sample.crop).shape for sample in fish.samples]
+
+
+@pytest.mark.parametrize(("log_factor", "candidate"), [(-0.4, 0), (0.4, 1)])
+def test_a_fish_is_given_the_shape_that_it_has(log_factor, candidate):
+    shapes = candidates(fore=tapered(-0.4), aft=tapered(0.4))
+    fitter = TrackFitter(TEMPLATE, SETTINGS, calibration=None, candidates=shapes)
+    shapes = shapes_of(fitter, fish_of(tapered(log_factor), track_id=4, num_frames=4))
+    assert shapes[-1].candidate == candidate
+    assert shapes[-1].iou > 0.9
+    assert shapes[-1].shape_std_ratio > 0
+
+
+def test_where_masks_say_nothing_yet_the_larger_share_counts():
+    """One candidate twice: only the shares distinguish them."""
+    twins = candidates((0.1, 0.9), one=broader(0.0), other=broader(0.0))
+    fitter = TrackFitter(TEMPLATE, SETTINGS, calibration=None, candidates=twins)
+    (shape,) = shapes_of(fitter, fish_of(broader(0.0), track_id=4, num_frames=1))
+    assert shape.candidate == 1
+
+
+def test_without_candidates_a_fish_has_the_template_s_own_shape():
+    fitter = TrackFitter(TEMPLATE, SETTINGS, calibration=None)
+    (shape,) = shapes_of(fitter, fish_of(broader(0.0), track_id=4, num_frames=1))
+    assert shape.candidate is None
+    assert shape.shape_std_ratio > 0  # individuals differ all the same
+
+
+def test_less_is_known_of_a_length_where_the_stock_is_not_known():
+    sample = fish_of(broader(0.0), track_id=4, num_frames=1)
+    own = TrackFitter(TEMPLATE, SETTINGS, calibration=None)
+    guessed = TrackFitter(TEMPLATE, SETTINGS, calibration=None, candidates=forms())
+    (known,), (unknown,) = shapes_of(own, sample), shapes_of(guessed, sample)
+    assert unknown.shape_std_ratio > known.shape_std_ratio
+
+
+def test_a_solver_that_scans_no_sizes_says_nothing_of_the_shape():
+    settings = SETTINGS.model_copy(update={"scan_iterations": 0})
+    (shape,) = shapes_of(
+        TrackFitter(TEMPLATE, settings, calibration=None),
+        fish_of(broader(0.0), track_id=4, num_frames=1),
+    )
+    assert shape.shape_std_ratio is None

@@ -1,0 +1,99 @@
+"""`--template auto`: a run learns the shape of its own fish first, writes it and records it."""
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stream_dmr.fitting.shape.space import reshaped
+from stream_dmr.replaying.replay import ReplayRequest, replay
+from stream_dmr.running.measure_source import measure_source
+from stream_dmr.running.run_folder import LEARNT
+from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.running.run_request import RunRequest
+from stream_dmr.template.template import load_template
+from tests.support.command import rows
+from tests.support.fish_run import request
+from tests.support.reading import read_header
+from tests.support.tiny_clip import write_clip
+
+
+class Listener(RunObserver):
+    """Hears what a run says, and asks it to stop after so many frames."""
+
+    def __init__(self, *, stop_after: int | None = None) -> None:
+        self.stop, self.notices, self._stop_after = threading.Event(), list[str](), stop_after
+        self._num_frames = 0
+
+    def notice(self, line: str) -> None:
+        self.notices.append(line)
+
+    def frame_done(self) -> None:
+        self._num_frames += 1
+        if self._num_frames == self._stop_after:
+            self.stop.set()
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("auto") / "clip"
+    write_clip(folder, num_frames=4)
+    config = folder / "quick.toml"
+    config.write_text(config.read_text().replace("[fit_mesh]", "[fit_mesh]\nmax_faces = 600"))
+    return folder
+
+
+def measured(clip: Path, out: Path, observer: Listener, **other: object) -> RunRequest:
+    asked = request(clip, out, **{"template": "auto"} | other)
+    measure_source(asked, stop=observer.stop, observer=observer)
+    return asked
+
+
+@pytest.fixture(scope="module")
+def learnt(clip: Path) -> tuple[Path, Listener]:
+    observer = Listener()
+    return measured(clip, clip.parent / "learnt", observer).out, observer
+
+
+def test_what_was_learnt_is_written_recorded_and_said(learnt: tuple[Path, Listener]):
+    out, observer = learnt
+    header = read_header(out / "recording.mcap")
+    assert header.candidates is not None
+    assert header.candidates.are_learnt
+    assert len(observer.notices) == len(header.candidates)
+    assert (out / LEARNT).with_suffix(".toml").exists()
+    written, stock = load_template(str(out / LEARNT)), next(iter(header.candidates))
+    mean = reshaped(header.template, stock.coefficients)
+    np.testing.assert_allclose(written.rest_vertices, mean.rest_vertices, atol=1e-5)
+    assert [row["status"] for row in rows(out / "lengths.csv")] == ["measured"]
+
+
+def test_it_replays_to_the_last_bit(learnt: tuple[Path, Listener]):
+    asked = ReplayRequest(recordings=[learnt[0] / "recording.mcap"], first="fit", check=True)
+    assert not replay(asked, stop=threading.Event()).mismatches
+
+
+def test_a_live_run_s_recording_learns_its_shapes_ashore(clip: Path, tmp_path: Path):
+    named = measured(clip, tmp_path / "named", Listener(), template="cod").out
+    header = read_header(named / "recording.mcap")
+    assert header.candidates is not None
+    assert not header.candidates.are_learnt
+    assert not (named / LEARNT).exists()
+    ashore = tmp_path / "ashore"
+    asked = ReplayRequest(
+        recordings=[named / "recording.mcap"], first="fit", template="auto", out=ashore
+    )
+    replay(asked, stop=threading.Event())
+    again = read_header(ashore / "recording.mcap")
+    assert again.candidates is not None
+    assert again.candidates.are_learnt
+
+
+def test_a_stop_while_fish_are_looked_for_leaves_an_empty_valid_result(clip: Path, tmp_path: Path):
+    out = measured(clip, tmp_path / "out", Listener(stop_after=1)).out
+    assert rows(out / "lengths.csv") == []
+    header = read_header(out / "recording.mcap")
+    assert header.candidates is not None
+    assert not header.candidates.are_learnt
+    assert not (out / LEARNT).exists()
