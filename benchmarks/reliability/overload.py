@@ -13,7 +13,7 @@ from stream_dmr.messages import LocalizedFish, Message
 from stream_dmr.running.measure_source import RunSummary, measure_source
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.running.run_request import RunRequest
-from stream_dmr.watch.watch import Watch
+from stream_dmr.watch.watch_observer import WatchObserver
 from tests.support.camera import Camera, free_port
 
 _TIMES = 3
@@ -97,4 +97,4 @@ def measured(
         template=str(scene / "species.ply"),
         config=folder / "config.toml",
     )
-    return measure_source(request, stop=stop or threading.Event(), observer=Watch(observer))
+    return measure_source(request, stop=stop or threading.Event(), observer=WatchObserver(observer))

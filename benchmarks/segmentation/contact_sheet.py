@@ -19,7 +19,7 @@ import numpy as np
 from stream_dmr.messages import FishCrop, FittedMesh, Message
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
-from stream_dmr.report.pictures import drawn, outlines_of
+from stream_dmr.report.view_pictures import crop_outlines, draw_outlines
 from stream_dmr.running.config import load_config
 from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.running.pipeline import run_chain
@@ -61,7 +61,9 @@ def tile(pair: Pair, faces: np.ndarray) -> np.ndarray:
     picture = cv2.resize(crop.image, (_TILE_PX, _TILE_PX), interpolation=cv2.INTER_CUBIC)
     found = picture
     if mesh.shape is not None:
-        found = drawn(picture, outlines_of(crop, mesh.shape, faces), crop_size=len(crop.mask))
+        found = draw_outlines(
+            picture, crop_outlines(crop, mesh.shape, faces), crop_size=len(crop.mask)
+        )
     text = f"{crop.track_id}: {crop.quality.mask_confidence:.2f} {mesh.refusal}"
     found = cv2.putText(
         found.copy(), text, (3, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1

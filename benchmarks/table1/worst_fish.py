@@ -16,7 +16,7 @@ from benchmarks.table1 import cached_results
 from benchmarks.table1.filmed_scene import chain_crops, table_scene
 from benchmarks.table1.tables import worst_fish
 from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
-from stream_dmr.report.pictures import drawn, outlines_of
+from stream_dmr.report.view_pictures import crop_outlines, draw_outlines
 from stream_dmr.running.config import Config
 from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.simulation.film import film
@@ -52,7 +52,9 @@ def _tile(
     assert crop.image is not None
     picture = cv2.resize(crop.image, (_TILE_PX, _TILE_PX), interpolation=cv2.INTER_CUBIC)
     if mesh.shape is not None:
-        picture = drawn(picture, outlines_of(crop, mesh.shape, faces), crop_size=len(crop.mask))
+        picture = draw_outlines(
+            picture, crop_outlines(crop, mesh.shape, faces), crop_size=len(crop.mask)
+        )
     length = "" if place.length_mm is None else f"{place.length_mm:.0f} mm "
     return _written(picture.copy(), f"{length}{place.reason}", y=12)
 

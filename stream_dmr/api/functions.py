@@ -21,7 +21,7 @@ from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.running.run_request import RunRequest, command_of, default_out
 from stream_dmr.template.template import Template
-from stream_dmr.watch.watch import Watch
+from stream_dmr.watch.watch_observer import WatchObserver
 
 Location = str | PathLike[str]
 Stage = Literal["crop", "fit", "localize", "smooth"]
@@ -122,7 +122,7 @@ def measure(
     measure_source(
         command_of(request),
         stop=stop or threading.Event(),
-        observer=Watch(observer or LoggingObserver()),
+        observer=WatchObserver(observer or LoggingObserver()),
     )
     return Run(request.out)
 

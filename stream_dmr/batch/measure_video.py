@@ -17,7 +17,7 @@ from stream_dmr.results.provenance import add_files
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.running.run_request import RunRequest, command_of
-from stream_dmr.watch.watch import Watch
+from stream_dmr.watch.watch_observer import WatchObserver
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,7 @@ def measure_video(job: Job, out: Path, *, on_progress: OnProgress = lambda share
     folder.parent.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(folder, ignore_errors=True)
     try:
-        observer = Watch(_ProgressObserver(on_progress))
+        observer = WatchObserver(_ProgressObserver(on_progress))
         summary = measure_source(request_of(job, out), stop=threading.Event(), observer=observer)
         write_tables(folder, job)
         outcome = Outcome(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from stream_dmr.cli.support import ConfigOption, TemplateOption, stop_on_signals
+from stream_dmr.cli.shared_options import ConfigOption, TemplateOption, stop_on_signals
 
 if TYPE_CHECKING:
     from stream_dmr.batch.engine import Engine

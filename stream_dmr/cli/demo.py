@@ -46,7 +46,7 @@ def print_beside_truth(lengths: Path, truth: Path) -> bool:
 
     Fish are compared by track_id: here both count them in the order in which they come into view.
     """
-    from stream_dmr.cli.display import print_evaluation
+    from stream_dmr.cli.terminal import print_evaluation
     from stream_dmr.evaluation.compare import evaluate
 
     evaluation = evaluate(lengths, truth)

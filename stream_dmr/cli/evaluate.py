@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from stream_dmr.cli.support import warn
+from stream_dmr.cli.shared_options import warn
 
 _NOT_THE_SAME_IDS = (
     "the run found its fish in the video and numbered them as they came; where the truth numbers "
@@ -36,7 +36,7 @@ def evaluate(
     ] = None,
 ) -> None:
     """Compare measured lengths with known ones: fish by fish, as intervals, as distributions."""
-    from stream_dmr.cli.display import print_distributions, print_evaluation
+    from stream_dmr.cli.terminal import print_distributions, print_evaluation
     from stream_dmr.errors import OutputError
     from stream_dmr.evaluation.compare import evaluate, evaluate_histogram
     from stream_dmr.evaluation.histogram_plot import plot_histograms

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from stream_dmr.cli.support import TimeOption, TrackOption, parse_selection, warn
+from stream_dmr.cli.shared_options import TimeOption, TrackOption, parse_selection, warn
 
 Meshes = Literal["ply", "glb"]
 Tables = Literal["csv", "parquet"]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stream_dmr.cli.support import ConfigOption, warn
+from stream_dmr.cli.shared_options import ConfigOption, warn
 
 if TYPE_CHECKING:
     from stream_dmr.messages import FishCrop

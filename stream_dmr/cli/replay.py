@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from stream_dmr.cli.support import (
+from stream_dmr.cli.shared_options import (
     TimeOption,
     TrackOption,
     command_line,
@@ -58,7 +58,7 @@ def replay(
     ] = False,
 ) -> None:
     """Compute a recording anew from one stage on, with its own inputs or with others."""
-    from stream_dmr.cli.display import RunDisplay, print_check, print_fish, print_timings
+    from stream_dmr.cli.terminal import RunDisplay, print_check, print_fish, print_timings
     from stream_dmr.replaying.replay import replay as replay_recording
     from stream_dmr.replaying.replay_request import ReplayRequest
 

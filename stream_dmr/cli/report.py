@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from stream_dmr.cli.support import stop_on_signals, warn
+from stream_dmr.cli.shared_options import stop_on_signals, warn
 
 _Source = Annotated[
     str | None,
@@ -43,7 +43,7 @@ def report(
 ) -> None:
     """Write results as one page that opens offline: plots, a table of fish, their best frames."""
     from stream_dmr.errors import UserError
-    from stream_dmr.report.report import is_batch, open_batch, open_report, write_report
+    from stream_dmr.report.open_reports import is_batch, open_batch, open_report, write_report
 
     failed = list[str]()
     if is_batch(path):
@@ -74,8 +74,8 @@ def review(
         from getpass import getuser
 
         from stream_dmr.errors import UserError
-        from stream_dmr.report.report import is_batch, open_report
-        from stream_dmr.review.server import ReviewServer
+        from stream_dmr.report.open_reports import is_batch, open_report
+        from stream_dmr.review.review_server import ReviewServer
 
         if is_batch(folder):
             raise UserError(

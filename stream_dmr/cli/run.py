@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stream_dmr.cli.support import (
+from stream_dmr.cli.shared_options import (
     ConfigOption,
     TemplateOption,
     command_line,
@@ -86,10 +86,10 @@ def run(
     ends the run early and keeps what was done.
     """
     with stop_on_signals() as stop:
-        from stream_dmr.cli.display import RunDisplay
+        from stream_dmr.cli.terminal import RunDisplay
         from stream_dmr.running.measure_source import measure_source
-        from stream_dmr.watch.journal import Journal
-        from stream_dmr.watch.watch import Watch
+        from stream_dmr.watch.json_log import JsonLog
+        from stream_dmr.watch.watch_observer import WatchObserver
 
         request = RunRequest(
             source=source,
@@ -109,8 +109,8 @@ def run(
             trip=trip,
             haul=haul,
         )
-        with nullcontext(Journal()) if log_json else RunDisplay() as observer:
-            summary = measure_source(request, stop=stop, observer=Watch(observer))
+        with nullcontext(JsonLog()) if log_json else RunDisplay() as observer:
+            summary = measure_source(request, stop=stop, observer=WatchObserver(observer))
         _print_summary(summary, request.out, timings=timings)
     if stop.signal_number:
         print(f"stopped by {signal.Signals(stop.signal_number).name}", file=sys.stderr)
@@ -118,7 +118,7 @@ def run(
 
 
 def _print_summary(summary: "RunSummary", out: Path, *, timings: bool) -> None:
-    from stream_dmr.cli.display import print_fish, print_timings
+    from stream_dmr.cli.terminal import print_fish, print_timings
 
     print_fish(summary.fish)
     if timings:

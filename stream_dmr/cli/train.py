@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from stream_dmr.cli.support import command_line, stop_on_signals
+from stream_dmr.cli.shared_options import command_line, stop_on_signals
 
 Device = Literal["cpu", "cuda"]
 

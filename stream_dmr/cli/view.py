@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stream_dmr.cli.support import TimeOption, TrackOption, parse_selection, warn
+from stream_dmr.cli.shared_options import TimeOption, TrackOption, parse_selection, warn
 
 if TYPE_CHECKING:
     from stream_dmr.recording.messages.selection import Selection

@@ -1,9 +1,9 @@
-// What a row opens: the best frames, every frame's length, the mesh. Parsed when it is opened.
+// The panel of one fish: best frames, every frame's length, the mesh. Its data is parsed when it opens.
 
 const SVG = "http://www.w3.org/2000/svg";
 // One plot of each kind for all fish, since a new one takes longer than new data in an old one.
-const FRAMES = element("div", { className: "plot" });
-const SOLID = element("div", { className: "solid" });
+const FRAMES_PLOT = element("div", { className: "plot" });
+const MESH_PLOT = element("div", { className: "mesh-plot" });
 const POINTS = [["head", "#ff3c3c"], ["center", "#ffffff"], ["tail", "#3ca0ff"]];
 
 function svg(tag, attributes, ...children) {
@@ -13,24 +13,24 @@ function svg(tag, attributes, ...children) {
   return made;
 }
 
-function shotOf(shot, index, fish) {
-  const s = shot.size;
-  const moved = fish.moved[shot.frame];
-  const [, center] = shot.keypoints;
-  const keypoints = moved ? [moved[0], center, moved[1]] : shot.keypoints;
-  const box = svg("svg", { viewBox: `-0.5 -0.5 ${s} ${s}`, "data-frame": shot.frame },
-    svg("image", { href: shot.uri, x: -0.5, y: -0.5, width: s, height: s, preserveAspectRatio: "none" }),
-    ...shot.mask.map((points) => svg("polygon", { points, class: "mask" })),
-    ...shot.mesh.map((points) => svg("polygon", { points, class: "mesh" })),
+function viewFigure(view, fish) {
+  const s = view.size;
+  const moved = fish.moved[view.frame];
+  const [, center] = view.keypoints;
+  const keypoints = moved ? [moved[0], center, moved[1]] : view.keypoints;
+  const box = svg("svg", { viewBox: `-0.5 -0.5 ${s} ${s}`, "data-frame": view.frame },
+    svg("image", { href: view.uri, x: -0.5, y: -0.5, width: s, height: s, preserveAspectRatio: "none" }),
+    ...view.mask.map((points) => svg("polygon", { points, class: "mask" })),
+    ...view.mesh.map((points) => svg("polygon", { points, class: "mesh" })),
     ...POINTS.map(([name, fill], k) => svg("circle", { cx: keypoints[k][0], cy: keypoints[k][1], r: s / 55, fill, class: "point", "data-name": name }, svg("title", {}, name))));
-  const row = fish.detail.frames.find((frame) => frame[0] === shot.frame);
-  const caption = row ? `frame ${shot.frame}, ${row[2] === null ? "" : `${cm(row[2])} cm, `}IoU ${row[6] ?? "-"}${row[4] ? "" : `, refused: ${row[5]}`}${moved ? ", points moved" : ""}` : `frame ${shot.frame}`;
+  const row = fish.detail.frames.find((frame) => frame[0] === view.frame);
+  const caption = row ? `frame ${view.frame}, ${row[2] === null ? "" : `${cm(row[2])} cm, `}IoU ${row[6] ?? "-"}${row[4] ? "" : `, refused: ${row[5]}`}${moved ? ", points moved" : ""}` : `frame ${view.frame}`;
   const figure = element("figure", {}, box, element("figcaption", {}, element("small", { textContent: caption }),
     element("button", { type: "button", textContent: "larger", onclick: () => figure.classList.toggle("large") })));
   return figure;
 }
 
-function facts(fish) {
+function factList(fish) {
   const run = DATA.runs[fish.run_id] ?? {};
   const reasons = Object.entries(fish.refused).map(([reason, count]) => `${reason} (${count})`).join(", ");
   const legal = fish.is_legal_size === null ? "" : fish.is_legal_size ? "yes" : "no";
@@ -54,15 +54,15 @@ function facts(fish) {
 function drawDetail(fish) {
   const panel = document.getElementById("detail");
   fish.detail = JSON.parse(document.getElementById(`fish-${fish.id}`).textContent);
-  const shots = element("div", { className: "shots" }, ...fish.detail.shots.map((shot, k) => shotOf(shot, k, fish)));
-  const overlay = element("input", { type: "checkbox", checked: true, onchange: () => shots.classList.toggle("plain", !overlay.checked) });
+  const views = element("div", { className: "views" }, ...fish.detail.views.map((view) => viewFigure(view, fish)));
+  const overlay = element("input", { type: "checkbox", checked: true, onchange: () => views.classList.toggle("plain", !overlay.checked) });
   panel.replaceChildren(
     element("h2", { textContent: `Fish ${fish.track_id}${fish.video && ` of ${fish.video}`}: ${lengthText(fish)}` }),
     element("label", {}, overlay, " mask (yellow), mesh (green), head (red), center, tail (blue)"),
-    shots, ...reviewTools(fish, shots), element("div", { className: "pair" }, FRAMES, SOLID), facts(fish));
+    views, ...reviewTools(fish, views), element("div", { className: "pair" }, FRAMES_PLOT, MESH_PLOT), factList(fish));
   panel.scrollTop = 0;
-  drawFrames(FRAMES, fish.detail.frames);
-  setTimeout(() => state.chosen === fish.id && drawMesh(SOLID, fish.detail.mesh, fish.unit));  // the slow part, last
+  drawFrames(FRAMES_PLOT, fish.detail.frames);
+  setTimeout(() => state.chosen === fish.id && drawMesh(MESH_PLOT, fish.detail.mesh, fish.unit));  // last, since it is slow
 }
 
 function drawFrames(place, rows) {
@@ -78,23 +78,23 @@ function drawFrames(place, rows) {
   const heights = [...known.map((row) => row[2]), ...running.flatMap((row) => row.slice(8))];
   const [low, high] = [Math.min(...heights) / 10, Math.max(...heights) / 10];
   const drawn = layout("Frames (x: refused), estimate, 95 %", "frame", "cm");
-  if (!heights.length) sayEmpty(drawn);
+  if (!heights.length) showNoLengths(drawn);
   else drawn.yaxis.range = [low - 0.1 * (high - low) - 0.5, high + 0.1 * (high - low) + 0.5];
   Plotly.react(place, [
     { type: "scatter", mode: "lines", x: [...x, ...[...x].reverse()], y: [...running.map((row) => row[9] / 10), ...running.map((row) => row[8] / 10).reverse()], fill: "toself", fillcolor: "rgba(22,104,168,.15)", line: { width: 0 }, hoverinfo: "skip" },
     { type: "scatter", mode: "lines", x, y: running.map((row) => row[7] / 10), line: { color: BLUE, width: 2 }, hovertemplate: "after frame %{x}: %{y:.1f} cm<extra></extra>" },
     marks(true, { color: BLUE, size: 6 }), marks(false, { color: ORANGE, size: 7, symbol: "x" }),
-  ], drawn, QUIET);
+  ], drawn, PLOT_CONFIG);
 }
 
-function unpacked(text, kind) {
+function decodeArray(text, kind) {
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   return new kind(bytes.buffer);
 }
 
 function drawMesh(place, mesh, unit) {
   if (!mesh) return Plotly.purge(place);
-  const points = unpacked(mesh.points, Int16Array);
+  const points = decodeArray(mesh.points, Int16Array);
   const axis = (k, from, to) => Array.from({ length: to - from }, (_, n) => points[3 * (from + n) + k] * mesh.step);
   const corner = (k) => Array.from(FACES.filter((_, n) => n % 3 === k));
   const [n, all] = [mesh.vertices, points.length / 3];
@@ -102,5 +102,5 @@ function drawMesh(place, mesh, unit) {
   Plotly.react(place, [
     { type: "mesh3d", x: axis(0, 0, n), y: axis(1, 0, n), z: axis(2, 0, n), i: corner(0), j: corner(1), k: corner(2), color: "#7fb2d6", flatshading: false, opacity: 0.75, lighting: { ambient: 0.5, diffuse: 0.8 }, hoverinfo: "skip" },
     { type: "scatter3d", mode: "lines", x: axis(0, n, all), y: axis(1, n, all), z: axis(2, n, all), line: { color: ORANGE, width: 6 }, hoverinfo: "skip" },
-  ], { margin: { l: 0, r: 0, t: 24, b: 0 }, scene, showlegend: false, title: { text: "Mesh of the best frame", font: { size: 13 }, x: 0.02 } }, QUIET);
+  ], { margin: { l: 0, r: 0, t: 24, b: 0 }, scene, showlegend: false, title: { text: "Mesh of the best frame", font: { size: 13 }, x: 0.02 } }, PLOT_CONFIG);
 }

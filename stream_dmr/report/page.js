@@ -1,15 +1,15 @@
 // The page as a whole: filters, choice, keys.
 
 const DATA = JSON.parse(document.getElementById("data").textContent);
-const FACES = unpacked(DATA.faces, Uint32Array);
+const FACES = decodeArray(DATA.faces, Uint32Array);
 const FILTERS = ["search", "status", "verdict", "shortest", "longest", "frames"];
 
-function wanted() {
+function filterValues() {
   return Object.fromEntries(FILTERS.map((name) => [name, document.getElementById(name).value]));
 }
 
 function show() {
-  state.shown = filtered(DATA.fish, wanted());
+  state.shown = filtered(DATA.fish, filterValues());
   document.getElementById("count").textContent = `${state.shown.length} of ${DATA.fish.length} fish`;
   drawTable();
   drawSummary(state.shown);
@@ -37,12 +37,12 @@ function replaceFish(fish) {
   choose(fish.id);
 }
 
-// What was said of fish since the page was made, by others, too. What is open stays as it is.
-let heard = "";
+// Shows the verdicts given since the page was made, also by others. What is open stays as it is.
+let lastAnswer = "";
 async function refresh() {
-  const text = await fetch("judged.json").then((answer) => (answer.ok ? answer.text() : heard), () => heard);
-  if (text === heard) return;
-  heard = text;
+  const text = await fetch("reviewed.json").then((answer) => (answer.ok ? answer.text() : lastAnswer), () => lastAnswer);
+  if (text === lastAnswer) return;
+  lastAnswer = text;
   for (const fish of JSON.parse(text)) DATA.fish[DATA.fish.findIndex((one) => one.id === fish.id)] = fish;
   show();
 }
@@ -68,7 +68,7 @@ document.getElementById("table").onkeydown = (event) => {
   const by = { ArrowDown: 1, ArrowUp: -1 }[event.key];
   if (by) { event.preventDefault(); step(by); }
 };
-document.getElementById("made").textContent = `stream-dmr ${DATA.software}, template ${DATA.template}`;
+document.getElementById("software").textContent = `stream-dmr ${DATA.software}, template ${DATA.template}`;
 document.getElementById("notes").replaceChildren(...DATA.notes.map((note) => element("li", { textContent: note })));
 show();
 if (DATA.reviewer !== null) {

@@ -1,26 +1,26 @@
 // Plots of all fish that are shown, and the summary of them.
 
-const QUIET = { displayModeBar: false, responsive: true };
+const PLOT_CONFIG = { displayModeBar: false, responsive: true };
 const BLUE = "#1668a8", ORANGE = "#d55e00";
 
-function counted(fish) {
+function countedFish(fish) {
   return fish.filter((f) => lengthOf(f) !== null && f.verdict !== "reject" && f.verdict !== "duplicate");
 }
 
 function drawSummary(fish) {
-  const lengths = counted(fish).map((f) => lengthOf(f) / 10).sort((a, b) => a - b);
+  const lengths = countedFish(fish).map((f) => lengthOf(f) / 10).sort((a, b) => a - b);
   const tiles = [[fish.length, "fish"], [lengths.length, "with a length, not rejected"]];
   if (lengths.length) {
     const mean = lengths.reduce((sum, x) => sum + x, 0) / lengths.length;
     const sd = lengths.length > 1 ? Math.sqrt(lengths.reduce((sum, x) => sum + (x - mean) ** 2, 0) / (lengths.length - 1)) : 0;
     tiles.push([`${mean.toFixed(1)} cm`, "mean"], [`${sd.toFixed(1)} cm`, "standard deviation"],
       [`${quantile(lengths, 0.5).toFixed(1)} cm`, "median"],
-      [`${quantile(lengths, 0.25).toFixed(1)} to ${quantile(lengths, 0.75).toFixed(1)} cm`, "middle half"],
+      [`${quantile(lengths, 0.25).toFixed(1)} to ${quantile(lengths, 0.75).toFixed(1)} cm`, "25 % to 75 %"],
       [`${lengths[0].toFixed(1)} to ${lengths.at(-1).toFixed(1)} cm`, "shortest to longest"]);
   }
-  const weights = counted(fish).map((f) => f.weight_kg).filter((w) => w !== null);
+  const weights = countedFish(fish).map((f) => f.weight_kg).filter((w) => w !== null);
   if (weights.length) tiles.push([`${weights.reduce((sum, w) => sum + w, 0).toFixed(1)} kg`, `of ${weights.length} fish, W = a L^b`]);
-  const legal = counted(fish).map((f) => f.is_legal_size).filter((is) => is !== null);
+  const legal = countedFish(fish).map((f) => f.is_legal_size).filter((is) => is !== null);
   if (legal.length) tiles.push([`${legal.filter(Boolean).length} of ${legal.length}`, `from ${DATA.fisheries.legal_cm} cm: legal size`]);
   document.getElementById("summary").replaceChildren(...tiles.map(([value, name]) => element(
     "div", { className: "tile" }, element("b", { textContent: value }), element("span", { textContent: name }))));
@@ -50,13 +50,13 @@ function layout(title, x, y) {
   };
 }
 
-function sayEmpty(drawn) {
+function showNoLengths(drawn) {
   drawn.xaxis.visible = drawn.yaxis.visible = false;
   drawn.annotations = [{ text: "no lengths", showarrow: false, xref: "paper", yref: "paper", x: 0.5, y: 0.5 }];
 }
 
 function drawHistogram(fish) {
-  const lengths = counted(fish).map((f) => lengthOf(f) / 10).sort((a, b) => a - b);
+  const lengths = countedFish(fish).map((f) => lengthOf(f) / 10).sort((a, b) => a - b);
   const low = lengths[0] ?? 0, high = lengths.at(-1) ?? 1;
   const width = [1, 2, 5, 10, 20, 50].find((w) => (high - low) / w <= Math.min(30, Math.max(6, 2 * Math.sqrt(lengths.length)))) ?? 100;
   const first = Math.floor(low / width) * width;
@@ -69,10 +69,10 @@ function drawHistogram(fish) {
   }
   const drawn = layout("Length frequency (bars) and kernel density (line)", "cm", "fish");
   if (Math.max(...counts) < 6) drawn.yaxis.dtick = 1;
-  if (!lengths.length) sayEmpty(drawn);
+  if (!lengths.length) showNoLengths(drawn);
   const limit = DATA.fisheries.legal_cm;
   if (fish.some((f) => f.is_legal_size !== null)) drawn.shapes = [{ type: "line", x0: limit, x1: limit, yref: "paper", y0: 0, y1: 1, line: { color: ORANGE, dash: "dot" } }];
-  Plotly.react("histogram", traces, drawn, QUIET);
+  Plotly.react("histogram", traces, drawn, PLOT_CONFIG);
 }
 
 function drawTime(fish, onChoose) {
@@ -88,15 +88,15 @@ function drawTime(fish, onChoose) {
     bars.x.push(at(f), at(f), null);
     bars.y.push(interval[0] / 10, interval[1] / 10, null);
   }
-  const counts = new Set(counted(fish));
+  const counts = new Set(countedFish(fish));
   const traces = [
     { type: "scatter", mode: "lines", ...bars, line: { color: "#c4d4e1", width: 1 }, hoverinfo: "skip" },
     { type: "scatter", mode: "markers", x: measured.map(at), y: measured.map((f) => lengthOf(f) / 10), customdata: measured.map((f) => f.id), text: measured.map((f) => `${f.track_id} ${f.video && `of ${f.video}`}`),
       marker: { color: measured.map((f) => (counts.has(f) ? BLUE : "#c0c0c0")), size: 6 }, hovertemplate: "fish %{text}<br>%{y:.1f} cm<extra></extra>" },
   ];
   const drawn = layout("Fish over time, with 95 % intervals", unit, "cm");
-  if (!measured.length) sayEmpty(drawn);
-  Plotly.react("time", traces, drawn, QUIET).then((plot) => {
+  if (!measured.length) showNoLengths(drawn);
+  Plotly.react("time", traces, drawn, PLOT_CONFIG).then((plot) => {
     plot.removeAllListeners("plotly_click");
     plot.on("plotly_click", (event) => event.points[0].customdata && onChoose(event.points[0].customdata));
   });

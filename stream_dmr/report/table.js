@@ -12,7 +12,7 @@ const COLUMNS = [
   { title: "Verdict", key: (f) => f.verdict ?? "" },
 ];
 
-const state = { shown: [], column: 1, down: false, chosen: null };
+const state = { shown: [], column: 1, descending: false, chosen: null };
 
 function lengthOf(fish) {
   return fish.corrected_length_mm ?? fish.length_mm;
@@ -65,7 +65,7 @@ function verdictOf(fish) {
 
 function sorted(fish) {
   const key = COLUMNS[state.column].key;
-  const sign = state.down ? -1 : 1;
+  const sign = state.descending ? -1 : 1;
   const compare = (a, b) => (a < b ? -1 : a > b ? 1 : 0);
   return [...fish].sort((a, b) => sign * compare(key(a), key(b)) || a.id - b.id);
 }
@@ -73,10 +73,10 @@ function sorted(fish) {
 function drawHead(onSort) {
   const head = document.getElementById("head");
   head.replaceChildren(...COLUMNS.map((column, k) => element("span", {
-    textContent: column.title + (k === state.column ? (state.down ? " \u2193" : " \u2191") : ""),
+    textContent: column.title + (k === state.column ? (state.descending ? " \u2193" : " \u2191") : ""),
     onclick: () => {
       if (column.key === null) return;
-      state.down = k === state.column && !state.down;
+      state.descending = k === state.column && !state.descending;
       state.column = k;
       onSort();
     },
@@ -109,7 +109,7 @@ function rowOf(fish) {
   return element(
     "div",
     { className: fish.id === state.chosen ? "row chosen" : "row", role: "row", "data-id": fish.id },
-    fish.thumb ? element("img", { src: fish.thumb, alt: "", loading: "lazy" }) : element("span"),
+    fish.thumbnail ? element("img", { src: fish.thumbnail, alt: "", loading: "lazy" }) : element("span"),
     element("span", {}, element("b", { textContent: fish.track_id }), element("small", { textContent: fish.video })),
     element("span", {}, element("b", { textContent: lengthText(fish) }), ...corrected, element("small", { textContent: interval }), size),
     element("span", { textContent: `${fish.frames_used} of ${fish.frames_seen}` }),

@@ -1,17 +1,32 @@
-"""HTTP for those who know a token, given by ?token=, a cookie or an Authorization header."""
+"""HTTP for those who have a token, given by ?token=, a cookie or an Authorization header.
+
+Whoever connects is bounded: in connections, in the time that a request may take to arrive, and in
+the time that its answer may take to be read. A page of another site can't read along: the names
+Host and Origin of a request are checked.
+"""
 
 import hmac
 import json
+import socket
 import sys
 import threading
+from contextlib import suppress
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from ipaddress import ip_address
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-_PATIENCE_S = 10.0  # for a slow reader
-_MOST_READERS = 16
+_BUSY = b"HTTP/1.0 503 Service Unavailable\r\nContent-Length: 0\r\n\r\n"
+
+
+def is_loopback(host: str) -> bool:
+    """True for a host name or address that only this machine reaches."""
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 class TokenServer(ThreadingHTTPServer):
@@ -19,88 +34,171 @@ class TokenServer(ThreadingHTTPServer):
 
     daemon_threads = True
     block_on_close = False
+    request_queue_size = 64  # in the kernel: a burst does not have to wait a second for a retry
+    # Chosen: some phones and Prometheus need a handful of connections, for a second at most.
+    max_connections = 32
+    request_timeout_s = 5.0  # until the headers are there
+    answer_timeout_s = 30.0  # from there on
 
     def __init__(
         self, address: tuple[str, int], handler: type["TokenHandler"], *, token: str
     ) -> None:
-        """OSError where the address can't be had."""
+        """Listens; OSError where it can't have the address."""
         self.token = token
-        self.readers = threading.BoundedSemaphore(_MOST_READERS)
+        self._connections = threading.BoundedSemaphore(self.max_connections)
         super().__init__(address, handler)
+        self.is_local = is_loopback(str(self.server_address[0]))
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Handle a connection in a thread of its own; close it where there are too many."""
+        if not self._connections.acquire(blocking=False):
+            with suppress(OSError):
+                request.sendall(_BUSY)
+            return self.shutdown_request(request)
+        try:
+            super().process_request(request, client_address)
+        except BaseException:
+            self._connections.release()
+            raise
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Handle a connection to its end."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._connections.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A reader who left is no error of ours; anything else is one."""
+        """Print a traceback, but not for a reader who left."""
         if not isinstance(sys.exception(), ConnectionError | TimeoutError):
             super().handle_error(request, client_address)
 
 
 class TokenHandler(BaseHTTPRequestHandler):
-    """Says no to strangers; what the others get is for the classes made of this one."""
+    """Refuses requests without the token or from other sites; subclasses answer the rest."""
 
     server: TokenServer  # pyright: ignore[reportIncompatibleVariableOverride]
     server_version = "stream-dmr"
     sys_version = ""
-    timeout = _PATIENCE_S
 
-    @property
-    def cookie(self) -> str:
-        """The name of the cookie: a browser has those of all ports of a machine in common."""
-        return f"stream_dmr_{self.server.server_address[1]}"
-
-    def serve(self, path: str) -> None:
-        """Answer a GET of someone who may."""
+    def answer_get(self, path: str) -> None:
+        """Answer a GET that has the token."""
         raise NotImplementedError
 
-    def do_GET(self) -> None:
-        """Let in, refuse, or serve."""
-        url = urlsplit(self.path)
-        if not self.server.readers.acquire(blocking=False):
-            return self.answer(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", b"too many readers\n")
-        try:
-            given = parse_qs(url.query).get("token", [""])[0]
-            if given and self._is_right(given):
-                return self._let_in(url.path)
-            if not self.may_read():
-                return self.refuse()
-            self.serve(url.path)
-        finally:
-            self.server.readers.release()
+    def answer_post(self, path: str) -> None:
+        """Answer a POST that has the token."""
+        self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"expected GET\n")
 
-    def refuse(self) -> None:
-        """Answer a stranger."""
+    def setup(self) -> None:
+        """Begin to wait for the request."""
+        super().setup()
+        self._timer = self._start_timer(self.server.request_timeout_s)
+
+    def parse_request(self) -> bool:
+        """Read the headers; from there on the answer has its own time."""
+        is_valid = super().parse_request()
+        self._timer.cancel()
+        self._timer = self._start_timer(self.server.answer_timeout_s)
+        return is_valid
+
+    def finish(self) -> None:
+        """End the connection."""
+        self._timer.cancel()
+        super().finish()
+
+    def do_GET(self) -> None:
+        """Refuse, keep the token as a cookie, or answer."""
+        url = urlsplit(self.path)
+        token = parse_qs(url.query).get("token", [""])[0]
+        if not self._is_own_page():
+            self._refuse_site()
+        elif token and self._is_valid(token):
+            self._set_cookie(url.path)
+        elif self._is_authorized():
+            self.answer_get(url.path)
+        else:
+            self._refuse_token()
+
+    def do_POST(self) -> None:
+        """Refuse or answer."""
+        if not self._is_own_page():
+            self._refuse_site()
+        elif self._is_authorized():
+            self.answer_post(self.path)
+        else:
+            self._refuse_token()
+
+    def _start_timer(self, seconds: float) -> threading.Timer:
+        timer = threading.Timer(seconds, self._end_connection)
+        timer.daemon = True
+        timer.start()
+        return timer
+
+    def _end_connection(self) -> None:
+        with suppress(OSError):
+            self.connection.shutdown(socket.SHUT_RDWR)  # ends what waits for it
+
+    def _is_own_page(self) -> bool:
+        """True unless a browser was led here by a page of another site.
+
+        DNS rebinding: a page's own name, resolved to an address of this machine, lets that page
+        read what is served without a token. So a server for this machine alone answers to the names
+        of this machine alone. `Origin`, where a browser sends it, is where the page comes from.
+        """
+        host, origin = self.headers.get("Host"), self.headers.get("Origin")
+        if host is not None and self.server.is_local:
+            try:
+                name = urlsplit(f"//{host}").hostname
+            except ValueError:
+                return False
+            if name is None or not is_loopback(name):
+                return False
+        return origin is None or origin == f"http://{host}"
+
+    def _refuse_site(self) -> None:
+        port = self.server.server_address[1]
+        text = f"open http://localhost:{port}/, got a request for another name or from another page"
+        self.answer(HTTPStatus.FORBIDDEN, "text/plain", f"{text}\n".encode())
+
+    def _refuse_token(self) -> None:
         self.answer(HTTPStatus.UNAUTHORIZED, "text/plain", b"open this page with ?token=...\n")
 
-    def _let_in(self, path: str) -> None:
-        """Keep the token as a cookie, so that it stands in no address that is shown or logged."""
+    @property
+    def _cookie_name(self) -> str:
+        """A name with the port: a browser shares cookies between all ports of a machine."""
+        return f"stream_dmr_{self.server.server_address[1]}"
+
+    def _set_cookie(self, path: str) -> None:
+        """Keep the token as a cookie, so that it is in no address that is shown or logged."""
         self.send_response(HTTPStatus.SEE_OTHER)
-        cookie = f"{self.cookie}={self.server.token}; Path=/; HttpOnly; SameSite=Strict"
+        cookie = f"{self._cookie_name}={self.server.token}; Path=/; HttpOnly; SameSite=Strict"
         self.send_header("Set-Cookie", cookie)
         self.send_header("Location", "/" + path.lstrip("/"))
         self.send_header("Content-Length", "0")
         self.end_headers()
 
-    def may_read(self) -> bool:
-        """Whether the request has the token."""
+    def _is_authorized(self) -> bool:
+        """True where no token is asked for, or the request has it."""
         if not self.server.token:
             return True
         scheme, _, token = self.headers.get("Authorization", "").partition(" ")
-        if scheme.lower() == "bearer" and self._is_right(token.strip()):
+        if scheme.lower() == "bearer" and self._is_valid(token.strip()):
             return True
         try:
-            cookie = SimpleCookie(self.headers.get("Cookie", "")).get(self.cookie)
+            cookie = SimpleCookie(self.headers.get("Cookie", "")).get(self._cookie_name)
         except CookieError:
             return False
-        return cookie is not None and self._is_right(cookie.value)
+        return cookie is not None and self._is_valid(cookie.value)
 
-    def _is_right(self, token: str) -> bool:
+    def _is_valid(self, token: str) -> bool:
         return hmac.compare_digest(token.encode(), self.server.token.encode())
 
-    def json(self, code: HTTPStatus, content: object) -> None:
+    def answer_json(self, code: HTTPStatus, content: object) -> None:
         """Answer with JSON."""
         self.answer(code, "application/json", json.dumps(content).encode())
 
     def answer(self, code: HTTPStatus, media_type: str, content: bytes) -> None:
-        """Answer with bytes, which nobody keeps."""
+        """Answer with bytes, which no browser caches or guesses the type of."""
         self.send_response(code)
         self.send_header("Content-Type", media_type)
         self.send_header("Content-Length", str(len(content)))
@@ -111,4 +209,4 @@ class TokenHandler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing: who reads is not what the log is for."""
+        """Log no requests."""

@@ -11,10 +11,10 @@ import pytest
 from stream_dmr.errors import SourceError
 from stream_dmr.messages import FittedMesh, LocalizedFish
 from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
-from stream_dmr.report.album import make_album
-from stream_dmr.report.gather import gather
-from stream_dmr.report.page import _script
-from stream_dmr.report.report import open_report, write_report
+from stream_dmr.report.drawn_views import draw_views
+from stream_dmr.report.open_reports import open_report, write_report
+from stream_dmr.report.recorded_tracks import read_tracks
+from stream_dmr.report.report_page import _script
 from stream_dmr.results.verdicts import Verdict, add_verdict
 from tests.support.browser import evaluate
 from tests.support.command import invoke, rows
@@ -36,7 +36,7 @@ def page(out: Path) -> Path:
 
 def test_the_best_views_are_the_best_of_all(out: Path):
     recording = open_recordings([out])
-    tracks = gather(recording, keep=2)
+    tracks = read_tracks(recording, max_views=2)
     ious: dict[int, list[float]] = {}
     for fish, _ in decoded_messages(recording, [LocalizedFish]):
         assert isinstance(fish, LocalizedFish)
@@ -52,8 +52,8 @@ def test_the_best_views_are_the_best_of_all(out: Path):
 
 def test_outlines_lie_on_the_mask_and_on_the_mesh(out: Path):
     recording = open_recordings([out])
-    tracks = gather(recording)
-    album = make_album(tracks, recording)
+    tracks = read_tracks(recording)
+    album = draw_views(tracks, recording)
     fits = {
         (fit.track_id, fit.frame_index): fit
         for fit, _ in decoded_messages(recording, [FittedMesh])
@@ -61,7 +61,7 @@ def test_outlines_lie_on_the_mask_and_on_the_mesh(out: Path):
     }
     for track_id, shots in album.items():
         for shot in shots:
-            size, frame = shot.crop_camera.width, shot.view.row.fish.frame_index
+            size, frame = shot.crop_camera.width, shot.recorded.row.fish.frame_index
             drawn = [np.zeros((size, size), np.uint8) for _ in range(2)]
             for image, lines in zip(drawn, (shot.outlines.mask, shot.outlines.mesh), strict=True):
                 for line in lines:
@@ -75,10 +75,10 @@ def test_outlines_lie_on_the_mask_and_on_the_mesh(out: Path):
 
 def test_pictures_come_from_the_clip_and_without_it_from_the_mask(out: Path, tmp_path: Path):
     recording = open_recordings([out])
-    tracks = gather(recording)
-    seen = make_album(tracks, recording)[1][0].picture
+    tracks = read_tracks(recording)
+    seen = draw_views(tracks, recording)[1][0].picture
     clip = out.parent / "clip" / "video.mp4"
-    assert make_album(tracks, recording, str(clip))[1][0].picture == seen
+    assert draw_views(tracks, recording, str(clip))[1][0].picture == seen
     image = cv2.imdecode(np.frombuffer(seen, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert image.max() > 150  # the light ground of the clip; a mask alone is darker
     other = tmp_path / "other.mp4"
@@ -88,10 +88,10 @@ def test_pictures_come_from_the_clip_and_without_it_from_the_mask(out: Path, tmp
         writer.write(np.full((120, 160, 3), 9, np.uint8))
     writer.release()
     with pytest.raises(SourceError, match="not the recorded one"):
-        make_album(tracks, recording, str(other))
+        draw_views(tracks, recording, str(other))
     shutil.move(clip, tmp_path / "moved.mp4")
     try:
-        masked = make_album(tracks, recording)[1][0].picture
+        masked = draw_views(tracks, recording)[1][0].picture
     finally:
         shutil.move(tmp_path / "moved.mp4", clip)
     image = cv2.imdecode(np.frombuffer(masked, np.uint8), cv2.IMREAD_GRAYSCALE)
@@ -103,7 +103,7 @@ def test_the_page_needs_nothing_from_elsewhere(page: Path):
     own = re.sub(r"<script>/\*\*\n\* plotly.*?</script>", "", text, count=1, flags=re.DOTALL)
     assert len(text) - len(own) > 1_000_000  # that was plotly
     assert not re.search(r'(?:src|href)="(?!data:)[^"]', own)
-    reviewers = own.replace('fetch("verdict"', "").replace('fetch("judged.json"', "")
+    reviewers = own.replace('fetch("verdict"', "").replace('fetch("reviewed.json"', "")
     assert "fetch(" not in reviewers  # and these two only where a server asks for verdicts
     assert "http" not in own.replace("http://www.w3.org/2000/svg", "")
 
@@ -121,11 +121,11 @@ def test_what_the_browser_shows_is_what_was_measured(out: Path, page: Path):
         const before = cells();
         choose(2);
         const panel = document.getElementById('detail');
-        const solid = panel.querySelector('.solid');
+        const solid = panel.querySelector('.mesh-plot');
         while (!solid.data) await new Promise((done) => setTimeout(done, 50));
         const text = panel.innerText;
         const number = (query) => panel.querySelectorAll(query).length;
-        const shapes = ['.shots svg', '.shots .mask', '.shots .mesh', '.shots .point'].map(number);
+        const shapes = ['.views svg', '.views .mask', '.views .mesh', '.views .point'].map(number);
         const plots = panel.querySelectorAll('.js-plotly-plot').length;
         const frames = panel.querySelector('.plot').data;
         const histogram = document.getElementById('histogram').data;
@@ -180,7 +180,7 @@ def test_filters_sorting_and_verdicts(out: Path, tmp_path: Path):
         set('verdict', '');
         result.glove = set('search', 'glove');
         set('search', '');
-        state.column = 1; state.down = true; show();
+        state.column = 1; state.descending = true; show();
         result.backwards = ids();
         result.second = document.querySelector('[data-id="2"]').innerText;
         result.counted = document.getElementById('summary').innerText;

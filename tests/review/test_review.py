@@ -18,15 +18,15 @@ from stream_dmr.camera import crop_from_frame
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.recording.messages.codec import decode
-from stream_dmr.report.gathered import Report
-from stream_dmr.report.page import page
-from stream_dmr.report.report import open_report
+from stream_dmr.report.open_reports import open_report
+from stream_dmr.report.report_page import render_page
+from stream_dmr.report.run_report import RunReport
 from stream_dmr.results.finished_fish import read_stored
 from stream_dmr.results.verdicts import read_verdicts
 from stream_dmr.results.verify import verify
-from stream_dmr.review.corrected import corrected_fish, corrected_length
-from stream_dmr.review.judge import Judge
-from stream_dmr.review.server import ReviewServer
+from stream_dmr.review.corrected_length import corrected_fish, corrected_length
+from stream_dmr.review.review_server import ReviewServer
+from stream_dmr.review.verdict_recorder import VerdictRecorder
 from tests.support.browser import Tab
 from tests.support.command import rows
 from tests.support.fish_run import measure
@@ -43,20 +43,20 @@ def out(measured: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def report(out: Path) -> Report:
+def report(out: Path) -> RunReport:
     return open_report(out)
 
 
 @pytest.fixture
-def judge(report: Report) -> Judge:
-    return Judge(report, "Ada")
+def judge(report: RunReport) -> VerdictRecorder:
+    return VerdictRecorder(report, "Ada")
 
 
-def say(judge: Judge, **said: Any) -> dict[str, Any]:
-    return judge.take(json.dumps(said).encode())
+def submit(judge: VerdictRecorder, **said: Any) -> dict[str, Any]:
+    return judge.record(json.dumps(said).encode())
 
 
-def ends(report: Report, track_id: int) -> tuple[int, FittedMesh, list[list[float]]]:
+def ends(report: RunReport, track_id: int) -> tuple[int, FittedMesh, list[list[float]]]:
     """The best frame of a fish, its fit, and its head and tail in pixels of the crop."""
     view = report.tracks[track_id].views[0]
     crop, fit = decode(FishCrop, view.crop), decode(FittedMesh, view.fit)
@@ -67,20 +67,24 @@ def ends(report: Report, track_id: int) -> tuple[int, FittedMesh, list[list[floa
     return fit.frame_index, fit, pixels[[0, 2]].tolist()
 
 
-def test_points_left_where_they_are_give_the_length_of_their_frame(judge: Judge, report: Report):
+def test_points_left_where_they_are_give_the_length_of_their_frame(
+    judge: VerdictRecorder, report: RunReport
+):
     frame_index, fit, (head, tail) = ends(report, 1)
-    row = say(judge, track_id=1, kind="correct", frame_index=frame_index, head=head, tail=tail)
+    row = submit(judge, track_id=1, kind="correct", frame_index=frame_index, head=head, tail=tail)
     of_frame = report.tracks[1].views[0].row.fish
     assert fit.shape is not None
     assert row["corrected_length_mm"] == pytest.approx(of_frame.length_mm, rel=1e-6)
     assert row["length_from"] == "review"
 
 
-def test_a_tail_further_out_is_a_longer_fish(judge: Judge, report: Report, out: Path):
+def test_a_tail_further_out_is_a_longer_fish(judge: VerdictRecorder, report: RunReport, out: Path):
     before = rows(out / "lengths.csv")
     frame_index, _, (head, tail) = ends(report, 1)
     further = (np.array(tail) + 0.1 * (np.array(tail) - np.array(head))).tolist()
-    row = say(judge, track_id=1, kind="correct", frame_index=frame_index, head=head, tail=further)
+    row = submit(
+        judge, track_id=1, kind="correct", frame_index=frame_index, head=head, tail=further
+    )
     of_frame = report.tracks[1].views[0].row.fish.length_mm
     assert of_frame is not None
     assert row["corrected_length_mm"] == pytest.approx(1.1 * of_frame, rel=0.03)
@@ -89,7 +93,9 @@ def test_a_tail_further_out_is_a_longer_fish(judge: Judge, report: Report, out: 
     assert verify(out)[0] == []
 
 
-def test_two_corrected_frames_are_put_together_as_a_run_does(judge: Judge, report: Report):
+def test_two_corrected_frames_are_put_together_as_a_run_does(
+    judge: VerdictRecorder, report: RunReport
+):
     frames = {}
     row: dict[str, Any] = {}
     for view in report.tracks[1].views[:2]:
@@ -104,24 +110,24 @@ def test_two_corrected_frames_are_put_together_as_a_run_does(judge: Judge, repor
             fit, points, config=report.config, calibration=header.calibration
         )
         said = {"frame_index": fit.frame_index, "head": head, "tail": tail}
-        row = say(judge, track_id=1, kind="correct", **said)
+        row = submit(judge, track_id=1, kind="correct", **said)
     together = corrected_length(frames, report.config)
     assert row["corrected_length_mm"] == pytest.approx(together.length_mm, rel=1e-6)
     assert together.frames_used == 2
-    say(judge, track_id=1, kind="withdraw")
-    assert judge.judged()[0]["corrected_length_mm"] is None
+    submit(judge, track_id=1, kind="withdraw")
+    assert judge.reviewed_rows()[0]["corrected_length_mm"] is None
 
 
-def test_every_verdict_is_kept_with_its_reviewer(judge: Judge, out: Path):
-    say(judge, track_id=1, kind="reject", reason=" a glove ")
-    say(judge, track_id=1, kind="species", species="Gadus morhua")
-    row = say(judge, track_id=2, kind="duplicate", duplicate_of=1)
+def test_every_verdict_is_kept_with_its_reviewer(judge: VerdictRecorder, out: Path):
+    submit(judge, track_id=1, kind="reject", reason=" a glove ")
+    submit(judge, track_id=1, kind="species", species="Gadus morhua")
+    row = submit(judge, track_id=2, kind="duplicate", duplicate_of=1)
     assert (row["verdict"], row["duplicate_of"], row["reviewer"]) == ("duplicate", 1, "Ada")
     assert [v.kind for v in read_verdicts(out / "lengths.db")] == ["reject", "species", "duplicate"]
     one = read_stored(out / "lengths.db")[0]
     assert (one.review.decision, one.review.reason) == ("reject", "a glove")
     assert one.review.species == "Gadus morhua"
-    assert {row["track_id"] for row in judge.judged()} == {1, 2}
+    assert {row["track_id"] for row in judge.reviewed_rows()} == {1, 2}
 
 
 @pytest.mark.parametrize(
@@ -139,13 +145,15 @@ def test_every_verdict_is_kept_with_its_reviewer(judge: Judge, out: Path):
         b'{"track_id": 1, "kind": "correct", "frame_index": 1, "head": [1, NaN], "tail": [3, 4]}',
     ],
 )
-def test_what_is_no_verdict_is_refused_and_not_kept(judge: Judge, out: Path, content: bytes):
+def test_what_is_no_verdict_is_refused_and_not_kept(
+    judge: VerdictRecorder, out: Path, content: bytes
+):
     with pytest.raises(UserError):
-        judge.take(content)
+        judge.record(content)
     assert read_verdicts(out / "lengths.db") == []
 
 
-def test_head_and_tail_on_one_spot_give_no_length(judge: Judge, report: Report):
+def test_head_and_tail_on_one_spot_give_no_length(judge: VerdictRecorder, report: RunReport):
     _, fit, _ = ends(report, 1)
     assert fit.shape is not None
     with pytest.raises(UserError, match="give no length"):
@@ -158,7 +166,7 @@ def test_head_and_tail_on_one_spot_give_no_length(judge: Judge, report: Report):
 
 
 @pytest.fixture
-def server(report: Report) -> Iterator[ReviewServer]:
+def server(report: RunReport) -> Iterator[ReviewServer]:
     served = ReviewServer(report, reviewer="Ada <Byron>")
     yield served
     served.close()
@@ -191,12 +199,12 @@ def test_only_who_has_the_token_may_judge(server: ReviewServer, out: Path):
     assert len(read_verdicts(out / "lengths.db")) == 1
 
 
-def test_two_reviews_in_one_browser_keep_their_cookies(server: ReviewServer, report: Report):
+def test_two_reviews_in_one_browser_keep_their_cookies(server: ReviewServer, report: RunReport):
     other = ReviewServer(report, reviewer="Bob")
     try:
         cookies = [first_cookie(one.address) for one in (server, other)]
         for one in (server, other):
-            address = one.address.split("?")[0] + "judged.json"
+            address = one.address.split("?")[0] + "reviewed.json"
             request = urllib.request.Request(address, headers={"Cookie": "; ".join(cookies)})
             with urllib.request.urlopen(request, timeout=10) as answer:
                 assert answer.status == 200
@@ -217,7 +225,7 @@ def test_a_recording_alone_takes_no_verdicts(out: Path):
         ReviewServer(open_report(out / "recording.mcap"), reviewer="Ada")
 
 
-def test_a_port_in_use_is_refused(server: ReviewServer, report: Report):
+def test_a_port_in_use_is_refused(server: ReviewServer, report: RunReport):
     port = int(server.address.split(":")[2].split("/")[0])
     with pytest.raises(OutputError, match="another --port"):
         ReviewServer(report, reviewer="Ada", port=port)
@@ -239,7 +247,7 @@ window.press = async (id) => {
 };
 window.fill = (id, value) => { document.getElementById(id).value = value; };
 window.where = (name) => {
-  const point = document.querySelector(`.shots svg [data-name="${name}"]`);
+  const point = document.querySelector(`.views svg [data-name="${name}"]`);
   const { x, y, width, height } = point.getBoundingClientRect();
   return [x + width / 2, y + height / 2, point.cx.baseVal.value, point.cy.baseVal.value];
 };
@@ -259,7 +267,7 @@ def test_a_reviewer_clicks_through_it(tab: Tab, out: Path):
         """
         choose(1);
         await press('do-reject');
-        const refusal = document.getElementById('said').textContent;
+        const refusal = document.getElementById('message').textContent;
         fill('reason', 'a <b>glove</b>');
         await press('do-reject');
         fill('species-name', 'Gadus morhua');
@@ -307,7 +315,7 @@ def test_points_are_dragged_and_stay_where_they_were_put(tab: Tab, out: Path, by
     assert abs(verdict.length_mm / measured.estimate.length_mm - 1) > 0.02
 
 
-def test_another_reviewers_verdicts_come_in(tab: Tab, report: Report, server: ReviewServer):
+def test_another_reviewers_verdicts_come_in(tab: Tab, report: RunReport, server: ReviewServer):
     other = ReviewServer(report, reviewer="Bob")
     try:
         assert post(other, b'{"track_id": 2, "kind": "reject", "reason": "a glove"}') == 200
@@ -325,29 +333,35 @@ def test_another_reviewers_verdicts_come_in(tab: Tab, report: Report, server: Re
 def test_a_verdict_that_nobody_takes_is_said_to_be_lost(tab: Tab, server: ReviewServer, out: Path):
     tab.run("choose(1); return 0")
     server.close()
-    said = "return document.getElementById('said').textContent"
+    said = "return document.getElementById('message').textContent"
     assert "Not saved" in tab.run(f"await press('do-accept'); {said}")
     assert read_verdicts(out / "lengths.db") == []
 
 
-def test_a_corrected_length_has_its_own_interval(tab: Tab, judge: Judge, report: Report):
+def test_a_corrected_length_has_its_own_interval(
+    tab: Tab, judge: VerdictRecorder, report: RunReport
+):
     frame_index, _, (head, tail) = ends(report, 1)
     further = (np.array(tail) + 0.2 * (np.array(tail) - np.array(head))).tolist()
-    row = say(judge, track_id=1, kind="correct", frame_index=frame_index, head=head, tail=further)
+    row = submit(
+        judge, track_id=1, kind="correct", frame_index=frame_index, head=head, tail=further
+    )
     mm, std = row["corrected_length_mm"], row["corrected_length_std_mm"]
     shown = tab.run("await refresh(); return document.querySelector('[data-id=\"1\"]').innerText")
     assert f"{(mm - 1.96 * std) / 10:.1f} to {(mm + 1.96 * std) / 10:.1f}" in shown
 
 
-def test_moved_points_are_in_the_report(judge: Judge, report: Report, out: Path):
+def test_moved_points_are_in_the_report(judge: VerdictRecorder, report: RunReport, out: Path):
     frame_index, _, (head, tail) = ends(report, 1)
     further = (np.array(tail) + 0.1 * (np.array(tail) - np.array(head))).tolist()
-    row = say(judge, track_id=1, kind="correct", frame_index=frame_index, head=head, tail=further)
+    row = submit(
+        judge, track_id=1, kind="correct", frame_index=frame_index, head=head, tail=further
+    )
     assert row["moved"][frame_index] == [
         pytest.approx(head, abs=0.01),
         pytest.approx(further, abs=0.01),
     ]
-    text = page([open_report(out)], title="out")
+    text = render_page([open_report(out)], title="out")
     moved = json.dumps(row["moved"], separators=(",", ":"))
     assert f'"moved":{moved}' in text
-    assert say(judge, track_id=1, kind="withdraw")["moved"] == {}
+    assert submit(judge, track_id=1, kind="withdraw")["moved"] == {}

@@ -26,11 +26,11 @@ from stream_dmr.running.run_request import RunRequest
 from stream_dmr.running.run_settings import WatchSettings
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
-from stream_dmr.watch.journal import Journal
-from stream_dmr.watch.server import WatchServer
-from stream_dmr.watch.service import Watchdog
-from stream_dmr.watch.state import RunState
-from stream_dmr.watch.watch import Watch
+from stream_dmr.watch.json_log import JsonLog
+from stream_dmr.watch.run_state import RunState
+from stream_dmr.watch.systemd import SystemdWatchdog
+from stream_dmr.watch.watch_observer import WatchObserver
+from stream_dmr.watch.watch_server import WatchServer
 from tests.support.browser import chromium
 from tests.support.camera import free_port
 from tests.support.recorded_run import HEIGHT, WIDTH
@@ -92,7 +92,7 @@ def test_the_page_its_status_and_its_picture(server: WatchServer):
 
 
 def test_the_picture_shows_the_fish_of_its_frame(state: RunState):
-    scene = state.scene()
+    scene = state.latest_frame()
     assert scene is not None
     assert scene.frame.frame_index == 3
     assert {fish.track_id for fish in scene.fish} <= {1, 2}
@@ -103,7 +103,7 @@ def test_the_picture_shows_the_fish_of_its_frame(state: RunState):
 def test_health_says_what_is_wrong(server: WatchServer, state: RunState, problem: str):
     assert get(f"{server.address}health")[0] == 200
     if problem == "lengths":
-        state.trouble = lambda: "disk full"
+        state.store_error = lambda: "disk full"
     else:
         state.chain = SimpleNamespace(  # type: ignore[assignment]
             longest_busy_s=lambda: 99.0, counters=[], waiting=list
@@ -156,7 +156,7 @@ def test_a_port_in_use_is_refused(server: WatchServer, state: RunState):
 def test_a_phone_sees_fish_problems_and_warnings(server: WatchServer, state: RunState):
     state.warn("<b>the lens</b> is dirty")
     state.warn("<b>the lens</b> is dirty")
-    state.trouble = lambda: "no space left"
+    state.store_error = lambda: "no space left"
     command = [chromium(), "--headless", "--no-sandbox", "--disable-gpu", "--window-size=390,800"]
     command += ["--virtual-time-budget=4000", "--dump-dom", server.address]
     dom = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
@@ -197,7 +197,7 @@ def test_a_run_counts_every_frame_of_every_stage(tmp_path: Path):
         config=clip / "quick.toml",
         out=tmp_path / "out",
     )
-    measure_source(request, stop=threading.Event(), observer=Watch(observer))
+    measure_source(request, stop=threading.Event(), observer=WatchObserver(observer))
     assert observer.served == observer.address
     for number, metrics in enumerate(observer.seen, start=1):
         frames = {k[1:]: v for k, v in metrics.items() if k[0] == "stream_dmr_frames_total"}
@@ -218,7 +218,7 @@ def test_systemd_is_told_as_long_as_the_run_is_alive(
         systemd.settimeout(10)
         monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
         monkeypatch.setenv("WATCHDOG_USEC", "200000")
-        watchdog = Watchdog(lambda: alive)
+        watchdog = SystemdWatchdog(lambda: alive)
         assert [systemd.recv(99) for _ in range(3)] == [b"READY=1", b"WATCHDOG=1", b"WATCHDOG=1"]
         alive = False
         watchdog._ended.wait(0.3)
@@ -239,7 +239,7 @@ def test_without_systemd_nothing_is_said(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     monkeypatch.delenv("WATCHDOG_USEC", raising=False)
     asked = []
-    watchdog = Watchdog(lambda: not asked.append(True))
+    watchdog = SystemdWatchdog(lambda: not asked.append(True))
     watchdog._ended.wait(0.05)
     watchdog.close()
     assert not asked
@@ -249,8 +249,8 @@ def test_the_log_is_json_and_says_nothing_too_often(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     now = SimpleNamespace(s=0.0)
-    monkeypatch.setattr("stream_dmr.watch.journal.time.monotonic", lambda: now.s)
-    journal = Journal()
+    monkeypatch.setattr("stream_dmr.watch.json_log.time.monotonic", lambda: now.s)
+    journal = JsonLog()
     final = next(m for m in recorded_messages(3) if isinstance(m, LengthEstimate))
     for track_id in (1, 2):
         journal.take(replace(final, track_id=track_id, is_final=True))

@@ -1,4 +1,4 @@
-"""The pictures of a report: a fish as it was seen, and the outlines of its mask and its mesh."""
+"""The pictures of a report: a fish as the camera saw it, and the outlines of mask and mesh."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -17,11 +17,9 @@ from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
 
-MASK, MESH, HEAD, CENTER, TAIL = (
-    *((80, 220, 255), (90, 230, 90)),  # BGR
-    *((60, 60, 255), (255, 255, 255), (255, 160, 60)),
-)
-_FINE = 2  # the outline of a mesh is taken at so many times the resolution
+_MASK_BGR, _MESH_BGR = (80, 220, 255), (90, 230, 90)
+_KEYPOINTS_BGR = (60, 60, 255), (255, 255, 255), (255, 160, 60)  # head, center, tail
+_OVERSAMPLING = 2  # of the crop's pixels, for the outline of a mesh
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -33,32 +31,34 @@ class Outlines:
     keypoints: Float[np.ndarray, "3 2"]
 
 
-def outlines_of(crop: FishCrop, shape: FittedShape, faces: Int[np.ndarray, "F 3"]) -> Outlines:
+def crop_outlines(crop: FishCrop, shape: FittedShape, faces: Int[np.ndarray, "F 3"]) -> Outlines:
     """The outlines of the mask and of the fitted mesh, and the keypoints."""
     keypoints = crop_from_frame(
         shape.keypoints_px, crop_camera=crop.crop_camera, frame_camera=crop.frame_camera
     )
     mesh: list[Float[np.ndarray, "_ 2"]] = []
     if shape.vertices is not None:
-        size = crop.mask.shape[0] * _FINE
+        size = crop.mask.shape[0] * _OVERSAMPLING
         drawn = np.zeros((size, size), np.uint8)
-        pixels = (crop.crop_camera.project(shape.vertices) + 0.5) * _FINE - 0.5
+        pixels = (crop.crop_camera.project(shape.vertices) + 0.5) * _OVERSAMPLING - 0.5
         for face in np.round(pixels).astype(np.int32)[faces]:
             cv2.fillConvexPoly(drawn, face, 1)
-        mesh = [(line + 0.5) / _FINE - 0.5 for line in _polygons(drawn > 0, coarse_px=1.0)]
-    return Outlines(mask=_polygons(crop.mask, coarse_px=0.5), mesh=mesh, keypoints=keypoints)
+        mesh = [
+            (line + 0.5) / _OVERSAMPLING - 0.5 for line in _polygons(drawn > 0, tolerance_px=1.0)
+        ]
+    return Outlines(mask=_polygons(crop.mask, tolerance_px=0.5), mesh=mesh, keypoints=keypoints)
 
 
-def _polygons(mask: Bool[np.ndarray, "H W"], *, coarse_px: float) -> list[np.ndarray]:
+def _polygons(mask: Bool[np.ndarray, "H W"], *, tolerance_px: float) -> list[np.ndarray]:
     lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    simple = (cv2.approxPolyDP(line, coarse_px, closed=True)[:, 0] for line in lines)
+    simple = (cv2.approxPolyDP(line, tolerance_px, closed=True)[:, 0] for line in lines)
     return [line.astype(float) for line in simple if len(line) > 2]
 
 
-def picture_of(
+def crop_picture(
     crop: FishCrop, frame: UInt8[np.ndarray, "H W 3"] | None, *, size: int
 ) -> UInt8[np.ndarray, "N N 3"]:
-    """A crop as it was seen, `size` px; without any picture, its mask in grey."""
+    """A crop of `size` by `size` px: from `frame`, else as recorded, else its mask in grey."""
     if frame is not None:
         x, y = frame_from_crop_map(_resized(crop.crop_camera, size), frame_camera=crop.frame_camera)
         return cv2.remap(frame, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
@@ -68,46 +68,46 @@ def picture_of(
     return cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
 
 
-def drawn(
+def draw_outlines(
     picture: UInt8[np.ndarray, "N N 3"], outlines: Outlines, *, crop_size: int
 ) -> UInt8[np.ndarray, "N N 3"]:
-    """A picture with mask, mesh and keypoints drawn over it."""
+    """The picture with mask, mesh and keypoints drawn over it."""
     image, scale = picture.copy(), picture.shape[0] / crop_size
 
-    def place(points: Float[np.ndarray, "N 2"]) -> Int[np.ndarray, "N 2"]:
+    def to_picture(points: Float[np.ndarray, "N 2"]) -> Int[np.ndarray, "N 2"]:
         return np.round((points + 0.5) * scale * 16 - 8).astype(np.int32)  # 1/16 px
 
-    for lines, colour in ((outlines.mask, MASK), (outlines.mesh, MESH)):
-        polygons = [place(line) for line in lines]
+    for lines, colour in ((outlines.mask, _MASK_BGR), (outlines.mesh, _MESH_BGR)):
+        polygons = [to_picture(line) for line in lines]
         cv2.polylines(image, polygons, True, colour, 1, cv2.LINE_AA, 4)
-    for point, colour in zip(place(outlines.keypoints), (HEAD, CENTER, TAIL), strict=True):
+    for point, colour in zip(to_picture(outlines.keypoints), _KEYPOINTS_BGR, strict=True):
         cv2.circle(image, point.tolist(), 2 * 16, colour, -1, cv2.LINE_AA, 4)
     return image
 
 
-def frames_of(
+def frame_images(
     recording: Recording, wanted: set[int], source: str | None
 ) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
-    """The pictures of the wanted frames, from the source or from the recording, where it has any.
+    """The images of the wanted frames, from `source`, or from the recording where it has any.
 
     SourceError where the source is not the recorded one.
     """
-    with closing(_Pictures(recording, source)) as pictures:
+    with closing(_FrameImages(recording, source)) as images:
         for message, payload in decoded_messages(recording, [Frame], EVERYTHING):
             if message.frame_index in wanted and isinstance(message, Frame):
-                frame = pictures.restorer.restore(message, payload)
+                frame = images.restorer.restore(message, payload)
                 if frame.image.size:
                     yield frame.frame_index, frame.image
 
 
-def named_source(recording: Recording) -> str | None:
-    """The place of the recorded source, where there is still a file or folder."""
+def recorded_source(recording: Recording) -> str | None:
+    """Path of the recorded source, where there is still a file or folder."""
     inputs = recording.header.known_inputs
     return inputs.source.path if inputs is not None and inputs.source.exists() else None
 
 
-class _Pictures:
-    """A restorer, and the source behind it."""
+class _FrameImages:
+    """The images of a recording's frames, with the source that has to be closed."""
 
     def __init__(self, recording: Recording, source: str | None) -> None:
         self._source = None if source is None else open_source(source, ReadFramesSettings())
@@ -123,7 +123,7 @@ class _Pictures:
 
 
 def _resized(camera: Camera, size: int) -> Camera:
-    """The camera of the same crop at another number of pixels."""
+    """The same camera with `size` by `size` pixels."""
     scale = size / camera.width
     K = camera.K.copy()
     K[:2] *= scale

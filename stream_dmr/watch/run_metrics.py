@@ -1,4 +1,4 @@
-"""/metrics: what a run counts, in the words of Prometheus, worked out when it is asked for."""
+"""/metrics: the counters of a run for Prometheus, computed when they are asked for."""
 
 from collections.abc import Iterator
 
@@ -6,17 +6,17 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from stream_dmr.watch.state import RunState
+from stream_dmr.watch.run_state import RunState
 
 
 class RunMetrics(Collector):
-    """Every stage: frames in = processed + dropped + failed + in work."""
+    """Collects a run's metrics. Of each stage, in = processed + dropped + failed + in work."""
 
     def __init__(self, state: RunState) -> None:
         self._state = state
 
     def collect(self) -> Iterator[Metric]:
-        """All metrics as they are now."""
+        """Give all metrics as they are now."""
         yield from self._stages()
         yield from self._camera()
         yield from self._results()
@@ -71,17 +71,17 @@ class RunMetrics(Collector):
         yield fit
         yield _gauge("frames_per_second", "That left the chain.", self._state.frames_per_s())
         yield _gauge("disk_free_bytes", "Room for results.", self._state.disk_free_bytes())
-        warnings = sum(warned.count for warned in self._state.warnings())
+        warnings = sum(warning.count for warning in self._state.warnings())
         yield _gauge("warnings", "Warnings that are shown.", warnings)
-        yield _gauge("healthy", "1: well, 0: not.", 0.0 if self._state.problems() else 1.0)
+        yield _gauge("healthy", "1: healthy, 0: not.", 0.0 if self._state.problems() else 1.0)
 
 
 def _gauge(name: str, text: str, value: float | int) -> Metric:
     return GaugeMetricFamily(f"stream_dmr_{name}", text, value=value)
 
 
-def registry_of(state: RunState) -> CollectorRegistry:
-    """A registry of this run alone."""
+def make_registry(state: RunState) -> CollectorRegistry:
+    """A registry with the metrics of this run alone."""
     registry = CollectorRegistry()
     registry.register(RunMetrics(state))
     return registry

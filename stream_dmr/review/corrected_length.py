@@ -22,10 +22,10 @@ def corrected_fish(
     config: Config,
     calibration: Calibration | None,
 ) -> LocalizedFish:
-    """A frame of a fish with its head and tail at `points_px` (frame pixels), localized anew.
+    """Localize a frame of a fish again with its head and tail at `points_px`, in frame pixels.
 
-    Shape, center and bend stay those of the fit. The reviewer has looked, so the gates of quality
-    don't hold; UserError where these points give no length.
+    Shape, center and bend stay those of the fit. The gates of quality are left out, since the
+    reviewer has looked; UserError where these points give no length.
     """
     shape = fit.shape
     if shape is None:
@@ -42,7 +42,7 @@ def corrected_fish(
 
 
 def corrected_length(frames: Mapping[int, LocalizedFish], config: Config) -> LengthEstimate:
-    """The length of the corrected frames alone, put together as those of a run are."""
+    """The length from the corrected frames alone, filtered as in a run."""
     settings = config.smooth_length.model_copy(update={"min_frames": 1, "max_std_ratio": math.inf})
     ordered = [frames[index] for index in sorted(frames)]
     track = TrackLength(ordered[0], settings)

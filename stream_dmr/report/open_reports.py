@@ -1,4 +1,4 @@
-"""`stream-dmr report`: results as one file that a reviewer can believe or refute."""
+"""Opens the results of a run or a batch for a report, and writes its page."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,41 +7,41 @@ from stream_dmr.batch.layout import DONE, FAILED, VIDEO_FOLDERS, VIDEOS, read_vi
 from stream_dmr.errors import UserError
 from stream_dmr.files import make_folder, writing_to
 from stream_dmr.recording.reading.open_recording import open_recordings
-from stream_dmr.report.album import make_album
-from stream_dmr.report.gather import gather
-from stream_dmr.report.gathered import Report
-from stream_dmr.report.page import page
+from stream_dmr.report.drawn_views import draw_views
+from stream_dmr.report.recorded_tracks import read_tracks
+from stream_dmr.report.report_page import render_page
+from stream_dmr.report.run_report import RunReport
 from stream_dmr.results.finished_fish import read_fish
 from stream_dmr.results.provenance import add_files
 from stream_dmr.running.config import load_config, parse_config
 
 
-def open_report(path: Path, *, source: str | None = None, config: Path | None = None) -> Report:
-    """Gather a report of a run's folder or of a recording.
+def open_report(path: Path, *, source: str | None = None, config: Path | None = None) -> RunReport:
+    """Read the report of a run's folder or of a recording.
 
     Raises a UserError where they can't be read, or where `source` is not the recorded one.
     """
     recording = open_recordings([path])
     header = recording.header
     of_run = parse_config(header.config_toml, where=f"{path}: its config.toml")
-    tracks = gather(recording)
-    return Report(
+    tracks = read_tracks(recording)
+    return RunReport(
         path=path,
         recording=recording,
         fish=read_fish(path, recording),
         tracks=tracks,
-        album=make_album(tracks, recording, source),
+        views=draw_views(tracks, recording, source),
         config=of_run,
         settings=(of_run if config is None else load_config(config)).fisheries,
     )
 
 
 def is_batch(path: Path) -> bool:
-    """Whether a path is the --out of a batch."""
+    """True for the --out of a batch."""
     return (path / VIDEOS).is_file()
 
 
-def open_batch(out: Path, *, config: Path | None = None) -> tuple[list[Report], list[str]]:
+def open_batch(out: Path, *, config: Path | None = None) -> tuple[list[RunReport], list[str]]:
     """A report of each video that is done, and a line for each that failed. Raises UserError."""
     rows = read_videos(out)
     done = [row["name"] for row in rows if row["status"] == DONE]
@@ -58,11 +58,11 @@ def open_batch(out: Path, *, config: Path | None = None) -> tuple[list[Report], 
 
 
 def write_report(
-    reports: Sequence[Report], out: Path, *, title: str, notes: Sequence[str] = ()
+    reports: Sequence[RunReport], out: Path, *, title: str, notes: Sequence[str] = ()
 ) -> int:
-    """Write the page; returns its bytes. Beside results it is one of their files to `verify`."""
+    """Write the page and return its bytes; beside results, `verify` checks it as one of them."""
     make_folder(out.parent)
     with writing_to(out):
-        out.write_text(page(reports, title=title, notes=notes), encoding="utf-8")
+        out.write_text(render_page(reports, title=title, notes=notes), encoding="utf-8")
     add_files(out.parent, [out])
     return out.stat().st_size

@@ -1,35 +1,35 @@
-"""Watching a run: its state, the server that shows it, and the watchdog."""
+"""Shows a run while it measures: its state, the server of the status page, the watchdog."""
 
 from stream_dmr.messages import Message
 from stream_dmr.running.pipeline import Chain
 from stream_dmr.running.run_observer import OpenRun, RunObserver
-from stream_dmr.watch.server import WatchServer
-from stream_dmr.watch.service import Watchdog
-from stream_dmr.watch.state import RunState
+from stream_dmr.watch.run_state import RunState
+from stream_dmr.watch.systemd import SystemdWatchdog
+from stream_dmr.watch.watch_server import WatchServer
 
 
-class Watch(RunObserver):
-    """Hands on to an observer what it is told; serves and tells systemd what it saw."""
+class WatchObserver(RunObserver):
+    """Passes everything on to another observer, serves it, and tells systemd that the run lives."""
 
     def __init__(self, observer: RunObserver) -> None:
         self._observer = observer
         self._state: RunState | None = None  # from `open` on
         self._server: WatchServer | None = None
-        self._watchdog: Watchdog | None = None
+        self._watchdog: SystemdWatchdog | None = None
 
     def open(self, run: OpenRun) -> None:
         """Serve as `[watch]` says; ConfigError or OutputError where it can't listen as asked."""
         self._observer.open(run)
         settings, silence_s = run.config.watch, run.config.read_frames.silence_s
         state = RunState(run.source, run.out, silence_s=silence_s, stuck_s=settings.stuck_s)
-        state.trouble = lambda: run.store.trouble
+        state.store_error = lambda: run.store.trouble
         self._server = WatchServer(state, settings) if settings.port else None
-        self._watchdog = Watchdog(lambda: not state.is_stuck())
+        self._watchdog = SystemdWatchdog(lambda: not state.is_stuck())
         self._state = state
         self.address = None if self._server is None else self._server.address
 
     def attach(self, chain: Chain) -> None:
-        """Watch this chain's counters."""
+        """Show this chain's counters."""
         if self._state is not None:
             self._state.chain = chain
         self._observer.attach(chain)

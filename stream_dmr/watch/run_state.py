@@ -1,4 +1,4 @@
-"""What there is to see of a run: kept by reference while it measures, worked out when asked."""
+"""What the status page shows of a run: kept by reference while it measures, computed when asked."""
 
 import shutil
 import threading
@@ -15,16 +15,21 @@ from stream_dmr.reasons import without_counts
 from stream_dmr.running.pipeline import Chain
 from stream_dmr.sources.source import Source
 
-_FRAMES_KEPT = 16  # more than are on their way through the chain, so that fish find their picture
-_FISH_KEPT = 20
-_FITS_KEPT = 1000
+_MAX_FRAMES = 16  # more than the chain's queues hold, so that a fish finds its frame
+_MAX_FISH = 4 * _MAX_FRAMES  # in these frames
+_MAX_FINISHED = 20  # in the page's table
+_MAX_WARNINGS = 50
+_MAX_FITS = 1000  # for quantiles of their time
 _HOUR_S = 3600.0
-_RATE_S = 10.0
+_MIN_RATE_WINDOW_S = 60.0  # else one fish in the first second would be thousands an hour
+_RATE_WINDOW_S = 10.0
+_MAX_RATE_FRAMES = 300  # in this window
+_MAX_HOURLY_FISH = 10_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Warned:
-    """A warning, with how often it came and when last, s of the monotonic clock."""
+class RepeatedWarning:
+    """A warning, how often it came, and when last (monotonic clock)."""
 
     line: str
     count: int
@@ -32,38 +37,39 @@ class Warned:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Scene:
-    """A frame with the fish that were found in it, where its fits are done."""
+class MeasuredFrame:
+    """A frame with the fish that were localized in it."""
 
     frame: Frame
     fish: tuple[LocalizedFish, ...]
-    lengths_mm: dict[int, float]  # so far, by track id
+    lengths_mm: dict[int, float]  # the running estimates, by track id
 
 
 class RunState:
-    """Told of every message in the chain's threads; asked from those of the server."""
+    """Is told every message in the chain's threads, and asked in the server's. Thread-safe."""
 
     def __init__(self, source: Source, out_dir: Path, *, silence_s: float, stuck_s: float) -> None:
+        """A camera that is silent for `silence_s` and a frame that takes `stuck_s` are problems."""
         self.source = source
         self.chain: Chain | None = None
-        self.trouble: Callable[[], str] = lambda: ""  # why lengths can't be written; "" if they can
-        self.finished: deque[LengthEstimate] = deque(maxlen=_FISH_KEPT)  # newest last
+        self.store_error: Callable[[], str] = lambda: ""  # why lengths can't be written, else ""
+        self.finished: deque[LengthEstimate] = deque(maxlen=_MAX_FINISHED)  # newest last
         self.num_fish: Counter[str] = Counter()  # finished ones, by status
-        self.fit_s: deque[float] = deque(maxlen=_FITS_KEPT)
+        self.fit_s: deque[float] = deque(maxlen=_MAX_FITS)
         self._out_dir = out_dir
         self._silence_s = silence_s
         self._stuck_s = stuck_s
         self._began_s = time.monotonic()
         self._lock = threading.Lock()
-        self._frames: deque[Frame] = deque(maxlen=_FRAMES_KEPT)
-        self._fish: deque[LocalizedFish] = deque(maxlen=4 * _FRAMES_KEPT)
+        self._frames: deque[Frame] = deque(maxlen=_MAX_FRAMES)
+        self._fish: deque[LocalizedFish] = deque(maxlen=_MAX_FISH)
         self._lengths_mm: dict[int, float] = {}
-        self._passed_s: deque[float] = deque(maxlen=300)
-        self._finished_s: deque[float] = deque(maxlen=10_000)
-        self._warned: dict[str, Warned] = {}
+        self._frames_done_s: deque[float] = deque(maxlen=_MAX_RATE_FRAMES)
+        self._fish_done_s: deque[float] = deque(maxlen=_MAX_HOURLY_FISH)
+        self._warnings: dict[str, RepeatedWarning] = {}  # the latest last
 
     def take(self, message: Message) -> None:
-        """Keep what a message shows; no picture is copied."""
+        """Keep what the page shows of a message; no picture is copied."""
         with self._lock:
             match message:
                 case Frame():
@@ -80,26 +86,26 @@ class RunState:
                     pass
 
     def frame_done(self) -> None:
-        """Take note that a frame has left the chain."""
+        """Count a frame that has left the chain."""
         with self._lock:
-            self._passed_s.append(time.monotonic())
+            self._frames_done_s.append(time.monotonic())
 
     def warn(self, line: str) -> None:
-        """Keep a warning; the fifty latest are."""
+        """Keep a warning, or count it again."""
         with self._lock:
-            before = self._warned.pop(line, None)
+            before = self._warnings.pop(line, None)
             count = 1 if before is None else before.count + 1
-            self._warned[line] = Warned(line=line, count=count, last_s=time.monotonic())
-            if len(self._warned) > 50:
-                del self._warned[next(iter(self._warned))]
+            self._warnings[line] = RepeatedWarning(line=line, count=count, last_s=time.monotonic())
+            if len(self._warnings) > _MAX_WARNINGS:
+                del self._warnings[next(iter(self._warnings))]
 
-    def warnings(self) -> list[Warned]:
-        """The latest first."""
+    def warnings(self) -> list[RepeatedWarning]:
+        """The warnings, the latest first."""
         with self._lock:
-            return list(self._warned.values())[::-1]
+            return list(self._warnings.values())[::-1]
 
-    def scene(self) -> Scene | None:
-        """The latest frame whose fish are known, or the latest one where there are none."""
+    def latest_frame(self) -> MeasuredFrame | None:
+        """The latest frame whose fish are localized; the latest of all where there are no fish."""
         with self._lock:
             if not self._frames:
                 return None
@@ -108,30 +114,31 @@ class RunState:
             if self._fish and self._fish[-1].frame_index in by_index:
                 frame = by_index[self._fish[-1].frame_index]
             fish = [one for one in self._fish if one.frame_index == frame.frame_index]
-            return Scene(frame=frame, fish=tuple(fish), lengths_mm=dict(self._lengths_mm))
+            return MeasuredFrame(frame=frame, fish=tuple(fish), lengths_mm=dict(self._lengths_mm))
 
     def frames_per_s(self) -> float:
         """Frames that left the chain, over the last ten seconds."""
         with self._lock:
-            now = time.monotonic()
-            recent = sum(now - passed <= _RATE_S for passed in self._passed_s)
-        return recent / max(min(_RATE_S, now - self._began_s), 1e-3)
+            now_s = time.monotonic()
+            recent = sum(now_s - done_s <= _RATE_WINDOW_S for done_s in self._frames_done_s)
+        return recent / max(min(_RATE_WINDOW_S, now_s - self._began_s), 1e-3)
 
     def fish_per_hour(self) -> float:
         """Fish that were finished, over the last hour or since the start."""
         with self._lock:
-            now = time.monotonic()
-            recent = sum(now - finished <= _HOUR_S for finished in self._finished_s)
-        return recent * _HOUR_S / min(_HOUR_S, max(now - self._began_s, 60.0))
+            now_s = time.monotonic()
+            recent = sum(now_s - done_s <= _HOUR_S for done_s in self._fish_done_s)
+        window_s = min(_HOUR_S, max(now_s - self._began_s, _MIN_RATE_WINDOW_S))
+        return recent * _HOUR_S / window_s
 
     def fit_quantiles(self) -> dict[float, float]:
-        """Seconds that a fit took, of the last thousand; empty where there was none."""
+        """Quantile -> seconds that a fit took, of the last thousand; empty without any."""
         with self._lock:
-            taken = list(self.fit_s)
-        return {q: float(np.quantile(taken, q)) for q in (0.5, 0.9, 0.99)} if taken else {}
+            fit_s = list(self.fit_s)
+        return {q: float(np.quantile(fit_s, q)) for q in (0.5, 0.9, 0.99)} if fit_s else {}
 
     def last_frame_age_s(self) -> float | None:
-        """Since the last frame came from the camera; None where the source is none."""
+        """Time since the last frame came from the camera; None where the source is no camera."""
         counts = self.source.counts
         if counts is None:
             return None
@@ -142,23 +149,23 @@ class RunState:
         return shutil.disk_usage(self._out_dir).free
 
     def problems(self) -> list[str]:
-        """Why this run is not well, for people; empty when it is."""
-        problems = []
+        """Why this run is not healthy, for people; empty when it is."""
+        problems: list[str] = []
         age_s = self.last_frame_age_s()
         if age_s is not None and age_s > self._silence_s:
             problems.append(f"no picture from the camera for {age_s:.0f} s")
         if self.is_stuck():
             problems.append("the measurement hangs")
-        if trouble := self.trouble():
-            problems.append(f"lengths can't be written: {trouble}")
+        if store_error := self.store_error():
+            problems.append(f"lengths can't be written: {store_error}")
         return problems
 
     def is_stuck(self) -> bool:
-        """Whether a stage has had one frame for longer than any fit takes."""
+        """True where a stage has had one frame for longer than any fit takes."""
         return self.chain is not None and self.chain.longest_busy_s() > self._stuck_s
 
     def _finish(self, estimate: LengthEstimate) -> None:
         self.finished.append(estimate)
         self.num_fish[without_counts(estimate.status)] += 1
-        self._finished_s.append(time.monotonic())
+        self._fish_done_s.append(time.monotonic())
         self._lengths_mm.pop(estimate.track_id, None)

@@ -5,28 +5,28 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stream_dmr.recording.reading.open_recording import Recording
-from stream_dmr.report.album import Album
-from stream_dmr.report.gather import Track
+from stream_dmr.report.drawn_views import DrawnViews
+from stream_dmr.report.recorded_tracks import RecordedTrack
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.fisheries import FisheriesSettings
 from stream_dmr.running.config import Config
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Report:
-    """Gathered once."""
+class RunReport:
+    """The results of one run with what was recorded of each fish."""
 
     path: Path
     recording: Recording
     fish: Sequence[FishResult]
-    tracks: Mapping[int, Track]
-    album: Album
+    tracks: Mapping[int, RecordedTrack]  # by track id
+    views: DrawnViews
     config: Config  # of the run
     settings: FisheriesSettings
 
     @property
     def title(self) -> str:
-        """The results' name."""
+        """The name of the results' folder or file."""
         return self.path.resolve().name
 
     @property

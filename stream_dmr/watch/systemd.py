@@ -1,4 +1,4 @@
-"""What systemd wants to know of a service: that it is ready, and that it is alive.
+"""Tells systemd that the service is ready, and that it is alive.
 
 The protocol of sd_notify(3): a line to the datagram socket that NOTIFY_SOCKET names.
 """
@@ -10,10 +10,10 @@ from collections.abc import Callable
 from contextlib import suppress
 
 
-class Watchdog:
-    """Says READY at once, then WATCHDOG twice in each interval as long as `is_alive` says so.
+class SystemdWatchdog:
+    """Sends READY at once, then WATCHDOG twice per interval while `is_alive` returns True.
 
-    Without a NOTIFY_SOCKET it does nothing.
+    The interval is WATCHDOG_USEC. Without a NOTIFY_SOCKET it does nothing.
     """
 
     def __init__(self, is_alive: Callable[[], bool]) -> None:
@@ -28,7 +28,7 @@ class Watchdog:
             self._thread.start()
 
     def close(self) -> None:
-        """Say that the service is stopping."""
+        """Send STOPPING, and end."""
         notify("STOPPING=1")
         self._ended.set()
         if self._thread.is_alive():
@@ -42,7 +42,7 @@ class Watchdog:
 
 
 def notify(line: str) -> None:
-    """Send a line to systemd, if it started us."""
+    """Send a line to systemd, where it started this process."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
         return

@@ -1,4 +1,4 @@
-"""Takes verdicts on the fish of one folder, checks them and writes them down."""
+"""Checks the verdicts on the fish of one folder and writes them to its lengths.db."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -13,9 +13,9 @@ from stream_dmr.camera import frame_from_crop
 from stream_dmr.errors import UserError
 from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate
 from stream_dmr.recording.messages.codec import decode
-from stream_dmr.report.gather import View
-from stream_dmr.report.gathered import Report
-from stream_dmr.report.page import summary
+from stream_dmr.report.recorded_tracks import RecordedView
+from stream_dmr.report.report_page import summary_row
+from stream_dmr.report.run_report import RunReport
 from stream_dmr.results.finished_fish import FishResult, database_of
 from stream_dmr.results.provenance import seal_verdicts
 from stream_dmr.results.verdicts import (
@@ -28,12 +28,12 @@ from stream_dmr.results.verdicts import (
     read_verdicts,
     reviews,
 )
-from stream_dmr.review.corrected import corrected_fish, corrected_length
+from stream_dmr.review.corrected_length import corrected_fish, corrected_length
 
-_Point = tuple[float, float]
+_Point = tuple[float, float]  # x, y
 
 
-class Said(BaseModel):
+class SubmittedVerdict(BaseModel):
     """A verdict as the page sends it; points are in pixels of the frame's crop."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -48,10 +48,10 @@ class Said(BaseModel):
     tail: _Point | None = None
 
 
-class Judge:
+class VerdictRecorder:
     """Verdicts of one reviewer. Thread-safe."""
 
-    def __init__(self, report: Report, reviewer: str) -> None:
+    def __init__(self, report: RunReport, reviewer: str) -> None:
         """UserError where the results have no database to write to."""
         database = database_of(report.path)
         if database is None:
@@ -65,63 +65,66 @@ class Judge:
         self._fish = {one.estimate.track_id: one for one in report.fish}
         self._lock = Lock()
 
-    def take(self, content: bytes) -> dict[str, Any]:
-        """Check and write a verdict, JSON of `Said`; returns the fish's row. UserError."""
+    def record(self, content: bytes) -> dict[str, Any]:
+        """Check and write a verdict, JSON of `SubmittedVerdict`; returns the row of its fish.
+
+        UserError where it is not one.
+        """
         try:
-            said = Said.model_validate_json(content)
+            submitted = SubmittedVerdict.model_validate_json(content)
         except ValidationError as error:
             raise UserError(f"verdict: {error.errors()[0]['msg']}") from error
         with self._lock:
             verdict = Verdict(
-                track_id=said.track_id,
-                kind=said.kind,
+                track_id=submitted.track_id,
+                kind=submitted.kind,
                 reviewer=self._reviewer,
-                reason=said.reason.strip() if said.kind == "reject" else "",
-                species=said.species.strip() if said.kind == "species" else "",
-                duplicate_of=said.duplicate_of if said.kind == "duplicate" else None,
+                reason=submitted.reason.strip() if submitted.kind == "reject" else "",
+                species=submitted.species.strip() if submitted.kind == "species" else "",
+                duplicate_of=submitted.duplicate_of if submitted.kind == "duplicate" else None,
             )
             check(verdict, set(self._fish))
-            if said.kind == "correct":
-                verdict = self._corrected(verdict, said)
+            if submitted.kind == "correct":
+                verdict = self._corrected(verdict, submitted)
             add_verdict(self._database, verdict)
             seal_verdicts(self._database.parent)
-            return self._row(self._fish[said.track_id])
+            return self._row(self._fish[submitted.track_id])
 
-    def judged(self) -> list[dict[str, Any]]:
-        """The rows of all fish of which anything was said."""
-        held = reviews(read_verdicts(self._database))
-        return [self._row(one) for track_id, one in self._fish.items() if track_id in held]
+    def reviewed_rows(self) -> list[dict[str, Any]]:
+        """The rows of all fish with verdicts."""
+        reviewed = reviews(read_verdicts(self._database))
+        return [self._row(one) for track_id, one in self._fish.items() if track_id in reviewed]
 
     def _row(self, fish: FishResult) -> dict[str, Any]:
-        now = replace(fish, review=self._review(fish.estimate.track_id))
-        return summary(now, self._report)
+        reviewed = replace(fish, review=self._review(fish.estimate.track_id))
+        return summary_row(reviewed, self._report)
 
     def _review(self, track_id: int) -> Review:
         return reviews(read_verdicts(self._database)).get(track_id, NOTHING_SAID)
 
-    def _corrected(self, verdict: Verdict, said: Said) -> Verdict:
+    def _corrected(self, verdict: Verdict, submitted: SubmittedVerdict) -> Verdict:
         """The verdict with its points in frame pixels and the length that follows."""
-        if said.frame_index is None or said.head is None or said.tail is None:
+        if submitted.frame_index is None or submitted.head is None or submitted.tail is None:
             raise UserError("verdict: expected a frame with its head and tail points")
-        crop = decode(FishCrop, self._view(said.track_id, said.frame_index).crop)
+        crop = decode(FishCrop, self._view(submitted.track_id, submitted.frame_index).crop)
         head, tail = frame_from_crop(
-            np.array([said.head, said.tail], float),
+            np.array([submitted.head, submitted.tail], float),
             crop_camera=crop.crop_camera,
             frame_camera=crop.frame_camera,
         ).tolist()
         verdict = replace(
             verdict,
-            frame_index=said.frame_index,
+            frame_index=submitted.frame_index,
             head_u=head[0],
             head_v=head[1],
             tail_u=tail[0],
             tail_v=tail[1],
         )
-        moved = {**self._review(said.track_id).moved, **verdict.moved}
-        length = self._length(said.track_id, moved)
+        moved = {**self._review(submitted.track_id).moved, **verdict.moved}
+        length = self._corrected_length(submitted.track_id, moved)
         return replace(verdict, length_mm=length.length_mm, length_std_mm=length.length_std_mm)
 
-    def _length(self, track_id: int, moved: Mapping[int, Ends]) -> LengthEstimate:
+    def _corrected_length(self, track_id: int, moved: Mapping[int, Ends]) -> LengthEstimate:
         report = self._report
         frames = {
             frame_index: corrected_fish(
@@ -134,7 +137,7 @@ class Judge:
         }
         return corrected_length(frames, report.config)
 
-    def _view(self, track_id: int, frame_index: int) -> View:
+    def _view(self, track_id: int, frame_index: int) -> RecordedView:
         track = self._report.tracks.get(track_id)
         for view in track.views if track else ():
             if view.row.fish.frame_index == frame_index:

@@ -4,7 +4,6 @@ import threading
 import time
 from http import HTTPStatus
 from importlib.resources import files
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
@@ -12,22 +11,23 @@ from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from stream_dmr.errors import ConfigError, OutputError
 from stream_dmr.running.run_settings import WatchSettings
-from stream_dmr.watch.metrics import registry_of
-from stream_dmr.watch.picture import as_jpeg, draw
-from stream_dmr.watch.state import RunState
-from stream_dmr.web.token_server import TokenHandler, TokenServer
+from stream_dmr.watch.frame_picture import draw_fish, encode_jpeg
+from stream_dmr.watch.run_metrics import make_registry
+from stream_dmr.watch.run_state import RunState
+from stream_dmr.web.token_server import TokenHandler, TokenServer, is_loopback
 
-_PICTURE_S = 0.5  # a picture serves all who ask for so long: watching must not slow the measuring
+_PICTURE_INTERVAL_S = 0.5  # one picture for all who ask meanwhile: measuring must not slow down
+_MIN_TOKEN_CHARACTERS = 16
 
 
 class WatchServer:
-    """Listens from the start; threads of its own."""
+    """Serves a run from threads of its own, from the start until `close`."""
 
     def __init__(self, state: RunState, settings: WatchSettings) -> None:
         """ConfigError where others could read along without a token; OutputError for the port."""
-        token = _token(settings)
+        token = _read_token(settings)
         try:
-            self._server = _Server((settings.host, settings.port), state, token)
+            self._server = _WatchHttpServer((settings.host, settings.port), state, token)
         except OSError as error:
             raise OutputError(
                 f"[watch] {settings.host}:{settings.port}: expected an address to listen on, got: "
@@ -47,64 +47,60 @@ class WatchServer:
         self._thread.join()
 
 
-def _token(settings: WatchSettings) -> str:
-    if settings.token_file:
-        try:
-            token = Path(settings.token_file).read_text(encoding="utf-8").strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(
-                f"[watch] token_file: expected a file with a token, {settings.token_file} can't be "
-                f"read: {error}"
-            ) from error
-        if len(token) < 16:
-            raise ConfigError(
-                "[watch] token_file: expected a token of 16 characters or more, got "
-                f"{len(token)}; make one with: openssl rand -hex 16"
-            )
-        return token
-    if not _is_loopback(settings.host):
+def _read_token(settings: WatchSettings) -> str:
+    """The token that readers need; "" where the server is for this machine alone."""
+    if not settings.token_file:
+        if is_loopback(settings.host):
+            return ""
         raise ConfigError(
             f"[watch] host = {settings.host!r}: expected a token_file beside it, since others can "
             "reach this address; make one with: openssl rand -hex 16 > token"
         )
-    return ""
-
-
-def _is_loopback(host: str) -> bool:
     try:
-        return host == "localhost" or ip_address(host).is_loopback
-    except ValueError:
-        return False
+        token = Path(settings.token_file).read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not text"
+        raise ConfigError(
+            f"[watch] token_file: expected a file with a token, {settings.token_file} can't be "
+            f"read: {reason}"
+        ) from error
+    if len(token) < _MIN_TOKEN_CHARACTERS:
+        raise ConfigError(
+            f"[watch] token_file: expected a token of {_MIN_TOKEN_CHARACTERS} characters or more, "
+            f"got {len(token)}; make one with: openssl rand -hex 16"
+        )
+    return token
 
 
-class _Server(TokenServer):
+class _WatchHttpServer(TokenServer):
     def __init__(self, address: tuple[str, int], state: RunState, token: str) -> None:
         self.state = state
-        self.registry = registry_of(state)
+        self.registry = make_registry(state)
         self._picture_lock = threading.Lock()
         self._picture, self._picture_until_s = b"", 0.0
-        super().__init__(address, _Handler, token=token)
+        super().__init__(address, _WatchHandler, token=token)
 
     def picture(self) -> bytes:
+        """The latest measured frame as JPEG; empty before the first."""
         with self._picture_lock:
             if time.monotonic() >= self._picture_until_s:
-                scene = self.state.scene()
-                self._picture = b"" if scene is None else as_jpeg(draw(scene))
-                self._picture_until_s = time.monotonic() + _PICTURE_S
+                measured = self.state.latest_frame()
+                self._picture = b"" if measured is None else encode_jpeg(draw_fish(measured))
+                self._picture_until_s = time.monotonic() + _PICTURE_INTERVAL_S
             return self._picture
 
 
-class _Handler(TokenHandler):
-    server: _Server  # pyright: ignore[reportIncompatibleVariableOverride]
+class _WatchHandler(TokenHandler):
+    server: _WatchHttpServer  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    def serve(self, path: str) -> None:
+    def answer_get(self, path: str) -> None:
         state = self.server.state
         match path:
             case "/":
                 page = files("stream_dmr.watch").joinpath("page.html").read_bytes()
                 self.answer(HTTPStatus.OK, "text/html; charset=utf-8", page)
             case "/status.json":
-                self.json(HTTPStatus.OK, status_of(state))
+                self.answer_json(HTTPStatus.OK, status_json(state))
             case "/picture.jpg":
                 self.answer(HTTPStatus.OK, "image/jpeg", self.server.picture())
             case "/metrics":
@@ -114,13 +110,13 @@ class _Handler(TokenHandler):
             case "/health":
                 problems = state.problems()
                 code = HTTPStatus.SERVICE_UNAVAILABLE if problems else HTTPStatus.OK
-                self.json(code, {"healthy": not problems, "problems": problems})
+                self.answer_json(code, {"healthy": not problems, "problems": problems})
             case _:
                 self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
 
 
-def status_of(state: RunState) -> dict[str, Any]:
-    """What the page shows."""
+def status_json(state: RunState) -> dict[str, Any]:
+    """What the status page shows, for JSON."""
     now_s = time.monotonic()
     return {
         "problems": state.problems(),
@@ -139,7 +135,7 @@ def status_of(state: RunState) -> dict[str, Any]:
             for fish in reversed(list(state.finished))
         ],
         "warnings": [
-            {"line": one.line, "count": one.count, "age_s": now_s - one.last_s}
-            for one in state.warnings()
+            {"line": warning.line, "count": warning.count, "age_s": now_s - warning.last_s}
+            for warning in state.warnings()
         ],
     }

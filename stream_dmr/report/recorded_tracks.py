@@ -1,0 +1,89 @@
+"""Reads each fish of a recording: all of its frames, and its best views in full."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate, LocalizedFish
+from stream_dmr.recording.messages.codec import decode
+from stream_dmr.recording.messages.selection import EVERYTHING, Selection
+from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
+from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
+
+_Key = tuple[int, int]  # frame index, track id
+
+
+@dataclass(frozen=True, kw_only=True)
+class FishFrame:
+    """One fish in one frame: its own length, and the running estimate after it."""
+
+    fish: LocalizedFish
+    estimate: LengthEstimate
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedView:
+    """One fish in one frame with its crop and fit, encoded: a season of masks fills no memory."""
+
+    crop: bytes
+    fit: bytes
+    row: FishFrame
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """For sorting; the best view is the largest: used frames first, then by their IoU."""
+        return self.row.estimate.is_frame_used, self.row.fish.iou or 0.0
+
+    def decode(self, meshes: MeshRebuilder) -> tuple[FishCrop, FittedMesh]:
+        """Crop and fit, the fit with its vertices."""
+        return decode(FishCrop, self.crop), meshes.with_vertices(decode(FittedMesh, self.fit))
+
+
+@dataclass(kw_only=True)
+class RecordedTrack:
+    """All frames of one fish, and its best views."""
+
+    rows: list[FishFrame] = field(default_factory=list[FishFrame])
+    views: list[RecordedView] = field(default_factory=list[RecordedView])  # the best first
+
+    def add(self, row: FishFrame, crop: bytes | None, fit: bytes | None, *, max_views: int) -> None:
+        """Add a frame; keep its crop and fit if it is among the `max_views` best so far."""
+        self.rows.append(row)
+        if crop is None or fit is None or row.fish.keypoints_px is None:
+            return
+        self.views.append(RecordedView(crop=crop, fit=fit, row=row))
+        self.views.sort(key=lambda view: view.rank, reverse=True)
+        del self.views[max_views:]
+
+
+def read_tracks(
+    recording: Recording, *, selection: Selection = EVERYTHING, max_views: int = 3
+) -> dict[int, RecordedTrack]:
+    """Every track of a recording with its `max_views` best views. Raises RecordingError."""
+    tracks: dict[int, RecordedTrack] = {}
+    for row, crop, fit in _read_rows(recording, selection):
+        track = tracks.setdefault(row.fish.track_id, RecordedTrack())
+        track.add(row, crop, fit, max_views=max_views)
+    return tracks
+
+
+def _read_rows(
+    recording: Recording, selection: Selection
+) -> Iterator[tuple[FishFrame, bytes | None, bytes | None]]:
+    """Each fish in each frame, with the encodings of its crop and its fit."""
+    crops, fits = dict[_Key, bytes](), dict[_Key, bytes]()
+    located = dict[_Key, LocalizedFish]()
+    kinds = (FishCrop, FittedMesh, LocalizedFish, LengthEstimate)
+    for message, payload in decoded_messages(recording, kinds, selection):
+        key = message.frame_index, getattr(message, "track_id", 0)
+        match message:
+            case FishCrop():
+                crops[key] = payload
+            case FittedMesh():
+                fits[key] = payload
+            case LocalizedFish():
+                located[key] = message
+            case LengthEstimate() if (fish := located.pop(key, None)) is not None:
+                row = FishFrame(fish=fish, estimate=message)
+                yield row, crops.pop(key, None), fits.pop(key, None)
+            case _:
+                pass

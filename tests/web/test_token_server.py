@@ -1,0 +1,139 @@
+"""Servers bound what others can take of them, and answer no page of another site."""
+
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from http import HTTPStatus
+from http.client import HTTPConnection
+
+import pytest
+
+from stream_dmr.web.token_server import TokenHandler, TokenServer, is_loopback
+
+
+class PatientServer(TokenServer):
+    """For a test: little is allowed, and not for long."""
+
+    max_connections = 4
+    request_timeout_s = 0.4
+    answer_timeout_s = 0.8
+
+
+class Hello(TokenHandler):
+    def answer_get(self, path: str) -> None:
+        self.answer(HTTPStatus.OK, "text/plain", b"hello" * (1 << 22 if path == "/large" else 1))
+
+    def answer_post(self, path: str) -> None:
+        self.answer(HTTPStatus.OK, "text/plain", b"taken")
+
+
+@pytest.fixture
+def server() -> Iterator[TokenServer]:
+    served = PatientServer(("127.0.0.1", 0), Hello, token="")
+    thread = threading.Thread(target=lambda: served.serve_forever(poll_interval=0.02))
+    thread.start()
+    yield served
+    served.shutdown()
+    served.server_close()
+    thread.join()
+
+
+def status_of(server: TokenServer, method: str = "GET", **headers: str) -> int:
+    connection = HTTPConnection("127.0.0.1", server.server_address[1], timeout=10)
+    try:
+        connection.request(method, "/", headers=headers)
+        return connection.getresponse().status
+    finally:
+        connection.close()
+
+
+def num_descriptors() -> int:
+    return len(os.listdir("/proc/self/fd"))
+
+
+def wait_until(condition, timeout_s: float = 10.0) -> bool:
+    end_s = time.monotonic() + timeout_s
+    while time.monotonic() < end_s:
+        if condition():
+            return True
+        time.sleep(0.02)
+    return False
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.0\r\nX-A: ", b"GET /large HTTP/1.0\r\n\r\n"])
+def test_requests_that_stand_still_take_few_descriptors_and_end(server: TokenServer, sent: bytes):
+    before = num_descriptors()
+    with ExitStack() as stack:
+        for _ in range(30):
+            client = stack.enter_context(socket.create_connection(server.server_address[:2]))
+            client.sendall(sent)
+        assert wait_until(lambda: num_descriptors() <= before + 30 + PatientServer.max_connections)
+        assert wait_until(lambda: status_of(server) == 200)  # they are still there, and time is up
+        assert num_descriptors() <= before + 30 + PatientServer.max_connections
+
+
+def test_a_request_that_drips_ends(server: TokenServer):
+    with socket.create_connection(server.server_address[:2]) as client:
+        client.settimeout(10)
+        client.sendall(b"GET / HTTP/1.0\r\nX-A: ")
+
+        def drip() -> bool:
+            try:
+                client.sendall(b"a")
+            except OSError:
+                return True
+            return False
+
+        assert wait_until(drip)
+
+
+@pytest.mark.parametrize(
+    ("headers", "expected"),
+    [
+        ({}, 200),
+        ({"Host": "localhost:{port}"}, 200),
+        ({"Host": "127.0.0.1:{port}"}, 200),
+        ({"Host": "[::1]:{port}"}, 200),
+        ({"Host": "LOCALHOST:{port}", "Origin": "http://LOCALHOST:{port}"}, 200),
+        ({"Host": "rebound.example:{port}"}, 403),
+        ({"Host": "localhost.rebound.example:{port}"}, 403),
+        ({"Host": "10.0.0.7:{port}"}, 403),
+        ({"Host": "["}, 403),
+        ({"Host": "localhost:{port}", "Origin": "http://rebound.example"}, 403),
+        ({"Host": "localhost:{port}", "Origin": "http://localhost:1"}, 403),
+        ({"Host": "localhost:{port}", "Origin": "null"}, 403),
+    ],
+)
+@pytest.mark.parametrize("method", ["GET", "POST"])
+def test_a_page_of_another_site_reads_and_sends_nothing(
+    server: TokenServer, method: str, headers: dict[str, str], expected: int
+):
+    port = server.server_address[1]
+    given = {name: value.format(port=port) for name, value in headers.items()}
+    assert status_of(server, method, **given) == expected
+
+
+def test_a_server_for_others_answers_to_every_name_with_the_token():
+    with PatientServer(("0.0.0.0", 0), Hello, token="secret") as server:
+        thread = threading.Thread(target=lambda: server.serve_forever(poll_interval=0.02))
+        thread.start()
+        with_token = {"Authorization": "Bearer secret"}
+        try:
+            assert status_of(server, Host="camera.vessel") == 401
+            assert status_of(server, Host="camera.vessel", **with_token) == 200
+            elsewhere = with_token | {"Origin": "http://rebound.example"}
+            assert status_of(server, Host="camera.vessel", **elsewhere) == 403
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [("localhost", True), ("127.8.0.1", True), ("::1", True), ("0.0.0.0", False), ("box", False)],
+)
+def test_loopback_is_what_only_this_machine_reaches(host: str, expected: bool):
+    assert is_loopback(host) == expected
