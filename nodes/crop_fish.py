@@ -18,10 +18,13 @@ class CropFish:
     def __init__(
         self, settings: CropFishSettings, *, camera: Camera | None, finder: FishFinder
     ) -> None:
-        """Raises ModelError where the model that `settings.segmenter` names cannot be used."""
+        """Raises ModelError where the model that `settings.segmenter` names cannot be used.
+
+        It is not opened, and torch is not imported, where the finder gives all masks.
+        """
         self._finder = finder
         self._numbering = TrackNumbering(keeps_source_ids=finder.knows_ids)
-        self._segmenter = open_segmenter(settings.segmenter)
+        self._segmenter = None if finder.gives_masks else open_segmenter(settings.segmenter)
         self._settings = settings
         self._camera = camera
 

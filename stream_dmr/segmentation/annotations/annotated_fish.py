@@ -51,6 +51,11 @@ class AnnotatedFish:
         self._boxed_ids: set[int] = set()
         self._masked_ids: set[int] = set()
 
+    @property
+    def gives_masks(self) -> bool:
+        """True with a masks folder: a fish that is in no mask gets an empty one."""
+        return self._masks is not None
+
     def detect(self, frame: Frame) -> list[Detection]:
         """The fish of one frame, ordered by id. Raises AnnotationError for an unusable mask."""
         if self._boxes is None:

@@ -17,7 +17,7 @@ def crop_fish(
     *,
     frame_camera: Camera,
     settings: CropFishSettings,
-    segmenter: Segmenter,
+    segmenter: Segmenter | None,
 ) -> FishCrop:
     """One fish, seen through a crop camera around its box and its mask; not numbered yet.
 
@@ -25,10 +25,12 @@ def crop_fish(
     in the mask, so only then `TrackNumbering` gives it a `track_id`.
     """
     view = FrameView(image=frame.image, camera=frame_camera, settings=settings)
-    if detection.mask is None:
+    if detection.mask is not None:
+        crop = crop_given_mask(view, detection.bbox_xyxy_px, detection.mask)
+    elif segmenter is not None:
         crop = crop_segmented(view, detection.bbox_xyxy_px, segmenter)
     else:
-        crop = crop_given_mask(view, detection.bbox_xyxy_px, detection.mask)
+        raise ValueError("expected a detection with a mask or a segmenter, got neither")
     return FishCrop(
         frame_index=frame.frame_index,
         timestamp_ns=frame.timestamp_ns,

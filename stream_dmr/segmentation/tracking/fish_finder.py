@@ -19,6 +19,11 @@ class FishFinder(Protocol):
     """Finds the fish of each frame: `detect` before the crops are cut, then `confirm`."""
 
     @property
+    def gives_masks(self) -> bool:
+        """True where every detection comes with a mask, so that no segmenter is needed."""
+        ...
+
+    @property
     def warnings(self) -> list[str]:
         """What the user should know of the frames so far, one line each; complete at the end."""
         ...

@@ -41,6 +41,11 @@ class TrackedFish:
         return [track for track, crop in crops.items() if self._confirmation.update(track, crop)]
 
     @property
+    def gives_masks(self) -> bool:
+        """False: the segmenter finds the masks."""
+        return False
+
+    @property
     def warnings(self) -> list[str]:
         """Always empty: a missed fish is not noticed."""
         return []
