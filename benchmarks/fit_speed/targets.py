@@ -34,7 +34,7 @@ from stream_dmr.simulation.simulated_body import (
     keypoints,
     straight_body,
 )
-from stream_dmr.template.template import Template, make_template
+from stream_dmr.template.template import Template, canonical_template
 
 _NUM_FRAMES = 60
 
@@ -65,7 +65,7 @@ def body_template(simulated: SimulatedBody) -> Template:
     mesh = straight_body(simulated, num_rings=36, num_sides=16)
     points = {"keypoints": keypoints(), "joints": keypoints(JOINT_ARCS)}
     body = trimesh.Trimesh(mesh.points, mesh.faces, process=False)
-    return make_template(body, points, name="simulated halibut")
+    return canonical_template(body, points, name="simulated halibut")
 
 
 def draw_pair(*, size: int, seed: int, preset: str = "realistic") -> FramePair:

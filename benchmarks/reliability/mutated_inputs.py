@@ -37,7 +37,7 @@ from stream_dmr.segmentation.annotations.annotated_fish import open_annotated_fi
 from stream_dmr.simulation import DEMO_SCENE
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
-from stream_dmr.template.template import load_template
+from stream_dmr.template.template_file import load_template
 
 _SLOW_S = 10.0
 

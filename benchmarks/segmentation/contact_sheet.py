@@ -24,7 +24,7 @@ from stream_dmr.running.config import load_config
 from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.running.pipeline import run_chain
 from stream_dmr.segmentation.tracking.fish_finder import open_finder
-from stream_dmr.template.template import load_template
+from stream_dmr.template.template_file import load_template
 
 _SHOWN, _PER_ROW = 30, 10
 _TILE_PX = 160

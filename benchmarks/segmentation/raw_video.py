@@ -37,7 +37,7 @@ from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map
 from stream_dmr.segmentation.tracking.fish_finder import open_finder
 from stream_dmr.simulation.presets import PRESETS
 from stream_dmr.simulation.write_scene import simulate
-from stream_dmr.template.template import load_template
+from stream_dmr.template.template_file import load_template
 
 
 class ChainResult(NamedTuple):

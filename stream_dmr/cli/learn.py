@@ -45,7 +45,7 @@ def learn_template(
         raise OutputError(f"--out {out}: expected a name that ends in .ply")
     opened = [open_recordings([path]) for path in recordings]
     header = opened[0].header
-    mesh, forms = load_shapes(template)
+    mesh, forms = load_shapes(template, on_notice=lambda line: warn([line]))
     forms = forms or mesh_form(mesh)
     settings = (
         parse_config(header.config_toml, where=f"{recordings[0]}: its config.toml")

@@ -1,5 +1,6 @@
 """Reads and checks everything that a run needs, before the first frame."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +27,7 @@ class Inputs:
     request: RunRequest
     config: Config
     template: Template
+    notices: Sequence[str]  # what was repaired or found when the template was read
     candidates: CandidateShapes | None  # None: the template's own shape
     calibration: Calibration | None
     finder: FishFinder
@@ -90,7 +92,8 @@ def checked_inputs(request: RunRequest) -> Inputs:
         config = lying(config)
     if request.stills:
         config = stills(config)
-    template, candidates = load_shapes(request.template)
+    notices: list[str] = []
+    template, candidates = load_shapes(request.template, on_notice=notices.append)
     calibration = None if request.calibration is None else load_calibration(request.calibration)
     finder = open_finder(
         boxes=request.boxes,
@@ -103,6 +106,7 @@ def checked_inputs(request: RunRequest) -> Inputs:
         request=request,
         config=config,
         template=template,
+        notices=notices,
         candidates=candidates,
         calibration=calibration,
         finder=finder,

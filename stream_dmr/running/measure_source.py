@@ -100,6 +100,8 @@ def _report_start(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> No
         observer.serving(f"stream-dmr view {outputs.recorder.live_address}")
     if observer.address is not None:
         observer.serving(observer.address)
+    for note in inputs.notices:
+        observer.warn(note)
     if inputs.calibration is None:
         observer.warn("without --calibration there are relative shapes, no millimetres")
     if inputs.source.is_live and inputs.config.recording.frames == "reference":

@@ -18,7 +18,8 @@ from stream_dmr.running.inputs import Inputs
 from stream_dmr.running.kept_crops import keep_crops
 from stream_dmr.running.run_folder import refuse_earlier
 from stream_dmr.running.run_observer import RunObserver
-from stream_dmr.template.template import Template, save_template
+from stream_dmr.template.template import Template
+from stream_dmr.template.template_file import save_template
 
 
 def with_learnt_shapes(

@@ -1,24 +1,16 @@
 """The species' template: a closed mesh with joints, keypoints and a midline, in canonical form."""
 
-import json
-import tomllib
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
-from stream_dmr.errors import OutputError, TemplateError
+from stream_dmr.errors import TemplateError
 from stream_dmr.geometry import arc_lengths
 
-BUNDLED = Path(__file__).parent / "bundled"
 NUM_MIDLINE_POINTS = 33
-TAILS = ("fork", "total")
-# A keypoint or joint may stick out of the mesh by this much, in body lengths.
-_LARGEST = 1e12  # coordinate, in any unit; their squares must stay finite
-_MAX_OUTSIDE = 0.02
+_MAX_OUTSIDE = 0.02  # chosen: how far a keypoint or joint may lie outside the mesh, in body lengths
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -35,69 +27,18 @@ class Template:
     keypoints: Float[np.ndarray, "3 3"]  # head, center, tail
     joints: Float[np.ndarray, "J 3"]  # from head to tail, J >= 2
     midline: Float[np.ndarray, "M 3"]  # through head, joints and tail, evenly spaced
-    tail_gives: str | None = None  # which length the tail keypoint ends: one of TAILS; None: unsaid
+    tail_gives: str | None = None  # "fork" or "total": the length that the tail keypoint ends
     total_per_fork: float | None = None  # total length over fork length
 
 
-def load_template(path: str | Path) -> Template:
-    """Read a template: a bundled one by name, or any mesh that trimesh reads with a TOML beside it.
-
-    The TOML has the mesh's name and holds `joints` (two or more points, in any order) and
-    `[keypoints] head, center, tail`, all in the mesh's own coordinates; it may say in `[length]`
-    which length the tail keypoint ends, `tail = "fork"` or `"total"`, and `total_per_fork`. Raises
-    TemplateError where the mesh or the TOML breaks that contract.
-    """
-    mesh_path = BUNDLED / f"{path}.ply" if str(path) in bundled_names() else Path(path)
-    if not mesh_path.is_file():
-        raise TemplateError(
-            f"template {path}: expected a mesh file or one of {', '.join(bundled_names())}; "
-            "found neither; check the path"
-        )
-    toml = mesh_path.with_suffix(".toml")
-    mesh, table = _load_mesh(mesh_path), _load_table(toml)
-    template = make_template(mesh, _points_of(table, toml), name=mesh_path.stem)
-    tail_gives, total_per_fork = _length_of(table, toml)
-    return replace(template, tail_gives=tail_gives, total_per_fork=total_per_fork)
-
-
-def save_template(template: Template, path: Path, *, comment: str) -> None:
-    """Write a template's mesh, and its TOML beside it, as `load_template` reads them.
-
-    Raises OutputError where they can't be written.
-    """
-    head, center, tail = template.keypoints.tolist()
-    lines = [
-        f"# {comment}",
-        f"name = {json.dumps(template.name)}",
-        f"joints = {template.joints.tolist()}",
-        "[keypoints]",
-        f"head = {head}",
-        f"center = {center}",
-        f"tail = {tail}",
-    ]
-    if template.tail_gives is not None:
-        lines += ["[length]", f'tail = "{template.tail_gives}"']
-        if template.total_per_fork is not None:
-            lines.append(f"total_per_fork = {template.total_per_fork}")
-    mesh = trimesh.Trimesh(template.rest_vertices, template.faces, process=False)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        mesh.export(path)
-        path.with_suffix(".toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(
-            f"{path}: can't be written: {error.strerror}; give another --out"
-        ) from error
-
-
 def simplified(template: Template, *, max_faces: int) -> Template:
-    """The same body with at most so many faces (Garland and Heckbert, SIGGRAPH 1997).
+    """The same body with at most `max_faces` faces (Garland and Heckbert, SIGGRAPH 1997).
 
-    The template itself where it has no more, or where fewer would leave its surface open.
+    The template itself where it has no more, or where the simplified surface would be open.
     """
     if len(template.faces) <= max_faces:
         return template
-    # Copied: the library refuses arrays that may not be written to, as those of a message.
+    # Copied: the library refuses read-only arrays, as those of a message.
     mesh = trimesh.Trimesh(template.rest_vertices.copy(), template.faces.copy(), process=False)
     fewer = mesh.simplify_quadric_decimation(face_count=max_faces)
     if not (fewer.is_watertight and fewer.is_winding_consistent):
@@ -109,17 +50,14 @@ def simplified(template: Template, *, max_faces: int) -> Template:
     )
 
 
-def bundled_names() -> list[str]:
-    """Names of the templates that come with the package."""
-    return sorted(file.stem for file in BUNDLED.glob("*.ply"))
-
-
-def make_template(
+def canonical_template(
     mesh: trimesh.Trimesh, points: dict[str, Float[np.ndarray, "N 3"]], *, name: str
 ) -> Template:
-    """Bring a closed mesh and its `keypoints` and `joints` to canonical form.
+    """The template of a closed mesh in any unit, place and orientation.
 
-    Raises TemplateError where a point lies off the mesh or head and tail coincide.
+    `points` holds `keypoints` (head, center, tail) and `joints` (J, 3; J >= 2, in any order) in the
+    mesh's coordinates. Raises TemplateError where a point lies off the mesh or head and tail
+    coincide.
     """
     keypoints, joints = points["keypoints"], points["joints"]
     head, _, tail = keypoints
@@ -143,93 +81,6 @@ def make_template(
         joints=to_canonical(joints),
         midline=_resample(to_canonical(spine), NUM_MIDLINE_POINTS),
     )
-
-
-def _load_mesh(path: Path) -> trimesh.Trimesh:
-    try:
-        mesh = trimesh.load_mesh(path, process=False)
-    except Exception as error:  # trimesh raises whatever its many readers raise
-        raise TemplateError(
-            f"template {path}: expected a mesh that trimesh reads, got: {error}"
-        ) from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise TemplateError(
-            f"template {path}: expected one mesh with faces, got an empty one; export the surface"
-        )
-    # Before merging, which would drop such vertices without a word.
-    if not (np.abs(mesh.vertices) < _LARGEST).all():
-        raise TemplateError(
-            f"template {path}: expected finite vertices, got NaN, infinity or above {_LARGEST:g}"
-        )
-    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
-        raise TemplateError(
-            f"template {path}: expected faces of its {len(mesh.vertices)} vertices, got others; "
-            "the file is damaged"
-        )
-    # Some formats repeat a vertex for each face, or along the seams of a texture.
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    if not (mesh.is_watertight and mesh.is_winding_consistent):
-        raise TemplateError(
-            f"template {path}: expected a closed mesh, got one with holes or flipped faces; "
-            "close it in a mesh editor"
-        )
-    if mesh.volume < 0:
-        mesh.invert()
-    return mesh
-
-
-def _load_table(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise TemplateError(
-            f"template: expected {path} beside the mesh, with joints and [keypoints]; it is missing"
-        )
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:  # ValueError: what TOML is not, or text
-        raise TemplateError(f"template {path}: expected TOML, got: {error}") from error
-
-
-def _length_of(table: dict[str, Any], path: Path) -> tuple[str | None, float | None]:
-    length = table.get("length", {})
-    if not isinstance(length, dict):
-        raise TemplateError(f"template {path}: expected a table [length], got {length}")
-    tail, factor = length.get("tail"), length.get("total_per_fork")
-    if tail is not None and tail not in TAILS:
-        raise TemplateError(f'template {path}: expected tail = "fork" or "total", got {tail!r}')
-    if factor is None:
-        return tail, None
-    if isinstance(factor, bool) or not isinstance(factor, int | float) or not 1 <= factor < 2:
-        raise TemplateError(
-            f"template {path}: expected total_per_fork from 1 to below 2, got {factor!r}"
-        )
-    return tail, float(factor)
-
-
-def _points_of(table: dict[str, Any], path: Path) -> dict[str, Float[np.ndarray, "N 3"]]:
-    keypoints = table.get("keypoints")
-    keypoints = keypoints if isinstance(keypoints, dict) else {}
-    missing = [key for key in ("head", "center", "tail") if key not in keypoints]
-    if missing:
-        raise TemplateError(f"template {path}: [keypoints] lacks {', '.join(missing)}; add it")
-    joints = _points(table.get("joints", []), path, "joints")
-    if len(joints) < 2:
-        raise TemplateError(
-            f"template {path}: expected two or more joints, got {len(joints)}; add bend points"
-        )
-    ends = [keypoints[key] for key in ("head", "center", "tail")]
-    return {"keypoints": _points(ends, path, "keypoints"), "joints": joints}
-
-
-def _points(values: Any, path: Path, name: str) -> Float[np.ndarray, "N 3"]:
-    try:
-        points = np.array(values, dtype=np.float64) if len(values) else np.empty((0, 3))
-    except (ValueError, TypeError, OverflowError):
-        points = np.empty((0, 0))
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise TemplateError(f"template {path}: expected {name} as [x, y, z], got {values}")
-    if not (np.abs(points) < _LARGEST).all():
-        raise TemplateError(f"template {path}: expected finite {name}, got {values}")
-    return points
 
 
 def _require_on_mesh(

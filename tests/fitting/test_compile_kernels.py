@@ -18,7 +18,7 @@ from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.replaying.replay import replay
 from stream_dmr.replaying.replay_request import ReplayRequest
 from stream_dmr.fitting.paper.skinning import Rig
-from stream_dmr.template.template import load_template
+from stream_dmr.template.template_file import load_template
 
 def compiled():
     loops = [one for one in gc.get_objects() if isinstance(one, Dispatcher)]

@@ -24,7 +24,7 @@ from stream_dmr.fitting.paper.skinning import DEFORMATIONS, Parameters, Rig
 from stream_dmr.fitting.parameters import LOG_SIZE, NUM_PER_JOINT, NUM_ROOT
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target, mask_contour
-from stream_dmr.template.template import load_template
+from stream_dmr.template.template_file import load_template
 from tests.support.shapes import (
     POINTS,
     anchor,

@@ -40,7 +40,7 @@ from stream_dmr.fitting.parameters import LOG_SIZE, NUM_PER_JOINT, NUM_ROOT, Pri
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
 from stream_dmr.geometry import arc_length
-from stream_dmr.template.template import load_template
+from stream_dmr.template.template_file import load_template
 from tests.support.shapes import (
     STRAIGHT,
     crop_camera,

@@ -13,7 +13,7 @@ from stream_dmr.fitting.target import Target
 from stream_dmr.geometry import arc_length
 from stream_dmr.messages import FishEnds, SolverReport
 from stream_dmr.nodes.fit_mesh import FitMesh
-from stream_dmr.template.template import load_template
+from stream_dmr.template.template_file import load_template
 from tests.support.shapes import (
     FRAME_CAMERA,
     STRAIGHT,

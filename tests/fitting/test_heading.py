@@ -14,7 +14,7 @@ from stream_dmr.fitting.paper.skinning import Rig
 from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.messages import FishEnds
 from stream_dmr.nodes.fit_mesh import FitMesh
-from stream_dmr.template.template import load_template
+from stream_dmr.template.template_file import load_template
 from tests.support.shapes import FRAME_CAMERA, STRAIGHT, crop_of, fish_template, pose
 
 TEMPLATE = fish_template(points=STRAIGHT)

@@ -18,7 +18,7 @@ from stream_dmr.fitting.size.density import mean_and_std
 from stream_dmr.fitting.size.scan import only_size, scan_sizes
 from stream_dmr.fitting.size.scanner import SizeScanner
 from stream_dmr.fitting.target import Target
-from stream_dmr.template.template import load_template
+from stream_dmr.template.template_file import load_template
 from tests.support.batches import PLANE_NORMAL, crops_of_poses, moved
 
 OFFSETS = np.linspace(-0.3, 0.3, 13)

@@ -20,7 +20,7 @@ from stream_dmr.fitting.paper.skinning import (
     spine,
 )
 from stream_dmr.geometry import arc_length
-from stream_dmr.template.template import load_template
+from stream_dmr.template.template_file import load_template
 from tests.support.shapes import STRAIGHT, fish_rig, fish_template, random_flat, seeds
 
 RIG = fish_rig()

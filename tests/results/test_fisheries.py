@@ -19,7 +19,7 @@ from stream_dmr.results.fisheries import Derived, FisheriesSettings, derive, who
 from stream_dmr.results.provenance import read_provenance
 from stream_dmr.results.verdicts import Review, Verdict, add_verdict, check, read_verdicts, reviews
 from stream_dmr.running.config import parse_config
-from stream_dmr.template.template import BUNDLED, load_template
+from stream_dmr.template.template_file import BUNDLED, load_template
 from tests.support.fish_run import measure
 
 HALIBUT = load_template("halibut")

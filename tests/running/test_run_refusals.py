@@ -100,7 +100,7 @@ def open_template(clip: Path) -> None:
 
 
 def template_without_points(clip: Path) -> None:
-    (clip / "tiny.toml").unlink()
+    (clip / "tiny.toml").write_text("joints = []")
 
 
 def unknown_config_key(clip: Path) -> None:

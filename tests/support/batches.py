@@ -5,7 +5,7 @@ import torch
 
 from stream_dmr.fitting.paper.skinning import Rig
 from stream_dmr.fitting.parameters import JOINT_ROTATION, NUM_PER_JOINT, NUM_ROOT
-from stream_dmr.template.template import load_template
+from stream_dmr.template.template_file import load_template
 from tests.support.shapes import POINTS, crop_of, fish_template, pose
 
 THREE_JOINTS = {

@@ -9,7 +9,7 @@ from stream_dmr.camera import Camera
 from stream_dmr.fitting.paper.silhouette import project, silhouette
 from stream_dmr.fitting.paper.skinning import Deformed, Rig, deform, rest_parameters, spine
 from stream_dmr.messages import CropQuality, FishCrop
-from stream_dmr.template.template import make_template
+from stream_dmr.template.template import canonical_template
 
 # Small tensors: threads cost more than they bring, tenfold where test runs share the cores.
 torch.set_num_threads(1)
@@ -38,7 +38,7 @@ def fish_mesh(*, subdivisions=1):
 
 
 def fish_template(*, subdivisions=1, points=POINTS):
-    return make_template(fish_mesh(subdivisions=subdivisions), points, name="fish")
+    return canonical_template(fish_mesh(subdivisions=subdivisions), points, name="fish")
 
 
 def fish_rig(*, subdivisions=1, points=POINTS, device="cpu"):

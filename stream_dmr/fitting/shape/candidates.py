@@ -1,6 +1,6 @@
 """The shapes that a fish may have before its mask is seen: body forms, or learnt stocks."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.fitting.shape.space import coefficients_of, form_precision
-from stream_dmr.template.template import Template, bundled_names, load_template
+from stream_dmr.template.template import Template
+from stream_dmr.template.template_file import bundled_names, load_template
 
 AUTO = "auto"
 # The mesh of rings that is given the other forms' shapes; any bundled one would do.
@@ -76,14 +77,17 @@ def body_forms(template: Template, *, named: str | None = None) -> CandidateShap
     )
 
 
-def load_shapes(name: str) -> tuple[Template, CandidateShapes | None]:
+def load_shapes(
+    name: str, *, on_notice: Callable[[str], None] = lambda notice: None
+) -> tuple[Template, CandidateShapes | None]:
     """What `--template` says: the mesh, and the shapes that fish may have.
 
     `auto`: any body form. The name of a body form: that one, unless the masks say otherwise. A
-    mesh: its own shape alone, since it is the user's word. Raises TemplateError.
+    mesh: its own shape alone, since it is the user's word; `on_notice` hears what was repaired and
+    found of it. Raises TemplateError.
     """
     if name != AUTO and name not in bundled_names():
-        return load_template(name), None
+        return load_template(name, on_notice=on_notice), None
     template = replace(load_template(_BASE_FORM), name=name)
     return template, body_forms(template, named=None if name == AUTO else name)
 

@@ -22,7 +22,7 @@ from stream_dmr.fitting.shape.space import (
     individual_covariance,
     reshaped,
 )
-from stream_dmr.template.template import bundled_names, load_template
+from stream_dmr.template.template_file import bundled_names, load_template
 from tests.support.shapes import fish_template
 
 HALIBUT, SALMON = load_template("halibut"), load_template("salmon")

@@ -1,0 +1,145 @@
+"""A template from masks of a straight fish: seen from the side and, if possible, from above."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float
+
+from stream_dmr.errors import TemplateError
+from stream_dmr.template.body_forms import CENTER, JOINTS, BodyForm, load_body_forms
+from stream_dmr.template.fish_outline import FishOutline, fish_outline
+from stream_dmr.template.ring_mesh import ring_angles, ring_mesh, ring_places
+from stream_dmr.template.template import Template, canonical_template
+
+_MIN_HALF_THICKNESS = 0.003  # of the fork length: that of the tail fin's edge in `body_forms.toml`
+_LOBE_TIP = 0.005  # chosen: parts of the trailing edge that lie so near to the farthest are its tip
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OutlineTemplate:
+    """A template that was made from masks, and how."""
+
+    template: Template
+    outline: FishOutline  # of the side view
+    thickness: float  # the largest thickness over the largest breadth
+    thickness_source: str  # where the thickness comes from, for people
+
+
+def template_from_masks(
+    side: Path, *, top: Path | None = None, thickness: float | None = None, name: str
+) -> OutlineTemplate:
+    """Make a template from a mask of a straight fish seen from the side, and one from above.
+
+    Pixels above 0 are fish. The two masks may have different scales: total lengths are equated.
+    Without `top`, the thickness along the body is that of the bundled body form whose outline is
+    nearest; `thickness` scales it to this largest thickness, as a share of the breadth.
+
+    Raises TemplateError where a mask can't be read or shows no whole straight fish, or `thickness`
+    is out of range.
+    """
+    if thickness is not None and not 0 < thickness <= 2:
+        raise TemplateError(
+            f"--thickness: expected thickness over breadth, above 0 to 2, got {thickness:g}"
+        )
+    outline = fish_outline(_read_mask(side), name=str(side))
+    if top is None:
+        form = nearest_form(outline)
+        half_thickness = form.half_thickness_at(outline.x.clip(0.0, 1.0))
+        half_thickness *= outline.breadth / form.breadth
+        source = f"the bundled body form nearest in outline, {form.name}"
+    else:
+        above = fish_outline(_read_mask(top), name=str(top))
+        share = outline.x / outline.total_per_fork * above.total_per_fork
+        half_thickness = np.interp(share, above.x, (above.upper + above.lower) / 2)
+        half_thickness *= outline.total_per_fork / above.total_per_fork
+        source = f"the view from above, {top.name}"
+    if thickness is not None:
+        half_thickness *= thickness * outline.breadth / (2 * half_thickness.max())
+        source = f"--thickness, along the body as in {source}"
+    half_thickness = np.maximum(half_thickness, _MIN_HALF_THICKNESS)
+    points = {"keypoints": _on_axis(0.0, CENTER, 1.0), "joints": _on_axis(*JOINTS)}
+    template = canonical_template(outline_mesh(outline, half_thickness), points, name=name)
+    return OutlineTemplate(
+        template=replace(template, tail_gives="fork", total_per_fork=outline.total_per_fork),
+        outline=outline,
+        thickness=float(2 * half_thickness.max() / outline.breadth),
+        thickness_source=source,
+    )
+
+
+def nearest_form(outline: FishOutline) -> BodyForm:
+    """The bundled body form with the least mean square difference in depth along the body."""
+    place = np.linspace(0.0, 1.0, 200)
+    half_depth = np.interp(place, outline.x, (outline.upper + outline.lower) / 2)
+
+    def difference(form: BodyForm) -> float:
+        return float(np.mean((form.half_depth_at(place) - half_depth) ** 2))
+
+    return min(load_body_forms().values(), key=difference)
+
+
+def outline_mesh(outline: FishOutline, half_thickness: Float[np.ndarray, "N"]) -> trimesh.Trimesh:
+    """A closed mesh in fork lengths of elliptic sections, `half_thickness` at `outline.x`.
+
+    x runs from snout to tail, y from the lower to the upper edge, z through the thickness. Rings of
+    the tail fin are bent backwards, the more the nearer they are to its trailing edge, so that the
+    last one runs along that edge from lobe to lobe.
+    """
+    across, through = np.cos(ring_angles()), np.sin(ring_angles())
+    trailing_edge = _trailing_edge(outline, across)
+    rings = []
+    for place in ring_places():
+        x = np.full_like(across, place)
+        if place > outline.peduncle:
+            share = (place - outline.peduncle) / (1 - outline.peduncle)
+            x = outline.peduncle + share * (trailing_edge - outline.peduncle)
+        upper = np.interp(x[0], outline.x, outline.upper)
+        lower = np.interp(x[len(x) // 2], outline.x, outline.lower)
+        y = across * np.where(across > 0, upper, lower)
+        z = through * np.interp(place, outline.x, half_thickness)
+        rings.append(np.stack([x, y, z], axis=-1))
+    return ring_mesh(np.stack(rings))
+
+
+def _trailing_edge(outline: FishOutline, across: Float[np.ndarray, "S"]) -> Float[np.ndarray, "S"]:
+    """The tail fin's trailing edge (x) for `across` from -1, the lower lobe's tip, to 1."""
+    if len(outline.edge_x) == 0:
+        return np.ones_like(across)
+    lower, upper = (_lobe_height(outline, sign) for sign in (-1.0, 1.0))
+    heights = across * np.where(across > 0, upper, -lower)
+    return np.interp(heights, outline.edge_y, outline.edge_x)
+
+
+def _lobe_height(outline: FishOutline, sign: float) -> float:
+    """Height (y) of the tip of the upper (1) or lower (-1) lobe; 0 without one on that side."""
+    half = sign * outline.edge_y >= 0
+    x, y = outline.edge_x[half], outline.edge_y[half]
+    if len(x) == 0:
+        return 0.0
+    tips = y[x >= x.max() - _LOBE_TIP]
+    return float(sign * (sign * tips).max())
+
+
+def _on_axis(*places: float) -> Float[np.ndarray, "N 3"]:
+    return np.array([[place, 0.0, 0.0] for place in places])
+
+
+def _read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
+    """Pixels above 0, in any channel. Raises TemplateError."""
+    try:
+        content = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise TemplateError(
+            f"{path}: expected a mask, but it can't be read: {error.strerror}"
+        ) from error
+    image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if len(content) else None
+    if image is None:
+        raise TemplateError(
+            f"{path}: expected a picture of a mask, such as a PNG, got another file"
+        )
+    return (
+        np.asarray(image > 0) if image.ndim == 2 else np.asarray((image[..., :3] > 0).any(axis=2))
+    )
