@@ -12,7 +12,7 @@ from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_folder import LEARNT
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.running.run_request import RunRequest
-from stream_dmr.template.template import load_template
+from stream_dmr.template.template_file import load_template
 from tests.support.command import rows
 from tests.support.fish_run import request
 from tests.support.reading import read_header

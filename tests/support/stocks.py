@@ -12,7 +12,8 @@ from stream_dmr.fitting.shape.space import (
     form_precision,
     reshaped,
 )
-from stream_dmr.template.template import load_template, simplified
+from stream_dmr.template.template import simplified
+from stream_dmr.template.template_file import load_template
 from tests.support.shapes import crop_of, pose
 
 TEMPLATE = simplified(load_template("salmon"), max_faces=600)
