@@ -1,3 +1,5 @@
+"""A training: its files, resuming, fine-tuning, and what is refused."""
+
 import json
 import threading
 
@@ -41,7 +43,7 @@ def history(out):
     return json.loads((out / "scores.json").read_text())["history"]
 
 
-def test_a_training_leaves_weights_scores_and_pictures(trained):
+def test_a_training_writes_weights_scores_and_pictures(trained):
     out, best = trained
     report = json.loads((out / "scores.json").read_text())
     assert [epoch["epoch"] for epoch in report["history"]] == [1, 2]
@@ -61,7 +63,7 @@ class StopAfterFirst(TrainObserver):
         self.stop.set()
 
 
-def test_a_resumed_training_is_the_one_that_was_not_stopped(trained, tmp_path):
+def test_a_resumed_training_equals_an_uninterrupted_one(trained, tmp_path):
     whole, best = trained
     observer = StopAfterFirst()
     train_unet(request(tmp_path), stop=observer.stop, observer=observer)
@@ -96,7 +98,7 @@ def test_fine_tuning_never_ends_with_worse_weights_than_it_began_with(tmp_path):
     assert (tmp_path / "worst.png").exists()
 
 
-def test_what_cannot_be_is_refused_before_anything_is_learnt(trained, tmp_path):
+def test_impossible_requests_are_refused_before_training(trained, tmp_path):
     out, _ = trained
     with pytest.raises(OutputError, match=r"last\.pt of an earlier one"):
         train_unet(request(out), stop=never())
@@ -126,7 +128,7 @@ def test_the_command_says_what_is_wrong(tmp_path, monkeypatch, arguments):
     assert "expected" in str(result.exception)
 
 
-def test_images_without_masks_are_a_mistake():
+def test_images_without_masks_are_refused():
     result = CliRunner().invoke(app, ["train", "--images", "x"])
     assert result.exit_code == 2
     assert "belong together" in result.output

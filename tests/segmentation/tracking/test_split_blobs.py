@@ -1,4 +1,4 @@
-"""Shapes that several fish share are cut where the fish should be; single fish stay whole."""
+"""Blobs that several fish share are split where the fish are predicted; single fish stay whole."""
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ def candidate_of(mask):
     return Candidate(bbox_xyxy_px=box, score=0.8, foreground=mask[y : y + h, x : x + w])
 
 
-def expected_of(mask, *, off=(0.0, 0.0)):
+def predicted(mask, *, off=(0.0, 0.0)):
     one = candidate_of(mask)
     return PredictedSilhouette(
         shape=one.foreground,
@@ -56,7 +56,7 @@ def test_two_known_fish_get_their_own_pieces(across, along, one_off, other_off):
     one, other = fish(200, 120), fish(200 + across, 120 + along)
     pieces = split_merged_blob(
         candidate_of(one | other),
-        [expected_of(one, off=one_off), expected_of(other, off=other_off)],
+        [predicted(one, off=one_off), predicted(other, off=other_off)],
     )
     assert len(pieces) == 2
     for piece, true, others in zip(
@@ -69,9 +69,9 @@ def test_two_known_fish_get_their_own_pieces(across, along, one_off, other_off):
 
 @given(st.integers(-40, 40), offsets)
 @settings(max_examples=25, deadline=None)
-def test_a_fish_that_nobody_knew_is_what_is_left_over(across, off):
+def test_an_unknown_fish_is_the_remainder(across, off):
     known, new = fish(250, 120), fish(250 + across, 250)
-    pieces = split_merged_blob(candidate_of(known | new), [expected_of(known, off=off)])
+    pieces = split_merged_blob(candidate_of(known | new), [predicted(known, off=off)])
     assert len(pieces) == 2
     assert share(new & ~known, in_frame(pieces[1])) > 0.65
     assert share(known & ~new, in_frame(pieces[1])) < 0.2
@@ -79,24 +79,24 @@ def test_a_fish_that_nobody_knew_is_what_is_left_over(across, off):
 
 @pytest.mark.parametrize("width", [20, 50, 80])
 @pytest.mark.parametrize("off", [(0, 0), (15, 25), (-10, -40)])
-def test_a_fish_that_turns_or_was_expected_elsewhere_stays_whole(width, off):
+def test_a_fish_that_turns_or_was_predicted_elsewhere_stays_whole(width, off):
     before, now = fish(250, 200, width=20), fish(250, 200, width=width)
-    assert len(split_merged_blob(candidate_of(now), [expected_of(before, off=off)])) == 1
+    assert len(split_merged_blob(candidate_of(now), [predicted(before, off=off)])) == 1
 
 
 def test_a_line_at_a_fish_is_no_second_fish():
     before = fish(250, 250)
     now = before.copy()
     now[20:200, 246:252] = True
-    assert len(split_merged_blob(candidate_of(now), [expected_of(before)])) == 1
+    assert len(split_merged_blob(candidate_of(now), [predicted(before)])) == 1
 
 
-def test_boxes_alone_are_not_cut():
+def test_boxes_alone_are_not_split():
     whole = candidate_of(fish(200, 120) | fish(210, 240))
     box = Candidate(bbox_xyxy_px=whole.bbox_xyxy_px, score=1.0)
-    assert split_merged_blob(box, [expected_of(fish(200, 120))]) == [box]
+    assert split_merged_blob(box, [predicted(fish(200, 120))]) == [box]
 
 
 def test_a_fish_that_has_gone_gets_no_piece_of_another():
     gone, here = fish(250, 110), fish(250, 250)
-    assert len(split_merged_blob(candidate_of(here), [expected_of(gone), expected_of(here)])) == 1
+    assert len(split_merged_blob(candidate_of(here), [predicted(gone), predicted(here)])) == 1

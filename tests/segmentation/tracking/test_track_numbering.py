@@ -1,4 +1,4 @@
-"""Track ids: the ids of annotations or numbers as fish come, on after earlier runs, none twice."""
+"""Track ids are given once, in order."""
 
 from hypothesis import given
 from hypothesis import strategies as st

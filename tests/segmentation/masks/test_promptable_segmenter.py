@@ -1,3 +1,5 @@
+"""A user's promptable model finds masks to the pixel, or is refused at once."""
+
 import cv2
 import numpy as np
 import onnx
@@ -5,10 +7,6 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from stream_dmr.errors import ModelError
-from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.segmentation.annotations.annotated_fish import AnnotatedFish
-from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
-from stream_dmr.segmentation.masks.grabcut_segmenter import GrabCutSegmenter
 from stream_dmr.segmentation.masks.open_segmenter import open_segmenter
 from stream_dmr.segmentation.masks.promptable_segmenter import PromptableSegmenter
 
@@ -48,12 +46,13 @@ def model(path, *, prompts, side=SIDE, bias=-5.0, extra=(), weight=10.0):
 
 
 BOX = {"box": [1, 4]}
+
 SAM = {"point_coords": [1, 1, 2, 2], "point_labels": [1, 1, 2]}
 
 
 @pytest.mark.parametrize("prompts", [BOX, SAM, {"boxes": [1, 1, 4]}], ids=["box", "sam", "boxes"])
 @pytest.mark.parametrize("size", [64, 128, 192])
-def test_a_bright_fish_lies_where_it_is_in_the_crop(tmp_path, prompts, size):
+def test_a_mask_lies_where_the_fish_is_in_the_crop(tmp_path, prompts, size):
     segmenter = open_segmenter(str(model(tmp_path / "bright.onnx", prompts=prompts)))
     image = np.zeros((size, size, 3), np.uint8)
     center = ((size - 1) / 2 + 0.1 * size, 0.45 * size)
@@ -79,20 +78,8 @@ def test_a_bright_fish_lies_where_it_is_in_the_crop(tmp_path, prompts, size):
         ({"prompts": BOX, "bias": float("nan")}, "NaN"),
     ],
 )
-def test_models_that_are_no_such_model_are_refused_at_once(tmp_path, changes, complaint):
+def test_models_of_another_kind_are_refused(tmp_path, changes, complaint):
     path = model(tmp_path / "bad.onnx", **changes)
     with pytest.raises(ModelError, match=complaint) as caught:
         PromptableSegmenter(path)
     assert "\n" not in str(caught.value)
-
-
-def test_names_and_files_that_are_no_segmenter_are_refused_at_once(tmp_path):
-    (tmp_path / "text.onnx").write_text("no model")
-    for name in ("sam", "unet.onx", str(tmp_path / "text.onnx"), str(tmp_path / "none.onnx")):
-        settings = CropFishSettings(segmenter=name)
-        with pytest.raises(ModelError, match="expected"):
-            CropFish(settings, camera=None, finder=AnnotatedFish(boxes={}, masks=None))
-
-
-def test_grabcut_needs_no_file():
-    assert isinstance(open_segmenter("grabcut"), GrabCutSegmenter)

@@ -1,0 +1,66 @@
+"""Label pictures give ids however they are stored; others are refused."""
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from stream_dmr.errors import AnnotationError
+from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
+from tests.support.annotation_files import LABELS_SIZE, labels_of
+
+
+def write_palette(path, labels):
+    picture = Image.fromarray(labels, mode=None).convert("L")
+    palette = Image.frombytes("P", picture.size, picture.tobytes())
+    palette.putpalette([value for i in range(256) for value in (255 - i, 7 * i % 256, 3 * i % 256)])
+    palette.save(path)
+
+
+@pytest.mark.parametrize("kind", ["grey", "palette", "16-bit"])
+def test_masks_give_ids_in_every_storage_format(tmp_path, kind):
+    labels = labels_of(id1=(0, 0, 2, 2), id3=(4, 1, 7, 5))
+    path = tmp_path / "000001.png"
+    if kind == "palette":
+        write_palette(path, labels)
+    else:
+        labels = labels.astype(np.uint16) * 100 if kind == "16-bit" else labels
+        cv2.imwrite(str(path), labels)
+    np.testing.assert_array_equal(MaskFolder(tmp_path).labels(1, **LABELS_SIZE), labels)
+
+
+def test_a_1_bit_mask_is_fish_1(tmp_path):
+    labels = labels_of(id1=(1, 1, 5, 4))
+    Image.fromarray(labels == 1).save(tmp_path / "000001.png")
+    np.testing.assert_array_equal(MaskFolder(tmp_path).labels(1, **LABELS_SIZE), labels)
+
+
+def test_unusable_masks_are_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "000001.png"), np.zeros((12, 16), np.uint8))
+    cv2.imwrite(str(tmp_path / "000002.png"), np.zeros((6, 8, 3), np.uint8))
+    whole = (tmp_path / "000001.png").read_bytes()
+    (tmp_path / "000003.png").write_bytes(b"no picture")
+    (tmp_path / "000004.png").write_bytes(whole[:-30])
+    (tmp_path / "000005.png").touch()
+    masks = MaskFolder(tmp_path)
+    with pytest.raises(AnnotationError, match=r"000001.*8x6 px, got 16x12 px"):
+        masks.labels(1, **LABELS_SIZE)
+    with pytest.raises(AnnotationError, match=r"000002.*colour \(RGB\)"):
+        masks.labels(2, **LABELS_SIZE)
+    for frame in (3, 4, 5):
+        with pytest.raises(AnnotationError, match=f"00000{frame}.*decoded"):
+            masks.labels(frame, width=16, height=12)
+    assert masks.labels(6, **LABELS_SIZE) is None
+
+
+def test_folders_without_masks_are_refused(tmp_path):
+    with pytest.raises(AnnotationError, match="found none there"):
+        MaskFolder(tmp_path / "missing")
+    with pytest.raises(AnnotationError, match="found no PNG"):
+        MaskFolder(tmp_path)
+    (tmp_path / "00001.png").touch()
+    with pytest.raises(AnnotationError, match=r"found 00001\.png"):
+        MaskFolder(tmp_path)
+    (tmp_path / "000000.png").touch()
+    with pytest.raises(AnnotationError, match=r"counted from 000001\.png"):
+        MaskFolder(tmp_path)

@@ -1,0 +1,47 @@
+"""Blobs of fish are kept; poles, lines and specks go."""
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from stream_dmr.segmentation.detection.blobs import fish_blobs
+
+
+def drawn(draw: Callable[[np.ndarray], object]) -> list[np.ndarray]:
+    picture = np.zeros((360, 480), np.uint8)
+    draw(picture)
+    return fish_blobs(picture > 0, min_length_px=15.0, max_length_px=340.0)
+
+
+def test_lines_poles_and_specks_are_no_fish():
+    assert not drawn(lambda p: cv2.line(p, (200, 0), (220, 180), 1, 2))
+    assert not drawn(lambda p: cv2.line(p, (479, 10), (250, 170), 1, 6))
+    assert not drawn(lambda p: cv2.circle(p, (100, 100), 4, 1, -1))
+    assert not drawn(lambda p: cv2.rectangle(p, (20, 0), (460, 355), 1, -1))
+
+
+def test_a_connected_gaff_is_removed_from_a_fish():
+    def draw(picture: np.ndarray) -> None:
+        cv2.ellipse(picture, (200, 200), (40, 14), 70, 0, 360, 1, -1)
+        cv2.line(picture, (479, 60), (205, 205), 1, 5)
+
+    [fish] = drawn(draw)
+    x, y, w, h = cv2.boundingRect(fish.view(np.uint8))
+    assert 160 < x < 190
+    assert x + w < 260
+    assert 150 < y < 165
+    assert 235 < y + h < 245
+
+
+def test_a_bent_fish_seen_edge_on_is_kept_whole():
+    for width in (6, 8, 10, 12):
+        [fish] = drawn(lambda p, w=width: cv2.ellipse(p, (200, 200), (60, 40), 0, 0, 110, 1, w))
+        _, _, w, h = cv2.boundingRect(fish.view(np.uint8))
+        assert w > 75
+        assert h > 38
+
+
+def test_a_fish_seen_edge_on_is_kept():
+    [fish] = drawn(lambda p: cv2.ellipse(p, (200, 200), (35, 3), 70, 0, 360, 1, -1))
+    assert fish.sum() > 200

@@ -1,0 +1,87 @@
+"""Boxes and pixels between frame and crop."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stream_dmr.camera import Camera, frame_from_crop
+from stream_dmr.segmentation.masks.crop_geometry import (
+    box_in_crop,
+    box_iou,
+    frame_from_crop_map,
+    mask_bbox,
+    mask_bbox_in_frame,
+    visible_bbox,
+)
+from tests.support.frames import lens_cameras
+from tests.support.given_masks import crop_of
+
+
+@given(lens_cameras, st.floats(0, 639), st.floats(0, 479), st.floats(20, 500), st.integers(1, 3))
+@settings(max_examples=30, deadline=None)
+def test_the_fast_map_is_the_exact_one(camera, x, y, side, samples):
+    crop = camera.crop(center_px=np.array([x, y]), side_px=side, size=32)
+    map_x, map_y = frame_from_crop_map(crop, frame_camera=camera, samples=samples)
+    places = (np.arange(32 * samples) + 0.5) / samples - 0.5
+    grid = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
+    exact = frame_from_crop(grid, crop_camera=crop, frame_camera=camera)
+    fast = np.column_stack([map_x.ravel(), map_y.ravel()])
+    np.testing.assert_allclose(fast, exact, atol=0.01)
+
+
+@given(
+    lens_cameras,
+    st.floats(100, 440),
+    st.floats(100, 300),
+    st.floats(20, 120),
+    st.floats(20, 120),
+)
+@settings(max_examples=30)
+def test_a_box_goes_to_the_crop_and_a_mask_in_it_comes_back(
+    camera: Camera, x: float, y: float, w: float, h: float
+):
+    box = np.round([x, y, x + w, y + h])
+    mask = np.zeros((480, 640), bool)
+    x0, y0, x1, y1 = box.astype(int)
+    mask[y0:y1, x0:x1] = True
+    crop = crop_of(mask, camera, crop_size_px=256)
+    inside = box_in_crop(box, crop_camera=crop.crop_camera, frame_camera=camera)
+    assert ((inside > 0) & (inside < 256)).all()
+    back = mask_bbox_in_frame(crop)
+    assert back is not None
+    pixel = crop.frame_camera.K[0, 0] / crop.crop_camera.K[0, 0]  # of the crop, in the frame
+    np.testing.assert_allclose(back, box, atol=1 + 2 * pixel)
+
+
+def test_an_empty_mask_has_no_box():
+    assert mask_bbox(np.zeros((4, 5), bool)) is None
+
+
+@given(st.integers(0, 30), st.integers(0, 30), st.integers(1, 9), st.integers(1, 9))
+def test_the_box_of_a_mask_is_tight_and_half_open(x: int, y: int, w: int, h: int):
+    mask = np.zeros((40, 40), bool)
+    mask[y : y + h, x : x + w] = True
+    box = mask_bbox(mask)
+    assert box is not None
+    assert box.tolist() == [x, y, min(x + w, 40), min(y + h, 40)]
+
+
+def test_a_visible_box_is_clipped_and_encloses_the_mask():
+    mask = np.zeros((30, 40), bool)
+    mask[2:5, 20:38] = True
+    box = np.array([-10.0, 10, 15, 50])
+    assert visible_bbox(box, None, width=40, height=30).tolist() == [0, 10, 15, 30]
+    assert visible_bbox(box, mask, width=40, height=30).tolist() == [0, 2, 38, 30]
+
+
+boxes = st.tuples(*[st.floats(0, 50)] * 2, *[st.floats(1, 50)] * 2).map(
+    lambda b: np.array([b[0], b[1], b[0] + b[2], b[1] + b[3]])
+)
+
+
+@given(boxes, boxes)
+def test_iou_is_symmetric_from_0_to_1_and_1_for_the_same_box(one: np.ndarray, other: np.ndarray):
+    assert 0 <= box_iou(one, other) <= 1
+    assert box_iou(one, other) == pytest.approx(box_iou(other, one))
+    assert box_iou(one, one) == pytest.approx(1)

@@ -1,0 +1,117 @@
+"""Masks found by a segmenter: in the whole fish, in frame pixels, with a confidence."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stream_dmr.camera import Camera
+from stream_dmr.segmentation.detection.fish_detection import Detection
+from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
+from stream_dmr.segmentation.masks.cropping import crop_fish
+from stream_dmr.segmentation.segmenter import SegmentedFish
+from tests.support.frames import frame_of, grey_frame, lens_cameras
+from tests.support.given_masks import crop_of
+
+SETTINGS = CropFishSettings()
+
+
+class Painter:
+    """A segmenter that takes every white pixel for fish, and half believes the grey ones."""
+
+    def segment(self, image, bbox_xyxy_px):
+        self.bbox_xyxy_px = bbox_xyxy_px
+        return SegmentedFish(probability=image[..., 0].astype(np.float32) / 255, ends=None)
+
+
+def segmented(picture, box, camera, **knobs):
+    detection = Detection(
+        source_id=1, bbox_xyxy_px=np.array(box, np.float64), mask=None, visible_fraction=1.0
+    )
+    painter = Painter()
+    crop = crop_fish(
+        frame_of(np.repeat(picture[..., None], 3, axis=2)),
+        detection,
+        frame_camera=camera,
+        settings=CropFishSettings(**knobs),
+        segmenter=painter,
+    )
+    return crop, painter.bbox_xyxy_px
+
+
+@given(lens_cameras, st.floats(30, 400), st.floats(30, 300), st.floats(40, 200), st.floats(40, 200))
+@settings(max_examples=30, deadline=None)
+def test_a_mask_found_in_the_crop_is_the_one_given_in_the_frame(camera, x, y, w, h):
+    x0, y0, x1, y1 = np.round([x, y, x + w, y + h]).astype(int)
+    mask = np.zeros((480, 640), bool)
+    mask[y0:y1, x0:x1] = True
+    box = [x0, y0, min(x1, 640), min(y1, 480)]
+    given_mask = crop_of(mask, camera, box=box)
+    found, in_crop = segmented(mask.astype(np.uint8) * 255, box, camera)
+    assert (found.mask != given_mask.mask).mean() < 0.002
+    # Pixels count whole: the outline is right to half a crop pixel.
+    outline_px = 2 * (w + h) * np.sqrt(found.quality.mask_area_px / found.mask.sum())
+    assert found.quality.mask_area_px == pytest.approx(mask.sum(), abs=0.6 * outline_px)
+    assert found.quality.touches_border == given_mask.quality.touches_border
+    rows, columns = np.nonzero(found.mask)
+    extent = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+    if not camera.distortion.any():
+        np.testing.assert_allclose(in_crop, extent, atol=1.5)
+    # Through a lens the box's edges are arcs; their middles lie inside the box_from_xywh.
+    assert np.all(
+        (in_crop[:2] > np.array(extent[:2]) - 1.5) & (in_crop[2:] < np.array(extent[2:]) + 1.5)
+    )
+
+
+@given(st.floats(0.7, 1.0), st.sampled_from([0, 1]), st.booleans())
+@settings(max_examples=30, deadline=None)
+def test_a_fish_that_extends_beyond_its_box_is_found_whole(share, axis, from_its_end):
+    strip = np.array([[180, 240], [60, 360]])
+    x, y = strip if axis else strip[::-1]
+    picture = np.zeros((420, 420), np.uint8)
+    picture[slice(*y), slice(*x)] = 255
+    box = np.array([x[0], y[0], x[1], y[1]], np.float64)
+    box[axis + 2 * (not from_its_end)] = 360 - share * 300 if from_its_end else 60 + share * 300
+    camera = Camera.nominal(width=420, height=420)
+    crop, _ = segmented(picture, box, camera)
+    assert not crop.quality.touches_border
+    assert crop.quality.mask_area_px == pytest.approx(60 * 300, rel=0.08)
+
+
+def test_a_fish_that_no_crop_shows_whole_touches_the_border():
+    picture = np.zeros((420, 420), np.uint8)
+    picture[20:400, 200:220] = 255
+    crop, _ = segmented(picture, [200, 190, 220, 230], Camera.nominal(width=420, height=420))
+    assert crop.quality.touches_border
+
+
+def test_an_uncertain_mask_has_a_lower_confidence():
+    camera = Camera.nominal(width=200, height=200)
+    picture = np.zeros((200, 200), np.uint8)
+    picture[80:120, 60:140] = 255
+    sure, _ = segmented(picture, [60, 80, 140, 120], camera)
+    picture[90:110, 60:140] = 160
+    doubtful, _ = segmented(picture, [60, 80, 140, 120], camera)
+    assert sure.quality.mask_confidence > 0.97
+    assert doubtful.quality.mask_confidence == pytest.approx(0.5 + 0.5 * 160 / 255, abs=0.03)
+    nothing, _ = segmented(np.zeros_like(picture), [60, 80, 140, 120], camera)
+    assert (nothing.quality.mask_confidence, nothing.quality.mask_area_px) == (0.0, 0.0)
+    assert crop_of(picture > 0, camera).quality.mask_confidence is None
+
+
+def test_a_mask_found_beyond_the_frame_does_not_count():
+    camera = Camera.nominal(width=100, height=80)
+
+    class Everywhere:
+        def segment(self, image, bbox_xyxy_px):
+            return SegmentedFish(probability=np.ones(image.shape[:2], np.float32), ends=None)
+
+    detection = Detection(
+        source_id=1, bbox_xyxy_px=np.array([0.0, 0, 50, 60]), mask=None, visible_fraction=1.0
+    )
+    frame = grey_frame(camera, 255)
+    crop = crop_fish(
+        frame, detection, frame_camera=camera, settings=SETTINGS, segmenter=Everywhere()
+    )
+    np.testing.assert_array_equal(crop.mask, crop.image[..., 0] > 127)
+    assert crop.quality.touches_border

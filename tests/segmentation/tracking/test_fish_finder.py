@@ -1,0 +1,32 @@
+"""Files are used where they are given; fish without ids are tracked."""
+
+from pathlib import Path
+
+import numpy as np
+
+from stream_dmr.messages import Frame
+from stream_dmr.segmentation.annotations.annotated_fish import AnnotatedFish
+from stream_dmr.segmentation.detection.open_detector import DetectFishSettings
+from stream_dmr.segmentation.tracking.fish_finder import open_finder
+from stream_dmr.segmentation.tracking.tracked_fish import TrackedFish, TrackFishSettings
+
+
+def finder(boxes: Path | None, masks: Path | None = None):
+    settings = {"detect": DetectFishSettings(), "track": TrackFishSettings(min_track_frames=2)}
+    return open_finder(boxes=boxes, masks=masks, **settings)
+
+
+def test_boxes_with_ids_are_kept_and_others_are_tracked(tmp_path):
+    named, unnamed = tmp_path / "named.txt", tmp_path / "unnamed.txt"
+    named.write_text("".join(f"{f},7,{10 * f},20,50,30,1\n" for f in range(1, 9)))
+    unnamed.write_text("".join(f"{f},-1,{10 * f},20,50,30,0.8,-1,-1,-1\n" for f in range(1, 9)))
+    assert isinstance(finder(named), AnnotatedFish)
+    assert isinstance(finder(None), TrackedFish)
+    followed = finder(unnamed)
+    assert isinstance(followed, TrackedFish)
+    image = np.zeros((100, 200, 3), np.uint8)
+    for f in range(1, 9):
+        found = followed.detect(Frame(frame_index=f, timestamp_ns=f, image=image, source=""))
+        expected = [(1, [10 * f, 20, 10 * f + 50, 50])]
+        assert [(d.source_id, list(d.bbox_xyxy_px)) for d in found] == expected
+        assert all(d.mask is None for d in found)

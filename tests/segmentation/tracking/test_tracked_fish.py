@@ -1,0 +1,133 @@
+"""Tracks become fish once their masks confirm them, and boxes follow the masks."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from stream_dmr.camera import Camera
+from stream_dmr.messages import Frame
+from stream_dmr.segmentation.detection.detector import Candidate
+from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
+from stream_dmr.segmentation.masks.cropping import crop_fish
+from stream_dmr.segmentation.segmenter import SegmentedFish, Segmenter
+from stream_dmr.segmentation.tracking.track_numbering import TrackNumbering
+from stream_dmr.segmentation.tracking.tracked_fish import TrackedFish, TrackFishSettings
+from tests.support.spots import HEIGHT, WIDTH, Spot, climbing, spots_candidates, spots_frame
+
+
+class Found(NamedTuple):
+    """A fish in one frame."""
+
+    track_id: int
+    bbox_xyxy_px: np.ndarray
+
+
+class ScriptedDetector:
+    """Finds the given spots, frame by frame."""
+
+    def __init__(self, frames: Sequence[Sequence[Spot]]) -> None:
+        self._frames = frames
+
+    def find(self, frame: Frame) -> list[Candidate]:
+        return spots_candidates(self._frames[frame.frame_index - 1])
+
+
+class WholeBox:
+    """A segmenter that takes every box for fish, with this probability."""
+
+    def __init__(self, confidence: float) -> None:
+        self._confidence = confidence
+
+    def segment(self, image: np.ndarray, bbox_xyxy_px: np.ndarray) -> SegmentedFish:
+        probability = np.zeros(image.shape[:2], np.float32)
+        x0, y0, x1, y1 = bbox_xyxy_px.round().astype(int)
+        probability[max(y0, 0) : y1, max(x0, 0) : x1] = self._confidence
+        return SegmentedFish(probability=probability, ends=None)
+
+
+def follow(
+    frames: Sequence[Sequence[Spot]],
+    *,
+    confidence: float = 1.0,
+    segmenter: Segmenter | None = None,
+    **settings: object,
+) -> dict[int, list[Found]]:
+    """The fish of each frame."""
+    track_settings = TrackFishSettings.model_validate({"min_track_frames": 1, **settings})
+    fish = TrackedFish(ScriptedDetector(frames), track_settings)
+    numbering = TrackNumbering(keeps_source_ids=fish.knows_ids)
+    camera = Camera.nominal(width=WIDTH, height=HEIGHT)
+    found = {}
+    for i, spots in enumerate(frames, start=1):
+        frame = spots_frame(spots, i)
+        crops = {
+            detection.source_id: crop_fish(
+                frame,
+                detection,
+                frame_camera=camera,
+                settings=CropFishSettings(crop_size_px=32),
+                segmenter=segmenter or WholeBox(confidence),
+            )
+            for detection in fish.detect(frame)
+        }
+        found[i] = [
+            Found(numbering.track_id(number), crops[number].bbox_xyxy_px)
+            for number in fish.confirm(crops)
+        ]
+    return found
+
+
+def ids(found: dict[int, list[Found]]) -> list[list[int]]:
+    return [[one.track_id for one in found[i]] for i in sorted(found)]
+
+
+def test_a_track_counts_once_it_is_long_enough():
+    frames = [[climbing(i)] for i in range(10)]
+    assert ids(follow(frames, min_track_frames=4)) == [[]] * 3 + [[1]] * 7
+    flashes = [[climbing(i)] if i < 3 else [] for i in range(12)]
+    assert not any(ids(follow(flashes * 3, min_track_frames=4)))
+
+
+def test_what_never_looks_like_a_fish_does_not_count():
+    frames = [[climbing(i)] for i in range(20)]
+    assert ids(follow(frames, confidence=0.7, min_track_frames=4)) == [[]] * 20
+    assert ids(follow(frames, confidence=0.7, min_mask_confidence=0.6)) == [[1]] * 20
+
+
+def test_fish_count_in_the_zone_and_keep_their_ids_outside():
+    frames = [[climbing(i)] for i in range(30)]
+    found = ids(follow(frames, zone=[0.0, 0.4, 1.0, 0.6]))
+    entered = next(i for i in range(30) if climbing(i)[1] <= 0.6 * HEIGHT)
+    assert found == [[]] * entered + [[1]] * (30 - entered)
+    beside = ids(follow(frames, zone=[0.6, 0.0, 1.0, 1.0]))
+    assert not any(beside)
+
+
+def test_ids_go_to_fish_in_the_order_in_which_they_count():
+    def both(i: int) -> list[Spot]:
+        return [(100, 450 - 5 * i, 40, 60, 200), (400, 450 - 12 * i, 40, 60, 200)]
+
+    found = follow([both(i) for i in range(30)], zone=[0.0, 0.0, 1.0, 0.7])
+    assert {d.track_id: d.bbox_xyxy_px[0] for d in found[30]} == {1: 380, 2: 80}
+
+
+@pytest.mark.parametrize(("confidence", "beyond"), [(1.0, 10.0), (0.8, 0.0)])
+def test_a_box_is_corrected_by_the_last_confident_mask_by_a_tenth_at_most(
+    confidence: float, beyond: float
+):
+    class Longer:
+        """Sees the fish reach on below every box, by an eighth of the box's height."""
+
+        def segment(self, image: np.ndarray, bbox_xyxy_px: np.ndarray) -> SegmentedFish:
+            probability = np.zeros(image.shape[:2], np.float32)
+            x0, y0, x1, y1 = bbox_xyxy_px.round().astype(int)
+            probability[max(y0, 0) : y1 + (y1 - y0) // 8, max(x0, 0) : x1] = confidence
+            return SegmentedFish(probability=probability, ends=None)
+
+    found = follow([[climbing(i)] for i in range(10)], segmenter=Longer())
+    for i in range(2, 11):
+        x, y, w, h, _ = climbing(i - 1)
+        edges = [x - w / 2, y - h / 2, x + w / 2, y + h / 2 + beyond]
+        np.testing.assert_allclose(found[i][0].bbox_xyxy_px, edges, atol=0.5)
