@@ -10,8 +10,8 @@ import pytest
 
 from stream_dmr.results.fish_table import FISH_TABLE
 from stream_dmr.results.frames_table import FRAMES_COLUMNS
+from stream_dmr.results.lengths_database import open_for_writing
 from stream_dmr.results.lengths_table import LENGTHS_COLUMNS
-from stream_dmr.results.store_schema import open_database
 from stream_dmr.results.verdicts import Verdict
 from tests.support.pages import pages
 from tests.support.plan import Plan, direct
@@ -32,7 +32,7 @@ def test_generated_part_of_a_page_is_up_to_date(path, text):
 
 
 def test_page_of_the_files_names_every_table_and_column(tmp_path):
-    with closing(open_database(tmp_path / "lengths.db")) as database:
+    with closing(open_for_writing(tmp_path / "lengths.db")) as database:
         in_database = database.execute(
             "SELECT name FROM sqlite_master WHERE type = 'table' UNION "
             "SELECT c.name FROM sqlite_master AS t JOIN pragma_table_info(t.name) AS c"

@@ -12,7 +12,8 @@ from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.topics import TOPICS
 from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.recording.segments.repair import repair_recordings
-from tests.results.test_store import FACTS, LengthStore, fish
+from stream_dmr.results.length_store import LengthStore
+from tests.support.final_estimates import FACTS, fish
 from tests.support.recorded_run import header, run
 
 _NAME = "recording-000001.mcap"

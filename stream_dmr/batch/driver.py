@@ -28,8 +28,8 @@ from stream_dmr.batch.measure_video import Outcome, finish_folder, read_outcome
 from stream_dmr.batch.progress import BatchProgress
 from stream_dmr.errors import OutputError
 from stream_dmr.files import make_folder, writing_to
+from stream_dmr.results.folder_lock import require_unlocked
 from stream_dmr.results.provenance import seal_files
-from stream_dmr.results.store import require_free
 
 _LOCK_PATIENCE_S = 10.0  # a killed process may hold its folder while the kernel ends it; generous
 _LOCK_POLL_S = 0.1
@@ -138,7 +138,7 @@ def _remove_unfinished(out: Path) -> None:
         deadline = time.monotonic() + _LOCK_PATIENCE_S
         while True:
             try:
-                require_free(folder)
+                require_unlocked(folder)
                 break
             except OutputError:
                 if time.monotonic() > deadline:

@@ -1,7 +1,6 @@
-"""The finished fish of a run's folder or of a recording, with what made and what judged them."""
+"""Reads the finished fish of a run's folder or of a recording, with their run and review."""
 
 import json
-import os
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -13,11 +12,10 @@ from stream_dmr.messages import LengthEstimate
 from stream_dmr.recording.messages.run_inputs import RunInputs
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
-from stream_dmr.results.run_facts import run_facts
-from stream_dmr.results.store import NAME, RunFacts
+from stream_dmr.results.lengths_database import NAME, open_for_reading
+from stream_dmr.results.run_facts import RunFacts, run_facts
 from stream_dmr.results.store_rows import read_estimates
-from stream_dmr.results.store_schema import open_database
-from stream_dmr.results.verdicts import NOTHING_SAID, Review, read_verdicts, reviews
+from stream_dmr.results.verdicts import NOT_REVIEWED, Review, read_verdicts, reviews_of
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -29,17 +27,17 @@ class FishResult:
     run_id: str  # "": of a recording without its database
     iou: float | None = None
     flags: Sequence[str] = ()
-    review: Review = NOTHING_SAID
+    review: Review = NOT_REVIEWED
 
     @property
     def length_mm(self) -> float | None:
-        """As a reviewer corrected it, else as it was measured."""
+        """The length that a reviewer corrected, else the measured one."""
         corrected = self.review.length_mm
         return self.estimate.length_mm if corrected is None else corrected
 
 
 def database_of(path: Path) -> Path | None:
-    """The lengths.db that belongs to a folder, if there is one."""
+    """The lengths.db of a folder; None without one."""
     database = path / NAME
     return database if path.is_dir() and database.is_file() else None
 
@@ -47,13 +45,13 @@ def database_of(path: Path) -> Path | None:
 def read_fish(
     path: Path, recording: Recording, selection: Selection = EVERYTHING
 ) -> list[FishResult]:
-    """The fish of a folder by its lengths.db, or by the recording where it has none.
+    """The fish of a folder from its lengths.db, or from the recording where it has none.
 
     Raises OutputError or RecordingError where they can't be read.
     """
     database = database_of(path)
     if database is not None:
-        fish = read_stored(database)
+        fish = read_stored_fish(database)
         return [
             one
             for one in fish
@@ -69,19 +67,19 @@ def read_fish(
     ]
 
 
-def read_stored(database: Path) -> list[FishResult]:
-    """All fish of a lengths.db. OutputError where it is damaged."""
-    return _stored_fish(database, reviews(read_verdicts(database)))
+def read_stored_fish(database: Path) -> list[FishResult]:
+    """All fish of a lengths.db. Raises OutputError where it is damaged."""
+    return _stored_fish(database, reviews_of(read_verdicts(database)))
 
 
 def read_runs(database: Path) -> dict[str, RunFacts]:
-    """What made the lengths, by run id, in the order of the runs. OutputError."""
-    with _opened(database) as connection:
+    """The facts of the runs by run id, in their order. Raises OutputError."""
+    with closing(open_for_reading(database)) as connection:
         return dict(_runs(connection))
 
 
 def numbers_its_own(folder: Path) -> bool:
-    """True where a run in a folder was given no files that say which fish is which. OutputError."""
+    """True where a run in a folder was given no ids of its fish. Raises OutputError."""
     database = database_of(folder)
     runs = {} if database is None else read_runs(database)
     given = [RunInputs.from_facts(asdict(facts)) for facts in runs.values()]
@@ -89,17 +87,25 @@ def numbers_its_own(folder: Path) -> bool:
 
 
 def fish_by_run(database: Path) -> dict[str, list[str]]:
-    """Every stored value of the fish of each run, as JSON, a line each: for checksums."""
+    """Every stored value of the fish of each run, as lines of JSON, for checksums."""
     lines: dict[str, list[str]] = {}
-    with _opened(database) as connection:
+    with closing(open_for_reading(database)) as connection:
         for row in connection.execute("SELECT run_id, * FROM fish ORDER BY number"):
             lines.setdefault(row[0], []).append(json.dumps(row[1:]))
     return lines
 
 
-def _opened(database: Path) -> closing[sqlite3.Connection]:
-    """For reading; who may only read can't tidy up SQLite's own files beside it, so others do."""
-    return closing(open_database(database, read_only=not os.access(database.parent, os.W_OK)))
+def flagged_fish(out_dir: Path) -> set[int]:
+    """The ids of fish whose length has a flag. Raises OutputError where they can't be read."""
+    path = out_dir / NAME
+    if not path.exists():
+        return set()
+    try:
+        with closing(open_for_reading(path)) as connection:
+            rows = connection.execute("SELECT track_id FROM fish WHERE flags != '[]'")
+            return {track_id for (track_id,) in rows}
+    except sqlite3.Error as error:
+        raise OutputError(f"{path}: expected the flags of its fish, got: {error}") from error
 
 
 def _runs(connection: sqlite3.Connection) -> Iterator[tuple[str, RunFacts]]:
@@ -110,9 +116,9 @@ def _runs(connection: sqlite3.Connection) -> Iterator[tuple[str, RunFacts]]:
         yield row["run_id"], RunFacts(**{f.name: row.get(f.name) or "" for f in fields(RunFacts)})
 
 
-def _stored_fish(database: Path, held: dict[int, Review]) -> list[FishResult]:
+def _stored_fish(database: Path, reviews: dict[int, Review]) -> list[FishResult]:
     try:
-        with _opened(database) as connection:
+        with closing(open_for_reading(database)) as connection:
             runs = dict(_runs(connection))
             estimates = read_estimates(connection)
             others = connection.execute("SELECT run_id, iou, flags FROM fish ORDER BY number")
@@ -123,7 +129,7 @@ def _stored_fish(database: Path, held: dict[int, Review]) -> list[FishResult]:
                     run_id=run_id,
                     iou=iou,
                     flags=json.loads(flags),
-                    review=held.get(estimate.track_id, NOTHING_SAID),
+                    review=reviews.get(estimate.track_id, NOT_REVIEWED),
                 )
                 for estimate, (run_id, iou, flags) in zip(estimates, others, strict=True)
             ]

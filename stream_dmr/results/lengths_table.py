@@ -9,7 +9,7 @@ from stream_dmr.csv_file import CsvFile
 from stream_dmr.errors import OutputError
 from stream_dmr.files import rename_durably, writing_to
 from stream_dmr.messages import LengthEstimate
-from stream_dmr.results.store import LengthStore
+from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.table_cells import number, numbers, seconds
 
 LENGTHS_COLUMNS = [

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from hashlib import sha256
@@ -12,8 +12,8 @@ from typing import Any
 from stream_dmr.errors import OutputError
 from stream_dmr.files import rename_durably, sha256_of, writing_to
 from stream_dmr.results.finished_fish import database_of, fish_by_run, read_runs
-from stream_dmr.results.store import NAME as DATABASE
-from stream_dmr.results.store import RunFacts
+from stream_dmr.results.lengths_database import NAME as DATABASE
+from stream_dmr.results.run_facts import RunFacts
 from stream_dmr.results.verdicts import Verdict, read_verdicts
 from stream_dmr.version import __version__
 
@@ -23,7 +23,7 @@ NAME = "provenance.json"
 @contextmanager
 def sealed(
     folder: Path, *, with_recordings: bool, on_notice: Callable[[str], None]
-) -> Iterator[None]:
+) -> Generator[None]:
     """Write the provenance of a run's results when it ends, however it does.
 
     Recordings of months are left out: a run that is told to stop has no time to read them. What a

@@ -1,4 +1,4 @@
-"""A finished fish as a row of lengths.db, and back."""
+"""Converts a finished fish to a row of lengths.db, and back."""
 
 import json
 import sqlite3
@@ -7,13 +7,13 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from stream_dmr.messages import LengthEstimate
-from stream_dmr.results.store_schema import FISH_COLUMNS
+from stream_dmr.results.lengths_database import FISH_COLUMNS
 
 
 def fish_row(estimate: LengthEstimate, flags: Sequence[str]) -> dict[str, object]:
-    """The columns of a final estimate."""
+    """The columns of a final estimate; `flags`: what a reader of its length must know."""
     low, high = (None, None) if estimate.ci95_mm is None else estimate.ci95_mm.tolist()
-    row = {name: getattr(estimate, name) for name in FISH_COLUMNS}
+    row: dict[str, object] = {name: getattr(estimate, name) for name in FISH_COLUMNS}
     return row | {
         "ci95_low_mm": low,
         "ci95_high_mm": high,
@@ -23,7 +23,7 @@ def fish_row(estimate: LengthEstimate, flags: Sequence[str]) -> dict[str, object
 
 
 def read_estimates(database: sqlite3.Connection) -> Iterator[LengthEstimate]:
-    """The finished fish as they were, but for the smoothed series, which the recordings have."""
+    """The final estimates, without their smoothed series, which the recordings have."""
     names = [*FISH_COLUMNS, "ci95_low_mm", "ci95_high_mm", "refused"]
     for values in database.execute(f"SELECT {', '.join(names)} FROM fish ORDER BY number"):
         row = dict(zip(names, values, strict=True))

@@ -1,19 +1,18 @@
-"""What reviewers said of fish: a table of its own in lengths.db, to which rows are only added.
+"""Verdicts of reviewers on fish: a table of its own in lengths.db, to which rows are only added.
 
-The measurement stays as it was. What holds of a fish is what its rows say together: the last
-decision, the last species, and the last correction; `withdraw` takes back all before it.
+Measurements stay as they were. The review of a fish is what its verdicts say together: the last
+decision, the last species and the last correction; `withdraw` takes back all before it.
 """
 
-import os
 import sqlite3
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 from stream_dmr.errors import OutputError, UserError
-from stream_dmr.results.store_schema import open_database
+from stream_dmr.results.lengths_database import DiskRefusal, open_for_reading, open_for_writing
 
 KINDS = ("accept", "reject", "duplicate", "species", "correct", "withdraw")
 DECISIONS = KINDS[:3]
@@ -37,7 +36,7 @@ CREATE TABLE IF NOT EXISTS verdicts (
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """One row: what one reviewer said of one fish."""
+    """One row: the verdict of one reviewer on one fish."""
 
     track_id: int
     kind: str  # of KINDS
@@ -56,7 +55,7 @@ class Verdict:
 
     @property
     def moved(self) -> dict[int, Ends]:
-        """The points of a correction, by their frame."""
+        """Head and tail of a correction by its frame; empty for other kinds."""
         head_u, head_v, tail_u, tail_v = self.head_u, self.head_v, self.tail_u, self.tail_v
         if self.frame_index is None or head_u is None or head_v is None:
             return {}
@@ -67,40 +66,51 @@ class Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class Review:
-    """What holds of one fish; "" and None where nothing was said."""
+    """The state of one fish's review; "" and None where no verdict says anything."""
 
     decision: str = ""  # of DECISIONS
     reason: str = ""
     duplicate_of: int | None = None
     species: str = ""
-    length_mm: float | None = None  # as corrected
+    length_mm: float | None = None  # corrected
     length_std_mm: float | None = None
-    moved: Mapping[int, Ends] = field(default_factory=dict)  # by frame: where it was corrected
+    moved: Mapping[int, Ends] = field(default_factory=dict[int, Ends])  # corrections, by frame
     reviewer: str = ""  # the last one
     written_ns: int = 0
 
     def after(self, verdict: Verdict) -> "Review":
-        """What holds after one more verdict."""
-        signed = {"reviewer": verdict.reviewer, "written_ns": verdict.written_ns}
+        """The review after one more verdict."""
+        before = Review() if verdict.kind == "withdraw" else self
+        now = replace(before, reviewer=verdict.reviewer, written_ns=verdict.written_ns)
         match verdict.kind:
             case "withdraw":
-                return Review(**signed)
+                return now
             case "species":
-                return replace(self, species=verdict.species, **signed)
+                return replace(now, species=verdict.species)
             case "correct":
-                lengths = {"length_mm": verdict.length_mm, "length_std_mm": verdict.length_std_mm}
-                moved = {**self.moved, **verdict.moved}
-                return replace(self, **lengths, moved=moved, **signed)
+                return replace(
+                    now,
+                    length_mm=verdict.length_mm,
+                    length_std_mm=verdict.length_std_mm,
+                    moved={**now.moved, **verdict.moved},
+                )
             case _:
-                said = {"reason": verdict.reason, "duplicate_of": verdict.duplicate_of}
-                return replace(self, decision=verdict.kind, **said, **signed)
+                return replace(
+                    now,
+                    decision=verdict.kind,
+                    reason=verdict.reason,
+                    duplicate_of=verdict.duplicate_of,
+                )
 
 
-NOTHING_SAID = Review()
+NOT_REVIEWED = Review()
 
 
-def check(verdict: Verdict, track_ids: set[int]) -> None:
-    """Raise UserError where a verdict says nothing that could hold."""
+def check_verdict(verdict: Verdict, track_ids: set[int], reviews: Mapping[int, Review]) -> None:
+    """Raise UserError where a verdict contradicts itself or the reviews so far.
+
+    `track_ids`: the fish of the run. Of fish that are duplicates of each other, one must remain.
+    """
     known = verdict.track_id in track_ids
     problems = {
         f"a fish of this run, got {verdict.track_id}": not known,
@@ -110,27 +120,39 @@ def check(verdict: Verdict, track_ids: set[int]) -> None:
         "the name of a species": verdict.kind == "species" and not verdict.species.strip(),
         "another fish that this one repeats": verdict.kind == "duplicate"
         and (verdict.duplicate_of not in track_ids or verdict.duplicate_of == verdict.track_id),
+        f"a fish that is not itself a duplicate of fish {verdict.track_id}; withdraw that first": (
+            verdict.kind == "duplicate" and verdict.track_id in _originals(verdict, reviews)
+        ),
     }
     for expected, is_wrong in problems.items():
         if is_wrong:
             raise UserError(f"verdict: expected {expected}")
 
 
+def _originals(verdict: Verdict, reviews: Mapping[int, Review]) -> list[int]:
+    """The fish that this one duplicates, directly and by earlier verdicts, until one repeats."""
+    originals, track_id = list[int](), verdict.duplicate_of
+    while track_id is not None and track_id not in originals:
+        originals.append(track_id)
+        track_id = reviews.get(track_id, NOT_REVIEWED).duplicate_of
+    return originals
+
+
 def add_verdict(path: Path, verdict: Verdict) -> Verdict:
-    """Write one row into a lengths.db, durably; returns it with its time. OutputError."""
+    """Write a verdict into a lengths.db, durably; returns it with its time. Raises OutputError."""
     verdict = replace(verdict, written_ns=time.time_ns())
     names = [field.name for field in fields(Verdict)]
     values = [getattr(verdict, name) for name in names]
     marks = ", ".join("?" for _ in names)
-    with _database(path, read_only=False) as database:
+    with _refusing(path), closing(_open_for_verdicts(path)) as database:
         database.execute(_TABLE)
         database.execute(f"INSERT INTO verdicts ({', '.join(names)}) VALUES ({marks})", values)
     return verdict
 
 
 def read_verdicts(path: Path) -> list[Verdict]:
-    """All rows of a lengths.db, in the order in which they were written."""
-    with _database(path, read_only=not os.access(path.parent, os.W_OK)) as database:
+    """All verdicts of a lengths.db in the order of writing. Raises OutputError."""
+    with _refusing(path), closing(open_for_reading(path)) as database:
         if not database.execute(
             "SELECT 1 FROM sqlite_master WHERE name = 'verdicts' AND type = 'table'"
         ).fetchone():
@@ -140,18 +162,32 @@ def read_verdicts(path: Path) -> list[Verdict]:
         return [Verdict(**dict(zip(names, row, strict=True))) for row in rows]
 
 
-def reviews(verdicts: list[Verdict]) -> dict[int, Review]:
-    """What holds of each fish of which anything was said."""
-    held: dict[int, Review] = {}
+def reviews_of(verdicts: Sequence[Verdict]) -> dict[int, Review]:
+    """The review of each fish that has a verdict, by track id.
+
+    A verdict that closes a circle of duplicates doesn't count: one of the fish must remain.
+    """
+    reviews: dict[int, Review] = {}
     for verdict in verdicts:
-        held[verdict.track_id] = held.get(verdict.track_id, NOTHING_SAID).after(verdict)
-    return held
+        if verdict.kind == "duplicate" and verdict.track_id in _originals(verdict, reviews):
+            continue
+        reviews[verdict.track_id] = reviews.get(verdict.track_id, NOT_REVIEWED).after(verdict)
+    return reviews
+
+
+def _open_for_verdicts(path: Path) -> sqlite3.Connection:
+    try:
+        return open_for_writing(path)
+    except DiskRefusal as error:
+        raise OutputError(
+            f"{path}: expected a disk to write verdicts to, got: {error.__cause__}; review a copy "
+            "of the folder"
+        ) from error
 
 
 @contextmanager
-def _database(path: Path, *, read_only: bool) -> Iterator[sqlite3.Connection]:
+def _refusing(path: Path) -> Generator[None]:
     try:
-        with closing(open_database(path, read_only=read_only)) as database:
-            yield database
+        yield
     except sqlite3.Error as error:
         raise OutputError(f"{path}: expected a database of lengths, got: {error}") from error

@@ -24,15 +24,14 @@ from stream_dmr.results.finished_fish import (
     database_of,
     fish_by_run,
     read_runs,
-    read_stored,
+    read_stored_fish,
 )
 from stream_dmr.results.frames_table import FRAMES_COLUMNS, frames_row
+from stream_dmr.results.lengths_database import NAME as DATABASE
 from stream_dmr.results.lengths_table import LENGTHS_COLUMNS, lengths_row
 from stream_dmr.results.provenance import NAME as PROVENANCE
 from stream_dmr.results.provenance import lines_sha256, read_provenance, verdicts_sum
-from stream_dmr.results.run_facts import run_facts
-from stream_dmr.results.store import NAME as DATABASE
-from stream_dmr.results.store import RunFacts
+from stream_dmr.results.run_facts import RunFacts, run_facts
 from stream_dmr.results.verdicts import Verdict, read_verdicts
 
 _MADE_BY = ("config_sha256", "calibration_sha256", "template_sha256")
@@ -84,7 +83,7 @@ def _changes(folder: Path, others: Checks) -> Iterator[Change]:
         return
     try:
         runs = read_runs(database)
-        fish = {one.estimate.track_id: one for one in read_stored(database)}
+        fish = {one.estimate.track_id: one for one in read_stored_fish(database)}
     except OutputError as error:
         yield Change(database, f"damaged: {error}")
         return

@@ -19,14 +19,14 @@ from stream_dmr.report.run_report import RunReport
 from stream_dmr.results.finished_fish import FishResult, database_of
 from stream_dmr.results.provenance import seal_verdicts
 from stream_dmr.results.verdicts import (
-    NOTHING_SAID,
+    NOT_REVIEWED,
     Ends,
     Review,
     Verdict,
     add_verdict,
-    check,
+    check_verdict,
     read_verdicts,
-    reviews,
+    reviews_of,
 )
 from stream_dmr.review.corrected_length import corrected_fish, corrected_length
 
@@ -83,7 +83,8 @@ class VerdictRecorder:
                 species=submitted.species.strip() if submitted.kind == "species" else "",
                 duplicate_of=submitted.duplicate_of if submitted.kind == "duplicate" else None,
             )
-            check(verdict, set(self._fish))
+            reviews = reviews_of(read_verdicts(self._database))
+            check_verdict(verdict, set(self._fish), reviews)
             if submitted.kind == "correct":
                 verdict = self._corrected(verdict, submitted)
             add_verdict(self._database, verdict)
@@ -92,7 +93,7 @@ class VerdictRecorder:
 
     def reviewed_rows(self) -> list[dict[str, Any]]:
         """The rows of all fish with verdicts."""
-        reviewed = reviews(read_verdicts(self._database))
+        reviewed = reviews_of(read_verdicts(self._database))
         return [self._row(one) for track_id, one in self._fish.items() if track_id in reviewed]
 
     def _row(self, fish: FishResult) -> dict[str, Any]:
@@ -100,7 +101,7 @@ class VerdictRecorder:
         return summary_row(reviewed, self._report)
 
     def _review(self, track_id: int) -> Review:
-        return reviews(read_verdicts(self._database)).get(track_id, NOTHING_SAID)
+        return reviews_of(read_verdicts(self._database)).get(track_id, NOT_REVIEWED)
 
     def _corrected(self, verdict: Verdict, submitted: SubmittedVerdict) -> Verdict:
         """The verdict with its points in frame pixels and the length that follows."""

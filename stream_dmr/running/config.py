@@ -32,7 +32,12 @@ _HEADER = """\
 # Every knob of stream-dmr with its default. Keep only the lines that you change, if you like;
 # unknown keys and wrong values are refused.
 """
-_TYPES = {bool: "true or false", int: "an integer", float: "a number", str: "a string"}
+_TYPES: dict[object, str] = {
+    bool: "true or false",
+    int: "an integer",
+    float: "a number",
+    str: "a string",
+}
 _BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 
 
@@ -137,6 +142,7 @@ def _quoted(choices: tuple[str, ...]) -> str:
 
 
 def _toml_value(value: object) -> str:
+    """A setting as TOML. Raises TypeError for types that no setting has."""
     match value:
         case bool():
             return str(value).lower()
@@ -146,7 +152,8 @@ def _toml_value(value: object) -> str:
             return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
         case list() | tuple():
             return "[" + ", ".join(_toml_value(item) for item in value) + "]"
-    raise TypeError(f"no TOML for {type(value).__name__} {value!r}")
+        case _:
+            raise TypeError(f"no TOML for {type(value).__name__} {value!r}")
 
 
 def _explain(problem: ErrorDetails) -> str:
@@ -211,7 +218,8 @@ def _toml_name(value: object) -> str:
             return "an array"
         case dict():
             return "a table"
-    return f"{value}"
+        case _:  # a date or a time
+            return f"{value}"
 
 
 if __name__ == "__main__":

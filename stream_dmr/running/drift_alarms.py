@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from stream_dmr.messages import Frame
-from stream_dmr.results.store import LengthStore
+from stream_dmr.results.length_store import LengthStore
 from stream_dmr.running.fit_drift import FitMonitor
 from stream_dmr.running.run_settings import DriftSettings
 from stream_dmr.running.scene_drift import SceneMonitor, cause_of, decode_scene, encode_scene

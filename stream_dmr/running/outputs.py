@@ -12,11 +12,12 @@ from stream_dmr.recording.segments.recording_files import open_recording_files
 from stream_dmr.recording.segments.repair import Repair
 from stream_dmr.recording.segments.retention import Retention
 from stream_dmr.recording.segments.rotation import open_segments
+from stream_dmr.results.finished_fish import flagged_fish
 from stream_dmr.results.frames_table import FramesTable
+from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.lengths_table import LengthsTable
 from stream_dmr.results.provenance import sealed
 from stream_dmr.results.run_facts import run_facts
-from stream_dmr.results.store import LengthStore, flagged_fish
 from stream_dmr.running.inputs import Inputs
 from stream_dmr.running.resume import interrupted_tracks
 from stream_dmr.running.run_folder import prepare_folder
@@ -59,7 +60,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
     facts = run_facts(header, vessel=request.vessel, trip=request.trip, haul=request.haul)
     with ExitStack() as stack:
         stack.enter_context(sealed(out, with_recordings=not is_endless, on_notice=observer.warn))
-        store = stack.enter_context(closing(LengthStore(out, facts, waits=is_endless)))
+        store = stack.enter_context(closing(LengthStore(out, facts, waits_for_disk=is_endless)))
         lengths = LengthsTable(out, store, resume=resume, on_refusal=on_refusal)
         stack.enter_context(closing(lengths))
         stack.enter_context(closing(observer))

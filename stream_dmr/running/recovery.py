@@ -9,11 +9,12 @@ from stream_dmr.messages import LengthEstimate
 from stream_dmr.recording.messages.codec import decode
 from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.recording.segments.repair import repair_recordings
+from stream_dmr.results.folder_lock import require_unlocked
+from stream_dmr.results.length_store import LengthStore
+from stream_dmr.results.lengths_database import NAME, open_for_reading
 from stream_dmr.results.lengths_table import write_lengths
 from stream_dmr.results.run_facts import run_facts
-from stream_dmr.results.store import NAME, LengthStore, require_free
 from stream_dmr.results.store_rows import read_estimates
-from stream_dmr.results.store_schema import open_database
 
 FROM_RECORDING = "taken over from the recording"
 
@@ -25,7 +26,7 @@ def recover_folder(folder: Path) -> Iterator[str]:
     """
     if not folder.is_dir():
         raise OutputError(f"{folder}: expected the folder of a run, found none; check the path")
-    require_free(folder)
+    require_unlocked(folder)
     for repair in repair_recordings(folder):
         yield repair.line
     if (folder / NAME).exists():
@@ -44,7 +45,7 @@ def _add_lengths(path: Path, folder: Path) -> Iterator[str]:
     except RecordingError as error:
         yield str(error)
         return
-    with closing(open_database(folder / NAME, read_only=True)) as database:
+    with closing(open_for_reading(folder / NAME)) as database:
         stored = {estimate.track_id for estimate in read_estimates(database)}
     missing = [estimate for estimate in final if estimate.track_id not in stored]
     if not missing:

@@ -7,7 +7,7 @@ from stream_dmr.messages import LocalizedFish
 from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.recording.segments.open_tracks import unfinished_frames
 from stream_dmr.recording.segments.repair import Repair
-from stream_dmr.results.store import LengthStore
+from stream_dmr.results.length_store import LengthStore
 from stream_dmr.sources.source import ResumePoint, Source
 
 

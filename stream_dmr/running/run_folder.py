@@ -7,8 +7,8 @@ from pathlib import Path
 from stream_dmr.errors import OutputError
 from stream_dmr.recording.segments.recording_files import STEM
 from stream_dmr.recording.segments.repair import Repair, repair_recordings
+from stream_dmr.results.folder_lock import require_unlocked
 from stream_dmr.results.provenance import NAME as PROVENANCE
-from stream_dmr.results.store import require_free
 
 RESULTS = (
     *("lengths.db", "lengths.csv", "frames.csv", "recording.mcap", "recording.rrd"),
@@ -31,7 +31,7 @@ def prepare_folder(
     earlier = refuse_earlier(out, is_fine=overwrite or resume)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        require_free(out)
+        require_unlocked(out)
         if overwrite:
             for path in (*earlier, *out.glob(f"{STEM}.*")):
                 for leftover in ("", "-wal", "-shm"):  # of a database after a crash

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stream_dmr.messages import LengthEstimate, Message
-from stream_dmr.results.store import LengthStore
+from stream_dmr.results.length_store import LengthStore
 from stream_dmr.running.config import Config
 from stream_dmr.running.pipeline import Chain
 from stream_dmr.sources.source import Source

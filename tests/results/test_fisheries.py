@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyarrow import parquet
 
-from stream_dmr.errors import TemplateError, UserError
+from stream_dmr.errors import TemplateError
 from stream_dmr.results.export import Export
 from stream_dmr.results.fish_table import FISH_TABLE
 from stream_dmr.results.fisheries import Derived, FisheriesSettings, derive, whole_cm
 from stream_dmr.results.provenance import read_provenance
-from stream_dmr.results.verdicts import Review, Verdict, add_verdict, check, read_verdicts, reviews
+from stream_dmr.results.verdicts import Verdict, add_verdict
 from stream_dmr.running.config import parse_config
 from stream_dmr.template.template_file import BUNDLED, load_template
 from tests.support.fish_run import measure
@@ -165,39 +165,6 @@ def test_verdicts_stand_beside_the_measurement(finished: Path, tmp_path: Path):
     assert {json.dumps(row["length_mm"]) for row in (one, two)} == {
         json.dumps(row["length_mm"]) for row in before
     }
-
-
-def test_verdicts_are_a_log_of_which_the_last_holds(finished: Path, tmp_path: Path):
-    database = shutil.copy(finished / "lengths.db", tmp_path)
-    assert read_verdicts(Path(database)) == []
-    written = [
-        add_verdict(Path(database), Verdict(track_id=1, kind=kind, reviewer="Ada", reason="r"))
-        for kind in ("reject", "accept", "withdraw")
-    ]
-    assert read_verdicts(Path(database)) == written
-    assert reviews(written[:1])[1].decision == "reject"
-    assert reviews(written[:2])[1].decision == "accept"
-    held = reviews(written)[1]
-    assert held == Review(reviewer="Ada", written_ns=written[-1].written_ns)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"track_id": 9},
-        {"kind": "maybe"},
-        {"reviewer": "  "},
-        {"kind": "reject"},
-        {"kind": "species"},
-        {"kind": "duplicate"},
-        {"kind": "duplicate", "duplicate_of": 1},
-    ],
-)
-def test_a_verdict_that_says_nothing_is_refused(wrong: dict[str, object]):
-    good = Verdict(track_id=1, kind="accept", reviewer="Ada")
-    check(good, {1, 2})
-    with pytest.raises(UserError, match="verdict: expected"):
-        check(replace(good, **wrong), {1, 2})
 
 
 def test_settings_are_read_from_a_config():

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from stream_dmr.errors import OutputError
+from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.lengths_table import LengthsTable, lengths_row
-from stream_dmr.results.store import LengthStore
 from tests.support.final_estimates import FACTS, fish
 from tests.support.small_disk import file_size_limit
 

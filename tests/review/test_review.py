@@ -21,7 +21,7 @@ from stream_dmr.recording.messages.codec import decode
 from stream_dmr.report.open_reports import open_report
 from stream_dmr.report.report_page import render_page
 from stream_dmr.report.run_report import RunReport
-from stream_dmr.results.finished_fish import read_stored
+from stream_dmr.results.finished_fish import read_stored_fish
 from stream_dmr.results.verdicts import read_verdicts
 from stream_dmr.results.verify import verify
 from stream_dmr.review.corrected_length import corrected_fish, corrected_length
@@ -124,7 +124,7 @@ def test_every_verdict_is_kept_with_its_reviewer(judge: VerdictRecorder, out: Pa
     row = submit(judge, track_id=2, kind="duplicate", duplicate_of=1)
     assert (row["verdict"], row["duplicate_of"], row["reviewer"]) == ("duplicate", 1, "Ada")
     assert [v.kind for v in read_verdicts(out / "lengths.db")] == ["reject", "species", "duplicate"]
-    one = read_stored(out / "lengths.db")[0]
+    one = read_stored_fish(out / "lengths.db")[0]
     assert (one.review.decision, one.review.reason) == ("reject", "a glove")
     assert one.review.species == "Gadus morhua"
     assert {row["track_id"] for row in judge.reviewed_rows()} == {1, 2}
@@ -308,7 +308,7 @@ def test_points_are_dragged_and_stay_where_they_were_put(tab: Tab, out: Path, by
     assert after[:2] == pytest.approx([x, y + 12], abs=0.5)
     assert tab.run("await press('do-correct'); return where('tail')") == pytest.approx(after, abs=1)
     (verdict,) = read_verdicts(out / "lengths.db")
-    (measured, *_) = read_stored(out / "lengths.db")
+    (measured, *_) = read_stored_fish(out / "lengths.db")
     assert measured.estimate.length_mm is not None
     assert measured.length_mm == verdict.length_mm
     assert verdict.length_mm is not None

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish
+from stream_dmr.results.lengths_database import open_for_reading
 from stream_dmr.results.lengths_table import lengths_row
 from stream_dmr.results.store_rows import read_estimates
-from stream_dmr.results.store_schema import open_database
 from stream_dmr.running.config import load_config, to_toml
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_folder import RESULTS
@@ -38,7 +38,7 @@ def assert_readable(out: Path) -> None:
     assert counts[LocalizedFish] == len(frames)
     assert counts[LengthEstimate] == len(frames) + len(lengths)
     assert {row["track_id"] for row in frames} == {row["track_id"] for row in lengths}
-    database = open_database(out / "lengths.db", read_only=True)
+    database = open_for_reading(out / "lengths.db")
     stored = [list(row.values()) for row in lengths]
     assert [lengths_row(estimate) for estimate in read_estimates(database)] == stored
     database.close()

@@ -1,4 +1,4 @@
-"""A disk of its own for a test, as small as it likes."""
+"""Disks that are small, full or write-protected."""
 
 import resource
 import subprocess
@@ -19,6 +19,19 @@ def small_disk(folder: Path, *, kilobytes: int) -> Iterator[Path]:
     if subprocess.run(mount, capture_output=True, check=False).returncode != 0:
         pytest.skip("needs the right to mount a small disk")
     try:
+        yield folder
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+@contextmanager
+def read_only(folder: Path) -> Iterator[Path]:
+    """The same folder on a write-protected disk; skips the test where mounting isn't allowed."""
+    bind = ["mount", "--bind", str(folder), str(folder)]
+    if subprocess.run(bind, capture_output=True, check=False).returncode != 0:
+        pytest.skip("needs the right to mount a disk")
+    try:
+        subprocess.run(["mount", "-o", "remount,ro,bind", str(folder)], check=True)
         yield folder
     finally:
         subprocess.run(["umount", str(folder)], check=True)

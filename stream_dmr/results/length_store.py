@@ -1,15 +1,13 @@
-"""lengths.db: every finished fish in SQLite, durable the moment its track ends.
+"""LengthStore: writes every finished fish into lengths.db, durable the moment its track ends.
 
-One file in the output folder, open to any reader of SQLite while it is written: WAL, synchronous
-FULL. It also holds what a restart must not use again: track ids, frame numbers and capture times.
+The database also holds what a restart must not use again: track ids, frame numbers and capture
+times.
 """
 
-import fcntl
-import os
 import sqlite3
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from threading import RLock
@@ -17,110 +15,91 @@ from uuid import uuid4
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate
-from stream_dmr.results.store_rows import fish_row, read_estimates
-from stream_dmr.results.store_schema import (
-    MARK_EVERY_NS,
+from stream_dmr.results.folder_lock import FolderLock
+from stream_dmr.results.lengths_database import (
+    NAME,
     DiskRefusal,
     copy_in_memory,
-    open_database,
+    open_for_writing,
 )
+from stream_dmr.results.reserved_space import ReservedSpace
+from stream_dmr.results.run_facts import RunFacts
+from stream_dmr.results.store_rows import fish_row, read_estimates
 
-NAME = "lengths.db"
-_BALLAST = "lengths.reserve"  # room that is given up when the disk is full, so that lengths fit
-_BALLAST_BYTES = 1 << 20
-_BALLAST_SHARE = 0.01  # of the free space, at most
+_MARK_EVERY_NS = 5_000_000_000  # capture times that a crash may leave unmarked; chosen
+_FRAMES_AHEAD = 1000  # frame numbers that are marked as used at a time; a crash skips the rest
 _MARK = "INSERT INTO marks VALUES (?1, ?2) ON CONFLICT (name) DO UPDATE SET value = ?2"
 _CLIP = "INSERT OR REPLACE INTO clips VALUES (?, ?, ?)"
-_FRAMES_AHEAD = 1000  # frame numbers set aside at a time: a gap after a crash does no harm
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunFacts:
-    """What made the lengths of one run; hashes are SHA-256 in hex, "" where there is none."""
-
-    source: str
-    command: str
-    software_version: str
-    config_sha256: str
-    calibration_sha256: str
-    template_sha256: str
-    source_path: str = ""  # the files that the run was given, see `RunInputs`
-    source_sha256: str = ""
-    boxes_path: str = ""
-    boxes_sha256: str = ""
-    masks_path: str = ""
-    masks_sha256: str = ""
-    calibration_path: str = ""
-    vessel: str = ""
-    trip: str = ""
-    haul: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Marks:
-    """The last of everything that was handed out in this folder; 0 where nothing was."""
+    """The last numbers that runs in this folder have used; 0 where there was none."""
 
     track_id: int = 0
     frame_index: int = 0
-    timestamp_ns: int = 0
-    written: int = 0  # statements, by which a commit that failed tells whether it did
+    timestamp_ns: int = 0  # capture time
+    written: int = 0  # statements committed: shows whether a commit that failed was one after all
 
 
 class LengthStore:
-    """The lengths of one output folder, and this run's right to add to them. Thread-safe.
+    """The lengths of one output folder, which it locks for this run. Thread-safe.
 
-    A fish that the disk refuses is kept in memory and tried again with everything that follows;
-    `trouble` says so meanwhile, and `close` raises OutputError if it never got there.
+    A row that the disk refuses stays in memory and is tried again with everything that follows;
+    `trouble` has the reason meanwhile, and `close` raises OutputError if it was never written.
     """
 
-    def __init__(self, out_dir: Path, facts: RunFacts, *, waits: bool = False) -> None:
+    def __init__(self, out_dir: Path, facts: RunFacts, *, waits_for_disk: bool = False) -> None:
         """Raises OutputError where another run writes there or the file can't be used.
 
-        With `waits` not where the disk refuses it: then all waits in memory from the start.
+        With `waits_for_disk`, rows wait in memory from the start where the disk refuses the file.
         """
         self.path = out_dir / NAME
         self.run_id = uuid4().hex
         self.trouble = ""  # why the last row could not be written; "" when all are
         self._facts = facts
-        self._ballast = out_dir / _BALLAST
+        self._reserve = ReservedSpace(out_dir)
         self._lock = RLock()
         self._pending: list[tuple[str, tuple[object, ...]]] = []
         self._clip: tuple[str, int] | None = None  # in work, and its frames done
-        self._folder = _lock_folder(out_dir)
+        self._lock_of_folder = FolderLock(out_dir)
         try:
-            self._database, self._is_reached = self._open(waits=waits)
+            self._database, self._is_reached = self._open(waits_for_disk=waits_for_disk)
             self._is_stand_in = not self._is_reached
-            self.before = self._handed_out = _marks(self._database)
-            self._begin_run(waits=waits)
+            self.before = self._used = _marks(self._database)
+            self._begin_run(waits_for_disk=waits_for_disk)
         except BaseException:
-            os.close(self._folder)
+            self._lock_of_folder.release()
             raise
         self._marked_at_ns = time.monotonic_ns()
-        _set_aside(self._ballast)
+        self._reserve.reserve()
 
     def add(
         self, estimate: LengthEstimate, *, iou: float | None = None, flags: Sequence[str] = ()
     ) -> None:
-        """Make a final estimate durable; `flags` are what a reader of this length must know."""
+        """Write a final estimate durably; `flags`: what a reader of this length must know.
+
+        `iou`: median over its accepted frames, of mesh and mask.
+        """
         values = fish_row(estimate, flags) | {"iou": iou, "run_id": self.run_id}
         values["written_ns"] = time.time_ns()
         marks = ", ".join("?" for _ in values)
         self._write(f"INSERT INTO fish ({', '.join(values)}) VALUES ({marks})", *values.values())
 
     def reserve_track(self, track_id: int) -> None:
-        """Take note, durably, that an id is used: no later run in this folder uses it again."""
-        if track_id > self._handed_out.track_id:
+        """Mark an id as used, durably: no later run in this folder uses it again."""
+        if track_id > self._used.track_id:
             self._mark(track_id=track_id)
 
     def frame_passed(self, *, frame_index: int, timestamp_ns: int) -> None:
-        """Take note of a frame; durable for its number at once, for its time within seconds."""
-        is_due = time.monotonic_ns() - self._marked_at_ns > MARK_EVERY_NS
-        if is_due or frame_index > self._handed_out.frame_index:
+        """Mark a frame: its number durably at once, its capture time within seconds."""
+        is_due = time.monotonic_ns() - self._marked_at_ns > _MARK_EVERY_NS
+        if is_due or frame_index > self._used.frame_index:
             self._marked_at_ns = time.monotonic_ns()
             self._mark(frame_index=frame_index + _FRAMES_AHEAD, timestamp_ns=timestamp_ns)
 
     def clip_progress(self, name: str, *, frames_done: int) -> None:
-        """Keep in mind how far a clip is: it becomes durable with the next fish or mark.
+        """Mark how far a clip is measured; durable with the next fish or mark.
 
         So a restart neither repeats a finished fish nor begins the clip anew.
         """
@@ -130,7 +109,7 @@ class LengthStore:
             self._clip = name, frames_done
 
     def clips_before(self) -> tuple[set[str], dict[str, int]]:
-        """Of earlier runs: the clips that are done, and the frames done of others."""
+        """The clips that earlier runs have finished, and the frames done of others."""
         rows = self._database.execute("SELECT name, frames_done, is_done FROM clips").fetchall()
         done = {name for name, _, is_done in rows if is_done}
         return done, {name: frames for name, frames, is_done in rows if not is_done}
@@ -138,21 +117,21 @@ class LengthStore:
     def resume_after_ns(self) -> int:
         """The capture time after which a live source goes on, whatever the clock was set to."""
         mark_ns = self.before.timestamp_ns
-        return mark_ns if time.time_ns() > mark_ns else mark_ns + MARK_EVERY_NS
+        return mark_ns if time.time_ns() > mark_ns else mark_ns + _MARK_EVERY_NS
 
     def scene(self) -> bytes | None:
-        """What the camera saw when this run's calibration was first used here."""
+        """The static scene (see `DriftAlarms`) when this run's calibration was first used here."""
         query = "SELECT data FROM scenes WHERE calibration_sha256 = ?"
         row = self._database.execute(query, (self._facts.calibration_sha256,)).fetchone()
         return None if row is None else row[0]
 
     def keep_scene(self, data: bytes) -> None:
-        """Keep the scene of this calibration, for this run and later ones."""
+        """Write the static scene of this calibration, for this run and later ones."""
         key = self._facts.calibration_sha256
         self._write("INSERT OR IGNORE INTO scenes VALUES (?, ?)", key, data)
 
     def first_ious(self, count: int) -> list[float]:
-        """Of the first fish that were measured here with this calibration."""
+        """The IoU of the first `count` fish that were measured here with this calibration."""
         query = (
             "SELECT iou FROM fish JOIN runs USING (run_id) "
             "WHERE calibration_sha256 = ? AND iou IS NOT NULL ORDER BY number LIMIT ?"
@@ -161,7 +140,7 @@ class LengthStore:
         return [iou for (iou,) in rows]
 
     def note(self, kind: str, text: str, *, timestamp_ns: int) -> None:
-        """Write an event that later readers of the lengths should know of."""
+        """Write an event that readers of the lengths must know."""
         self._write(
             "INSERT INTO events (run_id, kind, text, timestamp_ns, written_ns) "
             "VALUES (?, ?, ?, ?, ?)",
@@ -170,40 +149,47 @@ class LengthStore:
 
     def estimates(self) -> list[LengthEstimate]:
         """All finished fish of this folder, in the order in which their tracks ended."""
-        with self._lock, _refusing(self.path):
-            return list(read_estimates(self._database))
+        with self._lock:
+            try:
+                return list(read_estimates(self._database))
+            except sqlite3.Error as error:
+                raise OutputError(
+                    f"{self.path}: expected a database of lengths, got: {error}; make room, or "
+                    "choose another --out"
+                ) from error
 
     def close(self) -> None:
-        """End the run and leave one file. Idempotent. OutputError where fish are not written."""
-        if self._folder < 0:
+        """End the run and leave one file. Idempotent.
+
+        Raises OutputError where rows could not be written.
+        """
+        if not self._lock_of_folder.is_held:
             return
         self._write("UPDATE runs SET ended_ns = ? WHERE run_id = ?", time.time_ns(), self.run_id)
         with suppress(sqlite3.Error):
             self._database.close()
-        with suppress(OSError):
-            self._ballast.unlink(missing_ok=True)
-        os.close(self._folder)
-        self._folder = -1
+        self._reserve.release()
+        self._lock_of_folder.release()
         if self.trouble:
             raise OutputError(
                 f"{self.path}: expected room for {len(self._pending)} more rows, got: "
                 f"{self.trouble}; the recording has them: make room and run stream-dmr recover"
             )
 
-    def _open(self, *, waits: bool) -> tuple[sqlite3.Connection, bool]:
-        """The file, or with `waits` a copy of it in memory, and which."""
+    def _open(self, *, waits_for_disk: bool) -> tuple[sqlite3.Connection, bool]:
+        """The file and True, or a copy of it in memory and False."""
         try:
-            return open_database(self.path), True
+            return open_for_writing(self.path), True
         except DiskRefusal as error:
-            if not waits:
+            if not waits_for_disk:
                 raise
             self.trouble = str(error.__cause__)
-        self._give_up_ballast()
+        self._reserve.release()
         with suppress(DiskRefusal):
-            return open_database(self.path), True
+            return open_for_writing(self.path), True
         return copy_in_memory(self.path), False
 
-    def _begin_run(self, *, waits: bool) -> None:
+    def _begin_run(self, *, waits_for_disk: bool) -> None:
         values = {"run_id": self.run_id, "started_ns": time.time_ns()}
         values |= {field.name: getattr(self._facts, field.name) for field in fields(self._facts)}
         marks = ", ".join("?" for _ in values)
@@ -211,7 +197,7 @@ class LengthStore:
         self._pending.append((statement, tuple(values.values())))
         if self._is_reached:
             self._write_pending()
-            if self.trouble and not waits:
+            if self.trouble and not waits_for_disk:
                 raise OutputError(
                     f"{self.path}: expected a database of lengths to write to, got: "
                     f"{self.trouble}; make room, or choose another --out"
@@ -219,8 +205,8 @@ class LengthStore:
 
     def _mark(self, **marks: int) -> None:
         with self._lock:
-            higher = {n: max(v, getattr(self._handed_out, n)) for n, v in marks.items()}
-            self._handed_out = replace(self._handed_out, **higher)
+            higher = {n: max(v, getattr(self._used, n)) for n, v in marks.items()}
+            self._used = replace(self._used, **higher)
             self._write_pending()
 
     def _write(self, statement: str, *values: object) -> None:
@@ -229,7 +215,7 @@ class LengthStore:
             self._write_pending()
 
     def _write_pending(self) -> None:
-        """Commit all that waits; where that fails, give up the ballast and try once more."""
+        """Commit all that waits; where that fails, release the reserved space and try once more."""
         for is_last in (False, True):
             try:
                 self._reach_file()
@@ -241,10 +227,10 @@ class LengthStore:
                 self.trouble = str(error.__cause__ or error)
             self._is_reached = False
             if not is_last:
-                self._give_up_ballast()
+                self._reserve.release()
 
     def _commit(self) -> None:
-        marks = replace(self._handed_out, written=self._handed_out.written + len(self._pending))
+        marks = replace(self._used, written=self._used.written + len(self._pending))
         with _transaction(self._database):
             for statement, values in self._pending:
                 self._database.execute(statement, values)
@@ -252,18 +238,18 @@ class LengthStore:
                 self._database.execute(_CLIP, (*self._clip, 0))
             for field in fields(marks):
                 self._database.execute(_MARK, (field.name, getattr(marks, field.name)))
-        self._handed_out = marks
+        self._used = marks
         self._pending.clear()
         self.trouble = ""
 
     def _reach_file(self) -> None:
-        """Open the file anew after trouble; what was committed in spite of it waits no more."""
+        """Open the file anew after trouble; drop from memory what was committed in spite of it."""
         if self._is_reached:
             return
         if not self._is_stand_in:
             self._database.close()  # SQLite may hold on to a state of the file that never was
         try:
-            fresh = open_database(self.path)
+            fresh = open_for_writing(self.path)
         except DiskRefusal:
             if not self._is_stand_in:
                 self._database, self._is_stand_in = copy_in_memory(self.path), True
@@ -271,12 +257,8 @@ class LengthStore:
         self._database.close()
         self._database, self._is_reached, self._is_stand_in = fresh, True, False
         written = _marks(fresh).written
-        del self._pending[: max(0, written - self._handed_out.written)]
-        self._handed_out = replace(self._handed_out, written=written)
-
-    def _give_up_ballast(self) -> None:
-        with suppress(OSError):
-            self._ballast.unlink(missing_ok=True)
+        del self._pending[: max(0, written - self._used.written)]
+        self._used = replace(self._used, written=written)
 
 
 def _marks(database: sqlite3.Connection) -> Marks:
@@ -284,7 +266,7 @@ def _marks(database: sqlite3.Connection) -> Marks:
 
 
 @contextmanager
-def _transaction(database: sqlite3.Connection) -> Iterator[None]:
+def _transaction(database: sqlite3.Connection) -> Generator[None]:
     database.execute("BEGIN IMMEDIATE")
     try:
         yield
@@ -293,57 +275,3 @@ def _transaction(database: sqlite3.Connection) -> Iterator[None]:
         with suppress(sqlite3.Error):
             database.execute("ROLLBACK")
         raise
-
-
-@contextmanager
-def _refusing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except sqlite3.Error as error:
-        raise OutputError(
-            f"{path}: expected a database of lengths to write to, got: {error}; make room, or "
-            "choose another --out"
-        ) from error
-
-
-def flagged_fish(out_dir: Path) -> set[int]:
-    """The ids of fish whose length has a flag. Raises OutputError where they can't be read."""
-    path = out_dir / NAME
-    if not path.exists():
-        return set()
-    try:
-        database = open_database(path, read_only=True)
-    except DiskRefusal:  # a full disk has no room for SQLite's own files
-        database = copy_in_memory(path)
-    with _refusing(path), closing(database):
-        rows = database.execute("SELECT track_id FROM fish WHERE flags != '[]'")
-        return {track_id for (track_id,) in rows}
-
-
-def require_free(out_dir: Path) -> None:
-    """Raise OutputError where another run is writing to the folder."""
-    os.close(_lock_folder(out_dir))
-
-
-def _lock_folder(out_dir: Path) -> int:
-    """Take the folder for this process alone; a crash gives it back."""
-    folder = os.open(out_dir, os.O_RDONLY)
-    try:
-        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(folder)
-        raise OutputError(
-            f"{out_dir}: expected a folder of its own for each run, found one that another run is "
-            "writing to; wait for that one or choose another --out"
-        ) from None
-    return folder
-
-
-def _set_aside(ballast: Path) -> None:
-    """Take a little room on the disk beforehand; a disk with hardly any is left alone."""
-    with suppress(OSError):
-        room = os.statvfs(ballast.parent)
-        size = min(_BALLAST_BYTES, int(_BALLAST_SHARE * room.f_bavail * room.f_frsize))
-        if size > 0:
-            with ballast.open("wb") as file:
-                os.posix_fallocate(file.fileno(), 0, size)

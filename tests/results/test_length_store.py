@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -17,8 +18,9 @@ from hypothesis import strategies as st
 
 from stream_dmr.errors import OutputError
 from stream_dmr.results.finished_fish import read_runs
+from stream_dmr.results.length_store import LengthStore
+from stream_dmr.results.lengths_database import open_for_reading, open_for_writing
 from stream_dmr.results.lengths_table import lengths_row
-from stream_dmr.results.store import LengthStore
 from tests.support.final_estimates import FACTS, fish
 from tests.support.small_disk import fill, small_disk
 
@@ -152,7 +154,8 @@ WRITER = """
 import sys
 from pathlib import Path
 sys.path[:0] = [{tests!r}]
-from tests.results.test_store import FACTS, LengthStore, fish
+from stream_dmr.results.length_store import LengthStore
+from tests.support.final_estimates import FACTS, fish
 store = LengthStore(Path(sys.argv[1]), FACTS)
 for number in range(store.before.track_id + 1, 10**6):
     store.reserve_track(number)
@@ -212,7 +215,7 @@ def test_a_disk_that_is_full_at_the_start_is_waited_for_and_no_id_is_used_twice(
         ballast = fill(disk)
         with pytest.raises(OutputError, match="expected a database of lengths"):
             LengthStore(disk, FACTS)
-        store = LengthStore(disk, FACTS, waits=True)
+        store = LengthStore(disk, FACTS, waits_for_disk=True)
         assert store.trouble
         assert store.before.track_id == 7
         assert [estimate.track_id for estimate in store.estimates()] == [7]
@@ -230,7 +233,7 @@ def test_a_disk_that_is_full_at_the_start_is_waited_for_and_no_id_is_used_twice(
 def test_a_disk_that_is_full_from_the_very_first_start_is_waited_for(tmp_path: Path):
     with small_disk(tmp_path / "disk", kilobytes=600) as disk:
         ballast = fill(disk)
-        store = LengthStore(disk, FACTS, waits=True)
+        store = LengthStore(disk, FACTS, waits_for_disk=True)
         store.add(fish(1))
         assert store.trouble
         ballast.unlink()
@@ -241,18 +244,43 @@ def test_a_disk_that_is_full_from_the_very_first_start_is_waited_for(tmp_path: P
         store.close()
 
 
-def test_a_commit_that_failed_and_yet_came_to_be_is_not_written_twice(tmp_path: Path):
+class LateError:
+    """A connection whose next COMMIT is done, and then reports an error, as a failed fsync does."""
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self._connection = connection
+        self.is_armed = False
+
+    def execute(self, statement: str, *values: Any) -> sqlite3.Cursor:
+        cursor = self._connection.execute(statement, *values)
+        if statement == "COMMIT" and self.is_armed:
+            self.is_armed = False
+            raise sqlite3.OperationalError("disk I/O error")
+        return cursor
+
+    def close(self) -> None:
+        self._connection.close()
+
+
+def test_a_commit_that_failed_and_yet_came_to_be_is_not_written_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    opened = list[LateError]()
+
+    def open_late(path: Path) -> LateError:
+        opened.append(LateError(open_for_writing(path)))
+        return opened[-1]
+
+    monkeypatch.setattr("stream_dmr.results.length_store.open_for_writing", open_late)
     store = LengthStore(tmp_path, FACTS)
+    opened[0].is_armed = True
+    store.note("camera", "moved by 4 px", timestamp_ns=7)
     store.add(fish(1))
-    before, pending = store._handed_out, ("INSERT INTO events VALUES (5, ?, '', '', 0, 0)",)
-    store._pending.append((*pending, (store.run_id,)))
-    store._commit()
-    store._handed_out, store._is_reached = before, False  # as an error of its fsync leaves it
-    store._pending.append((*pending, (store.run_id,)))
-    store.add(fish(2))
+    assert len(opened) == 2
     assert not store.trouble
-    assert [estimate.track_id for estimate in store.estimates()] == [1, 2]
     store.close()
+    with closing(open_for_reading(store.path)) as database:
+        assert database.execute("SELECT count(*) FROM events").fetchone() == (1,)
 
 
 def test_fish_that_never_got_to_the_disk_are_not_passed_over(tmp_path: Path):

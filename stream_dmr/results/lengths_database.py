@@ -1,15 +1,23 @@
-"""The tables of lengths.db, and how a file of them is opened."""
+"""The tables of lengths.db, opened for writing and for reading.
 
+The file is in SQLite's WAL mode while a run writes to it, so that others may read meanwhile.
+Reading never writes, since archives are kept on write-protected disks.
+"""
+
+import os
+import shutil
 import sqlite3
 from contextlib import closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from stream_dmr.errors import OutputError
 
+NAME = "lengths.db"
 VERSION = 1  # PRAGMA user_version
 APPLICATION_ID = 0x646D726C  # "dmrl": what `file` and other programs may know it by
-MARK_EVERY_NS = 5_000_000_000  # how much of the capture times a crash may leave unmarked
-_PATIENCE_S = 5.0  # for a reader that holds the file
+_LOCK_TIMEOUT_S = 5.0  # for another program that holds the file; SQLite's own default
+_LOGS = ("-wal", "-journal")  # of SQLite, beside a file that is written to
 _DISK_ERRORS = {
     *(sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
 }
@@ -78,42 +86,49 @@ class DiskRefusal(OutputError):
     """The disk doesn't let a database be used now; nothing says that it is damaged."""
 
 
-def open_database(path: Path, *, read_only: bool = False) -> sqlite3.Connection:
+def open_for_writing(path: Path) -> sqlite3.Connection:
     """Open a lengths.db, making its tables where there are none; usable from any one thread.
 
     Raises OutputError where the file is no such database, damaged, or of a newer version, and
-    DiskRefusal where it is the disk that refuses.
+    DiskRefusal where the disk refuses it.
     """
-    mode = "ro" if read_only else "rwc"
     try:
-        database = sqlite3.connect(
-            f"{path.absolute().as_uri()}?mode={mode}",
-            uri=True,
-            timeout=_PATIENCE_S,
-            isolation_level=None,
-            check_same_thread=False,
-        )
-        try:
-            _check(database, path)
-            if not read_only:
-                _prepare(database)
-        except BaseException:
-            database.close()
-            raise
+        return _opened(f"{path.absolute().as_uri()}?mode=rwc", path, make_tables=True)
     except sqlite3.Error as error:
-        raise _refusal(path, error) from error
-    return database
+        raise _refusal(
+            path, error, remedy="move it away to begin a new one, or choose another --out"
+        ) from error
+
+
+def open_for_reading(path: Path) -> sqlite3.Connection:
+    """Open a lengths.db without writing anything, also beside a run and on a read-only disk.
+
+    Raises OutputError where there is none, or one that is damaged or of a newer version.
+    """
+    if not _size(path):
+        raise OutputError(f"{path}: expected a database of lengths, found none; check the path")
+    address = path.absolute().as_uri()
+    try:
+        if not any(_beside(path, log).exists() for log in _LOGS):  # no run goes on or has crashed
+            return _opened(f"{address}?mode=ro&immutable=1", path)
+        try:
+            return _opened(f"{address}?mode=ro", path)
+        except sqlite3.OperationalError:  # SQLite can't write its index of the log
+            may_write = os.access(path.parent, os.W_OK)
+            return copy_in_memory(path) if may_write else _copy_with_log(path)
+    except (OSError, sqlite3.Error) as error:
+        raise _refusal(path, error, remedy="the file is damaged; use a copy of it") from error
 
 
 def copy_in_memory(path: Path) -> sqlite3.Connection:
-    """What a lengths.db holds, for reading, where the disk has no room for SQLite's own files.
+    """A copy to work with while the disk has no room for SQLite's own files; empty without a file.
 
     Nobody else may have it open. Raises OutputError where it can't be read or is damaged.
     """
     memory = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
     try:
-        if _size(path) and not _size(path, "-journal"):  # which it has only while it is made
-            how = "mode=rw" if _size(path, "-wal") else "mode=ro&immutable=1"
+        if _size(path) and not _size(_beside(path, "-journal")):  # else it was never made whole
+            how = "mode=rw" if _size(_beside(path, "-wal")) else "mode=ro&immutable=1"
             address = f"{path.absolute().as_uri()}?{how}"
             with closing(sqlite3.connect(address, uri=True, isolation_level=None)) as file:
                 file.execute("PRAGMA locking_mode = EXCLUSIVE")  # the log's index, in memory
@@ -123,26 +138,66 @@ def copy_in_memory(path: Path) -> sqlite3.Connection:
     except BaseException as error:
         memory.close()
         if isinstance(error, (OSError, sqlite3.Error)):
-            raise _refusal(path, error) from error
+            raise _refusal(path, error, remedy="make room, or choose another --out") from error
         raise
     return memory
 
 
-def _size(path: Path, more: str = "") -> int:
-    """Bytes of a file beside the database; 0 where there is none."""
+def _opened(address: str, path: Path, *, make_tables: bool = False) -> sqlite3.Connection:
+    database = sqlite3.connect(
+        address,
+        uri=True,
+        timeout=_LOCK_TIMEOUT_S,
+        isolation_level=None,
+        check_same_thread=False,
+    )
     try:
-        return path.with_name(path.name + more).stat().st_size
+        _check(database, path)
+        if make_tables:
+            _prepare(database)
+    except BaseException:
+        database.close()
+        raise
+    return database
+
+
+def _copy_with_log(path: Path) -> sqlite3.Connection:
+    """A copy in memory of a file with its log, where SQLite can't write beside it."""
+    memory = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
+    with TemporaryDirectory() as folder:
+        copy = Path(folder) / path.name
+        shutil.copyfile(path, copy)
+        for log in _LOGS:
+            if _beside(path, log).exists():
+                shutil.copyfile(_beside(path, log), _beside(copy, log))
+        with closing(sqlite3.connect(copy, isolation_level=None)) as file:
+            file.backup(memory)
+    try:
+        _check(memory, path)
+    except BaseException:
+        memory.close()
+        raise
+    return memory
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    """SQLite's own file of this kind beside a database."""
+    return path.with_name(path.name + suffix)
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file; 0 where there is none."""
+    try:
+        return path.stat().st_size
     except FileNotFoundError:
         return 0
 
 
-def _refusal(path: Path, error: sqlite3.Error | OSError) -> OutputError:
-    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_IOERR) & 0xFF  # the rest says more
+def _refusal(path: Path, error: sqlite3.Error | OSError, *, remedy: str) -> OutputError:
+    # The lower byte is the error, the rest its details.
+    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_IOERR) & 0xFF
     kind = DiskRefusal if code in _DISK_ERRORS else OutputError
-    return kind(
-        f"{path}: expected a database of lengths, got: {error}; move it away to begin a new one, "
-        "or choose another --out"
-    )
+    return kind(f"{path}: expected a database of lengths, got: {error}; {remedy}")
 
 
 def _check(database: sqlite3.Connection, path: Path) -> None:
