@@ -244,22 +244,17 @@ def test_a_disk_that_is_full_from_the_very_first_start_is_waited_for(tmp_path: P
         store.close()
 
 
-class LateError:
+class LateError(sqlite3.Connection):
     """A connection whose next COMMIT is done, and then reports an error, as a failed fsync does."""
 
-    def __init__(self, connection: sqlite3.Connection) -> None:
-        self._connection = connection
-        self.is_armed = False
+    is_armed = False
 
     def execute(self, statement: str, *values: Any) -> sqlite3.Cursor:
-        cursor = self._connection.execute(statement, *values)
+        cursor = super().execute(statement, *values)
         if statement == "COMMIT" and self.is_armed:
             self.is_armed = False
             raise sqlite3.OperationalError("disk I/O error")
         return cursor
-
-    def close(self) -> None:
-        self._connection.close()
 
 
 def test_a_commit_that_failed_and_yet_came_to_be_is_not_written_twice(
@@ -268,7 +263,8 @@ def test_a_commit_that_failed_and_yet_came_to_be_is_not_written_twice(
     opened = list[LateError]()
 
     def open_late(path: Path) -> LateError:
-        opened.append(LateError(open_for_writing(path)))
+        open_for_writing(path).close()
+        opened.append(LateError(path, isolation_level=None, check_same_thread=False))
         return opened[-1]
 
     monkeypatch.setattr("stream_dmr.results.length_store.open_for_writing", open_late)
