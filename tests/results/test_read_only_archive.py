@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from stream_dmr.errors import OutputError
-from stream_dmr.report.report import open_report
+from stream_dmr.report.open_reports import open_report
 from stream_dmr.results.finished_fish import read_stored_fish
 from stream_dmr.results.length_store import LengthStore
-from stream_dmr.review.judge import Judge
+from stream_dmr.review.verdict_recorder import VerdictRecorder
 from tests.support.command import invoke
 from tests.support.final_estimates import FACTS, fish
 from tests.support.fish_run import measure
@@ -56,9 +56,9 @@ def test_an_archive_is_evaluated(archive: Path, tmp_path: Path):
 
 
 def test_verdicts_on_an_archive_are_refused_in_one_line(archive: Path):
-    judge = Judge(open_report(archive), "Ada")
+    recorder = VerdictRecorder(open_report(archive), "Ada")
     with pytest.raises(OutputError, match="a copy") as refusal:
-        judge.take(b'{"track_id": 1, "kind": "accept"}')
+        recorder.record(b'{"track_id": 1, "kind": "accept"}')
     assert "\n" not in str(refusal.value)
 
 
