@@ -139,7 +139,7 @@ def _find_plane(
     _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
         points, found, camera.K, camera.distortion, flags=cv2.SOLVEPNP_IPPE
     )
-    candidates = []
+    candidates: list[tuple[ReferencePlane, float]] = []
     for rvec, tvec in zip(rvecs, tvecs, strict=True):
         rvec, tvec = cv2.solvePnPRefineLM(points, found, camera.K, camera.distortion, rvec, tvec)
         plane = ReferencePlane(rotation=cv2.Rodrigues(rvec)[0], translation_mm=tvec.ravel())

@@ -3,7 +3,7 @@
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -79,7 +79,7 @@ def batch(
 
 
 @contextmanager
-def _engine(name: str, workers: int, address: str | None, gpus: float) -> Iterator["Engine"]:
+def _engine(name: str, workers: int, address: str | None, gpus: float) -> Generator["Engine"]:
     if name == "local":
         from stream_dmr.batch.local_engine import LocalEngine
 

@@ -3,7 +3,7 @@
 import signal
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -107,7 +107,7 @@ def _convert(
 
 
 @contextmanager
-def _as_rrd(recording: str, source: str | None, selection: "Selection") -> Iterator[str]:
+def _as_rrd(recording: str, source: str | None, selection: "Selection") -> Generator[str]:
     """An .rrd or address as it is; an .mcap, a part, and with a source, drawn anew."""
     if "://" in recording:
         yield recording

@@ -8,7 +8,7 @@ the checksums of the index and of the chunks that are read.
 import json
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Generator, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
@@ -155,7 +155,7 @@ class McapRecording:
         self.ends_early |= record.name in (SEGMENT, RECOVERED)
 
     @contextmanager
-    def _open(self) -> Iterator[IO[bytes]]:
+    def _open(self) -> Generator[IO[bytes]]:
         try:
             with self.path.open("rb") as stream:
                 yield stream

@@ -7,7 +7,7 @@ comes first, and every chunk of messages can be read without the others.
 import json
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from itertools import chain
 from pathlib import Path
@@ -131,7 +131,7 @@ class McapSink:
             self._flush()
 
     @contextmanager
-    def _closing_on_error(self) -> Iterator[None]:
+    def _closing_on_error(self) -> Generator[None]:
         try:
             yield
         except OSError as error:

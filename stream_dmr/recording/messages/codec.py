@@ -45,12 +45,18 @@ _DATACLASSES: dict[str, type] = {
     )
 }
 _MAX_PIXELS = 1 << 28  # 16384 x 16384; damaged bytes must not allocate all memory
+
+
+def _encodable(text: str) -> str:
+    # A file name of undecodable bytes must not stop a run.
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
 _SCALARS = {
     FieldDescriptor.TYPE_BOOL: bool,
     FieldDescriptor.TYPE_DOUBLE: float,
     FieldDescriptor.TYPE_INT64: int,
-    # A file name of undecodable bytes must not stop a run.
-    FieldDescriptor.TYPE_STRING: lambda text: text.encode("utf-8", "backslashreplace").decode(),
+    FieldDescriptor.TYPE_STRING: _encodable,
 }
 
 

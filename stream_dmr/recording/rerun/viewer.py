@@ -8,7 +8,7 @@ import re
 import socket
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -64,7 +64,7 @@ def screenshot(rrd: str, png: Path, *, frame_index: int) -> None:
 
 
 @contextmanager
-def _headless() -> Iterator[ViewerClient]:
+def _headless() -> Generator[ViewerClient]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -110,7 +110,7 @@ def _settled_picture(viewer: ViewerClient) -> bytes:
 
 
 @contextmanager
-def _running(options: Sequence[str]) -> Iterator[subprocess.Popen[str]]:
+def _running(options: Sequence[str]) -> Generator[subprocess.Popen[str]]:
     """Run Rerun's program, listening on this machine only, until the context ends."""
     with (
         TemporaryDirectory() as scratch,  # for the files that it leaves behind

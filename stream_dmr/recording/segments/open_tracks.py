@@ -26,7 +26,7 @@ class OpenTracks:
             case LocalizedFish(track_id=track_id):
                 self._tracks.setdefault(track_id, deque(maxlen=_MAX_FRAMES)).append(record)
             case LengthEstimate() as estimate:
-                if estimate.is_final or estimate.frame_reason == Reason.TRACK_ENDED:
+                if estimate.is_final or estimate.frame_reason == str(Reason.TRACK_ENDED):
                     self._tracks.pop(estimate.track_id, None)
             case _:
                 pass

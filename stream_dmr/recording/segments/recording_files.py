@@ -1,6 +1,6 @@
 """The files of a recording, or of one segment of it: an .mcap and an .rrd of the same name."""
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -56,7 +56,7 @@ def _extra_topics(header: RunHeader, settings: RecordingSettings) -> Iterator[Ex
 
 
 @contextmanager
-def _requires_extra(extra: str, setting: str) -> Iterator[None]:
+def _requires_extra(extra: str, setting: str) -> Generator[None]:
     """Turn a missing package into a ConfigError that names how to install it."""
     try:
         yield
