@@ -1,5 +1,6 @@
 """Records a run: writes every message of every stage to every sink."""
 
+import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -15,11 +16,15 @@ from stream_dmr.recording.messages.record import Record, make_record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.sink import BufferedSink, Sink, SinkFactory
+from stream_dmr.recording.messages.sink_states import SinkStates
 from stream_dmr.recording.rerun.live_view import LiveView
 from stream_dmr.recording.segments.recording_files import open_recording_files
 
 _MAX_QUEUED = 64  # messages, some six frames; where the disk can't keep up, the run waits
 _MIN_PAUSE_S = 0.05  # between two looks for what is due, whatever `flush_s` says
+# Chosen: an unexpected failure may be expensive to repeat. It is tried again after the first time,
+# each time twice that, and at last the longest.
+_FIRST_RETRY_S, _LONGEST_RETRY_S = 1.0, 60.0
 
 
 class Recorder:
@@ -40,17 +45,22 @@ class Recorder:
         sinks: Sequence[Sink] = (),
         files: SinkFactory = open_recording_files,
         on_refusal: Callable[[str], None] | None = None,
+        states: SinkStates | None = None,
         in_one_thread: bool = False,
     ) -> None:
         """Open all sinks: `sinks`, which get each record first, then those that `files` opens.
 
         `files` is `open_recording_files` or, for a source without an end, `open_segments`. With
         `live` the view is served as well, at `live_address`. `on_refusal` is called with what the
-        disk refuses, instead of an exception, and the sink is tried again with the next record.
+        disk refuses, instead of an exception, and the sink is tried again with the next record;
+        after a failure of any other kind later and later. `states` is told how each sink is.
         With `in_one_thread` everything is written in the caller's thread.
         """
         self.live_address: str | None = None
+        self.states = states or SinkStates()
         self._on_refusal = on_refusal
+        self._pauses_s: dict[str, float] = {}  # by sink, after unexpected failures
+        self._retry_at_s: dict[str, float] = {}  # monotonic clock
         self._settings = settings
         self._sinks: list[Sink] = [*sinks]
         self._failed_sinks: list[Sink] = []
@@ -140,17 +150,27 @@ class Recorder:
 
         The others go on: where there is no room for pictures, there may still be for lengths.
         """
-        if sink in self._failed_sinks:
+        if sink in self._failed_sinks or time.monotonic() < self._retry_at_s.get(sink.name, 0.0):
             return
         try:
             write()
-        except OutputError as error:
-            if self._on_refusal is not None:
-                self._on_refusal(str(error))
-                return
-            self._fail(sink, error)
-        except Exception as error:  # whatever it is, the run must be told
-            self._fail(sink, error)
+        except Exception as error:
+            self._refuse(sink, error)
+        else:
+            self._pauses_s.pop(sink.name, None)
+            self.states.report(sink.name)
+
+    def _refuse(self, sink: Sink, error: Exception) -> None:
+        line = str(error) if isinstance(error, OutputError) else f"{type(error).__name__}: {error}"
+        self.states.report(sink.name, line)
+        if self._on_refusal is None:
+            return self._fail(sink, error)
+        if not isinstance(error, OutputError):
+            pause_s = self._pauses_s.get(sink.name, _FIRST_RETRY_S)
+            self._pauses_s[sink.name] = min(2 * pause_s, _LONGEST_RETRY_S)
+            self._retry_at_s[sink.name] = time.monotonic() + pause_s
+            line = f"{sink.name}: {line}; tried again in {pause_s:g} s"
+        self._on_refusal(line)
 
     def _fail(self, sink: Sink, error: BaseException) -> None:
         self._failed_sinks.append(sink)
@@ -171,7 +191,7 @@ class Recorder:
     def _close_sink(self, sink: Sink) -> None:
         try:
             sink.close()
-        except OutputError as error:
+        except Exception as error:
             if self._on_refusal is None:
                 raise
-            self._on_refusal(str(error))
+            self._refuse(sink, error)

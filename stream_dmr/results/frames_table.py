@@ -25,6 +25,8 @@ class FramesTable:
     whether the frame was used.
     """
 
+    name = "frames.csv"
+
     def __init__(self, out_dir: Path, *, resume: bool = False, is_endless: bool = False) -> None:
         """With `resume`, the whole rows of an earlier run stay.
 
@@ -33,7 +35,7 @@ class FramesTable:
         in the recording.
         """
         self._table = CsvFile(
-            out_dir / "frames.csv",
+            out_dir / self.name,
             FRAMES_COLUMNS,
             resume=resume,
             retry_open=is_endless,

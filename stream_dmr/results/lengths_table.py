@@ -40,6 +40,7 @@ class LengthsTable:
         with the next one, and the whole table at the end and by the next run.
         """
         self._path, self._store, self._on_refusal = out_dir / "lengths.csv", store, on_refusal
+        self.trouble = ""  # why the last row could not be written; "" when all are
         self._waiting: deque[LengthEstimate] = deque()
         if resume:
             self._export()
@@ -54,6 +55,7 @@ class LengthsTable:
             while self._waiting:
                 self._rows.add(lengths_row(self._waiting[0]))
                 self._waiting.popleft()
+            self.trouble = ""
         except OutputError as error:
             self._refuse(error)
 
@@ -73,6 +75,7 @@ class LengthsTable:
     def _refuse(self, error: OutputError) -> None:
         if self._on_refusal is None:
             raise error
+        self.trouble = str(error)
         self._on_refusal(str(error))
 
 

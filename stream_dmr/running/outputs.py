@@ -7,6 +7,7 @@ from functools import partial
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LocalizedFish
+from stream_dmr.recording.messages.sink_states import SinkStates
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.segments.recording_files import open_recording_files
 from stream_dmr.recording.segments.repair import Repair
@@ -56,7 +57,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
     repairs = prepare_folder(
         out, overwrite=request.overwrite, resume=resume, waits_for_room=is_endless
     )
-    header = inputs.header()
+    header, states = inputs.header(), SinkStates()
     facts = run_facts(header, vessel=request.vessel, trip=request.trip, haul=request.haul)
     with ExitStack() as stack:
         stack.enter_context(sealed(out, with_recordings=not is_endless, on_notice=observer.warn))
@@ -64,7 +65,9 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
         lengths = LengthsTable(out, store, resume=resume, on_refusal=on_refusal)
         stack.enter_context(closing(lengths))
         stack.enter_context(closing(observer))
-        observer.open(OpenRun(config=config, source=inputs.source, store=store, out=out))
+        observer.open(
+            OpenRun(config=config, source=inputs.source, store=store, out=out, sinks=states)
+        )
         interrupted = interrupted_tracks(
             repairs if is_endless else [], store, on_notice=observer.warn
         )
@@ -74,10 +77,13 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
             config.recording,
             live=request.live,
             sinks=[FramesTable(out, resume=resume, is_endless=is_endless)],
-            files=partial(open_segments, interrupted=interrupted, on_notice=observer.warn)
+            files=partial(
+                open_segments, interrupted=interrupted, on_notice=observer.warn, states=states
+            )
             if is_endless
             else open_recording_files,
             on_refusal=on_refusal,
+            states=states,
         )
         stack.enter_context(recorder)
         stack.enter_context(closing(retention))

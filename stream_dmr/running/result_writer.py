@@ -56,11 +56,14 @@ class ResultWriter:
                 self._store_fish(message)
             case _:
                 pass
+        states = self._recorder.states
+        states.report(self._store.path.name, self._store.trouble)
         if self._store.trouble:
             self._on_notice(f"{self._store.path}: {self._store.trouble}; lengths wait in memory")
         message = self._recorder.write(message)
         if isinstance(message, LengthEstimate) and message.is_final:
             self._lengths.add(message)
+            states.report("lengths.csv", self._lengths.trouble)
         return message
 
     def frame_done(self) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stream_dmr.messages import LengthEstimate, Message
+from stream_dmr.recording.messages.sink_states import SinkStates
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.running.config import Config
 from stream_dmr.running.pipeline import Chain
@@ -20,6 +21,7 @@ class OpenRun:
     source: Source
     store: LengthStore
     out: Path
+    sinks: SinkStates
 
 
 class RunObserver:

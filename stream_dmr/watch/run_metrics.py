@@ -71,6 +71,12 @@ class RunMetrics(Collector):
         yield fit
         yield _gauge("frames_per_second", "That left the chain.", self._state.frames_per_s())
         yield _gauge("disk_free_bytes", "Room for results.", self._state.disk_free_bytes())
+        sinks = GaugeMetricFamily(
+            "stream_dmr_output_works", "1: can be written, 0: not.", labels=["name"]
+        )
+        for sink in self._state.sinks.all():
+            sinks.add_metric([sink.name], 0.0 if sink.is_failing else 1.0)
+        yield sinks
         warnings = sum(warning.count for warning in self._state.warnings())
         yield _gauge("warnings", "Warnings that are shown.", warnings)
         yield _gauge("healthy", "1: healthy, 0: not.", 0.0 if self._state.problems() else 1.0)

@@ -4,7 +4,6 @@ import shutil
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.reasons import without_counts
+from stream_dmr.recording.messages.sink_states import SinkStates
 from stream_dmr.running.pipeline import Chain
 from stream_dmr.sources.source import Source
 
@@ -48,11 +48,19 @@ class MeasuredFrame:
 class RunState:
     """Is told every message in the chain's threads, and asked in the server's. Thread-safe."""
 
-    def __init__(self, source: Source, out_dir: Path, *, silence_s: float, stuck_s: float) -> None:
+    def __init__(
+        self,
+        source: Source,
+        out_dir: Path,
+        *,
+        silence_s: float,
+        stuck_s: float,
+        sinks: SinkStates | None = None,
+    ) -> None:
         """A camera that is silent for `silence_s` and a frame that takes `stuck_s` are problems."""
         self.source = source
         self.chain: Chain | None = None
-        self.store_error: Callable[[], str] = lambda: ""  # why lengths can't be written, else ""
+        self.sinks = sinks or SinkStates()
         self.finished: deque[LengthEstimate] = deque(maxlen=_MAX_FINISHED)  # newest last
         self.num_fish: Counter[str] = Counter()  # finished ones, by status
         self.fit_s: deque[float] = deque(maxlen=_MAX_FITS)
@@ -145,8 +153,11 @@ class RunState:
         return (time.monotonic_ns() - counts.last_arrival_ns) / 1e9
 
     def disk_free_bytes(self) -> int:
-        """Room where the results go."""
-        return shutil.disk_usage(self._out_dir).free
+        """Room where the results go; 0 where that folder is away."""
+        try:
+            return shutil.disk_usage(self._out_dir).free
+        except OSError:
+            return 0
 
     def problems(self) -> list[str]:
         """Why this run is not healthy, for people; empty when it is."""
@@ -156,9 +167,7 @@ class RunState:
             problems.append(f"no picture from the camera for {age_s:.0f} s")
         if self.is_stuck():
             problems.append("the measurement hangs")
-        if store_error := self.store_error():
-            problems.append(f"lengths can't be written: {store_error}")
-        return problems
+        return problems + self.sinks.problems()
 
     def is_stuck(self) -> bool:
         """True where a stage has had one frame for longer than any fit takes."""

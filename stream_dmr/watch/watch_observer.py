@@ -21,8 +21,9 @@ class WatchObserver(RunObserver):
         """Serve as `[watch]` says; ConfigError or OutputError where it can't listen as asked."""
         self._observer.open(run)
         settings, silence_s = run.config.watch, run.config.read_frames.silence_s
-        state = RunState(run.source, run.out, silence_s=silence_s, stuck_s=settings.stuck_s)
-        state.store_error = lambda: run.store.trouble
+        state = RunState(
+            run.source, run.out, silence_s=silence_s, stuck_s=settings.stuck_s, sinks=run.sinks
+        )
         self._server = WatchServer(state, settings) if settings.port else None
         self._watchdog = SystemdWatchdog(lambda: not state.is_stuck())
         self._state = state

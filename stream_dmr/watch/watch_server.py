@@ -2,6 +2,7 @@
 
 import threading
 import time
+from datetime import UTC, datetime
 from http import HTTPStatus
 from importlib.resources import files
 from pathlib import Path
@@ -108,11 +109,26 @@ class _WatchHandler(TokenHandler):
                     HTTPStatus.OK, CONTENT_TYPE_LATEST, generate_latest(self.server.registry)
                 )
             case "/health":
-                problems = state.problems()
-                code = HTTPStatus.SERVICE_UNAVAILABLE if problems else HTTPStatus.OK
-                self.answer_json(code, {"healthy": not problems, "problems": problems})
+                health = health_json(state)
+                code = HTTPStatus.OK if health["healthy"] else HTTPStatus.SERVICE_UNAVAILABLE
+                self.answer_json(code, health)
             case _:
                 self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
+
+
+def health_json(state: RunState) -> dict[str, Any]:
+    """Whether a run is healthy, why not, and how each of its outputs is."""
+    problems = state.problems()
+    sinks = [
+        {
+            "name": sink.name,
+            "state": "fails" if sink.is_failing else "works",
+            "since": datetime.fromtimestamp(sink.since_ns / 1e9, UTC).isoformat(),
+            "last_error": sink.last_error,
+        }
+        for sink in state.sinks.all()
+    ]
+    return {"healthy": not problems, "problems": problems, "sinks": sinks}
 
 
 def status_json(state: RunState) -> dict[str, Any]:

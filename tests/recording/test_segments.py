@@ -19,12 +19,15 @@ from mcap.reader import make_reader
 
 from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.recording.messages.codec import decode
+from stream_dmr.recording.messages.record import Record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
+from stream_dmr.recording.messages.sink_states import SinkStates
 from stream_dmr.recording.messages.topics import TOPICS
 from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.segments.repair import repair_recordings
 from stream_dmr.recording.segments.rotation import open_segments
+from stream_dmr.results.frames_table import FramesTable
 from stream_dmr.running.result_writer import INTERRUPTED
 from tests.running.test_run_signals import start, wait_for_rows
 from tests.support.command import invoke, rows
@@ -110,6 +113,67 @@ def test_segments_hold_every_message_once_and_are_cut_between_frames(
         assert {m.frame_index for m in found if isinstance(m, Frame)} == indices
         cuts.append(min(indices))
     assert cuts == [1, 6, 11, 16, 21]
+
+
+def test_recording_goes_on_when_the_folder_was_away(tmp_path: Path, messages: list[Message]):
+    out, away, notices = tmp_path / "out", tmp_path / "away", list[str]()
+    states = SinkStates()
+    files = partial(open_segments, on_notice=notices.append, states=states)
+    out.mkdir()
+    with Recorder(
+        out,
+        header(),
+        SETTINGS,
+        sinks=[FramesTable(out, is_endless=True)],
+        files=files,
+        on_refusal=notices.append,
+        states=states,
+        in_one_thread=True,
+    ) as segments:
+        for message in messages:
+            if message.frame_index == 3 and out.exists() and not away.exists():
+                out.rename(away)
+            if message.frame_index == 13 and away.exists():
+                failing = states.problems()
+                away.rename(out)
+            segments.write(message)
+    assert failing == [notice for notice in failing if "recording-*.mcap" in notice] != []
+    assert states.problems() == []
+    assert all(state.last_error for state in states.all() if state.name == "recording-*.mcap")
+    assert all(name.endswith(".mcap") for name in names(out))
+    recorded = {m.frame_index for m in read_messages(out, [Frame])}
+    assert recorded == set(range(1, NUM_FRAMES + 1))  # into the file that was open
+
+
+def test_a_sink_that_broke_is_tried_again(tmp_path: Path, messages: list[Message]):
+    class Breaking:
+        name, num_written, breaks = "other.txt", 0, True
+
+        def write(self, record: Record) -> None:
+            if self.breaks:
+                raise ConnectionError("gone")
+            self.num_written += 1
+
+        def close(self) -> None: ...
+
+    sink, notices, now_s = Breaking(), list[str](), [0.0]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stream_dmr.recording.recorder.time.monotonic", lambda: now_s[0])
+        with recorder(
+            tmp_path, sinks=[sink], on_refusal=notices.append, in_one_thread=True
+        ) as segments:
+            for message in messages[:7]:
+                segments.write(message)
+                now_s[0] += 1.1
+            assert [line[-3:] for line in notices] == ["1 s", "2 s", "4 s"]
+            assert segments.states.problems() == [
+                "other.txt can't be written: ConnectionError: gone"
+            ]
+            sink.breaks = False
+            now_s[0] += 60
+            segments.write(messages[9])
+            assert sink.num_written == 1
+            assert segments.states.problems() == []
 
 
 def test_a_segment_carries_the_fish_that_are_in_view(whole: Path, messages: list[Message]):

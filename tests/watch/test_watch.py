@@ -103,7 +103,7 @@ def test_the_picture_shows_the_fish_of_its_frame(state: RunState):
 def test_health_says_what_is_wrong(server: WatchServer, state: RunState, problem: str):
     assert get(f"{server.address}health")[0] == 200
     if problem == "lengths":
-        state.store_error = lambda: "disk full"
+        state.sinks.report("lengths.db", "disk full")
     else:
         state.chain = SimpleNamespace(  # type: ignore[assignment]
             longest_busy_s=lambda: 99.0, counters=[], waiting=list
@@ -112,6 +112,22 @@ def test_health_says_what_is_wrong(server: WatchServer, state: RunState, problem
     assert code == 503
     assert len(json.loads(content)["problems"]) == 1
     assert metrics_of(server.address)["stream_dmr_healthy",] == 0
+
+
+def test_health_knows_every_output(server: WatchServer, state: RunState):
+    state.sinks.report("frames.csv")
+    state.sinks.report("recording-*.mcap", "no such folder")
+    code, _, content = get(f"{server.address}health")
+    works, fails = json.loads(content)["sinks"]
+    assert code == 503
+    assert (works["name"], works["state"], works["last_error"]) == ("frames.csv", "works", "")
+    assert (fails["state"], fails["last_error"]) == ("fails", "no such folder")
+    state.sinks.report("recording-*.mcap")
+    code, _, content = get(f"{server.address}health")
+    again = json.loads(content)["sinks"][1]
+    assert (code, again["state"], again["last_error"]) == (200, "works", "no such folder")
+    assert again["since"] >= fails["since"]
+    assert metrics_of(server.address)["stream_dmr_output_works", "recording-*.mcap"] == 1
 
 
 def test_others_need_the_token(state: RunState, tmp_path: Path):
@@ -156,13 +172,13 @@ def test_a_port_in_use_is_refused(server: WatchServer, state: RunState):
 def test_a_phone_sees_fish_problems_and_warnings(server: WatchServer, state: RunState):
     state.warn("<b>the lens</b> is dirty")
     state.warn("<b>the lens</b> is dirty")
-    state.store_error = lambda: "no space left"
+    state.sinks.report("lengths.db", "no space left")
     command = [chromium(), "--headless", "--no-sandbox", "--disable-gpu", "--window-size=390,800"]
     command += ["--virtual-time-budget=4000", "--dump-dom", server.address]
     dom = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
     assert "<td>Fish 2</td>" in dom
     assert 'class="bad"' in dom
-    assert "lengths can't be written: no space left" in dom
+    assert "lengths.db can't be written: no space left" in dom
     assert "&lt;b&gt;the lens&lt;/b&gt; is dirty (2 times, " in dom
     assert 'src="picture.jpg?' in dom
 

@@ -97,6 +97,11 @@ class McapSink:
             raise self._output_error(error) from error
 
     @property
+    def name(self) -> str:
+        """The name of the file."""
+        return self.path.name
+
+    @property
     def size(self) -> int:
         """Bytes written so far."""
         return self._file.tell()

@@ -13,6 +13,11 @@ from stream_dmr.recording.messages.run_header import RunHeader
 class Sink(Protocol):
     """One kind of output."""
 
+    @property
+    def name(self) -> str:
+        """What people know it by: the name of its file."""
+        ...
+
     def write(self, record: Record, /) -> None:
         """Take one record. Raises OutputError where the disk refuses it."""
         ...

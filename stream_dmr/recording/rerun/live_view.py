@@ -30,6 +30,8 @@ class LiveView:
     after an error of its own it shows nothing more.
     """
 
+    name = "live view"
+
     def __init__(self, header: RunHeader, settings: RecordingSettings) -> None:
         self.num_dropped = 0
         self._queue: Queue[Record] = Queue(_MAX_QUEUED)

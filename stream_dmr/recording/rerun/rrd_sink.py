@@ -44,6 +44,11 @@ class RrdSink:
             self._log_header(header)
         self._flush()
 
+    @property
+    def name(self) -> str:
+        """The name of the file."""
+        return self.path.name
+
     def write(self, record: Record) -> None:
         """Draw one record. Raises OutputError where the disk refuses it, and closes the file."""
         self._drawing.draw(record)

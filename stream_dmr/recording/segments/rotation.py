@@ -7,17 +7,19 @@ from pathlib import Path
 from threading import Thread
 
 from stream_dmr.errors import OutputError
-from stream_dmr.files import free_bytes
+from stream_dmr.files import free_bytes, writing_to
 from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish
-from stream_dmr.recording.mcap.mcap_sink import McapSink
+from stream_dmr.recording.mcap.mcap_sink import PART, McapSink
 from stream_dmr.recording.messages.record import Record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.sink import BufferedSink, FileSink, Sink
+from stream_dmr.recording.messages.sink_states import SinkStates
 from stream_dmr.recording.segments.open_tracks import OpenTracks
 from stream_dmr.recording.segments.recording_files import STEM, open_recording_files
 from stream_dmr.recording.segments.repair import is_unfinished, repair_file
 
+_UNFINISHED = (f".mcap{PART}", ".rrd")  # ends of names that a segment may leave
 _NUMBERED = re.compile(rf"{STEM}-(\d+)\..*")
 _RETRY_NS = 5_000_000_000  # capture time after which a new segment is tried again
 _MIN_FREE_SHARE = 0.05  # of `keep_free_gb`: with less than that free only lengths are written
@@ -35,6 +37,8 @@ class RotatingSink:
     files are repaired once there is room for the next one.
     """
 
+    name = "segments"
+
     def __init__(
         self,
         out_dir: Path,
@@ -43,10 +47,14 @@ class RotatingSink:
         *,
         interrupted: Iterable[LocalizedFish] = (),
         on_notice: Callable[[str], None],
+        states: SinkStates | None = None,
     ) -> None:
-        """`interrupted`: frames of tracks that an earlier run left open and this one finishes."""
+        """`interrupted`: frames of tracks that an earlier run left open and this one finishes.
+
+        `states` is told how the files of each kind are.
+        """
         self._out_dir, self._header, self._settings = out_dir, header, settings
-        self._on_notice = on_notice
+        self._on_notice, self._states = on_notice, states or SinkStates()
         self._number = last_segment_number(out_dir)
         self._began_ns: int | None = None  # capture time of the first frame
         self._cut_ns: int | None = None  # of the first frame of `_next`
@@ -136,36 +144,51 @@ class RotatingSink:
         self._ahead.clear()
 
     def _lacks_room(self) -> bool:
-        """True where the space that is left is kept for lengths."""
-        return free_bytes(self._out_dir) < _MIN_FREE_SHARE * self._settings.keep_free_gb * 1e9
+        """True where the space that is left is kept for lengths; a folder that is away has room."""
+        try:
+            free = free_bytes(self._out_dir)
+        except OSError:  # open files can still be written to; the next segment says what is wrong
+            return False
+        return free < _MIN_FREE_SHARE * self._settings.keep_free_gb * 1e9
 
     def _stop_recording(self, now_ns: int) -> None:
         """Close what is open while there is room for its end."""
         if self._cut_ns is not None:
             self._complete()
         self._close_all(self._open)
+        self._refuse(now_ns, f"{self._out_dir}: {_NO_ROOM}")
+
+    def _refuse(self, now_ns: int, reason: str) -> None:
         self._retry_ns = now_ns + _RETRY_NS
-        self._on_notice(f"{self._out_dir}: {_NO_ROOM}")
+        self._report(reason)
+        self._on_notice(reason)
+
+    def _report(self, error: str = "") -> None:
+        """Say how the files of all kinds are."""
+        for suffix, is_wanted in ((".mcap", self._settings.mcap), (".rrd", self._settings.rrd)):
+            if is_wanted:
+                self._states.report(f"{STEM}-*{suffix}", error)
 
     def _try_next(self, now_ns: int) -> list[FileSink]:
         """The sinks of the next segment; none where the disk refuses them."""
         if self._lacks_room():
-            self._retry_ns = now_ns + _RETRY_NS
-            self._on_notice(f"{self._out_dir}: {_NO_ROOM}")
+            self._refuse(now_ns, f"{self._out_dir}: {_NO_ROOM}")
             return []
-        number = 1 + max(
-            self._number, last_segment_number(self._out_dir)
-        )  # a torn one keeps its own
-        stem = f"{STEM}-{number:06d}"
+        stem = ""
         try:
+            with writing_to(self._out_dir):
+                last = last_segment_number(self._out_dir)
+            number = 1 + max(self._number, last)  # a torn one keeps its own
+            stem = f"{STEM}-{number:06d}"
             files = open_recording_files(
                 self._out_dir, self._header, self._settings, stem=stem, segment_number=number
             )
         except OutputError as error:
-            self._retry_ns = now_ns + _RETRY_NS
-            self._unfinished += self._out_dir.glob(f"{stem}.*")
-            self._on_notice(f"{error}; tried again in some seconds")
+            if stem:
+                self._unfinished += [self._out_dir / f"{stem}{end}" for end in _UNFINISHED]
+            self._refuse(now_ns, f"{error}; tried again in some seconds")
             return []
+        self._report()
         self._number = number
         if self._unfinished and not self._repairs.is_alive():
             self._repairs = Thread(target=self._repair, name="repairs")
@@ -198,19 +221,27 @@ class RotatingSink:
                 is_again = self._now_ns - self._refused_ns < _RETRY_NS
                 self._retry_ns = self._now_ns + _RETRY_NS * is_again
                 self._refused_ns = self._now_ns
+                self._states.report(f"{STEM}-*{sink.path.suffix}", str(error))
                 self._on_notice(f"{error}; tried again with the next segment")
                 with suppress(OutputError):
                     sink.close()
-                self._unfinished += self._out_dir.glob(f"{sink.path.name}*")
+                self._unfinished.append(_unfinished(sink))
 
     def _close_all(self, sinks: list[FileSink]) -> None:
         for sink in sinks:
             try:
                 sink.close()
             except OutputError as error:
+                self._states.report(f"{STEM}-*{sink.path.suffix}", str(error))
                 self._on_notice(str(error))
-                self._unfinished += self._out_dir.glob(f"{sink.path.name}*")
+                self._unfinished.append(_unfinished(sink))
         sinks.clear()
+
+
+def _unfinished(sink: FileSink) -> Path:
+    """The file that a sink leaves when it can't be closed."""
+    is_mcap = isinstance(sink, McapSink)
+    return sink.path.with_name(sink.path.name + PART) if is_mcap else sink.path
 
 
 def open_segments(
@@ -220,11 +251,15 @@ def open_segments(
     *,
     interrupted: Iterable[LocalizedFish] = (),
     on_notice: Callable[[str], None],
+    states: SinkStates | None = None,
 ) -> list[Sink]:
     """A `RotatingSink`, or nothing where the settings ask for no recording."""
     if not (settings.mcap or settings.rrd):
         return []
-    return [RotatingSink(out_dir, header, settings, interrupted=interrupted, on_notice=on_notice)]
+    sink = RotatingSink(
+        out_dir, header, settings, interrupted=interrupted, on_notice=on_notice, states=states
+    )
+    return [sink]
 
 
 def last_segment_number(out_dir: Path) -> int:
