@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from stream_dmr.camera import Calibration
-from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.tracks import TrackFitter
 from stream_dmr.messages import FishCrop, FittedMesh

@@ -6,7 +6,7 @@ Fourth of the chain: FittedMesh -> LocalizedFish.
 from collections.abc import Sequence
 
 from stream_dmr.camera import Calibration
-from stream_dmr.localization.localize import LocalizeSettings, localize
+from stream_dmr.localization.localize_fish import LocalizeSettings, localize
 from stream_dmr.messages import FittedMesh, LocalizedFish
 
 

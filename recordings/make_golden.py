@@ -11,7 +11,7 @@ import tempfile
 import threading
 from pathlib import Path
 
-from stream_dmr.replaying.replay import replay
+from stream_dmr.replaying.replay_recording import replay
 from stream_dmr.replaying.replay_request import ReplayRequest
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_request import RunRequest

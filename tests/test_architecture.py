@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -63,7 +64,7 @@ ROOMS = [
     "stream_dmr.fitting.target",
     "stream_dmr.fitting.distance_map",
     "stream_dmr.fitting.heading",
-    "stream_dmr.fitting.settings",
+    "stream_dmr.fitting.fit_settings",
     "stream_dmr.fitting.mesh_levels",
     "stream_dmr.fitting.body",
     "stream_dmr.fitting.parameters",
@@ -177,6 +178,18 @@ def test_imports_point_downwards():
         and ROOMS.index(room_of(name)) < ROOMS.index(room_of(module_of(path)))
     ]
     assert not upwards
+
+
+def test_file_names_are_unique():
+    names = [path.stem for path in FILES if not path.stem.startswith("__")]
+    assert not [name for name, count in Counter(names).items() if count > 1]
+
+
+def test_class_names_are_unique():
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in FILES]
+    classes = (node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+    counts = Counter(node.name for node in classes)
+    assert not [name for name, count in counts.items() if count > 1]
 
 
 def test_imports_have_no_cycles():

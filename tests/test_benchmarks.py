@@ -20,9 +20,9 @@ from benchmarks.fit_speed.targets import draw_known, draw_pair, species_template
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.problem import Problem
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.paper.silhouette import project, silhouette
 from stream_dmr.fitting.paper.skinning import Rig, deform, spine
-from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"

@@ -29,7 +29,7 @@ from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import LOG_SIZE
 from stream_dmr.fitting.size.scanner import STD_SCALE
 from stream_dmr.fitting.tracks import TrackFitter
-from stream_dmr.localization.localize import localize
+from stream_dmr.localization.localize_fish import localize
 from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
 from stream_dmr.running.config import Config
 from stream_dmr.simulation.presets import PRESETS

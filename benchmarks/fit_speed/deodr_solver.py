@@ -15,11 +15,11 @@ from deodr.differentiable_renderer import Scene2D
 from jaxtyping import Float
 from torch import Tensor
 
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.paper import adam, losses
 from stream_dmr.fitting.paper.silhouette import project
 from stream_dmr.fitting.paper.skinning import Parameters, Rig, deform, spine
 from stream_dmr.fitting.parameters import NUM_PER_JOINT, NUM_ROOT
-from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
 from stream_dmr.template.template import Template
 

@@ -22,17 +22,17 @@ from stream_dmr.fitting.contour import (
     normal_equations,
     outline,
 )
+from stream_dmr.fitting.contour.contour_solver import ContourSolver
 from stream_dmr.fitting.contour.deformation import KINDS, deform
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.outline import project
 from stream_dmr.fitting.contour.problem import Problem
-from stream_dmr.fitting.contour.solver import ContourSolver
 from stream_dmr.fitting.distance_map import signed_distance
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.paper.adam import AdamSolver
 from stream_dmr.fitting.parameters import LOG_SIZE
-from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target, mask_contour
 from stream_dmr.fitting.uncertainty import covariance
 from stream_dmr.fitting.warm_start import recentered
@@ -219,7 +219,7 @@ from benchmarks.fit_speed.targets import species_template
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.compile_kernels import compile_kernels
 from stream_dmr.fitting.parameters import LOG_SIZE
-from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 fitter = Fitter(species_template(), FitMeshSettings())
 ready = time.perf_counter()
 compile_kernels(fitter)

@@ -17,13 +17,13 @@ from jaxtyping import Float
 from benchmarks.fit_speed.targets import FramePair
 from benchmarks.fit_speed.timing import Duration, median_duration, time_call
 from stream_dmr.fitting.cold_start import cold_starts
+from stream_dmr.fitting.contour.contour_solver import ContourSolver
 from stream_dmr.fitting.contour.problem import Problem
-from stream_dmr.fitting.contour.solver import ContourSolver
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.paper import adam
 from stream_dmr.fitting.paper.adam import AdamSolver
-from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution
 from stream_dmr.fitting.target import Target
 from stream_dmr.fitting.warm_start import recentered

@@ -31,7 +31,7 @@ from stream_dmr.messages import Frame, Message
 from stream_dmr.recording.messages.codec import decode
 from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.recording.reading.rrd_conversion import convert
-from stream_dmr.results.export import Export
+from stream_dmr.results.export_formats import Export
 from stream_dmr.running.config import load_config
 from stream_dmr.segmentation.annotations.annotated_fish import open_annotated_fish
 from stream_dmr.simulation import DEMO_SCENE

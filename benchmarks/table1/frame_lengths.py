@@ -9,7 +9,7 @@ from benchmarks.table1.filmed_scene import FilmedScene
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.evaluation.length_tables import LengthRow
 from stream_dmr.lengths.kalman import SmoothLengthSettings
-from stream_dmr.localization.localize import LocalizeSettings, localize
+from stream_dmr.localization.localize_fish import LocalizeSettings, localize
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms
 
 _MIN_FRAMES = SmoothLengthSettings().min_frames  # as many good frames as our own rows need

@@ -16,7 +16,7 @@ from benchmarks.table1.frame_lengths import medians
 from benchmarks.table1.mask_midline import midline_of
 from stream_dmr.evaluation.length_tables import LengthRow
 from stream_dmr.geometry import arc_length, arc_lengths
-from stream_dmr.localization.localize import LocalizeSettings
+from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.messages import FishCrop
 
 ROWS = ("stereo",)

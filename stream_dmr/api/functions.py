@@ -15,7 +15,7 @@ from stream_dmr.csv_file import rotated_files
 from stream_dmr.messages import Message
 from stream_dmr.recording.messages.selection import Selection
 from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
-from stream_dmr.replaying.replay import replay as replay_recordings
+from stream_dmr.replaying.replay_recording import replay as replay_recordings
 from stream_dmr.replaying.replay_request import ReplayRequest
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_observer import RunObserver

@@ -43,7 +43,7 @@ def export(
         raise typer.BadParameter(
             "say what to export: --fish csv, --meshes ply, --masks, --tables csv"
         )
-    from stream_dmr.results.export import Export
+    from stream_dmr.results.export_formats import Export
     from stream_dmr.running.config import load_config, parse_config
 
     exported = Export(recording, parse_selection(time, track))

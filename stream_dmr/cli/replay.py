@@ -59,7 +59,7 @@ def replay(
 ) -> None:
     """Compute a recording anew from one stage on, with its own inputs or with others."""
     from stream_dmr.cli.terminal import RunDisplay, print_check, print_fish, print_timings
-    from stream_dmr.replaying.replay import replay as replay_recording
+    from stream_dmr.replaying.replay_recording import replay as replay_recording
     from stream_dmr.replaying.replay_request import ReplayRequest
 
     request = ReplayRequest(

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from stream_dmr.evaluation.compare import Distributions, Evaluation, distribution_rows, summary_rows
 from stream_dmr.messages import LengthEstimate, Message
-from stream_dmr.replaying.replay import ReplaySummary
+from stream_dmr.replaying.replay_recording import ReplaySummary
 from stream_dmr.running.measure_source import RunSummary
 from stream_dmr.running.run_observer import RunObserver
 

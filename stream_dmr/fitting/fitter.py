@@ -10,15 +10,15 @@ from scipy.spatial.transform import Rotation
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.cold_start import cold_starts
+from stream_dmr.fitting.contour.contour_solver import ContourSolver, loss_of
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.outline import project
 from stream_dmr.fitting.contour.problem import Problem
-from stream_dmr.fitting.contour.solver import ContourSolver, loss_of
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.heading import is_reversed
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import ROOT_ROTATION
-from stream_dmr.fitting.settings import FitMeshSettings
-from stream_dmr.fitting.shape.candidates import Candidate
+from stream_dmr.fitting.shape.candidates import CandidateShape
 from stream_dmr.fitting.shape.length_std import freed, shape_std_ratio
 from stream_dmr.fitting.shape.space import (
     TRUNK,
@@ -70,7 +70,7 @@ class Fitter:
         settings: FitMeshSettings,
         *,
         index: int | None = None,
-        candidate: Candidate | None = None,
+        candidate: CandidateShape | None = None,
         plane_normal: Float[np.ndarray, "3"] | None = None,
         with_covariance: bool = False,
     ) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable
 
 from stream_dmr.camera import Calibration
-from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.shape.samples import (
     FRAMES_PER_FISH,

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.camera import Calibration
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fit, Fitter, Solved
 from stream_dmr.fitting.heading import HeadTracker
-from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.template.template import Template
@@ -23,7 +23,7 @@ _MIN_VISIBLE = 0.9  # of a frame that decides
 
 
 @dataclass(kw_only=True, slots=True)
-class _Track:
+class _TrackState:
     """What the next frame of a track starts from."""
 
     against: Float[np.ndarray, "N"]  # nats against each candidate
@@ -65,11 +65,11 @@ class TrackFitter:
         shares = np.ones(1) if candidates is None else candidates.shares
         self._unlikely = -np.log(shares)  # nats
         self._settings = settings
-        self._tracks: dict[int, _Track] = {}
+        self._tracks: dict[int, _TrackState] = {}
 
     def fit(self, crop: FishCrop) -> FittedMesh:
         """Fit one crop; a poor fit, or one of half a fish, warms no other."""
-        track = self._tracks.setdefault(crop.track_id, _Track(against=self._unlikely.copy()))
+        track = self._tracks.setdefault(crop.track_id, _TrackState(against=self._unlikely.copy()))
         track.seen_ns = crop.timestamp_ns
         weighed = replace(crop, ends=track.head.correct(crop.ends))
         fitted, best = self._fit(weighed, track)
@@ -86,7 +86,7 @@ class TrackFitter:
             if track.seen_ns < before_ns:
                 del self._tracks[track_id]
 
-    def _fit(self, crop: FishCrop, track: _Track) -> Fit:
+    def _fit(self, crop: FishCrop, track: _TrackState) -> Fit:
         chosen = int(np.argmin(track.against))
         if len(self.fitters) == 1 or track.num_decided >= _DECIDING_FRAMES:
             return self.fitters[chosen].fit(crop, track.best.get(chosen))
@@ -98,7 +98,7 @@ class TrackFitter:
                 track.best[n] = one.solution.parameters
         return self.fitters[chosen].answer(crop, solved[chosen])
 
-    def _decide(self, track: _Track, crop: FishCrop, solved: list[Solved]) -> None:
+    def _decide(self, track: _TrackState, crop: FishCrop, solved: list[Solved]) -> None:
         """Count what a frame of the whole fish says against each candidate."""
         if crop.quality.touches_border or crop.quality.visible_fraction < _MIN_VISIBLE:
             return

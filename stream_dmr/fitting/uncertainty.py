@@ -21,8 +21,8 @@ from stream_dmr.fitting.contour.normal_equations import (
 )
 from stream_dmr.fitting.contour.outline import Rendering
 from stream_dmr.fitting.contour.problem import Problem
-from stream_dmr.fitting.contour.rotation import dot
-from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.contour.rotation_vector import dot
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 
 # What is known of the parameters before any picture, as standard deviations: rotations of the root
 # and the joints (rad), their translations (body lengths), log scales, log precisions.

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
 from stream_dmr.lengths.track_length import TrackLength
-from stream_dmr.localization.localize import localize
+from stream_dmr.localization.localize_fish import localize
 from stream_dmr.messages import FittedMesh, LengthEstimate, LocalizedFish
 from stream_dmr.running.config import Config
 

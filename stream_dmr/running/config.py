@@ -15,9 +15,9 @@ from pydantic_core import ErrorDetails
 
 from stream_dmr.errors import ConfigError
 from stream_dmr.evaluation.length_errors import EvaluateSettings
-from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.lengths.kalman import SmoothLengthSettings
-from stream_dmr.localization.localize import LocalizeSettings
+from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.results.fisheries import FisheriesSettings
 from stream_dmr.running.run_settings import DriftSettings, WatchSettings

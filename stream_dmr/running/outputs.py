@@ -12,7 +12,7 @@ from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.segments.recording_files import open_recording_files
 from stream_dmr.recording.segments.repair import Repair
 from stream_dmr.recording.segments.retention import Retention
-from stream_dmr.recording.segments.rotation import open_segments
+from stream_dmr.recording.segments.rotating_sink import open_segments
 from stream_dmr.results.finished_fish import flagged_fish
 from stream_dmr.results.frames_table import FramesTable
 from stream_dmr.results.length_store import LengthStore

@@ -14,8 +14,8 @@ from tests.support.shapes import crop_of, pose
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.compile_kernels import compile_kernels
-from stream_dmr.fitting.settings import FitMeshSettings
-from stream_dmr.replaying.replay import replay
+from stream_dmr.fitting.fit_settings import FitMeshSettings
+from stream_dmr.replaying.replay_recording import replay
 from stream_dmr.replaying.replay_request import ReplayRequest
 from stream_dmr.fitting.paper.skinning import Rig
 from stream_dmr.template.template_file import load_template

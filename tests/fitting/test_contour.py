@@ -10,19 +10,19 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour import deformation, normal_equations, outline, rotation
+from stream_dmr.fitting.contour import deformation, normal_equations, outline, rotation_vector
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.mesh_terms import smoothness_slope
 from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.contour.pull_back import pull_back
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.paper.losses import laplacian_loss, normal_loss
 from stream_dmr.fitting.paper.objective import Objective
 from stream_dmr.fitting.paper.silhouette import project, silhouette
 from stream_dmr.fitting.paper.silhouette import rim_edges as torch_rim_edges
 from stream_dmr.fitting.paper.skinning import DEFORMATIONS, Parameters, Rig
 from stream_dmr.fitting.parameters import LOG_SIZE, NUM_PER_JOINT, NUM_ROOT
-from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target, mask_contour
 from stream_dmr.template.template_file import load_template
 from tests.support.shapes import (
@@ -99,7 +99,7 @@ class TestRotation:
     @given(seed=seeds, angle=angles)
     def test_is_scipy_s(self, seed, angle):
         w = self.vector(seed, angle)
-        R, _ = rotation.rotation_and_jacobian(w)
+        R, _ = rotation_vector.rotation_and_jacobian(w)
         np.testing.assert_allclose(R, Rotation.from_rotvec(w).as_matrix(), atol=1e-11)
 
     @given(seed=seeds, angle=angles)
@@ -111,17 +111,17 @@ class TestRotation:
         for k in range(1, 60):
             term = term @ -cross / (k + 1)
             total = total + term
-        _, J = rotation.rotation_and_jacobian(w)
+        _, J = rotation_vector.rotation_and_jacobian(w)
         np.testing.assert_allclose(J, total, atol=1e-10)
 
     @given(seed=seeds, angle=angles)
     def test_right_jacobian_is_the_slope(self, seed, angle):
         """R(w + d) = R(w) exp(J_r d) to first order."""
         w = self.vector(seed, angle)
-        _, J = rotation.rotation_and_jacobian(w)
+        _, J = rotation_vector.rotation_and_jacobian(w)
         slopes = []
         for step in np.eye(3) * 1e-5:
-            ahead, behind = (rotation.rotation_and_jacobian(w + s)[0] for s in (step, -step))
+            ahead, behind = (rotation_vector.rotation_and_jacobian(w + s)[0] for s in (step, -step))
             slopes.append(Rotation.from_matrix(behind.T @ ahead).as_rotvec() / 2e-5)
         np.testing.assert_allclose(J, np.transpose(slopes), atol=1e-8)
 

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour import levenberg_marquardt
+from stream_dmr.fitting.contour.contour_solver import ContourSolver, mirror
 from stream_dmr.fitting.contour.deformation import KINDS, deform
 from stream_dmr.fitting.contour.levenberg_marquardt import (
     EXHAUSTED,
@@ -32,12 +33,11 @@ from stream_dmr.fitting.contour.normal_equations import (
     weighted_squares,
 )
 from stream_dmr.fitting.contour.problem import Options, Problem
-from stream_dmr.fitting.contour.solver import ContourSolver, mirror
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.paper.skinning import Parameters, Rig, rest_parameters, rotation_matrices
 from stream_dmr.fitting.parameters import LOG_SIZE, NUM_PER_JOINT, NUM_ROOT, Priors, rest_vector
-from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
 from stream_dmr.geometry import arc_length
 from stream_dmr.template.template_file import load_template

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from stream_dmr.fitting.body import Body
+from stream_dmr.fitting.contour.contour_solver import ContourSolver
 from stream_dmr.fitting.contour.levenberg_marquardt import WARM_DAMPING, evaluate, minimise
 from stream_dmr.fitting.contour.normal_equations import prior_loss
 from stream_dmr.fitting.contour.problem import Options, Problem
-from stream_dmr.fitting.contour.solver import ContourSolver
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import LOG_SIZE, rest_vector
-from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.size.density import mean_and_std
 from stream_dmr.fitting.size.scan import only_size, scan_sizes
 from stream_dmr.fitting.size.scanner import SizeScanner

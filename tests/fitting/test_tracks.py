@@ -2,7 +2,7 @@
 
 import pytest
 
-from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.tracks import TrackFitter
 from tests.support.stocks import TEMPLATE, broader, candidates, fish_of, forms, tapered
 

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.geometry import arc_length
-from stream_dmr.localization.localize import (
+from stream_dmr.localization.localize_fish import (
     LocalizeSettings,
     Unlocatable,
     intersect,

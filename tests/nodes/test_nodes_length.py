@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stream_dmr.lengths.kalman import SmoothLengthSettings
-from stream_dmr.localization.localize import LocalizeSettings
+from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.nodes.localize import Localize
 from stream_dmr.nodes.smooth_length import SmoothLength
 from tests.lengths.test_lengths import frame

@@ -40,7 +40,7 @@ from stream_dmr.recording.messages.sink import SinkFactory
 from stream_dmr.recording.messages.topics import FOXGLOVE_TOPICS, TOPICS, topics_table
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.segments.recording_files import open_recording_files
-from stream_dmr.recording.segments.rotation import open_segments
+from stream_dmr.recording.segments.rotating_sink import open_segments
 from stream_dmr.recording.view.view_geometry import place_fit
 from stream_dmr.results.frames_table import FramesTable
 from tests.support.reading import read_header, read_messages, read_metadata

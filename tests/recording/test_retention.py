@@ -17,7 +17,7 @@ from stream_dmr.recording.messages.topics import TOPICS
 from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.segments.retention import Retention
-from stream_dmr.recording.segments.rotation import open_segments
+from stream_dmr.recording.segments.rotating_sink import open_segments
 from stream_dmr.results.frames_table import FramesTable
 from tests.recording.test_segments import read_by_others, write_clips
 from tests.support.command import invoke, rows

@@ -26,7 +26,7 @@ from stream_dmr.recording.messages.topics import TOPICS
 from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.segments.repair import repair_recordings
-from stream_dmr.recording.segments.rotation import open_segments
+from stream_dmr.recording.segments.rotating_sink import open_segments
 from stream_dmr.results.frames_table import FramesTable
 from stream_dmr.running.result_writer import INTERRUPTED
 from tests.running.test_run_signals import start, wait_for_rows

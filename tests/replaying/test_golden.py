@@ -11,7 +11,7 @@ import pytest
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.recording.messages.codec import decode
 from stream_dmr.recording.reading.open_recording import Recording, open_recordings
-from stream_dmr.replaying.replay import replay
+from stream_dmr.replaying.replay_recording import replay
 from stream_dmr.replaying.replay_request import ReplayRequest
 
 GOLDEN = Path(__file__).parents[2] / "recordings" / "golden" / "recording.mcap"

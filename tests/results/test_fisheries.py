@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pyarrow import parquet
 
 from stream_dmr.errors import TemplateError
-from stream_dmr.results.export import Export
+from stream_dmr.results.export_formats import Export
 from stream_dmr.results.fish_table import FISH_TABLE
 from stream_dmr.results.fisheries import Derived, FisheriesSettings, derive, whole_cm
 from stream_dmr.results.provenance import read_provenance

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stream_dmr.fitting.shape.space import reshaped
-from stream_dmr.replaying.replay import ReplayRequest, replay
+from stream_dmr.replaying.replay_recording import ReplayRequest, replay
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_folder import LEARNT
 from stream_dmr.running.run_observer import RunObserver

@@ -3,7 +3,7 @@
 import numpy as np
 
 from stream_dmr.fitting.paper.skinning import Rig
-from stream_dmr.fitting.shape.candidates import Candidate, CandidateShapes
+from stream_dmr.fitting.shape.candidates import CandidateShape, CandidateShapes
 from stream_dmr.fitting.shape.samples import FishSamples, Sample
 from stream_dmr.fitting.shape.space import (
     BREADTH,
@@ -40,7 +40,7 @@ def candidates(shares=(0.5, 0.5), **shapes):
     covariance = np.linalg.inv(form_precision())
     return CandidateShapes.of(
         [
-            Candidate(name, shape, covariance, share)
+            CandidateShape(name, shape, covariance, share)
             for (name, shape), share in zip(shapes.items(), shares, strict=True)
         ],
         are_learnt=False,

@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.linear_blend import blend_jacobian, blend_points, move_and_scale
-from stream_dmr.fitting.contour.rotation import rotation_and_jacobian
+from stream_dmr.fitting.contour.rotation_vector import rotation_and_jacobian
 from stream_dmr.fitting.contour.spine import spine_jacobian, spine_points
 from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION, ROOT_TRANSLATION
 

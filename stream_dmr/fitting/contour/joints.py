@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.compiled import compiled
-from stream_dmr.fitting.contour.rotation import rotated_slope
+from stream_dmr.fitting.contour.rotation_vector import rotated_slope
 from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION, ROOT_TRANSLATION
 
 

@@ -11,7 +11,7 @@ from stream_dmr.fitting.contour.mesh_terms import smoothness
 from stream_dmr.fitting.contour.normal_equations import normal_equations, prior_loss
 from stream_dmr.fitting.contour.outline import Rendering, coverage, overlap, project, rim_edges
 from stream_dmr.fitting.contour.problem import LAPLACIAN, NORMAL, Options, Problem
-from stream_dmr.fitting.contour.rotation import dot
+from stream_dmr.fitting.contour.rotation_vector import dot
 from stream_dmr.fitting.parameters import LOG_SIZE, joints_of
 
 SETTLED, STUCK, EXHAUSTED = 0, 1, 2
@@ -34,7 +34,7 @@ class Minimum(NamedTuple):
     H: Float[np.ndarray, "P P"]  # curvature of the loss where the last step began, nothing held
 
 
-class Evaluation(NamedTuple):
+class Iterate(NamedTuple):
     """One iterate, with what the normal equations need again."""
 
     terms: Float[np.ndarray, "6"]  # of eq. (3), before their lambdas
@@ -45,7 +45,7 @@ class Evaluation(NamedTuple):
 @compiled
 def evaluate(
     problem: Problem, parameters: Float[np.ndarray, "P"], with_smoothness: bool
-) -> Evaluation:
+) -> Iterate:
     """The six terms of eq. (3) and the hard IoU.
 
     Without smoothness the last two, L_normal and L_lap, are left at 0: they take a third of it.
@@ -66,7 +66,7 @@ def evaluate(
         for i in range(3):
             translation += joints.translation[j, i] ** 2
     terms = np.array([iou, boundary, scale, translation, normal, laplacian])
-    return Evaluation(terms, hard_iou, Rendering(points, pixels, rim, covered))
+    return Iterate(terms, hard_iou, Rendering(points, pixels, rim, covered))
 
 
 @compiled

@@ -18,7 +18,7 @@ from stream_dmr.fitting.contour.deformation import jacobian
 from stream_dmr.fitting.contour.mesh_terms import smoothness_slope
 from stream_dmr.fitting.contour.outline import COVERED, Rendering, boundary_loss
 from stream_dmr.fitting.contour.problem import LAPLACIAN, NORMAL, SCALE, TRANSLATION, Problem
-from stream_dmr.fitting.contour.rotation import rotated_slope, rotation_and_jacobian
+from stream_dmr.fitting.contour.rotation_vector import rotated_slope, rotation_and_jacobian
 from stream_dmr.fitting.parameters import (
     JOINT_LOG_SCALE,
     JOINT_ROTATION,

@@ -7,8 +7,8 @@ from jaxtyping import Float
 
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.deformation import KINDS
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.parameters import Priors, rest_vector
-from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
 
 # The terms of eq. (3), and their lambdas, in this order.

@@ -11,7 +11,7 @@ from stream_dmr.compiled import compiled
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.deformation import SPINE, jacobian
 from stream_dmr.fitting.contour.joints import blend, cholesky_factors, skinning_weights
-from stream_dmr.fitting.contour.rotation import (
+from stream_dmr.fitting.contour.rotation_vector import (
     dot,
     fill_rotation_and_jacobian,
     rotation_and_jacobian,

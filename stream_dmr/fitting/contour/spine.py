@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.joints import blend, cholesky_factors, root_slope, skinning_weights
-from stream_dmr.fitting.contour.rotation import (
+from stream_dmr.fitting.contour.rotation_vector import (
     dot,
     fill_rotation,
     fill_rotation_and_jacobian,

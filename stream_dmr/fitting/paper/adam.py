@@ -6,10 +6,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stream_dmr.errors import ConfigError
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.paper.objective import Objective
 from stream_dmr.fitting.paper.skinning import Rig
 from stream_dmr.fitting.parameters import NUM_PER_JOINT, NUM_ROOT
-from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution, rank
 from stream_dmr.fitting.target import Target
 from stream_dmr.template.template import Template

@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.paper import losses
 from stream_dmr.fitting.paper.silhouette import project, silhouette
 from stream_dmr.fitting.paper.skinning import DEFORMATIONS, Parameters, Rig, deform
-from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.target import Target
 
 

@@ -18,7 +18,7 @@ _BASE_FORM = "cod"
 _NAMED_ODDS = 20.0
 
 
-class Candidate(NamedTuple):
+class CandidateShape(NamedTuple):
     """One shape, as coefficients of `space.py` on the run's template."""
 
     name: str
@@ -37,19 +37,19 @@ class CandidateShapes:
     shares: Float[np.ndarray, "N"]  # sum to 1
     are_learnt: bool  # from the fish of a run; False: body forms
 
-    def __iter__(self) -> Iterator[Candidate]:
+    def __iter__(self) -> Iterator[CandidateShape]:
         """Iterate over the candidates."""
         rows = zip(
             self.names.split(","), self.coefficients, self.covariances, self.shares, strict=True
         )
-        return (Candidate(*row[:3], float(row[3])) for row in rows)
+        return (CandidateShape(*row[:3], float(row[3])) for row in rows)
 
     def __len__(self) -> int:
         """Return their number."""
         return len(self.shares)
 
     @classmethod
-    def of(cls, candidates: list[Candidate], *, are_learnt: bool) -> "CandidateShapes":
+    def of(cls, candidates: list[CandidateShape], *, are_learnt: bool) -> "CandidateShapes":
         """Stack them."""
         return cls(
             names=",".join(candidate.name for candidate in candidates),
@@ -70,7 +70,7 @@ def body_forms(template: Template, *, named: str | None = None) -> CandidateShap
     covariance = np.linalg.inv(form_precision())
     return CandidateShapes.of(
         [
-            Candidate(name, coefficients_of(load_template(name), template), covariance, share)
+            CandidateShape(name, coefficients_of(load_template(name), template), covariance, share)
             for name, share in zip(names, odds / odds.sum(), strict=True)
         ],
         are_learnt=False,
@@ -97,5 +97,5 @@ def mesh_form(template: Template) -> CandidateShapes:
     name = template.name.replace(",", " ")
     covariance = np.linalg.inv(form_precision())
     return CandidateShapes.of(
-        [Candidate(name, np.zeros(len(covariance)), covariance, 1.0)], are_learnt=False
+        [CandidateShape(name, np.zeros(len(covariance)), covariance, 1.0)], are_learnt=False
     )

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from stream_dmr.fitting.shape.candidates import Candidate, CandidateShapes
+from stream_dmr.fitting.shape.candidates import CandidateShape, CandidateShapes
 from stream_dmr.fitting.shape.space import THICKNESS, TRUNK
 
 _WORTH_SAYING = 0.02  # of a log factor: smaller differences are called none
@@ -17,7 +17,7 @@ def describe(forms: CandidateShapes, stocks: CandidateShapes) -> Iterator[str]:
         yield f"{stock.share:.0%} of the fish: {difference(by_name[stock.name], stock)}"
 
 
-def difference(form: Candidate, stock: Candidate) -> str:
+def difference(form: CandidateShape, stock: CandidateShape) -> str:
     """How a stock differs from its form."""
     change = stock.coefficients - form.coefficients
     std = float(np.sqrt(TRUNK @ stock.covariance @ TRUNK))

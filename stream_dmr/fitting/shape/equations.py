@@ -24,7 +24,7 @@ from stream_dmr.fitting.contour.normal_equations import (
     weighted_squares,
 )
 from stream_dmr.fitting.contour.problem import Problem
-from stream_dmr.fitting.contour.rotation import dot, fill_rotation, rotation_and_jacobian
+from stream_dmr.fitting.contour.rotation_vector import dot, fill_rotation, rotation_and_jacobian
 from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION, joints_of
 
 

@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.fitting.contour.problem import Problem
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.parameters import LOG_SIZE
-from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.shape.equations import shape_equations
 
 

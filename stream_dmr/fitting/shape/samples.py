@@ -36,7 +36,7 @@ class FishSamples:
 
 
 @dataclass
-class _Track:
+class _GoodCrops:
     stride: int = 1  # every how many good crops one is kept
     num_good: int = 0
     kept: list[FishCrop] = field(default_factory=list)
@@ -44,11 +44,11 @@ class _Track:
 
 def good_crops(crops: Iterable[FishCrop]) -> list[list[FishCrop]]:
     """An even choice of fish, and of each one's crops that show it whole; memory is bounded."""
-    tracks: dict[int, _Track] = {}
+    tracks: dict[int, _GoodCrops] = {}
     for crop in crops:
         if not _is_good(crop):
             continue
-        track = tracks.setdefault(crop.track_id, _Track())
+        track = tracks.setdefault(crop.track_id, _GoodCrops())
         if track.num_good % track.stride == 0:
             track.kept.append(replace(crop, image=None))
         track.num_good += 1

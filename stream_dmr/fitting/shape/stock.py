@@ -22,9 +22,9 @@ from scipy.linalg import cho_factor, cho_solve
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.levenberg_marquardt import WARM_DAMPING, minimise
 from stream_dmr.fitting.contour.problem import Options, Problem
-from stream_dmr.fitting.contour.rotation import rotation_and_jacobian
+from stream_dmr.fitting.contour.rotation_vector import rotation_and_jacobian
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.parameters import ROOT_ROTATION
-from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.shape.equations import shape_equations
 from stream_dmr.fitting.shape.space import (
     BREADTH,

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.fitting.cold_start import cold_starts
-from stream_dmr.fitting.contour.solver import ContourSolver
+from stream_dmr.fitting.contour.contour_solver import ContourSolver
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.mesh_levels import MeshLevels
-from stream_dmr.fitting.settings import FitMeshSettings
-from stream_dmr.fitting.shape.candidates import Candidate, CandidateShapes
+from stream_dmr.fitting.shape.candidates import CandidateShape, CandidateShapes
 from stream_dmr.fitting.shape.samples import FishSamples
 from stream_dmr.fitting.shape.space import NUM_COEFFICIENTS, form_precision, reshaped
 from stream_dmr.fitting.shape.stock import PosedTarget, Stock, StockFitter
@@ -31,7 +31,7 @@ _MOST_FOR, _MOST_AGAINST = 20.0, -6.0
 class _Group:
     """Fish that share a shape, and the body form that it is near to."""
 
-    def __init__(self, form: Candidate, frames: list[PosedTarget], stock: Stock) -> None:
+    def __init__(self, form: CandidateShape, frames: list[PosedTarget], stock: Stock) -> None:
         self.form, self.frames, self.stock = form, frames, stock
 
     @property
@@ -66,7 +66,7 @@ def learn_stocks(
     total = sum(group.num_fish for group in groups)
     return CandidateShapes.of(
         [
-            Candidate(
+            CandidateShape(
                 group.form.name,
                 group.stock.coefficients,
                 group.stock.covariance,
@@ -89,7 +89,7 @@ class _StockLearner:
         self._plane_normal = np.ascontiguousarray(plane_normal)
         self._fitter = StockFitter(template, settings)
 
-    def by_form(self, forms: Sequence[Candidate], fish: Sequence[FishSamples]) -> list[_Group]:
+    def by_form(self, forms: Sequence[CandidateShape], fish: Sequence[FishSamples]) -> list[_Group]:
         """One group of each form that any fish was fitted with."""
         frames: dict[int, list[PosedTarget]] = {}
         for one in fish:
@@ -148,7 +148,7 @@ class _StockLearner:
 
     def _learn(
         self,
-        form: Candidate,
+        form: CandidateShape,
         frames: list[PosedTarget],
         start: Float[np.ndarray, "W"],
         *,

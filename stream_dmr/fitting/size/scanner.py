@@ -9,12 +9,12 @@ wherever its search has led it. So sizes near it are tried, with everything else
 import numpy as np
 
 from stream_dmr.fitting.body import Body
+from stream_dmr.fitting.contour.contour_solver import solution_of
 from stream_dmr.fitting.contour.levenberg_marquardt import WARM_DAMPING, minimise
 from stream_dmr.fitting.contour.problem import Options, Problem
-from stream_dmr.fitting.contour.solver import solution_of
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import LOG_SIZE
-from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.size.density import mean_and_std
 from stream_dmr.fitting.size.scan import only_size, scan_sizes
 from stream_dmr.fitting.solver import Solution
@@ -27,7 +27,7 @@ _OFFSETS = np.array([-0.2, -0.1, -0.04, 0.0, 0.04, 0.1, 0.2])
 # flat pose, since slant shows in second order only. Chosen by the errors on simulated scenes.
 LOG_VOLUME_WEIGHT = 0.5
 # Std of a frame's error over that of the density, which is as wide as its priors; slant, bend and
-# misfit have parts of their own (localize.py). Measured on 10,000 simulated frames: 0.5 to 0.67.
+# misfit have parts of their own (localization/). Measured on 10,000 simulated frames: 0.5 to 0.67.
 STD_SCALE = 0.5
 # A scan ends at sizes this many nats less likely than the best fit's; those behind weigh less than
 # exp(-8) = 0.03 %.

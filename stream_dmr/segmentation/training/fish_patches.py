@@ -8,7 +8,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from stream_dmr.segmentation.training.random_fish import (
     FishShape,
-    PosedFish,
+    PosedShape,
     draw_shape,
     pose_shape,
 )
@@ -41,7 +41,7 @@ def draw_fish_patch(rng: np.random.Generator) -> FishPatch:
     return FishPatch(bgra=small.astype(np.uint8), ends_px=(ends + 0.5) / _OVERSAMPLING - 0.5)
 
 
-def _fit_to_patch(posed: PosedFish) -> tuple[Float[np.ndarray, "V 2"], Float[np.ndarray, "2 2"]]:
+def _fit_to_patch(posed: PosedShape) -> tuple[Float[np.ndarray, "V 2"], Float[np.ndarray, "2 2"]]:
     """Pixels of vertices and ends in the oversampled patch, by perspective projection."""
     projected = posed.vertices[:, :2] / posed.vertices[:, 2:]
     low, high = projected.min(axis=0), projected.max(axis=0)
@@ -53,7 +53,7 @@ def _fit_to_patch(posed: PosedFish) -> tuple[Float[np.ndarray, "V 2"], Float[np.
 
 
 def _shade(
-    rng: np.random.Generator, shape: FishShape, posed: PosedFish, pixels: Float[np.ndarray, "V 2"]
+    rng: np.random.Generator, shape: FishShape, posed: PosedShape, pixels: Float[np.ndarray, "V 2"]
 ) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W 3"]]:
     """Coverage (0 or 1), and BGR colour where it is 1, in the oversampled patch."""
     normals = vertex_normals(posed.vertices, shape.faces)

@@ -31,7 +31,7 @@ class FishShape:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PosedFish:
+class PosedShape:
     """A fish in front of the camera, in body lengths; x right, y down, z away from the camera."""
 
     vertices: Float[np.ndarray, "V 3"]
@@ -60,7 +60,7 @@ def draw_shape(rng: np.random.Generator) -> FishShape:
     )
 
 
-def pose_shape(rng: np.random.Generator, shape: FishShape) -> PosedFish:
+def pose_shape(rng: np.random.Generator, shape: FishShape) -> PosedShape:
     """Bend, twist and turn a fish at random, head to the left, mostly with its broad side seen."""
     spine = bend_center_line(_draw_bends(rng, shape.is_flatfish), length_mm=1.0)
     middle = spine.frames[len(spine.frames) // 2]
@@ -73,7 +73,7 @@ def pose_shape(rng: np.random.Generator, shape: FishShape) -> PosedFish:
     centre = spine.points.mean(axis=0)
     distance = np.array([0.0, 0.0, rng.uniform(2.5, 12.0)])
     spine = spine.moved(np.eye(3), distance - centre)
-    return PosedFish(vertices=spine.place(shape.points), ends=_ends(spine))
+    return PosedShape(vertices=spine.place(shape.points), ends=_ends(spine))
 
 
 def _ends(spine: CenterLine) -> Float[np.ndarray, "2 3"]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stream_dmr.fitting.shape.candidates import (
-    Candidate,
+    CandidateShape,
     CandidateShapes,
     body_forms,
     load_shapes,
@@ -84,7 +84,9 @@ def test_a_stock_is_described_by_how_it_differs_from_its_form(breadth, thickness
     coefficients[THICKNESS] += thickness
     # Of one breadth for all knots, so that the trunk's std is that of each.
     covariance = np.full((NUM_COEFFICIENTS, NUM_COEFFICIENTS), 0.05**2)
-    stocks = CandidateShapes.of([Candidate("cod", coefficients, covariance, 0.3)], are_learnt=True)
+    stocks = CandidateShapes.of(
+        [CandidateShape("cod", coefficients, covariance, 0.3)], are_learnt=True
+    )
     assert list(describe(FORMS, stocks)) == [words]
 
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from stream_dmr.fitting.body import Body
+from stream_dmr.fitting.contour.contour_solver import loss_of
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.normal_equations import normal_equations
 from stream_dmr.fitting.contour.problem import Problem
-from stream_dmr.fitting.contour.solver import loss_of
-from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.shape.equations import shape_equations
 from stream_dmr.fitting.shape.length_std import freed, shape_std_ratio
 from stream_dmr.fitting.shape.space import (

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stream_dmr.fitting.settings import FitMeshSettings
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.shape.space import TRUNK
 from stream_dmr.fitting.shape.stock import PosedTarget, StockFitter
 from stream_dmr.fitting.shape.stocks import learn_stocks

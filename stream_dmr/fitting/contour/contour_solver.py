@@ -14,9 +14,9 @@ from stream_dmr.fitting.contour.levenberg_marquardt import (
 )
 from stream_dmr.fitting.contour.normal_equations import prior_loss
 from stream_dmr.fitting.contour.problem import Options, Problem
+from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import ROOT_ROTATION, joints_of
-from stream_dmr.fitting.settings import FitMeshSettings
 from stream_dmr.fitting.solver import Solution, rank
 from stream_dmr.fitting.target import Target
 
