@@ -50,6 +50,7 @@ def batch(
     """
     with stop_on_signals() as stop:
         from stream_dmr.batch.driver import run_batch
+        from stream_dmr.batch.layout import VIDEOS, read_videos
         from stream_dmr.batch.manifest import read_manifest
         from stream_dmr.batch.progress import duration
         from stream_dmr.fitting.shape.candidates import load_shapes
@@ -57,6 +58,8 @@ def batch(
 
         load_config(config)
         load_shapes(template)  # refuses what it can't read before any video
+        if (out / VIDEOS).exists():
+            read_videos(out)  # refuses a table that is no batch's
         jobs = read_manifest(manifest, config=config, template=template)
         with _engine(engine, workers, address, gpus) as where:
             summary = run_batch(

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stream_dmr.cli.shared_options import OverwriteOption
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -29,6 +31,7 @@ def calibrate(
         Path | None,
         typer.Option(help="Folder for pictures of the corners found; default: beside --out."),
     ] = None,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Calibrate a camera and its reference plane from photographs of a chessboard."""
     from rich.console import Console
@@ -37,7 +40,16 @@ def calibrate(
     from stream_dmr.calibration.board import calibrate as calibrate_camera
     from stream_dmr.calibration.board import draw_views, parse_board
     from stream_dmr.calibration.calibration_file import save_calibration
+    from stream_dmr.errors import OutputError
+    from stream_dmr.results.own_files import require_writable
 
+    require_writable(out, overwrite=overwrite)
+    folder = corners or out.with_name(f"{out.stem}-corners")
+    if folder.is_dir() and not overwrite and any(folder.iterdir()):
+        raise OutputError(
+            f"{folder}: expected an empty folder for the corners found, got one with files in it; "
+            "choose another with --corners, or add --overwrite"
+        )
     console = Console()
     result = calibrate_camera(
         track(images, "Looking for the board", console=console, transient=True),
@@ -52,7 +64,6 @@ def calibrate(
     for line in _summary(result):
         console.print(line, markup=False, soft_wrap=True)
     console.print(f"calibration: {out}", markup=False, soft_wrap=True)
-    folder = corners or out.with_name(f"{out.stem}-corners")
     draw_views(result, folder)
     console.print(f"corners drawn: {folder}", markup=False, soft_wrap=True)
 

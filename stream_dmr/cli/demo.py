@@ -9,12 +9,16 @@ from typing import Annotated
 import typer
 
 from stream_dmr.cli.run import run
+from stream_dmr.cli.shared_options import OverwriteOption
+
+_OUT = Path("runs/demo")
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for the results; replaced if it exists.")] = (
-        Path("runs/demo")
-    ),
+    out: Annotated[
+        Path, typer.Option(help="Folder for the results; those of an earlier demo are replaced.")
+    ] = _OUT,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Measure the fish of the embedded scene from its video, and print the true lengths beside.
 
@@ -31,7 +35,7 @@ def demo(
         calibration=calibration,
         template=str(template),
         out=out,
-        overwrite=True,
+        overwrite=overwrite or out == _OUT,
     )
     all_measured = print_beside_truth(out / "lengths.csv", DEMO_SCENE / "truth.csv")
     program = os.path.relpath(Path(sys.executable).with_name("stream-dmr"))  # venv not activated

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from stream_dmr.cli.shared_options import warn
+from stream_dmr.cli.shared_options import OverwriteOption, warn
 
 _NOT_THE_SAME_IDS = (
     "the run found its fish in the video and numbered them as they came; where the truth numbers "
@@ -34,6 +34,7 @@ def evaluate(
             show_default="lengths_histogram.png beside lengths",
         ),
     ] = None,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Compare measured lengths with known ones: fish by fish, as intervals, as distributions."""
     from stream_dmr.cli.terminal import print_distributions, print_evaluation
@@ -42,6 +43,7 @@ def evaluate(
     from stream_dmr.evaluation.histogram_plot import plot_histograms
     from stream_dmr.evaluation.length_tables import is_histogram
     from stream_dmr.results.finished_fish import numbers_its_own
+    from stream_dmr.results.own_files import is_made_by, require_writable
     from stream_dmr.running.config import load_config
 
     settings = load_config(config).evaluate
@@ -59,6 +61,7 @@ def evaluate(
         return
     picture = plot or lengths.with_name(f"{lengths.stem}_histogram.png")
     try:
+        require_writable(picture, overwrite=overwrite, is_own=is_made_by("evaluate"))
         plot_histograms(picture, distributions)
     except OutputError as error:
         if plot is not None:

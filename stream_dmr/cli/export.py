@@ -5,7 +5,13 @@ from typing import Annotated, Literal
 
 import typer
 
-from stream_dmr.cli.shared_options import TimeOption, TrackOption, parse_selection, warn
+from stream_dmr.cli.shared_options import (
+    OverwriteOption,
+    TimeOption,
+    TrackOption,
+    parse_selection,
+    warn,
+)
 
 Meshes = Literal["ply", "glb"]
 Tables = Literal["csv", "parquet"]
@@ -34,6 +40,7 @@ def export(
     ] = None,
     time: TimeOption = None,
     track: TrackOption = None,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Write meshes, masks, keypoints and lengths of a recording for other programs.
 
@@ -46,7 +53,7 @@ def export(
     from stream_dmr.results.export_formats import Export
     from stream_dmr.running.config import load_config, parse_config
 
-    exported = Export(recording, parse_selection(time, track))
+    exported = Export(recording, parse_selection(time, track), overwrite=overwrite)
     exported.claim(out)
     if meshes:
         print(f"{out / 'meshes'}: {exported.meshes(out / 'meshes', format=meshes)} meshes")

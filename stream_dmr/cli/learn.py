@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stream_dmr.cli.shared_options import ConfigOption, warn
+from stream_dmr.cli.shared_options import ConfigOption, OverwriteOption, warn
 
 if TYPE_CHECKING:
     from stream_dmr.messages import FishCrop
@@ -25,6 +25,7 @@ def learn_template(
         str, typer.Option(help="What to start from: auto, a body form, or a mesh with its TOML.")
     ] = "auto",
     config: ConfigOption = None,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Learn the mean shape of a stock from the masks of its own fish.
 
@@ -38,11 +39,13 @@ def learn_template(
     from stream_dmr.fitting.shape.candidates import load_shapes, mesh_form
     from stream_dmr.fitting.shape.describe import describe
     from stream_dmr.recording.reading.open_recording import open_recordings
+    from stream_dmr.results.own_files import require_writable
     from stream_dmr.running.config import load_config, parse_config
     from stream_dmr.running.shape_pass import save_stocks
 
     if out.suffix != ".ply":
         raise OutputError(f"--out {out}: expected a name that ends in .ply")
+    require_writable(out, out.with_suffix(".toml"), overwrite=overwrite)
     opened = [open_recordings([path]) for path in recordings]
     header = opened[0].header
     mesh, forms = load_shapes(template, on_notice=lambda line: warn([line]))
@@ -68,6 +71,9 @@ def learn_template(
             "learn-template: expected fish that are seen whole, found none; give more recordings"
         )
     names = ", ".join(path.name for path in recordings)
+    others = [out.with_stem(f"{out.stem}-{n}") for n in range(2, len(stocks) + 1)]
+    pairs = [file for other in others for file in (other, other.with_suffix(".toml"))]
+    require_writable(*pairs, overwrite=overwrite)
     for path in save_stocks(mesh, stocks, out, source=names):
         print(f"{path}: measure with --template {path}")
     for line in describe(forms, stocks):

@@ -20,6 +20,7 @@ from stream_dmr.cli.recover import recover
 from stream_dmr.cli.replay import replay
 from stream_dmr.cli.report import report, review, verify
 from stream_dmr.cli.run import run
+from stream_dmr.cli.shared_options import OverwriteOption
 from stream_dmr.cli.train import train
 from stream_dmr.cli.view import convert, view
 from stream_dmr.errors import UserError
@@ -93,10 +94,13 @@ def simulate_command(
     frames: Annotated[int, typer.Option(help="Number of frames.")] = 60,
     preset: Annotated[str, typer.Option(help="clean, realistic or severe.")] = "realistic",
     seed: Annotated[int, typer.Option(help="Equal seeds give equal scenes.")] = 0,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Make a scene of hooked fish with known lengths: video, boxes, masks, calibration, truth."""
-    from stream_dmr.simulation import simulate
+    from stream_dmr.results.own_files import require_writable
+    from stream_dmr.simulation import SCENE_FILES, simulate
 
+    require_writable(*(out / name for name in SCENE_FILES), overwrite=overwrite)
     simulate(out, num_fish=fish, num_frames=frames, preset=preset, seed=seed)
     print(f"scene in {out}: video.mp4, boxes.txt, masks, calibration.yaml, truth.csv, species.ply")
 

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from stream_dmr.cli.shared_options import OverwriteOption
+
 
 def make_template(
     side: Annotated[
@@ -22,6 +24,7 @@ def make_template(
             show_default="as seen from above, or of the bundled body form nearest in outline",
         ),
     ] = None,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Make a template from one picture's mask of a straight fish; head and tail are found.
 
@@ -29,11 +32,13 @@ def make_template(
     measure with --template OUT.
     """
     from stream_dmr.errors import OutputError
+    from stream_dmr.results.own_files import require_writable
     from stream_dmr.template.outline_template import template_from_masks
     from stream_dmr.template.template_file import save_template
 
     if out.suffix != ".ply":
         raise OutputError(f"--out {out}: expected a name that ends in .ply")
+    require_writable(out, out.with_suffix(".toml"), overwrite=overwrite)
     made = template_from_masks(side, top=top, thickness=thickness, name=out.stem)
     views = side.name if top is None else f"{side.name} and {top.name}"
     save_template(made.template, out, comment=f"made of {views} by stream-dmr make-template")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from stream_dmr.cli.shared_options import stop_on_signals, warn
+from stream_dmr.cli.shared_options import OverwriteOption, stop_on_signals, warn
 
 _Source = Annotated[
     str | None,
@@ -40,11 +40,14 @@ def report(
     out: Annotated[Path, typer.Option(help="The page to write.")] = Path("report.html"),
     source: _Source = None,
     config: _Config = None,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Write results as one page that opens offline: plots, a table of fish, their best frames."""
     from stream_dmr.errors import UserError
     from stream_dmr.report.open_reports import is_batch, open_batch, open_report, write_report
+    from stream_dmr.results.own_files import is_made_by, require_writable
 
+    require_writable(out, overwrite=overwrite, is_own=is_made_by("report"))
     failed = list[str]()
     if is_batch(path):
         if source is not None:

@@ -35,6 +35,10 @@ TrackOption = Annotated[
     list[int] | None, typer.Option("--track", help="Only this fish; may be repeated.")
 ]
 
+OverwriteOption = Annotated[
+    bool, typer.Option("--overwrite", help="Write over files that are there.")
+]
+
 
 def command_line() -> str:
     """The command as typed, for the recording; passwords are left out."""

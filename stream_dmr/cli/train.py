@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from stream_dmr.cli.shared_options import command_line, stop_on_signals
+from stream_dmr.cli.shared_options import OverwriteOption, command_line, stop_on_signals
 
 Device = Literal["cpu", "cuda"]
 
@@ -34,6 +34,7 @@ def train(
         bool,
         typer.Option("--resume", help="Continue the training in --out after its last epoch."),
     ] = False,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Train the network that finds masks, on simulated pictures or on your own as well.
 
@@ -44,9 +45,16 @@ def train(
         raise typer.BadParameter("--images and --masks belong together: give both or neither")
     with stop_on_signals() as stop:
         from stream_dmr.cli.train_display import TrainDisplay
+        from stream_dmr.results.own_files import require_writable
         from stream_dmr.running.config import load_config
-        from stream_dmr.segmentation.training.train_unet import TrainRequest, train_unet
+        from stream_dmr.segmentation.training.train_unet import (
+            TRAINING_FILES,
+            TrainRequest,
+            train_unet,
+        )
 
+        if not resume and not (out / "last.pt").exists():  # else it refuses the earlier training
+            require_writable(*(out / name for name in TRAINING_FILES), overwrite=overwrite)
         settings = load_config(config).train
         request = TrainRequest(
             out=out,

@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stream_dmr.cli.shared_options import TimeOption, TrackOption, parse_selection, warn
+from stream_dmr.cli.shared_options import (
+    OverwriteOption,
+    TimeOption,
+    TrackOption,
+    parse_selection,
+    warn,
+)
 
 if TYPE_CHECKING:
     from stream_dmr.recording.messages.selection import Selection
@@ -40,10 +46,14 @@ def view(
         Path | None, typer.Option(help="Save a picture (.png) instead; needs no screen.")
     ] = None,
     frame: Annotated[int, typer.Option(help="The frame of --screenshot.")] = 1,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Look at a recording, or a part of it: frame, 3D scene, lengths, IoU, timings and events."""
     from stream_dmr.recording.rerun import viewer
+    from stream_dmr.results.own_files import require_writable
 
+    if screenshot is not None:
+        require_writable(screenshot, overwrite=overwrite)
     for number in (signal.SIGINT, signal.SIGTERM):  # the viewer's process must end with us
         signal.signal(number, lambda number, _: sys.exit(128 + number))
     with _as_rrd(recording, source, parse_selection(time, track)) as rrd:
@@ -70,11 +80,15 @@ def convert(
     full_size: Annotated[
         bool, typer.Option("--full-size", help="Pictures as large as the source's.")
     ] = False,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Make the .rrd of a recording, or of a part of it, again, with every frame drawn."""
     rrd = out or (
         recording / "recording.rrd" if recording.is_dir() else recording.with_suffix(".rrd")
     )
+    from stream_dmr.results.own_files import require_writable
+
+    require_writable(rrd, overwrite=overwrite)
     _convert(recording, rrd, source, parse_selection(time, track), full_size=full_size)
     print(rrd)
 

@@ -27,7 +27,8 @@ from stream_dmr.results.fish_table import fish_record, write_csv, write_parquet
 from stream_dmr.results.fisheries import FisheriesSettings
 from stream_dmr.results.frames_table import FramesTable
 from stream_dmr.results.lengths_table import write_lengths
-from stream_dmr.results.provenance import read_origin, seal_files
+from stream_dmr.results.own_files import require_writable
+from stream_dmr.results.provenance import known_files, read_origin, seal_files
 from stream_dmr.results.run_facts import run_facts
 
 MeshFormat = Literal["ply", "glb"]
@@ -37,11 +38,16 @@ TableFormat = Literal["csv", "parquet"]
 class Export:
     """A recording, or a part of it, for other programs. Raises RecordingError and OutputError."""
 
-    def __init__(self, recording: Path, selection: Selection = EVERYTHING) -> None:
+    def __init__(
+        self, recording: Path, selection: Selection = EVERYTHING, *, overwrite: bool = False
+    ) -> None:
+        """With `overwrite`, files that are in the way are written over, but for a run's own."""
         self._path = recording
         self._recording = open_recordings([recording])
         self._selection = selection
         self._written: list[Path] = []
+        self._overwrite = overwrite
+        self._earlier: set[Path] = set()  # exported before from the same recording
 
     @property
     def config_toml(self) -> str:
@@ -69,6 +75,7 @@ class Export:
             folder = make_folder(out / f"fish-{fit.track_id}")
             mesh = trimesh.Trimesh(vertices, template.faces, process=False)
             target = folder / f"{fit.frame_index:06d}.{format}"
+            self._require_writable(target)
             with writing_to(folder):
                 mesh.export(target)
             self._written.append(target)
@@ -81,6 +88,7 @@ class Export:
         They are in the pixels of the frame, lens distortion included. Frames without fish are
         listed too.
         """
+        self._require_writable(path)
         images, annotations = list[dict[str, Any]](), list[dict[str, Any]]()
         for message, payload in decoded_messages(
             self._recording, (Frame, FishCrop), self._selection
@@ -99,6 +107,8 @@ class Export:
 
     def tables(self, out: Path, *, format: TableFormat) -> list[Path]:
         """Write lengths and frames (keypoints, one row a fish and frame) into `out`, as `run`."""
+        paths = [out / "lengths.csv", out / "frames.csv"]
+        self._require_writable(*paths, *(path.with_suffix(".parquet") for path in paths))
         frames, finished = FramesTable(make_folder(out)), list[LengthEstimate]()
         for message in self._messages(LocalizedFish, LengthEstimate):
             frames.write(make_record(message, RecordingSettings()))
@@ -106,13 +116,13 @@ class Export:
                 finished.append(message)
         frames.close()
         write_lengths(out / "lengths.csv", finished)
-        paths = [out / "lengths.csv", out / "frames.csv"]
         paths = paths if format == "csv" else [_as_parquet(path) for path in paths]
         self._written += paths
         return paths
 
     def fish(self, out: Path, settings: FisheriesSettings, *, format: TableFormat) -> Path:
         """Write fish.csv (or .parquet): what a fishery asks, what reviewers said, what made it."""
+        self._require_writable(out / f"fish.{format}")
         template = self._recording.header.template
         records = [
             fish_record(fish, template, settings)
@@ -131,12 +141,16 @@ class Export:
                 f"{out}: expected a folder for what comes from {self._path}, found what came from "
                 f"{origin}; choose another --out"
             )
+        self._earlier = {out / name for name in known_files(out)}
 
     def provenance(self, out: Path) -> Path:
         """Write beside all that was written into `out` what made it, and its checksums."""
         database = database_of(self._path)
         runs = {"": run_facts(self._recording.header)} if database is None else read_runs(database)
         return seal_files(out, self._written, runs=runs, origin=str(self._path))
+
+    def _require_writable(self, *paths: Path) -> None:
+        require_writable(*paths, overwrite=self._overwrite, is_own=self._earlier.__contains__)
 
     def _messages(self, *kinds: type[Message]) -> Iterator[Message]:
         for message, _ in decoded_messages(self._recording, kinds, self._selection):

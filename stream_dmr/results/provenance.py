@@ -151,6 +151,15 @@ def read_origin(folder: Path) -> Path | None:
     return None if made is None else Path(made.get("origin") or folder)
 
 
+def known_files(folder: Path) -> Sequence[str]:
+    """The names of the files that provenance.json knows; none where it is missing or damaged."""
+    try:
+        made = read_provenance(folder)
+    except ValueError:
+        return []
+    return [] if made is None else list(made["files"])
+
+
 def read_provenance(folder: Path) -> dict[str, Any] | None:
     """What was written; None where nothing was. ValueError where it is damaged."""
     path = folder / NAME

@@ -30,7 +30,7 @@ from stream_dmr.results.frames_table import FRAMES_COLUMNS, frames_row
 from stream_dmr.results.lengths_database import NAME as DATABASE
 from stream_dmr.results.lengths_table import LENGTHS_COLUMNS, lengths_row
 from stream_dmr.results.provenance import NAME as PROVENANCE
-from stream_dmr.results.provenance import lines_sha256, read_provenance, verdicts_sum
+from stream_dmr.results.provenance import known_files, lines_sha256, read_provenance, verdicts_sum
 from stream_dmr.results.run_facts import RunFacts, run_facts
 from stream_dmr.results.verdicts import Verdict, read_verdicts
 
@@ -102,10 +102,7 @@ def _changes(folder: Path, others: Checks) -> Iterator[Change]:
 
 def _recordings(folder: Path) -> list[Path]:
     """Those to be read: every .mcap, and an .rrd, which is slow to read, where nothing knows it."""
-    try:
-        known = (read_provenance(folder) or {"files": {}})["files"]
-    except ValueError:
-        known = {}
+    known = known_files(folder)
     rrd = [path for path in folder.glob("*.rrd") if path.name not in known]
     return sorted([*folder.glob("*.mcap"), *folder.glob("*.mcap.part"), *rrd])
 

@@ -19,6 +19,10 @@ from stream_dmr.simulation.simulated_body import HALIBUT, JOINT_ARCS, keypoints,
 
 _MAX_FISH = 65535  # the largest id of a 16-bit mask
 
+SCENE_FILES = (
+    *("video.mp4", "boxes.txt", "masks", "calibration.yaml"),
+    *("truth.csv", "truth_frames.csv", "species.ply", "species.toml"),
+)
 TRUTH_FRAMES_COLUMNS = (
     "frame_index",
     "track_id",

@@ -28,6 +28,8 @@ from stream_dmr.version import __version__
 
 _VALIDATION_BANK_DIVISOR = 10  # of the training bank's size: the validation bank's
 
+TRAINING_FILES = ("unet.pt", "last.pt", "scores.json", "curve.png", "worst.png")
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainRequest:

@@ -1,0 +1,93 @@
+"""No command writes over a file that it did not make, and never over what a run measured."""
+
+from pathlib import Path
+
+import pytest
+
+from stream_dmr.results.own_files import is_made_by, require_writable
+from stream_dmr.simulation import SCENE_FILES
+from tests.support.command import Outcome, invoke
+from tests.support.fish_run import measure
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return measure(tmp_path_factory.mktemp("fish"))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def report(out: Path, target: Path, *flags: str) -> Outcome:
+    options: dict[str, str | None] = {str(out): None, "--out": str(target)}
+    return invoke("report", options | dict.fromkeys(flags))
+
+
+OVER_RESULTS = [
+    ("report OUT --out", "lengths.db"),
+    ("report OUT --out", "frames.csv"),
+    ("convert OUT --out", "recording.mcap"),
+    ("convert OUT --out", "recording.rrd"),
+    ("view OUT --screenshot", "recording.mcap"),
+    ("export OUT --tables csv --out", "."),
+    ("make-template --side OUT/mask.png --out", "../clip/tiny.ply"),
+    ("learn-template OUT --out", "../clip/tiny.ply"),
+    ("simulate --fish 1 --frames 1 --out", "../clip"),
+    ("calibrate OUT/a.png --plane OUT/b.png --out", "../clip/calibration.yaml"),
+    ("evaluate --lengths OUT/lengths.csv --truth OUT/truth.csv --plot", "lengths.csv"),
+    ("demo --out", "."),
+]
+
+
+@pytest.mark.parametrize(("command", "target"), OVER_RESULTS)
+def test_results_and_inputs_are_not_written_over(out: Path, command: str, target: str):
+    before = contents(out) | contents(out.parent / "clip")
+    outcome = invoke(f"{command.replace('OUT', str(out))} {out / target}")
+    assert outcome.code == 2
+    assert "choose another" in outcome.error
+    assert contents(out) | contents(out.parent / "clip") == before
+
+
+@pytest.mark.parametrize("name", ["lengths.db", "recording.mcap", "recording.rrd", "frames.csv"])
+def test_not_even_overwrite_or_a_link_reaches_what_a_run_measured(
+    out: Path, tmp_path: Path, name: str
+):
+    link = tmp_path / "page.html"
+    link.symlink_to(out / name)
+    before = (out / name).read_bytes()
+    for target in (out / name, link):
+        outcome = report(out, target, "--overwrite")
+        assert outcome.code == 2
+        assert "results" in outcome.error
+    assert (out / name).read_bytes() == before
+
+
+def test_a_page_is_written_over_its_own_or_where_told_to(out: Path, tmp_path: Path):
+    mine = tmp_path / "mine.html"
+    mine.write_text("my own notes")
+    assert report(out, mine).code == 2
+    assert mine.read_text() == "my own notes"
+    assert report(out, mine, "--overwrite").code == 0
+    assert is_made_by("report")(mine)
+    assert report(out, mine).code == 0
+
+
+def test_exports_are_made_again_but_not_over_files_of_others(out: Path, tmp_path: Path):
+    options = {str(out): None, "--out": str(tmp_path), "--fish": "csv"}
+    assert [invoke("export", options).code for _ in range(2)] == [0, 0]
+    (tmp_path / "masks.json").write_text("mine")
+    assert invoke("export", options | {"--masks": None}).code == 2
+    assert (tmp_path / "masks.json").read_text() == "mine"
+
+
+def test_a_scene_knows_its_files(tmp_path: Path):
+    options = {"--out": str(tmp_path), "--fish": "1", "--frames": "1"}
+    assert invoke("simulate", options).code == 0
+    assert {path.name for path in tmp_path.iterdir()} == set(SCENE_FILES)
+    assert invoke("simulate", options).code == 2
+    assert invoke("simulate", options | {"--overwrite": None}).code == 0
+
+
+def test_names_of_results_are_free_outside_of_a_run(tmp_path: Path):
+    require_writable(tmp_path / "lengths.csv", tmp_path / "recording.rrd")
