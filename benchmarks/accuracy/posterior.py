@@ -23,8 +23,9 @@ from benchmarks.fit_speed.targets import species_template
 from benchmarks.table1.filmed_scene import film_passages
 from stream_dmr.camera import Calibration
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
-from stream_dmr.fitting.contour.normal_equations import normal_equations, prior_loss
+from stream_dmr.fitting.contour.normal_equations import normal_equations
 from stream_dmr.fitting.contour.problem import Problem
+from stream_dmr.fitting.contour.regularisers import prior_loss
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import LOG_SIZE
 from stream_dmr.fitting.size.scanner import STD_SCALE

@@ -15,18 +15,15 @@ from jaxtyping import Float
 
 from benchmarks.fit_speed.targets import FramePair, KnownTarget
 from benchmarks.fit_speed.timing import Duration, median_duration, time_call
-from stream_dmr.fitting.contour import (
-    deformation,
-    levenberg_marquardt,
-    mesh_terms,
-    normal_equations,
-    outline,
-)
+from stream_dmr.fitting.contour import deformation, levenberg_marquardt, mesh_terms, outline
+from stream_dmr.fitting.contour.contour_residuals import Residuals
 from stream_dmr.fitting.contour.contour_solver import ContourSolver
 from stream_dmr.fitting.contour.deformation import KINDS, deform
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
+from stream_dmr.fitting.contour.normal_equations import normal_equations, weighted_squares
 from stream_dmr.fitting.contour.outline import project
 from stream_dmr.fitting.contour.problem import Problem
+from stream_dmr.fitting.contour.visible_rim import visible_rim
 from stream_dmr.fitting.distance_map import signed_distance
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fitter
@@ -184,11 +181,11 @@ def iteration_parts(setup: Setup, pair: FramePair) -> dict[str, Callable[[], obj
     problem, size = setup.problem(target), np.exp(start[LOG_SIZE])
     rendering = evaluate(problem, start, True).rendering
     points, pixels, rim, covered = rendering
-    visible = normal_equations.visible_rim(rendering).edges
-    chosen, vertices = np.unique(visible), points[: body.num_vertices]
-    rows = np.random.default_rng(0).normal(size=(len(visible) + len(target.contour), len(start)))
-    residuals = normal_equations.Residuals(rows, np.ones(len(rows)), np.ones(len(rows)))
-    H, g = normal_equations.normal_equations(problem, start, rendering)
+    edges = visible_rim(rendering).edges
+    chosen, vertices = np.unique(edges), points[: body.num_vertices]
+    rows = np.random.default_rng(0).normal(size=(len(edges) + len(target.contour), len(start)))
+    residuals = Residuals(rows, np.ones(len(rows)), np.ones(len(rows)))
+    H, g = normal_equations(problem, start, rendering)
     return {
         "evaluate": lambda: evaluate(problem, start, True),
         "- deform": lambda: deform(body, SPINE, start),
@@ -197,10 +194,10 @@ def iteration_parts(setup: Setup, pair: FramePair) -> dict[str, Callable[[], obj
         "- coverage": lambda: out.coverage(pixels, rim, len(target.mask)),
         "- overlap": lambda: out.overlap(covered, target),
         "- smoothness": lambda: mesh_terms.smoothness(body, points, size),
-        "normal equations": lambda: normal_equations.normal_equations(problem, start, rendering),
-        "- visible rim": lambda: normal_equations.visible_rim(rendering),
+        "normal equations": lambda: normal_equations(problem, start, rendering),
+        "- visible rim": lambda: visible_rim(rendering),
         "- jacobian": lambda: deformation.jacobian(body, SPINE, start, chosen),
-        "- sums of squares": lambda: normal_equations.weighted_squares(residuals),
+        "- sums of squares": lambda: weighted_squares(residuals),
         "solve": lambda: lm.solve(H, g, 1e-2, np.zeros(len(g), np.bool_)),
     }
 

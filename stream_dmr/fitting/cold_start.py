@@ -24,6 +24,9 @@ _BENDS_RAD = (-1.2, 0.0, 1.2)
 # Turns about the body's own axis, rad: the broad side, its mirror image, and a slant either way.
 _ROLLS_RAD = (0.0, np.pi, 0.9, -0.9)
 _FLIPS_RAD = (0.0, np.pi)  # which end is the head?
+# Joints turn further than their share of a bend, since their weights never get to 0 and 1. All
+# numbers here were chosen by trial: a start has to be near enough for the fit to find the rest.
+_JOINT_SHARE = 1.25
 NUM_STARTS = len(_BENDS_RAD) * len(_ROLLS_RAD) * len(_FLIPS_RAD)
 
 
@@ -40,9 +43,8 @@ def cold_starts(target: Target, template: Template) -> Float[np.ndarray, "B P"]:
     length = extent_px / float(focal.mean()) / np.sinc(bends / (2 * np.pi))
     # The broad side (z toward or away from the camera) faces the camera when roll is 0.
     root = Rotation.from_euler("zx", np.stack([angle + flips, rolls], axis=1))
-    # The bend's axis is the camera's, seen from the body. Joints turn a little further than their
-    # share, since their weights never get to 0 and 1.
-    axis = 1.25 * bends[:, None] * root.inv().apply([0.0, 0.0, 1.0])
+    # The bend's axis is the camera's, seen from the body.
+    axis = _JOINT_SHARE * bends[:, None] * root.inv().apply([0.0, 0.0, 1.0])
     # The middle of head and tail, not the center keypoint, falls on the centroid.
     middle = root.apply(template.keypoints[[0, 2]].mean(axis=0))[:, :2]
     offset = (center_px - target.K[:2, 2]) / focal - target.anchor[:2]

@@ -24,7 +24,8 @@ JOINT_LOG_SCALE = 6
 JOINT_WEIGHT = slice(7, 13)
 NUM_PER_JOINT = 13
 
-# Radius of a joint's Gaussian before it is learnt, in body lengths.
+# Radius of a joint's Gaussian before it is learnt, in body lengths. The paper gives none; chosen by
+# trial, so that those of neighbouring joints, a third of the body apart, overlap.
 _REST_RADIUS = 0.25
 
 

@@ -1,4 +1,4 @@
-"""How sure a fit is: the covariance of its parameters by the outline's own curvature.
+"""The uncertainty of a fit: the covariance of its parameters by the outline's own curvature.
 
 At the optimum each place of the visible rim says how far the outline moves across itself when a
 parameter moves. With edges that are off by `edge_std_px` over stretches of `edge_correlation_px`,
@@ -12,22 +12,28 @@ from jaxtyping import Float
 
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.body import Body
+from stream_dmr.fitting.contour.contour_residuals import Residuals
 from stream_dmr.fitting.contour.deformation import jacobian
-from stream_dmr.fitting.contour.normal_equations import (
-    Residuals,
-    rim_slopes,
-    visible_rim,
-    weighted_squares,
-)
+from stream_dmr.fitting.contour.normal_equations import weighted_squares
 from stream_dmr.fitting.contour.outline import Rendering
 from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.contour.rotation_vector import dot
+from stream_dmr.fitting.contour.visible_rim import rim_slopes, visible_rim
 from stream_dmr.fitting.fit_settings import FitMeshSettings
+from stream_dmr.fitting.parameters import (
+    JOINT_LOG_SCALE,
+    JOINT_ROTATION,
+    JOINT_TRANSLATION,
+    JOINT_WEIGHT,
+    NUM_PER_JOINT,
+)
 
-# What is known of the parameters before any picture, as standard deviations: rotations of the root
-# and the joints (rad), their translations (body lengths), log scales, log precisions.
-_ROOT_PRIOR = [2.0] * 3 + [1.0] * 2 + [1.0]
-_JOINT_PRIOR = [1.0] * 3 + [0.013] * 3 + [0.1] + [1.0] * 6
+# What is known of the parameters before any picture, as standard deviations: rotation (rad),
+# translation (body lengths) and log scale of the root and of a joint, logs of a joint's precision.
+# All are wide, so that the outline decides, but for the joints' scales and translations: the latter
+# have the std that L_t means. Chosen by trial; the scan of sizes needs none of them.
+_ROOT_STD = [2.0] * 3 + [1.0] * 2 + [1.0]
+_JOINT_ROTATION_STD, _JOINT_LOG_SCALE_STD, _JOINT_WEIGHT_STD = 1.0, 0.1, 1.0
 
 
 def covariance(
@@ -39,10 +45,27 @@ def covariance(
     """Covariance of the parameters of a fit, from its rendering by `evaluate`."""
     weight = 1.0 / (settings.edge_correlation_px * settings.edge_std_px**2)
     information = _information(problem, parameters, rendering, weight)
-    num_joints = len(problem.body.joints)
-    prior = np.array(_ROOT_PRIOR + _JOINT_PRIOR * num_joints)
-    spread = np.linalg.inv(information + np.diag(prior**-2.0))
+    prior = _prior_precisions(settings, len(problem.body.joints))
+    spread = np.linalg.inv(information + np.diag(prior))
     return (spread + spread.T) / 2
+
+
+def _prior_precisions(settings: FitMeshSettings, num_joints: int) -> Float[np.ndarray, "P"]:
+    """One over the variances that the parameters have a priori."""
+    joint = np.empty(NUM_PER_JOINT)
+    joint[JOINT_ROTATION] = _JOINT_ROTATION_STD**-2
+    joint[JOINT_TRANSLATION] = _translation_precision(settings)
+    joint[JOINT_LOG_SCALE] = _JOINT_LOG_SCALE_STD**-2
+    joint[JOINT_WEIGHT] = _JOINT_WEIGHT_STD**-2
+    return np.concatenate([np.array(_ROOT_STD) ** -2.0, np.tile(joint, num_joints)])
+
+
+def _translation_precision(settings: FitMeshSettings) -> float:
+    """Precision of a joint's translation t by L_t: lambda t^2 in nats is t^2 precision / 2.
+
+    Without priors L_rec is not in nats, and those of the default settings are taken.
+    """
+    return 2 * settings.lambda_translation / (settings.nat or FitMeshSettings().nat)
 
 
 def length_std_ratio(

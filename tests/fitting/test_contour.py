@@ -10,12 +10,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour import deformation, normal_equations, outline, rotation_vector
+from stream_dmr.fitting.contour import deformation, outline, rotation_vector
 from stream_dmr.fitting.contour.deformation import KINDS
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.mesh_terms import smoothness_slope
 from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.contour.pull_back import pull_back
+from stream_dmr.fitting.contour.visible_rim import rim_slopes, visible_rim
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.paper.losses import laplacian_loss, normal_loss
 from stream_dmr.fitting.paper.objective import Objective
@@ -160,7 +161,7 @@ class TestDeformation:
         problem, parameters = problem_of(name, kind, target), flat[0].numpy()
         points, pixels, rim, _ = evaluate(problem, parameters, True).rendering
         rim = np.ascontiguousarray(rim[:: max(1, len(rim) // 6)])
-        index, slopes = normal_equations.rim_slopes(problem, parameters, points, rim)
+        index, slopes = rim_slopes(problem, parameters, points, rim)
         chosen = np.unique(rim)
         assert (np.flatnonzero(index >= 0) == chosen).all()
 
@@ -288,7 +289,7 @@ class TestVisibleRim:
         rendering, field = self.visible(fish_pose(seed, bend_rad=bend))
         _, pixels, _, covered = rendering
         assume(is_all_in(covered))
-        visible, normals, lengths = normal_equations.visible_rim(rendering)
+        visible, normals, lengths = visible_rim(rendering)
         middles = pixels[visible].mean(axis=1)
         steps = pixels[visible[:, 1]] - pixels[visible[:, 0]]
         np.testing.assert_allclose(np.linalg.norm(steps, axis=1), lengths)
@@ -309,7 +310,7 @@ class TestVisibleRim:
         rendering, field = self.visible(fish_pose(seed, bend_rad=bend))
         _, pixels, rim, covered = rendering
         assume(is_all_in(covered))
-        visible, _, _ = normal_equations.visible_rim(rendering)
+        visible, _, _ = visible_rim(rendering)
         kept = {tuple(edge) for edge in visible.tolist()}
         is_kept = np.array([tuple(edge) in kept for edge in rim.tolist()])
         depth = self.depth(field, pixels[rim].mean(axis=1))
@@ -327,7 +328,7 @@ class TestVisibleRim:
         joints = flat[0, NUM_ROOT:].view(2, NUM_PER_JOINT)
         joints[:, :3] = torch.tensor([[0.0, 2.8, 0.0], [0.0, -2.8, 0.0]])  # toward the camera
         rendering, _ = self.visible(flat)
-        visible, _, _ = normal_equations.visible_rim(rendering)
+        visible, _, _ = visible_rim(rendering)
         layers = silhouette_layers(rendering.pixels)
         assert (layers > 1.5).sum() > 0.1 * (layers > 0.5).sum()
         assert len(visible) < 0.5 * len(rendering.rim)

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour import levenberg_marquardt
+from stream_dmr.fitting.contour.contour_residuals import Residuals
 from stream_dmr.fitting.contour.contour_solver import ContourSolver, mirror
 from stream_dmr.fitting.contour.deformation import KINDS, deform
 from stream_dmr.fitting.contour.levenberg_marquardt import (
@@ -24,15 +25,9 @@ from stream_dmr.fitting.contour.levenberg_marquardt import (
     minimise,
     solve,
 )
-from stream_dmr.fitting.contour.normal_equations import (
-    GAUGE,
-    Residuals,
-    normal_equations,
-    prior_loss,
-    regularise,
-    weighted_squares,
-)
+from stream_dmr.fitting.contour.normal_equations import normal_equations, weighted_squares
 from stream_dmr.fitting.contour.problem import Options, Problem
+from stream_dmr.fitting.contour.regularisers import GAUGE, prior_loss, regularise
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.mesh_levels import MeshLevels

@@ -9,8 +9,8 @@ from scipy.interpolate import PchipInterpolator
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.contour_solver import ContourSolver
 from stream_dmr.fitting.contour.levenberg_marquardt import WARM_DAMPING, evaluate, minimise
-from stream_dmr.fitting.contour.normal_equations import prior_loss
 from stream_dmr.fitting.contour.problem import Options, Problem
+from stream_dmr.fitting.contour.regularisers import prior_loss
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import LOG_SIZE, rest_vector

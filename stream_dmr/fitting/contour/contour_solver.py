@@ -12,8 +12,8 @@ from stream_dmr.fitting.contour.levenberg_marquardt import (
     evaluate,
     minimise,
 )
-from stream_dmr.fitting.contour.normal_equations import prior_loss
 from stream_dmr.fitting.contour.problem import Options, Problem
+from stream_dmr.fitting.contour.regularisers import prior_loss
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import ROOT_ROTATION, joints_of

@@ -8,19 +8,24 @@ from jaxtyping import Bool, Float
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.contour.deformation import deform
 from stream_dmr.fitting.contour.mesh_terms import smoothness
-from stream_dmr.fitting.contour.normal_equations import normal_equations, prior_loss
+from stream_dmr.fitting.contour.normal_equations import normal_equations
 from stream_dmr.fitting.contour.outline import Rendering, coverage, overlap, project, rim_edges
 from stream_dmr.fitting.contour.problem import LAPLACIAN, NORMAL, Options, Problem
+from stream_dmr.fitting.contour.regularisers import prior_loss
 from stream_dmr.fitting.contour.rotation_vector import dot
 from stream_dmr.fitting.parameters import LOG_SIZE, joints_of
 
 SETTLED, STUCK, EXHAUSTED = 0, 1, 2
 STOP_REASONS = ("L_rec settled", "no step lowers L_rec", "iterations used up")
 
-# Damping at the start: near the answer the model is trusted, far from it less.
+# Damping at the start, a share of the curvature's diagonal: near the answer the model is trusted,
+# far from it less. The numbers here were chosen by trial.
 WARM_DAMPING, COLD_DAMPING = 1e-2, 1e-1
+# The damping is multiplied by these after a refused and an accepted step: raised fast and lowered
+# slowly, as by Press et al., "Numerical Recipes", 3rd ed., sec. 15.5, who have 10 and 0.1.
 _GROWTH, _SHRINK = 10.0, 0.3
-_MOST_REFUSED = 3  # steps in a row, each ten times shorter: what is left to gain is pixel noise
+# Consecutive steps, each ten times shorter: what is left to gain is pixel noise.
+_MAX_REFUSED = 3
 
 
 class Minimum(NamedTuple):
@@ -104,7 +109,7 @@ def minimise(
         else:
             damping *= _GROWTH
             num_refused += 1
-            if num_refused == _MOST_REFUSED:
+            if num_refused == _MAX_REFUSED:
                 return Minimum(best, loss, here.iou, iteration, STUCK, H)
     return Minimum(best, loss, here.iou, options.iterations, EXHAUSTED, H)
 

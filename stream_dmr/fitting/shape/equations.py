@@ -1,6 +1,6 @@
 """The least-squares problem of one fit over pose and shape together.
 
-The contour residuals of `contour.normal_equations`, with further columns: a coefficient of
+The contour residuals of `contour.contour_residuals`, with further columns: a coefficient of
 `space.py` moves rest vertices, and the deformation carries that along as it carries the vertices.
 """
 
@@ -11,20 +11,20 @@ from jaxtyping import Float, Int
 
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.body import Body
+from stream_dmr.fitting.contour.contour_residuals import contour_residuals
 from stream_dmr.fitting.contour.deformation import jacobian
 from stream_dmr.fitting.contour.joints import blend, cholesky_factors, skinning_weights
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
-from stream_dmr.fitting.contour.normal_equations import (
+from stream_dmr.fitting.contour.normal_equations import weighted_squares
+from stream_dmr.fitting.contour.problem import Problem
+from stream_dmr.fitting.contour.regularisers import regularise
+from stream_dmr.fitting.contour.rotation_vector import dot, fill_rotation, rotation_and_jacobian
+from stream_dmr.fitting.contour.visible_rim import (
     RimSlopes,
-    contour_residuals,
     pixel_slopes,
-    regularise,
     rim_vertices,
     visible_rim,
-    weighted_squares,
 )
-from stream_dmr.fitting.contour.problem import Problem
-from stream_dmr.fitting.contour.rotation_vector import dot, fill_rotation, rotation_and_jacobian
 from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION, joints_of
 
 
