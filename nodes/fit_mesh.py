@@ -1,4 +1,4 @@
-"""FitMesh: crop -> fitted mesh, each track warm-started from its frame before."""
+"""FitMesh: crop -> fitted mesh, warm-started from the track's previous frame."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ _FORGET_NS = 60_000_000_000
 
 
 class FitMesh:
-    """Holds what each track seen lately knows of its fish's pose."""
+    """Fits crops; keeps the pose of each track that was seen lately."""
 
     def __init__(
         self,
@@ -25,7 +25,7 @@ class FitMesh:
         candidates: CandidateShapes | None = None,
         with_covariance: bool = False,
     ) -> None:
-        """Each fish gets that of the `candidates` which its masks prefer."""
+        """`candidates`: shapes of which each fish gets the one that its masks prefer."""
         self._tracks = TrackFitter(
             template,
             settings,
@@ -44,5 +44,5 @@ class FitMesh:
         return []
 
     def close(self) -> Sequence[FittedMesh]:
-        """Nothing is owed."""
+        """No output at the end."""
         return []

@@ -22,9 +22,9 @@ class Localize:
         return [localize(message, settings=self._settings, calibration=self._calibration)]
 
     def tick(self, timestamp_ns: int, /) -> Sequence[LocalizedFish]:
-        """Nothing is owed: every fit was answered at once."""
+        """No output: every fit was answered by `step`."""
         return []
 
     def close(self) -> Sequence[LocalizedFish]:
-        """Nothing is owed: every fit was answered at once."""
+        """No output: every fit was answered by `step`."""
         return []

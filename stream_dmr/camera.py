@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-# cv2.undistortPoints stops after five coarse steps unless told otherwise: too early for 1e-6.
+# By default cv2.undistortPoints stops after five coarse steps: too early for 1e-6.
 _UNDISTORT_UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 

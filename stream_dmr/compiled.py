@@ -1,4 +1,4 @@
-"""How the hot loops are compiled: by numba, once, cached on disk, without the GIL."""
+"""Compiles kernels by numba: once, cached on disk, without the GIL."""
 
 import hashlib
 import inspect

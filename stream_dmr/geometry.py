@@ -1,4 +1,4 @@
-"""Small geometry that several rooms share: polylines in numpy, nothing that knows fish."""
+"""Geometry of polylines in numpy, shared by several rooms."""
 
 import numpy as np
 from jaxtyping import Float

@@ -69,7 +69,7 @@ class CropQuality:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class FishEnds(_ReadOnly):
-    """Where a segmenter sees the snout and the fork of the tail, and how sure it is."""
+    """Where a segmenter sees the snout and the fork of the tail, and its confidence."""
 
     head_px: Float[np.ndarray, "2"]  # crop pixels
     tail_px: Float[np.ndarray, "2"]
@@ -86,7 +86,7 @@ class FishCrop(FishMessage):
     crop_camera: Camera  # of `image` and `mask`; the orientation is the frame camera's
     frame_camera: Camera  # with crop_camera it gives the exact crop-to-frame pixel map
     quality: CropQuality
-    ends: FishEnds | None = None  # None where nobody looked for them
+    ends: FishEnds | None = None  # None where the segmenter does not find them
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -134,7 +134,7 @@ class FittedShape(_ReadOnly):
     # Which of the run's candidate shapes the template was given; None: its own.
     candidate: int | None = None
     # Std of the arc length since the fish's shape isn't known exactly, as a fraction: an error that
-    # all frames of a fish share. None: an older recording, or a solver that can't tell.
+    # all frames of a fish share. None: an older recording, or a solver that doesn't estimate it.
     shape_std_ratio: float | None = None
     # How far the body reaches beyond its center towards the reference plane, as a fraction of the
     # arc length: half its thickness for a fish on its side. None: an older recording.

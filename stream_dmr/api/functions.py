@@ -34,7 +34,7 @@ class Run:
     out: Path
 
     def __init__(self, out: Location) -> None:
-        """Opens the folder; what is missing in it is said where it is asked for."""
+        """Opens the folder; what is missing in it raises where it is asked for."""
         object.__setattr__(self, "out", Path(out))
 
     @cached_property
@@ -103,7 +103,7 @@ def measure(
 
     `out` is runs/ and the source's name by default. Without `calibration` there are shapes and
     pixels, no millimetres. Setting `stop` ends the run early, with what was measured so far.
-    Warnings are logged (logger "stream_dmr"), or told to `observer`. Raises a UserError, in one
+    Warnings are logged (logger "stream_dmr"), or passed to `observer`. Raises a UserError, in one
     line, where an input is wrong.
     """
     request = RunRequest(
@@ -145,7 +145,7 @@ def replay(
     observer: RunObserver | None = None,
     stop: threading.Event | None = None,
 ) -> Run:
-    """Compute a recording anew from the stage `first` on, as `stream-dmr replay` does.
+    """Recompute a recording from the stage `first` on, as `stream-dmr replay` does.
 
     `recordings`: files, folders of runs or of segments, in order. What is None is as it was
     recorded; `tracks` and `time_s` (from, to, capture time) take a part of it. Raises a UserError

@@ -26,19 +26,24 @@ def batch(
             metavar="MANIFEST.csv",
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Folder for the results; a batch goes on there.")],
+    out: Annotated[
+        Path, typer.Option(help="Folder for the results; an interrupted batch continues there.")
+    ],
     engine: Annotated[
-        Engines, typer.Option(help="Where: processes of this machine, or a cluster of many.")
+        Engines, typer.Option(help="Where to measure: processes of this machine, or a Ray cluster.")
     ] = "local",
     address: Annotated[
         str | None,
-        typer.Option(help="Of a Ray cluster; auto: this machine's. Without it a new one starts."),
+        typer.Option(help="Address of a Ray cluster; auto: this machine's; default: start one."),
     ] = None,
     gpus: Annotated[
-        float, typer.Option(help="GPUs for each video on Ray, also a part of one.", min=0)
+        float, typer.Option(help="GPUs per video on Ray; fractions are allowed.", min=0)
     ] = 0.0,
     workers: Annotated[
-        int, typer.Option(help="Videos at a time, with local.", show_default="one a core")
+        int,
+        typer.Option(
+            help="Videos measured at the same time, with local.", show_default="one a core"
+        ),
     ] = 0,
     template: TemplateOption = "auto",
     config: ConfigOption = None,

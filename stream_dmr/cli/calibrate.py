@@ -21,7 +21,7 @@ def calibrate(
         Path, typer.Option(help="Photograph of the board lying in the reference plane.")
     ],
     board: Annotated[
-        str, typer.Option(help="Inner corners a row and a column; 10x7 squares have 9x6.")
+        str, typer.Option(help="Inner corners per row and column; 10x7 squares have 9x6.")
     ] = "9x6",
     square_mm: Annotated[float, typer.Option(help="Side of one square in mm.")] = 25.0,
     out: Annotated[Path, typer.Option(help="Calibration file to write.")] = Path(

@@ -9,9 +9,9 @@ import typer
 from stream_dmr.cli.shared_options import OverwriteOption, warn
 
 _NOT_THE_SAME_IDS = (
-    "the run found its fish in the video and numbered them as they came; where the truth numbers "
-    "them otherwise, other fish are compared: run with the truth's --boxes or --masks, or believe "
-    "the distributions alone"
+    "the run numbered its fish in the order in which it found them; where the truth numbers them "
+    "differently, different fish are compared: run with the truth's --boxes or --masks, or compare "
+    "the distributions only"
 )
 
 
@@ -25,7 +25,7 @@ def evaluate(
         ),
     ],
     config: Annotated[
-        Path | None, typer.Option(help="A config.toml; its table [evaluate] says the bins.")
+        Path | None, typer.Option(help="A config.toml; its [evaluate] has the bins.")
     ] = None,
     plot: Annotated[
         Path | None,

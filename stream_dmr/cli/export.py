@@ -1,4 +1,4 @@
-"""`stream-dmr export`: what a recording holds, for other programs."""
+"""`stream-dmr export`: a recording's contents for other programs."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -33,10 +33,13 @@ def export(
     ] = None,
     fish: Annotated[
         Tables | None,
-        typer.Option(help="What a fishery asks: total and fork length, cm, weight, legal size."),
+        typer.Option(
+            help="Table for fisheries: total and fork length, whole cm, weight, legal size."
+        ),
     ] = None,
     config: Annotated[
-        Path | None, typer.Option(help="Its [fisheries] instead of the run's, for --fish.")
+        Path | None,
+        typer.Option(help="A config.toml; its [fisheries] replaces the run's, for --fish."),
     ] = None,
     time: TimeOption = None,
     track: TrackOption = None,
@@ -48,7 +51,8 @@ def export(
     """
     if not (meshes or masks or tables or fish):
         raise typer.BadParameter(
-            "say what to export: --fish csv, --meshes ply, --masks, --tables csv"
+            "expected a choice of what to export, got none; give some of: "
+            "--fish csv, --meshes ply, --masks, --tables csv"
         )
     from stream_dmr.results.export_formats import Export
     from stream_dmr.running.config import load_config, parse_config

@@ -56,7 +56,7 @@ def learn_template(
         else load_config(config)
     )
     with Progress(transient=True) as progress:
-        task = progress.add_task("looking for fish that are seen whole", total=None)
+        task = progress.add_task("looking for fish that are completely visible", total=None)
         stocks = learn_shapes(
             _crops(opened),
             mesh,
@@ -68,7 +68,8 @@ def learn_template(
     warn([line for one in opened for line in one.warnings])
     if stocks is None:
         raise TemplateError(
-            "learn-template: expected fish that are seen whole, found none; give more recordings"
+            "learn-template: expected fish that are completely visible, found none; give more "
+            "recordings"
         )
     names = ", ".join(path.name for path in recordings)
     others = [out.with_stem(f"{out.stem}-{n}") for n in range(2, len(stocks) + 1)]

@@ -48,7 +48,7 @@ def main() -> None:
 
 @contextmanager
 def exit_codes() -> Generator[None]:
-    """A user's mistake becomes one line and exit code 2, our own a traceback and exit code 1."""
+    """Turns a UserError into one line and exit code 2, other errors into a traceback and 1."""
     try:
         yield
     except UserError as error:

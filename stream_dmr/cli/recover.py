@@ -1,4 +1,4 @@
-"""`stream-dmr recover`: what a crash or a power cut left, made whole."""
+"""`stream-dmr recover`: repairs what a crash or a power cut left unfinished."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,7 +9,7 @@ import typer
 def recover(
     folder: Annotated[Path, typer.Argument(help="The folder of a run.", metavar="DIR")],
 ) -> None:
-    """Make recordings that a crash or a power cut left unfinished whole, for any reader.
+    """Repair recordings that a crash or a power cut left unfinished.
 
     `run` does it by itself when it starts. Lengths that a full disk kept out of lengths.db are
     taken over from the recordings.

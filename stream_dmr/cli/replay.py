@@ -1,4 +1,4 @@
-"""`stream-dmr replay`: a recording computed anew from one stage on."""
+"""`stream-dmr replay`: recomputes a recording from one stage on."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -24,18 +24,18 @@ def replay(
             metavar="REC...",
         ),
     ],
-    first: Annotated[
-        Stage, typer.Option("--from", help="The first stage that is computed anew.")
-    ] = "fit",
+    first: Annotated[Stage, typer.Option("--from", help="The first stage to recompute.")] = "fit",
     check: Annotated[
         bool, typer.Option("--check", help="Compare with what was recorded; exit 1 if it differs.")
     ] = False,
-    config: Annotated[Path | None, typer.Option(help="Settings instead of the recorded.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="Settings instead of the recorded ones.")
+    ] = None,
     calibration: Annotated[
         Path | None, typer.Option(help="A calibration instead of the recorded one.")
     ] = None,
     template: Annotated[
-        str | None, typer.Option(help="A species instead of the recorded one.")
+        str | None, typer.Option(help="A template instead of the recorded one: its name or mesh.")
     ] = None,
     source: Annotated[
         str | None,
@@ -57,7 +57,7 @@ def replay(
         bool, typer.Option("--timings", help="At the end, show the time that each stage took.")
     ] = False,
 ) -> None:
-    """Compute a recording anew from one stage on, with its own inputs or with others."""
+    """Recompute a recording from one stage on, with its own inputs or with others."""
     from stream_dmr.cli.terminal import RunDisplay, print_check, print_fish, print_timings
     from stream_dmr.replaying.replay_recording import replay as replay_recording
     from stream_dmr.replaying.replay_request import ReplayRequest

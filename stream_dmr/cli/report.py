@@ -1,4 +1,4 @@
-"""`stream-dmr verify`, `report` and `review`: what a reviewer does with results."""
+"""`stream-dmr verify`, `report` and `review`: the commands of a reviewer."""
 
 from contextlib import closing
 from pathlib import Path
@@ -15,7 +15,9 @@ _Source = Annotated[
         show_default="the one that was measured, if it is still there",
     ),
 ]
-_Config = Annotated[Path | None, typer.Option(help="Its [fisheries] instead of the run's.")]
+_Config = Annotated[
+    Path | None, typer.Option(help="A config.toml; its [fisheries] replaces the run's.")
+]
 
 
 def verify(
@@ -65,7 +67,7 @@ def review(
     reviewer: Annotated[
         str, typer.Option(help="Your name, for the verdicts.", show_default="who is logged in")
     ] = "",
-    port: Annotated[int, typer.Option(help="On this machine; 0: any free one.")] = 0,
+    port: Annotated[int, typer.Option(help="Port on this machine; 0: any free one.")] = 0,
     source: _Source = None,
     config: _Config = None,
 ) -> None:

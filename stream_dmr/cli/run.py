@@ -58,18 +58,18 @@ def run(
     ] = Pose.HANGING,
     stills: Annotated[
         bool,
-        typer.Option("--stills", help="Every picture stands for itself; one gives a length."),
+        typer.Option("--stills", help="Pictures are independent; one good picture gives a length."),
     ] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the results of an earlier run in --out.")
     ] = False,
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="Go on after an earlier run in --out; a live source does."),
+        typer.Option("--resume", help="Continue an earlier run in --out; live sources always do."),
     ] = False,
-    vessel: Annotated[str, typer.Option(help="Where the fish come from, for the exports.")] = "",
-    trip: Annotated[str, typer.Option(help="Of this vessel, for the exports.")] = "",
-    haul: Annotated[str, typer.Option(help="Of this trip, for the exports.")] = "",
+    vessel: Annotated[str, typer.Option(help="Name of the vessel, for the exports.")] = "",
+    trip: Annotated[str, typer.Option(help="Name of the trip, for the exports.")] = "",
+    haul: Annotated[str, typer.Option(help="Name of the haul, for the exports.")] = "",
     live: Annotated[
         bool, typer.Option("--live", help="Serve the view on this machine while measuring.")
     ] = False,

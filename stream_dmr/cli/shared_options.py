@@ -1,4 +1,4 @@
-"""What several commands need: the command as typed, and signals that end a run gently."""
+"""What several commands share: options, the command as typed, signals that end a run."""
 
 import shlex
 import signal
@@ -35,9 +35,7 @@ TrackOption = Annotated[
     list[int] | None, typer.Option("--track", help="Only this fish; may be repeated.")
 ]
 
-OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="Write over files that are there.")
-]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
 
 
 def command_line() -> str:
@@ -46,7 +44,7 @@ def command_line() -> str:
 
 
 def warn(lines: Iterable[str]) -> None:
-    """Print what the user should know."""
+    """Print warnings to stderr."""
     for line in lines:
         print(f"warning: {line}", file=sys.stderr)
 
@@ -77,7 +75,7 @@ class Stop(threading.Event):
 
 @contextmanager
 def stop_on_signals() -> Generator[Stop]:
-    """Ctrl-C and SIGTERM set the event instead of breaking in; repeated ones change nothing."""
+    """Ctrl-C and SIGTERM set the event instead of interrupting; repeated ones change nothing."""
     stop = Stop()
 
     def on_signal(number: int, frame: FrameType | None) -> None:

@@ -17,11 +17,11 @@ from stream_dmr.running.run_observer import RunObserver
 
 _LINE_EVERY_S = 10.0  # where there is no terminal to draw a bar on
 _PLAIN_WIDTH = 120
-_MOST_SHOWN = 20  # differences of a replay
+_MAX_SHOWN = 20  # differences of a replay
 
 
 class RunDisplay(RunObserver):
-    """A progress bar on a terminal, a plain line now and then elsewhere; all of it on stderr."""
+    """Progress on stderr: a bar on a terminal, elsewhere a plain line every few seconds."""
 
     def __init__(self) -> None:
         self._console = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -110,16 +110,16 @@ def print_fish(fish: Sequence[LengthEstimate]) -> None:
 
 
 def print_check(summary: ReplaySummary) -> None:
-    """Print what a replay computed otherwise than it was recorded, to stdout."""
+    """Print to stdout how the results of a replay differ from the recorded ones."""
     found = summary.mismatches
-    for item in found[:_MOST_SHOWN]:
+    for item in found[:_MAX_SHOWN]:
         print(
             f"frame {item.frame_index}, fish {item.track_id}, {item.kind}, "
             f"{item.difference.field}: recorded {item.difference.recorded}, "
             f"now {item.difference.computed}"
         )
-    if len(found) > _MOST_SHOWN:
-        print(f"... and {len(found) - _MOST_SHOWN} more")
+    if len(found) > _MAX_SHOWN:
+        print(f"... and {len(found) - _MAX_SHOWN} more")
     if summary.num_left_out:
         print(
             f"{summary.num_left_out} messages not compared, of fish that were in view before this "
@@ -151,7 +151,7 @@ def print_timings(summary: RunSummary | ReplaySummary) -> None:
 
 
 def print_evaluation(evaluation: Evaluation) -> None:
-    """Print measured lengths beside the true ones, then the figures, to stdout."""
+    """Print measured lengths beside the true ones, then the summary, to stdout."""
     fish = _table("fish", "truth mm", "measured mm", "error mm", "error %")
     for row in evaluation.fish:
         measured = "-" if row.length_mm is None else f"{row.length_mm:.1f}"
@@ -162,7 +162,7 @@ def print_evaluation(evaluation: Evaluation) -> None:
 
 
 def print_distributions(distributions: Distributions) -> None:
-    """Print the figures of two histograms to stdout."""
+    """Print the measures of difference of two histograms to stdout."""
     _stdout().print(_figures(distribution_rows(distributions)))
 
 
@@ -174,7 +174,7 @@ def _figures(rows: list[tuple[str, str]]) -> Table:
 
 
 def _stdout() -> Console:
-    """A console as wide as the terminal; wide enough for any row where there is none."""
+    """A console as wide as the terminal, or without one, wide enough for any row."""
     width = None if sys.stdout.isatty() else _PLAIN_WIDTH
     return Console(highlight=False, width=width)
 

@@ -28,7 +28,7 @@ def train(
         Path | None,
         typer.Option(help="Weights to start from; with --images the shipped ones by themselves."),
     ] = None,
-    config: Annotated[Path | None, typer.Option(help="A config.toml; [train] is read.")] = None,
+    config: Annotated[Path | None, typer.Option(help="A config.toml; its [train] is used.")] = None,
     device: Annotated[Device, typer.Option(help="Where to compute.")] = "cpu",
     resume: Annotated[
         bool,

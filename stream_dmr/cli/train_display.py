@@ -11,7 +11,7 @@ from stream_dmr.segmentation.training.unet_trainer import EpochScores
 
 
 class TrainDisplay(TrainObserver):
-    """A progress bar per task on a terminal, a line per epoch everywhere; all on stderr."""
+    """Progress on stderr: a bar per task on a terminal, and a line per epoch."""
 
     def __init__(self, settings: TrainSettings) -> None:
         self._console = Console(stderr=True, highlight=False, soft_wrap=True)

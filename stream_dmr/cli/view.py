@@ -41,7 +41,7 @@ def view(
     web: Annotated[
         bool, typer.Option("--web", help="For a browser on this machine, in bounded memory.")
     ] = False,
-    port: Annotated[int, typer.Option(help="Of --web; 0 takes any that is free.")] = 0,
+    port: Annotated[int, typer.Option(help="Port of --web; 0: any free one.")] = 0,
     screenshot: Annotated[
         Path | None, typer.Option(help="Save a picture (.png) instead; needs no screen.")
     ] = None,
@@ -82,7 +82,7 @@ def convert(
     ] = False,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Make the .rrd of a recording, or of a part of it, again, with every frame drawn."""
+    """Write the .rrd of a recording, or of a part of it, again, with every frame drawn."""
     rrd = out or (
         recording / "recording.rrd" if recording.is_dir() else recording.with_suffix(".rrd")
     )
@@ -122,7 +122,7 @@ def _convert(
 
 @contextmanager
 def _as_rrd(recording: str, source: str | None, selection: "Selection") -> Generator[str]:
-    """An .rrd or address as it is; an .mcap, a part, and with a source, drawn anew."""
+    """An .rrd or address as it is; of an .mcap, a part, or with a source, a new .rrd."""
     if "://" in recording:
         yield recording
         return

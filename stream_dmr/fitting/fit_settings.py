@@ -26,22 +26,22 @@ class FitMeshSettings(Settings):
         default="contour", description='"contour" is second order and fast; "adam" is the paper\'s'
     )
     device: Literal["cpu", "cuda"] = Field(
-        default="cpu", description="where adam runs; the contour solver: the CPU"
+        default="cpu", description="device of adam; contour always runs on the CPU"
     )
     lambda_scale: float = Field(default=1.0, ge=0, description="weight of L_s, eq. (3)")
     lambda_translation: float = Field(default=10.0, ge=0, description="weight of L_t, eq. (3)")
     lambda_normal: float = Field(default=0.003, ge=0, description="weight of L_normal, eq. (3)")
     lambda_laplacian: float = Field(default=0.003, ge=0, description="weight of L_lap, eq. (3)")
     tilt_std_rad: float = Field(
-        default=0.25, gt=0, description="how far a fish hangs out of the reference plane, rad"
+        default=0.25, gt=0, description="std of a fish's tilt out of the reference plane, rad"
     )
-    bend_std_rad: float = Field(default=0.5, gt=0, description="how far a joint bends, rad")
-    twist_std_rad: float = Field(default=0.3, gt=0, description="how far a joint twists, rad")
+    bend_std_rad: float = Field(default=0.5, gt=0, description="std of a joint's bend, rad")
+    twist_std_rad: float = Field(default=0.3, gt=0, description="std of a joint's twist, rad")
     weight_std: float = Field(
-        default=0.5, gt=0, description="spread of the logs that shape the skinning weights"
+        default=0.5, gt=0, description="std of the logarithms that shape the skinning weights"
     )
     prior_weight: float = Field(
-        default=0.003, ge=0, description="of these spreads in L_rec; 0 is the paper's loss"
+        default=0.003, ge=0, description="weight of these priors in L_rec; 0 is the paper's loss"
     )
     contour_iterations: int = Field(
         default=30, ge=1, description="most iterations of a contour fit"
@@ -49,19 +49,22 @@ class FitMeshSettings(Settings):
     scan_iterations: int = Field(
         default=2,
         ge=0,
-        description="of a fit at each size that a fish might have; 0: the best fit's own size",
+        description="iterations at each size of a scan; 0: no scan, the best fit's own size",
     )
     max_faces: int = Field(
         default=3000,
         ge=600,
-        description="templates of more faces are simplified to so many for the contour fit",
+        description="templates with more faces are simplified to this number for the contour fit",
     )
     adam_iterations: int = Field(default=150, ge=1, description="most iterations of an adam fit")
     tolerance: float = Field(
         default=2e-4, gt=0, description="a fit has settled when L_rec falls by less than this"
     )
     cold_below_iou: float = Field(
-        default=0.85, ge=0, le=1, description="IoU under which a warm fit is tried again from cold"
+        default=0.85,
+        ge=0,
+        le=1,
+        description="IoU below which a warm fit is repeated from a cold start",
     )
     min_mask_px: int = Field(
         default=100, ge=1, description="smallest mask that is fitted, crop pixels"
@@ -69,10 +72,12 @@ class FitMeshSettings(Settings):
     edge_std_px: float = Field(
         default=1.0,
         gt=0,
-        description="how far a mask's edge is off, crop pixels; enters the uncertainty",
+        description="std of a mask's edge, crop pixels; enters the uncertainty",
     )
     edge_correlation_px: float = Field(
-        default=8.0, gt=0, description="how far along the edge such an error reaches, crop pixels"
+        default=8.0,
+        gt=0,
+        description="length along the edge over which its errors are correlated, crop pixels",
     )
 
     @property

@@ -24,13 +24,13 @@ class SmoothLengthSettings(Settings):
 
     min_frames: int = Field(default=3, ge=1, description="fewest good frames that give a length")
     max_std_ratio: float = Field(
-        default=0.2, gt=0, description="least certain length that is given, std over length"
+        default=0.2, gt=0, description="largest std of a length that is given, over length"
     )
-    max_frames: int = Field(
-        default=2000, ge=1, description="good frames of one fish after which no more are used"
-    )
+    max_frames: int = Field(default=2000, ge=1, description="most frames of one fish that are used")
     track_timeout_s: float = Field(
-        default=10.0, gt=0, description="a track ends when unseen for so long, s of capture time"
+        default=10.0,
+        gt=0,
+        description="a track ends when its fish is unseen for so long, s of capture time",
     )
     process_std_mm: float = Field(
         default=0.1, ge=0, description="drift of the measured length from frame to frame, std, mm"
@@ -39,18 +39,18 @@ class SmoothLengthSettings(Settings):
         default=0.99, gt=0, lt=1, description="share of sound frames that pass the outlier gate"
     )
     min_frame_std_ratio: float = Field(
-        default=0.005, gt=0, description="no frame counts as surer than this, std over length"
+        default=0.005, gt=0, description="smallest std that a frame is given, over length"
     )
     frame_correlation: float = Field(
         default=0.03,
         ge=0,
         le=1,
-        description="of the errors of one fish's frames, however far apart, 0 to 1",
+        description="correlation of the errors of a fish's frames at any distance in time, 0 to 1",
     )
     correlation_time_s: float = Field(
         default=0.2,
         gt=0,
-        description="in which the rest of a frame's error is forgotten, s of capture time",
+        description="time constant in which the rest of the correlation decays, s of capture time",
     )
     common_std_ratio: float = Field(
         default=0.01,

@@ -34,10 +34,13 @@ class LocalizeSettings(Settings):
         default=0.7, ge=0, le=1, description="least visible part of a fish that counts, 0 to 1"
     )
     min_mask_confidence: float = Field(
-        default=0.7, ge=0, le=1, description="least certain mask that counts, where it was found"
+        default=0.7,
+        ge=0,
+        le=1,
+        description="least mask confidence that counts; given masks have none",
     )
     max_length_std_ratio: float = Field(
-        default=0.2, gt=0, description="least certain fit that counts, std of length over length"
+        default=0.2, gt=0, description="largest std of a fit's length that counts, over length"
     )
     refuse_border: bool = Field(
         default=True, description="refuse frames whose mask touches the edge of the picture"
@@ -61,7 +64,7 @@ class LocalizeSettings(Settings):
         description="std that the misfit of an IoU of 0.9 adds to a length, as a fraction of it",
     )
     max_slant_rad: float = Field(
-        default=1.0, gt=0, description="most slanting view that counts; 0 is broadside, rad"
+        default=1.0, gt=0, description="largest slant of a fish that counts; 0 is broadside, rad"
     )
 
 

@@ -1,1 +1,1 @@
-"""A recording computed anew from any stage, and compared with what was recorded."""
+"""Recomputes recordings from any stage, and compares the results with the recorded ones."""

@@ -40,7 +40,7 @@ class ReplaySummary:
     counters: Sequence[StageCounters]
     num_compared: int
     num_left_out: int  # of fish that were in view before the recording began, see docs/replay.md
-    num_beyond: int  # computed anew where the recording was cut off before them
+    num_beyond: int  # recomputed where the recording was cut off before them
     mismatches: Sequence[Mismatch]
 
 

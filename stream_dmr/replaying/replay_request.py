@@ -40,5 +40,5 @@ class ReplayRequest:
 
     @property
     def recomputed(self) -> Sequence[type[Message]]:
-        """The types of the messages that are computed anew."""
+        """The types of the messages that are recomputed."""
         return [*STAGES.values()][self.first_index :]

@@ -15,7 +15,7 @@ class FisheriesSettings(Settings):
 
     species: str = Field(
         default="halibut",
-        description="the template for which weight and legal size hold; others get neither",
+        description="template to which weight and legal size apply; others get neither",
     )
     rounding: Literal["down", "nearest"] = Field(
         default="down",
@@ -31,18 +31,18 @@ class FisheriesSettings(Settings):
     weight_source: str = Field(
         default="Clark 1992, IPHC Report of Assessment and Research Activities 1991: 113-116; "
         "net weight (gutted, head off), 6.921e-6 lb cm^-3.24",
-        description="where a and b come from; it stands in the exports; what of the default was "
+        description="source of a and b, copied into the exports; how the default was "
         "checked, and against what: docs/research/fishery-numbers.md",
     )
     legal_cm: float = Field(
-        default=81.3, ge=0, description="the least length that may be landed, cm; 0: no flag"
+        default=81.3, ge=0, description="smallest length that may be landed, cm; 0: no flag"
     )
     legal_length: Literal["fork", "total"] = Field(
-        default="fork", description="the length that the law means"
+        default="fork", description="length that the legal size refers to"
     )
     legal_source: str = Field(
         default="IPHC-IB-2017-01: 32 inches, commercial, head on; lower jaw to middle of tail",
-        description="where the legal size comes from; it stands in the exports; see "
+        description="source of the legal size, copied into the exports; see "
         "docs/research/fishery-numbers.md",
     )
 

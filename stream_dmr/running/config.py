@@ -29,7 +29,7 @@ from stream_dmr.settings import Settings
 from stream_dmr.sources.read_settings import ReadFramesSettings
 
 _HEADER = """\
-# Every knob of stream-dmr with its default. Keep only the lines that you change, if you like;
+# Every setting of stream-dmr with its default. Lines that you don't change may be left out;
 # unknown keys and wrong values are refused.
 """
 _TYPES: dict[object, str] = {
@@ -70,19 +70,21 @@ class Config(Settings):
         default_factory=SmoothLengthSettings, description="from many frames to one length per fish"
     )
     train: TrainSettings = Field(
-        default_factory=TrainSettings, description="how `stream-dmr train` teaches the U-Net"
+        default_factory=TrainSettings, description="how `stream-dmr train` trains the U-Net"
     )
     recording: RecordingSettings = Field(
         default_factory=RecordingSettings, description="what is recorded, and how exactly"
     )
     drift: DriftSettings = Field(
-        default_factory=DriftSettings, description="when a camera at sea is no longer trusted"
+        default_factory=DriftSettings,
+        description="when a live camera raises an alarm: moved, blurred, or fitted worse",
     )
     watch: WatchSettings = Field(
-        default_factory=WatchSettings, description="who may watch a run, and how"
+        default_factory=WatchSettings, description="the status page of a run"
     )
     fisheries: FisheriesSettings = Field(
-        default_factory=FisheriesSettings, description="what the exports make of a length"
+        default_factory=FisheriesSettings,
+        description="columns of the exports that follow from a length",
     )
     evaluate: EvaluateSettings = Field(
         default_factory=EvaluateSettings, description="how `stream-dmr evaluate` compares lengths"

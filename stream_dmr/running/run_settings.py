@@ -30,7 +30,7 @@ class DriftSettings(Settings):
         default=0.01,
         gt=0,
         lt=1,
-        description="a median IoU lower by this, if significant, is an alarm",
+        description="drop of the median IoU that raises an alarm, if significant",
     )
 
 
@@ -46,7 +46,7 @@ class WatchSettings(Settings):
     )
     token_file: str = Field(
         default="",
-        description='file with the token that readers give; "": none, on this machine alone',
+        description='file with the access token; "": no token, on this machine only',
     )
     stuck_s: float = Field(
         default=120.0,

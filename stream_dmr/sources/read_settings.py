@@ -24,7 +24,7 @@ class ReadFramesSettings(Settings):
         default=6.0,
         ge=0.1,
         le=3600,
-        description="longest wait for a camera's first frame; more than between two key frames, s",
+        description="longest wait for a first frame; more than the time between key frames, s",
     )
     retry_s: float = Field(
         default=3.0,

@@ -48,24 +48,24 @@ class RecordingSettings(Settings):
     )
     foxglove: bool = Field(
         default=False,
-        description="in the .mcap, also what Foxglove Studio draws, as often as in the .rrd",
+        description="also write topics for Foxglove Studio into the .mcap, as often as the .rrd's",
     )
     flush_s: float = Field(
         default=0.5,
         gt=0,
         le=60,
-        description="the most that waits for the disk, seconds: what a crash may lose",
+        description="longest time that data wait for the disk, s: what a crash may lose",
     )
     segment_s: float = Field(
         default=60.0,
         ge=2,
-        description="a source without an end is recorded in files of so many seconds",
+        description="duration of one recording file of a live source, s",
     )
     segment_mb: float = Field(
-        default=512.0, ge=1, description="or of so many MB of .mcap, if that comes first"
+        default=512.0, ge=1, description="largest .mcap of one recording file of a live source, MB"
     )
     keep_free_gb: float = Field(
         default=2.0,
         ge=0,
-        description="where less is free on the disk, the oldest of those files go, GB; 0: never",
+        description="free space below which the oldest of these files are deleted, GB; 0: never",
     )

@@ -38,7 +38,7 @@ class MotionSettings(Settings):
         default=20.0, ge=2, description="frames over which the background is learnt"
     )
     motion_min_distance: float = Field(
-        default=5.0, gt=0, description="how foreign a fish's colours are at least, std"
+        default=5.0, gt=0, description="least distance of a fish's colours from the background, std"
     )
     motion_min_length: float = Field(
         default=0.03, gt=0, le=1, description="shortest fish, as a fraction of the longer side"

@@ -15,10 +15,10 @@ class CropFishSettings(Settings):
         default=0.15,
         ge=0,
         le=2,
-        description="room on each side, as a fraction of the fish's longer side",
+        description="margin on each side, as a fraction of the fish's longer side",
     )
     min_mask_area_px: int = Field(
-        default=64, ge=1, description="a smaller mask counts as none, in frame px"
+        default=64, ge=1, description="smaller masks are ignored, frame px"
     )
     segmenter: str = Field(
         default="unet",

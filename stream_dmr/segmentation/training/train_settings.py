@@ -10,9 +10,11 @@ class TrainSettings(Settings):
 
     seed: int = Field(default=1, ge=0, description="equal seeds draw equal pictures")
     epochs: int = Field(default=34, ge=1, description="most epochs; fewer where nothing improves")
-    crops_per_epoch: int = Field(default=2048, ge=32, description="pictures between two checks")
+    crops_per_epoch: int = Field(
+        default=2048, ge=32, description="pictures between two validations"
+    )
     validation_crops: int = Field(
-        default=512, ge=16, description="pictures that each check is made on, never trained on"
+        default=512, ge=16, description="pictures of each validation, never trained on"
     )
     batch_size: int = Field(default=32, ge=2, le=1024, description="pictures per step")
     learning_rate: float = Field(default=2e-3, gt=0, le=0.1, description="highest step size")
