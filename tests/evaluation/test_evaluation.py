@@ -73,7 +73,7 @@ def test_numbers_that_a_run_gave_itself_are_warned_of(tmp_path):
             database.commit()
         outcome = invoke("evaluate", {"--lengths": str(out / "lengths.csv"), "--truth": str(truth)})
         assert outcome.code == 0
-        assert ("numbered them as they came" in outcome.err) == is_warned
+        assert ("numbered its fish in the order" in outcome.err) == is_warned
 
 
 def test_nothing_measured_is_no_error(tmp_path):
