@@ -12,7 +12,9 @@ from tests.support.fish_run import measure
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return measure(tmp_path_factory.mktemp("fish"))
+    folder = tmp_path_factory.mktemp("fish")
+    (folder / "truth.csv").write_text("track_id,length_mm\n1,800\n2,900\n")
+    return measure(folder)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -35,7 +37,7 @@ OVER_RESULTS = [
     ("learn-template OUT --out", "../clip/tiny.ply"),
     ("simulate --fish 1 --frames 1 --out", "../clip"),
     ("calibrate OUT/a.png --plane OUT/b.png --out", "../clip/calibration.yaml"),
-    ("evaluate --lengths OUT/lengths.csv --truth OUT/truth.csv --plot", "lengths.csv"),
+    ("evaluate --lengths OUT/lengths.csv --truth OUT/../truth.csv --plot", "lengths.csv"),
     ("demo --out", "."),
 ]
 
