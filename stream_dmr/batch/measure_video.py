@@ -13,6 +13,7 @@ from stream_dmr.batch.manifest import Job
 from stream_dmr.batch.progress import OnProgress
 from stream_dmr.errors import UserError
 from stream_dmr.files import rename_durably
+from stream_dmr.results.finished_fish import runs_cut_short
 from stream_dmr.results.provenance import add_files
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_observer import RunObserver
@@ -27,7 +28,7 @@ class Outcome:
     name: str  # of the job
     key: str  # of the job: an outcome counts while this is unchanged
     status: str  # DONE or FAILED
-    reason: str = ""  # why it failed
+    reason: str = ""  # why it failed, or was cut short
     num_frames: int = 0
     num_fish: int = 0
     elapsed_s: float = 0.0
@@ -66,6 +67,7 @@ def measure_video(job: Job, out: Path, *, on_progress: OnProgress = lambda share
             name=job.name,
             key=key,
             status=DONE,
+            reason="; ".join(runs_cut_short(folder)),
             num_frames=summary.num_frames,
             num_fish=len(summary.fish),
             elapsed_s=round(time.perf_counter() - began, 3),

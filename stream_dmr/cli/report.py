@@ -1,6 +1,6 @@
 """`stream-dmr verify`, `report` and `review`: the commands of a reviewer."""
 
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -25,10 +25,17 @@ def verify(
 ) -> None:
     """Check that results are still what their run measured; exit 1 and say what was changed."""
     from stream_dmr.batch.verify_batch import verify_all
+    from stream_dmr.errors import OutputError
+    from stream_dmr.results.finished_fish import runs_cut_short
+    from stream_dmr.results.lengths_database import NAME
 
     changes, num_files = verify_all(folder)
     for change in changes:
         print(f"{change.path}: {change.what}")
+    for database in sorted(folder.rglob(NAME)):
+        with suppress(OutputError):  # damaged, which is said above
+            for line in runs_cut_short(database.parent):
+                print(f"{database}: {line}")
     if changes:
         raise typer.Exit(1)
     print(f"{folder}: {num_files} files, nothing was changed")

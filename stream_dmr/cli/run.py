@@ -124,5 +124,7 @@ def _print_summary(summary: "RunSummary", out: Path, *, timings: bool) -> None:
     if timings:
         print_timings(summary)
     rate = summary.num_frames / summary.elapsed_s
-    print(f"{summary.num_frames} frames in {summary.elapsed_s:.1f} s, {rate:.1f} frames/s")
+    promised = summary.frames_promised
+    of = "" if promised is None or summary.num_frames >= promised - 1 else f" of {promised}"
+    print(f"{summary.num_frames}{of} frames in {summary.elapsed_s:.1f} s, {rate:.1f} frames/s")
     print(f"results in {out}: {', '.join(path.name for path in summary.files)}")

@@ -42,7 +42,10 @@ def render_page(
         "faces": _packed(template.faces.astype("<u4")),
         "fisheries": reports[0].settings.model_dump(),
         "runs": {one.run_id: asdict(one.facts) for report in reports for one in report.fish},
-        "notes": [*notes, *(line for report in reports for line in report.recording.warnings)],
+        "notes": [
+            *notes,
+            *(line for one in reports for line in (*one.notes, *one.recording.warnings)),
+        ],
         "reviewer": reviewer,
     }
     rows, details = list[dict[str, Any]](), list[str]()

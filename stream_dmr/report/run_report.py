@@ -23,6 +23,7 @@ class RunReport:
     views: DrawnViews
     config: Config  # of the run
     settings: FisheriesSettings
+    notes: Sequence[str] = ()  # what a reader must know of the run
 
     @property
     def title(self) -> str:

@@ -13,7 +13,7 @@ from stream_dmr.recording.messages.run_inputs import RunInputs
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
 from stream_dmr.results.lengths_database import NAME, open_for_reading
-from stream_dmr.results.run_facts import RunFacts, run_facts
+from stream_dmr.results.run_facts import RunFacts, cut_short, run_facts
 from stream_dmr.results.store_rows import read_estimates
 from stream_dmr.results.verdicts import NOT_REVIEWED, Review, read_verdicts, reviews_of
 
@@ -78,11 +78,19 @@ def read_runs(database: Path) -> dict[str, RunFacts]:
         return dict(_runs(connection))
 
 
+def runs_cut_short(path: Path) -> list[str]:
+    """A line for each run in a folder that measured a part of its source. Raises OutputError."""
+    database = database_of(path)
+    runs = {} if database is None else read_runs(database)
+    return [line for facts in runs.values() if (line := cut_short(facts))]
+
+
 def numbers_its_own(folder: Path) -> bool:
     """True where a run in a folder was given no ids of its fish. Raises OutputError."""
     database = database_of(folder)
     runs = {} if database is None else read_runs(database)
-    given = [RunInputs.from_facts(asdict(facts)) for facts in runs.values()]
+    texts = [{k: v for k, v in asdict(f).items() if isinstance(v, str)} for f in runs.values()]
+    given = [RunInputs.from_facts(facts) for facts in texts]
     return any(inputs is not None and not (inputs.boxes or inputs.masks) for inputs in given)
 
 
@@ -113,7 +121,8 @@ def _runs(connection: sqlite3.Connection) -> Iterator[tuple[str, RunFacts]]:
     columns = [column[0] for column in rows.description]
     for values in rows:
         row = dict(zip(columns, values, strict=True))  # an older database has fewer columns
-        yield row["run_id"], RunFacts(**{f.name: row.get(f.name) or "" for f in fields(RunFacts)})
+        known = {f.name: row[f.name] for f in fields(RunFacts) if row.get(f.name) is not None}
+        yield row["run_id"], RunFacts(**known)
 
 
 def _stored_fish(database: Path, reviews: dict[int, Review]) -> list[FishResult]:

@@ -37,6 +37,8 @@ FISH_TABLE: dict[str, type] = {
     **dict.fromkeys(("weight_source", "legal_source", "source", "run_id"), str),
     **dict.fromkeys(("software_version", "config_sha256", "calibration_sha256"), str),
     "template_sha256": str,
+    "ended_by": str,  # of the run
+    **dict.fromkeys(("frames_done", "frames_promised"), int),
 }
 
 

@@ -23,12 +23,17 @@ from stream_dmr.results.lengths_database import (
     open_for_writing,
 )
 from stream_dmr.results.reserved_space import ReservedSpace
-from stream_dmr.results.run_facts import RunFacts
+from stream_dmr.results.run_facts import NOT_ENDED, RunFacts
 from stream_dmr.results.store_rows import fish_row, read_estimates
 
 _MARK_EVERY_NS = 5_000_000_000  # capture times that a crash may leave unmarked; chosen
 _FRAMES_AHEAD = 1000  # frame numbers that are marked as used at a time; a crash skips the rest
 _MARK = "INSERT INTO marks VALUES (?1, ?2) ON CONFLICT (name) DO UPDATE SET value = ?2"
+_COUNTS = "UPDATE runs SET frames_done = ?, frames_promised = ? WHERE run_id = ?"
+_END = (
+    "UPDATE runs SET ended_ns = ?, ended_by = ?, frames_done = ?, frames_promised = ? "
+    "WHERE run_id = ?"
+)
 _CLIP = "INSERT OR REPLACE INTO clips VALUES (?, ?, ?)"
 
 
@@ -57,7 +62,7 @@ class LengthStore:
         self.path = out_dir / NAME
         self.run_id = uuid4().hex
         self.trouble = ""  # why the last row could not be written; "" when all are
-        self._facts = facts
+        self._facts = replace(facts, ended_by=NOT_ENDED)
         self._reserve = ReservedSpace(out_dir)
         self._lock = RLock()
         self._pending: list[tuple[str, tuple[object, ...]]] = []
@@ -97,6 +102,20 @@ class LengthStore:
         if is_due or frame_index > self._used.frame_index:
             self._marked_at_ns = time.monotonic_ns()
             self._mark(frame_index=frame_index + _FRAMES_AHEAD, timestamp_ns=timestamp_ns)
+
+    def count_frames(self, promised: int | None) -> None:
+        """Count the frames that are done from now on, of as many as the source promises."""
+        self._facts = replace(self._facts, frames_done=0, frames_promised=promised)
+
+    def frame_done(self) -> None:
+        """A frame went through the whole chain; durable with the next fish or mark."""
+        with self._lock:
+            self._facts = replace(self._facts, frames_done=(self._facts.frames_done or 0) + 1)
+
+    def end(self, ended_by: str, *, promised: int | None = None) -> None:
+        """Say what ended the run, before `close`; `promised`: where that is known only now."""
+        promised = self._facts.frames_promised if promised is None else promised
+        self._facts = replace(self._facts, ended_by=ended_by, frames_promised=promised)
 
     def clip_progress(self, name: str, *, frames_done: int) -> None:
         """Mark how far a clip is measured; durable with the next fish or mark.
@@ -165,7 +184,9 @@ class LengthStore:
         """
         if not self._lock_of_folder.is_held:
             return
-        self._write("UPDATE runs SET ended_ns = ? WHERE run_id = ?", time.time_ns(), self.run_id)
+        facts = self._facts
+        counts = facts.frames_done, facts.frames_promised
+        self._write(_END, time.time_ns(), facts.ended_by, *counts, self.run_id)
         with suppress(sqlite3.Error):
             self._database.close()
         self._reserve.release()
@@ -236,6 +257,8 @@ class LengthStore:
                 self._database.execute(statement, values)
             if self._clip is not None:
                 self._database.execute(_CLIP, (*self._clip, 0))
+            counts = self._facts.frames_done, self._facts.frames_promised
+            self._database.execute(_COUNTS, (*counts, self.run_id))
             for field in fields(marks):
                 self._database.execute(_MARK, (field.name, getattr(marks, field.name)))
         self._used = marks

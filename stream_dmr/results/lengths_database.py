@@ -28,10 +28,11 @@ FISH_COLUMNS = [
 ]
 # Columns of `runs` that the first databases lack. Older versions read and write tables that have
 # them, so they need no new VERSION.
-_ADDED_COLUMNS = (
-    *("source_path", "source_sha256", "boxes_path", "boxes_sha256"),
-    *("masks_path", "masks_sha256", "calibration_path"),
-)
+_ADDED_COLUMNS = {
+    **dict.fromkeys(("source_path", "source_sha256", "boxes_path", "boxes_sha256"), "TEXT"),
+    **dict.fromkeys(("masks_path", "masks_sha256", "calibration_path", "ended_by"), "TEXT"),
+    **dict.fromkeys(("frames_done", "frames_promised"), "INTEGER"),
+}
 _TABLES = """
 CREATE TABLE runs (
     run_id TEXT PRIMARY KEY,
@@ -46,7 +47,10 @@ CREATE TABLE runs (
     vessel TEXT, trip TEXT, haul TEXT,
     -- the files that the run was given; NULL: by an older stream-dmr, '': it was given none
     source_path TEXT, source_sha256 TEXT, boxes_path TEXT, boxes_sha256 TEXT,
-    masks_path TEXT, masks_sha256 TEXT, calibration_path TEXT
+    masks_path TEXT, masks_sha256 TEXT, calibration_path TEXT,
+    ended_by TEXT, -- why, for people; NULL: by an older stream-dmr
+    frames_done INTEGER, -- that went through the whole chain
+    frames_promised INTEGER -- by the source; of a camera: that came; NULL: unknown
 ) STRICT;
 CREATE TABLE fish (
     number INTEGER PRIMARY KEY, -- in the order in which the tracks ended
@@ -222,6 +226,6 @@ def _prepare(database: sqlite3.Connection) -> None:
             f"PRAGMA user_version = {VERSION}; COMMIT;"
         )
     known = {column[1] for column in database.execute("PRAGMA table_info(runs)")}
-    for name in _ADDED_COLUMNS:
+    for name, kind in _ADDED_COLUMNS.items():
         if name not in known:
-            database.execute(f"ALTER TABLE runs ADD COLUMN {name} TEXT")
+            database.execute(f"ALTER TABLE runs ADD COLUMN {name} {kind}")

@@ -2,9 +2,16 @@
 
 from dataclasses import dataclass
 from hashlib import sha256
+from typing import Any
 
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.version import __version__
+
+# What `ended_by` says; beside these "an error: ..." with the error's line.
+SOURCE_ENDED = "the end of the source"
+STOPPED = "a stop before the end of the source"
+ENDLESS_STOPPED = "a stop; the source has no end"
+NOT_ENDED = "nothing so far: it goes on, or a crash ended it"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +34,25 @@ class RunFacts:
     vessel: str = ""
     trip: str = ""
     haul: str = ""
+    ended_by: str = ""  # "": an older stream-dmr, which didn't say
+    frames_done: int | None = None  # that went through the whole chain
+    frames_promised: int | None = None  # by the source; of a camera: that came; None: unknown
+
+
+def cut_short(facts: RunFacts) -> str:
+    """Which share of its source a run measured, and why it ended; "" where that is all of it."""
+    done, promised = facts.frames_done, facts.frames_promised
+    # A container's number of frames, duration x rate, may be one too many.
+    is_whole = done is None or promised is None or done >= promised - 1
+    if not facts.ended_by or (is_whole and facts.ended_by in (SOURCE_ENDED, ENDLESS_STOPPED)):
+        return ""
+    if done is not None and promised:
+        if is_whole and facts.ended_by == STOPPED:
+            return ""
+        share = f"{done} of {promised} frames ({100 * done / promised:.0f} %)"
+    else:
+        share = f"{'an unknown number of' if done is None else done} frames"
+    return f"{share} of {facts.source} were measured; what ended the run: {facts.ended_by}"
 
 
 def run_facts(header: RunHeader, *, vessel: str = "", trip: str = "", haul: str = "") -> RunFacts:
@@ -34,7 +60,8 @@ def run_facts(header: RunHeader, *, vessel: str = "", trip: str = "", haul: str 
     parts = header.attachments()
     hashes = {name: sha256(data).hexdigest() for name, data in parts.items()}
     given = {} if header.inputs is None else header.inputs.metadata()
-    facts = {
+    facts: dict[str, Any] = {
+        **given,
         "source": header.source,
         "command": header.command,
         "software_version": __version__,
@@ -45,4 +72,4 @@ def run_facts(header: RunHeader, *, vessel: str = "", trip: str = "", haul: str 
         "trip": trip,
         "haul": haul,
     }
-    return RunFacts(**given | facts)
+    return RunFacts(**facts)

@@ -140,7 +140,7 @@ def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
     for run_id, facts in made["runs"].items():
         for field in fields(RunFacts):
             now = getattr(runs.get(run_id), field.name, "missing")
-            was = facts.get(field.name, "")  # older ones have fewer
+            was = facts.get(field.name, field.default)  # older ones have fewer
             if now != was:
                 yield Change(database, f"run {run_id}: {field.name} is {now!r}, was {was!r}")
     yield from _verdicts(database, said, made.get("verdicts", {}))

@@ -16,6 +16,7 @@ from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.nodes.localize import Localize
 from stream_dmr.nodes.smooth_length import SmoothLength
+from stream_dmr.results.run_facts import ENDLESS_STOPPED, SOURCE_ENDED, STOPPED
 from stream_dmr.running.config import Config
 from stream_dmr.running.drift_alarms import DriftAlarms
 from stream_dmr.running.error_policy import ErrorPolicy
@@ -39,6 +40,7 @@ class RunSummary:
 
     fish: Sequence[LengthEstimate]  # final, by track id; of an endless source the last 100
     num_frames: int  # that went through the whole chain
+    frames_promised: int | None  # by the source; None where it doesn't
     elapsed_s: float
     counters: Sequence[StageCounters]
     files: Sequence[Path]  # names of segments as a pattern
@@ -156,6 +158,7 @@ def _run_chain(
     stop: threading.Event,
 ) -> RunSummary:
     request, began = inputs.request, time.perf_counter()
+    outputs.store.count_frames(inputs.source.num_frames)
     writer = _result_writer(inputs, outputs, on_notice=observer.warn)
     policy = ErrorPolicy(is_endless=inputs.is_endless, on_notice=observer.warn)
     totals = RunTotals(max_fish=_MAX_SUMMARY_FISH if inputs.is_endless else None)
@@ -180,17 +183,35 @@ def _run_chain(
             on_failure=policy.continues_after,
             stop=stop,
         )
+        outputs.store.end(_end_of(inputs, stop), promised=_frames_received(inputs))
     except UserError as error:
+        outputs.store.end(f"an error: {error}", promised=_frames_received(inputs))
         if not isinstance(error, OutputError):  # which says so itself
             error.add_note(f"what was computed before is kept in {request.out}")
+        raise
+    except BaseException as error:
+        outputs.store.end(f"an error: {type(error).__name__}: {error}")
         raise
     return RunSummary(
         fish=totals.fish(),
         num_frames=totals.num_frames,
+        frames_promised=inputs.source.num_frames,
         elapsed_s=time.perf_counter() - began,
         counters=counters,
         files=[request.out / name for name in (ENDLESS_RESULTS if inputs.is_endless else RESULTS)],
     )
+
+
+def _end_of(inputs: Inputs, stop: threading.Event) -> str:
+    """What ended a run that no error ended."""
+    if not stop.is_set():
+        return SOURCE_ENDED
+    return ENDLESS_STOPPED if inputs.is_endless else STOPPED
+
+
+def _frames_received(inputs: Inputs) -> int | None:
+    """The frames that came from a camera; None for another source."""
+    return None if inputs.source.counts is None else inputs.source.counts.received
 
 
 def _result_writer(

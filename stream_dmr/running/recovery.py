@@ -51,6 +51,7 @@ def _add_lengths(path: Path, folder: Path) -> Iterator[str]:
     if not missing:
         return
     with closing(LengthStore(folder, run_facts(recording.header))) as store:
+        store.end(f"not by itself: its lengths are {FROM_RECORDING}")
         for estimate in missing:
             store.add(estimate, flags=[FROM_RECORDING])
             yield f"fish {estimate.track_id}: its length was only in {path.name}, now in {NAME}"

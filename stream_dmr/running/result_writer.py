@@ -68,6 +68,7 @@ class ResultWriter:
 
     def frame_done(self) -> None:
         """Take note that a frame has left the last stage: its clip is measured so far."""
+        self._store.frame_done()
         if self._clips is not None:
             clip = self._clips_in_chain.popleft()
             self._clips[clip] += 1

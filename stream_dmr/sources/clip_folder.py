@@ -1,7 +1,7 @@
 """A folder of clips, to which a recorder on board may still be adding, as one source of frames."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
@@ -30,7 +30,8 @@ class ClipFolder(Source):
     """The clips of a folder in natural order of their names, all of one size.
 
     Frames are numbered through all clips. A clip is read once it has stopped growing or a later
-    one is there. One that can't be read, or has another size, is left out with a warning. Capture
+    one is there; what comes into it after that, such as after a pause of its recorder, is read as
+    well. One that can't be read, or has another size, is left out with a warning. Capture
     times: a clip ends when its file was last modified, but never begins before its predecessor
     ended.
     """
@@ -43,7 +44,8 @@ class ClipFolder(Source):
         self._settings = settings
         self._closing = Event()
         self._begun: set[str] = set()  # names of clips that were read, are being read or left out
-        self._frames_done: Mapping[str, int] = {}
+        self._frames_done: dict[str, int] = {}
+        self._bytes_read: dict[str, int] = {}  # sizes of the clips when their reading began
         self._after_ns = 0
         self._video: VideoFile | None = None
         first = self._first_clip()
@@ -64,12 +66,17 @@ class ClipFolder(Source):
     def resume(self, point: ResumePoint) -> None:
         """Skip the clips and frames that were done, and begin after the last capture time."""
         self._begun.update(point.clips_done)
-        self._frames_done, self._after_ns = point.frames_done, point.after_ns
+        self._frames_done, self._after_ns = {**point.frames_done}, point.after_ns
 
     def __iter__(self) -> Iterator[Frame]:
         frame_index, last_ns = 0, self._after_ns
         while (path := self._next_clip()) is not None:
+            if path.name in self._bytes_read:
+                done = self._frames_done.get(path.name, 0)
+                self.warnings.append(f"{path.name}: grew after its {done} frames were read")
             self._begun.add(path.name)
+            state = _state_of(path)
+            self._bytes_read[path.name] = 0 if state is None else state.num_bytes
             self._video = self._open(path)
             if self._video is None:
                 continue
@@ -78,6 +85,7 @@ class ClipFolder(Source):
                 frame_index += 1
                 last_ns = start_ns + frame.timestamp_ns
                 if frame.frame_index > self._frames_done.get(path.name, 0):
+                    self._frames_done[path.name] = frame.frame_index
                     yield replace(frame, frame_index=frame_index, timestamp_ns=last_ns)
             self.warnings += self._video.warnings
 
@@ -111,12 +119,19 @@ class ClipFolder(Source):
             return None
         return video
 
+    def _has_more(self, path: Path) -> bool:
+        """True for a clip that was not read, or has grown since."""
+        if path.name not in self._begun:
+            return True
+        state, num_bytes = _state_of(path), self._bytes_read.get(path.name)
+        return state is not None and num_bytes is not None and state.num_bytes > num_bytes
+
     def _next_clip(self) -> Path | None:
         """Wait for a complete clip; None when closed, or when none came for `clips_wait_s`."""
         seen: dict[str, _FileState] = {}
         unchanged_since = waiting_since = time.monotonic()
         while not self._closing.is_set():
-            paths = [path for path in clips_in(self._folder) if path.name not in self._begun]
+            paths = [path for path in clips_in(self._folder) if self._has_more(path)]
             if len(paths) > 1:
                 return paths[0]
             now = time.monotonic()

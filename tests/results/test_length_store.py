@@ -82,12 +82,14 @@ def test_a_database_from_before_a_column_is_read_and_gone_on_with(store: LengthS
     store.add(fish(1))
     store.close()
     with closing(sqlite3.connect(store.path)) as database:
-        for name in ("source_path", "masks_path", "calibration_path"):
+        for name in ("source_path", "masks_path", "calibration_path", "ended_by"):
             database.execute(f"ALTER TABLE runs DROP COLUMN {name}")
     assert list(read_runs(store.path).values()) == [FACTS]
     facts = replace(FACTS, source_path="/clips/clip.mp4")
-    LengthStore(store.path.parent, facts).close()
-    assert list(read_runs(store.path).values()) == [FACTS, facts]
+    again = LengthStore(store.path.parent, facts)
+    again.end("a test")
+    again.close()
+    assert list(read_runs(store.path).values()) == [FACTS, replace(facts, ended_by="a test")]
 
 
 def test_one_file_is_left(store: LengthStore):

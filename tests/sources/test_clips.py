@@ -111,6 +111,20 @@ def test_a_clip_is_read_when_it_has_come_and_not_before(tmp_path: Path):
     assert folder.warnings == []
 
 
+def test_a_clip_that_grows_after_it_was_read_is_read_on(tmp_path: Path):
+    clip(tmp_path / "1.ts", first=1)
+    whole = clip(tmp_path / "whole", first=1, num_frames=9)
+    folder = ClipFolder(tmp_path, AT_ONCE)
+    frames = iter(folder)
+    first = list(itertools.islice(frames, 4))
+    (tmp_path / "1.ts").write_bytes(whole.read_bytes())
+    os.utime(tmp_path / "1.ts", (OLD_S + 60, OLD_S + 60))
+    rest = list(frames)
+    assert numbers(first + rest) == list(range(1, 10))
+    assert all(a.timestamp_ns < b.timestamp_ns for a, b in itertools.pairwise(first + rest))
+    assert folder.warnings == ["1.ts: grew after its 4 frames were read"]
+
+
 def test_closing_ends_the_wait_for_a_clip(tmp_path: Path):
     clip(tmp_path / "1.avi", first=1)
     folder = ClipFolder(tmp_path, ReadFramesSettings(clips_wait_s=1e9))
