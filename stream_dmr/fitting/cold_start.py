@@ -1,4 +1,4 @@
-"""Where a fit begins when nothing is known: the mask's moments, tried in several poses."""
+"""Start parameters without a frame before: the mask's moments, in several poses."""
 
 from itertools import product
 
@@ -33,7 +33,7 @@ NUM_STARTS = len(_BENDS_RAD) * len(_ROLLS_RAD) * len(_FLIPS_RAD)
 def cold_starts(target: Target, template: Template) -> Float[np.ndarray, "B P"]:
     """One start for each head end, roll and bend, placed and scaled by the mask's moments.
 
-    Where the target's heading is known, those alone whose head is there.
+    Where the target's heading is known, only those with their head at that end.
     """
     center_px, angle, extent_px = _moments(target.mask)
     focal = target.K[[0, 1], [0, 1]]

@@ -39,8 +39,8 @@ from stream_dmr.template.template import Template
 # Without a calibration, fish are taken to hang square to the camera.
 _TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
 
-# In L_rec: by so much must a cold fit be better to give up the pose of the frame before, and which
-# end is the head.
+# Of L_rec: what a cold fit must gain to replace the pose of the frame before, and with it the end
+# at which the head is. Chosen by trial.
 _CLEAR_GAIN = 0.01
 
 
@@ -55,7 +55,7 @@ class Solved(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """What came of one crop."""
+    """The result of one crop."""
 
     mesh: FittedMesh
     best: Float[np.ndarray, "P"] | None  # the likeliest parameters: where the next frame begins
@@ -104,7 +104,7 @@ class Fitter:
         return AdamSolver(self._template, self._settings)
 
     def target(self, crop: FishCrop) -> Target:
-        """What is fitted to of a crop."""
+        """The target of a crop."""
         return Target.from_crop(crop, plane_normal=self.plane_normal)
 
     def fit(self, crop: FishCrop, warm: Float[np.ndarray, "P"] | None) -> Fit:
@@ -168,7 +168,7 @@ class Fitter:
     def _solve(self, target: Target, warm: Float[np.ndarray, "P"] | None) -> tuple[Solution, bool]:
         """The warm fit if it is good, else a cold one where that is clearly better.
 
-        A warm start whose head is at the wrong end leads nowhere.
+        A warm start whose head is at the wrong end is not tried.
         """
         solution = None
         if warm is not None and not is_reversed(warm, target.heading):

@@ -17,7 +17,7 @@ from stream_dmr.fitting.tracks import TrackFitter
 from stream_dmr.messages import FishCrop
 from stream_dmr.template.template import Template
 
-_MIN_IOU = 0.85  # of a fit that tells of a shape
+_MIN_IOU = 0.85  # of a fit from which a shape is learnt; chosen
 
 
 def learn_shapes(

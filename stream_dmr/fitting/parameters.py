@@ -1,4 +1,4 @@
-"""The parameters of a deformation: how they stand in one vector, and how likely each is.
+"""The parameters of a deformation: their layout in one vector, and their priors.
 
 The vector has P = NUM_ROOT + NUM_PER_JOINT * J numbers: the root's, then one block for each joint.
 """

@@ -1,4 +1,4 @@
-"""What every solver offers, and what it answers."""
+"""The interface of a solver, and its result."""
 
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -21,7 +21,7 @@ class Solution(NamedTuple):
 
 
 def rank(target: Target, solution: Solution) -> float:
-    """L_rec as a search compares it: from afar a fit may turn round, whatever it began with."""
+    """L_rec as a search compares it: a fit may swap head and tail, whatever its start."""
     return solution.loss + REVERSED_LOSS * float(is_reversed(solution.parameters, target.heading))
 
 

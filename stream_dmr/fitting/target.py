@@ -13,7 +13,7 @@ from stream_dmr.messages import FishCrop
 
 _SMOOTHING_PX = 1.5  # of the staircase that pixels make of an edge; short beside any fin
 _REACH = 4  # of the smoothing's kernel, px
-_SPACING_PX = 2.0
+_SPACING_PX = 2.0  # between two points of the contour; chosen
 _FEWEST = 8  # pixels of an edge: less is a speck
 _BORDER_PX = 0.6  # nearer to the picture's border there is no edge of the fish, only of the picture
 

@@ -17,8 +17,8 @@ from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.template.template import Template
 
 _DECIDING_FRAMES = 3  # good ones: each takes a fit of every candidate
-# What one frame may say against a candidate, nats: its mask may be wrong.
-_MOST_AGAINST = 8.0
+# Most evidence of one frame against a candidate, nats: its mask may be wrong. Chosen by trial.
+_MAX_AGAINST = 8.0
 _MIN_VISIBLE = 0.9  # of a frame that decides
 
 
@@ -105,5 +105,5 @@ class TrackFitter:
         pairs = zip(self.fitters, solved, strict=True)
         nats = np.array([fitter.nats(one) for fitter, one in pairs])
         if np.isfinite(nats).all():
-            track.against += np.minimum(nats - nats.min(), _MOST_AGAINST)
+            track.against += np.minimum(nats - nats.min(), _MAX_AGAINST)
             track.num_decided += 1

@@ -1,4 +1,4 @@
-"""Where a fit begins when the frame before is known."""
+"""Start parameters from the fit of the frame before."""
 
 import numpy as np
 from jaxtyping import Float

@@ -103,7 +103,7 @@ def robust_start(measurements: Sequence[Measurement]) -> RobustStart:
     """Weighted median of the frames and the scatter around it, neither moved by a few outliers.
 
     The scatter is the median absolute residual in units of each frame's std, brought to a std
-    (x 1.48). Above 1 the fits were too sure of themselves, and all are widened by it alike,
+    (x 1.48). Above 1 the fits' stds are too small, and all of them are multiplied by it,
     after Birge's ratio (Phys. Rev. 40, 207, 1932), here in its robust form.
     """
     lengths = np.array([m.length_mm for m in measurements])
@@ -116,8 +116,8 @@ def robust_start(measurements: Sequence[Measurement]) -> RobustStart:
     return RobustStart(length_mm=median, variance=float(variance), inflation=inflation)
 
 
-class _Likeness:
-    """How alike the errors of some frames are: c + (1 - c) exp(-t / tau) for two a time t apart.
+class _ErrorCorrelation:
+    """Correlation of the errors of frames: c + (1 - c) exp(-t / tau) for two a time t apart.
 
     A fish in one pose for a second is seen no better by sixty frames than by fifteen.
     """
@@ -147,7 +147,9 @@ class ConstantLengthFilter:
 
     def __init__(self, start: RobustStart, settings: SmoothLengthSettings) -> None:
         self.frames: list[int] = []
-        self._likeness = _Likeness(settings.frame_correlation, settings.correlation_time_s)
+        self._correlation = _ErrorCorrelation(
+            settings.frame_correlation, settings.correlation_time_s
+        )
         self._x: list[np.ndarray] = []
         self._P: list[np.ndarray] = []
         self._start = start
@@ -166,8 +168,8 @@ class ConstantLengthFilter:
 
     @property
     def design_effect(self) -> float:
-        """How many times larger the variance is, since frames of one fish err alike."""
-        return self._likeness.design_effect
+        """How many times larger the variance is, since the errors of frames are correlated."""
+        return self._correlation.design_effect
 
     def offer(self, measurement: Measurement) -> bool:
         """Use one more frame, in the order of frames, unless its innovation is too large."""
@@ -185,7 +187,7 @@ class ConstantLengthFilter:
         # The start serves the gate only: the first frame used is the whole state (no prior).
         x, P = update(x, P, z, R, _ONE)[:2] if self.frames else (z, R)
         self.frames.append(measurement.frame_index)
-        self._likeness.add(measurement.timestamp_ns)
+        self._correlation.add(measurement.timestamp_ns)
         self._x.append(x)
         self._P.append(P)
         return True

@@ -53,7 +53,7 @@ class Recorder:
         `files` is `open_recording_files` or, for a source without an end, `open_segments`. With
         `live` the view is served as well, at `live_address`. `on_refusal` is called with what the
         disk refuses, instead of an exception, and the sink is tried again with the next record;
-        after a failure of any other kind later and later. `states` is told how each sink is.
+        after a failure of any other kind later and later. `states` gets the state of each sink.
         With `in_one_thread` everything is written in the caller's thread.
         """
         self.live_address: str | None = None

@@ -70,7 +70,7 @@ def _unchanged(file: InputFile | None, option: str) -> Path | None:
         return None
     if not file.sha256:
         raise UserError(
-            "--from crop: expected to be told where the fish are, since the recording is too old "
+            "--from crop: expected boxes or masks of the fish, since the recording is too old "
             "to hold it; give the run's --boxes, --masks or both"
         )
     if not file.is_unchanged():

@@ -11,7 +11,7 @@ _LYING: dict[str, dict[str, Any]] = {
     "fit_mesh": {"tilt_std_rad": 0.05, "bend_std_rad": 0.15, "twist_std_rad": 0.05},
     "localize": {"rests_on_plane": True, "plane_std_mm": 3.0, "slant_std_rad": 0.03},
 }
-# Pictures that stand for themselves: none follows another, and one good one gives a length. Ten
+# Independent pictures: none follows another, and one good one gives a length. Ten
 # seconds between them are more than anything in `[smooth_length]` remembers, but for the track.
 _STILLS: dict[str, dict[str, Any]] = {
     "read_frames": {"images_fps": 0.1},
@@ -27,7 +27,7 @@ def lying(config: Config) -> Config:
 
 
 def stills(config: Config) -> Config:
-    """The settings for pictures of which each stands for itself."""
+    """The settings for independent pictures."""
     return _with(config, _STILLS)
 
 

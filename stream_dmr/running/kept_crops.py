@@ -1,4 +1,4 @@
-"""The crops of a first pass over a source, kept so that its fish are found but once."""
+"""The crops of a first pass over a source, kept so that its fish are found only once."""
 
 from collections.abc import Callable, Iterator, Sequence
 from tempfile import SpooledTemporaryFile
@@ -43,7 +43,7 @@ class KeptCrops:
         return ()
 
     def close(self) -> Sequence[FishCrop]:
-        """Let go of the file; no output at the end."""
+        """Close the file; no output at the end."""
         self._file.close()
         return ()
 

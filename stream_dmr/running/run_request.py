@@ -18,13 +18,13 @@ class RunRequest:
     masks: Path | None = None
     template: str = "auto"  # or the name of a body form, or a path
     pose: Literal["hanging", "lying"] = "hanging"  # lying: flat on the reference plane
-    stills: bool = False  # every picture stands for itself
+    stills: bool = False  # pictures are independent of each other
     config: Path | None = None
     overwrite: bool = False  # replace the results of an earlier run in `out`
-    resume: bool = False  # go on after them; a live source always does
+    resume: bool = False  # continue after them; a live source always does
     live: bool = False  # serve the view while measuring
     command: str = ""  # as typed, for the recording
-    vessel: str = ""  # where the fish come from, for the exports
+    vessel: str = ""  # vessel, trip and haul, for the exports
     trip: str = ""
     haul: str = ""
 

@@ -1,7 +1,7 @@
 """A first pass over a source, for the shapes of its fish, before any of them is measured.
 
-Of `--template auto`, and only of sources with an end: what the last fish taught counts for the
-first one too.
+For `--template auto`, and only for sources with an end: the last fish are learnt from before the
+first one is measured.
 """
 
 from dataclasses import replace

@@ -58,9 +58,9 @@ def fish_outline(
 ) -> FishOutline:
     """Measure a straight fish, lying in any direction, whose pixels are True in `mask`.
 
-    Head and tail are told by the tail fin's spread or, without one, by the head's half being
-    larger; `head_is_left` says it instead. Raises TemplateError where the mask shows no fish, more
-    than one, one too small or too bent; `name` stands in the message.
+    Head and tail are distinguished by the tail fin's spread or, without one, by the larger half,
+    which is the head's; `head_is_left` says it instead. Raises TemplateError where the mask shows
+    no fish, more than one, one too small or too bent; `name` stands in the message.
     """
     blob = _one_blob(mask, name=name)
     left, right = _far_ends(blob)

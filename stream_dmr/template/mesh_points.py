@@ -14,8 +14,8 @@ from stream_dmr.template.fish_outline import fish_outline
 _MIN_ELONGATION = 1.3
 _MIN_VOLUME, _MAX_VOLUME = 3e-4, 0.1
 _LENGTH_PX = 1200  # of the side view in which snout and fork are found
-_ENDS = (0.05, 0.10, 0.15)  # of the length: sections that tell a head from a tail fin
-_TIP = 0.01  # of the length: sections this far inside tell where a tip lies across
+_ENDS = (0.05, 0.10, 0.15)  # of the length: sections that distinguish a head from a tail fin
+_TIP = 0.01  # of the length: sections this far inside locate a tip across the body
 
 
 def find_points(mesh: trimesh.Trimesh, *, name: str) -> dict[str, Float[np.ndarray, "N 3"]]:

@@ -81,7 +81,7 @@ def loss_of(problem: Problem, parameters: Float[np.ndarray, "P"]) -> float:
 
 
 def solution_of(found: Minimum) -> Solution:
-    """What a descent found, as every solver says it."""
+    """The `Solution` of a descent."""
     settled = found.stop != EXHAUSTED
     reason = STOP_REASONS[found.stop]
     return Solution(found.parameters, found.loss, found.iou, found.iterations, settled, reason)

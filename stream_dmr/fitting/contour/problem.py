@@ -47,7 +47,7 @@ class Problem(NamedTuple):
 
 
 class Options(NamedTuple):
-    """Of one descent."""
+    """The options of one descent."""
 
     iterations: int  # at most
     tolerance: float  # of L_rec: it has settled when it falls by less

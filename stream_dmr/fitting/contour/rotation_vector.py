@@ -1,4 +1,4 @@
-"""Rotations of three numbers, and their slopes: compiled loops.
+"""Rotation vectors, their matrices and slopes: compiled loops.
 
 The derivative of a rotated vector is d(R v) = R ((J_r d_omega) x v), with J_r the right Jacobian of
 the rotation vector omega (Sola et al., "A micro Lie theory", 2018, eq. (143)).

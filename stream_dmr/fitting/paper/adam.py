@@ -18,6 +18,8 @@ from stream_dmr.template.template import Template
 _ROOT_STEPS = [0.06] * 3 + [0.01] * 2 + [0.02]
 _JOINT_STEPS = [0.06] * 3 + [0.003] * 3 + [0.01] + [0.06] * 6
 _DECAY = 0.97  # of the steps, per iteration: large ones find the pose, small ones the outline
+# Iterations between two checks for an end; of every start in a search; starts that are finished.
+# All numbers of the descent were chosen by trial: the paper gives none.
 _CHECK_EVERY = 10
 _SEARCH_ITERATIONS = 40
 _NUM_FINISHED = 3

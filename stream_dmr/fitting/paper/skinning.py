@@ -4,7 +4,7 @@ Both variants share their parameters: a root rotation, translation and scale, an
 rotation, a translation, a scale and the precision Q of its Gaussian skinning weight.
 
 The root's translation has no depth: under a perspective camera depth and scale of one silhouette
-can't be told apart, so the root stays at depth 1 and the localization finds the millimetres.
+can't be distinguished, so the root stays at depth 1 and the localization finds the millimetres.
 """
 
 from collections.abc import Callable

@@ -83,7 +83,7 @@ def load_shapes(
     """What `--template` says: the mesh, and the shapes that fish may have.
 
     `auto`: any body form. The name of a body form: that one, unless the masks say otherwise. A
-    mesh: its own shape alone, since it is the user's word; `on_notice` hears what was repaired and
+    mesh: its own shape alone, since it is the user's word; `on_notice` gets what was repaired and
     found of it. Raises TemplateError.
     """
     if name != AUTO and name not in bundled_names():

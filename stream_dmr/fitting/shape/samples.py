@@ -10,8 +10,9 @@ from jaxtyping import Float
 from stream_dmr.messages import FishCrop
 
 FRAMES_PER_FISH = 4  # far apart: more of one passage say little that is new
-_TRIED_PER_FISH = 8  # from which those are chosen by their fits
+_TRIED_PER_FISH = 8  # frames of which the best fitted are taken; chosen
 _MAX_FISH = 60  # a stock's mean is known to an eighth of its individuals' spread, then
+# Of a frame; chosen so that only masks of whole fish are learnt from.
 _MIN_VISIBLE = 0.99
 _MIN_CONFIDENCE = 0.8  # of a mask that was found
 

@@ -44,9 +44,10 @@ from stream_dmr.template.template import Template
 _TILT_STD_RAD = 0.15
 # Within which the roll about the fish's own axis may hide, where an outline says nothing of it.
 _ROLL_STD_RAD = 0.5
+# Chosen by trial, as the limits below.
 _MAX_ROUNDS = 12
 _MAX_STEP = 0.25  # of a log factor in one round: directions are those of the shape at hand
-_SETTLED = 0.01
+_SETTLED = 0.01  # of a log factor
 _MAX_SHIFT = 0.15  # by log volumes, which are known to first order only
 _PROBE = 0.05  # step of the finite difference of log volumes
 _POSE_OPTIONS = Options(6, 1e-5, WARM_DAMPING)
@@ -170,7 +171,7 @@ class StockFitter:
         return sum(float(np.mean(values)) for values in volumes.values())
 
     def _follow(self, body: Body, frame: PosedTarget) -> tuple[float, Float[np.ndarray, "P P"]]:
-        """Fit a frame anew from where it was; its loss and the loss's curvature."""
+        """Refit a frame from its last pose; its loss and the loss's curvature."""
         problem = self._problem(body, frame.target)
         nothing_held = np.zeros(len(frame.pose), np.bool_)
         found = minimise(problem, frame.pose, nothing_held, _POSE_OPTIONS)

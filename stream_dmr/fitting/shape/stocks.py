@@ -1,9 +1,9 @@
 """The stocks of a catch: groups of fish of one mean shape, learnt from frames of them all.
 
 Fish are grouped by the body form that each one's masks prefer. Two groups are one stock unless
-their masks tell them apart by more than the parameters that a second shape costs (Akaike's
-criterion). Then every fish is looked at again with each stock's shape, and the stocks are learnt
-once more from their own.
+their masks distinguish them by more than the parameters that a second shape costs (Akaike's
+criterion). Then every fish is refitted with each stock's shape, and the stocks are learnt once
+more from their own.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,10 +22,11 @@ from stream_dmr.fitting.shape.stock import PosedTarget, Stock, StockFitter
 from stream_dmr.fitting.target import Target
 from stream_dmr.template.template import Template
 
-# The frames of a fish, far apart, say as much of its shape as two independent ones.
+# The frames of a fish, far apart, determine its shape as two independent ones would.
 _FRAMES_WORTH = 2.0
-# What one fish may say at most for or against parting two groups, nats: a mask may be wrong.
-_MOST_FOR, _MOST_AGAINST = 20.0, -6.0
+# Most evidence of one fish for and against separating two groups, nats: a mask may be wrong. Chosen
+# by trial.
+_MAX_FOR, _MAX_AGAINST = 20.0, -6.0
 
 
 class _Group:
@@ -61,7 +62,7 @@ def learn_stocks(
     groups = learner.by_form(list(forms), fish)
     progress(f"{len(fish)} fish of {len(groups)} body forms")
     groups = learner.merged(groups)
-    groups = learner.looked_at_again(groups)
+    groups = learner.reassigned(groups)
     progress(f"{len(groups)} stocks")
     total = sum(group.num_fish for group in groups)
     return CandidateShapes.of(
@@ -117,14 +118,14 @@ class _StockLearner:
                     joined[a, b] = self._learn(
                         a.form, _copies(a.frames + b.frames), a.stock.coefficients
                     )
-            a, b = min(pairs, key=lambda pair: _reason_to_part(*pair, joined[pair]))
-            if _reason_to_part(a, b, joined[a, b]) > 0:
+            a, b = min(pairs, key=lambda pair: _evidence_for_two(*pair, joined[pair]))
+            if _evidence_for_two(a, b, joined[a, b]) > 0:
                 break
             groups = [joined[a, b], *(group for group in groups if group not in (a, b))]
         return groups
 
-    def looked_at_again(self, groups: list[_Group]) -> list[_Group]:
-        """Each fish in the group whose shape its masks prefer; poses sought anew, stocks learnt."""
+    def reassigned(self, groups: list[_Group]) -> list[_Group]:
+        """Each fish in the group whose shape its masks prefer, by a new search; stocks learnt."""
         searches = [self._search(group.stock.coefficients) for group in groups]
         shapes = [group.stock.coefficients for group in groups]
         shares = np.log([group.num_fish for group in groups])
@@ -175,8 +176,8 @@ def _copies(frames: Sequence[PosedTarget]) -> list[PosedTarget]:
     return [PosedTarget(frame.fish, frame.target, frame.pose) for frame in frames]
 
 
-def _reason_to_part(a: _Group, b: _Group, both: _Group) -> float:
+def _evidence_for_two(a: _Group, b: _Group, both: _Group) -> float:
     """Nats by which masks prefer two shapes to one, less the parameters of the smaller group."""
     apart = a.stock.nats | b.stock.nats
     gains = [_FRAMES_WORTH * (both.stock.nats[fish] - nats) for fish, nats in apart.items()]
-    return float(np.clip(gains, _MOST_AGAINST, _MOST_FOR).sum()) - b.num_effective
+    return float(np.clip(gains, _MAX_AGAINST, _MAX_FOR).sum()) - b.num_effective

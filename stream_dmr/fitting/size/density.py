@@ -1,4 +1,4 @@
-"""From sizes that were tried to what is to be expected: a density and its moments, compiled."""
+"""Density of a fish's size from the sizes that were tried, and its moments: compiled loops."""
 
 import numpy as np
 from jaxtyping import Float

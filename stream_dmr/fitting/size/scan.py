@@ -37,7 +37,7 @@ def scan_sizes(
     max_excess: float,
     options: Options,
 ) -> SizeScan:
-    """Fit anew at each log size `start[LOG_SIZE] + offsets` (ascending, 0 among them).
+    """Refit at each log size `start[LOG_SIZE] + offsets` (ascending, 0 among them).
 
     From the start outwards, each size from where its neighbour's fit is headed, and no further than
     sizes whose loss exceeds the start's by `max_excess`.

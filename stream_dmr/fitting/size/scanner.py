@@ -1,9 +1,10 @@
 """The expected size of a fish, given one mask: the mean over all sizes, not the best fit's.
 
-A silhouette tells the size of a fish one-sidedly. A fish that seems to be flat may be a slanting
-one that is longer, but not a shorter one; and a long fish, slanting and bent, can look like a short
-one in more ways than the other way round. The best fit alone is therefore too short on average, or
-wherever its search has led it. So sizes near it are tried, with everything else fitted anew.
+A silhouette bounds the size of a fish on one side only. A fish that seems to be flat may be a
+slanting one that is longer, but not a shorter one; and a long fish, slanting and bent, can look
+like a short one in more ways than the other way round. The best fit alone is therefore too short on
+average, or wherever its search has led it. So sizes near it are tried, with everything else
+refitted.
 """
 
 import numpy as np

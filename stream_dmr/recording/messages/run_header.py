@@ -35,7 +35,7 @@ class RunHeader:
 
     @property
     def known_inputs(self) -> RunInputs | None:
-        """`inputs`, or of an old recording what its command tells of them."""
+        """`inputs`, or of an old recording what its command says of them."""
         return self.inputs or RunInputs.from_command(self.command)
 
     @cached_property

@@ -67,7 +67,7 @@ class RunInputs:
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, str]) -> "RunInputs | None":
-        """What metadata or `RunFacts` of any age tell, of old ones by `from_command`."""
+        """What metadata or `RunFacts` of any age say, of old ones by `from_command`."""
         return cls.from_metadata(facts) or cls.from_command(facts["command"])
 
     @classmethod

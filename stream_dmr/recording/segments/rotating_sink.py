@@ -33,8 +33,8 @@ class RotatingSink:
     A cut lies between two frames. The stages are some frames apart, so two segments are open for a
     moment: messages of frames after the cut go to the new one. A segment is complete when the last
     stage has reached the cut; the frames of open tracks are then carried over to the next one.
-    Where the disk refuses a write, `on_notice` is told and a new segment is tried; the unfinished
-    files are repaired once there is room for the next one.
+    Where the disk refuses a write, `on_notice` gets a line and a new segment is tried; the
+    unfinished files are repaired once there is room for the next one.
     """
 
     name = "segments"
@@ -51,7 +51,7 @@ class RotatingSink:
     ) -> None:
         """`interrupted`: frames of tracks that an earlier run left open and this one finishes.
 
-        `states` is told how the files of each kind are.
+        `states` gets the state of the files of each kind.
         """
         self._out_dir, self._header, self._settings = out_dir, header, settings
         self._on_notice, self._states = on_notice, states or SinkStates()

@@ -1,7 +1,7 @@
 """Confirm a track as a fish once it was clearly segmented in enough frames inside the zone.
 
-The tracker follows whatever moves. Gaffs and waves are told from fish by their masks, which are
-empty or of low confidence.
+The tracker follows whatever moves. Gaffs and waves are distinguished from fish by their masks,
+which are empty or of low confidence.
 """
 
 from collections import Counter

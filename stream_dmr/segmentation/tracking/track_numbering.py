@@ -14,7 +14,7 @@ class TrackNumbering:
     """
 
     def __init__(self, *, keeps_source_ids: bool) -> None:
-        """`keeps_source_ids`: the ids of annotation files, instead of numbering the fish anew."""
+        """`keeps_source_ids`: the ids of annotation files, instead of new numbers."""
         self._keeps_source_ids = keeps_source_ids
         self._last_id = 0  # of earlier runs
         self._ids: dict[int, int] = {}  # by source id
