@@ -2,7 +2,10 @@
 
 import hashlib
 import inspect
+import logging
 import os
+import shutil
+import stat
 import tempfile
 from collections.abc import Callable
 from functools import cache
@@ -44,7 +47,63 @@ def _cache_folder() -> Path:
     here = Path(__file__).parent
     texts = [path.read_bytes() for path in sorted(here.rglob("*.py"))]
     sources = [text for text in texts if b"stream_dmr.compiled" in text]
-    version = hashlib.sha256(b"".join(sources)).hexdigest()[:16]
-    if os.access(here, os.W_OK):
-        return here / "__pycache__" / f"compiled-{version}"
-    return Path(tempfile.gettempdir()) / f"stream-dmr-{os.getuid()}" / f"compiled-{version}"
+    name = f"compiled-{hashlib.sha256(b''.join(sources)).hexdigest()[:16]}"
+    installed = here / "__pycache__" / name
+    return installed if os.access(here, os.W_OK) else users_cache(name, installed=installed)
+
+
+def users_cache(name: str, *, installed: Path) -> Path:
+    """The folder `name` in this user's cache, filled from the one that an installation filled.
+
+    What lies there is executed, so it is refused where others own it or may write to it; functions
+    are then compiled for this process alone, into a folder that nobody could know before.
+    """
+    cache = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]  # of a systemd service
+    base = Path(cache) if cache else _users_cache_base() / "stream-dmr"
+    folder = base / name
+    try:
+        base.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _require_private(base)
+        if not folder.exists():
+            _fill(folder, installed)
+        _require_private(folder)
+    except OSError as error:
+        logging.getLogger("stream_dmr").warning(
+            "%s: expected a folder for compiled code that only this user can write to, got: %s; "
+            "compiling for this process alone",
+            folder,
+            error.strerror or error,
+        )
+        return Path(tempfile.mkdtemp(prefix="stream-dmr-"))
+    return folder
+
+
+def _users_cache_base() -> Path:
+    """$XDG_CACHE_HOME, or ~/.cache, as the XDG Base Directory Specification says."""
+    given = os.environ.get("XDG_CACHE_HOME", "")
+    return Path(given) if Path(given).is_absolute() else Path.home() / ".cache"
+
+
+def _require_private(folder: Path) -> None:
+    """Raise PermissionError unless a folder is this user's, and only this user may write to it."""
+    state = folder.lstat()
+    if not stat.S_ISDIR(state.st_mode):
+        raise PermissionError(f"{folder} is no folder")
+    if state.st_uid != os.getuid():
+        raise PermissionError(f"{folder} belongs to another user")
+    if state.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise PermissionError(f"others may write to {folder}")
+
+
+def _fill(folder: Path, installed: Path) -> None:
+    """Make a folder, with copies of the installation's compiled functions where there are any."""
+    draft = Path(tempfile.mkdtemp(prefix=f"{folder.name}.", dir=folder.parent))
+    if installed.is_dir():
+        shutil.copytree(installed, draft, dirs_exist_ok=True, copy_function=shutil.copyfile)
+        draft.chmod(0o700)
+    try:
+        draft.rename(folder)
+    except OSError:  # another process was faster
+        shutil.rmtree(draft)
+        if not folder.exists():
+            raise
