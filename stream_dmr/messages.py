@@ -87,6 +87,8 @@ class FishCrop(FishMessage):
     frame_camera: Camera  # with crop_camera it gives the exact crop-to-frame pixel map
     quality: CropQuality
     ends: FishEnds | None = None  # None where the segmenter does not find them
+    # What something in front of the fish may hide, neither fish nor water; None: nothing.
+    unknown: Bool[np.ndarray, "S S"] | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

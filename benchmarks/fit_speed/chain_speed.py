@@ -42,7 +42,7 @@ def write_clip(out: Path, *, num_frames: int, num_fish: int = NUM_FISH, seed: in
     together = [replace(visit, first_frame=1, is_gaffed=False) for visit in slots.visits]
     scene = replace(slots, visits=together)
     shots = (shot for shot in film(scene) if _shows_all(shot, num_fish))
-    write_species(out)
+    write_species(out / "species.ply")
     save_calibration(out / "calibration.yaml", scene.calibration)
     (out / "masks").mkdir()
     codec = cv2.VideoWriter.fourcc(*"mp4v")

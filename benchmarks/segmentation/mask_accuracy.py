@@ -47,7 +47,7 @@ def crops_of(scene: Path, segmenter: str) -> Iterator[tuple[FishCrop, Bool[np.nd
         labels = masks.labels(frame.frame_index, width=source.width, height=source.height)
         for crop in node.step(frame) if labels is not None else []:
             x, y = frame_from_crop_map(crop.crop_camera, frame_camera=crop.frame_camera)
-            grey = (labels == crop.track_id) * np.uint8(255)
+            grey = (labels.ids == crop.track_id) * np.uint8(255)
             truth = cv2.remap(grey, x, y, cv2.INTER_LINEAR) > 127
             if np.count_nonzero(truth) >= _MIN_MASK_PX:
                 yield crop, truth

@@ -122,7 +122,7 @@ def _against_masks(
         if labels is None:
             continue
         x, y = frame_from_crop_map(crop.crop_camera, frame_camera=camera)
-        seen = cv2.remap(labels.astype(np.uint16), x, y, cv2.INTER_NEAREST)
+        seen = cv2.remap(labels.ids.astype(np.uint16), x, y, cv2.INTER_NEAREST)
         ids = Counter(seen[crop.mask & (seen > 0)].tolist())
         name = ids.most_common(1)[0][0] if ids else 0
         votes.setdefault(crop.track_id, Counter())[name] += 1

@@ -94,6 +94,9 @@ def simulate_command(
     frames: Annotated[int, typer.Option(help="Number of frames.")] = 60,
     preset: Annotated[str, typer.Option(help="clean, realistic or severe.")] = "realistic",
     seed: Annotated[int, typer.Option(help="Equal seeds give equal scenes.")] = 0,
+    species: Annotated[
+        str, typer.Option(help="Body of the fish; several, joined by commas, take turns.")
+    ] = "halibut",
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make a scene of hooked fish with known lengths: video, boxes, masks, calibration, truth."""
@@ -101,8 +104,8 @@ def simulate_command(
     from stream_dmr.simulation import SCENE_FILES, simulate
 
     require_writable(*(out / name for name in SCENE_FILES), overwrite=overwrite)
-    simulate(out, num_fish=fish, num_frames=frames, preset=preset, seed=seed)
-    print(f"scene in {out}: video.mp4, boxes.txt, masks, calibration.yaml, truth.csv, species.ply")
+    simulate(out, num_fish=fish, num_frames=frames, preset=preset, seed=seed, species=species)
+    print(f"scene in {out}: video.mp4, boxes.txt, masks, calibration.yaml, truth.csv, templates")
 
 
 if __name__ == "__main__":

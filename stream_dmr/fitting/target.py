@@ -26,7 +26,8 @@ class Target(NamedTuple):
     plane_normal: Float[np.ndarray, "3"]  # of the plane that fish hang in, camera frame
     heading: Float[np.ndarray, "2"]  # tail to head in the picture; 0: not known
     mask: Float[np.ndarray, "S S"]
-    distance: Float[np.ndarray, "S S"]  # to the mask's edge, px, negative inside
+    unknown: Bool[np.ndarray, "S S"]  # what something hides: it counts neither way
+    distance: Float[np.ndarray, "S S"]  # to the mask's edge, px, negative inside, 0 where unknown
     mask_area: float  # px
     contour: Float[np.ndarray, "C 2"]  # points on the mask's edge, px
     contour_normals: Float[np.ndarray, "C 2"]  # outward
@@ -35,15 +36,17 @@ class Target(NamedTuple):
     @classmethod
     def from_crop(cls, crop: FishCrop, *, plane_normal: Float[np.ndarray, "3"]) -> "Target":
         """Distance map, contour, heading and camera of a crop with a mask."""
+        unknown = np.zeros_like(crop.mask) if crop.unknown is None else crop.unknown.copy()
         return cls(
             crop.crop_camera.K.copy(),  # see Body.from_template
             crop.crop_camera.middle_ray(),
             plane_normal,
             heading_from_ends(crop.ends, crop.crop_camera),
             crop.mask.astype(np.float64),
-            signed_distance(crop.mask),
+            unknown,
+            _distance(crop.mask, crop.unknown),
             float(crop.mask.sum()),
-            *mask_contour(crop.mask),
+            *mask_contour(crop.mask, crop.unknown),
         )
 
     def coarse(self) -> "Target":
@@ -54,12 +57,23 @@ class Target(NamedTuple):
         return self._replace(
             K=K,
             mask=_halved(self.mask),
+            unknown=_halved(self.unknown.astype(np.float64)) > 0,
             distance=_halved(self.distance) / 2,
             mask_area=self.mask_area / 4,
             contour=_halved_px(self.contour[::2]),
             contour_normals=np.ascontiguousarray(self.contour_normals[::2]),
             contour_lengths=self.contour_lengths[::2].copy(),  # as many px for twice the edge
         )
+
+
+def _distance(
+    mask: Bool[np.ndarray, "S S"], unknown: Bool[np.ndarray, "S S"] | None
+) -> Float[np.ndarray, "S S"]:
+    """To the sure fish from inside of it, to all that may be fish from outside, 0 in between."""
+    if unknown is None:
+        return signed_distance(mask)
+    outside = signed_distance(mask | unknown)
+    return np.where(mask, signed_distance(mask), np.where(unknown, 0.0, outside))
 
 
 def _halved_px(pixels: Float[np.ndarray, "*N 2"]) -> Float[np.ndarray, "*N 2"]:
@@ -79,20 +93,25 @@ def _halved(picture: Float[np.ndarray, "S S"]) -> Float[np.ndarray, "S//2 S//2"]
 
 
 def mask_contour(
-    mask: Bool[np.ndarray, "S S"],
+    mask: Bool[np.ndarray, "S S"], unknown: Bool[np.ndarray, "S S"] | None = None
 ) -> tuple[Float[np.ndarray, "C 2"], Float[np.ndarray, "C 2"], Float[np.ndarray, "C"]]:
     """Points along the edge of a mask in pixels, unit outward normals, and each one's length.
 
     The edge runs between the centres of the last pixels inside and the first ones outside, so the
-    traced pixels are moved half a pixel outward. Edges along the picture's border are left out: the
-    fish goes on beyond them.
+    traced pixels are moved half a pixel outward. Edges along the picture's border, and along what
+    is unknown, are left out: the fish may go on beyond them.
     """
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     parts = [_edge(traced[:, 0], *mask.shape) for traced in contours if len(traced) >= _FEWEST]
     if not parts:
         return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
     points, normals, lengths = (np.concatenate(values) for values in zip(*parts, strict=True))
-    return points, normals, lengths
+    if unknown is None:
+        return points, normals, lengths
+    near = cv2.dilate(unknown.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    columns, rows = np.round(points).astype(int).T
+    is_edge = ~near[rows, columns]
+    return points[is_edge], normals[is_edge], lengths[is_edge]
 
 
 @compiled

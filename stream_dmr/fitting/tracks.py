@@ -93,9 +93,10 @@ class TrackFitter:
         solved = [fitter.solve(crop, track.best.get(n)) for n, fitter in enumerate(self.fitters)]
         self._decide(track, crop, solved)
         chosen = int(np.argmin(track.against))
-        for n, one in enumerate(solved):  # all begin the next frame where they ended in this one
-            if one.solution is not None and one.solution.iou >= self._settings.cold_below_iou:
-                track.best[n] = one.solution.parameters
+        if not crop.quality.touches_border:
+            for n, one in enumerate(solved):  # the next frame begins where this one ended
+                if one.solution is not None and one.solution.iou >= self._settings.cold_below_iou:
+                    track.best[n] = one.solution.parameters
         return self.fitters[chosen].answer(crop, solved[chosen])
 
     def _decide(self, track: _TrackState, crop: FishCrop, solved: list[Solved]) -> None:

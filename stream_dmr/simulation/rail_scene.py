@@ -1,5 +1,6 @@
 """A scene at the rail: one camera, one reference plane, and the visits of fish."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -9,6 +10,7 @@ from jaxtyping import Float
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.simulation.pose_sequence import draw_poses, draw_still_pose
 from stream_dmr.simulation.presets import Preset, find_preset
+from stream_dmr.simulation.simulated_body import HALIBUT, SimulatedBody
 from stream_dmr.simulation.simulated_fish import (
     HangingPose,
     PosedFish,
@@ -69,11 +71,18 @@ class RailScene:
         return pose_fish(visit.fish, pose, calibration=self.calibration)
 
 
-def make_scene(*, num_fish: int, num_frames: int, preset: str, seed: int) -> RailScene:
+def make_scene(
+    *,
+    num_fish: int,
+    num_frames: int,
+    preset: str,
+    seed: int,
+    species: Sequence[SimulatedBody] = (HALIBUT,),
+) -> RailScene:
     """A random scene; equal arguments give equal scenes. Track ids count from 1.
 
     Up to three fish are in the picture together; the first and last frames, and those between
-    groups of three, are empty.
+    groups of three, are empty. Several `species` take turns.
     """
     chosen = find_preset(preset)
     return RailScene(
@@ -82,7 +91,14 @@ def make_scene(*, num_fish: int, num_frames: int, preset: str, seed: int) -> Rai
         calibration=draw_calibration(np.random.default_rng((seed, _CALIBRATION))),
         num_frames=num_frames,
         visits=[
-            _draw_visit(index, num_fish=num_fish, num_frames=num_frames, preset=chosen, seed=seed)
+            _draw_visit(
+                index,
+                num_fish=num_fish,
+                num_frames=num_frames,
+                preset=chosen,
+                seed=seed,
+                species=species[index % len(species)],
+            )
             for index in range(num_fish)
         ],
     )
@@ -138,7 +154,15 @@ def draw_view(*, preset: str, seed: int) -> SimulatedView:
     )
 
 
-def _draw_visit(index: int, *, num_fish: int, num_frames: int, preset: Preset, seed: int) -> Visit:
+def _draw_visit(
+    index: int,
+    *,
+    num_fish: int,
+    num_frames: int,
+    preset: Preset,
+    seed: int,
+    species: SimulatedBody,
+) -> Visit:
     """Fish number `index` (from 0), when it comes, and its poses."""
     rng = np.random.default_rng((seed, _FISH, index))
     last_start = _start_slot(num_fish - 1)
@@ -148,7 +172,7 @@ def _draw_visit(index: int, *, num_fish: int, num_frames: int, preset: Preset, s
     visit_frames = max(1, round(_VISIT_SLOTS * frames_per_slot))
     lane = (index % _GROUP - 1) * preset.lane_mm * (1 if index // _GROUP % 2 else -1)
     return Visit(
-        fish=draw_fish(rng, track_id=index + 1),
+        fish=draw_fish(rng, track_id=index + 1, species=species),
         first_frame=first_frame,
         poses=draw_poses(
             rng,

@@ -76,16 +76,16 @@ class StraightBody:
     faces: Int[np.ndarray, "F 3"]  # counter-clockwise outside
 
 
-def draw_body(rng: np.random.Generator) -> SimulatedBody:
+def draw_body(rng: np.random.Generator, species: SimulatedBody = HALIBUT) -> SimulatedBody:
     """A random individual: 5 % standard deviation in width, 10 % in thickness (chosen)."""
     vary = rng.standard_normal(5).clip(-2.0, 2.0)
     return replace(
-        HALIBUT,
-        half_width=HALIBUT.half_width * (1 + 0.05 * vary[0]),
-        half_thickness=HALIBUT.half_thickness * (1 + 0.10 * vary[1]),
-        widest_at=HALIBUT.widest_at + 0.015 * vary[2],
-        tail_half_width=HALIBUT.tail_half_width * (1 + 0.08 * vary[3]),
-        peduncle_half_width=HALIBUT.peduncle_half_width * (1 + 0.05 * vary[4]),
+        species,
+        half_width=species.half_width * (1 + 0.05 * vary[0]),
+        half_thickness=species.half_thickness * (1 + 0.10 * vary[1]),
+        widest_at=species.widest_at + 0.015 * vary[2],
+        tail_half_width=species.tail_half_width * (1 + 0.08 * vary[3]),
+        peduncle_half_width=species.peduncle_half_width * (1 + 0.05 * vary[4]),
     )
 
 

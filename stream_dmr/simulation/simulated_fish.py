@@ -10,6 +10,7 @@ from stream_dmr.camera import Calibration, ReferencePlane
 from stream_dmr.geometry import arc_length, bending_ratio
 from stream_dmr.simulation.center_line import CenterLine, bend_center_line, total_bend_rad
 from stream_dmr.simulation.simulated_body import (
+    HALIBUT,
     SimulatedBody,
     StraightBody,
     draw_body,
@@ -75,9 +76,11 @@ class PosedFish:
         return bending_ratio(self.midline)
 
 
-def draw_fish(rng: np.random.Generator, *, track_id: int) -> SimulatedFish:
-    """A random halibut of 500 to 1000 mm, from a beta(1.8, 3) distribution (chosen; mean 690)."""
-    body = draw_body(rng)
+def draw_fish(
+    rng: np.random.Generator, *, track_id: int, species: SimulatedBody = HALIBUT
+) -> SimulatedFish:
+    """A random fish of 500 to 1000 mm, from a beta(1.8, 3) distribution (chosen; mean 690)."""
+    body = draw_body(rng, species)
     length_mm = 500.0 + 500.0 * float(rng.beta(1.8, 3.0))
     return SimulatedFish(
         track_id=track_id, length_mm=length_mm, body=body, mesh=straight_body(body)

@@ -15,13 +15,14 @@ from stream_dmr.errors import OutputError, UserError
 from stream_dmr.simulation.film import VisibleBox, film
 from stream_dmr.simulation.pose_sequence import FPS
 from stream_dmr.simulation.rail_scene import RailScene, make_scene
-from stream_dmr.simulation.simulated_body import HALIBUT, JOINT_ARCS, keypoints, straight_body
+from stream_dmr.simulation.simulated_body import JOINT_ARCS, keypoints, straight_body
+from stream_dmr.simulation.species import SPECIES, find_species
 
 _MAX_FISH = 65535  # the largest id of a 16-bit mask
 
 SCENE_FILES = (
     *("video.mp4", "boxes.txt", "masks", "calibration.yaml"),
-    *("truth.csv", "truth_frames.csv", "species.ply", "species.toml"),
+    *("truth.csv", "truth_frames.csv", "species.ply", "species.toml", "species.csv"),
 )
 TRUTH_FRAMES_COLUMNS = (
     "frame_index",
@@ -34,22 +35,29 @@ TRUTH_FRAMES_COLUMNS = (
 )
 
 
-def simulate(out: Path, *, num_fish: int, num_frames: int, preset: str, seed: int) -> None:
+def simulate(
+    out: Path, *, num_fish: int, num_frames: int, preset: str, seed: int, species: str = "halibut"
+) -> None:
     """Write a clip of hooked fish with known lengths into the folder `out`.
 
     `video.mp4`, `boxes.txt`, `masks/`, `calibration.yaml`, `truth.csv` (length per fish),
     `truth_frames.csv` (per fish and frame: keypoints in the camera frame in mm and in frame
     pixels with lens distortion, arc, bending), and `species.ply` with `species.toml`, the mean
-    body as a template. Equal arguments write equal masks and truth to the last bit.
+    body as a template. Of several `species`, names joined by commas, which take turns, there is a
+    mesh of each, and `species.csv` says which fish is which. Equal arguments write equal masks and
+    truth to the last bit.
 
-    Raises UserError for counts, a preset or a seed out of range, OutputError where `out` can't be
-    written to.
+    Raises UserError for counts, a preset, a species or a seed out of range, OutputError where `out`
+    can't be written to.
     """
     _check(num_fish=num_fish, num_frames=num_frames, seed=seed)
-    scene = make_scene(num_fish=num_fish, num_frames=num_frames, preset=preset, seed=seed)
+    bodies = find_species(species)
+    scene = make_scene(
+        num_fish=num_fish, num_frames=num_frames, preset=preset, seed=seed, species=bodies
+    )
     try:
         _empty_masks(out / "masks")
-        write_species(out)
+        _write_all_species(out, species.split(","), num_fish=num_fish)
         _write_truth(out, scene)
         save_calibration(out / "calibration.yaml", scene.calibration)
         _write_film(out, scene)
@@ -60,16 +68,26 @@ def simulate(out: Path, *, num_fish: int, num_frames: int, preset: str, seed: in
         ) from error
 
 
-def write_species(out: Path) -> None:
-    """Write the mean body as a template for the fit: `species.ply` with `species.toml`."""
-    mesh = straight_body(HALIBUT)
-    trimesh.Trimesh(mesh.points, mesh.faces, process=False).export(out / "species.ply")
+def write_species(path: Path, name: str = "halibut") -> None:
+    """Write a mean body as a template for the fit: the mesh to `path`, its TOML beside it."""
+    mesh = straight_body(SPECIES[name])
+    trimesh.Trimesh(mesh.points, mesh.faces, process=False).export(path)
     head, center, tail = keypoints().tolist()
-    (out / "species.toml").write_text(
-        f'name = "simulated halibut"\njoints = {keypoints(JOINT_ARCS).tolist()}\n\n'
+    path.with_suffix(".toml").write_text(
+        f'name = "simulated {name}"\njoints = {keypoints(JOINT_ARCS).tolist()}\n\n'
         f"[keypoints]\nhead = {head}\ncenter = {center}\ntail = {tail}\n",
         encoding="utf-8",
     )
+
+
+def _write_all_species(out: Path, names: list[str], *, num_fish: int) -> None:
+    if len(names) == 1:
+        write_species(out / "species.ply", names[0])
+        return
+    for name in names:
+        write_species(out / f"{name}.ply", name)
+    rows = ((index + 1, names[index % len(names)]) for index in range(num_fish))
+    _write_csv(out / "species.csv", ("track_id", "species"), rows)
 
 
 def encode_mask(labels: UInt16[np.ndarray, "H W"], *, num_fish: int) -> bytes:

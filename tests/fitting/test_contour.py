@@ -258,9 +258,13 @@ class TestOutline:
 @both_kinds
 @every_template
 @five
-@given(seed=seeds)
-def test_terms_and_iou_are_those_of_the_torch_objective(name, kind, seed):
+@given(seed=seeds, is_cut=st.booleans())
+def test_terms_and_iou_are_those_of_the_torch_objective(name, kind, seed, is_cut):
     target = target_of(fish_pose(seed), "2 joints")
+    if is_cut:
+        unknown = np.indices(target.mask.shape)[1] // 10 == 4
+        mask = np.where(unknown, 0.0, target.mask)
+        target = target._replace(mask=mask, unknown=unknown, mask_area=mask.sum())
     flat = motion(name, seed)
     objective = Objective(RIGS[name], target, FitMeshSettings(deformation=kind))
     expected = objective.terms(flat)

@@ -137,6 +137,24 @@ class TestFinds:
         gap = np.linalg.norm(whole.keypoints_px - fewer.keypoints_px, axis=1)
         assert gap.max() < 0.02 * np.linalg.norm(np.diff(whole.keypoints_px[[0, 2]], axis=0))
 
+    def test_a_fish_that_a_gaff_cuts_in_two(self, fitter):
+        flat = true_pose(4)
+        crop = crop_of(flat, RIG, size=96)
+        columns, rows = np.nonzero(crop.mask)[::-1]
+        middle = np.array([columns.mean(), rows.mean()])
+        head, _, tail = crop_from_frame(
+            true_keypoints_px(flat, RIG, crop),
+            crop_camera=crop.crop_camera,
+            frame_camera=FRAME_CAMERA,
+        )
+        along = (tail - head) / np.linalg.norm(tail - head)
+        places = np.stack(np.indices(crop.mask.shape)[::-1], axis=-1) - middle
+        gaff = np.abs(places @ along) < 7
+        cut = replace(crop, mask=crop.mask & ~gaff, unknown=gaff)
+        assert_found(fitter.fit(cut, near(flat)).mesh, flat, RIG, cut)
+        water = replace(cut, unknown=None)
+        assert fitter.fit(water, near(flat)).mesh.shape.iou < 0.9
+
     def test_a_fish_from_cold_heads_where_the_segmenter_says(self):
         """Also where it is wrong: it has seen the fish, the fit only its outline."""
         flat = true_pose(3)

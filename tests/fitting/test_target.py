@@ -1,5 +1,7 @@
 """What a solver sees of a mask: its edge, and the distance to it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -61,6 +63,40 @@ class TestSignedDistance:
             edt = ndimage.distance_transform_edt
             expected = np.where(mask, 0.5 - edt(mask), edt(~mask) - 0.5)
         np.testing.assert_array_equal(signed_distance(mask), expected)
+
+
+class TestUnknown:
+    """Half a disc hidden by something: its edge is neither the fish's nor the water's."""
+
+    def hidden(self):
+        whole, unknown = disc(30.0), np.indices((SIZE, SIZE))[1] > 60
+        return whole, unknown, replace(crop_from_mask(whole & ~unknown), unknown=unknown)
+
+    def test_lies_at_no_distance_and_between_both_sides(self):
+        whole, unknown, crop = self.hidden()
+        distance = Target.from_crop(crop, plane_normal=np.array([0.0, 0.0, 1.0])).distance
+        assert (distance[unknown] == 0).all()
+        assert (distance[crop.mask] < 0).all()
+        water = ~whole & ~unknown
+        assert (distance[water] > 0).all()
+        # Nothing is nearer than it is to the whole disc, and all that may be fish.
+        np.testing.assert_array_equal(distance[water], signed_distance(crop.mask | unknown)[water])
+
+    def test_has_no_contour(self):
+        whole, _, crop = self.hidden()
+        points, _, _ = mask_contour(crop.mask, crop.unknown)
+        everywhere, _, _ = mask_contour(whole)
+        assert points[:, 0].max() < 60
+        visible = everywhere[everywhere[:, 0] < 58]
+        assert len(points) == pytest.approx(len(visible), abs=3)
+        gaps = np.linalg.norm(points[:, None] - everywhere, axis=2).min(axis=1)
+        assert gaps.max() < 2.5  # none of them lies along the cut
+
+    def test_stays_unknown_at_half_the_resolution(self):
+        *_, crop = self.hidden()
+        target = Target.from_crop(crop, plane_normal=np.array([0.0, 0.0, 1.0])).coarse()
+        assert target.unknown[:, 31:].all()
+        assert not target.unknown[:, :30].any()
 
 
 class TestContour:

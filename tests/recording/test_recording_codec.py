@@ -81,6 +81,7 @@ crops = sizes.flatmap(
         frame_camera=cameras,
         quality=qualities,
         ends=optional(ends),
+        unknown=optional(arrays(np.bool_, (size, size))),
     )
 )
 shapes = st.tuples(sizes, sizes, sizes).flatmap(

@@ -202,3 +202,14 @@ def test_an_unwritable_folder_is_refused_by_name(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="file"):
         simulate(tmp_path / "file", num_fish=1, num_frames=1, preset="clean", seed=0)
+
+
+def test_a_mixed_catch_says_which_fish_is_which(tmp_path):
+    simulate(tmp_path, num_fish=3, num_frames=2, preset="clean", seed=1, species="gar,perch")
+    rows = (tmp_path / "species.csv").read_text().split()
+    assert rows == ["track_id,species", "1,gar", "2,perch", "3,gar"]
+    breadths = {
+        name: np.ptp(trimesh.load(tmp_path / f"{name}.ply").vertices[:, 1])
+        for name in ("gar", "perch")
+    }
+    assert breadths["gar"] < breadths["perch"] / 2

@@ -7,6 +7,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stream_dmr.errors import UserError
 from stream_dmr.geometry import arc_length, bending_ratio
 from stream_dmr.simulation.center_line import NUM_STEPS, bend_center_line, total_bend_rad
 from stream_dmr.simulation.presets import PRESETS
@@ -20,6 +21,7 @@ from stream_dmr.simulation.simulated_body import (
     straight_body,
 )
 from stream_dmr.simulation.simulated_fish import HangingPose, draw_fish, pose_fish
+from stream_dmr.simulation.species import SPECIES, find_species
 
 SEEDS = st.integers(0, 2**32 - 1)
 PRESET_NAMES = st.sampled_from(sorted(PRESETS))
@@ -233,3 +235,17 @@ def test_a_broad_straight_fish_covers_its_outline_in_pixels():
     facing = plane.rotation[2, 2]  # the plane is tilted away from the line of sight by little
     scale = calibration.camera.K[0, 0] / plane.translation_mm[2]
     assert mask.sum() == pytest.approx(area_mm2 * scale**2 * facing, rel=0.05)
+
+
+def test_species_take_turns_and_keep_their_proportions():
+    scene = make_scene(
+        num_fish=6, num_frames=30, preset="clean", seed=3, species=find_species("conger,perch")
+    )
+    breadths = [visit.fish.body.half_width for visit in scene.visits]
+    for breadth, name in zip(breadths, 3 * ("conger", "perch"), strict=True):
+        assert breadth == pytest.approx(SPECIES[name].half_width, rel=0.11)
+
+
+def test_an_unknown_species_is_refused_with_those_that_exist():
+    with pytest.raises(UserError, match=r"--species: expected any of halibut.*, got 'whale'"):
+        find_species("perch,whale")

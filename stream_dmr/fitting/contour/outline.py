@@ -123,15 +123,16 @@ def _add_row(
 
 @compiled
 def overlap(covered: Float[np.ndarray, "S S"], target: Target) -> tuple[float, float, float]:
-    """L_iou and L_boundary of eq. (3), and the hard IoU."""
+    """L_iou and L_boundary of eq. (3), and the hard IoU; what is unknown is left out of all."""
     mask, distance, mask_area = target.mask, target.distance, target.mask_area
+    unknown = target.unknown
     size = len(mask)
     both = total = boundary = 0.0
     hard_both = hard_total = 0
     for i in range(size):
         for k in range(size):
             c = covered[i, k]
-            if c > 0.0:
+            if c > 0.0 and not unknown[i, k]:
                 total += c
                 boundary += c * distance[i, k]
                 both += c * mask[i, k]

@@ -32,13 +32,14 @@ class Objective:
         self._deformation = DEFORMATIONS[settings.deformation]
         self._K, self._anchor = tensor(target.K), tensor(target.anchor)
         self._mask, self._distance = tensor(target.mask), tensor(target.distance)
+        self._known = tensor(~target.unknown)
 
     def terms(self, vector: Float[Tensor, "B P"]) -> Terms:
         """Each term of eq. (3); the shape terms are taken in body lengths."""
         parameters = Parameters.from_vector(vector)
         vertices = deform(self._rig, vector, self._deformation).vertices
         pixels = project(vertices + self._anchor, self._K)
-        covered = silhouette(pixels, self._rig, size=self._mask.shape[0])
+        covered = silhouette(pixels, self._rig, size=self._mask.shape[0]) * self._known
         shape = vertices / parameters.root_log_scale.exp()[:, None, None]
         terms = (
             losses.iou_loss(covered, self._mask),

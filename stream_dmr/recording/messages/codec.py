@@ -3,6 +3,7 @@
 The schema is `messages.proto`; a dataclass and its protobuf message have the same field names.
 """
 
+import re
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
@@ -25,11 +26,12 @@ from stream_dmr.recording.messages.picture_codec import (
 )
 from stream_dmr.recording.messages.schema import proto_class
 
-CODEC_VERSION = 3
+CODEC_VERSION = 4
 """Increased when an older reader would read a new file wrongly.
 
 2: a crop may lack its picture, a fit its vertices and covariance.
 3: the JPEG of a frame may not be what the run used.
+4: a crop may say what of it is unknown.
 """
 
 T = TypeVar("T")
@@ -44,6 +46,7 @@ _DATACLASSES: dict[str, type] = {
         *(Camera, ReferencePlane, Calibration),
     )
 }
+_DTYPE = re.compile(r"[<|][bifu]\d")
 _MAX_PIXELS = 1 << 28  # 16384 x 16384; damaged bytes must not allocate all memory
 
 
@@ -189,6 +192,8 @@ def _picture(proto: Any) -> EncodedPicture:
 
 def _array(proto: Any) -> np.ndarray:
     try:
+        if not _DTYPE.fullmatch(proto.dtype):  # NumPy warns of some others, or takes any text
+            raise ValueError(f"no type of numbers: {proto.dtype!r}")
         dtype = np.dtype(proto.dtype)
         array = np.frombuffer(proto.data, dtype).reshape(tuple(proto.shape))
     except (TypeError, ValueError) as error:

@@ -10,7 +10,7 @@ from stream_dmr.errors import AnnotationError, UserError
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.annotations.annotated_box import UNKNOWN_ID, AnnotatedBox
 from stream_dmr.segmentation.annotations.box_files import load_boxes
-from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
+from stream_dmr.segmentation.annotations.mask_folder import Labels, MaskFolder
 from stream_dmr.segmentation.detection.fish_detection import Detection
 
 
@@ -69,6 +69,7 @@ class AnnotatedFish:
                 bbox_xyxy_px=box.bbox_xyxy_px,
                 mask=self._mask(frame, box, labels),
                 visible_fraction=box.visibility,
+                unknown=None if labels is None else labels.unknown,
             )
             for box in boxes
         ]
@@ -102,13 +103,13 @@ class AnnotatedFish:
                 lines.append(f"masks: ids {_join(unboxed)} have no box, so were left out")
         return lines
 
-    def _labels(self, frame: Frame, *, is_expected: bool) -> Integer[np.ndarray, "H W"] | None:
+    def _labels(self, frame: Frame, *, is_expected: bool) -> Labels | None:
         if self._masks is None:
             return None
         height, width = frame.image.shape[:2]
         labels = self._masks.labels(frame.frame_index, width=width, height=height)
         if labels is not None:
-            self._masked_ids.update(_ids(labels))
+            self._masked_ids.update(_ids(labels.ids))
         elif is_expected:  # a frame without boxes needs no mask
             self._frames_without_mask.append(frame.frame_index)
         return labels
@@ -127,24 +128,30 @@ class AnnotatedFish:
         return inside
 
     def _mask(
-        self, frame: Frame, box: AnnotatedBox, labels: Integer[np.ndarray, "H W"] | None
+        self, frame: Frame, box: AnnotatedBox, labels: Labels | None
     ) -> Bool[np.ndarray, "H W"] | None:
         if self._masks is None:
             return None
         if labels is None:
             return np.zeros(frame.image.shape[:2], bool)
-        return labels == box.track_id
+        return labels.ids == box.track_id
 
 
-def _detections_of(labels: Integer[np.ndarray, "H W"]) -> list[Detection]:
+def _detections_of(labels: Labels) -> list[Detection]:
     """One detection per id in a label picture, with its tightest box."""
     detections = []
-    for source_id in _ids(labels):
-        mask = labels == source_id
+    for source_id in _ids(labels.ids):
+        mask = labels.ids == source_id
         columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
         box = np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.float64)
         detections.append(
-            Detection(source_id=source_id, bbox_xyxy_px=box, mask=mask, visible_fraction=1.0)
+            Detection(
+                source_id=source_id,
+                bbox_xyxy_px=box,
+                mask=mask,
+                visible_fraction=1.0,
+                unknown=labels.unknown,
+            )
         )
     return detections
 

@@ -5,9 +5,10 @@ Pont-Tuset et al., "The 2017 DAVIS Challenge on Video Object Segmentation", arXi
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Integer
+from jaxtyping import Bool, Integer
 from PIL import Image
 
 from stream_dmr.errors import AnnotationError
@@ -15,13 +16,22 @@ from stream_dmr.errors import AnnotationError
 _FILE_NAME = re.compile(r"\d{6,}\.png")
 # What Pillow raises for a PNG that it cannot decode.
 _DECODING_ERRORS = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
+_MAX_LOOKED_AT = 20  # pictures, for ids where the first one has none
 _LABEL_MODES = {"1", "L", "P", "I", "I;16", "I;16B"}  # one channel; "P": palette indices
+
+
+class Labels(NamedTuple):
+    """What each pixel of a frame shows."""
+
+    ids: Integer[np.ndarray, "H W"]  # of a fish; 0: background, or unknown
+    unknown: Bool[np.ndarray, "H W"] | None  # hidden by something in front; None: no such pixel
 
 
 class MaskFolder:
     """A folder of label pictures `000001.png` ...: a pixel's value is a fish's id, 0 is background.
 
-    Pictures are read on demand. Palette pictures give their indices, not their colours.
+    The largest value of the type, 255 or 65535, is "unknown": what a gaff, a line or another fish
+    hides. Pictures are read on demand. Palette pictures give their indices, not their colours.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -40,13 +50,14 @@ class MaskFolder:
                 "rename them by one"
             )
         self.folder = folder
+        self._names = names
+        self._has_ids = False
 
-    def labels(
-        self, frame_index: int, *, width: int, height: int
-    ) -> Integer[np.ndarray, "H W"] | None:
-        """The label picture of a frame of that size in px; None where the folder has none.
+    def labels(self, frame_index: int, *, width: int, height: int) -> Labels | None:
+        """The labels of a frame of that size in px; None where the folder has no such picture.
 
-        Raises AnnotationError for a picture in colour, of another size, or unreadable.
+        Raises AnnotationError for a picture in colour, of another size, or unreadable, and where no
+        picture of the folder has an id.
         """
         path = self.folder / f"{frame_index:06d}.png"
         try:
@@ -58,7 +69,30 @@ class MaskFolder:
             return None
         except _DECODING_ERRORS:
             raise AnnotationError(f"{path}: expected a PNG mask, but it can't be decoded") from None
-        return labels.astype(np.uint8) if labels.dtype == bool else labels
+        if labels.dtype == bool:
+            return Labels(labels.astype(np.uint8), None)
+        largest = 255 if labels.dtype == np.uint8 else 65535
+        is_unknown = labels == largest
+        if not is_unknown.any():
+            return Labels(labels, None)
+        ids = np.where(is_unknown, 0, labels)
+        if not self._has_ids and not ids.any():
+            self._check_ids(largest)
+        self._has_ids = True
+        return Labels(ids, is_unknown)
+
+    def _check_ids(self, largest: int) -> None:
+        """A fish drawn as 255 on 0 is one that nobody would measure. Raises AnnotationError."""
+        names = [name for name in self._names if _FILE_NAME.fullmatch(name)]
+        for name in names[:: max(1, len(names) // _MAX_LOOKED_AT)]:
+            with Image.open(self.folder / name) as picture:
+                values = np.unique(np.asarray(picture))
+            if ((values > 0) & (values < largest)).any():
+                return
+        raise AnnotationError(
+            f"{self.folder}: expected fish ids from 1 on, found only 0 and {largest}, which means "
+            "unknown; write the mask of a single fish with the value 1"
+        )
 
 
 def _check_labels(picture: Image.Image, path: Path, *, size: tuple[int, int]) -> None:

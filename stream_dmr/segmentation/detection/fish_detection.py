@@ -15,3 +15,5 @@ class Detection:
     # Of the frame's size, all False for an empty mask; None: the segmenter is to find it.
     mask: Bool[np.ndarray, "H W"] | None
     visible_fraction: float  # 0 to 1
+    # Pixels that something in front of fish hides: neither fish nor water; None: no such pixel.
+    unknown: Bool[np.ndarray, "H W"] | None = None

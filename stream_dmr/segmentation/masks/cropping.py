@@ -26,7 +26,7 @@ def crop_fish(
     """
     view = FrameView(image=frame.image, camera=frame_camera, settings=settings)
     if detection.mask is not None:
-        crop = crop_given_mask(view, detection.bbox_xyxy_px, detection.mask)
+        crop = crop_given_mask(view, detection.bbox_xyxy_px, detection.mask, detection.unknown)
     elif segmenter is not None:
         crop = crop_segmented(view, detection.bbox_xyxy_px, segmenter)
     else:
@@ -38,6 +38,7 @@ def crop_fish(
         bbox_xyxy_px=detection.bbox_xyxy_px,
         image=crop.image,
         mask=crop.mask,
+        unknown=crop.unknown,
         crop_camera=crop.crop_camera,
         frame_camera=frame_camera,
         quality=CropQuality(

@@ -62,22 +62,30 @@ class MaskedCrop:
     is_cut: bool  # the mask reaches the crop's edge, so the fish may go on in the frame
     confidence: float | None  # see `expected_iou`; None for a given mask
     ends: FishEnds | None
+    unknown: Bool[np.ndarray, "S S"] | None = None  # hidden by something in front
 
 
 def crop_given_mask(
-    view: FrameView, bbox_xyxy_px: Float[np.ndarray, "4"], given: Bool[np.ndarray, "H W"]
+    view: FrameView,
+    bbox_xyxy_px: Float[np.ndarray, "4"],
+    given: Bool[np.ndarray, "H W"],
+    unknown: Bool[np.ndarray, "H W"] | None = None,
 ) -> MaskedCrop:
-    """The crop around a box and a mask of the frame."""
+    """The crop around a box and a mask of the frame, of which something may hide a part."""
     given = clean_mask(given, min_area_px=view.settings.min_mask_area_px)
     height, width = view.shape
     crop_camera = view.camera_around(visible_bbox(bbox_xyxy_px, given, width=width, height=height))
-    image, coverage = resample(
-        [view.image, given * np.uint8(255)], crop_camera=crop_camera, frame_camera=view.camera
-    )
+    layers = [view.image, given * np.uint8(255)]
+    if unknown is not None:
+        layers.append((unknown | given) * np.uint8(255))
+    image, coverage, *possible = resample(layers, crop_camera=crop_camera, frame_camera=view.camera)
+    mask = coverage > 127  # by majority
+    hidden = (possible[0] > 127) & ~mask if possible else np.zeros_like(mask)
     return MaskedCrop(
         image=image,
         crop_camera=crop_camera,
-        mask=coverage > 127,  # by majority
+        mask=mask,
+        unknown=hidden if hidden.any() else None,
         area_px=float(np.count_nonzero(given)),
         extent=mask_bbox(given),
         is_cut=False,

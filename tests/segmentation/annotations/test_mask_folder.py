@@ -26,13 +26,33 @@ def test_masks_give_ids_in_every_storage_format(tmp_path, kind):
     else:
         labels = labels.astype(np.uint16) * 100 if kind == "16-bit" else labels
         cv2.imwrite(str(path), labels)
-    np.testing.assert_array_equal(MaskFolder(tmp_path).labels(1, **LABELS_SIZE), labels)
+    np.testing.assert_array_equal(MaskFolder(tmp_path).labels(1, **LABELS_SIZE).ids, labels)
 
 
 def test_a_1_bit_mask_is_fish_1(tmp_path):
     labels = labels_of(id1=(1, 1, 5, 4))
     Image.fromarray(labels == 1).save(tmp_path / "000001.png")
-    np.testing.assert_array_equal(MaskFolder(tmp_path).labels(1, **LABELS_SIZE), labels)
+    np.testing.assert_array_equal(MaskFolder(tmp_path).labels(1, **LABELS_SIZE).ids, labels)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_the_largest_value_is_no_fish_but_unknown(tmp_path, dtype):
+    labels = labels_of(id1=(0, 0, 4, 3)).astype(dtype)
+    labels[1] = np.iinfo(dtype).max
+    cv2.imwrite(str(tmp_path / "000001.png"), labels)
+    found = MaskFolder(tmp_path).labels(1, **LABELS_SIZE)
+    np.testing.assert_array_equal(found.ids, np.where(labels == 1, 1, 0))
+    np.testing.assert_array_equal(found.unknown, labels > 1)
+
+
+def test_masks_that_show_fish_as_unknown_are_refused(tmp_path):
+    """A mask of one fish is often written as 255 on 0."""
+    labels = labels_of(id1=(0, 0, 4, 3)) * np.uint8(255)
+    cv2.imwrite(str(tmp_path / "000001.png"), labels)
+    with pytest.raises(AnnotationError, match=r"only 0 and 255.*the value 1"):
+        MaskFolder(tmp_path).labels(1, **LABELS_SIZE)
+    cv2.imwrite(str(tmp_path / "000002.png"), labels // 255)
+    assert MaskFolder(tmp_path).labels(1, **LABELS_SIZE).unknown.sum() == 12
 
 
 def test_unusable_masks_are_refused(tmp_path):
