@@ -68,7 +68,7 @@ def _frame_records(
 def publish(folder: Path, job: Job, out: Path) -> None:
     """Copy the tables of a finished video into the data set. Idempotent.
 
-    They are written anew where a reviewer has added verdicts since.
+    They are written again where a reviewer has added verdicts since.
     """
     if _last_verdict_ns(folder) > _written_ns(folder, "fish"):
         write_tables(folder, job)

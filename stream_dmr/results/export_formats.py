@@ -1,4 +1,4 @@
-"""Recordings in the formats of others: meshes, COCO masks, tables."""
+"""Exports recordings as meshes, COCO masks and tables."""
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
@@ -41,7 +41,7 @@ class Export:
     def __init__(
         self, recording: Path, selection: Selection = EVERYTHING, *, overwrite: bool = False
     ) -> None:
-        """With `overwrite`, files that are in the way are written over, but for a run's own."""
+        """With `overwrite`, existing files are replaced, except for those of a run."""
         self._path = recording
         self._recording = open_recordings([recording])
         self._selection = selection
@@ -56,7 +56,7 @@ class Export:
 
     @property
     def warnings(self) -> Sequence[str]:
-        """What of the recording is lost, a line each."""
+        """The parts of the recording that are lost, one line each."""
         return self._recording.warnings
 
     def meshes(self, out: Path, *, format: MeshFormat) -> int:
@@ -121,7 +121,7 @@ class Export:
         return paths
 
     def fish(self, out: Path, settings: FisheriesSettings, *, format: TableFormat) -> Path:
-        """Write fish.csv (or .parquet): what a fishery asks, what reviewers said, what made it."""
+        """Write fish.csv (or .parquet): lengths as fisheries use them, verdicts, inputs."""
         self._require_writable(out / f"fish.{format}")
         template = self._recording.header.template
         records = [
@@ -134,17 +134,17 @@ class Export:
         return path
 
     def claim(self, out: Path) -> None:
-        """Raise OutputError where `out` has what was made from something else."""
+        """Raise OutputError where `out` holds exports of another recording."""
         origin = read_origin(out)
         if origin is not None and origin.resolve() != self._path.resolve():
             raise OutputError(
-                f"{out}: expected a folder for what comes from {self._path}, found what came from "
+                f"{out}: expected a folder for exports of {self._path}, found exports of "
                 f"{origin}; choose another --out"
             )
         self._earlier = {out / name for name in known_files(out)}
 
     def provenance(self, out: Path) -> Path:
-        """Write beside all that was written into `out` what made it, and its checksums."""
+        """Write provenance.json: the inputs and checksums of all files written into `out`."""
         database = database_of(self._path)
         runs = {"": run_facts(self._recording.header)} if database is None else read_runs(database)
         return seal_files(out, self._written, runs=runs, origin=str(self._path))
@@ -224,7 +224,7 @@ def _annotation(crop: FishCrop, *, number: int) -> dict[str, Any]:
 
 
 def _pairs(messages: Iterable[Message]) -> Iterator[tuple[FittedMesh, LocalizedFish]]:
-    """Each fit with where its fish hangs."""
+    """Each fit with the place of its fish."""
     waiting: dict[tuple[int, int], FittedMesh] = {}
     for message in messages:
         if isinstance(message, FittedMesh):

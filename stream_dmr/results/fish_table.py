@@ -1,4 +1,4 @@
-"""fish.csv (or .parquet): one row a fish with all that a fishery and an auditor ask of it."""
+"""fish.csv (or .parquet): one row a fish with all that fisheries and auditors need of it."""
 
 import csv
 import json
@@ -52,7 +52,7 @@ def fish_record(
     values |= {n: getattr(derived, n) for n in FISH_TABLE if hasattr(derived, n)}
     return values | {
         **_measured(fish),
-        **_said(fish.review),
+        **_review_columns(fish.review),
         "template": template.name,
         "species": fish.review.species or template.name,
         "weight_source": None if derived.weight_kg is None else settings.weight_source,
@@ -76,7 +76,7 @@ def _measured(fish: FishResult) -> dict[str, Any]:
     }
 
 
-def _said(review: Review) -> dict[str, Any]:
+def _review_columns(review: Review) -> dict[str, Any]:
     return {
         "verdict": review.decision or None,
         "verdict_reason": review.reason or None,

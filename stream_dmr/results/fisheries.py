@@ -1,4 +1,4 @@
-"""What a fishery asks of a length: total and fork length, centimetres, weight, legal size."""
+"""Quantities of a fishery from a length: total and fork length, cm, weight, legal size."""
 
 import math
 from dataclasses import dataclass

@@ -28,7 +28,7 @@ class FolderLock:
         return self._descriptor >= 0
 
     def release(self) -> None:
-        """Let other processes have the folder. Idempotent."""
+        """Unlock the folder. Idempotent."""
         if self.is_held:
             os.close(self._descriptor)
             self._descriptor = -1

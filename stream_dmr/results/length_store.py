@@ -120,7 +120,7 @@ class LengthStore:
     def clip_progress(self, name: str, *, frames_done: int) -> None:
         """Mark how far a clip is measured; durable with the next fish or mark.
 
-        So a restart neither repeats a finished fish nor begins the clip anew.
+        So a restart neither repeats a finished fish nor begins the clip again.
         """
         with self._lock:
             if self._clip is not None and self._clip[0] != name:
@@ -266,7 +266,7 @@ class LengthStore:
         self.trouble = ""
 
     def _reach_file(self) -> None:
-        """Open the file anew after trouble; drop from memory what was committed in spite of it."""
+        """Open the file again after an error; forget rows that were committed in spite of it."""
         if self._is_reached:
             return
         if not self._is_stand_in:

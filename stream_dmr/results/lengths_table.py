@@ -60,7 +60,7 @@ class LengthsTable:
             self._refuse(error)
 
     def close(self) -> None:
-        """Write the table anew from the store. Idempotent."""
+        """Write the whole table from the store. Idempotent."""
         self._rows.close()
         self._export()
 
@@ -80,7 +80,7 @@ class LengthsTable:
 
 
 def write_lengths(path: Path, estimates: Iterable[LengthEstimate]) -> None:
-    """Write lengths.csv anew and durably; at any moment the old or the new one is there whole.
+    """Replace lengths.csv durably; at any moment the old or the new one is complete.
 
     Raises OutputError where the disk refuses it.
     """

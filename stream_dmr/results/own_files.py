@@ -1,4 +1,4 @@
-"""Keeps commands from writing over what they did not make, and over a run's own results at all."""
+"""Keeps commands from replacing files of others, and the results of a run in any case."""
 
 import re
 from collections.abc import Callable
@@ -49,7 +49,7 @@ def is_of_run(path: Path) -> bool:
 
 
 def is_made_by(command: str) -> Callable[[Path], bool]:
-    """Tells the files that name `stream-dmr COMMAND` in their first bytes."""
+    """A test for files that name `stream-dmr COMMAND` in their first bytes."""
 
     def is_made(path: Path) -> bool:
         try:

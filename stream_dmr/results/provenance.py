@@ -1,4 +1,4 @@
-"""provenance.json: what made the files of a folder, and their SHA-256."""
+"""provenance.json: the inputs of the files of a folder, and their SHA-256."""
 
 import json
 import os
@@ -58,12 +58,12 @@ def seal_run(folder: Path, *, with_recordings: bool) -> None:
 
 
 def lines_sha256(lines: Iterable[str]) -> str:
-    """Of what a database holds, a line a row."""
+    """SHA-256 of the rows of a database, a line each."""
     return sha256("\n".join(lines).encode()).hexdigest()
 
 
 def verdicts_sum(verdicts: Sequence[Verdict]) -> dict[str, Any]:
-    """How many there are, and their SHA-256."""
+    """The number of verdicts and their SHA-256."""
     lines = (json.dumps(asdict(verdict)) for verdict in verdicts)
     return {"count": len(verdicts), "sha256": lines_sha256(lines)}
 
@@ -71,7 +71,7 @@ def verdicts_sum(verdicts: Sequence[Verdict]) -> dict[str, Any]:
 def seal_files(
     folder: Path, files: Iterable[Path], *, runs: Mapping[str, RunFacts], origin: str = ""
 ) -> Path:
-    """Say of `files` what they are and what made them, beside what is said of others.
+    """Add the checksums and inputs of `files`; entries of other files stay.
 
     `origin` is the folder or recording that they were exported from. OutputError, also where what
     is said of others is damaged.
@@ -80,14 +80,14 @@ def seal_files(
         made = read_provenance(folder) or _new(runs, origin)
     except ValueError as error:
         raise OutputError(
-            f"{folder / NAME}: expected what made the files beside it, got: {error}; remove it, or "
-            "write to another folder"
+            f"{folder / NAME}: expected the inputs of the files beside it, got: {error}; remove "
+            "it, or write to another folder"
         ) from error
     return _write(folder, made | {"files": made["files"] | _sums(folder, files)})
 
 
 def add_files(folder: Path, files: Iterable[Path]) -> None:
-    """Say in addition of `files` what they are, be they new or made anew. OutputError.
+    """Add the checksums of `files`, new or written again. Raises OutputError.
 
     What it says of others stays, whatever has become of them. One that is missing or damaged stays
     so: it is for `verify` to find.
@@ -96,7 +96,7 @@ def add_files(folder: Path, files: Iterable[Path]) -> None:
 
 
 def seal_verdicts(folder: Path) -> None:
-    """Say how many verdicts there are by now, and their SHA-256. As `add_files`.
+    """Update the number of verdicts and their SHA-256, as `add_files` does.
 
     Where those that were known have been changed, it stays at them, for `verify` to find.
     """
@@ -143,7 +143,7 @@ def _write(folder: Path, made: dict[str, Any]) -> Path:
 
 
 def read_origin(folder: Path) -> Path | None:
-    """What the files of a folder were made from: itself where it is a run's; None where unknown."""
+    """The source of a folder's files: the folder itself where a run wrote it; None: unknown."""
     try:
         made = read_provenance(folder)
     except ValueError:
@@ -161,7 +161,7 @@ def known_files(folder: Path) -> Sequence[str]:
 
 
 def read_provenance(folder: Path) -> dict[str, Any] | None:
-    """What was written; None where nothing was. ValueError where it is damaged."""
+    """The content of provenance.json; None without one. ValueError where it is damaged."""
     path = folder / NAME
     if not path.is_file():
         return None

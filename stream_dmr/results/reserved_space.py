@@ -1,4 +1,4 @@
-"""Room on the disk that is held back, and given up for lengths when the disk is full."""
+"""Disk space that is reserved, and released for lengths when the disk is full."""
 
 import os
 from contextlib import suppress
@@ -16,7 +16,7 @@ class ReservedSpace:
         self._path = folder / _NAME
 
     def reserve(self) -> None:
-        """Take the room; where the disk refuses it, there is none."""
+        """Reserve the space; where the disk refuses it, none is reserved."""
         with suppress(OSError):
             disk = os.statvfs(self._path.parent)
             size = min(_MAX_BYTES, int(_MAX_SHARE * disk.f_bavail * disk.f_frsize))
@@ -25,6 +25,6 @@ class ReservedSpace:
                     os.posix_fallocate(file.fileno(), 0, size)
 
     def release(self) -> None:
-        """Give the room back. Idempotent."""
+        """Release the space. Idempotent."""
         with suppress(OSError):
             self._path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""What made the lengths of a run: its inputs and settings, as lengths.db and provenance have it."""
+"""The inputs and settings of a run, as lengths.db and provenance.json hold them."""
 
 from dataclasses import dataclass
 from hashlib import sha256

@@ -1,8 +1,8 @@
-"""Whether results are still what their run measured: every file against what made it.
+"""Verifies that results are as their run measured them: every file against its inputs.
 
-The recording is the witness of the database, the database of lengths.csv, the recording of
-frames.csv, and provenance.json of them all. Who changes all of these alike can't be found here:
-keep a copy of provenance.json elsewhere.
+The recording attests the database and frames.csv, the database lengths.csv, and provenance.json
+all of them. A consistent change of all can't be found here: keep a copy of provenance.json
+elsewhere.
 """
 
 import csv
@@ -46,7 +46,7 @@ Checks = Mapping[str, Callable[[Path], Iterable[tuple[Path, str]]]]
 
 
 class Change(NamedTuple):
-    """One thing that is not as it was made."""
+    """One file, run or fish that was changed after it was written."""
 
     path: Path
     what: str
@@ -128,7 +128,7 @@ def _against_provenance(folder: Path) -> Iterator[Change]:
 
 
 def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
-    """The fish and the runs against what provenance.json says of them."""
+    """The fish and the runs against provenance.json."""
     try:
         stored, runs = fish_by_run(database), read_runs(database)
         said = read_verdicts(database)
@@ -147,7 +147,7 @@ def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
 
 
 def _verdicts(database: Path, said: Sequence[Verdict], known: dict[str, Any]) -> Iterator[Change]:
-    """What reviewers said, against what provenance.json says of it: rows are only added."""
+    """The verdicts against provenance.json: rows are only added."""
     count = known.get("count", 0)
     if verdicts_sum(said[:count]) != (known or verdicts_sum([])):
         yield Change(database, "the verdicts are not those that reviewers gave")
@@ -207,7 +207,7 @@ def _csv(
     witness: str,
     whole: bool,
 ) -> Iterator[Change]:
-    """Compare a table with the rows that a witness has; it may have others, but not if `whole`."""
+    """Compare a table with rows of a witness; it may have more rows, unless it is `whole`."""
     if not path.is_file():
         yield Change(path, "is missing")
         return

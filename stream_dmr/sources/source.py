@@ -43,7 +43,7 @@ class Source(ABC):
     """Frames in order, to be iterated once; `frame_index` from 1, `timestamp_ns` increasing.
 
     The properties say what a source can do, so that no user has to ask for its class. The defaults
-    are those of a file: it ends, can be read again, and begins anew in every run.
+    are those of a file: it ends, can be read again, and begins again in every run.
     """
 
     name: str  # file name or address, for people

@@ -197,7 +197,7 @@ def test_exports_of_another_run_are_refused(out: Path, tmp_path: Path):
     for target in (exp, out):
         outcome = invoke("export", {"--out": str(target), "--fish": "csv", str(other): None})
         assert outcome.code == 2
-        assert f"found what came from {out}" in outcome.error
+        assert f"found exports of {out}" in outcome.error
     assert verify(exp)[0] == []
 
 
