@@ -5,26 +5,25 @@ import time
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
 
-from stream_dmr.errors import UserError
+from stream_dmr.errors import OutputError, UserError
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
-from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.reading.frame_images import SourcePictures
 from stream_dmr.recording.reading.open_recording import Recording, open_recordings
-from stream_dmr.recording.recorder import Recorder
 from stream_dmr.replaying.comparator import MessageComparator, Mismatch
 from stream_dmr.replaying.recorded_messages import PlaybackNode, RecordedMessages
 from stream_dmr.replaying.replay_inputs import ReplayInputs, new_header, read_inputs
+from stream_dmr.replaying.replay_outputs import (
+    RecordedRun,
+    open_replay_outputs,
+    read_recorded_run,
+)
 from stream_dmr.replaying.replay_request import STAGES, ReplayRequest
 from stream_dmr.replaying.replay_writer import ReplayWriter
-from stream_dmr.results.frames_table import FramesTable
-from stream_dmr.results.lengths_table import write_lengths
 from stream_dmr.running.measure_source import continue_tracks, later_nodes
 from stream_dmr.running.pipeline import Node, StageCounters, run_chain
-from stream_dmr.running.run_folder import prepare_folder
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.segmentation.tracking.fish_finder import open_finder
 
@@ -62,31 +61,43 @@ def replay(
     with ExitStack() as stack:
         frames, nodes = _open_chain(request, recorded, inputs, stack)
         continue_tracks(nodes, carried_over)
-        recorder = None
+        outputs = None
         if request.out is not None:
-            header = new_header(request, recording.header, inputs)
-            recorder = _open_recorder(request, request.out, header, inputs, in_one_thread=is_light)
-            stack.enter_context(recorder)
+            outputs = stack.enter_context(
+                open_replay_outputs(
+                    request,
+                    request.out,
+                    new_header(request, recording.header, inputs),
+                    inputs,
+                    _recorded_run(request, recording, observer),
+                    stop=stop,
+                    observer=observer,
+                    in_one_thread=is_light,
+                )
+            )
         comparator = _open_comparator(request, recorded, {fish.track_id for fish in carried_over})
         writer = ReplayWriter(
             recorded,
             recomputed=request.recomputed,
             settings=inputs.config.recording,
-            recorder=recorder,
+            outputs=outputs,
             comparator=comparator,
         )
+
+        def on_frame() -> None:
+            writer.frame_done()
+            observer.frame_done()
+
         observer.begin(None)
         began = time.perf_counter()
         counters = run_chain(
             frames,
             nodes,
             on_message=writer.write,
-            on_frame=observer.frame_done,
+            on_frame=on_frame,
             stop=stop,
             in_one_thread=is_light,
         )
-    if request.out is not None:
-        write_lengths(request.out / "lengths.csv", writer.final)
     if comparator is not None:
         comparator.finish()
     for line in (*recording.warnings, *recorded.notes):
@@ -104,7 +115,23 @@ def replay(
     )
 
 
+def _recorded_run(
+    request: ReplayRequest, recording: Recording, observer: RunObserver
+) -> RecordedRun:
+    try:
+        return read_recorded_run(request.recordings, recording.header)
+    except OutputError as error:
+        observer.warn(f"{error}; vessel, trip, haul and flags are not taken over from it")
+        return RecordedRun()
+
+
 def _refuse_impossible(request: ReplayRequest, recording: Recording) -> None:
+    folders = {(path if path.is_dir() else path.parent).resolve() for path in request.recordings}
+    if request.out is not None and request.out.resolve() in folders:
+        raise UserError(
+            f"--out {request.out}: expected another folder than that of the recording, which would "
+            "be lost; choose another"
+        )
     if request.first == "fit" and recording.is_thinned:
         raise UserError(
             "--from fit: expected a recording with masks, but some of them were removed to free "
@@ -148,20 +175,6 @@ def _open_comparator(
     # The first fit of a track that was carried over starts from another one than in the run.
     leave_out = carried_over if FittedMesh in request.recomputed else ()
     return MessageComparator(recorded, request.recomputed, leave_out=leave_out)
-
-
-def _open_recorder(
-    request: ReplayRequest,
-    out: Path,
-    header: RunHeader,
-    inputs: ReplayInputs,
-    *,
-    in_one_thread: bool,
-) -> Recorder:
-    prepare_folder(out, overwrite=request.overwrite)
-    return Recorder(
-        out, header, inputs.config.recording, sinks=[FramesTable(out)], in_one_thread=in_one_thread
-    )
 
 
 def _open_chain(

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from stream_dmr.messages import Frame, LengthEstimate, Message
 from stream_dmr.recording.messages.record import Record, as_recorded
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
-from stream_dmr.recording.recorder import Recorder
 from stream_dmr.replaying.comparator import MessageComparator
 from stream_dmr.replaying.recorded_messages import RecordedMessages
+from stream_dmr.replaying.replay_outputs import ReplayOutputs
 
 
 class ReplayWriter:
@@ -19,11 +19,11 @@ class ReplayWriter:
         *,
         recomputed: Sequence[type[Message]],
         settings: RecordingSettings,
-        recorder: Recorder | None,
+        outputs: ReplayOutputs | None,
         comparator: MessageComparator | None,
     ) -> None:
         self._recorded, self._recomputed, self._settings = recorded, recomputed, settings
-        self._recorder, self._comparator = recorder, comparator
+        self._outputs, self._comparator = outputs, comparator
         self._first_ns: int | None = None
         self._last_ns = 0
         self.final: list[LengthEstimate] = []
@@ -43,13 +43,19 @@ class ReplayWriter:
             self.num_frames += 1
             self._first_ns = message.timestamp_ns if self._first_ns is None else self._first_ns
             self._last_ns = message.timestamp_ns
-        if self._recorder is not None:
-            self._recorder.put(Record.of_payload(message, payload))
+        if self._outputs is not None:
+            self._outputs.results.store(message)
+            self._outputs.recorder.put(Record.of_payload(message, payload))
         return message
 
+    def frame_done(self) -> None:
+        """Take note that a frame has left the last stage."""
+        if self._outputs is not None:
+            self._outputs.results.frame_done()
+
     def _write_recomputed(self, message: Message) -> Message:
-        if self._recorder is not None:
-            message = self._recorder.write(message)
+        if self._outputs is not None:
+            message = self._outputs.results.write(message)
         else:
             message = as_recorded(message, self._settings)
         if self._comparator is not None:

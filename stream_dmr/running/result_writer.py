@@ -3,6 +3,7 @@
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
 from statistics import median
+from types import MappingProxyType
 
 from stream_dmr.messages import FishCrop, Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.recording.recorder import Recorder
@@ -27,14 +28,17 @@ class ResultWriter:
         *,
         clips: Mapping[str, int] | None = None,
         interrupted: Sequence[LocalizedFish] = (),
+        flags: Mapping[int, Sequence[str]] = MappingProxyType({}),
         drift: DriftAlarms | None = None,
         on_notice: Callable[[str], None],
     ) -> None:
         """`clips`: frames done of each clip before; None where the source has no clips.
 
-        `interrupted`: frames of fish that a crash interrupted, and that this run finishes.
+        `interrupted`: frames of fish that a crash interrupted, and that this run finishes. `flags`:
+        what is known already, by track, of the fish of a recording.
         """
         self._store, self._lengths, self._recorder = store, lengths, recorder
+        self._flags = flags
         self._drift, self._on_notice = drift, on_notice
         self._clips = None if clips is None else Counter(clips)
         self._clips_in_chain: deque[str] = deque()  # of the frames that are in the chain, in order
@@ -45,6 +49,13 @@ class ResultWriter:
 
     def write(self, message: Message) -> Message:
         """Write a message; returns it as the next stage must get it, see `Recorder.write`."""
+        self.store(message)
+        message = self._recorder.write(message)
+        self.tabulate(message)
+        return message
+
+    def store(self, message: Message) -> None:
+        """Keep what lengths.db holds of a message, before anything else is done with it."""
         match message:
             case Frame():
                 self._take_frame(message)
@@ -60,11 +71,12 @@ class ResultWriter:
         states.report(self._store.path.name, self._store.trouble)
         if self._store.trouble:
             self._on_notice(f"{self._store.path}: {self._store.trouble}; lengths wait in memory")
-        message = self._recorder.write(message)
+
+    def tabulate(self, message: Message) -> None:
+        """Append a finished fish to lengths.csv."""
         if isinstance(message, LengthEstimate) and message.is_final:
             self._lengths.add(message)
-            states.report("lengths.csv", self._lengths.trouble)
-        return message
+            self._recorder.states.report("lengths.csv", self._lengths.trouble)
 
     def frame_done(self) -> None:
         """Take note that a frame has left the last stage: its clip is measured so far."""
@@ -88,7 +100,9 @@ class ResultWriter:
     def _store_fish(self, estimate: LengthEstimate) -> None:
         ious = self._ious.pop(estimate.track_id, [])
         iou = median(ious) if ious else None
-        flags = [] if self._drift is None else self._drift.take_fish(iou, estimate.timestamp_ns)
+        flags = [*self._flags.get(estimate.track_id, ())]
+        if self._drift is not None:
+            flags += self._drift.take_fish(iou, estimate.timestamp_ns)
         if estimate.track_id in self._interrupted:
             flags.append(INTERRUPTED)
         self._store.add(estimate, iou=iou, flags=flags)
