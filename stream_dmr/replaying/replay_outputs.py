@@ -22,14 +22,14 @@ from stream_dmr.running.run_observer import RunObserver
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordedRun:
+class OriginalRun:
     """What the lengths.db beside a recording knows and the recording doesn't."""
 
     facts: RunFacts | None = None  # None: there is no such run in it, or no lengths.db
     flags: Mapping[int, Sequence[str]] = field(default_factory=dict[int, Sequence[str]])
 
 
-def read_recorded_run(recordings: Sequence[Path], header: RunHeader) -> RecordedRun:
+def read_recorded_run(recordings: Sequence[Path], header: RunHeader) -> OriginalRun:
     """The run that made the recordings. Raises OutputError where lengths.db is damaged."""
     folders = [path if path.is_dir() else path.parent for path in recordings]
     databases = [database for folder in folders if (database := database_of(folder)) is not None]
@@ -39,7 +39,7 @@ def read_recorded_run(recordings: Sequence[Path], header: RunHeader) -> Recorded
         flags |= {one.estimate.track_id: one.flags for one in read_stored_fish(database)}
         made = [run for run in read_runs(database).values() if _is_same(run, expected)]
         facts = made[-1] if made else facts
-    return RecordedRun(facts=facts, flags=flags)
+    return OriginalRun(facts=facts, flags=flags)
 
 
 def _is_same(run: RunFacts, expected: RunFacts) -> bool:
@@ -61,7 +61,7 @@ def open_replay_outputs(
     out: Path,
     header: RunHeader,
     inputs: ReplayInputs,
-    recorded: RecordedRun,
+    recorded: OriginalRun,
     *,
     stop: threading.Event,
     observer: RunObserver,

@@ -16,7 +16,7 @@ from stream_dmr.replaying.comparator import MessageComparator, Mismatch
 from stream_dmr.replaying.recorded_messages import PlaybackNode, RecordedMessages
 from stream_dmr.replaying.replay_inputs import ReplayInputs, new_header, read_inputs
 from stream_dmr.replaying.replay_outputs import (
-    RecordedRun,
+    OriginalRun,
     open_replay_outputs,
     read_recorded_run,
 )
@@ -117,12 +117,12 @@ def replay(
 
 def _recorded_run(
     request: ReplayRequest, recording: Recording, observer: RunObserver
-) -> RecordedRun:
+) -> OriginalRun:
     try:
         return read_recorded_run(request.recordings, recording.header)
     except OutputError as error:
         observer.warn(f"{error}; vessel, trip, haul and flags are not taken over from it")
-        return RecordedRun()
+        return OriginalRun()
 
 
 def _refuse_impossible(request: ReplayRequest, recording: Recording) -> None:
