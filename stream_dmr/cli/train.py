@@ -24,6 +24,10 @@ def train(
         Path | None,
         typer.Option(help="Folder of a .png per image, values are fish ids; or a COCO .json."),
     ] = None,
+    backgrounds: Annotated[
+        Path | None,
+        typer.Option(help="Folder of photographs without fish, to put your own fish before."),
+    ] = None,
     init: Annotated[
         Path | None,
         typer.Option(help="Weights to start from; with --images the shipped ones by themselves."),
@@ -43,6 +47,8 @@ def train(
     """
     if (images is None) != (masks is None):
         raise typer.BadParameter("--images and --masks belong together: give both or neither")
+    if backgrounds is not None and images is None:
+        raise typer.BadParameter("--backgrounds needs your own fish: give --images and --masks")
     with stop_on_signals() as stop:
         from stream_dmr.cli.train_display import TrainDisplay
         from stream_dmr.results.own_files import require_writable
@@ -61,6 +67,7 @@ def train(
             settings=settings,
             images=images,
             masks=masks,
+            backgrounds=backgrounds,
             init=init,
             device=device,
             resume=resume,

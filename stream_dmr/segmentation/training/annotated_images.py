@@ -30,19 +30,25 @@ def read_annotated_images(images: Path, masks: Path) -> Iterator[AnnotatedImage]
     `masks` is a folder with STEM.png for each image, whose pixel values are fish ids and 0 is
     background, or a COCO file. Raises AnnotationError where images and masks do not match.
     """
-    if not images.is_dir():
-        raise AnnotationError(f"{images}: expected a folder of images, found none there")
-    paths = {
-        path.name: path for path in sorted(images.iterdir()) if path.suffix.lower() in _SUFFIXES
-    }
-    if not paths:
-        raise AnnotationError(f"{images}: expected images (.png, .jpg, .tif, .bmp), found none")
+    paths = list_images(images)
     if masks.is_dir():
         yield from _read_folder(paths, masks)
     elif masks.suffix.lower() == ".json":
         yield from _read_coco(paths, masks)
     else:
         raise AnnotationError(f"{masks}: expected a folder of PNG masks or a COCO .json")
+
+
+def list_images(folder: Path) -> dict[str, Path]:
+    """The images of a folder by name, in its order. Raises AnnotationError where it has none."""
+    if not folder.is_dir():
+        raise AnnotationError(f"{folder}: expected a folder of images, found none there")
+    paths = {
+        path.name: path for path in sorted(folder.iterdir()) if path.suffix.lower() in _SUFFIXES
+    }
+    if not paths:
+        raise AnnotationError(f"{folder}: expected images (.png, .jpg, .tif, .bmp), found none")
+    return paths
 
 
 def _read_folder(paths: dict[str, Path], masks: Path) -> Iterator[AnnotatedImage]:
@@ -53,7 +59,7 @@ def _read_folder(paths: dict[str, Path], masks: Path) -> Iterator[AnnotatedImage
             f"{len(missing)}, the first of them {missing[0]}; a mask is named like its image, .png"
         )
     for path in paths.values():
-        image, mask = _read_image(path), masks / f"{path.stem}.png"
+        image, mask = read_image(path), masks / f"{path.stem}.png"
         labels = cv2.imread(str(mask), cv2.IMREAD_UNCHANGED)
         if labels is None or labels.ndim != 2:
             raise AnnotationError(f"{mask}: expected a PNG of one channel, the ids of fish")
@@ -71,7 +77,7 @@ def _read_coco(paths: dict[str, Path], file: Path) -> Iterator[AnnotatedImage]:
             continue
         if name not in paths:
             raise AnnotationError(f"{file}: expected {name} among the images, found it not there")
-        image = _read_image(paths[name])
+        image = read_image(paths[name])
         masks = [_decode(one, file, image.shape[:2]) for one in found]
         yield AnnotatedImage(path=paths[name], image=image, masks=masks)
 
@@ -143,7 +149,8 @@ def _unpack(text: str) -> list[int]:
     return runs
 
 
-def _read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+    """The image, BGR. Raises AnnotationError where it cannot be decoded."""
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
         raise AnnotationError(f"{path}: expected an image, but it can't be decoded")

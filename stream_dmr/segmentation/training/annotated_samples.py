@@ -8,12 +8,18 @@ from jaxtyping import Bool, UInt8
 
 from stream_dmr.errors import AnnotationError
 from stream_dmr.segmentation.network.unet_interface import SIZE_PX, box_coverage
-from stream_dmr.segmentation.training.annotated_images import read_annotated_images
+from stream_dmr.segmentation.training.annotated_images import (
+    list_images,
+    read_annotated_images,
+    read_image,
+)
 from stream_dmr.segmentation.training.box_crops import crop_affine, jitter_box
-from stream_dmr.segmentation.training.image_degradation import simulate_camera
+from stream_dmr.segmentation.training.fish_patches import PATCH_PX, RIM_PX
+from stream_dmr.segmentation.training.image_degradation import add_weather, simulate_camera
+from stream_dmr.segmentation.training.random_backgrounds import BACKGROUND_PX
 from stream_dmr.segmentation.training.training_sample import TrainingSample
 
-_CUTOUT_PX = 256  # width and height of a cutout-out; twice a crop
+_CUTOUT_PX = 320  # width and height of a cutout-out: the fish is longer than in a crop
 _MARGIN = 0.6  # on each side, of the fish's longer side: room to rotate it
 _MIN_AREA_PX = 64  # of a fish's mask, as `[crop_fish] min_mask_area_px`
 _VALIDATION_EVERY = 5  # images, of which one is kept for validation
@@ -48,9 +54,10 @@ def load_fish_cutouts(images: Path, masks: Path) -> tuple[list[Cutout], list[Cut
 
 
 def draw_annotated_sample(rng: np.random.Generator, cutout: Cutout) -> TrainingSample:
-    """One crop of a fish, slightly rotated, perhaps mirrored, around a box with random errors."""
+    """One crop of a fish, rotated, perhaps mirrored, around a box with random errors."""
     center = (_CUTOUT_PX - 1) / 2
-    rotation = cv2.getRotationMatrix2D((center, center), rng.normal(0.0, 12.0), 1.0)
+    angle_deg = 90.0 * rng.integers(4) + rng.normal(0.0, 12.0)
+    rotation = cv2.getRotationMatrix2D((center, center), angle_deg, 1.0)
     if rng.random() < 0.5:
         rotation = rotation @ np.array([[-1.0, 0.0, 2 * center], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     rows, columns = np.nonzero(cutout[..., 3])
@@ -62,7 +69,9 @@ def draw_annotated_sample(rng: np.random.Generator, cutout: Cutout) -> TrainingS
     crop_from_cutout = crop_from_rotated @ np.vstack([rotation, [0.0, 0.0, 1.0]])
     crop = cv2.warpAffine(cutout, crop_from_cutout, (SIZE_PX, SIZE_PX), flags=cv2.INTER_LINEAR)
     picture = crop[..., :3].astype(np.float32)
-    image = simulate_camera(rng, picture) if rng.random() < 0.6 else crop[..., :3]
+    image = crop[..., :3]
+    if rng.random() < 0.7:
+        image = simulate_camera(rng, add_weather(rng, picture) if rng.random() < 0.5 else picture)
     edges = box.reshape(2, 2) @ crop_from_rotated[:, :2].T + crop_from_rotated[:, 2] + 0.5
     return TrainingSample(
         image=np.ascontiguousarray(image),
@@ -70,6 +79,38 @@ def draw_annotated_sample(rng: np.random.Generator, cutout: Cutout) -> TrainingS
         in_box=box_coverage(edges.ravel(), size=SIZE_PX),
         ends_px=None,
     )
+
+
+def cutout_patch(cutout: Cutout) -> UInt8[np.ndarray, "P P 4"]:
+    """The fish alone, its long axis horizontal, filling a patch: BGR times coverage, coverage."""
+    fish = cutout[..., 3] > 0
+    rows, columns = np.nonzero(fish)
+    points = np.column_stack([columns, rows]).astype(np.float64)
+    center = points.mean(axis=0)
+    _, axes = np.linalg.eigh(np.cov((points - center).T))
+    turn = np.stack([axes[:, 1], axes[::-1, 1] * [-1, 1]])  # long axis to x, without mirroring
+    turned = points @ turn.T
+    low, high = turned.min(axis=0), turned.max(axis=0)
+    scale = (PATCH_PX - 2 * RIM_PX) / max(float((high - low).max()), 1.0)
+    affine = np.column_stack([scale * turn, (PATCH_PX - 1) / 2 - scale * (low + high) / 2])
+    # The outermost pixels are partly background, so they are left out.
+    inner = cv2.erode(fish.astype(np.float32), np.ones((3, 3), np.uint8))
+    coverage = cv2.GaussianBlur(inner, (0, 0), 0.6)[..., None]
+    layer = np.dstack([cutout[..., :3] * coverage, 255 * coverage])
+    patch = cv2.warpAffine(layer, affine, (PATCH_PX, PATCH_PX), flags=cv2.INTER_LINEAR)
+    return np.clip(np.round(patch), 0, 255).astype(np.uint8)
+
+
+def load_backgrounds(folder: Path) -> list[UInt8[np.ndarray, "B B 3"]]:
+    """The middle square of every photograph in a folder, at the size of simulated backgrounds."""
+    squares = []
+    for path in list_images(folder).values():
+        image = read_image(path)
+        side = min(image.shape[:2])
+        top, left = (image.shape[0] - side) // 2, (image.shape[1] - side) // 2
+        square = image[top : top + side, left : left + side]
+        squares.append(cv2.resize(square, (BACKGROUND_PX,) * 2, interpolation=cv2.INTER_AREA))
+    return squares
 
 
 def _cut_out(image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]) -> Cutout:

@@ -18,7 +18,7 @@ from stream_dmr.simulation.skin import noise
 
 PATCH_PX = 160  # somewhat larger than a crop, 128 px
 _OVERSAMPLING = 2  # samples per pixel and axis while drawing
-_RIM_PX = 4  # transparent margin for the interpolation at the edges
+RIM_PX = 4  # transparent margin for the interpolation at the edges
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -46,7 +46,7 @@ def _fit_to_patch(posed: PosedShape) -> tuple[Float[np.ndarray, "V 2"], Float[np
     projected = posed.vertices[:, :2] / posed.vertices[:, 2:]
     low, high = projected.min(axis=0), projected.max(axis=0)
     side = PATCH_PX * _OVERSAMPLING
-    scale = (side - 2 * _RIM_PX * _OVERSAMPLING) / (high - low).max()
+    scale = (side - 2 * RIM_PX * _OVERSAMPLING) / (high - low).max()
     shift = (side - 1) / 2 - scale * (low + high) / 2
     ends = posed.ends[:, :2] / posed.ends[:, 2:]
     return projected * scale + shift, ends * scale + shift

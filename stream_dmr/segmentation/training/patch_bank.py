@@ -1,4 +1,7 @@
-"""The simulated fish and backgrounds that training pictures are composed of, cached in a file."""
+"""The fish and backgrounds that training pictures are composed of: simulated, and photographed.
+
+The simulated ones are cached in a file.
+"""
 
 import os
 import tempfile
@@ -12,16 +15,52 @@ from jaxtyping import Float32, UInt8
 from stream_dmr.segmentation.training.fish_patches import PATCH_PX, draw_fish_patch
 from stream_dmr.segmentation.training.random_backgrounds import BACKGROUND_PX, draw_background
 
+_PHOTOGRAPHED_SHARE = 0.5  # of fish, and of backgrounds, where there are any; chosen by hand
 _BANK_VERSION = 2  # part of the file's name; raised when fish or backgrounds are drawn differently
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PatchBank:
-    """Fish patches and backgrounds."""
+    """Fish patches and backgrounds; the last ones of each may be photographed."""
 
-    fish: UInt8[np.ndarray, "F P P 4"]  # BGR times coverage, and coverage; head to the left
-    ends_px: Float32[np.ndarray, "F 2 2"]  # snout and fork of the tail, x, y in the fish's patch
+    # BGR times coverage, and coverage; simulated heads are to the left
+    fish: UInt8[np.ndarray, "F P P 4"]
+    # snout and fork of the tail, x, y in the fish's patch; NaN: unknown, as of photographed fish
+    ends_px: Float32[np.ndarray, "F 2 2"]
     backgrounds: UInt8[np.ndarray, "G B B 3"]
+    num_photographed_fish: int = 0
+    num_photographed_backgrounds: int = 0
+
+    def draw_fish(self, rng: np.random.Generator) -> int:
+        """Index of a random fish, photographed for a fixed share."""
+        return _draw_index(rng, len(self.fish), self.num_photographed_fish)
+
+    def draw_background(self, rng: np.random.Generator) -> UInt8[np.ndarray, "B B 3"]:
+        """A random background, photographed for a fixed share."""
+        index = _draw_index(rng, len(self.backgrounds), self.num_photographed_backgrounds)
+        return self.backgrounds[index]
+
+    def with_photographs(
+        self, fish: list[UInt8[np.ndarray, "P P 4"]], backgrounds: list[UInt8[np.ndarray, "B B 3"]]
+    ) -> "PatchBank":
+        """The bank with these besides; either list may be empty."""
+        unknown = np.full((len(fish), 2, 2), np.nan, np.float32)
+        return PatchBank(
+            fish=np.concatenate([self.fish, *(one[None] for one in fish)]),
+            ends_px=np.concatenate([self.ends_px, unknown]),
+            backgrounds=np.concatenate([self.backgrounds, *(one[None] for one in backgrounds)]),
+            num_photographed_fish=self.num_photographed_fish + len(fish),
+            num_photographed_backgrounds=self.num_photographed_backgrounds + len(backgrounds),
+        )
+
+
+def _draw_index(rng: np.random.Generator, num_all: int, num_photographed: int) -> int:
+    if num_photographed == 0:
+        return int(rng.integers(num_all))
+    num_drawn = num_all - num_photographed
+    if rng.random() < _PHOTOGRAPHED_SHARE:
+        return num_drawn + int(rng.integers(num_photographed))
+    return int(rng.integers(num_drawn))
 
 
 def make_bank(

@@ -1,5 +1,7 @@
 """Render a training scene into a crop: picture and mask."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -14,6 +16,9 @@ from stream_dmr.segmentation.training.occluders import draw_into
 from stream_dmr.segmentation.training.patch_bank import PatchBank
 from stream_dmr.segmentation.training.training_scene import SceneFish, TrainingScene
 
+# Share of the scenes in which fish cast shadows on what is behind them, chosen by hand: without any
+# the network took shadows on steel tables for fish.
+_SHADOW_SHARE = 0.35
 _MIN_AREA_SCALE = 0.35  # crop px^2 per patch px^2; below, linear sampling would skip pixels
 
 
@@ -30,8 +35,11 @@ def render_scene(
     mask = np.zeros((SIZE_PX, SIZE_PX), np.float32)
     motion = motion_kernel(rng, rng.uniform(1.0, 5.0)) if rng.random() < 0.2 else None
     blur_px = rng.uniform(0.3, 1.2) if rng.random() < 0.5 else 0.0
+    shadow = _draw_shadow_kind(rng, crop_from_scene) if rng.random() < _SHADOW_SHARE else None
     for fish in scene.fish:
         layer = warp_fish(bank, fish, crop_from_scene, size=SIZE_PX)
+        if shadow is not None:
+            picture = picture * (1 - _cast(shadow, layer[..., 3])[..., None])
         mask *= 1 - layer[..., 3]
         if fish in targets:
             mask += layer[..., 3]
@@ -47,6 +55,33 @@ def render_scene(
     inside = frame_coverage(scene.frame, crop_from_scene, size=SIZE_PX)
     pixels = simulate_camera(rng, add_weather(rng, picture))
     return (pixels * (inside[..., None] > 0.5)).astype(np.uint8), mask * inside
+
+
+@dataclass(frozen=True)
+class _CastShadow:
+    offset_px: Float[np.ndarray, "2"]  # from a fish to its shadow, x, y
+    blur_px: float
+    strength: float  # fraction of the light that is missing in its middle
+
+
+def _draw_shadow_kind(
+    rng: np.random.Generator, crop_from_scene: Float[np.ndarray, "2 3"]
+) -> _CastShadow:
+    """The shadow under one random lamp, 2 to 20 % of a fish's length beside the fish."""
+    angle_rad, length = rng.uniform(0.0, 2 * np.pi), rng.uniform(0.02, 0.2)
+    scale = crop_from_scene[0, 0]  # crop px per fish length
+    return _CastShadow(
+        offset_px=scale * length * np.array([np.cos(angle_rad), np.sin(angle_rad)]),
+        blur_px=scale * length * rng.uniform(0.05, 0.5) + 0.3,
+        strength=rng.uniform(0.2, 0.85),
+    )
+
+
+def _cast(shadow: _CastShadow, coverage: Float32[np.ndarray, "S S"]) -> Float32[np.ndarray, "S S"]:
+    """The fraction of the light that is missing in each pixel."""
+    shift = np.column_stack([np.eye(2), shadow.offset_px])
+    moved = cv2.warpAffine(coverage, shift, coverage.shape[::-1], flags=cv2.INTER_LINEAR)
+    return np.float32(shadow.strength) * cv2.GaussianBlur(moved, (0, 0), shadow.blur_px)
 
 
 def warp_fish(
@@ -78,7 +113,7 @@ def frame_coverage(
 
 def _draw_backdrop(rng: np.random.Generator, bank: PatchBank) -> Float32[np.ndarray, "S S 3"]:
     """A piece of a background, rotated, mirrored at its edges, enlarged or shrunken."""
-    background = bank.backgrounds[rng.integers(len(bank.backgrounds))]
+    background = bank.draw_background(rng)
     half = background.shape[0] / 2
     angle_deg = rng.choice([0.0, 90.0, 180.0, 270.0]) + rng.normal(0.0, 8.0)
     affine = cv2.getRotationMatrix2D((half, half), angle_deg, np.exp(rng.normal(-0.15, 0.45)))

@@ -14,7 +14,9 @@ from stream_dmr.errors import ModelError, OutputError
 from stream_dmr.segmentation.network.unet_weights import SHIPPED, load_weights
 from stream_dmr.segmentation.training.annotated_samples import (
     Cutout,
+    cutout_patch,
     draw_annotated_sample,
+    load_backgrounds,
     load_fish_cutouts,
 )
 from stream_dmr.segmentation.training.draw_sample import draw_sample
@@ -39,6 +41,7 @@ class TrainRequest:
     settings: TrainSettings
     images: Path | None = None  # the user's, given with `masks`; None: simulated ones alone
     masks: Path | None = None
+    backgrounds: Path | None = None  # photographs without fish, behind simulated and own fish
     init: Path | None = None  # initial weights; None: the shipped ones with `images`, else random
     device: str = "cpu"  # or "cuda"
     resume: bool = False
@@ -127,10 +130,12 @@ def _sources(request: TrainRequest, observer: TrainObserver) -> tuple[Draw, Draw
         simulated = _SimulatedSource(_bank(request, observer))
         return simulated, _SimulatedSource(_bank(request, observer, is_validation=True))
     training, validation = load_fish_cutouts(request.images, request.masks)
-    simulated = _SimulatedSource(_bank(request, observer))
-    return _MixedSource(simulated, training, request.settings.own_share), _AnnotatedSource(
-        validation
+    bank = _bank(request, observer).with_photographs(
+        [cutout_patch(one) for one in training],
+        load_backgrounds(request.backgrounds) if request.backgrounds is not None else [],
     )
+    mixed = _MixedSource(_SimulatedSource(bank), training, request.settings.own_share)
+    return mixed, _AnnotatedSource(validation)
 
 
 def _bank(

@@ -59,8 +59,9 @@ def draw_scene(rng: np.random.Generator, bank: PatchBank) -> TrainingScene:
         (behind if rng.random() < 0.6 else before).append(other)
     occluders = draw_occluders(rng)
     for fish in (target, *behind, *before):
-        if rng.random() < 0.4:
-            occluders.append(draw_line(rng, fish.to_scene(bank.ends_px[fish.patch][0])))
+        head_px = bank.ends_px[fish.patch][0]
+        if rng.random() < 0.4 and np.isfinite(head_px).all():
+            occluders.append(draw_line(rng, fish.to_scene(head_px)))
     return TrainingScene(
         behind=behind, target=target, before=before, occluders=occluders, frame=_draw_frame(rng)
     )
@@ -83,7 +84,7 @@ def _draw_fish(
     center = np.full(2, (PATCH_PX - 1) / 2)
     tint = np.append(rng.uniform(20.0, 230.0, 3), rng.uniform(0.0, 0.6) * (rng.random() < 0.2))
     return SceneFish(
-        patch=int(rng.integers(len(bank.fish))),
+        patch=bank.draw_fish(rng),
         scene_from_patch=np.column_stack([linear, at - linear @ center]),
         gain=np.exp(rng.normal(0.0, 0.3) + rng.normal(0.0, 0.1, 3)),
         tint=tint,
