@@ -104,7 +104,7 @@ WHO_KNOWS = {
     "prometheus_client": ["stream_dmr.watch"],
     "sqlite3": ["stream_dmr.results"],
     "filterpy": ["stream_dmr.lengths", "stream_dmr.segmentation"],
-    "onnxruntime": ["stream_dmr.segmentation.detection"],
+    "onnxruntime": ["stream_dmr.segmentation.network"],
     "ray": ["stream_dmr.batch"],
     "stream_dmr.nodes": [
         "stream_dmr.running",

@@ -10,11 +10,11 @@ import argparse
 import os
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Bool, UInt8
 
 from stream_dmr.calibration.calibration_file import load_calibration
@@ -24,9 +24,9 @@ from stream_dmr.segmentation.annotations.annotated_fish import open_annotated_fi
 from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
 from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map
 from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
+from stream_dmr.segmentation.network.onnx_session import open_session
 from stream_dmr.segmentation.network.unet_interface import SIZE_PX
-from stream_dmr.segmentation.network.unet_segmenter import UNetSegmenter
-from stream_dmr.segmentation.network.unet_weights import SHIPPED
+from stream_dmr.segmentation.network.unet_segmenter import SHIPPED, UNetSegmenter
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
 
@@ -111,12 +111,8 @@ def measure_speed() -> None:
     segmenter = UNetSegmenter.load(SHIPPED)
     show("one crop, one thread", lambda: segmenter.segment(images[0], box), crops=1)
     for threads in sorted({1, os.cpu_count() or 1}):
-        torch.set_num_threads(threads)
-        name = f"batch of 64, CPU, {threads} threads"
-        show(name, lambda: segmenter.segment_batch(images, boxes), crops=64)
-    if torch.cuda.is_available():
-        on_gpu = UNetSegmenter.load(SHIPPED, device="cuda")
-        show("batch of 64, CUDA", lambda: on_gpu.segment_batch(images, boxes), crops=64)
+        run = UNetSegmenter(open_session(SHIPPED, threads=threads)).segment_batch
+        show(f"batch of 64, {threads} threads", partial(run, images, boxes), crops=64)
 
 
 def show(name, work, *, crops: int) -> None:

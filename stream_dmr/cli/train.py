@@ -42,8 +42,8 @@ def train(
 ) -> None:
     """Train the network that finds masks, on simulated pictures or on your own as well.
 
-    Writes unet.pt, scores.json, curve.png and worst.png into --out after every epoch; use the
-    weights by [crop_fish] segmenter = "OUT/unet.pt". Ctrl-C ends it; --resume continues.
+    Writes unet.onnx, unet.pt, scores.json, curve.png and worst.png into --out after every epoch;
+    use it by [crop_fish] segmenter = "OUT/unet.onnx". Ctrl-C ends it; --resume continues.
     """
     if (images is None) != (masks is None):
         raise typer.BadParameter("--images and --masks belong together: give both or neither")
@@ -76,7 +76,7 @@ def train(
         with TrainDisplay(settings) as display:
             best = train_unet(request, stop=stop, observer=display)
     if best is not None:
-        print(f"best: epoch {best.epoch}, mean IoU {best.iou:.3f}; {out / 'unet.pt'}")
+        print(f"best: epoch {best.epoch}, mean IoU {best.iou:.3f}; {out / 'unet.onnx'}")
     if stop.signal_number:
         print(
             f"stopped by {signal.Signals(stop.signal_number).name}; --resume continues",

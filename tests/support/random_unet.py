@@ -1,9 +1,14 @@
 """A network with random weights, and inputs and output maps for it."""
 
+from pathlib import Path
+
 import numpy as np
 import torch
 
+from stream_dmr.segmentation.network.onnx_session import open_session
 from stream_dmr.segmentation.network.unet import UNet
+from stream_dmr.segmentation.network.unet_export import unet_as_onnx
+from stream_dmr.segmentation.network.unet_segmenter import UNetSegmenter
 
 
 def random_network(seed: int = 0) -> UNet:
@@ -14,6 +19,11 @@ def random_network(seed: int = 0) -> UNet:
             module.running_mean.normal_()
             module.running_var.uniform_(0.5, 2.0)
     return network.eval()
+
+
+def segmenter_of(network: UNet) -> UNetSegmenter:
+    """The network as a run computes it."""
+    return UNetSegmenter(open_session(Path("unet.onnx"), content=unet_as_onnx(network)))
 
 
 def random_inputs(

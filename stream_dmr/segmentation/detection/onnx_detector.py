@@ -22,7 +22,7 @@ from stream_dmr.segmentation.detection.onnx_outputs import (
     OutputShapeError,
     decode,
 )
-from stream_dmr.segmentation.detection.onnx_session import open_session
+from stream_dmr.segmentation.network.onnx_session import open_session
 from stream_dmr.settings import Settings
 
 _MIN_INPUT_PX = 32  # the stride of the usual detectors

@@ -8,6 +8,8 @@ from stream_dmr.errors import ModelError
 from stream_dmr.segmentation.detection.detector import Detector
 from stream_dmr.segmentation.detection.motion_detector import MotionDetector, MotionSettings
 from stream_dmr.segmentation.detection.onnx_detector import OnnxDetector, OnnxSettings
+from stream_dmr.segmentation.detection.unet_detector import UNetDetector
+from stream_dmr.segmentation.network.unet_segmenter import SHIPPED, UNetSegmenter, is_unet_file
 from stream_dmr.settings import Settings
 
 
@@ -17,8 +19,8 @@ class DetectorSettings(Settings):
     detector: str = Field(
         default="motion",
         min_length=1,
-        description='what finds fish in the picture: "motion", "unet", weights of '
-        "`stream-dmr train` (.pt), or a detector's file (.onnx)",
+        description='what finds fish in the picture: "motion", "unet", a network of '
+        "`stream-dmr train` (.onnx), or a detector's file (.onnx)",
     )
 
 
@@ -35,21 +37,17 @@ class DetectFishSettings(OnnxSettings, UNetDetectorSettings, MotionSettings, Det
 
 
 def open_detector(settings: DetectFishSettings) -> Detector:
-    """The detector of a name, or of a path to weights (.pt) or to an ONNX file.
+    """The detector of a name, or of a path to an ONNX file or to weights (.pt).
 
-    Torch is imported only where the U-Net is asked for. Raises ModelError for an unknown name, and
-    where the file cannot be used.
+    Torch is imported only for weights. Raises ModelError for an unknown name, and where the file
+    cannot be used.
     """
     if settings.detector == "motion":
         return MotionDetector(settings)
     suffix = Path(settings.detector).suffix.lower()
-    if settings.detector == "unet" or suffix == ".pt":
-        from stream_dmr.segmentation.detection.unet_detector import UNetDetector
-        from stream_dmr.segmentation.network.unet_segmenter import UNetSegmenter
-        from stream_dmr.segmentation.network.unet_weights import SHIPPED
-
-        weights = SHIPPED if settings.detector == "unet" else Path(settings.detector)
-        return UNetDetector(UNetSegmenter.load(weights), longer_px=settings.unet_working_px)
+    path = SHIPPED if settings.detector == "unet" else Path(settings.detector)
+    if path == SHIPPED or suffix == ".pt" or (suffix == ".onnx" and is_unet_file(path)):
+        return UNetDetector(UNetSegmenter.load(path), longer_px=settings.unet_working_px)
     if suffix == ".onnx":
         return OnnxDetector(Path(settings.detector), settings)
     raise ModelError(

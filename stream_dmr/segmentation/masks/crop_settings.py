@@ -23,6 +23,6 @@ class CropFishSettings(Settings):
     segmenter: str = Field(
         default="unet",
         min_length=1,
-        description='what finds the mask in a box: "unet", "grabcut", weights of `stream-dmr train`'
-        " (.pt), or a promptable model (.onnx)",
+        description='what finds the mask in a box: "unet", "grabcut", a network of '
+        "`stream-dmr train` (.onnx), or a promptable model (.onnx)",
     )

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from stream_dmr.errors import ModelError
-from stream_dmr.segmentation.detection.onnx_session import open_session
+from stream_dmr.segmentation.network.onnx_session import open_session
 from stream_dmr.segmentation.segmenter import SegmentedFish
 
 _DEFAULT_SIDE_PX = 256  # for a model that takes images of any size; twice a default crop

@@ -12,7 +12,7 @@ from torch.nn.functional import interpolate, pixel_shuffle
 
 _WIDTHS = (24, 40, 64, 96)  # channels at 1/2, 1/4, 1/8 and 1/16 of the size
 _DEPTHS = (0, 1, 1, 2)  # residual blocks on the way down
-_MIN_SPREAD = 4.0  # grey levels: noise of a uniform image is not amplified
+MIN_SPREAD = 4.0  # grey levels: noise of a uniform image is not amplified
 
 
 class UNet(nn.Module):
@@ -23,10 +23,10 @@ class UNet(nn.Module):
         self.stem = _convolve(4, _WIDTHS[0], kernel=4, stride=2)
         self.down, self.across, self.up = nn.ModuleList(), nn.ModuleList(), nn.ModuleList()
         for fine, coarse, depth in zip(_WIDTHS, _WIDTHS[1:], _DEPTHS[1:], strict=False):
-            blocks = (_Residual(coarse) for _ in range(depth))
+            blocks = (Residual(coarse) for _ in range(depth))
             self.down.append(nn.Sequential(_convolve(fine, coarse, stride=2), *blocks))
             self.across.append(nn.Conv2d(coarse, fine, 1))
-            self.up.append(_Residual(fine))
+            self.up.append(Residual(fine))
         self.mask = nn.Conv2d(_WIDTHS[0], 4, 3, padding=1)
         self.ends = nn.Conv2d(_WIDTHS[1], 2, 3, padding=1)
 
@@ -60,11 +60,11 @@ def normalise(
     """
     centred = images - images.mean(dim=(1, 2), keepdim=True)
     spread = centred.square().mean(dim=(1, 2, 3), keepdim=True).sqrt()
-    channels = torch.cat([centred / (spread + _MIN_SPREAD), in_box[..., None] - 0.5], dim=3)
+    channels = torch.cat([centred / (spread + MIN_SPREAD), in_box[..., None] - 0.5], dim=3)
     return channels.permute(0, 3, 1, 2)  # channels_last in memory, the faster layout
 
 
-class _Residual(nn.Module):
+class Residual(nn.Module):
     """Two convolutions with a skip connection."""
 
     def __init__(self, width: int) -> None:
@@ -73,6 +73,7 @@ class _Residual(nn.Module):
         self.second = nn.Conv2d(width, width, 3, padding=1)
 
     def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
+        """`x`, plus what the two convolutions make of it."""
         return torch.relu(x + self.second(self.first(x)))
 
 

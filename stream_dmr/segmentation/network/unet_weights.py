@@ -1,4 +1,4 @@
-"""The network's weights as a file: those that are shipped, and those that a user trains."""
+"""The network's weights as a file to train on from: the shipped ones, and a user's."""
 
 from pathlib import Path
 
@@ -6,9 +6,9 @@ import torch
 
 from stream_dmr.errors import ModelError
 from stream_dmr.segmentation.network.unet import UNet
+from stream_dmr.segmentation.network.unet_interface import MODEL_FORMAT
 
 SHIPPED = Path(__file__).parent / "weights" / "unet.pt"
-_FORMAT = "stream-dmr unet 1"  # a new number where the network's layers change
 
 
 def save_weights(network: UNet, path: Path) -> None:
@@ -17,7 +17,7 @@ def save_weights(network: UNet, path: Path) -> None:
         name: value.half() if value.is_floating_point() else value
         for name, value in network.state_dict().items()
     }
-    torch.save({"format": _FORMAT, "state": state}, path)
+    torch.save({"format": MODEL_FORMAT, "state": state}, path)
 
 
 def load_weights(path: Path) -> UNet:
@@ -35,9 +35,9 @@ def load_weights(path: Path) -> UNet:
         raise ModelError(
             f"{path}: expected weights written by `stream-dmr train`, got another kind of file"
         ) from error
-    if not isinstance(content, dict) or content.get("format") != _FORMAT:
+    if not isinstance(content, dict) or content.get("format") != MODEL_FORMAT:
         raise ModelError(
-            f"{path}: expected weights in the format '{_FORMAT}', got others; train them again"
+            f"{path}: expected weights in the format '{MODEL_FORMAT}', got others; train them again"
         )
     network = UNet()
     try:

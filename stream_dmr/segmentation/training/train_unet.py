@@ -68,9 +68,9 @@ def train_unet(
 
     Fine-tuning counts its initial weights as epoch 0, so it never ends with worse ones.
 
-    Writes `unet.pt` (the best weights), `last.pt` (to resume from), `scores.json`, `curve.png` and
-    `worst.png` into `request.out`, after every epoch. Raises a UserError where an input is wrong,
-    before anything is trained.
+    After every epoch `request.out` has the best weights as `unet.onnx`, for runs, and as `unet.pt`,
+    to train on from; `last.pt` (to resume from), `scores.json`, `curve.png` and `worst.png`. Raises
+    a UserError where an input is wrong, before anything is trained.
     """
     observer = observer or TrainObserver()
     training = _prepare(request)

@@ -15,6 +15,7 @@ from torch.optim.swa_utils import AveragedModel
 
 from stream_dmr.errors import ModelError, UserError
 from stream_dmr.segmentation.network.unet import UNet, normalise
+from stream_dmr.segmentation.network.unet_export import export_unet
 from stream_dmr.segmentation.network.unet_weights import save_weights
 from stream_dmr.segmentation.training.sample_dataset import (
     Batch,
@@ -206,6 +207,7 @@ class UNetTrainer:
             network = self.averaged.module
             assert isinstance(network, UNet)
             save_weights(network, self.out / "unet.pt")
+            export_unet(network, self.out / "unet.onnx")
         state = {
             "settings": self._identity(),
             "network": self.network.state_dict(),

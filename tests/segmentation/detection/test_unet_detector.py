@@ -4,16 +4,18 @@ import numpy as np
 
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.detection.unet_detector import UNetDetector
-from stream_dmr.segmentation.network.unet import UNet
+from stream_dmr.segmentation.network.unet_interface import IMAGES_INPUT
 from stream_dmr.segmentation.network.unet_segmenter import UNetSegmenter
 
 
-class Bright(UNet):
-    """A network that takes what is brighter than the mean for fish, at the input's size."""
+class BrightSession:
+    """A network that takes what is bright for fish."""
 
-    def forward(self, inputs):
-        maps = inputs.new_zeros(len(inputs), 2, inputs.shape[2] // 4, inputs.shape[3] // 4)
-        return 20 * inputs[:, 0] - 10, maps
+    def run(self, outputs, feed):
+        images = feed[IMAGES_INPUT]
+        assert len(outputs) == 2
+        maps = np.zeros((len(images), 2, images.shape[1] // 4, images.shape[2] // 4), np.float32)
+        return (images[..., 0] > 128).astype(np.float32), maps
 
 
 def test_boxes_are_found_in_the_whole_frame_and_in_its_pixels():
@@ -21,7 +23,7 @@ def test_boxes_are_found_in_the_whole_frame_and_in_its_pixels():
     image[100:180, 200:400] = 220
     image[300:360, 50:110] = 220
     image[400:404, 500:504] = 220  # a speck
-    detector = UNetDetector(UNetSegmenter(Bright()), longer_px=320)
+    detector = UNetDetector(UNetSegmenter(BrightSession()), longer_px=320)
     found = detector.find(Frame(frame_index=1, timestamp_ns=0, image=image, source=""))
     boxes = sorted(candidate.bbox_xyxy_px.tolist() for candidate in found)
     np.testing.assert_allclose(boxes, [[50, 300, 110, 360], [200, 100, 400, 180]], atol=3)
