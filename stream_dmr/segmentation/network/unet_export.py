@@ -6,6 +6,7 @@ before it.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -59,7 +60,7 @@ class _Graph:
         self._constants: list[onnx.TensorProto] = []
         self.last = ""  # output of the last node
 
-    def add(self, kind: str, inputs: list[str], *, name: str = "", **attributes) -> str:
+    def add(self, kind: str, inputs: list[str], *, name: str = "", **attributes: Any) -> str:
         """Append a node; returns the name of its output."""
         self.last = name or f"{kind.lower()}_{len(self._nodes)}"
         self._nodes.append(helper.make_node(kind, inputs, [self.last], **attributes))
