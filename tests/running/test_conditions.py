@@ -1,0 +1,41 @@
+"""--pose lying and --stills as settings: what the user has set comes first."""
+
+from collections.abc import Callable
+
+import pytest
+
+from stream_dmr.running.conditions import lying, stills
+from stream_dmr.running.config import Config, parse_config
+
+
+@pytest.mark.parametrize("condition", [lying, stills])
+def test_a_condition_changes_settings_once(condition: Callable[[Config], Config]):
+    changed = condition(Config())
+    assert changed != Config()
+    assert condition(changed) == changed
+
+
+def test_lying_fish_rest_on_the_plane_and_hardly_tilt():
+    config = lying(Config())
+    assert config.localize.rests_on_plane
+    assert config.fit_mesh.tilt_std_rad < Config().fit_mesh.tilt_std_rad
+    assert config.smooth_length == Config().smooth_length
+
+
+def test_one_good_still_gives_a_length():
+    config = stills(Config())
+    assert config.smooth_length.min_frames == 1
+    assert config.localize == Config().localize
+
+
+def test_the_users_own_settings_stay():
+    own = parse_config(
+        "[fit_mesh]\ntilt_std_rad = 0.4\n[smooth_length]\nmin_frames = 5\n", where="own"
+    )
+    assert lying(own).fit_mesh.tilt_std_rad == 0.4
+    assert lying(own).fit_mesh.bend_std_rad == lying(Config()).fit_mesh.bend_std_rad
+    assert stills(own).smooth_length.min_frames == 5
+
+
+def test_both_conditions_hold_together_in_either_order():
+    assert lying(stills(Config())) == stills(lying(Config()))
