@@ -120,7 +120,7 @@ def run(
 def _print_summary(summary: "RunSummary", out: Path, *, timings: bool) -> None:
     from stream_dmr.cli.terminal import print_fish, print_timings
 
-    print_fish(summary.fish)
+    print_fish(summary.fish, may_count_twice=summary.may_count_twice)
     if timings:
         print_timings(summary)
     rate = summary.num_frames / summary.elapsed_s

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from types import TracebackType
 
 from rich.console import Console
@@ -12,6 +12,7 @@ from rich.table import Table
 from stream_dmr.evaluation.compare import Distributions, Evaluation, distribution_rows, summary_rows
 from stream_dmr.messages import LengthEstimate, Message
 from stream_dmr.replaying.replay_recording import ReplaySummary
+from stream_dmr.results.store_rows import MAY_COUNT_TWICE
 from stream_dmr.running.measure_source import RunSummary
 from stream_dmr.running.run_observer import RunObserver
 
@@ -95,8 +96,8 @@ class RunDisplay(RunObserver):
             self._progress.update(self._task, num_fish=len(self._fish))
 
 
-def print_fish(fish: Sequence[LengthEstimate]) -> None:
-    """Print the table of fish to stdout."""
+def print_fish(fish: Sequence[LengthEstimate], *, may_count_twice: Collection[int] = ()) -> None:
+    """Print the table of fish to stdout; `may_count_twice`: ids of which it says so."""
     table = _table("fish", "length mm", "95 % interval mm", "frames used/seen", "status")
     for estimate in fish:
         table.add_row(
@@ -104,7 +105,9 @@ def print_fish(fish: Sequence[LengthEstimate]) -> None:
             length_text(estimate),
             interval_text(estimate),
             f"{estimate.frames_used}/{estimate.frames_seen}",
-            status_text(estimate),
+            f"{status_text(estimate)}; {MAY_COUNT_TWICE}"
+            if estimate.track_id in may_count_twice
+            else status_text(estimate),
         )
     _stdout().print(table if fish else "no fish")
 

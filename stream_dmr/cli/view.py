@@ -4,7 +4,7 @@ import signal
 import sys
 import tempfile
 from collections.abc import Generator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -102,20 +102,20 @@ def _convert(
     full_size: bool = False,
 ) -> None:
     from stream_dmr.errors import RecordingError
+    from stream_dmr.recording.reading.frame_images import open_pictures
     from stream_dmr.recording.reading.rrd_conversion import EVERY_FRAME
     from stream_dmr.recording.reading.rrd_conversion import convert as convert_recording
-    from stream_dmr.sources.open_source import open_source
     from stream_dmr.sources.read_settings import ReadFramesSettings
 
     if recording.resolve() == rrd.resolve():
         raise RecordingError(f"{rrd}: expected another file to write to; choose one with --out")
     settings = EVERY_FRAME.model_copy(update={"view_px": 1 << 16} if full_size else {})
     with ExitStack() as stack:
-        frames = None
+        pictures = None
         if source is not None:
-            frames = stack.enter_context(closing(open_source(source, ReadFramesSettings())))
+            pictures = stack.enter_context(open_pictures(source, ReadFramesSettings()))
         lost = convert_recording(
-            recording, rrd, frames=frames, settings=settings, selection=selection
+            recording, rrd, source=pictures, settings=settings, selection=selection
         )
     warn(lost)
 

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.nodes.read_frames import ReadFrames
-from stream_dmr.recording.reading.frame_images import SourcePictures
+from stream_dmr.recording.reading.frame_images import open_pictures
 from stream_dmr.recording.reading.open_recording import Recording, open_recordings
 from stream_dmr.replaying.comparator import MessageComparator, Mismatch
 from stream_dmr.replaying.recorded_messages import PlaybackNode, RecordedMessages
@@ -196,9 +195,7 @@ def _open_chain(
         return recorded.frames(), [*playback, *computed[first - 1 :]]
     files, restorer = inputs.files, None
     if files.source is not None:
-        reader = ReadFrames(files.source, config.read_frames)
-        stack.callback(reader.close)
-        restorer = SourcePictures(reader)
+        restorer = stack.enter_context(open_pictures(files.source, config.read_frames))
     frames = recorded.frames_with_images(
         restorer, exact=request.check, missing_source=files.missing_source
     )

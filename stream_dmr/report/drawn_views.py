@@ -74,10 +74,10 @@ def _read_frames(
     recording: Recording, wanted: set[int], source: str | None
 ) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
     if source is not None:
-        yield from frame_images(recording, wanted, source)
+        yield from frame_images(recording, wanted, source, is_given=True)
         return
     with suppress(SourceError):  # a file of the same name that is not the recorded one
-        yield from frame_images(recording, wanted, recorded_source(recording))
+        yield from frame_images(recording, wanted, recorded_source(recording), is_given=False)
 
 
 def _draw_view(

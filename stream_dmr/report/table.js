@@ -114,7 +114,7 @@ function rowOf(fish) {
     element("span", {}, element("b", { textContent: lengthText(fish) }), ...corrected, element("small", { textContent: interval }), size),
     element("span", { textContent: `${fish.frames_used} of ${fish.frames_seen}` }),
     element("small", { textContent: reasons, title: reasons }),
-    element("small", { className: "bad", textContent: fish.flags.join(", ") }),
+    element("small", { className: "bad", textContent: fish.flags.join(", "), title: fish.flags.join(", ") }),
     verdict,
   );
 }

@@ -1,7 +1,7 @@
 """The pictures of a report: a fish as the camera saw it, and the outlines of mask and mesh."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import closing
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 
 import cv2
@@ -9,12 +9,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from stream_dmr.camera import Camera, crop_from_frame
+from stream_dmr.errors import SourceError
 from stream_dmr.messages import FishCrop, FittedShape, Frame
 from stream_dmr.recording.messages.selection import EVERYTHING
-from stream_dmr.recording.reading.frame_images import RecordedPictures, SourcePictures
+from stream_dmr.recording.reading.frame_images import (
+    FrameRestorer,
+    RecordedPictures,
+    open_pictures,
+)
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
 from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map
-from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
 
 _MASK_BGR, _MESH_BGR = (80, 220, 255), (90, 230, 90)
@@ -86,40 +90,36 @@ def draw_outlines(
 
 
 def frame_images(
-    recording: Recording, wanted: set[int], source: str | None
+    recording: Recording, wanted: set[int], source: str | None, *, is_given: bool
 ) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
     """The images of the wanted frames, from `source`, or from the recording where it has any.
 
-    SourceError where the source is not the recorded one.
+    A source that is not the recorded one raises SourceError where it `is_given` by the user; else
+    its frames are left out.
     """
-    with closing(_FrameImages(recording, source)) as images:
+    with _open_pictures(recording, source) as pictures:
         for message, payload in decoded_messages(recording, [Frame], EVERYTHING):
-            if message.frame_index in wanted and isinstance(message, Frame):
-                frame = images.restorer.restore(message, payload)
+            if message.frame_index not in wanted or not isinstance(message, Frame):
+                continue
+            with nullcontext() if is_given else suppress(SourceError):
+                frame = pictures.restore(message, payload)
                 if frame.image.size:
                     yield frame.frame_index, frame.image
+
+
+@contextmanager
+def _open_pictures(recording: Recording, source: str | None) -> Generator[FrameRestorer]:
+    if source is None:
+        yield RecordedPictures(recording, EVERYTHING)
+    else:
+        with open_pictures(source, ReadFramesSettings()) as pictures:
+            yield pictures
 
 
 def recorded_source(recording: Recording) -> str | None:
     """Path of the recorded source, where there is still a file or folder."""
     inputs = recording.header.known_inputs
     return inputs.source.path if inputs is not None and inputs.source.exists() else None
-
-
-class _FrameImages:
-    """The images of a recording's frames, with the source that has to be closed."""
-
-    def __init__(self, recording: Recording, source: str | None) -> None:
-        self._source = None if source is None else open_source(source, ReadFramesSettings())
-        self.restorer = (
-            RecordedPictures(recording, EVERYTHING)
-            if self._source is None
-            else SourcePictures(self._source)
-        )
-
-    def close(self) -> None:
-        if self._source is not None:
-            self._source.close()
 
 
 def _resized(camera: Camera, size: int) -> Camera:

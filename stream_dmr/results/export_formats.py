@@ -22,7 +22,7 @@ from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
 from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
 from stream_dmr.recording.view.view_geometry import place_fit
-from stream_dmr.results.finished_fish import database_of, read_fish, read_runs
+from stream_dmr.results.finished_fish import database_of, read_fish, read_runs, read_stored_fish
 from stream_dmr.results.fish_table import fish_record, write_csv, write_parquet
 from stream_dmr.results.fisheries import FisheriesSettings
 from stream_dmr.results.frames_table import FramesTable
@@ -115,7 +115,10 @@ class Export:
             if isinstance(message, LengthEstimate) and message.is_final:
                 finished.append(message)
         frames.close()
-        write_lengths(out / "lengths.csv", finished)
+        database = database_of(self._path)
+        fish = [] if database is None else read_stored_fish(database)
+        doubtful = {one.estimate.track_id for one in fish if one.may_count_twice}
+        write_lengths(out / "lengths.csv", finished, may_count_twice=doubtful)
         paths = paths if format == "csv" else [_as_parquet(path) for path in paths]
         self._written += paths
         return paths

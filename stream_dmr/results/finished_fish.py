@@ -14,7 +14,7 @@ from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
 from stream_dmr.results.lengths_database import NAME, open_for_reading
 from stream_dmr.results.run_facts import RunFacts, cut_short, run_facts
-from stream_dmr.results.store_rows import read_estimates
+from stream_dmr.results.store_rows import MAY_COUNT_TWICE, read_estimates
 from stream_dmr.results.verdicts import NOT_REVIEWED, Review, read_verdicts, reviews_of
 
 
@@ -28,6 +28,11 @@ class FishResult:
     iou: float | None = None
     flags: Sequence[str] = ()
     review: Review = NOT_REVIEWED
+
+    @property
+    def may_count_twice(self) -> bool:
+        """True where it was in view at a crash, and maybe again after it."""
+        return any(MAY_COUNT_TWICE in flag for flag in self.flags)
 
     @property
     def length_mm(self) -> float | None:

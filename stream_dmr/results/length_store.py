@@ -24,7 +24,7 @@ from stream_dmr.results.lengths_database import (
 )
 from stream_dmr.results.reserved_space import ReservedSpace
 from stream_dmr.results.run_facts import NOT_ENDED, RunFacts
-from stream_dmr.results.store_rows import fish_row, read_estimates
+from stream_dmr.results.store_rows import MAY_COUNT_TWICE, fish_row, read_estimates
 
 _MARK_EVERY_NS = 5_000_000_000  # capture times that a crash may leave unmarked; chosen
 _FRAMES_AHEAD = 1000  # frame numbers that are marked as used at a time; a crash skips the rest
@@ -166,16 +166,27 @@ class LengthStore:
             *(self.run_id, kind, text, timestamp_ns, time.time_ns()),
         )
 
-    def estimates(self) -> list[LengthEstimate]:
-        """All finished fish of this folder, in the order in which their tracks ended."""
+    def estimates(self, *, last: int | None = None) -> list[LengthEstimate]:
+        """The finished fish of this folder, in the order in which tracks ended; the `last` few."""
         with self._lock:
             try:
-                return list(read_estimates(self._database))
+                return list(read_estimates(self._database, last=last))
             except sqlite3.Error as error:
                 raise OutputError(
                     f"{self.path}: expected a database of lengths, got: {error}; make room, or "
                     "choose another --out"
                 ) from error
+
+    def may_count_twice(self) -> set[int]:
+        """The track ids of the fish that were in view at a crash."""
+        query = "SELECT track_id FROM fish WHERE flags LIKE ?"
+        with self._lock:
+            return {i for (i,) in self._database.execute(query, (f"%{MAY_COUNT_TWICE}%",))}
+
+    def counts(self) -> dict[str, int]:
+        """The number of finished fish by status."""
+        with self._lock:
+            return dict(self._database.execute("SELECT status, COUNT(*) FROM fish GROUP BY status"))
 
     def close(self) -> None:
         """End the run and leave one file. Idempotent.

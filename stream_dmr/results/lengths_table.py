@@ -1,7 +1,7 @@
 """lengths.csv: one row a finished fish, an export of lengths.db."""
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import closing, suppress
 from pathlib import Path
 
@@ -10,6 +10,7 @@ from stream_dmr.errors import OutputError
 from stream_dmr.files import rename_durably, writing_to
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.results.length_store import LengthStore
+from stream_dmr.results.store_rows import MAY_COUNT_TWICE
 from stream_dmr.results.table_cells import number, numbers, seconds
 
 LENGTHS_COLUMNS = [
@@ -53,7 +54,9 @@ class LengthsTable:
         self._waiting.append(estimate)
         try:
             while self._waiting:
-                self._rows.add(lengths_row(self._waiting[0]))
+                estimate = self._waiting[0]
+                is_doubtful = estimate.track_id in self._store.may_count_twice()
+                self._rows.add(lengths_row(estimate, may_count_twice=is_doubtful))
                 self._waiting.popleft()
             self.trouble = ""
         except OutputError as error:
@@ -68,7 +71,8 @@ class LengthsTable:
         if self._store.trouble:  # its file lacks fish; the next run exports them
             return
         try:
-            write_lengths(self._path, self._store.estimates())
+            store = self._store
+            write_lengths(self._path, store.estimates(), may_count_twice=store.may_count_twice())
         except OutputError as error:
             self._refuse(error)
 
@@ -79,16 +83,20 @@ class LengthsTable:
         self._on_refusal(str(error))
 
 
-def write_lengths(path: Path, estimates: Iterable[LengthEstimate]) -> None:
+def write_lengths(
+    path: Path, estimates: Iterable[LengthEstimate], *, may_count_twice: Collection[int] = ()
+) -> None:
     """Replace lengths.csv durably; at any moment the old or the new one is complete.
 
-    Raises OutputError where the disk refuses it.
+    `may_count_twice`: the ids of the fish of which `status` says so. Raises OutputError where the
+    disk refuses it.
     """
     draft = path.with_suffix(".csv.part")
     try:
         with closing(CsvFile(draft, LENGTHS_COLUMNS)) as table, writing_to(path):
             for estimate in estimates:
-                table.add(lengths_row(estimate))
+                is_doubtful = estimate.track_id in may_count_twice
+                table.add(lengths_row(estimate, may_count_twice=is_doubtful))
             table.sync()
             rename_durably(draft, path)
     except BaseException:
@@ -97,7 +105,7 @@ def write_lengths(path: Path, estimates: Iterable[LengthEstimate]) -> None:
         raise
 
 
-def lengths_row(estimate: LengthEstimate) -> list[str]:
+def lengths_row(estimate: LengthEstimate, *, may_count_twice: bool = False) -> list[str]:
     """The cells of a final estimate; times in seconds, exact to the nanosecond."""
     return [
         str(estimate.track_id),
@@ -110,5 +118,5 @@ def lengths_row(estimate: LengthEstimate) -> list[str]:
         str(estimate.last_frame),
         seconds(estimate.first_timestamp_ns),
         seconds(estimate.last_timestamp_ns),
-        estimate.status,
+        f"{estimate.status}; {MAY_COUNT_TWICE}" if may_count_twice else estimate.status,
     ]

@@ -9,6 +9,10 @@ import numpy as np
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.results.lengths_database import FISH_COLUMNS
 
+MAY_COUNT_TWICE = "may count twice"
+# A flag of a fish that was in view at a crash: it came into view again, with another number.
+INTERRUPTED = f"{MAY_COUNT_TWICE}: interrupted by a restart, finished with what was recorded"
+
 
 def fish_row(estimate: LengthEstimate, flags: Sequence[str]) -> dict[str, object]:
     """The columns of a final estimate; `flags`: what a reader of its length must know."""
@@ -22,10 +26,14 @@ def fish_row(estimate: LengthEstimate, flags: Sequence[str]) -> dict[str, object
     }
 
 
-def read_estimates(database: sqlite3.Connection) -> Iterator[LengthEstimate]:
-    """The final estimates, without their smoothed series, which the recordings have."""
+def read_estimates(
+    database: sqlite3.Connection, *, last: int | None = None
+) -> Iterator[LengthEstimate]:
+    """The final estimates, or the `last` few; the recordings have their smoothed series."""
     names = [*FISH_COLUMNS, "ci95_low_mm", "ci95_high_mm", "refused"]
-    for values in database.execute(f"SELECT {', '.join(names)} FROM fish ORDER BY number"):
+    wanted = "" if last is None else "WHERE number > (SELECT MAX(number) FROM fish) - ?"
+    query = f"SELECT {', '.join(names)} FROM fish {wanted} ORDER BY number"
+    for values in database.execute(query, () if last is None else (last,)):
         row = dict(zip(names, values, strict=True))
         ends = row.pop("ci95_low_mm"), row.pop("ci95_high_mm")
         yield LengthEstimate(

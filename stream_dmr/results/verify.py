@@ -87,10 +87,11 @@ def _changes(folder: Path, others: Checks) -> Iterator[Change]:
     except OutputError as error:
         yield Change(database, f"damaged: {error}")
         return
-    lengths = [(str(f.estimate.track_id), lengths_row(f.estimate)) for f in fish.values()]
-    yield from _csv(
-        folder / "lengths.csv", LENGTHS_COLUMNS, dict(lengths), witness=DATABASE, whole=True
-    )
+    lengths = {
+        str(track_id): lengths_row(one.estimate, may_count_twice=one.may_count_twice)
+        for track_id, one in fish.items()
+    }
+    yield from _csv(folder / "lengths.csv", LENGTHS_COLUMNS, lengths, witness=DATABASE, whole=True)
     frames: dict[str, list[str]] = {}
     for recording in _recordings(folder):
         yield from _recording(recording, runs, fish, frames)

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,6 +39,7 @@ class RunSummary:
     """The results of a run."""
 
     fish: Sequence[LengthEstimate]  # final, by track id; of an endless source the last 100
+    may_count_twice: Collection[int]  # the ids of those that were in view at a crash
     num_frames: int  # that went through the whole chain
     frames_promised: int | None  # by the source; None where it doesn't
     elapsed_s: float
@@ -194,6 +195,7 @@ def _run_chain(
         raise
     return RunSummary(
         fish=totals.fish(),
+        may_count_twice=outputs.store.may_count_twice(),
         num_frames=totals.num_frames,
         frames_promised=inputs.source.num_frames,
         elapsed_s=time.perf_counter() - began,

@@ -9,9 +9,8 @@ from stream_dmr.messages import FishCrop, Frame, LengthEstimate, LocalizedFish, 
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.lengths_table import LengthsTable
+from stream_dmr.results.store_rows import INTERRUPTED
 from stream_dmr.running.drift_alarms import DriftAlarms
-
-INTERRUPTED = "interrupted by a restart, finished with what was recorded; it may count twice"
 
 
 class ResultWriter:

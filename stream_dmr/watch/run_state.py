@@ -4,6 +4,7 @@ import shutil
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from stream_dmr.sources.source import Source
 
 _MAX_FRAMES = 16  # more than the chain's queues hold, so that a fish finds its frame
 _MAX_FISH = 4 * _MAX_FRAMES  # in these frames
-_MAX_FINISHED = 20  # in the page's table
+MAX_FINISHED = 20  # in the page's table
 _MAX_WARNINGS = 50
 _MAX_FITS = 1000  # for quantiles of their time
 _HOUR_S = 3600.0
@@ -61,7 +62,7 @@ class RunState:
         self.source = source
         self.chain: Chain | None = None
         self.sinks = sinks or SinkStates()
-        self.finished: deque[LengthEstimate] = deque(maxlen=_MAX_FINISHED)  # newest last
+        self.finished: deque[LengthEstimate] = deque(maxlen=MAX_FINISHED)  # newest last
         self.num_fish: Counter[str] = Counter()  # finished ones, by status
         self.fit_s: deque[float] = deque(maxlen=_MAX_FITS)
         self._out_dir = out_dir
@@ -75,6 +76,12 @@ class RunState:
         self._frames_done_s: deque[float] = deque(maxlen=_MAX_RATE_FRAMES)
         self._fish_done_s: deque[float] = deque(maxlen=_MAX_HOURLY_FISH)
         self._warnings: dict[str, RepeatedWarning] = {}  # the latest last
+
+    def continue_after(self, counts: Mapping[str, int], finished: Iterable[LengthEstimate]) -> None:
+        """Begin with the fish of earlier runs in the folder: their number by status, the last."""
+        for status, number in counts.items():
+            self.num_fish[without_counts(status)] += number
+        self.finished.extend(finished)
 
     def take(self, message: Message) -> None:
         """Keep what the page shows of a message; no picture is copied."""

@@ -19,6 +19,7 @@ from stream_dmr.messages import FishCrop, FittedMesh, Frame, LocalizedFish, Mess
 from stream_dmr.recording.messages.picture_codec import checksum
 from stream_dmr.recording.messages.record import make_record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
+from stream_dmr.recording.reading.frame_images import SourcePictures
 from stream_dmr.recording.reading.rrd_conversion import convert
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.rerun.live_view import LiveView
@@ -152,9 +153,9 @@ def test_another_source_is_refused(clip: Path, tmp_path: Path):
         for index in (1, 2, 3)
     ]
     with pytest.raises(SourceError, match="not the recorded one"):
-        convert(clip / "out" / "recording.mcap", tmp_path / "a.rrd", frames=frames)
+        convert(clip / "out" / "recording.mcap", tmp_path / "a.rrd", source=SourcePictures(frames))
     with pytest.raises(SourceError, match="ends before it"):
-        convert(clip / "out" / "recording.mcap", tmp_path / "a.rrd", frames=[])
+        convert(clip / "out" / "recording.mcap", tmp_path / "a.rrd", source=SourcePictures([]))
     assert not (tmp_path / "a.rrd").exists()
 
 

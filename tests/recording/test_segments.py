@@ -27,8 +27,10 @@ from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.segments.repair import repair_recordings
 from stream_dmr.recording.segments.rotating_sink import open_segments
+from stream_dmr.report.view_pictures import frame_images, recorded_source
 from stream_dmr.results.frames_table import FramesTable
-from stream_dmr.running.result_writer import INTERRUPTED
+from stream_dmr.results.store_rows import INTERRUPTED, MAY_COUNT_TWICE
+from stream_dmr.results.verify import verify
 from tests.running.test_run_signals import start, wait_for_rows
 from tests.support.command import invoke, rows
 from tests.support.reading import read_messages
@@ -275,6 +277,7 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     outcome = invoke("run", options)
     assert outcome.code == 0, outcome.err
     assert "left unfinished by a crash" in outcome.err
+    assert MAY_COUNT_TWICE in outcome.out  # in the table of fish
     return out
 
 
@@ -320,8 +323,29 @@ def test_fish_in_view_at_a_crash_are_finished_by_the_restart_and_say_so(interrup
     assert max(fish) > max(flagged)  # it came into view again
     recorded = Counter(m.track_id for m in localized(interrupted))
     assert {track_id: seen for track_id, (seen, _) in fish.items()} == recorded
-    exported = {int(row["track_id"]) for row in rows(interrupted / "lengths.csv")}
-    assert exported == set(fish)
+    exported = {int(row["track_id"]): row["status"] for row in rows(interrupted / "lengths.csv")}
+    assert exported.keys() == fish.keys()
+    assert {i for i, status in exported.items() if MAY_COUNT_TWICE in status} == flagged
+    assert all("recovered after a crash" in change.what for change in verify(interrupted)[0])
+
+
+def test_every_frame_of_clips_is_found_again_over_a_restart(interrupted: Path):
+    recording = open_recordings([interrupted])
+    frames = {m.frame_index for m in read_messages(interrupted, [Frame])}
+    source = recorded_source(recording)
+    assert source == str(interrupted.parent / "clips")
+    found = [index for index, _ in frame_images(recording, frames, source, is_given=True)]
+    assert sorted(set(found)) == sorted(frames)
+
+
+def test_a_report_takes_a_folder_of_clips(interrupted: Path, tmp_path: Path):
+    page = tmp_path / "page.html"
+    options = {"--source": str(interrupted.parent / "clips"), "--out": str(page)}
+    outcome = invoke(f"report {interrupted}", options)
+    assert outcome.code == 0, outcome.err
+    assert MAY_COUNT_TWICE in page.read_text()
+    options = {"--source": str(interrupted), "--out": str(page)}
+    assert invoke(f"report {interrupted}", options).code == 2
 
 
 def localized(path: Path) -> list[LocalizedFish]:

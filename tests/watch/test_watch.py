@@ -19,6 +19,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from stream_dmr.errors import ConfigError, OutputError
 from stream_dmr.messages import LengthEstimate
+from stream_dmr.results.length_store import LengthStore
 from stream_dmr.running.config import Config
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_observer import RunObserver
@@ -27,12 +28,14 @@ from stream_dmr.running.run_settings import WatchSettings
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
 from stream_dmr.watch.json_log import JsonLog
-from stream_dmr.watch.run_state import RunState
+from stream_dmr.watch.run_state import MAX_FINISHED, RunState
 from stream_dmr.watch.systemd import SystemdWatchdog
 from stream_dmr.watch.watch_observer import WatchObserver
 from stream_dmr.watch.watch_server import WatchServer
 from tests.support.browser import chromium
 from tests.support.camera import free_port
+from tests.support.final_estimates import FACTS
+from tests.support.final_estimates import fish as finished_fish
 from tests.support.recorded_run import HEIGHT, WIDTH
 from tests.support.recorded_run import run as recorded_messages
 from tests.support.tiny_clip import write_clip
@@ -128,6 +131,17 @@ def test_health_knows_every_output(server: WatchServer, state: RunState):
     assert (code, again["state"], again["last_error"]) == (200, "works", "no such folder")
     assert again["since"] >= fails["since"]
     assert metrics_of(server.address)["stream_dmr_output_works", "recording-*.mcap"] == 1
+
+
+def test_the_page_counts_on_after_a_restart(state: RunState, tmp_path: Path):
+    store = LengthStore(tmp_path, FACTS)
+    for track_id in range(1, 30):
+        store.add(finished_fish(track_id, length_mm=None if track_id == 3 else 800.0))
+    before = sum(state.num_fish.values())
+    state.continue_after(store.counts(), store.estimates(last=MAX_FINISHED))
+    store.close()
+    assert sum(state.num_fish.values()) == before + 29
+    assert [fish.track_id for fish in state.finished] == list(range(10, 30))
 
 
 def test_others_need_the_token(state: RunState, tmp_path: Path):

@@ -1,8 +1,10 @@
 """Gives recorded frames their images, where the recording holds none or only lossy ones."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from itertools import chain
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -15,6 +17,10 @@ from stream_dmr.recording.messages.picture_codec import checksum
 from stream_dmr.recording.messages.selection import Selection
 from stream_dmr.recording.messages.topics import KEY_FRAME_NS
 from stream_dmr.recording.reading.open_recording import Recording
+from stream_dmr.sources.clip_folder import clips_in
+from stream_dmr.sources.open_source import open_source
+from stream_dmr.sources.read_settings import ReadFramesSettings
+from stream_dmr.sources.video_file import VideoFile
 
 
 @runtime_checkable
@@ -57,6 +63,59 @@ class SourcePictures:
                 "give the source that was recorded"
             )
         return restored
+
+
+class ClipPictures:
+    """The images of a folder of clips: each frame is found in its clip by its checksum.
+
+    Frames are numbered over all clips and restarts, so their numbers say nothing of the clips.
+    """
+
+    def __init__(self, folder: Path, settings: ReadFramesSettings) -> None:
+        self._folder, self._settings = folder, settings
+        self._name = ""  # of the open clip
+        self._video: VideoFile | None = None
+        self._frames: Iterator[Frame] = iter(())
+
+    def restore(self, frame: Frame, payload: bytes) -> Frame:
+        """The frame with its image. Raises SourceError where its clip doesn't have it."""
+        if has_original_pixels(frame, payload):
+            return frame
+        crc32 = stored_picture(payload).crc32
+        is_open = self._name == frame.source
+        for _ in range(1 + is_open):  # after a restart a clip goes on from before where it was
+            if not is_open:
+                self._open(frame.source)
+            for found in self._frames:
+                if checksum(found.image) == crc32:
+                    return replace(frame, image=found.image)
+            is_open = False
+        raise SourceError(
+            f"{self._folder / frame.source}: expected the picture of frame {frame.frame_index}, "
+            "found none with its checksum; give the folder that was recorded"
+        )
+
+    def close(self) -> None:
+        """Release the open clip."""
+        if self._video is not None:
+            self._video.close()
+
+    def _open(self, name: str) -> None:
+        self.close()
+        self._name, self._frames = name, iter(())
+        self._video = VideoFile(self._folder / Path(name).name, self._settings)
+        self._frames = iter(self._video)
+
+
+@contextmanager
+def open_pictures(source: str, settings: ReadFramesSettings) -> Generator[FrameRestorer]:
+    """The images of a source that was recorded. Raises SourceError where it can't be read."""
+    if Path(source).is_dir() and clips_in(Path(source)):
+        with closing(ClipPictures(Path(source), settings)) as pictures:
+            yield pictures
+    else:
+        with closing(open_source(source, settings)) as frames:
+            yield SourcePictures(frames)
 
 
 class RecordedPictures:

@@ -1,6 +1,6 @@
 """Converts a recording into an .rrd: the view drawn again, with every frame."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from stream_dmr.recording.messages.record import Record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.messages.topics import TOPICS
-from stream_dmr.recording.reading.frame_images import RecordedPictures, SourcePictures
+from stream_dmr.recording.reading.frame_images import FrameRestorer, RecordedPictures
 from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
 from stream_dmr.recording.rerun.rrd_sink import RrdSink
 from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
@@ -22,20 +22,20 @@ def convert(
     recording: Path,
     rrd: Path,
     *,
-    frames: Iterable[Frame] | None = None,
+    source: FrameRestorer | None = None,
     settings: RecordingSettings = EVERY_FRAME,
     selection: Selection = EVERYTHING,
 ) -> Sequence[str]:
     """Draw the selected messages of a recording into `rrd`, which can be replayed as well.
 
-    Pictures are those of `frames`, the source; without it those that the recording holds. Returns
+    Pictures are those of `source`; without it those that the recording holds. Returns
     what is lost of the recording, one line each. Raises RecordingError where the recording can't be
     read, SourceError where a picture is not the recorded one, OutputError where `rrd` can't be
     written.
     """
     opened = open_recordings([recording])
     meshes = MeshRebuilder(opened.header.template, opened.header.candidates)
-    pictures = RecordedPictures(opened, selection) if frames is None else SourcePictures(frames)
+    pictures = source or RecordedPictures(opened, selection)
     unfinished = rrd.with_name(f"{rrd.name}.part")
     with closing(RrdSink(unfinished, opened.header, settings)) as sink:
         for message, payload in decoded_messages(opened, list(TOPICS), selection):
