@@ -184,7 +184,13 @@ def test_a_part_is_shown_and_exported_alone(clip: Path, tmp_path: Path):
     part = {"--time": "0.05:0.15", "--track": "1"}
     rrd = tmp_path / "part.rrd"
     for recording in ("recording.mcap", "recording.rrd"):
-        assert invoke(f"convert {clip / 'out' / recording}", part | {"--out": str(rrd)}).code == 0
+        assert (
+            invoke(
+                f"convert {clip / 'out' / recording}",
+                part | {"--out": str(rrd), "--overwrite": None},
+            ).code
+            == 0
+        )
         for entity in ("/scene/fish/1/mesh", "/messages/frame", "/messages/fit"):
             assert drawn(rrd, entity) == [2]
     options = {"--out": str(tmp_path), "--tables": "csv", "--masks": None} | part
