@@ -11,6 +11,6 @@ def rerun_program() -> str:
 
 
 def copy_readable_chunks(rrd: Path, target: Path) -> None:
-    """Write what can be read of an .rrd into `target`, with a footer; no file where nothing can."""
+    """Write what can be read of an .rrd into `target`, with a footer."""
     command = [rerun_program(), "rrd", "filter", "--continue-on-error", str(rrd), "-o", str(target)]
     subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

@@ -1,0 +1,90 @@
+"""A folder of pictures as a source: their order, depth, brightness and gaps."""
+
+import cv2
+import numpy as np
+import pytest
+
+from stream_dmr.errors import SourceError
+from stream_dmr.sources.open_source import open_source
+from stream_dmr.sources.picture_folder import PictureFolder
+from stream_dmr.sources.read_settings import ReadFramesSettings
+from tests.support.sources import SETTINGS, noise, read, refusal
+
+
+def test_a_closed_folder_gives_no_more_frames(tmp_path):
+    for number in (1, 2, 3):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), noise(number))
+    folder = PictureFolder(tmp_path, fps=25.0)
+    frames = iter(folder)
+    next(frames)
+    folder.close()
+    assert list(frames) == []
+
+
+def test_pictures_in_natural_order(tmp_path):
+    for number in (10, 9, 1, 2):
+        cv2.imwrite(str(tmp_path / f"fish_{number}.png"), noise(number))
+    (tmp_path / "notes.txt").write_text("not a picture")
+    (tmp_path / "._fish_1.png").write_bytes(b"left behind by another system")
+    settings = ReadFramesSettings(images_fps=12.5)
+    opened = open_source(str(tmp_path), settings)
+    frames = list(opened)
+    assert [f.source for f in frames] == [f"fish_{n}.png" for n in (1, 2, 9, 10)]
+    assert [f.timestamp_ns for f in frames] == [0, 80_000_000, 160_000_000, 240_000_000]
+    assert (opened.num_frames, opened.fps, opened.name) == (4, 12.5, tmp_path.name)
+    for frame, number in zip(frames, (1, 2, 9, 10), strict=True):
+        np.testing.assert_array_equal(frame.image, noise(number))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".JPG"])
+def test_grey_pictures_become_three_equal_channels(tmp_path, suffix):
+    grey = noise(1, channels=1, size=(33, 21)) // 8 + 100
+    cv2.imwrite(str(tmp_path / f"1{suffix}"), grey)
+    _, [frame] = read(tmp_path)
+    assert frame.image.shape == (21, 33, 3)
+    assert frame.image.dtype == np.uint8
+    tolerance = 24 if suffix == ".JPG" else 0
+    assert np.abs(frame.image.astype(int) - grey[..., None].astype(int)).max() <= tolerance
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("suffix", [".png", ".tiff"])
+def test_16_bit_pictures_keep_their_brightness(tmp_path, channels, suffix):
+    eight = noise(2, channels=channels)
+    cv2.imwrite(str(tmp_path / f"1{suffix}"), eight.astype(np.uint16) * 257)
+    _, [frame] = read(tmp_path)
+    np.testing.assert_array_equal(frame.image, eight if channels == 3 else np.dstack([eight] * 3))
+
+
+def test_12_bits_in_16_are_not_read_as_night(tmp_path):
+    cv2.imwrite(str(tmp_path / "1.png"), np.zeros((20, 30), np.uint16))  # the lens cap is on
+    cv2.imwrite(str(tmp_path / "2.png"), np.full((20, 30), 4095, np.uint16))
+    cv2.imwrite(str(tmp_path / "3.png"), np.full((20, 30), 2048, np.uint16))
+    _, frames = read(tmp_path)
+    assert [int(f.image.max()) for f in frames] == [0, 255, 128]
+
+
+def test_a_picture_that_cannot_be_decoded_keeps_its_index(tmp_path):
+    for number in (1, 3):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), noise(number))
+    (tmp_path / "2.png").touch()
+    opened, frames = read(tmp_path)
+    assert [f.frame_index for f in frames] == [1, 3]
+    assert opened.warnings == ["2.png: can't be decoded, so was left out"]
+
+
+def test_pictures_of_two_sizes_are_refused_after_those_before(tmp_path):
+    cv2.imwrite(str(tmp_path / "1.png"), noise(1))
+    cv2.imwrite(str(tmp_path / "2.png"), noise(2, size=(32, 48)))
+    opened = iter(open_source(str(tmp_path), SETTINGS))
+    assert next(opened).frame_index == 1
+    with pytest.raises(SourceError, match=r"2\.png: expected 64x48 px.* got 32x48 px"):
+        next(opened)
+
+
+def test_refuses_folders_without_pictures(tmp_path):
+    assert "found none" in refusal(tmp_path)
+    (tmp_path / "1.png").write_bytes(b"no picture")
+    assert "none of its 1 can be decoded" in refusal(tmp_path)
+    (tmp_path / "1.png").rename(tmp_path / "1.mp4")
+    assert "1.mp4: expected a video" in refusal(tmp_path)
