@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.cold_start import cold_starts
-from stream_dmr.fitting.contour.contour_solver import ContourSolver, loss_of
+from stream_dmr.fitting.contour.contour_solver import ContourSolver
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.outline import project
 from stream_dmr.fitting.contour.problem import Problem
@@ -19,6 +19,7 @@ from stream_dmr.fitting.heading import is_reversed
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import ROOT_ROTATION
 from stream_dmr.fitting.shape.candidates import CandidateShape
+from stream_dmr.fitting.shape.evidence import nats_against
 from stream_dmr.fitting.shape.length_std import freed, shape_std_ratio
 from stream_dmr.fitting.shape.space import (
     TRUNK,
@@ -124,13 +125,13 @@ class Fitter:
         return Solved(target, solution, is_cold, None, began)
 
     def nats(self, solved: Solved) -> float:
-        """Negative log likelihood and prior of a solution, by which shapes can be compared."""
-        if solved.target is None or solved.solution is None:
+        """What a mask says against this shape, by which shapes can be compared; NaN: nothing."""
+        if solved.target is None or solved.solution is None or not _is_finite(solved.solution):
             return float("nan")
         problem = Problem.from_settings(
             self._settings, self._levels.fine, solved.target, with_smoothness=False
         )
-        return loss_of(problem, solved.solution.parameters) / self._settings.nat
+        return nats_against(problem, solved.solution.parameters, nat=self._settings.nat)
 
     def answer(self, crop: FishCrop, solved: Solved) -> Fit:
         """The second half: the message, at the size that is to be expected of the fish."""

@@ -32,8 +32,8 @@ _MAX_FOR, _MAX_AGAINST = 20.0, -6.0
 class _Group:
     """Fish that share a shape, and the body form that it is near to."""
 
-    def __init__(self, form: CandidateShape, frames: list[PosedTarget], stock: Stock) -> None:
-        self.form, self.frames, self.stock = form, frames, stock
+    def __init__(self, form: CandidateShape, stock: Stock) -> None:
+        self.form, self.stock = form, stock
 
     @property
     def num_fish(self) -> int:
@@ -116,7 +116,7 @@ class _StockLearner:
             for a, b in pairs:
                 if (a, b) not in joined:
                     joined[a, b] = self._learn(
-                        a.form, _copies(a.frames + b.frames), a.stock.coefficients
+                        a.form, a.stock.frames + b.stock.frames, a.stock.coefficients
                     )
             a, b = min(pairs, key=lambda pair: _evidence_for_two(*pair, joined[pair]))
             if _evidence_for_two(a, b, joined[a, b]) > 0:
@@ -131,18 +131,21 @@ class _StockLearner:
         shares = np.log([group.num_fish for group in groups])
         frames: list[list[PosedTarget]] = [[] for _ in groups]
         by_fish: dict[int, list[PosedTarget]] = {}
-        for frame in (frame for group in groups for frame in group.frames):
+        for frame in (frame for group in groups for frame in group.stock.frames):
             by_fish.setdefault(frame.fish, []).append(frame)
         for found in by_fish.values():
             options = [[search(frame) for frame in found] for search in searches]
             nats = [
-                list(self._fitter.nats(_copies(option), shape).values())
+                list(self._fitter.nats([one.copy() for one in option], shape).values())
                 for option, shape in zip(options, shapes, strict=True)
             ]
             best = int(np.argmin(_FRAMES_WORTH * np.mean(nats, axis=1) - shares))
             frames[best] += options[best]
         return [
-            self._learn(group.form, own, group.stock.coefficients, with_volumes=True)
+            _Group(
+                group.form,
+                self._fitter.best(own, group.form.coefficients, group.stock.coefficients),
+            )
             for group, own in zip(groups, frames, strict=True)
             if own
         ]
@@ -152,11 +155,8 @@ class _StockLearner:
         form: CandidateShape,
         frames: list[PosedTarget],
         start: Float[np.ndarray, "W"],
-        *,
-        with_volumes: bool = False,
     ) -> _Group:
-        stock = self._fitter.fit(frames, form.coefficients, start, with_volumes=with_volumes)
-        return _Group(form, frames, stock)
+        return _Group(form, self._fitter.fit(frames, form.coefficients, start))
 
     def _search(self, coefficients: Float[np.ndarray, "W"]) -> Callable[[PosedTarget], PosedTarget]:
         """Seeks the pose of a frame from cold, with a template of this shape."""
@@ -170,10 +170,6 @@ class _StockLearner:
             return PosedTarget(frame.fish, frame.target, found.parameters)
 
         return search
-
-
-def _copies(frames: Sequence[PosedTarget]) -> list[PosedTarget]:
-    return [PosedTarget(frame.fish, frame.target, frame.pose) for frame in frames]
 
 
 def _evidence_for_two(a: _Group, b: _Group, both: _Group) -> float:

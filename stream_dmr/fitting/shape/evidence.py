@@ -1,0 +1,32 @@
+"""How well a mask agrees with a shape: not in one pose alone, but in all that are likely.
+
+The best pose is not the mean one. A body that is too broad can always roll a little, one that is
+too narrow can't; but where it must roll, it must do so exactly, so that fewer of its poses fit.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
+from stream_dmr.fitting.contour.normal_equations import normal_equations
+from stream_dmr.fitting.contour.problem import Problem
+from stream_dmr.fitting.contour.regularisers import prior_loss
+from stream_dmr.fitting.shape.roll import ROLL_STD_RAD, roll_rad, roll_slope
+from stream_dmr.fitting.size.scanner import LOG_VOLUME_WEIGHT
+
+
+def nats_against(problem: Problem, pose: Float[np.ndarray, "P"], *, nat: float) -> float:
+    """-log of the likelihood of a mask around a fitted pose, up to a constant: for comparisons.
+
+    The loss and its priors, that of the roll, and half the log determinant of their curvature
+    (Laplace's method), with the weight that it has in the scan of sizes. `nat` is the loss that
+    stands for one.
+    """
+    here = evaluate(problem, pose, False)
+    loss = float(here.terms @ problem.lambdas) + prior_loss(problem, pose)
+    H, _ = normal_equations(problem, pose, here.rendering)
+    anchor = problem.target.anchor
+    roll, slope = roll_rad(pose, anchor) / ROLL_STD_RAD, roll_slope(pose, anchor) / ROLL_STD_RAD
+    curvature = H / nat + np.outer(slope, slope) + 1e-9 * np.eye(len(H))
+    log_volume = 0.5 * float(np.linalg.slogdet(curvature)[1])
+    return loss / nat + 0.5 * roll**2 + LOG_VOLUME_WEIGHT * log_volume

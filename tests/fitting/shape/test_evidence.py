@@ -1,0 +1,50 @@
+"""Evidence: a shape that only fits rolled in one way has less of it than one that fits at rest."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stream_dmr.fitting.body import Body
+from stream_dmr.fitting.contour.levenberg_marquardt import COLD_DAMPING, minimise
+from stream_dmr.fitting.contour.problem import Options, Problem
+from stream_dmr.fitting.fit_settings import FitMeshSettings
+from stream_dmr.fitting.parameters import ROOT_ROTATION
+from stream_dmr.fitting.shape.evidence import nats_against
+from stream_dmr.fitting.shape.roll import roll_rad
+from stream_dmr.fitting.shape.space import reshaped
+from stream_dmr.fitting.target import Target
+from tests.support.stocks import TEMPLATE, TOWARD_CAMERA, broader, fish_of
+
+SETTINGS = FitMeshSettings(max_faces=600)
+
+
+def fitted(log_breadth, sample, *, rolled_by=0.0):
+    """The problem of a body on a mask, and the pose that a descent from the true one ends in."""
+    target = Target.from_crop(sample.crop, plane_normal=TOWARD_CAMERA)
+    body = Body.from_template(reshaped(TEMPLATE, broader(log_breadth)))
+    problem = Problem.from_settings(SETTINGS, body, target, with_smoothness=False)
+    start = sample.pose.copy()
+    turned = Rotation.from_rotvec(start[ROOT_ROTATION]) * Rotation.from_euler("x", rolled_by)
+    start[ROOT_ROTATION] = turned.as_rotvec()
+    nothing = np.zeros(len(start), np.bool_)
+    return problem, minimise(problem, start, nothing, Options(60, 1e-9, COLD_DAMPING))
+
+
+@pytest.mark.parametrize("track_id", [3, 8])
+def test_a_broad_body_that_rolls_to_fit_has_less_evidence_than_the_true_one(track_id):
+    [sample] = fish_of(broader(0.0), track_id=track_id, num_frames=1).samples
+    own, found = fitted(0.0, sample)
+    broad, rolled = fitted(0.25, sample, rolled_by=0.6)
+    assert abs(roll_rad(rolled.parameters, broad.target.anchor)) > 0.3
+    by_evidence = nats_against(broad, rolled.parameters, nat=SETTINGS.nat) - nats_against(
+        own, found.parameters, nat=SETTINGS.nat
+    )
+    assert by_evidence > 0
+
+
+def test_evidence_is_the_same_for_the_same_pose():
+    [sample] = fish_of(broader(0.0), track_id=1, num_frames=1).samples
+    problem, found = fitted(0.0, sample)
+    once, again = (nats_against(problem, found.parameters, nat=SETTINGS.nat) for _ in range(2))
+    assert once == again
+    assert np.isfinite(once)

@@ -1,0 +1,69 @@
+"""Roll: known turns come back, slopes are finite differences, and what roll hides is found."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from stream_dmr.fitting.parameters import ROOT_ROTATION, rest_vector
+from stream_dmr.fitting.shape.roll import narrowed, roll_rad, roll_slope, unrolled
+from stream_dmr.fitting.shape.space import BREADTH, reshaped
+from tests.support.stocks import TEMPLATE, broader
+
+RAY = np.array([0.1, -0.05, 1.0])
+thirty = settings(max_examples=30)
+angles = st.floats(-1.2, 1.2)
+rotations = st.integers(0, 2**32 - 1).map(lambda seed: Rotation.random(random_state=seed))
+
+
+def pose_of(rotation):
+    pose = rest_vector(2)
+    pose[ROOT_ROTATION] = rotation.as_rotvec()
+    return pose
+
+
+@thirty
+@given(in_plane=st.floats(-3.1, 3.1), roll=angles)
+def test_a_turn_about_the_own_axis_is_the_roll(in_plane, roll):
+    """Also for a fish that shows its other side, and one that swims the other way."""
+    toward = np.array([0.0, 0.0, 1.0])
+    flat = Rotation.from_euler("z", in_plane)
+    for side in (0.0, np.pi):
+        rotation = flat * Rotation.from_euler("x", side + roll)
+        assert roll_rad(pose_of(rotation), toward) == pytest.approx(-roll, abs=1e-9)
+
+
+@thirty
+@given(rotation=rotations)
+def test_an_unrolled_fish_has_its_axis_and_no_roll(rotation):
+    pose = unrolled(pose_of(rotation), RAY)
+    assert roll_rad(pose, RAY) == pytest.approx(0.0, abs=1e-7)
+    turned = Rotation.from_rotvec(pose[ROOT_ROTATION])
+    np.testing.assert_allclose(turned.apply([1, 0, 0]), rotation.apply([1, 0, 0]), atol=1e-9)
+
+
+@thirty
+@given(rotation=rotations)
+def test_the_slope_is_a_finite_difference(rotation):
+    pose, step = pose_of(rotation), 1e-6
+    slope = roll_slope(pose, RAY)
+    for p in range(3):
+        ahead, behind = pose.copy(), pose.copy()
+        ahead[p] += step
+        behind[p] -= step
+        gap = roll_rad(ahead, RAY) - roll_rad(behind, RAY)
+        gap = (gap + np.pi / 2) % np.pi - np.pi / 2  # beyond a right angle the other side is seen
+        assert gap / (2 * step) == pytest.approx(slope[p], rel=1e-3, abs=1e-3)
+    assert not slope[3:].any()
+
+
+@pytest.mark.parametrize("roll", [0.0, 0.3, 0.9])
+def test_a_narrowed_body_shows_what_the_broad_one_shows_rolled(roll):
+    broad = broader(0.2)
+    body = reshaped(TEMPLATE, broad).rest_vertices
+    seen = np.abs(Rotation.from_euler("x", roll).apply(body)[:, 1])
+    narrow = reshaped(TEMPLATE, narrowed(TEMPLATE, broad, roll)).rest_vertices
+    assert np.abs(narrow[:, 1]).max() == pytest.approx(seen.max(), rel=0.03)
+    if roll == 0.0:
+        np.testing.assert_allclose(narrowed(TEMPLATE, broad, roll)[BREADTH], broad[BREADTH])
