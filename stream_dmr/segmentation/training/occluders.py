@@ -42,6 +42,26 @@ def draw_line(rng: np.random.Generator, start: Float[np.ndarray, "2"]) -> Occlud
     return Occluder(polygons=bars, tones=[1.0] * len(bars), colour=shade, hides=False)
 
 
+def draw_ruler(rng: np.random.Generator, along_rad: float) -> Occluder:
+    """A ruler or a measuring tape beside the fish, along it, with its marks."""
+    along, width = _direction(along_rad + rng.normal(0.0, 0.06)), rng.uniform(0.02, 0.1)
+    beside = along[::-1] * [-1.0, 1.0]  # at a right angle
+    side = rng.choice([-1.0, 1.0])
+    middle = side * (rng.uniform(0.08, 0.4) + width / 2) * beside + rng.normal(0.0, 0.2) * along
+    half = rng.uniform(0.4, 1.5)
+    polygons, tones = [_strip(middle - half * along, middle + half * along, width)], [1.0]
+    edge = middle + rng.choice([-0.5, 0.5]) * width * beside
+    inwards = np.sign((middle - edge) @ beside) * rng.uniform(0.3, 0.9) * width * beside
+    mark, pitch = rng.uniform(0.1, 0.6), rng.uniform(0.03, 0.1)
+    for place in np.arange(-half + pitch, half, pitch):
+        start = edge + place * along
+        polygons.append(_strip(start, start + inwards, rng.uniform(0.1, 0.3) * pitch))
+        tones.append(mark)
+    yellow_or_white = [40, 205, 235] if rng.random() < 0.5 else [225, 230, 230]
+    colour = np.array(yellow_or_white) * rng.uniform(0.6, 1.05)
+    return Occluder(polygons=polygons, tones=tones, colour=colour, hides=True)
+
+
 def draw_into(
     occluder: Occluder, crop_from_scene: Float[np.ndarray, "2 3"], *, size: int
 ) -> tuple[Float32[np.ndarray, "S S"], Float32[np.ndarray, "S S"]]:
@@ -144,6 +164,15 @@ def _bar(
     turns = angle + np.linspace(np.pi / 2, 3 * np.pi / 2, 7)
     cap = np.column_stack([np.cos(turns), np.sin(turns)])
     return np.concatenate([start + width / 2 * cap, end - end_width / 2 * cap])
+
+
+def _strip(
+    start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"], width: float
+) -> Float[np.ndarray, "4 2"]:
+    """A bar with square ends."""
+    along = (end - start) / (np.linalg.norm(end - start) + 1e-9)
+    beside = width / 2 * along[::-1] * [-1.0, 1.0]
+    return np.array([start + beside, end + beside, end - beside, start - beside])
 
 
 def _blob(rng: np.random.Generator, center: np.ndarray, size: float) -> Float[np.ndarray, "_ 2"]:

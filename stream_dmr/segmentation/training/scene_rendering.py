@@ -39,7 +39,7 @@ def render_scene(
     for fish in scene.fish:
         layer = warp_fish(bank, fish, crop_from_scene, size=SIZE_PX)
         if shadow is not None:
-            picture = picture * (1 - _cast(shadow, layer[..., 3])[..., None])
+            picture = picture * (1 - cast_shadow(shadow, layer[..., 3])[..., None])
         mask *= 1 - layer[..., 3]
         if fish in targets:
             mask += layer[..., 3]
@@ -58,7 +58,9 @@ def render_scene(
 
 
 @dataclass(frozen=True)
-class _CastShadow:
+class CastShadow:
+    """How the fish of a scene cast shadows on what is behind them."""
+
     offset_px: Float[np.ndarray, "2"]  # from a fish to its shadow, x, y
     blur_px: float
     strength: float  # fraction of the light that is missing in its middle
@@ -66,18 +68,20 @@ class _CastShadow:
 
 def _draw_shadow_kind(
     rng: np.random.Generator, crop_from_scene: Float[np.ndarray, "2 3"]
-) -> _CastShadow:
+) -> CastShadow:
     """The shadow under one random lamp, 2 to 20 % of a fish's length beside the fish."""
     angle_rad, length = rng.uniform(0.0, 2 * np.pi), rng.uniform(0.02, 0.2)
     scale = crop_from_scene[0, 0]  # crop px per fish length
-    return _CastShadow(
+    return CastShadow(
         offset_px=scale * length * np.array([np.cos(angle_rad), np.sin(angle_rad)]),
         blur_px=scale * length * rng.uniform(0.05, 0.5) + 0.3,
         strength=rng.uniform(0.2, 0.85),
     )
 
 
-def _cast(shadow: _CastShadow, coverage: Float32[np.ndarray, "S S"]) -> Float32[np.ndarray, "S S"]:
+def cast_shadow(
+    shadow: CastShadow, coverage: Float32[np.ndarray, "S S"]
+) -> Float32[np.ndarray, "S S"]:
     """The fraction of the light that is missing in each pixel."""
     shift = np.column_stack([np.eye(2), shadow.offset_px])
     moved = cv2.warpAffine(coverage, shift, coverage.shape[::-1], flags=cv2.INTER_LINEAR)

@@ -10,7 +10,12 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.segmentation.training.fish_patches import PATCH_PX
-from stream_dmr.segmentation.training.occluders import Occluder, draw_line, draw_occluders
+from stream_dmr.segmentation.training.occluders import (
+    Occluder,
+    draw_line,
+    draw_occluders,
+    draw_ruler,
+)
 from stream_dmr.segmentation.training.patch_bank import PatchBank
 
 
@@ -62,6 +67,9 @@ def draw_scene(rng: np.random.Generator, bank: PatchBank) -> TrainingScene:
         head_px = bank.ends_px[fish.patch][0]
         if rng.random() < 0.4 and np.isfinite(head_px).all():
             occluders.append(draw_line(rng, fish.to_scene(head_px)))
+    if rng.random() < 0.1:  # fish are laid beside rulers; without any those were taken for fish
+        along = target.scene_from_patch[:, 0]
+        occluders.append(draw_ruler(rng, float(np.arctan2(along[1], along[0]))))
     return TrainingScene(
         behind=behind, target=target, before=before, occluders=occluders, frame=_draw_frame(rng)
     )

@@ -2,11 +2,17 @@
 
 import cv2
 import numpy as np
+import pytest
 
+from stream_dmr.errors import AnnotationError
 from stream_dmr.segmentation.training.annotated_samples import (
+    cutout_patch,
     draw_annotated_sample,
+    load_backgrounds,
     load_fish_cutouts,
 )
+from stream_dmr.segmentation.training.fish_patches import PATCH_PX
+from stream_dmr.segmentation.training.random_backgrounds import BACKGROUND_PX
 
 
 def test_fish_are_cut_out_whole_and_validation_fish_apart(vessel):
@@ -26,3 +32,31 @@ def test_a_rotated_crop_rotates_the_mask(vessel):
         inside = sample.mask > 0.5
         assert bright[inside].mean() > bright[~inside].mean() + 20
         assert (inside & (sample.in_box > 0.5)).sum() > 0.8 * inside.sum()
+
+
+def test_a_patch_is_the_fish_alone_lying_along_it(vessel):
+    training, _ = load_fish_cutouts(vessel / "images", vessel / "masks")
+    for cut in training:
+        patch = cutout_patch(cut)
+        covered = patch[..., 3] > 127
+        rows, columns = np.nonzero(covered)
+        assert not covered[[0, -1]].any()
+        assert not covered[:, [0, -1]].any()
+        assert np.ptp(columns) == pytest.approx(PATCH_PX - 8, abs=6)
+        assert np.ptp(rows) < 0.7 * np.ptp(columns)
+        assert patch[covered][:, :3].mean() > 110  # the fish's colour; around it is dark
+        assert not patch[patch[..., 3] == 0].any()
+
+
+def test_backgrounds_are_the_middle_of_photographs(tmp_path):
+    image = np.zeros((100, 300, 3), np.uint8)
+    image[:, 110:190] = 200
+    cv2.imwrite(str(tmp_path / "deck.png"), image)
+    [square] = load_backgrounds(tmp_path)
+    assert square.shape == (BACKGROUND_PX, BACKGROUND_PX, 3)
+    assert square.mean() == pytest.approx(160, abs=5)
+
+
+def test_a_folder_without_photographs_is_refused(tmp_path):
+    with pytest.raises(AnnotationError, match="expected images"):
+        load_backgrounds(tmp_path)

@@ -10,6 +10,7 @@ from stream_dmr.segmentation.training.occluders import (
     draw_into,
     draw_line,
     draw_occluders,
+    draw_ruler,
 )
 
 SIZE = 96
@@ -57,3 +58,15 @@ def test_most_scenes_have_no_occluder():
     counts = [len(draw_occluders(np.random.default_rng(seed))) for seed in range(400)]
     assert np.mean([count == 0 for count in counts]) == pytest.approx(0.59, abs=0.08)
     assert max(counts) <= 4
+
+
+def test_a_ruler_lies_beside_the_fish_and_along_it():
+    for seed in range(40):
+        along_rad = seed * 0.3
+        ruler = draw_ruler(np.random.default_rng(seed), along_rad)
+        across = np.array([-np.sin(along_rad), np.cos(along_rad)])
+        beside = np.concatenate(ruler.polygons).mean(axis=0) @ across
+        assert 0.03 < abs(beside) < 0.6
+        extent = np.ptp(ruler.polygons[0] @ across), np.ptp(ruler.polygons[0], axis=0).max()
+        assert extent[0] < extent[1]
+        assert all(1 < len(polygon) < 5 for polygon in ruler.polygons)

@@ -9,6 +9,8 @@ from stream_dmr.segmentation.training.box_crops import crop_affine
 from stream_dmr.segmentation.training.fish_patches import PATCH_PX
 from stream_dmr.segmentation.training.patch_bank import PatchBank, make_bank
 from stream_dmr.segmentation.training.scene_rendering import (
+    CastShadow,
+    cast_shadow,
     frame_coverage,
     render_scene,
     warp_fish,
@@ -49,6 +51,16 @@ def test_a_fish_before_another_hides_it(bank: PatchBank):
     scene = scene_of(bank, 1)
     _, mask = render(bank, replace(scene, before=[replace(scene.target)]))
     assert mask.max() < 0.26  # of half-covered pixels, half shows
+
+
+def test_a_shadow_lies_beside_its_fish_and_takes_no_more_light_than_there_is():
+    coverage = np.zeros((128, 128), np.float32)
+    coverage[40:60, 30:70] = 1
+    shadow = CastShadow(offset_px=np.array([10.0, 20.0]), blur_px=2.0, strength=0.7)
+    missing = cast_shadow(shadow, coverage)
+    assert missing[70, 60] == pytest.approx(0.7, abs=0.01)
+    assert 0 <= missing.min() <= missing.max() <= 0.7 + 1e-6
+    assert not missing[:50].any()
 
 
 def test_beyond_the_frame_there_is_nothing(bank: PatchBank):

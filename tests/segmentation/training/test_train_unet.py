@@ -50,7 +50,7 @@ def test_a_training_writes_weights_scores_and_pictures(trained):
     assert report["history"][1]["loss"] < report["history"][0]["loss"]
     assert report["best"]["iou"] == best.iou == max(e["iou"] for e in report["history"])
     assert report["settings"] == TINY.model_dump()
-    for name in ("unet.pt", "last.pt", "curve.png", "worst.png"):
+    for name in ("unet.onnx", "unet.pt", "last.pt", "curve.png", "worst.png"):
         assert (out / name).stat().st_size > 1000
     load_weights(out / "unet.pt")
 
@@ -126,6 +126,23 @@ def test_the_command_says_what_is_wrong(tmp_path, monkeypatch, arguments):
     result = CliRunner().invoke(app, ["train", "--out", "out", *arguments])
     assert result.exit_code != 0
     assert "expected" in str(result.exception)
+
+
+def test_own_fish_are_trained_on_before_own_backgrounds(vessel):
+    out = vessel / "out"
+    tiny = TINY.model_copy(update={"epochs": 1})
+    own = {"images": vessel / "images", "masks": vessel / "masks"}
+    best = train_unet(
+        request(out, settings=tiny, backgrounds=vessel / "images", **own), stop=never()
+    )
+    assert best is not None
+    assert len(history(out)) == 2
+
+
+def test_backgrounds_without_own_fish_are_refused():
+    result = CliRunner().invoke(app, ["train", "--backgrounds", "x"])
+    assert result.exit_code == 2
+    assert "--images" in result.output
 
 
 def test_images_without_masks_are_refused():

@@ -1,0 +1,323 @@
+"""Build the data set of real pictures that `real_sources.toml` lists, from clones of repositories.
+
+    python -m benchmarks.segmentation.real_images REPOSITORIES --saliency u2net.onnx --out DIR
+
+REPOSITORIES has a clone `owner+name` per repository. `u2net.onnx` is U2-Net (Qin et al., Pattern
+Recognition 2020, Apache-2.0), as background removers bring it along; it proposes the masks of
+pictures that have none. DIR gets train/ and held-out/, each with images/ and masks/ as `stream-dmr
+train` and `photograph_accuracy` take them, backgrounds/, and with `--sheets` a picture of all
+proposals per source, kept or not, with their names.
+"""
+
+import argparse
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from benchmarks.segmentation.clone import Clone
+from stream_dmr.segmentation.network.onnx_session import open_session
+
+_MANIFEST = Path(__file__).parent / "real_sources.toml"
+_U2NET_PX = 320  # its input's side
+_BOX_MARGIN = 0.18  # around a given box, where a mask is looked for; of its longer side
+_KEPT_MARGIN = 0.7  # of the surroundings that are kept; room to rotate the fish
+_KEPT_PX = 480  # longest side of a kept picture
+_TILE_GAP_PX = 9  # from the edge of a tile's cell to its picture
+_MIN_BLOB_PX = 250  # of a given mask; smaller ones are specks
+_CANVAS_PX = 384  # side of the photographs that cut-outs are put before
+
+Image = UInt8[np.ndarray, "H W 3"]
+Mask = Bool[np.ndarray, "H W"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Proposal:
+    """A fish in a picture; without a mask, one is proposed in its box."""
+
+    name: str
+    image: Image
+    box: Float[np.ndarray, "4"]  # left, top, right, bottom, px
+    mask: Mask | None = None
+
+
+def read_tiles(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
+    """Pictures that lie in rows and columns in one file; of a video, in its first frame."""
+    for sheet in source["tiles"]:
+        image = clone.image(sheet["file"])
+        for name, (x0, y0, x1, y1) in _cells(image, sheet["rows"], sheet["columns"]):
+            tile = image[y0:y1, x0:x1]
+            if sheet.get("half"):
+                tile = tile[:, : tile.shape[1] // 2 - 2]
+            yield Proposal(name=sheet["name"] + name, image=tile, box=_whole(tile))
+
+
+def read_overlays(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
+    """Tiles whose masks are given in red: in another file, or in the right half of each."""
+    for sheet in source["tiles"]:
+        image = clone.image(sheet["file"])
+        red = _red(image)
+        if "overlay" in sheet:
+            overlay = clone.image(sheet["overlay"])
+            height = round(overlay.shape[0] * image.shape[1] / overlay.shape[1])
+            overlay = cv2.resize(overlay, (image.shape[1], height), interpolation=cv2.INTER_AREA)
+            red = _red(overlay)[: len(image)]
+        for name, (x0, y0, x1, y1) in _cells(image, sheet["rows"], sheet["columns"]):
+            tile, given = image[y0:y1, x0:x1], red[y0:y1, x0:x1]
+            if sheet.get("half"):
+                half = tile.shape[1] // 2
+                tile, given = tile[:, :half], given[:, half + 2 :]
+                given = cv2.resize(given, (half, len(tile)), interpolation=cv2.INTER_NEAREST)
+            for number, mask in enumerate(_blobs(given), start=1):
+                box = _box_of(mask)
+                yield Proposal(
+                    name=f"{sheet['name']}{name}_{number}", image=tile, box=box, mask=mask
+                )
+
+
+def read_pictures(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
+    """Whole pictures, or the boxes that the manifest gives for some of them."""
+    for path in clone.paths(source["files"]):
+        image = clone.image(path)
+        boxes = source.get("boxes", {}).get(Path(path).stem)
+        if boxes is None:
+            yield Proposal(name=Path(path).stem, image=image, box=_whole(image))
+            continue
+        height, width = image.shape[:2]
+        for number, box in enumerate(boxes):
+            edges = np.array(box) * [width, height, width, height]
+            yield Proposal(name=f"{Path(path).stem}_{number}", image=image, box=edges)
+
+
+def read_boxes(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
+    """Boxes of labels in YOLO's format: class, middle and size as fractions of the picture."""
+    for path in clone.paths(source["files"]):
+        labels = clone.text(path.replace("/images/", "/labels/").rsplit(".", 1)[0] + ".txt")
+        image = clone.image(path)
+        scale = np.tile(image.shape[1::-1], 2)
+        for number, line in enumerate(labels.splitlines()):
+            kind, *values = map(float, line.split())
+            if len(values) != 4 or (source["classes"] and int(kind) not in source["classes"]):
+                continue
+            x, y, width, height = np.array(values) * scale
+            box = np.array([x - width / 2, y - height / 2, x + width / 2, y + height / 2])
+            if max(width, height) >= source["min_side_px"]:
+                name = Path(path).name.split(".rf.")[0].removesuffix("_jpeg_jpg")
+                yield Proposal(name=f"{name}_{number}", image=image, box=box)
+
+
+def read_labelled(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
+    """Pictures with a mask of all fish each; every connected shape is one."""
+    for path in clone.paths(source["files"]):
+        image = clone.image(path)
+        labels = clone.image(f"{source['labels']}/{Path(path).stem}.bmp")
+        labels = cv2.resize(labels, image.shape[1::-1])[..., 0] > 127
+        for number, mask in enumerate(_blobs(labels), start=1):
+            name = f"{Path(path).stem.strip('_')}_{number}"
+            yield Proposal(name=name, image=image, box=_box_of(mask), mask=mask)
+
+
+def read_cutouts(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
+    """Fish on black in rows and columns, without surroundings."""
+    top, bottom, left, right = source["area"]
+    image = clone.image(source["file"])[top:bottom, left:right]
+    for name, (x0, y0, x1, y1) in _cells(image, source["rows"], source["columns"], gap=0):
+        tile = image[y0:y1, x0:x1]
+        bright = (tile.max(axis=2) > 14).astype(np.uint8)  # JPEG's noise is darker
+        mask = _largest(cv2.morphologyEx(bright, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0)
+        if mask is not None:
+            yield Proposal(name=name, image=tile, box=_whole(tile), mask=mask)
+
+
+READERS = {
+    "tiles": read_tiles,
+    "overlays": read_overlays,
+    "pictures": read_pictures,
+    "boxes": read_boxes,
+    "labelled": read_labelled,
+    "cutouts": read_cutouts,
+}
+
+
+def propose_mask(session: Any, proposal: Proposal) -> Mask | None:
+    """The largest shape that stands out in a box, by U2-Net; None without any."""
+    x0, y0, x1, y1 = window(proposal.image, proposal.box, margin=_BOX_MARGIN)
+    part = proposal.image[y0:y1, x0:x1]
+    small = cv2.resize(part, (_U2NET_PX, _U2NET_PX), interpolation=cv2.INTER_AREA)
+    rgb = small[..., ::-1] / max(float(small.max()), 1.0)
+    rgb = (rgb - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
+    blob = rgb.transpose(2, 0, 1)[None].astype(np.float32)
+    output = session.run(None, {session.get_inputs()[0].name: blob})[0][0, 0]
+    output = (output - output.min()) / max(float(np.ptp(output)), 1e-6)
+    salient = np.zeros(proposal.image.shape[:2], bool)
+    salient[y0:y1, x0:x1] = cv2.resize(output, part.shape[1::-1]) > 0.5
+    grow = 0.06 * float((proposal.box[2:] - proposal.box[:2]).max())
+    left, top, right, bottom = proposal.box + grow * np.array([-1, -1, 1, 1])
+    rows, columns = np.indices(salient.shape)
+    salient &= (columns >= left) & (columns <= right) & (rows >= top) & (rows <= bottom)
+    return _largest(salient)
+
+
+def window(image: Image, box: Float[np.ndarray, "4"], *, margin: float) -> tuple[int, ...]:
+    """Left, top, right, bottom of a square around a box, within the picture."""
+    half = float((box[2:] - box[:2]).max()) * (1 + 2 * margin) / 2
+    center, size = (box[:2] + box[2:]) / 2, image.shape[1::-1]
+    low = np.floor(center - half).astype(int).clip(0)
+    high = np.minimum(np.ceil(center + half).astype(int), size)
+    return (*low.tolist(), *high.tolist())
+
+
+def keep(proposal: Proposal, mask: Mask) -> tuple[Image, Mask]:
+    """The fish with its surroundings, not larger than `_KEPT_PX`."""
+    x0, y0, x1, y1 = window(proposal.image, _box_of(mask), margin=_KEPT_MARGIN)
+    image, kept = proposal.image[y0:y1, x0:x1], mask[y0:y1, x0:x1] * np.uint8(255)
+    scale = _KEPT_PX / max(image.shape[:2])
+    if scale < 1:
+        image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        kept = cv2.resize(kept, image.shape[1::-1], interpolation=cv2.INTER_AREA)
+    return image, kept > 127
+
+
+def put_before(photograph: Image, image: Image, mask: Mask) -> tuple[Image, Mask]:
+    """A cut-out in the middle of a photograph, with soft edges."""
+    canvas = cv2.resize(photograph, (_CANVAS_PX, _CANVAS_PX), interpolation=cv2.INTER_LINEAR)
+    top, left = (_CANVAS_PX - len(image)) // 2, (_CANVAS_PX - image.shape[1]) // 2
+    area = np.s_[top : top + len(image), left : left + image.shape[1]]
+    inner = cv2.erode(mask.astype(np.float32), np.ones((3, 3), np.uint8))
+    cover = cv2.GaussianBlur(inner, (0, 0), 0.7)[..., None]
+    canvas[area] = cover * image + (1 - cover) * canvas[area]
+    whole = np.zeros(canvas.shape[:2], bool)
+    whole[area] = cover[..., 0] > 0.5
+    return canvas, whole
+
+
+def build(repositories: Path, saliency: Path, out: Path, *, sheets: bool) -> None:
+    """Write the data set."""
+    manifest = tomllib.loads(_MANIFEST.read_text(encoding="utf-8"))
+    backgrounds = write_backgrounds(repositories, manifest["backgrounds"], out / "backgrounds")
+    session = open_session(saliency)
+    rng = np.random.default_rng(5)
+    for name, source in manifest["sources"].items():
+        clone = Clone(repositories, source["repository"], source["commit"])
+        folder = out / source["role"].replace(" ", "-")
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+        (folder / "masks").mkdir(exist_ok=True)
+        shown, num_kept = [], 0
+        for proposal in READERS[source["kind"]](clone, source):
+            is_kept = proposal.name in source.get("accepted", []) or (
+                "rejected" in source and proposal.name not in source["rejected"]
+            )
+            if not (is_kept or sheets):
+                continue
+            mask = proposal.mask if proposal.mask is not None else propose_mask(session, proposal)
+            if mask is None:
+                continue
+            image, mask = keep(proposal, mask)
+            if source["kind"] == "cutouts":
+                image, mask = put_before(_photograph(rng, backgrounds), image, mask)
+            shown.append(_outlined(image, mask, proposal.name))
+            if is_kept:
+                num_kept += 1
+                stem = f"{name.replace('-', '_')}-{proposal.name}.png"
+                cv2.imwrite(str(folder / "images" / stem), image)
+                cv2.imwrite(str(folder / "masks" / stem), mask.astype(np.uint8))
+        print(f"{name}: {num_kept} fish, {source['licence']}")
+        if sheets and shown:
+            cv2.imwrite(str(out / f"{name}.png"), _in_rows(shown))
+
+
+def write_backgrounds(repositories: Path, source: dict[str, Any], folder: Path) -> list[Path]:
+    """Photographs of everything but fish: of each category some."""
+    clone = Clone(repositories, source["repository"], source["commit"])
+    folder.mkdir(parents=True, exist_ok=True)
+    categories: dict[str, list[str]] = {}
+    for path in clone.paths(f"{source['folder']}/*/*.jpg"):
+        categories.setdefault(path.split("/")[-2], []).append(path)
+    written = []
+    for category, paths in sorted(categories.items()):
+        count = source["more"].get(category, source["per_category"])
+        for path in [] if category in source["without"] else paths[:count]:
+            written.append(folder / f"{category}_{Path(path).name}")
+            written[-1].write_bytes(clone.content(path))
+    return written
+
+
+def _photograph(rng: np.random.Generator, paths: list[Path]) -> Image:
+    image = cv2.imread(str(paths[int(rng.integers(len(paths)))]))
+    assert image is not None
+    return image
+
+
+def _cells(
+    image: Image, rows: int, columns: int, *, gap: int = _TILE_GAP_PX
+) -> Iterator[tuple[str, tuple[int, int, int, int]]]:
+    """Row and column, and left, top, right, bottom, of the cells of a regular grid."""
+    height, width = image.shape[:2]
+    for row in range(rows):
+        for column in range(columns):
+            x0, x1 = round(column * width / columns), round((column + 1) * width / columns)
+            y0, y1 = round(row * height / rows), round((row + 1) * height / rows)
+            yield f"{row}{column}", (x0 + gap, y0 + gap, x1 - gap, y1 - gap)
+
+
+def _red(image: Image) -> UInt8[np.ndarray, "H W"]:
+    """1 where a mask is drawn in translucent red."""
+    blue, green, red = np.moveaxis(image.astype(int), 2, 0)
+    is_red = (red > 110) & (red - green > 70) & (red - blue > 60)
+    return cv2.morphologyEx(is_red.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+
+
+def _blobs(mask: np.ndarray) -> list[Mask]:
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    return [labels == i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] >= _MIN_BLOB_PX]
+
+
+def _largest(mask: Mask) -> Mask | None:
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    return labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()) if count > 1 else None
+
+
+def _box_of(mask: Mask) -> Float[np.ndarray, "4"]:
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    return np.array([x, y, x + width, y + height], np.float64)
+
+
+def _whole(image: Image) -> Float[np.ndarray, "4"]:
+    return np.array([0, 0, image.shape[1], image.shape[0]], np.float64)
+
+
+def _outlined(image: Image, mask: Mask, name: str, *, side: int = 160) -> Image:
+    scale = side / max(image.shape[:2])
+    drawn = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(mask.astype(np.uint8), drawn.shape[1::-1])
+    lines, _ = cv2.findContours(small, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(drawn, lines, -1, (60, 60, 255), 1)
+    tile = np.zeros((side, side, 3), np.uint8)
+    tile[: len(drawn), : drawn.shape[1]] = drawn
+    cv2.putText(tile, name[-20:], (2, side - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 255, 255), 1)
+    return tile
+
+
+def _in_rows(tiles: list[Image], *, per_row: int = 12) -> Image:
+    tiles = tiles + [np.zeros_like(tiles[0])] * (-len(tiles) % per_row)
+    return np.vstack([np.hstack(tiles[k : k + per_row]) for k in range(0, len(tiles), per_row)])
+
+
+def main() -> None:
+    """Build it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("repositories", type=Path)
+    parser.add_argument("--saliency", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--sheets", action="store_true", help="pictures of all proposals; slow")
+    arguments = parser.parse_args()
+    build(arguments.repositories, arguments.saliency, arguments.out, sheets=arguments.sheets)
+
+
+if __name__ == "__main__":
+    main()
