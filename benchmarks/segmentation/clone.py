@@ -24,10 +24,15 @@ class Clone:
         self._commit = commit
 
     def paths(self, pattern: str) -> list[str]:
-        """The paths that match a pattern, in order."""
+        """The paths that match a pattern, in order; not of files that the clone lacks."""
         command = [*self._git, "ls-tree", "-r", "-z", "--name-only", self._commit]
         listed = subprocess.run(command, check=True, capture_output=True).stdout.decode()
-        return sorted(path for path in listed.split("\0") if fnmatch(path, pattern))
+        paths = sorted(path for path in listed.split("\0") if fnmatch(path, pattern))
+        return [path for path in paths if self._has(path)]
+
+    def _has(self, path: str) -> bool:
+        command = [*self._git, "cat-file", "-e", f"{self._commit}:{path}"]
+        return subprocess.run(command, check=False, capture_output=True).returncode == 0
 
     def content(self, path: str) -> bytes:
         """A file's bytes."""

@@ -107,7 +107,7 @@ def read_boxes(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
             x, y, width, height = np.array(values) * scale
             box = np.array([x - width / 2, y - height / 2, x + width / 2, y + height / 2])
             if max(width, height) >= source["min_side_px"]:
-                name = Path(path).name.split(".rf.")[0].removesuffix("_jpeg_jpg")
+                name = Path(path).name.split(".rf.")[0]
                 yield Proposal(name=f"{name}_{number}", image=image, box=box)
 
 
@@ -196,13 +196,14 @@ def put_before(photograph: Image, image: Image, mask: Mask) -> tuple[Image, Mask
     return canvas, whole
 
 
-def build(repositories: Path, saliency: Path, out: Path, *, sheets: bool) -> None:
-    """Write the data set."""
+def build(repositories: Path, saliency: Path, out: Path, *, only: list[str], sheets: bool) -> None:
+    """Write the data set, or only some of its sources."""
     manifest = tomllib.loads(_MANIFEST.read_text(encoding="utf-8"))
     backgrounds = write_backgrounds(repositories, manifest["backgrounds"], out / "backgrounds")
     session = open_session(saliency)
     rng = np.random.default_rng(5)
-    for name, source in manifest["sources"].items():
+    for name in only or manifest["sources"]:
+        source = manifest["sources"][name]
         clone = Clone(repositories, source["repository"], source["commit"])
         folder = out / source["role"].replace(" ", "-")
         (folder / "images").mkdir(parents=True, exist_ok=True)
@@ -226,7 +227,7 @@ def build(repositories: Path, saliency: Path, out: Path, *, sheets: bool) -> Non
                 stem = f"{name.replace('-', '_')}-{proposal.name}.png"
                 cv2.imwrite(str(folder / "images" / stem), image)
                 cv2.imwrite(str(folder / "masks" / stem), mask.astype(np.uint8))
-        print(f"{name}: {num_kept} fish, {source['licence']}")
+        print(f"{name}: {num_kept} fish, {source['licence']}", flush=True)
         if sheets and shown:
             cv2.imwrite(str(out / f"{name}.png"), _in_rows(shown))
 
@@ -314,9 +315,16 @@ def main() -> None:
     parser.add_argument("repositories", type=Path)
     parser.add_argument("--saliency", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--only", nargs="+", default=[], help="names of sources")
     parser.add_argument("--sheets", action="store_true", help="pictures of all proposals; slow")
     arguments = parser.parse_args()
-    build(arguments.repositories, arguments.saliency, arguments.out, sheets=arguments.sheets)
+    build(
+        arguments.repositories,
+        arguments.saliency,
+        arguments.out,
+        only=arguments.only,
+        sheets=arguments.sheets,
+    )
 
 
 if __name__ == "__main__":

@@ -15,6 +15,11 @@ class BoxDetector:
     def __init__(self, frames: Mapping[int, Sequence[AnnotatedBox]]) -> None:
         self._frames = frames
 
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Empty: every box of the file is a candidate."""
+        return {}
+
     def find(self, frame: Frame) -> list[Candidate]:
         """The file's boxes of this frame that are at least one pixel wide and high inside it."""
         height, width = frame.image.shape[:2]

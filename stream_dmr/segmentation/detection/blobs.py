@@ -1,6 +1,8 @@
 """Select the moving blobs that may be fish, without the lines and gaffs connected to them."""
 
+from collections import Counter
 from collections.abc import Iterator
+from enum import StrEnum
 
 import cv2
 import numpy as np
@@ -14,21 +16,34 @@ _MIN_THICKNESS = 0.06  # mean thickness over length; fish seen edge-on are thick
 _MIN_THICKNESS_PX = 3.5
 
 
+class Refusal(StrEnum):
+    """Why a moving shape is no fish."""
+
+    SHORT = "shorter than [detect_fish] motion_min_length"
+    LONG = "longer than [detect_fish] motion_max_length"
+    THIN = "too thin for fish, as lines, gaffs and ripples are"
+
+
 def fish_blobs(
     moving: Bool[np.ndarray, "H W"], *, min_length_px: float, max_length_px: float
-) -> list[Bool[np.ndarray, "H W"]]:
+) -> tuple[list[Bool[np.ndarray, "H W"]], Counter[Refusal]]:
     """The connected components that may be fish, without connected poles and lines.
 
     A thin component that reaches the edge of the picture is a pole or a line; a thin one inside may
-    be a fish seen edge-on.
+    be a fish seen edge-on. Also how many components were refused, by reason.
     """
     pole_px = max(3, round(_POLE_WIDTH * max(moving.shape))) | 1
-    blobs = [_without_poles(blob, pole_px) for blob in _components(moving)]
-    return [
-        blob
-        for blob in blobs
-        if blob is not None and _may_be_fish(blob, min_length_px, max_length_px)
-    ]
+    fish, refused = [], Counter[Refusal]()
+    for component in _components(moving):
+        blob = _without_poles(component, pole_px)
+        refusal = Refusal.THIN
+        if blob is not None:
+            refusal = _refusal(blob, min_length_px, max_length_px)
+        if blob is not None and refusal is None:
+            fish.append(blob)
+        elif refusal is not None:
+            refused[refusal] += 1
+    return fish, refused
 
 
 def _components(mask: Bool[np.ndarray, "H W"]) -> Iterator[Bool[np.ndarray, "H W"]]:
@@ -66,11 +81,15 @@ def _largest_component(mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w
     return (labels == largest).astype(np.uint8)
 
 
-def _may_be_fish(blob: Bool[np.ndarray, "H W"], min_length_px: float, max_length_px: float) -> bool:
-    """True where length and mean thickness (area over length) are those of a fish."""
+def _refusal(
+    blob: Bool[np.ndarray, "H W"], min_length_px: float, max_length_px: float
+) -> Refusal | None:
+    """None where length and mean thickness (area over length) are those of a fish."""
     points = cv2.findNonZero(blob.view(np.uint8))
     length_px = max(cv2.minAreaRect(points)[1]) + 1
-    thickness_px = len(points) / length_px
-    return min_length_px <= length_px <= max_length_px and thickness_px >= max(
-        _MIN_THICKNESS * length_px, _MIN_THICKNESS_PX
-    )
+    if length_px < min_length_px:
+        return Refusal.SHORT
+    if length_px > max_length_px:
+        return Refusal.LONG
+    min_thickness_px = max(_MIN_THICKNESS * length_px, _MIN_THICKNESS_PX)
+    return None if len(points) / length_px >= min_thickness_px else Refusal.THIN

@@ -1,6 +1,6 @@
 """The interface of a detector: a frame in, candidates for fish out; the tracker identifies them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -26,6 +26,11 @@ class Detector(Protocol):
 
     def find(self, frame: Frame) -> Sequence[Candidate]:
         """The candidates of one frame, in no particular order."""
+        ...
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """How many shapes of all frames were no candidates, by reason with its setting."""
         ...
 
 

@@ -1,5 +1,8 @@
 """Fish by their motion before the background, without trained weights: the default detector."""
 
+from collections import Counter
+from collections.abc import Mapping
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
@@ -62,6 +65,12 @@ class MotionDetector:
         self._before: UInt8[np.ndarray, "h w 3"] | None = None  # last picture, background's pixels
         self._is_foreign: Bool[np.ndarray, "h w"] | None = None  # in the last picture's pixels
         self._background_from_picture: Affine = _IDENTITY
+        self._refused: Counter[str] = Counter()
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """The moving shapes of all frames that were no candidates, by reason."""
+        return self._refused
 
     def find(self, frame: Frame) -> list[Candidate]:
         """The moving blobs of a frame whose size and thickness may be those of fish."""
@@ -69,11 +78,12 @@ class MotionDetector:
         scale = min(1.0, self._settings.motion_working_px / max(width, height))
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
         moving = self._find_moving(_shrink(frame.image, size))
-        blobs = fish_blobs(
+        blobs, refused = fish_blobs(
             moving,
             min_length_px=self._settings.motion_min_length * max(size),
             max_length_px=self._settings.motion_max_length * max(size),
         )
+        self._refused.update(refused)
         return [_candidate(blob, width=width, height=height) for blob in blobs]
 
     def _find_moving(self, small: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:

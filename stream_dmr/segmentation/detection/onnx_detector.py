@@ -4,6 +4,7 @@ It is tried on three pictures before the first frame, so that an unusable model 
 and not in the middle of a run.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -73,6 +74,11 @@ class OnnxDetector:
         noise = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
         for picture in (noise, np.zeros_like(noise), np.full_like(noise, 255)):
             self._try(picture)
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Empty: what was not found is not known."""
+        return {}
 
     def find(self, frame: Frame) -> list[Candidate]:
         """The boxes of a frame after non-maximum suppression, of any score."""

@@ -3,6 +3,8 @@
 For cameras and seas that move so much that no fish stands out by its motion.
 """
 
+from collections.abc import Mapping
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -22,6 +24,11 @@ class UNetDetector:
         """`longer_px`: longer side of the network's input; fish should be 40 to 140 px in it."""
         self._segmenter = segmenter
         self._longer_px = longer_px
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Empty: what was not found is not known."""
+        return {}
 
     def find(self, frame: Frame) -> list[Candidate]:
         """The candidates of one frame."""

@@ -7,6 +7,7 @@ from stream_dmr.segmentation.detection.detector import Detector
 from stream_dmr.segmentation.detection.fish_detection import Detection
 from stream_dmr.segmentation.tracking.box_correction import BoxCorrector
 from stream_dmr.segmentation.tracking.confirmation import ConfirmationSettings, FishConfirmation
+from stream_dmr.segmentation.tracking.no_fish import Sightings, explain_no_fish
 from stream_dmr.segmentation.tracking.tracker import Tracker, TrackerSettings
 
 
@@ -22,10 +23,16 @@ class TrackedFish:
         self._tracker = Tracker(settings)
         self._confirmation = FishConfirmation(settings)
         self._corrector = BoxCorrector()
+        self._settings = settings
+        self._seen = Sightings()
+        self._found_any = False
 
     def detect(self, frame: Frame) -> list[Detection]:
         """All tracks seen in a frame, by track number. Frames must come in order."""
-        tracked = self._tracker.step(frame, self._detector.find(frame))
+        candidates = self._detector.find(frame)
+        tracked = self._tracker.step(frame, candidates)
+        self._seen.frames += 1
+        self._seen.candidates += len(candidates)
         boxes = {one.track_number: one.candidate.bbox_xyxy_px for one in tracked}
         visible = {one.track_number: one.visible_fraction for one in tracked}
         return self._corrector.correct(boxes, visible, frame)
@@ -38,7 +45,13 @@ class TrackedFish:
     def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:
         """The track numbers of confirmed fish; `crops` are those of all detections of the frame."""
         self._corrector.update(crops)
-        return [track for track, crop in crops.items() if self._confirmation.update(track, crop)]
+        fish = [track for track, crop in crops.items() if self._confirmation.update(track, crop)]
+        self._found_any = self._found_any or bool(fish)
+        self._seen.tracks = max(self._seen.tracks, *crops) if crops else self._seen.tracks
+        for crop in crops.values():
+            confidence = crop.quality.mask_confidence or 0.0
+            self._seen.best_confidence = max(self._seen.best_confidence, confidence)
+        return fish
 
     @property
     def gives_masks(self) -> bool:
@@ -47,5 +60,14 @@ class TrackedFish:
 
     @property
     def warnings(self) -> list[str]:
-        """Always empty: a missed fish is not noticed."""
-        return []
+        """Why there are no fish, where there are none; a missed one of several is not noticed."""
+        if self._found_any or self._seen.frames == 0:
+            return []
+        return [
+            explain_no_fish(
+                self._seen,
+                self._detector.refused,
+                min_frames=self._settings.min_track_frames,
+                min_confidence=self._settings.min_mask_confidence,
+            )
+        ]

@@ -15,7 +15,7 @@ from jaxtyping import Float32, UInt8
 from stream_dmr.segmentation.training.fish_patches import PATCH_PX, draw_fish_patch
 from stream_dmr.segmentation.training.random_backgrounds import BACKGROUND_PX, draw_background
 
-_PHOTOGRAPHED_SHARE = 0.5  # of fish, and of backgrounds, where there are any; chosen by hand
+_PHOTOGRAPHED_SHARE = 0.4  # of fish, and of backgrounds, where there are any; chosen by hand
 _BANK_VERSION = 2  # part of the file's name; raised when fish or backgrounds are drawn differently
 
 

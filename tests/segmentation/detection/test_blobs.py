@@ -5,13 +5,14 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from stream_dmr.segmentation.detection.blobs import fish_blobs
+from stream_dmr.segmentation.detection.blobs import Refusal, fish_blobs
 
 
 def drawn(draw: Callable[[np.ndarray], object]) -> list[np.ndarray]:
     picture = np.zeros((360, 480), np.uint8)
     draw(picture)
-    return fish_blobs(picture > 0, min_length_px=15.0, max_length_px=340.0)
+    fish, _ = fish_blobs(picture > 0, min_length_px=15.0, max_length_px=340.0)
+    return fish
 
 
 def test_lines_poles_and_specks_are_no_fish():
@@ -45,3 +46,16 @@ def test_a_bent_fish_seen_edge_on_is_kept_whole():
 def test_a_fish_seen_edge_on_is_kept():
     [fish] = drawn(lambda p: cv2.ellipse(p, (200, 200), (35, 3), 70, 0, 360, 1, -1))
     assert fish.sum() > 200
+
+
+def test_every_refused_shape_is_counted_by_its_reason():
+    picture = np.zeros((360, 480), np.uint8)
+    cv2.circle(picture, (100, 100), 4, 1, -1)
+    cv2.circle(picture, (140, 100), 4, 1, -1)
+    cv2.line(picture, (200, 0), (220, 180), 1, 2)
+    cv2.ellipse(picture, (200, 270), (40, 14), 0, 0, 360, 1, -1)
+    fish, refused = fish_blobs(picture > 0, min_length_px=15.0, max_length_px=340.0)
+    assert len(fish) == 1
+    assert refused == {Refusal.SHORT: 2, Refusal.THIN: 1}
+    _, refused = fish_blobs(picture > 0, min_length_px=5.0, max_length_px=60.0)
+    assert refused[Refusal.LONG] == 1

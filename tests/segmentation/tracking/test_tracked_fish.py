@@ -1,7 +1,7 @@
 """Tracks become fish once their masks confirm them, and boxes follow the masks."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import pytest
@@ -29,6 +29,8 @@ class ScriptedDetector:
 
     def __init__(self, frames: Sequence[Sequence[Spot]]) -> None:
         self._frames = frames
+
+    refused: ClassVar[dict[str, int]] = {}
 
     def find(self, frame: Frame) -> list[Candidate]:
         return spots_candidates(self._frames[frame.frame_index - 1])
