@@ -1,11 +1,15 @@
 """Files: writes undone when they fail, durable renames, hashes, natural order of names."""
 
+import fcntl
+import io
 import os
 import re
+import weakref
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager, suppress
 from hashlib import file_digest, sha256
 from pathlib import Path
+from typing import Any
 
 from stream_dmr.errors import OutputError
 
@@ -67,6 +71,65 @@ class TransactionalFile:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
+
+
+class Snapshot:
+    """A file as it is now: what is appended later is not seen, and it may be renamed or deleted.
+
+    It is held open for as long as this object, or one of its streams, is in use.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises OSError where it can't be read."""
+        self.descriptor = os.open(path, os.O_RDONLY)
+        self.size = os.fstat(self.descriptor).st_size
+        weakref.finalize(self, os.close, self.descriptor)
+
+    def open(self) -> io.BufferedReader:
+        """A stream with a position of its own."""
+        return io.BufferedReader(_SnapshotStream(self))
+
+
+class _SnapshotStream(io.RawIOBase):
+    name, mode = "snapshot", "rb"  # which `IO` asks for
+
+    def __init__(self, snapshot: Snapshot) -> None:
+        self._snapshot, self._position = snapshot, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._snapshot.size}[
+            whence
+        ]
+        self._position = max(0, base + offset)
+        return self._position
+
+    def readinto(self, buffer: Any) -> int:
+        wanted = min(len(buffer), max(0, self._snapshot.size - self._position))
+        data = os.pread(self._snapshot.descriptor, wanted, self._position)
+        buffer[: len(data)] = data
+        self._position += len(data)
+        return len(data)
+
+
+def is_locked(folder: Path) -> bool:
+    """True while a process holds the advisory lock of a folder, as a run does."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
 
 
 def free_bytes(folder: Path) -> int:

@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 from collections import Counter
 from dataclasses import replace
+from fnmatch import fnmatch
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
@@ -23,17 +24,18 @@ from stream_dmr.recording.messages.record import Record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.sink_states import SinkStates
 from stream_dmr.recording.messages.topics import TOPICS
-from stream_dmr.recording.reading.open_recording import open_recordings
+from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.segments.repair import repair_recordings
 from stream_dmr.recording.segments.rotating_sink import open_segments
 from stream_dmr.report.view_pictures import frame_images, recorded_source
+from stream_dmr.results.folder_lock import FolderLock
 from stream_dmr.results.frames_table import FramesTable
 from stream_dmr.results.store_rows import INTERRUPTED, MAY_COUNT_TWICE
 from stream_dmr.results.verify import verify
 from tests.running.test_run_signals import start, wait_for_rows
 from tests.support.command import invoke, rows
-from tests.support.reading import read_messages
+from tests.support.reading import read_header, read_messages
 from tests.support.recorded_run import assert_same, header, run
 from tests.support.tiny_clip import HEIGHT, QUICK, WIDTH, write_clip
 
@@ -145,6 +147,42 @@ def test_recording_goes_on_when_the_folder_was_away(tmp_path: Path, messages: li
     assert all(name.endswith(".mcap") for name in names(out))
     recorded = {m.frame_index for m in read_messages(out, [Frame])}
     assert recorded == set(range(1, NUM_FRAMES + 1))  # into the file that was open
+
+
+def test_a_recording_is_read_as_it_is_while_a_run_writes_and_renames_it(
+    tmp_path: Path, messages: list[Message]
+):
+    lock = FolderLock(tmp_path)
+    with recorder(tmp_path, in_one_thread=True) as segments:
+        for message in messages[:60]:
+            segments.write(message)
+        parts = list(tmp_path.glob("*.part"))
+        assert parts
+        listed = open_recordings([tmp_path])
+        before = [m for m, _ in decoded_messages(listed, [LocalizedFish])]
+        assert len(before) > 3
+        assert [line for line in listed.warnings if "still being written" in line]
+        for message in messages[60:]:
+            segments.write(message)
+        assert not any(part.exists() for part in parts)
+        after = [m for m, _ in decoded_messages(listed, [LocalizedFish])]
+    assert [m.frame_index for m in after] == [m.frame_index for m in before]
+    assert not [line for line in listed.warnings if "lost" in line]
+    lock.release()
+
+
+def test_a_file_that_gets_its_name_while_the_folder_is_read_counts_once(whole: Path):
+    first = whole / "recording-000001.mcap"
+    assert read_header(first.with_name(f"{first.name}.part")).source == read_header(first).source
+    listed = [f"{first.name}.part", *names(whole)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            Path,
+            "glob",
+            lambda self, pattern: (self / name for name in listed if fnmatch(name, pattern)),
+        )
+        recording = open_recordings([whole])
+    assert len({m.frame_index for m, _ in decoded_messages(recording, [Frame])}) == NUM_FRAMES
 
 
 def test_a_sink_that_broke_is_tried_again(tmp_path: Path, messages: list[Message]):

@@ -23,7 +23,9 @@ from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
 from stream_dmr.errors import RecordingError
+from stream_dmr.files import Snapshot, is_locked
 from stream_dmr.messages import LocalizedFish, Message
+from stream_dmr.recording.mcap.mcap_sink import PART
 from stream_dmr.recording.messages.codec import check_version, decode
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection, Spans
@@ -52,8 +54,13 @@ class McapRecording:
     """One .mcap, as the protocol `Recording` of `open_recording` describes it."""
 
     def __init__(self, path: Path) -> None:
-        """Read the header. Raises RecordingError where not even that can be read."""
+        """Read the header. Raises RecordingError where not even that can be read.
+
+        Of a file that a run is writing, and may rename, this is what it holds now.
+        """
         self.path = path
+        self._snapshot = _snapshot(path) if path.suffix == PART else None
+        self.is_being_written = self._snapshot is not None and is_locked(path.parent)
         self.warnings: list[str] = []
         self.metadata: dict[str, str] = {}
         self.is_segment = self.is_thinned = self.ends_early = False
@@ -116,7 +123,11 @@ class McapRecording:
             if not is_torn:
                 raise
         if is_torn:
-            self._warn(f"{self.path}: torn; {count} messages are whole, what came after is lost")
+            self._warn(
+                f"{self.path}: still being written; {count} messages so far"
+                if self.is_being_written
+                else f"{self.path}: torn; {count} messages are whole, what came after is lost"
+            )
 
     def _warn(self, line: str) -> None:
         if line not in self.warnings:
@@ -157,6 +168,10 @@ class McapRecording:
     @contextmanager
     def _open(self) -> Generator[IO[bytes]]:
         try:
+            if self._snapshot is not None:
+                with self._snapshot.open() as stream:
+                    yield stream
+                return
             with self.path.open("rb") as stream:
                 yield stream
         except OSError as error:
@@ -171,6 +186,19 @@ class McapRecording:
                 f"{self.path}: expected a whole recording, got a damaged one ({error}); "
                 "what was read before the damage is sound"
             ) from error
+
+
+def _snapshot(path: Path) -> Snapshot:
+    """Of a file that may just be getting its final name."""
+    try:
+        try:
+            return Snapshot(path)
+        except FileNotFoundError:
+            return Snapshot(path.with_suffix(""))
+    except OSError as error:
+        raise RecordingError(
+            f"{path}: expected a recording (.mcap or .rrd), got: {error.strerror}; check the path"
+        ) from error
 
 
 def is_torn(path: Path) -> bool:

@@ -8,6 +8,7 @@ from stream_dmr.errors import RecordingError
 from stream_dmr.files import natural_order
 from stream_dmr.messages import Message
 from stream_dmr.recording.mcap.mcap_recording import McapRecording
+from stream_dmr.recording.mcap.mcap_sink import PART
 from stream_dmr.recording.messages.codec import decode
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
@@ -74,9 +75,11 @@ def _files_of(path: Path) -> list[Path]:
     """A file itself; of a folder its .mcap files, whole or torn, or else its .rrd files."""
     if not path.is_dir():
         return [path]
-    for patterns in (("*.mcap", "*.mcap.part"), ("*.rrd",)):
-        if found := [file for pattern in patterns for file in path.glob(pattern)]:
-            return sorted(found, key=natural_order)
+    # One that a run renames meanwhile is in both lists, and counts once.
+    unfinished, whole = list(path.glob(f"*.mcap{PART}")), list(path.glob("*.mcap"))
+    parts = [file for file in unfinished if file.with_suffix("") not in whole]
+    if found := [*whole, *parts] or list(path.glob("*.rrd")):
+        return sorted(found, key=natural_order)
     raise RecordingError(f"{path}: expected a folder with a recording, found no .mcap and no .rrd")
 
 
