@@ -90,5 +90,5 @@ def replay(
         raise typer.Exit(128 + stop.signal_number)
     if check:
         print_check(summary)
-        if summary.mismatches:
+        if not summary.is_as_recorded:
             raise typer.Exit(1)

@@ -3,6 +3,7 @@
 import sys
 import time
 from collections.abc import Collection, Sequence
+from math import inf
 from types import TracebackType
 
 from rich.console import Console
@@ -11,7 +12,7 @@ from rich.table import Table
 
 from stream_dmr.evaluation.compare import Distributions, Evaluation, distribution_rows, summary_rows
 from stream_dmr.messages import LengthEstimate, Message
-from stream_dmr.replaying.replay_recording import ReplaySummary
+from stream_dmr.replaying.replay_recording import LENGTH_TOLERANCE, ReplaySummary
 from stream_dmr.results.store_rows import MAY_COUNT_TWICE
 from stream_dmr.running.measure_source import RunSummary
 from stream_dmr.running.run_observer import RunObserver
@@ -130,12 +131,20 @@ def print_check(summary: ReplaySummary) -> None:
         )
     if summary.num_beyond:
         print(f"{summary.num_beyond} messages more than were recorded: it was cut off before them")
+    if not found:
+        print(f"check: {summary.num_compared} messages are the recorded ones to the last bit")
+        return
     kinds = ", ".join(sorted({item.kind for item in found}))
-    print(
-        f"check: {len(found)} fields differ, in {kinds}"
-        if found
-        else f"check: {summary.num_compared} messages are the recorded ones to the last bit"
-    )
+    lengths = f"lengths differ by {summary.length_change:.2g} at most, as a fraction"
+    if summary.length_change == inf:
+        lengths = "not all fish have the recorded status"
+    print(f"check: {len(found)} fields differ, in {kinds}; {lengths}")
+    if summary.other_versions:
+        print(
+            f"recorded with other versions of {', '.join(summary.other_versions)}, so bits may "
+            f"differ: lengths are {'' if summary.is_as_recorded else 'not '}within the tolerance "
+            f"of {LENGTH_TOLERANCE:g}"
+        )
 
 
 def print_timings(summary: RunSummary | ReplaySummary) -> None:

@@ -1,6 +1,7 @@
 """Compares the messages of a replay with the recorded ones."""
 
 from collections.abc import Collection, Iterator, Sequence
+from math import inf
 from typing import NamedTuple
 
 from stream_dmr.messages import LengthEstimate, Message
@@ -42,6 +43,8 @@ class MessageComparator:
         self.num_left_out = 0
         self.num_beyond = 0  # computed, and not recorded since the recording was cut off
         self.mismatches: list[Mismatch] = []
+        # Largest relative difference of a final length; infinite where one of two is missing.
+        self.length_change = 0.0
 
     def compare(self, computed: Message) -> None:
         """Compare with the recorded message of the same type, frame and fish."""
@@ -74,6 +77,8 @@ class MessageComparator:
                 self._add_surplus(computed)
             else:
                 self._compare(recorded, computed)
+                change = _length_change(recorded, computed)
+                self.length_change = max(self.length_change, change)
         for recorded in self._recorded_final.values():
             self._add_missing(recorded)
 
@@ -93,6 +98,7 @@ class MessageComparator:
 
     def _add_missing(self, recorded: Message) -> None:
         self._add(recorded, Difference("message", "one", "none"))
+        self.length_change = inf
 
     def _add_surplus(self, computed: Message) -> None:
         if self._ends_early:
@@ -100,6 +106,7 @@ class MessageComparator:
             self._tracks_beyond.add(_track_of(computed))
         else:
             self._add(computed, Difference("message", "none", "one more"))
+            self.length_change = inf
 
     def _add(self, message: Message, difference: Difference) -> None:
         kind = type(message).__name__
@@ -133,3 +140,11 @@ def _comes_before(recorded: Message, computed: Message) -> bool:
 def _is_of_same(recorded: Message, computed: Message) -> bool:
     is_same_frame = recorded.frame_index == computed.frame_index
     return is_same_frame and _track_of(recorded) == _track_of(computed)
+
+
+def _length_change(recorded: LengthEstimate, computed: LengthEstimate) -> float:
+    """Relative difference of two final lengths; infinite where their fish fared differently."""
+    before, now = recorded.length_mm, computed.length_mm
+    if recorded.status != computed.status or (before is None) != (now is None):
+        return inf
+    return 0.0 if before is None or now is None else abs(now / before - 1)

@@ -11,13 +11,13 @@ import pytest
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.recording.messages.codec import decode
 from stream_dmr.recording.reading.open_recording import Recording, open_recordings
-from stream_dmr.replaying.replay_recording import replay
+from stream_dmr.replaying.replay_recording import LENGTH_TOLERANCE, replay
 from stream_dmr.replaying.replay_request import ReplayRequest
 
 GOLDEN = Path(__file__).parents[2] / "recordings" / "golden" / "recording.mcap"
 # Relative, of the lengths, where another processor or library rounds the last bits otherwise. A
 # fit stops at its tolerance, so there it may stop an iteration sooner or later.
-ELSEWHERE = {"fit": 5e-3, "localize": 1e-9, "smooth": 1e-9}
+ELSEWHERE = {"fit": LENGTH_TOLERANCE, "localize": 1e-9, "smooth": 1e-9}
 
 
 @pytest.mark.parametrize("first", ELSEWHERE)

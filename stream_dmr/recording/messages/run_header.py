@@ -18,6 +18,8 @@ from stream_dmr.template.template import Template
 from stream_dmr.version import __version__
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "torch", "scipy", "numba", "mcap", "rerun-sdk")
+# Of the metadata: where all of these are the same, so are the bits of all results.
+REPRODUCIBLE_BY = ("stream_dmr", "arithmetic", *_LIBRARIES)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

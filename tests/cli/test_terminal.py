@@ -1,0 +1,132 @@
+"""What commands print, and what they make of their options."""
+
+import os
+import signal
+import sys
+
+import pytest
+import typer
+
+from stream_dmr.cli.shared_options import command_line, parse_selection, stop_on_signals
+from stream_dmr.cli.terminal import (
+    interval_text,
+    length_text,
+    print_check,
+    print_fish,
+    print_timings,
+    status_text,
+)
+from stream_dmr.replaying.comparator import Mismatch
+from stream_dmr.replaying.difference import Difference
+from stream_dmr.replaying.replay_recording import ReplaySummary
+from stream_dmr.running.pipeline import StageCounters
+from tests.support.final_estimates import fish
+
+DIFFERENCE = Mismatch(3, 1, "FittedMesh", Difference("shape.iou", "0.9", "0.8"))
+
+
+def summary(**changes: object) -> ReplaySummary:
+    values: dict[str, object] = {
+        "fish": [fish(1)],
+        "num_frames": 10,
+        "elapsed_s": 2.0,
+        "recorded_s": 4.0,
+        "counters": [],
+        "num_compared": 12,
+        "num_left_out": 0,
+        "num_beyond": 0,
+        "mismatches": [],
+    }
+    return ReplaySummary(**values | changes)  # type: ignore[arg-type]
+
+
+def test_a_length_is_shown_with_its_std_and_interval():
+    assert length_text(fish(1)) == "800.0 ± 4.0"
+    assert interval_text(fish(1)) == "792.0 to 808.0"
+    assert status_text(fish(1)) == "measured"
+
+
+def test_a_fish_without_a_length_says_why_most_frequent_first():
+    none = fish(1, length_mm=None, refused={"outlier": 2, "fit is poor": 5})
+    assert (length_text(none), interval_text(none)) == ("-", "-")
+    assert status_text(none) == "too few good frames: 5 fit is poor, 2 outlier"
+
+
+def test_the_table_names_every_fish(capsys: pytest.CaptureFixture[str]):
+    print_fish([fish(7), fish(8)], may_count_twice=[8])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["fish", "7", "8"]
+    assert "twice" in lines[2]
+    assert "twice" not in lines[1]
+    print_fish([])
+    assert capsys.readouterr().out == "no fish\n"
+
+
+def test_a_replay_of_equal_bits_says_so(capsys: pytest.CaptureFixture[str]):
+    assert summary().is_as_recorded
+    print_check(summary())
+    assert "12 messages are the recorded ones to the last bit" in capsys.readouterr().out
+
+
+def test_other_bits_of_the_same_versions_are_no_replay(capsys: pytest.CaptureFixture[str]):
+    other = summary(mismatches=[DIFFERENCE], length_change=1e-9)
+    assert not other.is_as_recorded
+    print_check(other)
+    shown = capsys.readouterr().out
+    assert "frame 3, fish 1, FittedMesh, shape.iou: recorded 0.9, now 0.8" in shown
+    assert "1 fields differ, in FittedMesh" in shown
+    assert "versions" not in shown
+
+
+@pytest.mark.parametrize(
+    ("change", "is_near", "said"),
+    [(1e-4, True, "are within"), (0.02, False, "not within"), (float("inf"), False, "status")],
+)
+def test_other_versions_are_held_to_a_tolerance(
+    capsys: pytest.CaptureFixture[str], change: float, is_near: bool, said: str
+):
+    other = summary(mismatches=[DIFFERENCE], length_change=change, other_versions=["numba"])
+    assert other.is_as_recorded == is_near
+    print_check(other)
+    shown = capsys.readouterr().out
+    assert said in shown
+    assert "other versions of numba" in shown
+
+
+def test_many_differences_are_cut_short(capsys: pytest.CaptureFixture[str]):
+    print_check(summary(mismatches=[DIFFERENCE] * 50))
+    assert "... and 30 more" in capsys.readouterr().out
+
+
+def test_timings_are_per_frame(capsys: pytest.CaptureFixture[str]):
+    print_timings(summary(counters=[StageCounters(stage="fit", busy_s=1.0)]))
+    assert capsys.readouterr().out.splitlines()[1].split()[-3:] == ["100.00", "0.00", "50"]
+
+
+def test_a_time_and_tracks_select_a_part():
+    part = parse_selection("60:90.5", [2, 3])
+    assert part.time_ns == (60_000_000_000, 90_500_000_000)
+    assert part.tracks == {2, 3}
+    assert parse_selection(None, None).is_everything
+
+
+@pytest.mark.parametrize("text", ["60", "90:60", "a:b", "1:2:3"])
+def test_an_impossible_time_is_refused(text: str):
+    with pytest.raises(typer.BadParameter, match="FROM:TO"):
+        parse_selection(text, None)
+
+
+def test_a_password_is_not_recorded(monkeypatch: pytest.MonkeyPatch):
+    typed = ["stream-dmr", "run", "--source", "rtsp://me:secret@camera/1", "--out", "my run"]
+    monkeypatch.setattr(sys, "argv", typed)
+    assert command_line() == "stream-dmr run --source rtsp://camera/1 --out 'my run'"
+
+
+def test_a_signal_sets_the_event_and_is_remembered():
+    before = signal.getsignal(signal.SIGTERM)
+    with stop_on_signals() as stop:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.wait(5)
+        os.kill(os.getpid(), signal.SIGINT)
+    assert stop.signal_number == signal.SIGTERM
+    assert signal.getsignal(signal.SIGTERM) == before
