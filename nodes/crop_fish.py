@@ -34,14 +34,13 @@ class CropFish:
 
     def step(self, frame: Frame, /) -> list[FishCrop]:
         """The fish of one frame, by id. Raises AnnotationError for an unusable mask."""
-        if self._camera is None:
-            height, width = frame.image.shape[:2]
-            self._camera = Camera.nominal(width=width, height=height)
+        height, width = frame.image.shape[:2]
+        camera = self._camera or Camera.nominal(width=width, height=height)
         crops = {
             detection.source_id: crop_fish(
                 frame,
                 detection,
-                frame_camera=self._camera,
+                frame_camera=camera,
                 settings=self._settings,
                 segmenter=self._segmenter,
             )

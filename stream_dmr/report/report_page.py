@@ -12,11 +12,14 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.camera import crop_from_frame
+from stream_dmr.fitting.shape.candidates import AUTO, body_forms, load_shapes
+from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.report.drawn_views import DrawnView
 from stream_dmr.report.recorded_tracks import FishFrame
 from stream_dmr.report.run_report import RunReport
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.fish_table import fish_record
+from stream_dmr.template.template_file import bundled_names
 from stream_dmr.version import __version__
 
 _SCRIPTS = ("table.js", "plots.js", "detail.js", "review.js", "page.js")
@@ -45,6 +48,7 @@ def render_page(
         "notes": [
             *notes,
             *(line for one in reports for line in (*one.notes, *one.recording.warnings)),
+            *(line for one in reports for line in _shape_notes(one)),
         ],
         "reviewer": reviewer,
     }
@@ -53,6 +57,16 @@ def render_page(
         rows.append(row)
         details.append(_script(f"fish-{row['id']}", fish_detail(fish, report)))
     return _fill_template(title, _script("data", about | {"fish": rows}) + "".join(details))
+
+
+def _shape_notes(report: RunReport) -> Iterator[str]:
+    """How the stocks that a run learnt differ from their body forms."""
+    header = report.recording.header
+    if header.candidates is None or not header.candidates.are_learnt:
+        return
+    if not {shape.name for shape in header.candidates} <= set(bundled_names()):
+        return  # learnt from a mesh of the user's own, which the recording does not have
+    yield from describe(body_forms(load_shapes(AUTO)[0]), header.candidates)
 
 
 def _rows(reports: Sequence[RunReport]) -> Iterator[tuple[dict[str, Any], FishResult, RunReport]]:

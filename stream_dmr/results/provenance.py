@@ -47,6 +47,7 @@ def seal_run(folder: Path, *, with_recordings: bool) -> None:
     """
     database = folder / DATABASE
     kinds = ("*.csv", "*.mcap", "*.rrd") if with_recordings else ("lengths.csv", "frames.csv")
+    kinds = (*kinds, "template*.ply", "template*.toml")  # what was learnt of the fish's shape
     files = [path for kind in kinds for path in folder.glob(kind)]
     fish = {run_id: lines_sha256(lines) for run_id, lines in fish_by_run(database).items()}
     _write(

@@ -14,7 +14,6 @@ _LYING: dict[str, dict[str, Any]] = {
 # Independent pictures: none follows another, and one good one gives a length. Ten
 # seconds between them are more than anything in `[smooth_length]` remembers, but for the track.
 _STILLS: dict[str, dict[str, Any]] = {
-    "read_frames": {"images_fps": 0.1},
     "detect_fish": {"detector": "unet"},  # nothing moves
     "track_fish": {"min_track_frames": 1, "max_lost_frames": 0},
     "smooth_length": {"min_frames": 1, "track_timeout_s": 1e9},
@@ -26,9 +25,10 @@ def lying(config: Config) -> Config:
     return _with(config, _LYING)
 
 
-def stills(config: Config) -> Config:
-    """The settings for independent pictures."""
-    return _with(config, _STILLS)
+def stills(config: Config, *, is_calibrated: bool) -> Config:
+    """The settings for independent pictures; one calibration holds for one size of them."""
+    sizes = "leave_out" if is_calibrated else "take"
+    return _with(config, _STILLS | {"read_frames": {"images_fps": 0.1, "other_sizes": sizes}})
 
 
 def _with(config: Config, changes: dict[str, dict[str, Any]]) -> Config:

@@ -91,7 +91,7 @@ def checked_inputs(request: RunRequest) -> Inputs:
     if request.pose == "lying":
         config = lying(config)
     if request.stills:
-        config = stills(config)
+        config = stills(config, is_calibrated=request.calibration is not None)
     notices: list[str] = []
     template, candidates = load_shapes(request.template, on_notice=notices.append)
     calibration = None if request.calibration is None else load_calibration(request.calibration)

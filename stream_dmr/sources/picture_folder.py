@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -13,20 +14,25 @@ from stream_dmr.messages import Frame
 from stream_dmr.sources.source import Source, check_size, nominal_ns
 
 PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
+OtherSizes = Literal["refuse", "leave_out", "take"]
 _DEPTHS = {"uint8", "uint16"}
 
 
 class PictureFolder(Source):
-    """A folder of pictures in natural order (`2.png` before `10.png`), all of one size.
+    """A folder of pictures in natural order (`2.png` before `10.png`), usually of one size.
 
     Grey and 16-bit pictures become 8-bit BGR. One that can't be decoded is left out with a warning
     but keeps its frame index, so that boxes and masks stay with their pictures.
     """
 
-    def __init__(self, folder: Path, *, fps: float) -> None:
-        """Raises SourceError where no picture can be decoded."""
+    def __init__(self, folder: Path, *, fps: float, other_sizes: OtherSizes = "refuse") -> None:
+        """`other_sizes`: what becomes of pictures whose size is not the first one's.
+
+        Raises SourceError where no picture can be decoded.
+        """
         self._paths = _pictures_in(folder)
         self._is_closed = False
+        self._other_sizes = other_sizes
         self.name = folder.resolve().name
         self.num_frames = len(self._paths)
         self.fps = fps
@@ -47,7 +53,15 @@ class PictureFolder(Source):
             if picture is None:
                 self.warnings.append(f"{path.name}: can't be decoded, so was left out")
                 continue
-            check_size(picture, width=self.width, height=self.height, where=str(path))
+            size = picture.shape[1], picture.shape[0]
+            if self._other_sizes == "refuse":
+                check_size(picture, width=self.width, height=self.height, where=str(path))
+            elif self._other_sizes == "leave_out" and size != (self.width, self.height):
+                self.warnings.append(
+                    f"{path.name}: {size[0]}x{size[1]} px, the calibration is for {self.width}x"
+                    f"{self.height}, so was left out; calibrate its camera and run it by itself"
+                )
+                continue
             yield Frame(
                 frame_index=frame_index,
                 timestamp_ns=nominal_ns(frame_index, self.fps),

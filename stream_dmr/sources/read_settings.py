@@ -1,5 +1,7 @@
 """The table [read_frames] of config.toml."""
 
+from typing import Literal
+
 from pydantic import Field
 
 from stream_dmr.settings import Settings
@@ -13,6 +15,11 @@ class ReadFramesSettings(Settings):
         gt=0,
         allow_inf_nan=False,
         description="frames/s of folders of pictures and of videos without timestamps",
+    )
+    other_sizes: Literal["refuse", "leave_out", "take"] = Field(
+        default="refuse",
+        description="pictures of a folder whose size is not the first one's; --stills takes them "
+        "without a calibration, and leaves them out with one",
     )
     silence_s: float = Field(
         default=20.0,

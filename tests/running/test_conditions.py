@@ -1,11 +1,15 @@
 """--pose lying and --stills as settings: what the user has set comes first."""
 
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 
-from stream_dmr.running.conditions import lying, stills
+from stream_dmr.running.conditions import lying
+from stream_dmr.running.conditions import stills as stills_of
 from stream_dmr.running.config import Config, parse_config
+
+stills = partial(stills_of, is_calibrated=True)
 
 
 @pytest.mark.parametrize("condition", [lying, stills])
@@ -39,3 +43,8 @@ def test_the_users_own_settings_stay():
 
 def test_both_conditions_hold_together_in_either_order():
     assert lying(stills(Config())) == stills(lying(Config()))
+
+
+def test_a_calibration_holds_for_pictures_of_one_size():
+    assert stills(Config()).read_frames.other_sizes == "leave_out"
+    assert stills_of(Config(), is_calibrated=False).read_frames.other_sizes == "take"

@@ -88,3 +88,16 @@ def test_refuses_folders_without_pictures(tmp_path):
     assert "none of its 1 can be decoded" in refusal(tmp_path)
     (tmp_path / "1.png").rename(tmp_path / "1.mp4")
     assert "1.mp4: expected a video" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize(("other_sizes", "kept"), [("take", [1, 2, 3]), ("leave_out", [1, 3])])
+def test_pictures_of_another_size_are_taken_or_left_out(tmp_path, other_sizes, kept):
+    for number, size in ((1, (30, 20)), (2, (20, 30)), (3, (30, 20))):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), noise(number, size=size))
+    folder = PictureFolder(tmp_path, fps=25.0, other_sizes=other_sizes)
+    frames = list(folder)
+    assert [frame.frame_index for frame in frames] == kept
+    assert [len(frame.image) != folder.height for frame in frames] == [n == 2 for n in kept]
+    assert len(folder.warnings) == (other_sizes == "leave_out")
+    with pytest.raises(SourceError, match="must have one size"):
+        list(PictureFolder(tmp_path, fps=25.0))

@@ -50,7 +50,8 @@ class H264Topic:
         # Measured: OpenCV's conversion takes a sixth of FFmpeg's time and loses less.
         planes = cv2.cvtColor(_even(frame.image), cv2.COLOR_BGR2YUV_I420)
         picture = av.VideoFrame.from_ndarray(planes.astype(np.uint8, copy=False), format="yuv420p")
-        if self._context is None:
+        size = (picture.width, picture.height)
+        if self._context is None or (self._context.width, self._context.height) != size:
             self._context = _encoder(picture, self._crf)
             self._key_at_ns = frame.timestamp_ns
         picture.pts = None
