@@ -119,6 +119,13 @@ class Reason(StrEnum):
         "the fish slants by more than `[localize] max_slant_rad`",
         "nothing; other frames count",
     )
+    BENT_TOO_FAR = (
+        "bent too far",
+        _FRAME,
+        "the fit's midline bows out of its own plane of view, or curls, further than a fish can: "
+        "`[localize] max_bow_ratio`, `max_bending_ratio`",
+        "look at mask and template; usually a wrong mask",
+    )
     OUTLIER = (
         "outlier",
         _FRAME,

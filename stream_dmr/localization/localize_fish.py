@@ -12,7 +12,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from stream_dmr.camera import Calibration, ReferencePlane
-from stream_dmr.geometry import bending_ratio
+from stream_dmr.geometry import arc_lengths, bending_ratio
 from stream_dmr.messages import CropQuality, FittedMesh, FittedShape, LocalizedFish
 from stream_dmr.reasons import Reason
 from stream_dmr.settings import Settings
@@ -66,6 +66,17 @@ class LocalizeSettings(Settings):
     max_slant_rad: float = Field(
         default=1.0, gt=0, description="largest slant of a fish that counts; 0 is broadside, rad"
     )
+    max_bow_ratio: float = Field(
+        default=0.35,
+        gt=0,
+        description="furthest that a midline may bow towards or away from the camera, over its "
+        "length; that of a half circle is 0.32",
+    )
+    max_bending_ratio: float = Field(
+        default=3.0,
+        gt=1,
+        description="largest arc over chord of a midline; that of a half circle is 1.57",
+    )
 
 
 class Unlocatable(Exception):
@@ -85,6 +96,8 @@ class Location:
     length_mm: float
     length_std_mm: float | None  # None where the fit can't tell
     slant_rad: float  # of the chord from the plane across the line of sight: 0 is broadside
+    bow_ratio: float  # of the midline from its chord along the line of sight, over its length
+    bending_ratio: float  # arc over chord
 
 
 def center_on_plane(ray: Float[np.ndarray, "3"], plane: ReferencePlane) -> Float[np.ndarray, "3"]:
@@ -191,7 +204,18 @@ def locate(shape: FittedShape, calibration: Calibration, settings: LocalizeSetti
         length_mm=length_mm,
         length_std_mm=std_mm if np.isfinite(std_mm) else None,
         slant_rad=slant_rad,
+        bow_ratio=bow_ratio(shape.midline, keypoints_mm[1]),
+        bending_ratio=ratio,
     )
+
+
+def bow_ratio(midline: Float[np.ndarray, "M 3"], toward: Float[np.ndarray, "3"]) -> float:
+    """How far a midline is from its chord in the direction `toward`, at most, over its length."""
+    arc = arc_lengths(midline)
+    share = (arc / arc[-1])[:, None]
+    chord = midline[0] + share * (midline[-1] - midline[0])
+    along = (midline - chord) @ toward / np.linalg.norm(toward)
+    return float(np.abs(along).max() / arc[-1])
 
 
 def raised(
@@ -262,6 +286,9 @@ def localize(
         location = locate(mesh.shape, calibration, settings)
         if location.slant_rad > settings.max_slant_rad:
             reason = reason or Reason.TURNED_AWAY
+        is_bent = location.bending_ratio > settings.max_bending_ratio
+        if is_bent or location.bow_ratio > settings.max_bow_ratio:
+            reason = reason or Reason.BENT_TOO_FAR
         return _message(mesh, reason, location)
     except Unlocatable as problem:
         return _message(mesh, reason or problem.reason)

@@ -9,7 +9,12 @@ from stream_dmr.settings import Settings
 # mostly within the plane, and are off it by what the plane itself was measured to.
 _LYING: dict[str, dict[str, Any]] = {
     "fit_mesh": {"tilt_std_rad": 0.05, "bend_std_rad": 0.15, "twist_std_rad": 0.05},
-    "localize": {"rests_on_plane": True, "plane_std_mm": 3.0, "slant_std_rad": 0.03},
+    "localize": {
+        "rests_on_plane": True,
+        "plane_std_mm": 3.0,
+        "slant_std_rad": 0.03,
+        "max_bow_ratio": 0.1,
+    },
 }
 # Independent pictures: none follows another, and one good one gives a length. Ten
 # seconds between them are more than anything in `[smooth_length]` remembers, but for the track.

@@ -9,6 +9,7 @@ from stream_dmr.geometry import arc_length
 from stream_dmr.localization.localize_fish import (
     LocalizeSettings,
     Unlocatable,
+    bow_ratio,
     intersect,
     localize,
 )
@@ -119,7 +120,8 @@ def exact_scenes(draw):
 @given(exact_scenes())
 def test_exact_data_give_the_exact_length_and_place(scene):
     shape, midline, center, calibration = scene
-    fish = localized(make_mesh(shape), calibration, max_slant_rad=2.0)
+    free = {"max_slant_rad": 2.0, "max_bow_ratio": 1.0, "max_bending_ratio": 100.0}
+    fish = localized(make_mesh(shape), calibration, **free)
     assert fish.accepted, fish.reason
     assert fish.length_mm == pytest.approx(arc_length(midline), rel=1e-6)
     np.testing.assert_allclose(
@@ -324,6 +326,25 @@ def test_a_poor_fit_is_less_certain(iou, std_ratio):
     mesh = straight_fish(calibration, std_ratio=0.0, iou=iou)
     fish = localized(mesh, calibration, plane_std_mm=1e-9, slant_std_rad=0.0, misfit_std=0.12)
     assert fish.length_std_mm == pytest.approx(700 * std_ratio, abs=0.1)
+
+
+@pytest.mark.parametrize("bend_rad", [0.6, 1.8, np.pi])
+def test_the_bow_of_an_arc_is_its_sagitta_where_it_bends_in_depth(bend_rad):
+    angles = np.linspace(-bend_rad / 2, bend_rad / 2, 200)
+    arc = np.stack([np.sin(angles), np.zeros(200), np.cos(angles)], axis=1) / bend_rad
+    sagitta = (1 - np.cos(bend_rad / 2)) / bend_rad
+    assert bow_ratio(arc, np.array([0.0, 0.0, 2.0])) == pytest.approx(sagitta, rel=1e-3)
+    assert bow_ratio(700 * arc, np.array([0.0, 1.0, 0.0])) == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(("bend_rad", "is_fine"), [(1.8, True), (2.9, True), (5.0, False)])
+def test_a_fish_that_bends_further_than_fish_can_is_refused(bend_rad, is_fine):
+    fish = localized(
+        make_mesh(bent_fish(make_calibration(), bend_rad=bend_rad)), make_calibration()
+    )
+    assert fish.accepted == is_fine
+    assert fish.length_mm == pytest.approx(700.0, rel=0.01)  # for whoever looks at it
+    assert is_fine or fish.reason == Reason.BENT_TOO_FAR
 
 
 def test_without_calibration_pixels_and_bending_remain():
