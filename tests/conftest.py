@@ -1,6 +1,5 @@
 """Shape annotations execute under pytest; scenes outside the repository skip with a reason."""
 
-import re
 from pathlib import Path
 
 import pytest
@@ -14,22 +13,6 @@ install_import_hook("stream_dmr", "beartype.beartype")
 settings.register_profile("same", deadline=None, derandomize=True)
 settings.register_profile("new", deadline=None)
 settings.load_profile("same")
-
-
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--may-skip", metavar="REGEX", help="fail if a test is skipped but for this")
-
-
-def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Where all that tests need is installed, a skipped one is an error: no test fades away."""
-    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
-    may_skip = session.config.getoption("--may-skip")
-    if may_skip is None or reporter is None:
-        return
-    skipped = [report.longrepr[2] for report in reporter.stats.get("skipped", [])]
-    if unexpected := [reason for reason in skipped if not re.search(may_skip, reason)]:
-        reporter.write_line(f"\n{len(unexpected)} skipped, but not for: {may_skip}", red=True)
-        session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"

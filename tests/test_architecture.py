@@ -193,6 +193,38 @@ def test_class_names_are_unique():
     assert not [name for name, count in counts.items() if count > 1]
 
 
+# Python's own names with an underscore that are public all the same.
+PUBLIC = {"_replace", "_asdict", "_fields", "_make", "_exit", "_value_"}
+OWNERS = {"self", "cls", "other"}
+
+
+def test_nobody_uses_private_names_of_others():
+    folders = [*FILES, *(ROOT / "tests").rglob("*.py"), *(ROOT / "benchmarks").rglob("*.py")]
+    used = [f"{path.relative_to(ROOT)}: {name}" for path in folders for name in private_uses(path)]
+    assert not used
+
+
+def private_uses(path: Path) -> Iterator[str]:
+    """Private names that a file imports, or takes of objects that are not its own."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    nodes = list(ast.walk(tree))
+    own = {node.attr for node in nodes if isinstance(node, ast.Attribute) and is_own(node)}
+    own |= {node.name for node in nodes if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+    for node in nodes:
+        if isinstance(node, ast.ImportFrom):
+            yield from (alias.name for alias in node.names if is_private(alias.name))
+        elif isinstance(node, ast.Attribute) and is_private(node.attr) and node.attr not in own:
+            yield node.attr
+
+
+def is_own(node: ast.Attribute) -> bool:
+    return isinstance(node.value, ast.Name) and node.value.id in OWNERS
+
+
+def is_private(name: str) -> bool:
+    return name.startswith("_") and not name.startswith("__") and name not in PUBLIC
+
+
 # Modules that no test names, and why. `python -m tests.support.named_modules` lists all.
 UNNAMED = {
     "stream_dmr.api.functions": "tested as `import stream_dmr`",

@@ -41,16 +41,16 @@ class DeodrSolver:
         step: float,
         watch: Callable[[float], None],
     ) -> None:
-        """Minimise from one start; `watch` is told the hard IoU of every iterate."""
+        """Minimise from one start; `watch` gets the hard IoU of every iterate."""
         scene = make_scene(self._rig, len(target.mask))
         mask, distance = torch.as_tensor(target.mask), torch.as_tensor(target.distance)
         K, anchor = torch.as_tensor(target.K), torch.as_tensor(target.anchor)
         origin = torch.as_tensor(start)[None]
         num_joints = (len(start) - NUM_ROOT) // NUM_PER_JOINT
-        unit = step * torch.tensor(adam._ROOT_STEPS + adam._JOINT_STEPS * num_joints)
+        unit = step * torch.tensor(adam.ROOT_STEPS + adam.JOINT_STEPS * num_joints)
         moved = torch.zeros_like(origin, requires_grad=True)
         optimizer = torch.optim.Adam([moved], lr=1.0, betas=(0.8, 0.95))
-        schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, adam._DECAY)
+        schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, adam.STEP_DECAY)
         for _ in range(iterations):
             vector = origin + moved * unit
             vertices = deform(self._rig, vector, spine).vertices

@@ -10,21 +10,24 @@ are stopped by an exception as soon as an iterate is there.
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 from jaxtyping import Float
 
 from benchmarks.fit_speed.targets import FramePair
 from benchmarks.fit_speed.timing import Duration, median_duration, time_call
+from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.cold_start import cold_starts
+from stream_dmr.fitting.contour import contour_solver
 from stream_dmr.fitting.contour.contour_solver import ContourSolver
+from stream_dmr.fitting.contour.levenberg_marquardt import Minimum, minimise
 from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.mesh_levels import MeshLevels
-from stream_dmr.fitting.paper import adam
-from stream_dmr.fitting.paper.adam import AdamSolver
-from stream_dmr.fitting.solver import Solution
+from stream_dmr.fitting.paper.adam import FAR, NEAR, AdamSolver
+from stream_dmr.fitting.paper.objective import Objective, Terms
 from stream_dmr.fitting.target import Target
 from stream_dmr.fitting.warm_start import recentered
 from stream_dmr.template.template import Template
@@ -33,7 +36,6 @@ GOAL = 0.97
 CAP = 300  # iterations of a gradient descent; then it counts as never there
 DEODR_ITERATIONS = 100  # iterations from each cold start before the next one
 _MOST_SIZE_OF_A_BATCH = 128  # 24 starts side by side take adam some 4 s at 256 px
-_NEAR, _FAR = 0.3, 1.0  # of adam's first steps, as `AdamSolver` has them
 
 
 class SolverTime(NamedTuple):
@@ -48,17 +50,6 @@ class SolverTime(NamedTuple):
 
 class _Reached(Exception):
     pass
-
-
-class _Watched(ContourSolver):
-    """Stops as soon as a minimisation ends at the goal."""
-
-    def _minimise(self, *arguments: Any, **options: Any) -> Solution:
-        solution = super()._minimise(*arguments, **options)
-        is_whole = arguments[0].body is self._body  # a coarse mesh only looks around
-        if is_whole and solution.iou >= GOAL:
-            raise _Reached
-        return solution
 
 
 def has_deodr() -> str:
@@ -114,16 +105,17 @@ class SolverComparison:
         self, pair: FramePair, start: Callable[[Target], Float[np.ndarray, "P"]], *, near: bool
     ) -> dict[str, Callable[[], Duration | None]]:
         """From one start."""
-        step = _NEAR if near else _FAR
+        step = NEAR if near else FAR
 
         def by_contour(settings: FitMeshSettings) -> None:
             target = _target(pair)
-            _Watched(self._levels, settings).refine(target, start(target))
+            with _stopping_contour(self._levels.fine):
+                ContourSolver(self._levels, settings).refine(target, start(target))
 
         def by_adam() -> None:
             target = _target(pair)
             with _stopping_adam():
-                self._adam._descend(target, start(target)[None], CAP, step)
+                self._adam.descend(target, start(target)[None], CAP, step)
 
         def by_deodr() -> None:
             target = _target(pair)
@@ -137,7 +129,8 @@ class SolverComparison:
         def by_contour() -> None:
             target = _target(pair)
             starts = cold_starts(target, self._template)
-            _Watched(self._levels, FitMeshSettings()).search(target, starts)
+            with _stopping_contour(self._levels.fine):
+                ContourSolver(self._levels, FitMeshSettings()).search(target, starts)
 
         def by_adam() -> None:
             target = _target(pair)
@@ -147,7 +140,7 @@ class SolverComparison:
         def by_deodr() -> None:
             target = _target(pair)
             for start in cold_starts(target, self._template):
-                self._deodr_from(target, start, DEODR_ITERATIONS, _FAR)
+                self._deodr_from(target, start, DEODR_ITERATIONS, FAR)
 
         return self._solvers(lambda: _until_reached(by_contour, repeats=3), by_adam, by_deodr)
 
@@ -170,10 +163,11 @@ class SolverComparison:
 
     def _known_start(self, target: Target) -> Float[np.ndarray, "P"] | None:
         """The first cold start that leads the contour solver to the goal."""
-        solver = _Watched(self._levels, FitMeshSettings())
+        solver = ContourSolver(self._levels, FitMeshSettings())
         for start in cold_starts(target, self._template):
             try:
-                solver.refine(target, start)
+                with _stopping_contour(self._levels.fine):
+                    solver.refine(target, start)
             except _Reached:
                 return start
         return None
@@ -214,16 +208,28 @@ def _stop_at_goal(iou: float) -> None:
 
 
 @contextmanager
-def _stopping_adam() -> Iterator[None]:
-    """`AdamSolver` hands every iterate to its `_Best`; this one stops at the goal."""
+def _stopping_contour(body: Body) -> Iterator[None]:
+    """Stops as soon as a minimisation of this body, not of a coarse one, ends at the goal."""
 
-    class Best(adam._Best):
-        def update(self, parameters: Any, loss: Any, iou: Any) -> None:
-            _stop_at_goal(float(iou.max()))
-            super().update(parameters, loss, iou)
+    def watched(problem: Problem, *rest: Any) -> Minimum:
+        found = minimise(problem, *rest)
+        if problem.body is body:
+            _stop_at_goal(found.iou)
+        return found
 
-    original, adam._Best = adam._Best, Best
-    try:
+    with patch.object(contour_solver, "minimise", watched):
         yield
-    finally:
-        adam._Best = original
+
+
+@contextmanager
+def _stopping_adam() -> Iterator[None]:
+    """Stops as soon as an iterate is at the goal."""
+    original = Objective.terms
+
+    def watched(objective: Objective, parameters: Any) -> Terms:
+        terms = original(objective, parameters)
+        _stop_at_goal(float(terms.iou.max()))
+        return terms
+
+    with patch.object(Objective, "terms", watched):
+        yield

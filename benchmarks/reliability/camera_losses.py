@@ -2,7 +2,6 @@
 
 import itertools
 import os
-import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -114,11 +113,9 @@ class Watched:
 def lose(camera: Camera, kind: str) -> None:
     """Take the camera away for some moments; it is back on return."""
     if kind == "frozen":
-        process = camera._process
-        assert process is not None
-        os.kill(process.pid, signal.SIGSTOP)
+        camera.freeze()
         time.sleep(3.5)
-        os.kill(process.pid, signal.SIGCONT)
+        camera.thaw()
         return
     camera.lose()
     if kind == "silent":

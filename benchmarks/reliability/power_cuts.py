@@ -3,9 +3,16 @@
 import random
 import shutil
 import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import patch
+
+from mcap.records import Message as McapMessage
 
 from benchmarks.reliability.kills import unreadable_ones
+from stream_dmr.files import TransactionalFile
+from stream_dmr.recording.mcap.mcap_recording import whole_records
 from stream_dmr.recording.mcap.mcap_sink import McapSink
 from stream_dmr.recording.messages.record import make_record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
@@ -50,14 +57,24 @@ def power_cuts(folder: Path, *, count: int, seed: int = 0) -> dict[str, object]:
     return {"cuts": count, "unusable": unusable, "durable fish lost": lost, "kept beyond": after}
 
 
-class Watched(McapSink):
-    """Knows how much of it an fsync has made durable."""
+@contextmanager
+def watched_syncs() -> Iterator[list[int]]:
+    """The sizes up to which an fsync has made a file of a recording durable."""
+    sizes, sync = [0], TransactionalFile.sync
 
-    durable = (0, 0)  # messages; bytes
+    def watched(file: TransactionalFile) -> None:
+        sync(file)
+        sizes.append(file.tell())
 
-    def _flush(self) -> None:
-        super()._flush()
-        self.durable = sum(self._sequences.values()), self.size
+    with patch.object(TransactionalFile, "sync", watched):
+        yield sizes
+
+
+def num_messages(data: bytes, folder: Path) -> int:
+    """The number of messages in the whole chunks of these bytes of an .mcap."""
+    path = folder / "durable.mcap"
+    path.write_bytes(data)
+    return sum(isinstance(record, McapMessage) for record in whole_records(path))
 
 
 def power_cuts_of_recordings(folder: Path, *, count: int, seed: int = 0) -> dict[str, object]:
@@ -70,11 +87,13 @@ def power_cuts_of_recordings(folder: Path, *, count: int, seed: int = 0) -> dict
         live, cut = folder / "live", folder / "cut"
         live.mkdir(parents=True)
         cut.mkdir()
-        sink = Watched(live / _NAME, header(), flush_s=0.01, segment_number=1)
-        for message in messages[: rng.randint(1, len(messages))]:
-            sink.write(make_record(message, settings))
-        (num_durable, size), part = sink.durable, f"{_NAME}.part"
+        with watched_syncs() as sizes:
+            sink = McapSink(live / _NAME, header(), flush_s=0.01, segment_number=1)
+            for message in messages[: rng.randint(1, len(messages))]:
+                sink.write(make_record(message, settings))
+        size, part = sizes[-1], f"{_NAME}.part"
         data = (live / part).read_bytes()
+        num_durable = num_messages(data[:size], folder)
         at = rng.randint(size, len(data))
         rubbish = rng.randbytes(rng.randint(0, 4096)) if rng.random() < 0.5 else b""
         (cut / part).write_bytes(data[:at] + rubbish)

@@ -55,8 +55,8 @@ def render_page(
     rows, details = list[dict[str, Any]](), list[str]()
     for row, fish, report in _rows(reports):
         rows.append(row)
-        details.append(_script(f"fish-{row['id']}", fish_detail(fish, report)))
-    return _fill_template(title, _script("data", about | {"fish": rows}) + "".join(details))
+        details.append(json_element(f"fish-{row['id']}", fish_detail(fish, report)))
+    return _fill_template(title, json_element("data", about | {"fish": rows}) + "".join(details))
 
 
 def _shape_notes(report: RunReport) -> Iterator[str]:
@@ -196,7 +196,7 @@ def _mesh_values(view: DrawnView) -> dict[str, Any] | None:
     }
 
 
-def _script(name: str, content: object) -> str:
+def json_element(name: str, content: object) -> str:
     """An element with JSON for the page's scripts; no text in it can end the element."""
     text = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     return f'<script type="application/json" id="{name}">{text}</script>\n'

@@ -11,7 +11,7 @@ from stream_dmr.fitting.body import bind_to_midline
 from stream_dmr.fitting.paper.skinning import (
     DEFORMATIONS,
     Parameters,
-    _cholesky_factors,
+    cholesky_factors,
     deform,
     linear_blend,
     rest_parameters,
@@ -298,7 +298,7 @@ class TestWeights:
     @forty
     @given(entries=st.lists(st.floats(-3, 3), min_size=6, max_size=6))
     def test_Q_is_positive_definite_whatever_is_learnt(self, entries):
-        L = _cholesky_factors(torch.tensor([[entries]], dtype=torch.float64))[0, 0].numpy()
+        L = cholesky_factors(torch.tensor([[entries]], dtype=torch.float64))[0, 0].numpy()
         Q = L @ L.T
         np.testing.assert_array_equal(Q, Q.T)
         assert np.linalg.eigvalsh(Q).min() > 0
@@ -309,7 +309,7 @@ class TestWeights:
         A = np.random.default_rng(seed).normal(size=(3, 4))
         L = np.linalg.cholesky(A @ A.T)
         entries = [*np.log(np.diag(L)), L[1, 0], L[2, 0], L[2, 1]]
-        again = _cholesky_factors(torch.tensor([[entries]]))[0, 0]
+        again = cholesky_factors(torch.tensor([[entries]]))[0, 0]
         np.testing.assert_allclose(again, L, atol=1e-12)
 
 

@@ -66,12 +66,6 @@ def write_all(recorder: Recorder, messages: list[Message]) -> list[Message]:
     return [recorder.write(message) for message in messages]
 
 
-def wait_for(recorder: Recorder) -> None:
-    """Until all that was handed over is written."""
-    while recorder._queue.unfinished_tasks:
-        time.sleep(0.01)
-
-
 def when(message: Message) -> tuple[int, int, bool]:
     track_id = 0 if isinstance(message, Frame) else message.track_id
     is_final = isinstance(message, LengthEstimate) and message.is_final
@@ -155,9 +149,9 @@ def test_any_protobuf_reader_understands_the_schema_in_the_file(
 def test_a_flush_leaves_all_messages_so_far_readable_in_the_part(
     tmp_path: Path, messages: list[Message]
 ):
-    recorder = Recorder(tmp_path, header(), EXACT.model_copy(update={"flush_s": 1e-9}))
+    settings = EXACT.model_copy(update={"flush_s": 1e-9})
+    recorder = Recorder(tmp_path, header(), settings, in_one_thread=True)
     write_all(recorder, messages)
-    wait_for(recorder)
     found = log_times_in_part(tmp_path)
     recorder.close()
     assert found == [message.timestamp_ns for message in messages]
@@ -265,10 +259,10 @@ def test_a_disk_that_fills_up_at_the_very_end_keeps_what_was_written(
 ):
     with files_no_longer_than(2**40):
         sink = McapSink(tmp_path / "recording.mcap", header(), flush_s=1e-9)
-    recorder = Recorder(tmp_path / "b", header(), EXACT.model_copy(update={"flush_s": 1e-9}))
+    settings = EXACT.model_copy(update={"flush_s": 1e-9})
+    recorder = Recorder(tmp_path / "b", header(), settings, in_one_thread=True)
     sink.close()
     write_all(recorder, messages)
-    wait_for(recorder)
     size = os.path.getsize(tmp_path / "b" / "recording.mcap.part")
     with files_no_longer_than(size + 200), pytest.raises(OutputError):  # no room for the index
         recorder.close()

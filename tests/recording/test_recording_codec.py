@@ -23,8 +23,8 @@ from stream_dmr.messages import (
     SolverReport,
 )
 from stream_dmr.recording.messages.codec import (
-    _DATACLASSES,
     CODEC_VERSION,
+    DATACLASSES,
     check_version,
     decode,
     encode,
@@ -146,7 +146,7 @@ def test_the_header_parts_come_back_to_the_last_bit():
     assert_same(template(), decode(Template, encode(template())))
 
 
-@pytest.mark.parametrize("kind", [*_DATACLASSES.values(), Template], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("kind", [*DATACLASSES.values(), Template], ids=lambda kind: kind.__name__)
 def test_schema_and_dataclass_have_the_same_fields(kind: type):
     schema = proto_class(kind.__name__).DESCRIPTOR
     assert [field.name for field in schema.fields] == [field.name for field in fields(kind)]

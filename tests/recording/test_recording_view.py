@@ -23,6 +23,7 @@ from stream_dmr.recording.reading.frame_images import SourcePictures
 from stream_dmr.recording.reading.rrd_conversion import convert
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.rerun.live_view import LiveView
+from stream_dmr.recording.rerun.scene_drawing import SceneDrawing
 from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
 from stream_dmr.recording.view.view_geometry import shrink_by_halves, view_factor
 from stream_dmr.results.export_formats import mask_in_frame, run_lengths
@@ -248,11 +249,11 @@ def test_run_lengths_give_the_mask(mask: np.ndarray):
     np.testing.assert_array_equal(again, mask)
 
 
-def test_a_live_view_never_waits(tmp_path: Path):
+def test_a_live_view_never_waits(monkeypatch: pytest.MonkeyPatch):
     """Nobody draws, so the queue is full: records are dropped, and writing returns."""
+    monkeypatch.setattr(SceneDrawing, "draw", lambda drawing, record: time.sleep(60))
     view = LiveView(header(), RecordingSettings())
     messages = list(run(2))
-    view._drawing.draw = lambda record: time.sleep(60)  # type: ignore[method-assign]
     for _ in range(50):
         for message in messages:
             view.write(make_record(message, RecordingSettings()))
@@ -262,14 +263,13 @@ def test_a_live_view_never_waits(tmp_path: Path):
     assert time.monotonic() - began < 30
 
 
-def test_a_live_view_that_breaks_is_silent(tmp_path: Path):
-    def broken(record: object) -> None:
+def test_a_live_view_that_breaks_is_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def broken(drawing: SceneDrawing, record: object) -> None:
         raise RuntimeError("no")
 
+    monkeypatch.setattr(SceneDrawing, "draw", broken)
     with Recorder(tmp_path, header(), RecordingSettings(rrd=False), live=True) as recorder:
         assert recorder.live_address is not None
-        view = next(sink for sink in recorder._sinks if isinstance(sink, LiveView))
-        view._drawing.draw = broken  # type: ignore[method-assign]
         messages = list(run(2))
         handed_on = [recorder.write(message) for message in messages]
     fits = [message for message in handed_on if isinstance(message, FittedMesh)]

@@ -171,16 +171,20 @@ def test_recording_goes_on_when_there_is_room_again(disk: Path, messages: list[M
     settings = SETTINGS.model_copy(update={"rrd": False})
     table = FramesTable(disk, is_endless=True)
     recorder = Recorder(
-        disk, header(), settings, sinks=[table], files=files, on_refusal=notices.append
+        disk,
+        header(),
+        settings,
+        sinks=[table],
+        files=files,
+        on_refusal=notices.append,
+        in_one_thread=True,
     )
     frames_csv = disk / "frames.csv"
     with recorder:
         for message in messages:
             if message.frame_index == 3 and isinstance(message, Frame):
-                recorder._queue.join()
                 fill(disk)
             if message.frame_index == 5 and isinstance(message, Frame):
-                recorder._queue.join()
                 assert notices
                 (disk / "ballast").unlink()
             recorder.write(message)

@@ -76,11 +76,10 @@ def whole(tmp_path_factory: pytest.TempPathFactory, messages: list[Message]) -> 
 def torn(tmp_path_factory: pytest.TempPathFactory, messages: list[Message]) -> Path:
     """What a crash leaves while the stages are on both sides of the first cut."""
     out = tmp_path_factory.mktemp("torn")
-    live = recorder(tmp_path_factory.mktemp("live"))
+    live = recorder(tmp_path_factory.mktemp("live"), in_one_thread=True)
     with live:
         for message in takewhile(lambda m: m.frame_index <= 8, messages):
             live.write(message)
-        live._queue.join()
         for path in (tmp_path_factory.getbasetemp()).glob("live*/recording*"):
             shutil.copy(path, out)
     return out

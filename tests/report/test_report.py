@@ -14,7 +14,7 @@ from stream_dmr.recording.reading.open_recording import decoded_messages, open_r
 from stream_dmr.report.drawn_views import draw_views
 from stream_dmr.report.open_reports import open_report, write_report
 from stream_dmr.report.recorded_tracks import read_tracks
-from stream_dmr.report.report_page import _script
+from stream_dmr.report.report_page import json_element
 from stream_dmr.results.verdicts import Verdict, add_verdict
 from tests.support.browser import evaluate
 from tests.support.command import invoke, rows
@@ -109,7 +109,7 @@ def test_the_page_needs_nothing_from_elsewhere(page: Path):
 
 
 def test_no_name_can_break_out_of_the_page():
-    text = _script("x", {"vessel": "</script><script>alert(1)</script>"})
+    text = json_element("x", {"vessel": "</script><script>alert(1)</script>"})
     assert text.count("<") == 2
 
 

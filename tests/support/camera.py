@@ -1,5 +1,6 @@
 """A camera on loopback: an RTSP server that can be taken away and brought back."""
 
+import signal
 import socket
 import subprocess
 from collections.abc import Iterator
@@ -53,6 +54,17 @@ class Camera:
             self._process.kill()
             self._process.communicate()
             self._process = None
+
+    def freeze(self) -> None:
+        """The connection stands, and no byte comes any more; until `thaw`."""
+        self._signal(signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        self._signal(signal.SIGCONT)
+
+    def _signal(self, number: signal.Signals) -> None:
+        assert self._process is not None
+        self._process.send_signal(number)
 
     @contextmanager
     def silent(self) -> Iterator[None]:

@@ -15,16 +15,16 @@ from stream_dmr.fitting.target import Target
 from stream_dmr.template.template import Template
 
 # First steps of Adam in each kind of parameter, in its own unit (rad, body lengths, log).
-_ROOT_STEPS = [0.06] * 3 + [0.01] * 2 + [0.02]
-_JOINT_STEPS = [0.06] * 3 + [0.003] * 3 + [0.01] + [0.06] * 6
-_DECAY = 0.97  # of the steps, per iteration: large ones find the pose, small ones the outline
+ROOT_STEPS = [0.06] * 3 + [0.01] * 2 + [0.02]
+JOINT_STEPS = [0.06] * 3 + [0.003] * 3 + [0.01] + [0.06] * 6
+STEP_DECAY = 0.97  # of the steps, per iteration: large ones find the pose, small ones the outline
 # Iterations between two checks for an end; of every start in a search; starts that are finished.
 # All numbers of the descent were chosen by trial: the paper gives none.
 _CHECK_EVERY = 10
 _SEARCH_ITERATIONS = 40
 _NUM_FINISHED = 3
 # First steps, relative to those above: near the answer they are smaller.
-_NEAR, _FAR = 0.3, 1.0
+NEAR, FAR = 0.3, 1.0
 
 
 class AdamSolver:
@@ -44,17 +44,17 @@ class AdamSolver:
 
     def refine(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
         """From one start near the answer."""
-        return self._descend(target, start[None], self._settings.adam_iterations, _NEAR)[0]
+        return self.descend(target, start[None], self._settings.adam_iterations, NEAR)[0]
 
     def search(self, target: Target, starts: Float[np.ndarray, "B P"]) -> Solution:
         """A few iterations from every start, the best ones to the end, the best of these."""
-        rough = self._descend(target, starts, _SEARCH_ITERATIONS, _FAR)
+        rough = self.descend(target, starts, _SEARCH_ITERATIONS, FAR)
         rough.sort(key=lambda solution: rank(target, solution))
         best = np.stack([solution.parameters for solution in rough[:_NUM_FINISHED]])
-        fine = self._descend(target, best, self._settings.adam_iterations, _NEAR)
+        fine = self.descend(target, best, self._settings.adam_iterations, NEAR)
         return min(fine, key=lambda solution: rank(target, solution))
 
-    def _descend(
+    def descend(
         self, target: Target, starts: Float[np.ndarray, "B P"], iterations: int, step: float
     ) -> list[Solution]:
         """Minimise L_rec from B starts at once.
@@ -64,11 +64,11 @@ class AdamSolver:
         objective = Objective(self._rig, target, self._settings)
         origin = torch.tensor(starts, device=self._settings.device)
         num_joints = (starts.shape[1] - NUM_ROOT) // NUM_PER_JOINT
-        unit = torch.tensor(_ROOT_STEPS + _JOINT_STEPS * num_joints, dtype=origin.dtype)
+        unit = torch.tensor(ROOT_STEPS + JOINT_STEPS * num_joints, dtype=origin.dtype)
         unit = unit.to(origin.device) * step
         moved = torch.zeros_like(origin, requires_grad=True)
         optimizer = torch.optim.Adam([moved], lr=1.0, betas=(0.8, 0.95))
-        schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, _DECAY)
+        schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, STEP_DECAY)
         best = _Best(origin)
         last_checked = best.loss
         for iteration in range(1, iterations + 1):

@@ -184,7 +184,7 @@ def skinning_weights(
 
     Q = L L^T with a positive diagonal of L, so Q stays positive definite whatever is learnt.
     """
-    L = _cholesky_factors(precisions)
+    L = cholesky_factors(precisions)
     difference = points[:, None] - joints
     scaled = torch.einsum("bjkl,njk->bnjl", L, difference)
     return torch.softmax(-0.5 * scaled.square().sum(dim=-1), dim=-1)
@@ -216,7 +216,7 @@ def _with_depth(translation: Float[Tensor, "B 2"]) -> Float[Tensor, "B 3"]:
     return torch.nn.functional.pad(translation, (0, 1))
 
 
-def _cholesky_factors(precisions: Float[Tensor, "B J 6"]) -> Float[Tensor, "B J 3 3"]:
+def cholesky_factors(precisions: Float[Tensor, "B J 6"]) -> Float[Tensor, "B J 3 3"]:
     """Lower triangular L from its logged diagonal and its entries (1,0), (2,0), (2,1)."""
     a, b, c = precisions[..., :3].exp().unbind(-1)
     d, e, f = precisions[..., 3:].unbind(-1)

@@ -36,7 +36,7 @@ CODEC_VERSION = 4
 
 T = TypeVar("T")
 
-_DATACLASSES: dict[str, type] = {
+DATACLASSES: dict[str, type] = {
     kind.__name__: kind
     for kind in (
         *(messages.Frame, messages.FishCrop, messages.FittedMesh),
@@ -181,7 +181,7 @@ def _get(proto: Proto, field: Any) -> Any:
         return _array(inner)
     if name == "Picture":
         return decompress(_picture(inner))
-    return _build(_DATACLASSES[name], inner)
+    return _build(DATACLASSES[name], inner)
 
 
 def _picture(proto: Any) -> EncodedPicture:
