@@ -339,9 +339,7 @@ def test_the_bow_of_an_arc_is_its_sagitta_where_it_bends_in_depth(bend_rad):
 
 @pytest.mark.parametrize(("bend_rad", "is_fine"), [(1.8, True), (2.9, True), (5.0, False)])
 def test_a_fish_that_bends_further_than_fish_can_is_refused(bend_rad, is_fine):
-    fish = localized(
-        make_mesh(bent_fish(make_calibration(), bend_rad=bend_rad)), make_calibration()
-    )
+    fish = localized(bent_fish(make_calibration(), bend_rad=bend_rad), make_calibration())
     assert fish.accepted == is_fine
     assert fish.length_mm == pytest.approx(700.0, rel=0.01)  # for whoever looks at it
     assert is_fine or fish.reason == Reason.BENT_TOO_FAR
