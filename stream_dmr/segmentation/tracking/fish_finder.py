@@ -9,6 +9,8 @@ from stream_dmr.segmentation.annotations.annotated_box import UNKNOWN_ID
 from stream_dmr.segmentation.annotations.annotated_fish import AnnotatedFish, open_annotated_fish
 from stream_dmr.segmentation.annotations.box_detector import BoxDetector
 from stream_dmr.segmentation.annotations.box_files import load_boxes
+from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
+from stream_dmr.segmentation.annotations.named_pictures import NamedPictures, names_pictures
 from stream_dmr.segmentation.detection.fish_detection import Detection
 from stream_dmr.segmentation.detection.open_detector import DetectFishSettings, open_detector
 from stream_dmr.segmentation.tracking.tracked_fish import TrackedFish, TrackFishSettings
@@ -51,6 +53,8 @@ def open_finder(
     """
     if boxes is None and masks is None:
         return TrackedFish(open_detector(detect), track)
+    if boxes is not None and names_pictures(boxes):
+        return NamedPictures(boxes, open_detector(detect) if masks is None else MaskFolder(masks))
     if boxes is None or masks is not None:
         return open_annotated_fish(boxes=boxes, masks=masks)
     frames = load_boxes(boxes)

@@ -1,0 +1,127 @@
+"""Pictures of one fish each, by a CSV that says which fish a picture shows."""
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.errors import AnnotationError
+from stream_dmr.messages import FishCrop, Frame
+from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
+from stream_dmr.segmentation.detection.detector import Detector
+from stream_dmr.segmentation.detection.fish_detection import Detection
+
+PICTURE, FISH = "picture", "fish"
+_SHOWN = 5  # names in a warning
+
+
+def names_pictures(path: Path) -> bool:
+    """True for a CSV whose header has the columns `picture` and `fish`, and no box."""
+    if path.suffix.lower() != ".csv" or not path.is_file():
+        return False
+    header = path.read_text(encoding="utf-8-sig", errors="replace").partition("\n")[0]
+    return {PICTURE, FISH} <= set(_cells(header))
+
+
+class NamedPictures:
+    """A `FishFinder` of pictures that show one fish each; the same id is the same fish.
+
+    The fish is the largest thing that the detector finds, or of the masks folder all that is fish.
+    """
+
+    def __init__(self, path: Path, found_by: Detector | MaskFolder) -> None:
+        """Raises AnnotationError, with the line, where an id is no number from 1 on."""
+        self._fish = _read(path)
+        self._masks = found_by if isinstance(found_by, MaskFolder) else None
+        self._detector = found_by if isinstance(found_by, Detector) else None
+        self._unnamed: list[str] = []
+        self._seen: set[str] = set()
+
+    @property
+    def gives_masks(self) -> bool:
+        """True with a masks folder."""
+        return self._masks is not None
+
+    @property
+    def knows_ids(self) -> bool:
+        """True: the file says which fish is which."""
+        return True
+
+    @property
+    def warnings(self) -> list[str]:
+        """Pictures without a row, and rows without a picture, so far; one line each."""
+        missing = sorted(self._fish.keys() - self._seen)
+        lines = []
+        if self._unnamed:
+            lines.append(f"pictures without a fish in the CSV: {_join(self._unnamed)}; left out")
+        if missing:
+            lines.append(f"pictures of the CSV that the source doesn't have: {_join(missing)}")
+        return lines
+
+    def detect(self, frame: Frame) -> list[Detection]:
+        """The fish of a picture. Raises AnnotationError for an unusable mask."""
+        fish = self._fish.get(frame.source)
+        if fish is None:
+            self._unnamed.append(frame.source)
+            return []
+        self._seen.add(frame.source)
+        height, width = frame.image.shape[:2]
+        mask = unknown = None
+        if self._masks is not None:
+            labels = self._masks.labels(frame.frame_index, width=width, height=height)
+            mask = np.zeros((height, width), bool) if labels is None else labels.ids > 0
+            unknown = None if labels is None else labels.unknown
+        return [
+            Detection(
+                source_id=fish,
+                bbox_xyxy_px=self._box(frame),
+                mask=mask,
+                visible_fraction=1.0,
+                unknown=unknown,
+            )
+        ]
+
+    def _box(self, frame: Frame) -> Float[np.ndarray, "4"]:
+        """Around the largest candidate; the whole picture where there is none."""
+        height, width = frame.image.shape[:2]
+        found = [] if self._detector is None else self._detector.find(frame)
+        boxes = [candidate.bbox_xyxy_px for candidate in found]
+        return max(boxes, key=_area, default=np.array([0.0, 0.0, width, height]))
+
+    def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:
+        """All ids: every picture that is named shows a fish."""
+        return list(crops)
+
+
+def _area(bbox_xyxy_px: Float[np.ndarray, "4"]) -> float:
+    return float(np.prod(bbox_xyxy_px[2:] - bbox_xyxy_px[:2]))
+
+
+def _read(path: Path) -> dict[str, int]:
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        rows = csv.DictReader(file)
+        found: dict[str, int] = {}
+        for line, row in enumerate(rows, start=2):
+            name, fish = (row.get(PICTURE) or "").strip(), (row.get(FISH) or "").strip()
+            if not name or not fish.isdecimal() or int(fish) < 1:
+                raise AnnotationError(
+                    f"{path}:{line}: expected a picture's file name and a fish's number from 1 on, "
+                    f"got {name!r} and {fish!r}"
+                )
+            if found.setdefault(name, int(fish)) != int(fish):
+                raise AnnotationError(
+                    f"{path}:{line}: expected one fish a picture, got another one for {name!r}; "
+                    "pictures of several fish need --boxes or --masks with ids"
+                )
+    return found
+
+
+def _cells(line: str) -> list[str]:
+    return [cell.strip() for cell in next(csv.reader([line]), [])]
+
+
+def _join(names: list[str]) -> str:
+    shown = ", ".join(names[:_SHOWN])
+    return shown if len(names) <= _SHOWN else f"{shown} and {len(names) - _SHOWN} more"
