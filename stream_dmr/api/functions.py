@@ -67,9 +67,11 @@ class RecordedRun:
     config_toml: str  # every setting of the run
 
     def __iter__(self) -> Iterator[Message]:
-        """The messages of each kind in the order in which they were made.
+        """The messages in the order in which they were written: each kind in that of its frames.
 
-        A frame recorded by reference has an image of shape (0, 0, 3). RecordingError where the
+        Stages run side by side, so a Frame may come before the LocalizedFish of the frame before;
+        a fish's final length comes when its track has ended. To have one frame's messages together
+        collect them by `frame_index`, or open one kind at a time. A frame recorded by reference has an image of shape (0, 0, 3). RecordingError where the
         recording is damaged; what a crash cut off is logged as a warning, and the rest read.
         """
         recording = open_recordings(self.paths)
