@@ -91,3 +91,19 @@ def test_every_picture_of_the_guide_is_shown():
         ["git", "ls-files", "docs/images"], cwd=ROOT, capture_output=True, text=True, check=True
     )
     assert {ROOT / name for name in pictures.stdout.split()} <= shown
+
+
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if page.parent.name == "research" and page.name != "README.md"],
+    ids=lambda page: page.stem,
+)
+def test_a_page_of_research_says_when_how_and_what_was_decided(page):
+    text = page.read_text(encoding="utf-8")
+    assert text.startswith("# ")
+    assert text.splitlines()[0].endswith("?"), "one question a page"
+    assert re.search(r"20\d\d-\d\d-\d\d", text), "when?"
+    assert re.search(r"python -m|make \w|stream-dmr |scripts?\b|[Ll]ooked up|Command then", text), (
+        "how?"
+    )
+    assert "ecided" in text, "and then?"

@@ -71,7 +71,9 @@ class RecordedRun:
 
         Stages run side by side, so a Frame may come before the LocalizedFish of the frame before;
         a fish's final length comes when its track has ended. To have one frame's messages together
-        collect them by `frame_index`, or open one kind at a time. A frame recorded by reference has an image of shape (0, 0, 3). RecordingError where the
+        collect them by `frame_index`, or open one kind at a time.
+
+        A frame recorded by reference has an image of shape (0, 0, 3). RecordingError where the
         recording is damaged; what a crash cut off is logged as a warning, and the rest read.
         """
         recording = open_recordings(self.paths)
