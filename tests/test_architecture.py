@@ -104,6 +104,7 @@ WHO_KNOWS = {
     "torch": ["stream_dmr.segmentation", "stream_dmr.fitting.paper"],
     "prometheus_client": ["stream_dmr.watch"],
     "sqlite3": ["stream_dmr.results"],
+    "cryptography": ["stream_dmr.results"],
     "filterpy": ["stream_dmr.lengths", "stream_dmr.segmentation"],
     "onnxruntime": ["stream_dmr.segmentation.network"],
     "ray": ["stream_dmr.batch"],

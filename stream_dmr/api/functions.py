@@ -100,6 +100,7 @@ def measure(
     vessel: str = "",
     trip: str = "",
     haul: str = "",
+    key: Location | None = None,
     observer: RunObserver | None = None,
     stop: threading.Event | None = None,
 ) -> Run:
@@ -126,6 +127,7 @@ def measure(
         vessel=vessel,
         trip=trip,
         haul=haul,
+        key=_path(key),
     )
     measure_source(
         command_of(request),

@@ -14,6 +14,7 @@ from stream_dmr.cli.calibrate import calibrate
 from stream_dmr.cli.demo import demo
 from stream_dmr.cli.evaluate import evaluate
 from stream_dmr.cli.export import export
+from stream_dmr.cli.keygen import keygen
 from stream_dmr.cli.learn import learn_template
 from stream_dmr.cli.make_template import make_template
 from stream_dmr.cli.recover import recover
@@ -35,7 +36,7 @@ app = typer.Typer(
 )
 for command in (
     *(demo, run, calibrate, replay, recover, view, convert, export),
-    *(report, review, verify, batch, evaluate, train, learn_template, make_template),
+    *(report, review, verify, keygen, batch, evaluate, train, learn_template, make_template),
 ):
     app.command()(command)
 

@@ -22,17 +22,35 @@ _Config = Annotated[
 
 def verify(
     folder: Annotated[Path, typer.Argument(help="The --out of runs or of exports.", metavar="DIR")],
+    key: Annotated[
+        Path | None,
+        typer.Option(help="The device's FILE.pub: all that it signed is checked by it as well."),
+    ] = None,
 ) -> None:
     """Check that results are still what their run measured; exit 1 and say what was changed."""
     from stream_dmr.batch.verify_batch import verify_all
     from stream_dmr.errors import OutputError
     from stream_dmr.results.finished_fish import runs_cut_short
     from stream_dmr.results.lengths_database import NAME
+    from stream_dmr.results.signatures import load_public_key
+    from stream_dmr.results.verify import Change
+    from stream_dmr.results.verify_signatures import check_signatures
 
+    signed_by = None if key is None else load_public_key(key)
     changes, num_files = verify_all(folder)
+    databases, notes = sorted(folder.rglob(NAME)), list[str]()
+    if signed_by is not None:
+        if not databases:
+            changes.append(Change(folder, f"has no {NAME}, so nothing in it is signed"))
+        for database in databases:
+            check = check_signatures(database.parent, signed_by)
+            changes += [Change(database.parent, what) for what in check.changes]
+            notes += [f"{database.parent}: {note}" for note in check.notes]
     for change in changes:
         print(f"{change.path}: {change.what}")
-    for database in sorted(folder.rglob(NAME)):
+    for note in notes:
+        print(note)
+    for database in databases:
         with suppress(OutputError):  # damaged, which is said above
             for line in runs_cut_short(database.parent):
                 print(f"{database}: {line}")

@@ -70,6 +70,9 @@ def run(
     vessel: Annotated[str, typer.Option(help="Name of the vessel, for the exports.")] = "",
     trip: Annotated[str, typer.Option(help="Name of the trip, for the exports.")] = "",
     haul: Annotated[str, typer.Option(help="Name of the haul, for the exports.")] = "",
+    key: Annotated[
+        Path | None, typer.Option(help="Device key of `keygen`; signs all that is measured.")
+    ] = None,
     live: Annotated[
         bool, typer.Option("--live", help="Serve the view on this machine while measuring.")
     ] = False,
@@ -108,6 +111,7 @@ def run(
             vessel=vessel,
             trip=trip,
             haul=haul,
+            key=key,
         )
         with nullcontext(JsonLog()) if log_json else RunDisplay() as observer:
             summary = measure_source(request, stop=stop, observer=WatchObserver(observer))

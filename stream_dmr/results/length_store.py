@@ -15,6 +15,7 @@ from uuid import uuid4
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate
+from stream_dmr.results.chain_table import ChainWriter, Statement, read_chain
 from stream_dmr.results.folder_lock import FolderLock
 from stream_dmr.results.lengths_database import (
     NAME,
@@ -23,7 +24,8 @@ from stream_dmr.results.lengths_database import (
     open_for_writing,
 )
 from stream_dmr.results.reserved_space import ReservedSpace
-from stream_dmr.results.run_facts import NOT_ENDED, RunFacts
+from stream_dmr.results.run_facts import END_COLUMNS, NOT_ENDED, RunFacts
+from stream_dmr.results.signatures import END, EVENT, FILE_KINDS, FISH, RUN, Signer
 from stream_dmr.results.store_rows import MAY_COUNT_TWICE, fish_row, read_estimates
 
 _MARK_EVERY_NS = 5_000_000_000  # capture times that a crash may leave unmarked; chosen
@@ -54,10 +56,18 @@ class LengthStore:
     `trouble` has the reason meanwhile, and `close` raises OutputError if it was never written.
     """
 
-    def __init__(self, out_dir: Path, facts: RunFacts, *, waits_for_disk: bool = False) -> None:
+    def __init__(
+        self,
+        out_dir: Path,
+        facts: RunFacts,
+        *,
+        waits_for_disk: bool = False,
+        signer: Signer | None = None,
+    ) -> None:
         """Raises OutputError where another run writes there or the file can't be used.
 
         With `waits_for_disk`, rows wait in memory from the start where the disk refuses the file.
+        With a `signer`, everything that is written is signed in the same transaction.
         """
         self.path = out_dir / NAME
         self.run_id = uuid4().hex
@@ -65,13 +75,15 @@ class LengthStore:
         self._facts = replace(facts, ended_by=NOT_ENDED)
         self._reserve = ReservedSpace(out_dir)
         self._lock = RLock()
-        self._pending: list[tuple[str, tuple[object, ...]]] = []
+        self._pending: list[Statement] = []
         self._clip: tuple[str, int] | None = None  # in work, and its frames done
         self._lock_of_folder = FolderLock(out_dir)
         try:
             self._database, self._is_reached = self._open(waits_for_disk=waits_for_disk)
             self._is_stand_in = not self._is_reached
             self.before = self._used = _marks(self._database)
+            self.is_signing = signer is not None
+            self._chain = ChainWriter(signer, self._database)
             self._begin_run(waits_for_disk=waits_for_disk)
         except BaseException:
             self._lock_of_folder.release()
@@ -89,7 +101,10 @@ class LengthStore:
         values = fish_row(estimate, flags) | {"iou": iou, "run_id": self.run_id}
         values["written_ns"] = time.time_ns()
         marks = ", ".join("?" for _ in values)
-        self._write(f"INSERT INTO fish ({', '.join(values)}) VALUES ({marks})", *values.values())
+        statement = f"INSERT INTO fish ({', '.join(values)}) VALUES ({marks})"
+        with self._lock:
+            signature = self._chain.row(FISH, str(estimate.track_id), values)
+            self._write((statement, tuple(values.values())), *signature)
 
     def reserve_track(self, track_id: int) -> None:
         """Mark an id as used, durably: no later run in this folder uses it again."""
@@ -147,7 +162,7 @@ class LengthStore:
     def keep_scene(self, data: bytes) -> None:
         """Write the static scene of this calibration, for this run and later ones."""
         key = self._facts.calibration_sha256
-        self._write("INSERT OR IGNORE INTO scenes VALUES (?, ?)", key, data)
+        self._write(("INSERT OR IGNORE INTO scenes VALUES (?, ?)", (key, data)))
 
     def first_ious(self, count: int) -> list[float]:
         """The IoU of the first `count` fish that were measured here with this calibration."""
@@ -160,11 +175,23 @@ class LengthStore:
 
     def note(self, kind: str, text: str, *, timestamp_ns: int) -> None:
         """Write an event that readers of the lengths must know."""
-        self._write(
-            "INSERT INTO events (run_id, kind, text, timestamp_ns, written_ns) "
-            "VALUES (?, ?, ?, ?, ?)",
-            *(self.run_id, kind, text, timestamp_ns, time.time_ns()),
-        )
+        values = {"run_id": self.run_id, "kind": kind, "text": text}
+        values |= {"timestamp_ns": timestamp_ns, "written_ns": time.time_ns()}
+        statement = f"INSERT INTO events ({', '.join(values)}) VALUES (?, ?, ?, ?, ?)"
+        with self._lock:
+            signature = self._chain.row(EVENT, kind, values)
+            self._write((statement, tuple(values.values())), *signature)
+
+    def sign_file(self, kind: str, name: str, sha256: str) -> None:
+        """Sign a file of the folder by its hash, durably; nothing without a signer."""
+        with self._lock:
+            self._write(*self._chain.content(kind, name, sha256))
+
+    def signed_files(self) -> set[str]:
+        """The names of all files that were ever signed here."""
+        with self._lock:
+            entries = read_chain(self._database)
+        return {entry.name for entry in entries if entry.kind in FILE_KINDS}
 
     def estimates(self, *, last: int | None = None) -> list[LengthEstimate]:
         """The finished fish of this folder, in the order in which tracks ended; the `last` few."""
@@ -195,9 +222,11 @@ class LengthStore:
         """
         if not self._lock_of_folder.is_held:
             return
-        facts = self._facts
-        counts = facts.frames_done, facts.frames_promised
-        self._write(_END, time.time_ns(), facts.ended_by, *counts, self.run_id)
+        values = {"ended_ns": time.time_ns()}
+        values |= {name: getattr(self._facts, name) for name in END_COLUMNS if name not in values}
+        with self._lock:
+            signature = self._chain.row(END, self.run_id, {"run_id": self.run_id} | values)
+            self._write((_END, (*values.values(), self.run_id)), *signature)
         with suppress(sqlite3.Error):
             self._database.close()
         self._reserve.release()
@@ -226,7 +255,9 @@ class LengthStore:
         values |= {field.name: getattr(self._facts, field.name) for field in fields(self._facts)}
         marks = ", ".join("?" for _ in values)
         statement = f"INSERT INTO runs ({', '.join(values)}) VALUES ({marks})"
-        self._pending.append((statement, tuple(values.values())))
+        begun = {k: v for k, v in values.items() if k not in END_COLUMNS}
+        signature = self._chain.row(RUN, self.run_id, begun)
+        self._pending += [(statement, tuple(values.values())), *signature]
         if self._is_reached:
             self._write_pending()
             if self.trouble and not waits_for_disk:
@@ -241,9 +272,9 @@ class LengthStore:
             self._used = replace(self._used, **higher)
             self._write_pending()
 
-    def _write(self, statement: str, *values: object) -> None:
+    def _write(self, *statements: Statement) -> None:
         with self._lock:
-            self._pending.append((statement, values))
+            self._pending += statements
             self._write_pending()
 
     def _write_pending(self) -> None:

@@ -12,6 +12,8 @@ SOURCE_ENDED = "the end of the source"
 STOPPED = "a stop before the end of the source"
 ENDLESS_STOPPED = "a stop; the source has no end"
 NOT_ENDED = "nothing so far: it goes on, or a crash ended it"
+# The columns of `runs` that a run writes at its end.
+END_COLUMNS = ("ended_ns", "ended_by", "frames_done", "frames_promised")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,6 +19,8 @@ from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.lengths_table import LengthsTable
 from stream_dmr.results.provenance import sealed
 from stream_dmr.results.run_facts import run_facts
+from stream_dmr.results.signatures import Signer
+from stream_dmr.results.signed_files import SignedFiles
 from stream_dmr.running.inputs import Inputs
 from stream_dmr.running.resume import interrupted_tracks
 from stream_dmr.running.run_folder import prepare_folder
@@ -46,11 +48,14 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
     request, config, out = inputs.request, inputs.config, inputs.request.out
     is_endless, resume = inputs.is_endless, inputs.resumes
     on_refusal = observer.warn if is_endless else None
+    signer = None if request.key is None else Signer(request.key)
+    files = SignedFiles(out)
     retention = Retention(
         out,
         free_bytes=round(config.recording.keep_free_gb * 1e9) if is_endless else 0,
         flagged=partial(flagged_fish, out),
         on_notice=observer.warn,
+        on_changed=files.changed,
     )
     with suppress(OSError, OutputError):  # it tries again while the run goes on
         retention.free_space()
@@ -61,7 +66,10 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
     facts = run_facts(header, vessel=request.vessel, trip=request.trip, haul=request.haul)
     with ExitStack() as stack:
         stack.enter_context(sealed(out, with_recordings=not is_endless, on_notice=observer.warn))
-        store = stack.enter_context(closing(LengthStore(out, facts, waits_for_disk=is_endless)))
+        store = LengthStore(out, facts, waits_for_disk=is_endless, signer=signer)
+        stack.enter_context(closing(store))
+        files.attach(store, repaired=[repair.path for repair in repairs])
+        stack.callback(partial(files.finish, with_recordings=not is_endless))
         lengths = LengthsTable(out, store, resume=resume, on_refusal=on_refusal)
         stack.enter_context(closing(lengths))
         stack.enter_context(closing(observer))
@@ -78,7 +86,11 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
             live=request.live,
             sinks=[FramesTable(out, resume=resume, is_endless=is_endless)],
             files=partial(
-                open_segments, interrupted=interrupted, on_notice=observer.warn, states=states
+                open_segments,
+                interrupted=interrupted,
+                on_notice=observer.warn,
+                on_closed=files.changed,
+                states=states,
             )
             if is_endless
             else open_recording_files,

@@ -27,6 +27,7 @@ class RunRequest:
     vessel: str = ""  # vessel, trip and haul, for the exports
     trip: str = ""
     haul: str = ""
+    key: Path | None = None  # of the device, to sign with
 
 
 def default_out(source: str) -> Path:

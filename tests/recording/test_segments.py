@@ -31,8 +31,10 @@ from stream_dmr.recording.segments.rotating_sink import open_segments
 from stream_dmr.report.view_pictures import frame_images, recorded_source
 from stream_dmr.results.folder_lock import FolderLock
 from stream_dmr.results.frames_table import FramesTable
+from stream_dmr.results.signatures import load_public_key, make_key
 from stream_dmr.results.store_rows import INTERRUPTED, MAY_COUNT_TWICE
 from stream_dmr.results.verify import verify
+from stream_dmr.results.verify_signatures import check_signatures
 from tests.running.test_run_signals import start, wait_for_rows
 from tests.support.command import invoke, rows
 from tests.support.reading import read_header, read_messages
@@ -304,7 +306,9 @@ def test_a_length_that_only_the_recording_has_is_taken_over(tmp_path: Path):
 @pytest.fixture(scope="module")
 def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A measurement of clips, killed in the middle of a fish and started again."""
-    options = write_clips(tmp_path_factory.mktemp("interrupted"), num_frames=110)
+    folder = tmp_path_factory.mktemp("interrupted")
+    make_key(folder / "key")
+    options = write_clips(folder, num_frames=110) | {"--key": str(folder / "key")}
     out = Path(options["--out"])
     killed = start(options)
     wait_for_rows(out / "frames.csv", 45, killed)
@@ -364,6 +368,12 @@ def test_fish_in_view_at_a_crash_are_finished_by_the_restart_and_say_so(interrup
     assert exported.keys() == fish.keys()
     assert {i for i, status in exported.items() if MAY_COUNT_TWICE in status} == flagged
     assert all("recovered after a crash" in change.what for change in verify(interrupted)[0])
+
+
+def test_what_a_crash_interrupted_is_signed_all_the_same(interrupted: Path):
+    check = check_signatures(interrupted, load_public_key(interrupted.parent / "key.pub"))
+    assert check.changes == []
+    assert [note for note in check.notes if "signed when a run found it" in note]
 
 
 def test_every_frame_of_clips_is_found_again_over_a_restart(interrupted: Path):

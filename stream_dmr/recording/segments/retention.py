@@ -37,9 +37,10 @@ class Retention:
         free_bytes: int,
         flagged: Callable[[], Collection[int]],
         on_notice: Callable[[str], None],
+        on_changed: Callable[[Path], None] = lambda path: None,
     ) -> None:
         self._folder, self._free_bytes = folder, free_bytes
-        self._flagged, self._on_notice = flagged, on_notice
+        self._flagged, self._on_notice, self._on_changed = flagged, on_notice, on_changed
         self._known: dict[str, tuple[Collection[int], bool]] = {}  # by stem, see `_facts`
         self._stop = Event()
         self._thread = Thread(target=self._watch, name="retention", daemon=True)
@@ -113,6 +114,7 @@ class Retention:
     def _remove(self, path: Path, what: str) -> Iterator[str]:
         if path.exists():
             path.unlink()
+            self._on_changed(path)
             yield what
 
     def _thin(self, path: Path) -> Iterator[str]:
@@ -123,6 +125,7 @@ class Retention:
         with suppress(OSError):
             copy, _ = rewrite(path, note=THINNED, edit=_without_pictures)
             rename_durably(copy, path)
+            self._on_changed(path)
             self._known[path.stem] = tracks, True
             yield "pictures and masks"
 

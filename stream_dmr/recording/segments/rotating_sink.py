@@ -47,14 +47,16 @@ class RotatingSink:
         *,
         interrupted: Iterable[LocalizedFish] = (),
         on_notice: Callable[[str], None],
+        on_closed: Callable[[Path], None] = lambda path: None,
         states: SinkStates | None = None,
     ) -> None:
         """`interrupted`: frames of tracks that an earlier run left open and this one finishes.
 
-        `states` gets the state of the files of each kind.
+        `on_closed` gets each file that is complete, `states` the state of the files of each kind.
         """
         self._out_dir, self._header, self._settings = out_dir, header, settings
         self._on_notice, self._states = on_notice, states or SinkStates()
+        self._on_closed = on_closed
         self._number = last_segment_number(out_dir)
         self._began_ns: int | None = None  # capture time of the first frame
         self._cut_ns: int | None = None  # of the first frame of `_next`
@@ -201,6 +203,7 @@ class RotatingSink:
         for path in filter(is_unfinished, unfinished):
             repaired = repair_file(path, left_by="a disk that refused its end")
             self._on_notice(repaired.line)
+            self._on_closed(repaired.path)
             if repaired.path == path and is_unfinished(path):
                 self._unfinished.append(path)
 
@@ -231,6 +234,7 @@ class RotatingSink:
         for sink in sinks:
             try:
                 sink.close()
+                self._on_closed(sink.path)
             except OutputError as error:
                 self._states.report(f"{STEM}-*{sink.path.suffix}", str(error))
                 self._on_notice(str(error))
@@ -251,13 +255,20 @@ def open_segments(
     *,
     interrupted: Iterable[LocalizedFish] = (),
     on_notice: Callable[[str], None],
+    on_closed: Callable[[Path], None] = lambda path: None,
     states: SinkStates | None = None,
 ) -> list[Sink]:
     """A `RotatingSink`, or nothing where the settings ask for no recording."""
     if not (settings.mcap or settings.rrd):
         return []
     sink = RotatingSink(
-        out_dir, header, settings, interrupted=interrupted, on_notice=on_notice, states=states
+        out_dir,
+        header,
+        settings,
+        interrupted=interrupted,
+        on_notice=on_notice,
+        on_closed=on_closed,
+        states=states,
     )
     return [sink]
 
