@@ -264,7 +264,7 @@ def first_parameter(method: object) -> str:
 
 
 @pytest.mark.parametrize("node", NODES)
-def test_what_a_node_owes_later_is_what_it_gives_at_once(node: type):
+def test_tick_and_close_return_what_step_returns(node: type):
     hints = [get_type_hints(inspect.unwrap(getattr(node, m))) for m in ("step", "tick", "close")]
     assert len({get_args(hint["return"]) for hint in hints}) == 1
     assert issubclass(node, Node)

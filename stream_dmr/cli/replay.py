@@ -58,7 +58,7 @@ def replay(
     ] = False,
 ) -> None:
     """Recompute a recording from one stage on, with its own inputs or with others."""
-    from stream_dmr.cli.terminal import RunDisplay, print_check, print_fish, print_timings
+    from stream_dmr.cli.terminal import RunDisplay, print_check, print_replay
     from stream_dmr.replaying.replay_recording import replay as replay_recording
     from stream_dmr.replaying.replay_request import ReplayRequest
 
@@ -79,13 +79,7 @@ def replay(
     )
     with stop_on_signals() as stop, RunDisplay() as display:
         summary = replay_recording(request, stop=stop, observer=display)
-    print_fish(summary.fish)
-    if timings:
-        print_timings(summary)
-    speed = summary.recorded_s / summary.elapsed_s
-    print(f"{summary.num_frames} frames in {summary.elapsed_s:.1f} s, {speed:.0f} times real time")
-    if out is not None:
-        print(f"results in {out}")
+    print_replay(summary, out, timings=timings)
     if stop.signal_number:
         raise typer.Exit(128 + stop.signal_number)
     if check:

@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Collection, Sequence
 from math import inf
+from pathlib import Path
 from types import TracebackType
 
 from rich.console import Console
@@ -111,6 +112,17 @@ def print_fish(fish: Sequence[LengthEstimate], *, may_count_twice: Collection[in
             else status_text(estimate),
         )
     _stdout().print(table if fish else "no fish")
+
+
+def print_replay(summary: ReplaySummary, out: Path | None, *, timings: bool) -> None:
+    """Print the fish of a replay, its speed and where its results are, to stdout."""
+    print_fish(summary.fish)
+    if timings:
+        print_timings(summary)
+    speed = summary.recorded_s / summary.elapsed_s
+    print(f"{summary.num_frames} frames in {summary.elapsed_s:.1f} s, {speed:.0f} times real time")
+    if out is not None:
+        print(f"results in {out}")
 
 
 def print_check(summary: ReplaySummary) -> None:

@@ -3,8 +3,9 @@
 import threading
 import time
 from collections.abc import Collection, Iterable, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish
@@ -17,6 +18,7 @@ from stream_dmr.replaying.recorded_messages import PlaybackNode, RecordedMessage
 from stream_dmr.replaying.replay_inputs import ReplayInputs, new_header, read_inputs
 from stream_dmr.replaying.replay_outputs import (
     OriginalRun,
+    ReplayOutputs,
     open_replay_outputs,
     read_recorded_run,
 )
@@ -69,25 +71,14 @@ def replay(
     _refuse_impossible(request, recording)
     inputs = read_inputs(request, recording)
     recorded = RecordedMessages(recording, request.selection)
-    is_light = FittedMesh not in request.recomputed  # no stage computes outside Python for long
     carried_over = _carried_over(request, recorded)
     with ExitStack() as stack:
         frames, nodes = _open_chain(request, recorded, inputs, stack)
         continue_tracks(nodes, carried_over)
         outputs = None
         if request.out is not None:
-            outputs = stack.enter_context(
-                open_replay_outputs(
-                    request,
-                    request.out,
-                    new_header(request, recording.header, inputs),
-                    inputs,
-                    _recorded_run(request, recording, observer),
-                    stop=stop,
-                    observer=observer,
-                    in_one_thread=is_light,
-                )
-            )
+            opening = _open_outputs(request, request.out, recording, inputs, stop, observer)
+            outputs = stack.enter_context(opening)
         comparator = _open_comparator(request, recorded, {fish.track_id for fish in carried_over})
         writer = ReplayWriter(
             recorded,
@@ -109,7 +100,7 @@ def replay(
             on_message=writer.write,
             on_frame=on_frame,
             stop=stop,
-            in_one_thread=is_light,
+            in_one_thread=_is_light(request),
         )
     if comparator is not None:
         comparator.finish()
@@ -127,6 +118,31 @@ def replay(
         mismatches=comparator.mismatches if comparator else [],
         other_versions=_other_versions(recording),
         length_change=comparator.length_change if comparator else 0.0,
+    )
+
+
+def _is_light(request: ReplayRequest) -> bool:
+    """True where no stage computes outside of Python for long."""
+    return FittedMesh not in request.recomputed
+
+
+def _open_outputs(
+    request: ReplayRequest,
+    out: Path,
+    recording: Recording,
+    inputs: ReplayInputs,
+    stop: threading.Event,
+    observer: RunObserver,
+) -> AbstractContextManager[ReplayOutputs]:
+    return open_replay_outputs(
+        request,
+        out,
+        new_header(request, recording.header, inputs),
+        inputs,
+        _recorded_run(request, recording, observer),
+        stop=stop,
+        observer=observer,
+        in_one_thread=_is_light(request),
     )
 
 

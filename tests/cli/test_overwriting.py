@@ -65,7 +65,7 @@ def test_not_even_overwrite_or_a_link_reaches_what_a_run_measured(
     assert (out / name).read_bytes() == before
 
 
-def test_a_page_is_written_over_its_own_or_where_told_to(out: Path, tmp_path: Path):
+def test_a_page_is_written_over_its_own_or_where_asked_to(out: Path, tmp_path: Path):
     mine = tmp_path / "mine.html"
     mine.write_text("my own notes")
     assert report(out, mine).code == 2

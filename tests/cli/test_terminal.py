@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+from pathlib import Path
 
 import pytest
 import typer
@@ -13,6 +14,7 @@ from stream_dmr.cli.terminal import (
     length_text,
     print_check,
     print_fish,
+    print_replay,
     print_timings,
     status_text,
 )
@@ -60,6 +62,15 @@ def test_the_table_names_every_fish(capsys: pytest.CaptureFixture[str]):
     assert "twice" not in lines[1]
     print_fish([])
     assert capsys.readouterr().out == "no fish\n"
+
+
+def test_a_replay_says_how_fast_it_was_and_where_its_results_are(
+    capsys: pytest.CaptureFixture[str],
+):
+    print_replay(summary(), Path("again"), timings=False)
+    shown = capsys.readouterr().out
+    assert "10 frames in 2.0 s, 2 times real time" in shown
+    assert "results in again" in shown
 
 
 def test_a_replay_of_equal_bits_says_so(capsys: pytest.CaptureFixture[str]):

@@ -236,7 +236,7 @@ def test_common_error_does_not_average_out():
     np.testing.assert_allclose(final.ci95_mm, [700 - 27.5, 700 + 27.5], atol=0.3)
 
 
-def test_no_single_frame_counts_as_surer_than_the_floor():
+def test_no_frame_has_a_smaller_std_than_the_floor():
     measurement = measurement_of(frame(1, 700.0, std_mm=0.0), SmoothLengthSettings())
     assert measurement.std_ratio == SmoothLengthSettings().min_frame_std_ratio
 

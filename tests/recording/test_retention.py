@@ -128,9 +128,7 @@ def test_what_is_left_of_a_segment_is_what_it_was(recorded: Path, disk: Path):
         assert path.stat().st_size < 0.5 * (recorded / path.name).stat().st_size
 
 
-def test_a_disk_without_room_to_write_the_rest_anew_loses_a_whole_segment(
-    recorded: Path, disk: Path
-):
+def test_a_disk_without_room_to_rewrite_the_rest_loses_a_whole_segment(recorded: Path, disk: Path):
     out = Path(shutil.copytree(recorded, disk / "out"))
     for rrd in out.glob("*.rrd"):
         rrd.unlink()

@@ -400,7 +400,7 @@ def localized(path: Path) -> list[LocalizedFish]:
 
 
 @pytest.mark.parametrize("first", ["fit", "localize", "smooth"])
-def test_all_segments_in_a_row_are_what_was_recorded_over_a_crash(interrupted: Path, first: str):
+def test_consecutive_segments_are_what_was_recorded_over_a_crash(interrupted: Path, first: str):
     outcome = invoke(f"replay {interrupted}", {"--from": first, "--check": None})
     assert outcome.code == 0, outcome.out + outcome.err
     assert "recovered after a crash" in outcome.err

@@ -38,7 +38,7 @@ def moved(recorded: Path):
         path.with_name(f"{path.name}.away").replace(path)
 
 
-def test_crops_are_cut_anew_from_the_run_s_own_files(recorded: Path, monkeypatch, tmp_path):
+def test_crops_are_cut_again_from_the_run_s_own_files(recorded: Path, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     outcome = invoke(f"replay {recorded / 'out'}", {"--from": "crop", "--check": None})
     assert outcome.code == 0, outcome.out + outcome.err

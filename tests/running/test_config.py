@@ -110,7 +110,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("text", MISTAKES)
-def test_every_mistake_is_one_line_that_mends_it(tmp_path: Path, text: str):
+def test_every_mistake_is_one_line_with_its_remedy(tmp_path: Path, text: str):
     assert refusal(tmp_path, text) == "config.toml" + MISTAKES[text]
 
 

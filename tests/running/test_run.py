@@ -177,7 +177,7 @@ def test_folders_of_any_kind_of_picture_are_measured(tmp_path: Path, kind: str):
     assert len(rows(Path(options["--out"]) / "frames.csv")) == 3
 
 
-def test_earlier_results_are_kept_unless_told_otherwise(tmp_path: Path):
+def test_earlier_results_are_kept_unless_asked_to_replace_them(tmp_path: Path):
     options = write_clip(tmp_path / "clip", num_frames=3)
     out = Path(options["--out"])
     assert invoke("run", options).code == 0
@@ -215,7 +215,7 @@ def test_a_resumed_run_numbers_fish_and_recordings_on(tmp_path: Path):
     assert {fish.track_id for fish in resumed} == {3, 4}
 
 
-def test_lengths_csv_is_mended_from_the_database(tmp_path: Path):
+def test_lengths_csv_is_restored_from_the_database(tmp_path: Path):
     options = write_clip(tmp_path / "clip", fish=[[1, 2]] * 3)
     out = Path(options["--out"])
     assert invoke("run", options).code == 0

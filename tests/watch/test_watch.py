@@ -240,7 +240,7 @@ def test_a_run_counts_every_frame_of_every_stage(tmp_path: Path):
         urllib.request.urlopen(observer.address, timeout=1)  # it ends with the run
 
 
-def test_systemd_is_told_as_long_as_the_run_is_alive(
+def test_systemd_is_notified_as_long_as_the_run_is_alive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     alive = True
