@@ -1,9 +1,11 @@
 """Files: writes undone when they fail, durable renames, hashes, natural order of names."""
 
+import errno
 import fcntl
 import io
 import os
 import re
+import warnings
 import weakref
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager, suppress
@@ -11,7 +13,12 @@ from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 from stream_dmr.errors import OutputError
+
+MAX_TEXT_BYTES = 1_000_000  # chosen: many times what any settings or calibration take
+MAX_PIXELS = 150_000_000  # chosen: the largest cameras have some 100 megapixels
 
 
 class TransactionalFile:
@@ -115,6 +122,35 @@ class _SnapshotStream(io.RawIOBase):
         buffer[: len(data)] = data
         self._position += len(data)
         return len(data)
+
+
+def read_text(path: Path, *, encoding: str = "utf-8", max_bytes: int = MAX_TEXT_BYTES) -> str:
+    """The text of a file that people write, such as settings; devices don't end.
+
+    Raises OSError where it can't be read or is larger than `max_bytes`, UnicodeDecodeError.
+    """
+    with path.open("rb") as file:
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise OSError(errno.EFBIG, f"more than {max_bytes // 1000} kB")
+    return data.decode(encoding)
+
+
+def size_if_huge(path: Path) -> str:
+    """Width and height of a picture too large to be decoded, by its header; "" of any other file.
+
+    Its pixels alone would take half a gigabyte and more.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path) as picture:
+                width, height = picture.size
+    except Image.DecompressionBombError:
+        return f"more than {MAX_PIXELS // 10**6} megapixels"
+    except (OSError, ValueError, SyntaxError):
+        return ""
+    return f"{width}x{height} px" if width * height > MAX_PIXELS else ""
 
 
 def is_locked(folder: Path) -> bool:

@@ -4,6 +4,7 @@ Keys: `image_width, image_height, camera_matrix, distortion_coefficients, rvec, 
 tvec take world points (the reference plane is world Z = 0) to camera points in mm.
 """
 
+import re
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.errors import CalibrationError, OutputError
+from stream_dmr.files import read_text
 
 _KEYS = (
     "image_width",
@@ -28,6 +30,7 @@ _REMEDY = "make the file again with `stream-dmr calibrate`"
 # that tvec is in metres.
 _MIN_SLOPE = np.sin(np.radians(3.0))
 _MIN_DEPTH_MM = 10.0
+_MAX_NESTING = 200  # chosen: ours has two levels
 
 
 def load_calibration(path: Path | str) -> Calibration:
@@ -93,7 +96,7 @@ def require_size(calibration: Calibration, *, width: int, height: int) -> None:
 def _read_values(path: Path) -> dict[str, float | np.ndarray]:
     """The number or matrix of every key, as OpenCV parses them."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise CalibrationError(f"{path}: expected a calibration file, got none there") from error
     except OSError as error:
@@ -104,6 +107,8 @@ def _read_values(path: Path) -> dict[str, float | np.ndarray]:
         raise _not_yaml(path, "bytes that are no text") from error
     if not text.startswith("%YAML"):
         raise _not_yaml(path, f"a file that begins with {text[:20]!r}" if text else "an empty file")
+    if _nesting(text) > _MAX_NESTING:  # OpenCV's parser would use up its stack, and the process
+        raise _not_yaml(path, f"one that is nested deeper than {_MAX_NESTING} levels")
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         nodes = {key: storage.getNode(key) for key in _KEYS}
@@ -115,6 +120,16 @@ def _read_values(path: Path) -> dict[str, float | np.ndarray]:
             f"add them, or {_REMEDY}"
         )
     return {key: _value(node, key, path=path) for key, node in nodes.items()}
+
+
+def _nesting(text: str) -> int:
+    """How deep the values of a YAML are nested at most: in brackets, dashes and indentation."""
+    deepest = depth = 0
+    for bracket in re.findall(r"[\[{\]}]", text):
+        depth += 1 if bracket in "[{" else -1
+        deepest = max(deepest, depth)
+    starts = re.findall(r"^(?:[ \t]|-(?=\s))+", text, re.MULTILINE)
+    return max(deepest, max(map(len, starts), default=0))
 
 
 def _value(node: cv2.FileNode, key: str, *, path: Path) -> float | np.ndarray:

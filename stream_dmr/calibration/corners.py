@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from stream_dmr.errors import CalibrationError
+from stream_dmr.files import size_if_huge
 
 Board = tuple[int, int]  # inner corners a row, and a column
 
@@ -44,8 +45,10 @@ def board_points_mm(board: Board, square_mm: float) -> Float[np.ndarray, "N 3"]:
 def read_grey(path: Path) -> UInt8[np.ndarray, "H W"]:
     """Read a picture in sensor orientation: grey, 8 bit, EXIF rotation ignored.
 
-    Raises CalibrationError where the file can't be read or is no picture.
+    Raises CalibrationError where the file can't be read, is no picture, or one that is too large.
     """
+    if huge := size_if_huge(path):
+        raise CalibrationError(f"{path}: too large: {huge}")
     try:
         content = np.frombuffer(path.read_bytes(), np.uint8)
     except OSError as error:

@@ -1,5 +1,6 @@
 """What several commands share: options, the command as typed, signals that end a run."""
 
+import _thread
 import shlex
 import signal
 import sys
@@ -79,9 +80,11 @@ def stop_on_signals() -> Generator[Stop]:
     stop = Stop()
 
     def on_signal(number: int, frame: FrameType | None) -> None:
-        if not stop.is_set():
+        if not stop.signal_number:
             stop.signal_number = number
-            stop.set()
+            # In another thread: a second signal may interrupt this one, or the main thread may be
+            # waiting for the event, and the lock in it can't be taken twice.
+            _thread.start_new_thread(stop.set, ())
 
     signals = (signal.SIGINT, signal.SIGTERM)
     before = [signal.signal(number, on_signal) for number in signals]

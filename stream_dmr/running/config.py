@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 
 from stream_dmr.errors import ConfigError
 from stream_dmr.evaluation.length_errors import EvaluateSettings
+from stream_dmr.files import read_text
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.localization.localize_fish import LocalizeSettings
@@ -100,7 +101,7 @@ def load_config(path: Path | str | None) -> Config:
     if path is None:
         return Config()
     try:
-        return parse_config(Path(path).read_text(encoding="utf-8"), where=str(path))
+        return parse_config(read_text(Path(path)), where=str(path))
     except OSError as error:
         raise ConfigError(f"{path}: expected a config.toml, got: {error.strerror}") from error
     except UnicodeDecodeError as error:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from stream_dmr.errors import SourceError
-from stream_dmr.files import natural_order
+from stream_dmr.files import MAX_PIXELS, natural_order, size_if_huge
 from stream_dmr.messages import Frame
 from stream_dmr.sources.source import Source, check_size, nominal_ns
 
@@ -91,7 +91,14 @@ def _pictures_in(folder: Path) -> list[Path]:
 
 
 def _read_picture(path: Path) -> np.ndarray | None:
-    """A picture as BGR of its own depth, turned upright if it says so; None if it can't be read."""
+    """A picture as BGR of its own depth, turned upright if it says so; None if it can't be read.
+
+    Raises SourceError for one that is too large, before it takes the memory.
+    """
+    if huge := size_if_huge(path):
+        raise SourceError(
+            f"{path}: expected a picture of {MAX_PIXELS // 10**6} megapixels or less, got {huge}"
+        )
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     return picture if picture is not None and picture.dtype.name in _DEPTHS else None
 

@@ -12,6 +12,7 @@ import trimesh
 from jaxtyping import Float
 
 from stream_dmr.errors import OutputError, TemplateError
+from stream_dmr.files import read_text
 from stream_dmr.template.body_forms import JOINTS
 from stream_dmr.template.mesh_points import find_points
 from stream_dmr.template.mesh_repair import repair_mesh
@@ -120,7 +121,7 @@ def _read_mesh(path: Path) -> trimesh.Trimesh:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(read_text(path))
     except (OSError, ValueError, RecursionError) as error:  # ValueError: not TOML, or not text
         raise TemplateError(f"template {path}: expected TOML, got: {error}") from error
 

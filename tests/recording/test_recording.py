@@ -40,6 +40,7 @@ from stream_dmr.recording.messages.sink import SinkFactory
 from stream_dmr.recording.messages.topics import FOXGLOVE_TOPICS, TOPICS, topics_table
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.segments.recording_files import open_recording_files
+from stream_dmr.recording.segments.repair import repair_recordings
 from stream_dmr.recording.segments.rotating_sink import open_segments
 from stream_dmr.recording.view.view_geometry import place_fit
 from stream_dmr.results.frames_table import FramesTable
@@ -236,6 +237,20 @@ def files_no_longer_than(size: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_view_that_has_no_room_to_be_repaired_stays(tmp_path: Path, messages: list[Message]):
+    record(tmp_path, messages, RecordingSettings())
+    rrd = tmp_path / "recording.rrd"
+    rrd.write_bytes(rrd.read_bytes()[:-200])
+    before = rrd.read_bytes()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stream_dmr.recording.segments.repair.free_bytes", lambda folder: 1000)
+        (repair,) = repair_recordings(tmp_path)
+    assert "No space left on device; it stays as it is" in repair.line
+    assert rrd.read_bytes() == before
+    (repair,) = repair_recordings(tmp_path)
+    assert "what is whole of the view is kept" in repair.line
 
 
 @pytest.mark.parametrize("size", [400_000, 543_210, 700_000])

@@ -1,5 +1,7 @@
 """Repairs recordings that a crash, a power cut or a full disk left unfinished."""
 
+import errno
+import os
 from collections.abc import Iterator
 from contextlib import suppress
 from itertools import count
@@ -7,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from stream_dmr.errors import RecordingError
-from stream_dmr.files import rename_durably, sync_path
+from stream_dmr.files import free_bytes, rename_durably, sync_path
 from stream_dmr.recording.mcap.mcap_recording import McapRecording, is_torn
 from stream_dmr.recording.mcap.mcap_sink import PART
 from stream_dmr.recording.mcap.rewrite import REWRITTEN, rewrite
@@ -85,6 +87,8 @@ def _repair_mcap(part: Path) -> tuple[Path, str]:
 
 def _repair_rrd(rrd: Path) -> tuple[Path, str]:
     repaired = rrd.with_name(rrd.name + REWRITTEN)
+    if free_bytes(rrd.parent) < rrd.stat().st_size:  # Rerun does not say that the copy had no room
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     copy_readable_chunks(rrd, repaired)
     if not (repaired.is_file() and is_closed(repaired)):
         raise RecordingError(f"{rrd}: nothing of it could be read")

@@ -3,11 +3,13 @@
 from pathlib import Path
 
 from stream_dmr.errors import AnnotationError
+from stream_dmr.files import read_text
 from stream_dmr.segmentation.annotations.annotated_box import AnnotatedBox
 from stream_dmr.segmentation.annotations.coco import parse_coco
 from stream_dmr.segmentation.annotations.cvat import parse_cvat
 from stream_dmr.segmentation.annotations.mot import COLUMNS, parse_mot
 
+_MAX_BYTES = 1 << 29  # chosen: some ten million boxes
 _PARSERS = {".json": parse_coco, ".xml": parse_cvat}
 
 
@@ -23,7 +25,7 @@ def load_boxes(path: Path) -> dict[int, list[AnnotatedBox]]:
 
 def _read_text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return read_text(path, encoding="utf-8-sig", max_bytes=_MAX_BYTES)
     except UnicodeDecodeError:
         raise AnnotationError(
             f"{path}: expected a text file of boxes ({COLUMNS}), got binary data"
