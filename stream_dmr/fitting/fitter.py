@@ -20,7 +20,7 @@ from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import ROOT_ROTATION
 from stream_dmr.fitting.shape.candidates import CandidateShape
 from stream_dmr.fitting.shape.evidence import nats_against
-from stream_dmr.fitting.shape.length_std import freed, shape_std_ratio
+from stream_dmr.fitting.shape.length_std import freed, shape_std_ratio, slant_std_ratio
 from stream_dmr.fitting.shape.space import (
     TRUNK,
     directions,
@@ -83,10 +83,12 @@ class Fitter:
         normal = _TOWARD_CAMERA if plane_normal is None else plane_normal
         self._index = index
         self._shape_covariance = individual_covariance()
+        self._breadth_std = 0.0  # of the log breadth, where it is learnt
         if candidate is not None:
             template = reshaped(template, candidate.coefficients)
             settings = freed(settings, float(TRUNK @ candidate.covariance @ TRUNK))
             self._shape_covariance += candidate.covariance
+            self._breadth_std = float(np.sqrt(TRUNK @ self._shape_covariance @ TRUNK))
         self.plane_normal = np.ascontiguousarray(normal)
         self._template = template
         self._settings = settings
@@ -218,7 +220,21 @@ class Fitter:
         if not self._settings.scans_sizes:
             return None
         problem = self._problem(self._levels.coarse, target.coarse())
-        return shape_std_ratio(problem, parameters, self._directions, self._shape_covariance)
+        std = shape_std_ratio(problem, parameters, self._directions, self._shape_covariance)
+        return float(np.hypot(std, self._hidden_slant_std(parameters)))
+
+    def _hidden_slant_std(self, parameters: Float[np.ndarray, "P"]) -> float:
+        """A flat fish would rather roll than slant, so it counts as far as the fish is round."""
+        if self._breadth_std == 0.0:
+            return 0.0
+        axis = Rotation.from_rotvec(parameters[ROOT_ROTATION]).as_matrix()[:, 0]
+        breadth, thickness = self._half_section
+        roundness = min(thickness / breadth, 1.0)
+        return roundness * slant_std_ratio(
+            float(np.arcsin(np.clip(self.plane_normal @ axis, -1, 1))),
+            slant_std_rad=self._settings.tilt_std_rad,
+            breadth_std=self._breadth_std,
+        )
 
     def _height_ratio(self, parameters: Float[np.ndarray, "P"]) -> float:
         """How far the elliptic section at the center reaches along the plane's normal."""

@@ -21,6 +21,25 @@ def freed(settings: FitMeshSettings, breadth_variance: float) -> FitMeshSettings
     return settings.model_copy(update={"lambda_scale": settings.nat / (2 * variance)})
 
 
+_SLANTS_RAD = np.linspace(0.0, 1.2, 61)
+
+
+def slant_std_ratio(slant_rad: float, *, slant_std_rad: float, breadth_std: float) -> float:
+    """Std of the log length by slant that hides behind a breadth known to `breadth_std` (log).
+
+    A fish of length L that slants by t is seen L cos t long, as one whose breadth is exp(t^2 / 2)
+    times as large. So a body that is taken for too broad is fitted without slant, and the slope of
+    its length to its shape, of `shape_std_ratio`, is nil. Here the slant has its prior and the
+    breadth makes good for the rest.
+    """
+    lengths = -np.log(np.cos(_SLANTS_RAD))
+    broader = lengths + np.log(np.cos(min(abs(slant_rad), _SLANTS_RAD[-1])))
+    nats = 0.5 * (_SLANTS_RAD / slant_std_rad) ** 2 + 0.5 * (broader / breadth_std) ** 2
+    weights = np.exp(nats.min() - nats)
+    weights /= weights.sum()
+    return float(np.sqrt(weights @ lengths**2 - (weights @ lengths) ** 2))
+
+
 def shape_std_ratio(
     problem: Problem,
     parameters: Float[np.ndarray, "P"],
