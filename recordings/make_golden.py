@@ -25,11 +25,13 @@ def main() -> None:
     if (GOLDEN / "recording.mcap").exists():
         _print_moved()
     with tempfile.TemporaryDirectory() as folder:
+        # From a copy, since a recording says where its inputs lay.
+        scene = Path(shutil.copytree(DEMO_SCENE, Path(folder) / "scene"))
         request = RunRequest(
-            source=str(DEMO_SCENE / "video.mp4"),
-            boxes=DEMO_SCENE / "boxes.txt",
-            masks=DEMO_SCENE / "masks",
-            calibration=DEMO_SCENE / "calibration.yaml",
+            source=str(scene / "video.mp4"),
+            boxes=scene / "boxes.txt",
+            masks=scene / "masks",
+            calibration=scene / "calibration.yaml",
             out=Path(folder) / "out",
             command="make golden",
         )
