@@ -4,11 +4,13 @@ Skinning weights are a softmax of e_j, so that a blend X = sum_j W_j X_j has
 dX/de_j = W_j (X_j - X). The layout of the parameters stands in `stream_dmr.fitting.parameters`.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.compiled import compiled
-from stream_dmr.fitting.contour.rotation_vector import rotated_slope
+from stream_dmr.fitting.contour.rotation_vector import rotated_slope, rotation_and_jacobian
 from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION, ROOT_TRANSLATION
 
 
@@ -67,29 +69,42 @@ def blend(
             out[k] += W[j] * values[j, k]
 
 
+class Root(NamedTuple):
+    """The root's own motion: a point p of the body comes to size (R p + shift)."""
+
+    R: Float[np.ndarray, "3 3"]
+    J: Float[np.ndarray, "3 3"]  # right Jacobian of the rotation vector
+    shift: Float[np.ndarray, "2"]  # x and y
+    size: float
+
+
+@compiled
+def root_of(parameters: Float[np.ndarray, "P"]) -> Root:
+    """The root's motion by its parameters."""
+    R, J = rotation_and_jacobian(parameters[ROOT_ROTATION])
+    return Root(R, J, parameters[ROOT_TRANSLATION], np.exp(parameters[LOG_SIZE]))
+
+
 @compiled
 def root_slope(
-    root: Float[np.ndarray, "3 3"],
-    root_J: Float[np.ndarray, "3 3"],
-    size: float,
-    parameters: Float[np.ndarray, "P"],
+    root: Root,
     v: Float[np.ndarray, "3"],
     shift: Float[np.ndarray, "3"],
     scale: float,
     out: Float[np.ndarray, "3 P"],
     A: Float[np.ndarray, "3 3"],
 ) -> None:
-    """Slope of scale size (root v + shift + T_0) to the root's parameters into `out`.
+    """Slope of scale size (R v + shift + T_0) to the root's parameters into `out`.
 
     A is overwritten.
     """
-    rotated_slope(root, root_J, v, A)
-    root_shift = parameters[ROOT_TRANSLATION]
+    R, size = root.R, root.size
+    rotated_slope(R, root.J, v, A)
     to_rotation, to_translation = out[:, ROOT_ROTATION], out[:, ROOT_TRANSLATION]
     for i in range(3):
-        moved = root[i, 0] * v[0] + root[i, 1] * v[1] + root[i, 2] * v[2] + shift[i]
+        moved = R[i, 0] * v[0] + R[i, 1] * v[1] + R[i, 2] * v[2] + shift[i]
         if i < 2:
-            moved += root_shift[i]
+            moved += root.shift[i]
             to_translation[i, i] = size * scale
         for m in range(3):
             to_rotation[i, m] = size * scale * A[i, m]

@@ -5,7 +5,13 @@ from jaxtyping import Float, Int
 
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.joints import blend, cholesky_factors, root_slope, skinning_weights
+from stream_dmr.fitting.contour.joints import (
+    blend,
+    cholesky_factors,
+    root_of,
+    root_slope,
+    skinning_weights,
+)
 from stream_dmr.fitting.contour.rotation_vector import (
     dot,
     fill_rotation,
@@ -20,7 +26,6 @@ from stream_dmr.fitting.parameters import (
     LOG_SIZE,
     NUM_PER_JOINT,
     NUM_ROOT,
-    ROOT_ROTATION,
     ROOT_TRANSLATION,
     joints_of,
 )
@@ -73,8 +78,8 @@ def blend_jacobian(
     """Slopes of chosen points to the parameters, into `out`."""
     num_joints, joints = len(body.joints), joints_of(parameters)
     L, S = cholesky_factors(joints.weight), np.exp(joints.log_scale)
-    root, root_J = rotation_and_jacobian(parameters[ROOT_ROTATION])
-    size = np.exp(parameters[LOG_SIZE])
+    root = root_of(parameters)
+    size = root.size
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
     shift, A, moved = np.empty(3), np.empty((3, 3)), np.empty(3)
     turns, turn_J = np.empty((num_joints, 3, 3)), np.empty((num_joints, 3, 3))
@@ -88,7 +93,7 @@ def blend_jacobian(
         v = np.zeros(3)
         for j in range(num_joints):
             v += W[j] * (turns[j] @ point)
-        root_slope(root, root_J, size, parameters, v, shift, scale, out[c], A)
+        root_slope(root, v, shift, scale, out[c], A)
         for i in range(3):
             moved[i] = out[c, i, LOG_SIZE] / (size * scale)
         for j in range(num_joints):
@@ -99,8 +104,8 @@ def blend_jacobian(
             )
             to_weight = to_joint[:, JOINT_WEIGHT]
             rotated_slope(turns[j], turn_J[j], point, A)
-            RA = root @ A
-            Rv = root @ (turns[j] @ point - v)
+            RA = root.R @ A
+            Rv = root.R @ (turns[j] @ point - v)
             for i in range(3):
                 for m in range(3):
                     to_rotation[i, m] = size * scale * W[j] * RA[i, m]

@@ -5,24 +5,27 @@ from jaxtyping import Float, Int
 
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.joints import blend, cholesky_factors, root_slope, skinning_weights
+from stream_dmr.fitting.contour.joints import (
+    blend,
+    cholesky_factors,
+    root_of,
+    root_slope,
+    skinning_weights,
+)
 from stream_dmr.fitting.contour.rotation_vector import (
     dot,
     fill_rotation,
     fill_rotation_and_jacobian,
     multiply,
     rotated_slope,
-    rotation_and_jacobian,
 )
 from stream_dmr.fitting.parameters import (
     JOINT_LOG_SCALE,
     JOINT_ROTATION,
     JOINT_TRANSLATION,
     JOINT_WEIGHT,
-    LOG_SIZE,
     NUM_PER_JOINT,
     NUM_ROOT,
-    ROOT_ROTATION,
     joints_of,
 )
 
@@ -75,8 +78,8 @@ def spine_jacobian(
     nodes, slopes = spine_nodes(body, parameters, L, True)
     middle = body.place_of[body.num_vertices + 1]
     center, center_slope = _at_place(body, nodes, middle), _at_place(body, slopes, middle)
-    root, root_J = rotation_and_jacobian(parameters[ROOT_ROTATION])
-    size = np.exp(parameters[LOG_SIZE])
+    root = root_of(parameters)
+    R0 = root.R
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
     omega, shift, off, o = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     v, Roff = np.empty(3), np.empty(3)
@@ -120,11 +123,11 @@ def spine_jacobian(
         multiply(R, o, v)
         for i in range(3):
             v[i] += (1.0 - t) * nodes[k, i] + t * nodes[k + 1, i] - center[i]
-        root_slope(root, root_J, size, parameters, v, none, 1.0, out[c], A)
+        root_slope(root, v, none, 1.0, out[c], A)
         for i in range(3):
             for p in range(NUM_PER_JOINT * num_joints):
-                out[c, i, NUM_ROOT + p] = size * (
-                    root[i, 0] * local[0, p] + root[i, 1] * local[1, p] + root[i, 2] * local[2, p]
+                out[c, i, NUM_ROOT + p] = root.size * (
+                    R0[i, 0] * local[0, p] + R0[i, 1] * local[1, p] + R0[i, 2] * local[2, p]
                 )
 
 
