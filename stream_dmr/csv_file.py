@@ -108,7 +108,23 @@ def _complete_bytes(path: Path) -> int:
     return 0
 
 
+def safe_cell(text: str) -> str:
+    """A cell that no spreadsheet takes for a formula: others than numbers get an apostrophe."""
+    if not text.startswith(("=", "+", "-", "@", "\t", "\r")):
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}"
+    return text
+
+
+def original_cell(text: str) -> str:
+    """The inverse of `safe_cell`."""
+    return text[1:] if text[:1] == "'" and safe_cell(text[1:]) == text else text
+
+
 def _line(row: list[str]) -> bytes:
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerow(row)
+    csv.writer(text, lineterminator="\n").writerow(map(safe_cell, row))
     return text.getvalue().encode("utf-8", "backslashreplace")

@@ -1,6 +1,11 @@
 """Errors of the user's input; each message says what was expected, what came, and what to do."""
 
 
+def reason_of(error: Exception) -> str:
+    """What went wrong, without number and file name where the system says it."""
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
+
+
 class UserError(Exception):
     """The user's input is wrong: the command prints this one line and exits with 2.
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.csv_file import CsvFile, rotated_files
+from stream_dmr.csv_file import CsvFile, original_cell, rotated_files
 from stream_dmr.errors import OutputError
 from tests.support.small_disk import file_size_limit
 
@@ -23,7 +23,8 @@ def write(path: Path, rows: list[list[str]], **options: object) -> None:
 
 
 def read(path: Path) -> list[list[str]]:
-    return list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"), newline="")))
+    rows = csv.reader(io.StringIO(path.read_text(encoding="utf-8"), newline=""))
+    return [[original_cell(cell) for cell in row] for row in rows]
 
 
 @given(before=tables, after=tables)

@@ -26,6 +26,7 @@ from stream_dmr.batch.layout import (
 from stream_dmr.batch.manifest import Job
 from stream_dmr.batch.measure_video import Outcome, finish_folder, read_outcome
 from stream_dmr.batch.progress import BatchProgress
+from stream_dmr.csv_file import safe_cell
 from stream_dmr.errors import OutputError
 from stream_dmr.files import make_folder, writing_to
 from stream_dmr.results.folder_lock import require_unlocked
@@ -118,7 +119,8 @@ class _BatchResults:
                 writer.writerow(VIDEO_COLUMNS)
                 for job in self._jobs:
                     origin = (job.name, job.video, job.vessel, job.trip, job.haul)
-                    writer.writerow(origin + _result_cells(self.outcomes.get(job.name)))
+                    cells = origin + _result_cells(self.outcomes.get(job.name))
+                    writer.writerow([safe_cell(str(cell)) for cell in cells])
             draft.replace(target)
         seal_files(self._out, [target], runs={})
 

@@ -5,7 +5,8 @@ from pathlib import Path
 from urllib.parse import quote
 
 from stream_dmr.batch.manifest import Job
-from stream_dmr.errors import OutputError
+from stream_dmr.csv_file import original_cell
+from stream_dmr.errors import OutputError, reason_of
 
 VIDEOS = "videos.csv"  # the outcome of each video
 VIDEO_FOLDERS = "videos"
@@ -40,10 +41,13 @@ def read_videos(out: Path) -> list[dict[str, str]]:
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.reader(file, strict=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise OutputError(f"{path}: expected the videos of a batch, got: {error}") from error
+        raise OutputError(
+            f"{path}: expected the videos of a batch, got: {reason_of(error)}"
+        ) from error
     if not rows or any(len(row) != len(VIDEO_COLUMNS) for row in rows):
         raise OutputError(f"{path}: expected the columns {','.join(VIDEO_COLUMNS)}")
-    return [dict(zip(VIDEO_COLUMNS, row, strict=True)) for row in rows[1:]]
+    cells = ([original_cell(cell) for cell in row] for row in rows[1:])
+    return [dict(zip(VIDEO_COLUMNS, row, strict=True)) for row in cells]
 
 
 def dataset_file(out: Path, kind: str, *, vessel: str, trip: str, name: str) -> Path:

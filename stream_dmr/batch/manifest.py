@@ -9,7 +9,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from stream_dmr.errors import UserError
+from stream_dmr.errors import UserError, reason_of
 from stream_dmr.version import __version__
 
 COLUMNS = ("video", "calibration", "boxes", "masks", "vessel", "trip", "haul")
@@ -61,10 +61,16 @@ def read_manifest(path: Path, *, config: Path | None, template: str) -> list[Job
     names = _names([row["video"] or "" for row in rows])
     mesh = template if not Path(template).is_file() else str(Path(template).resolve())
     shared = {"config": "" if config is None else str(config.resolve()), "template": mesh}
-    jobs, home = [], path.resolve().parent
+    jobs, home, lines = [], path.resolve().parent, dict[str, int]()
     for number, (row, name) in enumerate(zip(rows, names, strict=True), start=2):
         if not row["video"] or None in row:
             raise UserError(f"{path}, line {number}: expected {len(COLUMNS)} cells with a video")
+        video = str((home / row["video"].strip()).resolve())
+        if (first := lines.setdefault(video, number)) != number:
+            raise UserError(
+                f"{path}, line {number}: expected each video once, got {row['video']} again, which "
+                f"is in line {first}; its fish would count twice"
+            )
         cells = {key: (row[key] or "").strip() for key in COLUMNS}
         files = {key: str(home / cells[key]) for key in _FILES if cells[key]}
         values: dict[str, Any] = cells | files | shared
@@ -78,7 +84,9 @@ def _rows(path: Path) -> list[dict[str | None, str | None]]:
             reader = csv.DictReader(file)
             rows, columns = list(reader), reader.fieldnames or []
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{path}: expected a manifest as CSV in UTF-8, got: {error}") from error
+        raise UserError(
+            f"{path}: expected a manifest as CSV in UTF-8, got: {reason_of(error)}"
+        ) from error
     if sorted(columns) != sorted(COLUMNS):
         raise UserError(
             f"{path}: expected the columns {','.join(COLUMNS)}, got {','.join(columns) or 'none'}"

@@ -33,6 +33,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # else it takes [tables] of settings for markup, and they vanish
 )
 for command in (
     *(demo, run, calibrate, replay, recover, view, convert, export),

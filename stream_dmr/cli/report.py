@@ -92,7 +92,9 @@ def review(
     reviewer: Annotated[
         str, typer.Option(help="Your name, for the verdicts.", show_default="who is logged in")
     ] = "",
-    port: Annotated[int, typer.Option(help="Port on this machine; 0: any free one.")] = 0,
+    port: Annotated[
+        int, typer.Option(help="Port on this machine; 0: any free one.", min=0, max=65535)
+    ] = 0,
     source: _Source = None,
     config: _Config = None,
 ) -> None:

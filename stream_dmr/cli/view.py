@@ -41,7 +41,9 @@ def view(
     web: Annotated[
         bool, typer.Option("--web", help="For a browser on this machine, in bounded memory.")
     ] = False,
-    port: Annotated[int, typer.Option(help="Port of --web; 0: any free one.")] = 0,
+    port: Annotated[
+        int, typer.Option(help="Port of --web; 0: any free one.", min=0, max=65535)
+    ] = 0,
     screenshot: Annotated[
         Path | None, typer.Option(help="Save a picture (.png) instead; needs no screen.")
     ] = None,

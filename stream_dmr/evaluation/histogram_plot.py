@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from stream_dmr.errors import OutputError
+from stream_dmr.errors import OutputError, reason_of
 from stream_dmr.evaluation.compare import Distributions
 
 
@@ -33,4 +33,6 @@ def plot_histograms(path: Path, distributions: Distributions) -> None:
     try:
         figure.savefig(path, dpi=110, metadata=_made_by(path))
     except (OSError, ValueError) as error:  # ValueError: a suffix that matplotlib doesn't know
-        raise OutputError(f"{path}: expected to write a picture there, got: {error}") from error
+        raise OutputError(
+            f"{path}: expected to write a picture there, got: {reason_of(error)}"
+        ) from error

@@ -12,7 +12,11 @@ from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.recording.messages.run_header import REPRODUCIBLE_BY
 from stream_dmr.recording.reading.frame_images import open_pictures
-from stream_dmr.recording.reading.open_recording import Recording, open_recordings
+from stream_dmr.recording.reading.open_recording import (
+    Recording,
+    decoded_messages,
+    open_recordings,
+)
 from stream_dmr.replaying.comparator import MessageComparator, Mismatch
 from stream_dmr.replaying.recorded_messages import PlaybackNode, RecordedMessages
 from stream_dmr.replaying.replay_inputs import ReplayInputs, new_header, read_inputs
@@ -182,6 +186,11 @@ def _refuse_impossible(request: ReplayRequest, recording: Recording) -> None:
         raise UserError(
             f"--template with --from {request.first}: a template matters to the fit; use --from fit"
         )
+    if request.selection.tracks is not None and request.selection.time_ns is None:
+        found = decoded_messages(recording, [LocalizedFish], request.selection)
+        missing = request.selection.tracks - {getattr(m, "track_id", 0) for m, _ in found}
+        if missing:
+            raise UserError(f"--track {min(missing)}: expected a fish of the recording, got none")
     if request.first == "crop" and request.selection.tracks is not None:
         raise UserError("--track with --from crop: crops are made of whole frames; use --from fit")
 

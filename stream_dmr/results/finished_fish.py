@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Literal
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate
@@ -99,11 +100,18 @@ def numbers_its_own(folder: Path) -> bool:
     return any(inputs is not None and not (inputs.boxes or inputs.masks) for inputs in given)
 
 
-def fish_by_run(database: Path) -> dict[str, list[str]]:
-    """Every stored value of the fish of each run, as lines of JSON, for checksums."""
+def run_times(database: Path) -> dict[str, list[int | None]]:
+    """When each run began and ended, ns of the wall clock."""
+    with closing(open_for_reading(database)) as connection:
+        rows = connection.execute("SELECT run_id, started_ns, ended_ns FROM runs")
+        return {run_id: [started, ended] for run_id, started, ended in rows}
+
+
+def rows_by_run(database: Path, table: Literal["fish", "events"]) -> dict[str, list[str]]:
+    """Every stored value of the fish or events of each run, as lines of JSON, for checksums."""
     lines: dict[str, list[str]] = {}
     with closing(open_for_reading(database)) as connection:
-        for row in connection.execute("SELECT run_id, * FROM fish ORDER BY number"):
+        for row in connection.execute(f"SELECT run_id, * FROM {table} ORDER BY number"):
             lines.setdefault(row[0], []).append(json.dumps(row[1:]))
     return lines
 

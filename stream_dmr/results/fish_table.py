@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from stream_dmr.csv_file import safe_cell
 from stream_dmr.files import writing_to
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.fisheries import FisheriesSettings, derive
@@ -125,4 +126,4 @@ def _text(value: object) -> str:
         case float():
             return f"{value:.6f}"
         case _:
-            return str(value)
+            return safe_cell(str(value))

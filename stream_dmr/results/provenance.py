@@ -11,7 +11,7 @@ from typing import Any
 
 from stream_dmr.errors import OutputError
 from stream_dmr.files import rename_durably, sha256_of, writing_to
-from stream_dmr.results.finished_fish import database_of, fish_by_run, read_runs
+from stream_dmr.results.finished_fish import database_of, read_runs, rows_by_run, run_times
 from stream_dmr.results.lengths_database import NAME as DATABASE
 from stream_dmr.results.run_facts import RunFacts
 from stream_dmr.results.verdicts import Verdict, read_verdicts
@@ -49,11 +49,17 @@ def seal_run(folder: Path, *, with_recordings: bool) -> None:
     kinds = ("*.csv", "*.mcap", "*.rrd") if with_recordings else ("lengths.csv", "frames.csv")
     kinds = (*kinds, "template*.ply", "template*.toml")  # what was learnt of the fish's shape
     files = [path for kind in kinds for path in folder.glob(kind)]
-    fish = {run_id: lines_sha256(lines) for run_id, lines in fish_by_run(database).items()}
+    sums = {
+        f"{table}_sha256": {
+            run_id: lines_sha256(lines) for run_id, lines in rows_by_run(database, table).items()
+        }
+        for table in ("fish", "events")
+    }
     _write(
         folder,
         _new(read_runs(database))
-        | {"fish_sha256": fish, "files": _sums(folder, files)}
+        | sums
+        | {"run_times_ns": run_times(database), "files": _sums(folder, files)}
         | {"verdicts": verdicts_sum(read_verdicts(database))},
     )
 

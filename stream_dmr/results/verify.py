@@ -7,7 +7,7 @@ elsewhere.
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from types import MappingProxyType
@@ -22,9 +22,10 @@ from stream_dmr.recording.reading.open_recording import decoded_messages, open_r
 from stream_dmr.results.finished_fish import (
     FishResult,
     database_of,
-    fish_by_run,
     read_runs,
     read_stored_fish,
+    rows_by_run,
+    run_times,
 )
 from stream_dmr.results.frames_table import FRAMES_COLUMNS, frames_row
 from stream_dmr.results.lengths_database import NAME as DATABASE
@@ -125,19 +126,38 @@ def _against_provenance(folder: Path) -> Iterator[Change]:
             yield Change(path, f"was changed: its SHA-256 is not that in {PROVENANCE}")
     database = database_of(folder)
     if database is not None:
+        yield from _surplus_tables(folder, made["files"])
         yield from _database(database, made)
+
+
+def _surplus_tables(folder: Path, known: Collection[str]) -> Iterator[Change]:
+    """Tables that nothing of stream-dmr wrote, though their names may look like it."""
+    tables = {path for path in folder.glob("*.csv") if path.name not in known}
+    if not any(name.endswith((".mcap", ".rrd")) for name in known):  # a camera's are rotated
+        tables -= set(rotated_files(folder / "frames.csv"))
+    for path in sorted(tables):
+        yield Change(path, "is no table of this run")
 
 
 def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
     """The fish and the runs against provenance.json."""
     try:
-        stored, runs = fish_by_run(database), read_runs(database)
+        stored, runs = rows_by_run(database, "fish"), read_runs(database)
+        events, times = rows_by_run(database, "events"), run_times(database)
         said = read_verdicts(database)
     except OutputError:
         return  # `_changes` says so
     for run_id, expected in made["fish_sha256"].items():
         if lines_sha256(stored.get(run_id, [])) != expected:
             yield Change(database, f"the fish of run {run_id} are not those that were measured")
+    for run_id, known in made.get("run_times_ns", {}).items():  # older ones have neither of these
+        if times.get(run_id) != known:
+            yield Change(database, f"run {run_id}: its times are not those of its run")
+        expected = made["events_sha256"].get(run_id)
+        if events.get(run_id) and expected is None:
+            yield Change(database, f"run {run_id}: events were put in")
+        elif expected is not None and lines_sha256(events.get(run_id, [])) != expected:
+            yield Change(database, f"the events of run {run_id} are not those that were noted")
     for run_id, facts in made["runs"].items():
         for field in fields(RunFacts):
             now = getattr(runs.get(run_id), field.name, "missing")

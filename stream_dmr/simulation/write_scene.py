@@ -11,7 +11,7 @@ import trimesh
 from jaxtyping import UInt16
 
 from stream_dmr.calibration.calibration_file import save_calibration
-from stream_dmr.errors import OutputError, UserError
+from stream_dmr.errors import OutputError, UserError, reason_of
 from stream_dmr.simulation.film import VisibleBox, film
 from stream_dmr.simulation.pose_sequence import FPS
 from stream_dmr.simulation.rail_scene import RailScene, make_scene
@@ -63,7 +63,7 @@ def simulate(
         _write_film(out, scene)
     except OSError as error:
         raise OutputError(
-            f"{out}: expected a folder for the simulated scene, got: {error}; "
+            f"{out}: expected a folder for the simulated scene, got: {reason_of(error)}; "
             "choose another --out or free some space"
         ) from error
 

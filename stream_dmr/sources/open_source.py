@@ -16,6 +16,10 @@ def open_source(source: str, settings: ReadFramesSettings) -> Source:
 
     Raises SourceError where nothing can be read from it.
     """
+    if not source.strip():
+        raise SourceError(
+            "--source: expected a video, a folder, an address or a camera index, got an empty name"
+        )
     path = Path(source)
     if path.is_dir():
         if clips_in(path):

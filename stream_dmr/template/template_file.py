@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from stream_dmr.errors import OutputError, TemplateError
+from stream_dmr.errors import OutputError, TemplateError, reason_of
 from stream_dmr.files import read_text
 from stream_dmr.template.body_forms import JOINTS
 from stream_dmr.template.mesh_points import find_points
@@ -97,7 +97,7 @@ def _read_mesh(path: Path) -> trimesh.Trimesh:
         mesh = trimesh.load_mesh(path, process=False)
     except Exception as error:  # trimesh raises whatever its many readers raise
         raise TemplateError(
-            f"template {path}: expected a mesh that trimesh reads, got: {error}"
+            f"template {path}: expected a mesh that trimesh reads, got: {reason_of(error)}"
         ) from error
     if len(mesh.faces) == 0:
         raise TemplateError(
@@ -123,7 +123,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(read_text(path))
     except (OSError, ValueError, RecursionError) as error:  # ValueError: not TOML, or not text
-        raise TemplateError(f"template {path}: expected TOML, got: {error}") from error
+        raise TemplateError(f"template {path}: expected TOML, got: {reason_of(error)}") from error
 
 
 def _note_of_points(points: dict[str, Float[np.ndarray, "N 3"]], *, path: Path) -> str:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Integer
 from stream_dmr.errors import AnnotationError, UserError
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.annotations.annotated_box import UNKNOWN_ID, AnnotatedBox
-from stream_dmr.segmentation.annotations.box_files import load_boxes
+from stream_dmr.segmentation.annotations.box_files import load_boxes, unused_boxes
 from stream_dmr.segmentation.annotations.mask_folder import Labels, MaskFolder
 from stream_dmr.segmentation.detection.fish_detection import Detection
 
@@ -46,6 +46,7 @@ class AnnotatedFish:
     ) -> None:
         self._boxes = boxes
         self._masks = masks
+        self._last_frame = 0
         self._frames_without_mask: list[int] = []
         self._boxes_outside: list[tuple[int, int]] = []  # frame, id
         self._boxed_ids: set[int] = set()
@@ -58,6 +59,7 @@ class AnnotatedFish:
 
     def detect(self, frame: Frame) -> list[Detection]:
         """The fish of one frame, ordered by id. Raises AnnotationError for an unusable mask."""
+        self._last_frame = max(self._last_frame, frame.frame_index)
         if self._boxes is None:
             labels = self._labels(frame, is_expected=True)
             return [] if labels is None else _detections_of(labels)
@@ -86,7 +88,7 @@ class AnnotatedFish:
     @property
     def warnings(self) -> list[str]:
         """Mismatches between boxes and masks in the frames so far, one line each."""
-        lines = []
+        lines = [] if self._boxes is None else unused_boxes(self._boxes, self._last_frame)
         if missing := self._frames_without_mask:
             lines.append(
                 f"masks: no picture for {len(missing)} frames, the first of them {missing[0]}"

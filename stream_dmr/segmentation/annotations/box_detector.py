@@ -6,6 +6,7 @@ import numpy as np
 
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.annotations.annotated_box import AnnotatedBox
+from stream_dmr.segmentation.annotations.box_files import unused_boxes
 from stream_dmr.segmentation.detection.detector import Candidate
 
 
@@ -14,14 +15,21 @@ class BoxDetector:
 
     def __init__(self, frames: Mapping[int, Sequence[AnnotatedBox]]) -> None:
         self._frames = frames
+        self._last_frame = 0
 
     @property
     def refused(self) -> Mapping[str, int]:
         """Empty: every box of the file is a candidate."""
         return {}
 
+    @property
+    def warnings(self) -> list[str]:
+        """What of the file was not used so far."""
+        return unused_boxes(self._frames, self._last_frame)
+
     def find(self, frame: Frame) -> list[Candidate]:
         """The file's boxes of this frame that are at least one pixel wide and high inside it."""
+        self._last_frame = max(self._last_frame, frame.frame_index)
         height, width = frame.image.shape[:2]
         candidates = []
         for box in self._frames.get(frame.frame_index, ()):

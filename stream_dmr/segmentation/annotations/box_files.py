@@ -1,5 +1,6 @@
 """Boxes of fish from a file, in whichever of three formats it is written."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from stream_dmr.errors import AnnotationError
@@ -21,6 +22,20 @@ def load_boxes(path: Path) -> dict[int, list[AnnotatedBox]]:
     """
     parse = _PARSERS.get(path.suffix.lower(), parse_mot)
     return parse(_read_text(path), path)
+
+
+def unused_boxes(frames: Mapping[int, Sequence[AnnotatedBox]], last_frame: int) -> list[str]:
+    """A line where no frame up to the last one had boxes, or some are beyond it."""
+    if not any(frames.values()):
+        return ["boxes: the file has none, so there are no fish"]
+    beyond = sorted(index for index, boxes in frames.items() if boxes and index > last_frame)
+    if not beyond:
+        return []
+    which = "all" if len(beyond) == sum(map(bool, frames.values())) else "some"
+    return [
+        f"boxes: {which} are past the end of the source, {len(beyond)} frames from {beyond[0]} on, "
+        f"and it ended at frame {last_frame}; are they of another video?"
+    ]
 
 
 def _read_text(path: Path) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from stream_dmr.messages import FishCrop, Frame
+from stream_dmr.segmentation.annotations.box_detector import BoxDetector
 from stream_dmr.segmentation.detection.detector import Detector
 from stream_dmr.segmentation.detection.fish_detection import Detection
 from stream_dmr.segmentation.tracking.box_correction import BoxCorrector
@@ -61,13 +62,15 @@ class TrackedFish:
     @property
     def warnings(self) -> list[str]:
         """Why there are no fish, where there are none; a missed one of several is not noticed."""
+        unused = self._detector.warnings if isinstance(self._detector, BoxDetector) else []
         if self._found_any or self._seen.frames == 0:
-            return []
+            return unused
         return [
+            *unused,
             explain_no_fish(
                 self._seen,
                 self._detector.refused,
                 min_frames=self._settings.min_track_frames,
                 min_confidence=self._settings.min_mask_confidence,
-            )
+            ),
         ]

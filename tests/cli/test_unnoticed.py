@@ -1,0 +1,169 @@
+"""What used to pass without a word: each is refused or said now."""
+
+import json
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stream_dmr.csv_file import original_cell, safe_cell
+from stream_dmr.errors import SourceError
+from stream_dmr.results.length_store import LengthStore
+from stream_dmr.results.provenance import seal_run
+from stream_dmr.results.verify import verify
+from stream_dmr.segmentation.annotations.box_files import load_boxes, unused_boxes
+from stream_dmr.sources.open_source import open_source
+from stream_dmr.sources.read_settings import ReadFramesSettings
+from tests.support.command import invoke, rows
+from tests.support.final_estimates import FACTS, fish
+from tests.support.fish_run import measure
+from tests.support.tiny_clip import write_clip
+
+FORMULA = '=HYPERLINK("http://x";"fish")'
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return measure(tmp_path_factory.mktemp("fish"), vessel=FORMULA, trip="-7", haul="+")
+
+
+@given(st.text())
+def test_a_cell_is_never_a_formula_and_can_be_had_back(text: str):
+    cell = safe_cell(text)
+    assert original_cell(cell) == text
+    if cell[:1] in {"=", "+", "-", "@", "\t", "\r"}:
+        float(cell)
+
+
+def test_a_vessel_that_is_a_formula_is_text_in_a_table(out: Path, tmp_path: Path):
+    invoke("export", {str(out): None, "--fish": "csv", "--out": str(tmp_path)})
+    assert {(row["vessel"], row["trip"], row["haul"]) for row in rows(tmp_path / "fish.csv")} == {
+        ("'" + FORMULA, "-7", "'+")
+    }
+
+
+def test_a_track_that_is_not_there_is_refused(out: Path, tmp_path: Path):
+    outcome = invoke(f"replay {out}", {"--track": "999", "--out": str(tmp_path / "again")})
+    assert (outcome.code, "--track 999" in outcome.error) == (2, True)
+    assert not (tmp_path / "again").exists()
+
+
+@pytest.mark.parametrize("name", ["", " "])
+def test_a_source_without_a_name_is_refused(name: str):
+    with pytest.raises(SourceError, match="an empty name"):
+        open_source(name, ReadFramesSettings())
+
+
+def test_a_video_that_is_twice_in_a_manifest_is_refused(tmp_path: Path):
+    manifest = tmp_path / "videos.csv"
+    header = "video,calibration,boxes,masks,vessel,trip,haul\n"
+    manifest.write_text(header + "a.mp4,,,,,,1\nb.mp4,,,,,,2\n./a.mp4,,,,,,3\n")
+    outcome = invoke(f"batch {manifest}", {"--out": str(tmp_path / "out")})
+    assert outcome.code == 2
+    assert "line 4: expected each video once" in outcome.error
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        ("", "the file has none"),
+        ("700,1,10,10,30,30,1\n", "all are past the end"),
+        ("1,1,10,10,30,30,1\n700,1,10,10,30,30,1\n", "some are past the end"),
+        ("1,1,10,10,30,30,1\n", ""),
+    ],
+)
+def test_boxes_that_are_not_used_are_said(tmp_path: Path, lines: str, said: str):
+    boxes = tmp_path / "boxes.txt"
+    boxes.write_text(lines)
+    found = unused_boxes(load_boxes(boxes), 6)
+    assert said in " ".join(found)
+    assert bool(found) is bool(said)
+
+
+@pytest.mark.parametrize("track_id", ["1", "-1"])
+def test_a_run_says_that_all_its_boxes_are_past_the_end(tmp_path: Path, track_id: str):
+    options = write_clip(tmp_path, fish=[[1]] * 3)
+    Path(options["--boxes"]).write_text(f"700,{track_id},10,10,30,30,1\n")
+    del options["--masks"]
+    outcome = invoke("run", options)
+    assert "all are past the end of the source" in outcome.err
+
+
+CHANGES: dict[str, Callable[[Path], object]] = {
+    "a run begins earlier": lambda f: change(f, "UPDATE runs SET started_ns = started_ns - 1"),
+    "a run ends later": lambda f: change(f, "UPDATE runs SET ended_ns = ended_ns + 1"),
+    "an event goes": lambda f: change(f, "DELETE FROM events"),
+    "an event is put in": lambda f: change(
+        f,
+        "CREATE TEMP TABLE copy AS SELECT * FROM events",
+        "UPDATE copy SET number = 7",
+        "INSERT INTO events SELECT * FROM copy",
+    ),
+    "a table is put in": lambda f: (f / "lengths-2.csv").write_text("track_id\n"),
+    "a table of frames is put in": lambda f: (f / "frames-000009.csv").write_text("frame\n"),
+}
+
+
+def change(folder: Path, *statements: str) -> None:
+    with closing(sqlite3.connect(folder / "lengths.db")) as database, database:
+        for statement in statements:
+            database.execute(statement)
+
+
+@pytest.mark.parametrize("kind", CHANGES)
+def test_verify_finds(tmp_path: Path, kind: str):
+    store = LengthStore(tmp_path, FACTS)
+    store.add(fish(1))
+    store.note("drift", "the camera seems bumped", timestamp_ns=5)
+    store.end("the end of the source")
+    store.close()
+    (tmp_path / "lengths.csv").write_text("")
+    (tmp_path / "recording.mcap").write_bytes(b"")
+    seal_run(tmp_path, with_recordings=True)
+    before = verify(tmp_path)[0]
+    CHANGES[kind](tmp_path)
+    assert set(verify(tmp_path)[0]) - set(before)
+
+
+def test_provenance_of_before_says_nothing_of_events(tmp_path: Path):
+    store = LengthStore(tmp_path, FACTS)
+    store.close()
+    (tmp_path / "lengths.csv").write_text("")
+    seal_run(tmp_path, with_recordings=True)
+    path = tmp_path / "provenance.json"
+    made = json.loads(path.read_text())
+    del made["run_times_ns"], made["events_sha256"]
+    path.write_text(json.dumps(made))
+    assert not [one for one in verify(tmp_path)[0] if "times" in one.what or "event" in one.what]
+
+
+def test_help_shows_the_tables_of_settings(capsys: pytest.CaptureFixture[str]):
+    assert "[crop_fish]" in invoke("train --help").out
+    assert "[fisheries]" in invoke("export --help").out
+
+
+@pytest.mark.parametrize("command", ["review", "view"])
+@pytest.mark.parametrize("port", ["99999", "65536"])
+def test_a_port_that_is_none_is_refused(out: Path, command: str, port: str):
+    outcome = invoke(f"{command} {out}", {"--port": port})
+    assert outcome.code == 2
+    assert "65535" in outcome.err
+
+
+MISSING = [
+    ("batch NONE.csv", {"--out": "x"}),
+    ("run", {"--source": "x.mp4", "--config": "NONE.toml"}),
+    ("run", {"--source": "x.mp4", "--calibration": "NONE.yaml"}),
+    ("evaluate", {"--lengths": "NONE.csv", "--truth": "NONE.csv"}),
+]
+
+
+@pytest.mark.parametrize(("command", "options"), MISSING)
+def test_no_message_has_the_number_of_an_error(command: str, options: dict[str, str | None]):
+    outcome = invoke(command, options)
+    assert outcome.code == 2
+    assert "Errno" not in outcome.err
