@@ -4,7 +4,7 @@
 
 Simulated species whose bodies are not those of the bundled templates, 18 fish a scene, masks as the
 simulator's film has them. `own`: the species' mean mesh; `auto`: shapes learnt from the scene; a
-name: that body form is taken for likelier than the others, and nothing is learnt. Twelve minutes.
+name: the same, but that body form is taken for likelier than the others. Half an hour.
 """
 
 import argparse
@@ -68,7 +68,7 @@ def measure(task: tuple[str, int, Sequence[str]]) -> dict[str, Measured]:
             template, shapes = body_template(species[0]), None
         else:
             continue
-        if name == AUTO and shapes is not None:
+        if shapes is not None:
             shapes = learn_shapes(
                 crops, template, shapes, Config().fit_mesh, calibration=filmed.calibration
             )

@@ -22,10 +22,10 @@ from stream_dmr.fitting.shape.candidates import CandidateShape
 from stream_dmr.fitting.shape.evidence import nats_against
 from stream_dmr.fitting.shape.length_std import freed, shape_std_ratio, slant_std_ratio
 from stream_dmr.fitting.shape.space import (
-    TRUNK,
     directions,
     half_section,
     individual_covariance,
+    log_breadth_std,
     reshaped,
 )
 from stream_dmr.fitting.size.scanner import SizeScanner
@@ -86,9 +86,9 @@ class Fitter:
         self._breadth_std = 0.0  # of the log breadth, where it is learnt
         if candidate is not None:
             template = reshaped(template, candidate.coefficients)
-            settings = freed(settings, float(TRUNK @ candidate.covariance @ TRUNK))
+            settings = freed(settings, log_breadth_std(candidate.covariance) ** 2)
             self._shape_covariance += candidate.covariance
-            self._breadth_std = float(np.sqrt(TRUNK @ self._shape_covariance @ TRUNK))
+            self._breadth_std = log_breadth_std(self._shape_covariance)
         self.plane_normal = np.ascontiguousarray(normal)
         self._template = template
         self._settings = settings

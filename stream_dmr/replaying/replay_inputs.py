@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from stream_dmr.calibration.calibration_file import load_calibration
 from stream_dmr.camera import Calibration
 from stream_dmr.fitting.learn_shapes import learn_shapes
-from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
+from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
 from stream_dmr.messages import FishCrop
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
@@ -78,11 +78,11 @@ def new_header(request: ReplayRequest, recorded: RunHeader, inputs: ReplayInputs
 def _shapes(
     request: ReplayRequest, recording: Recording, config: Config, calibration: Calibration | None
 ) -> tuple[Template, CandidateShapes | None]:
-    """Mesh and candidate shapes; `auto` learns those from the crops of the recording."""
+    """Mesh and candidate shapes; those of `auto` and of names are learnt from recorded crops."""
     if request.template is None:
         return recording.header.template, recording.header.candidates
     template, candidates = load_shapes(request.template)
-    if request.template == AUTO and candidates is not None:
+    if candidates is not None:
         messages = (message for message, _ in decoded_messages(recording, [FishCrop]))
         crops = (message for message in messages if isinstance(message, FishCrop))
         learnt = learn_shapes(crops, template, candidates, config.fit_mesh, calibration=calibration)

@@ -9,7 +9,7 @@ from pathlib import Path
 from threading import Event
 
 from stream_dmr.fitting.learn_shapes import learn_shapes
-from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes
+from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.nodes.crop_fish import CropFish
@@ -27,12 +27,12 @@ def with_learnt_shapes(
 ) -> Inputs:
     """The inputs with the stocks of the source's own fish, and its crops.
 
-    As they are where nothing is to be learnt: a template was named, the source has no end, or an
+    As they are where nothing is to be learnt: a mesh was given, the source has no end, or an
     earlier run is taken up again, whose fish were measured by other shapes.
     """
     config, candidates = inputs.config.fit_mesh, inputs.candidates
     can_learn = config.solver == "contour" and config.deformation == "spine"
-    if candidates is None or inputs.request.template != AUTO or inputs.resumes or not can_learn:
+    if candidates is None or inputs.is_endless or inputs.resumes or not can_learn:
         return inputs
     refuse_earlier(inputs.request.out, is_fine=inputs.request.overwrite)  # before the work
     observer.stage("finding the fish, for their shapes")
@@ -40,20 +40,21 @@ def with_learnt_shapes(
         inputs.reader, crop_fish, inputs.config.recording, stop=stop, on_frame=observer.frame_done
     )
     inputs.reader.close()
+    stocks = None
+    if not stop.is_set():
+        stocks = learn_shapes(
+            crops,
+            inputs.template,
+            candidates,
+            config,
+            calibration=inputs.calibration,
+            progress=lambda step: observer.stage(f"learning their shapes: {step}"),
+        )
+        if stocks is None:
+            observer.warn("no fish was seen whole: each is measured as the form it is most like")
     reader = ReadFrames(inputs.request.source, inputs.config.read_frames)
     inputs = replace(inputs, reader=reader, crops=crops)
-    if stop.is_set():
-        return inputs
-    stocks = learn_shapes(
-        crops,
-        inputs.template,
-        candidates,
-        config,
-        calibration=inputs.calibration,
-        progress=lambda step: observer.stage(f"learning their shapes: {step}"),
-    )
     if stocks is None:
-        observer.warn("no fish was seen whole: each is measured as the body form it is most like")
         return inputs
     for line in describe(candidates, stocks):
         observer.notice(line)

@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 from stream_dmr.fitting.shape.space import reshaped
+from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.replaying.replay_recording import ReplayRequest, replay
+from stream_dmr.running.inputs import Inputs, checked_inputs
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_folder import LEARNT
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.running.run_request import RunRequest
+from stream_dmr.running.shape_pass import with_learnt_shapes
 from stream_dmr.template.template_file import load_template
 from tests.support.command import rows
 from tests.support.fish_run import request
@@ -75,7 +78,7 @@ def test_it_replays_to_the_last_bit(learnt: tuple[Path, Listener]):
 
 
 def test_a_live_run_s_recording_learns_its_shapes_ashore(clip: Path, tmp_path: Path):
-    named = measured(clip, tmp_path / "named", Listener(), template="cod").out
+    named = measured(clip, tmp_path / "named", Listener(), resume=True).out
     header = read_header(named / "recording.mcap")
     assert header.candidates is not None
     assert not header.candidates.are_learnt
@@ -88,6 +91,26 @@ def test_a_live_run_s_recording_learns_its_shapes_ashore(clip: Path, tmp_path: P
     again = read_header(ashore / "recording.mcap")
     assert again.candidates is not None
     assert again.candidates.are_learnt
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_source_without_an_end_is_not_looked_at_first(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, overwrite: bool
+):
+    monkeypatch.setattr(Inputs, "is_endless", property(lambda inputs: True))
+    asked = request(clip, tmp_path, template="auto", overwrite=overwrite)
+    inputs = checked_inputs(asked)
+    crop_fish = CropFish(inputs.config.crop_fish, camera=None, finder=inputs.finder)
+    same = with_learnt_shapes(inputs, crop_fish, stop=threading.Event(), observer=Listener())
+    inputs.reader.close()
+    assert same is inputs
+
+
+def test_a_named_form_is_a_hint_and_its_stock_is_learnt(clip: Path, tmp_path: Path):
+    named = measured(clip, tmp_path / "named", Listener(), template="cod").out
+    header = read_header(named / "recording.mcap")
+    assert header.candidates is not None
+    assert header.candidates.are_learnt
 
 
 def test_a_stop_while_fish_are_looked_for_leaves_an_empty_valid_result(clip: Path, tmp_path: Path):

@@ -66,16 +66,10 @@ def reshaped(template: Template, coefficients: Float[np.ndarray, "W"]) -> Templa
     place, feet = _feet(template)
     offsets = template.rest_vertices - feet
     breadth = _hats(place, BREADTH_KNOTS)
-    logs = np.where(offsets[:, 1] > 0, breadth @ coefficients[LEFT], breadth @ coefficients[RIGHT])
-    moved = offsets * np.exp(
-        np.column_stack(
-            [
-                np.zeros(len(offsets)),
-                logs,
-                _hats(place, THICKNESS_KNOTS) @ coefficients[THICKNESS],
-            ]
-        )
-    )
+    left, right = _weighed(breadth, coefficients[LEFT]), _weighed(breadth, coefficients[RIGHT])
+    thickness = _weighed(_hats(place, THICKNESS_KNOTS), coefficients[THICKNESS])
+    logs = np.where(offsets[:, 1] > 0, left, right)
+    moved = offsets * np.exp(np.column_stack([np.zeros(len(offsets)), logs, thickness]))
     moved[:, 0] += coefficients[LOBES] * _lobe_share(place, offsets)
     total_per_fork = template.total_per_fork
     if total_per_fork is not None:
@@ -130,6 +124,11 @@ def form_precision() -> Float[np.ndarray, "W W"]:
     return rows.T @ rows
 
 
+def log_breadth_std(covariance: Float[np.ndarray, "W W"]) -> float:
+    """Std of the mean log breadth of the trunk, the same to the last bit in every replay."""
+    return float(np.sqrt(np.einsum("i,ij,j", TRUNK, covariance, TRUNK)))
+
+
 def individual_covariance() -> Float[np.ndarray, "W W"]:
     """Covariance of individuals about their stock."""
     single = np.zeros(NUM_COEFFICIENTS)
@@ -153,6 +152,13 @@ def _feet(template: Template) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray,
 def _hats(place: Float[np.ndarray, "V"], knots: Float[np.ndarray, "K"]) -> Float[np.ndarray, "V K"]:
     """Weights of the knots at each place: linear between two knots, constant past the ends."""
     return np.stack([np.interp(place, knots, row) for row in np.eye(len(knots))], axis=1)
+
+
+def _weighed(
+    weights: Float[np.ndarray, "V K"], values: Float[np.ndarray, "K"]
+) -> Float[np.ndarray, "V"]:
+    """Weights @ values without BLAS, whose last bit depends on where in memory the arrays lie."""
+    return np.einsum("vk,k->v", weights, values)
 
 
 def _lobe_share(
