@@ -84,7 +84,7 @@ def jobs_of(manifest: Path, rows: Sequence[Mapping[str, object]]) -> list[Job]:
 
 
 def write_repeated(path: Path, video: Path, *, times: int) -> int:
-    """A video so many times in a row; returns the number of frames."""
+    """A video, repeated; returns the number of frames."""
     source = cv2.VideoCapture(str(video))
     frames = list[np.ndarray]()
     while (read := source.read())[0]:

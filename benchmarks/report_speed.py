@@ -36,7 +36,7 @@ window.flip = (id, value) => {
 ACTIONS = {
     "sort by length": "state.column = 2; state.down = !state.down; drawTable();",
     "jump in the table": "document.getElementById('table').scrollTop = any(76 * DATA.fish.length);",
-    "search (both plots anew)": "flip('search', 'border');",
+    "search (both plots redrawn)": "flip('search', 'border');",
     "from 70 cm (likewise)": "flip('shortest', '70');",
     "open a fish": "choose(1 + any(DATA.fish.length));",
     "open a fish, its mesh too": (

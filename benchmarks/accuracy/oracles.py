@@ -110,7 +110,7 @@ def _errors(
 def map_scenes(
     work: Callable[[tuple[str, int]], T], *, about: str | None, scenes: int
 ) -> list[tuple[str, T]]:
-    """What `work` makes of scenes of every preset, with the preset; `scenes` unless told."""
+    """What `work` makes of scenes of every preset, with the preset; by default `scenes`."""
     parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--scenes", type=int, default=scenes, help="of every preset")
     parser.add_argument("--processes", type=int, default=2)

@@ -3,7 +3,7 @@
     make table1 [FISH=60] [ROWS=dmr,bfs] [AGAIN=1]
 
 What has been measured is kept in benchmarks/table1/cache, scene by scene: a run that was broken
-off goes on, and ROWS with AGAIN measures only those rows anew. An hour on two idle cores for all
+off goes on, and ROWS with AGAIN measures only those rows again. An hour on two idle cores for all
 738 fish, half of it for Adam. With fewer fish the table is printed, not written to
 docs/research/table1.md.
 """
@@ -33,7 +33,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, prog="python -m table1")
     parser.add_argument("--fish", type=int, default=ALL_FISH, help="rounded up to whole scenes")
     parser.add_argument("--rows", default=",".join(METHODS), help=f"some of {', '.join(METHODS)}")
-    parser.add_argument("--again", action="store_true", help="measure these rows anew")
+    parser.add_argument("--again", action="store_true", help="measure these rows again")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--cache", type=Path, default=cached_results.CACHE)
     arguments = parser.parse_args()

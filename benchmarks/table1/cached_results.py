@@ -56,7 +56,7 @@ def is_saved(method: str, scene: int, *, cache: Path) -> bool:
 
 
 def forget(method: str, *, cache: Path) -> None:
-    """Measure a method anew."""
+    """Measure a method again."""
     for path in (cache / method).glob("*.csv"):
         path.unlink()
 

@@ -2,7 +2,7 @@
 
 The rig: the simulator's camera (1280 x 960, about 1300 px focal length, some 5 m from the plane)
 and a second one like it, 800 mm to its right, looking the same way; both are calibrated without
-error. Masks come with the preset's ragged edges, drawn anew for each camera, and with the gaff and
+error. Masks come with the preset's ragged edges, drawn for each camera, and with the gaff and
 the other fish in front. No picture is encoded: the labels of the film are used as they are.
 """
 

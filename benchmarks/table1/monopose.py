@@ -3,7 +3,7 @@
 The plate's seven parameters (bend, three turns, scale, place) minimise the chamfer distance between
 its points and the mask: a coarse search over bend, turns and which end is the head, placed by
 moments, then Levenberg-Marquardt from the best few. Stronger than the original in that it
-projects through the calibrated camera, and that each frame is searched anew.
+projects through the calibrated camera, and that each frame has a search of its own.
 """
 
 from itertools import product

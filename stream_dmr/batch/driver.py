@@ -56,7 +56,7 @@ def run_batch(
     """Measure every video that is not done yet; results go below `out`.
 
     Failed videos are tried again by the next call. Setting `stop` ends the batch soon; unfinished
-    videos begin anew with the next call. Raises OutputError where `out` can't be written to or
+    videos begin again with the next call. Raises OutputError where `out` can't be written to or
     another batch is writing there.
     """
     make_folder(out / VIDEO_FOLDERS)

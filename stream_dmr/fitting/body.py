@@ -50,7 +50,7 @@ class Body(NamedTuple):
         start, step = template.midline[:-1], np.diff(template.midline, axis=0)
         edges, edge_faces = _edges(template.faces)
         # Copies, since those of a recording are read-only: for numba that is another type of array,
-        # for which it would make all machine code anew.
+        # for which it would compile all kernels again.
         return cls(
             points=points,
             places=start[segments] + fractions[:, None] * step[segments],

@@ -81,7 +81,7 @@ class TrackLength:
         """Filter one more good frame.
 
         A bad start must not shut out the good frames after it, so the whole track is filtered
-        anew, from the median of all frames so far: at each frame at first, then at growing
+        again, from the median of all frames so far: at each frame at first, then at growing
         intervals (1/16 of the track), which keeps the mean work per frame bounded.
         """
         self._measurements.append(measurement)

@@ -23,7 +23,7 @@ class ReplayInputs:
     template: Template
     candidates: CandidateShapes | None  # the shapes that the fish may have; None: the template's
     calibration: Calibration | None
-    files: CropFiles | None  # None where no crop is cut anew
+    files: CropFiles | None  # None where no crop is cut again
 
 
 def read_inputs(request: ReplayRequest, recording: Recording) -> ReplayInputs:

@@ -26,7 +26,7 @@ def sealed(
 ) -> Generator[None]:
     """Write the provenance of a run's results when it ends, however it does.
 
-    Recordings of months are left out: a run that is told to stop has no time to read them. What a
+    Recordings of months are left out: a run that is asked to stop has no time to read them. What a
     full disk refuses is a notice: the lengths are there.
     """
     try:

@@ -47,7 +47,7 @@ class MeasuredFrame:
 
 
 class RunState:
-    """Is told every message in the chain's threads, and asked in the server's. Thread-safe."""
+    """Takes every message in the chain's threads; the server reads it in its own. Thread-safe."""
 
     def __init__(
         self,

@@ -175,7 +175,7 @@ class StockFitter:
         return H, g
 
     def _follow(self, body: Body, frame: PosedTarget) -> None:
-        """Fit a frame anew from where it was."""
+        """Refit a frame from its last pose."""
         problem = self._problem(body, frame.target)
         nothing_held = np.zeros(len(frame.pose), np.bool_)
         frame.pose = minimise(problem, frame.pose, nothing_held, _POSE_OPTIONS).parameters
