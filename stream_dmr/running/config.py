@@ -21,7 +21,7 @@ from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.results.fisheries import FisheriesSettings
-from stream_dmr.running.run_settings import DriftSettings, WatchSettings
+from stream_dmr.running.run_settings import AlertSettings, DriftSettings, WatchSettings
 from stream_dmr.segmentation.detection.open_detector import DetectFishSettings
 from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
 from stream_dmr.segmentation.tracking.tracked_fish import TrackFishSettings
@@ -82,6 +82,9 @@ class Config(Settings):
     )
     watch: WatchSettings = Field(
         default_factory=WatchSettings, description="the status page of a run"
+    )
+    alerts: AlertSettings = Field(
+        default_factory=AlertSettings, description="who is told of a run that is not well"
     )
     fisheries: FisheriesSettings = Field(
         default_factory=FisheriesSettings,

@@ -1,4 +1,4 @@
-"""The tables of config.toml that belong to a run as a whole: [drift] and [watch]."""
+"""The tables of config.toml that belong to a run as a whole: [drift], [watch] and [alerts]."""
 
 from pydantic import Field
 
@@ -52,4 +52,20 @@ class WatchSettings(Settings):
         default=120.0,
         gt=0,
         description="a stage that works on one frame for longer counts as hanging, s",
+    )
+
+
+class AlertSettings(Settings):
+    """`[alerts]`: who is told when a run becomes unhealthy, and when it is healthy again."""
+
+    webhook: str = Field(
+        default="", description='address that gets a POST of JSON; "": nobody is told this way'
+    )
+    mail_to: str = Field(default="", description='mail address that is told; "": none')
+    mail_from: str = Field(default="", description="mail address of the sender, and its login")
+    mail_server: str = Field(
+        default="", description="mail server that takes it, host or host:port (587)"
+    )
+    mail_password_file: str = Field(
+        default="", description='file with the sender\'s password; "": the server asks for none'
     )

@@ -3,6 +3,7 @@
 from stream_dmr.messages import Message
 from stream_dmr.running.pipeline import Chain
 from stream_dmr.running.run_observer import OpenRun, RunObserver
+from stream_dmr.watch.alerts import AlertSender
 from stream_dmr.watch.run_state import MAX_FINISHED, RunState
 from stream_dmr.watch.systemd import SystemdWatchdog
 from stream_dmr.watch.watch_server import WatchServer
@@ -16,6 +17,7 @@ class WatchObserver(RunObserver):
         self._state: RunState | None = None  # from `open` on
         self._server: WatchServer | None = None
         self._watchdog: SystemdWatchdog | None = None
+        self._alerts: AlertSender | None = None
 
     def open(self, run: OpenRun) -> None:
         """Serve as `[watch]` says; ConfigError or OutputError where it can't listen as asked."""
@@ -26,6 +28,11 @@ class WatchObserver(RunObserver):
         )
         state.continue_after(run.store.counts(), run.store.estimates(last=MAX_FINISHED))
         self._server = WatchServer(state, settings) if settings.port else None
+        alerts = run.config.alerts
+        if alerts.webhook or alerts.mail_to:
+            self._alerts = AlertSender(
+                alerts, run=run.out.resolve().name, problems=state.problems, on_notice=self.warn
+            )
         self._watchdog = SystemdWatchdog(lambda: not state.is_stuck())
         self._state = state
         self.address = None if self._server is None else self._server.address
@@ -38,6 +45,9 @@ class WatchObserver(RunObserver):
 
     def close(self) -> None:
         """Stop serving. Idempotent."""
+        if self._alerts is not None:
+            self._alerts.close()
+            self._alerts = None
         if self._watchdog is not None:
             self._watchdog.close()
             self._watchdog = None
