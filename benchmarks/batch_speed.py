@@ -61,7 +61,10 @@ def engine_of(name: str, workers: int) -> Iterator[Engine]:
 def backlogs(folder: Path, videos: int) -> Iterator[Backlog]:
     """So many videos with masks; one raw video as long as all of them."""
     masks = {"boxes": DEMO_SCENE / "boxes.txt", "masks": DEMO_SCENE / "masks"}
-    with_masks = [{"video": DEMO_SCENE / "video.mp4"} | masks] * videos
+    copies = [folder / f"{number}.mp4" for number in range(videos)]  # a batch takes each video once
+    for copy in copies:
+        copy.write_bytes((DEMO_SCENE / "video.mp4").read_bytes())
+    with_masks = [{"video": copy} | masks for copy in copies]
     num_frames = write_repeated(folder / "long.mp4", DEMO_SCENE / "video.mp4", times=videos)
     yield Backlog("masks", jobs_of(folder / "masks.csv", with_masks), num_frames)
     raw = jobs_of(folder / "raw.csv", [{"video": folder / "long.mp4"}])
