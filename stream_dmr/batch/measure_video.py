@@ -13,7 +13,7 @@ from stream_dmr.batch.manifest import Job
 from stream_dmr.batch.progress import OnProgress
 from stream_dmr.errors import UserError
 from stream_dmr.files import rename_durably
-from stream_dmr.results.finished_fish import runs_cut_short
+from stream_dmr.results.finished_fish import run_notes
 from stream_dmr.results.provenance import add_files
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_observer import RunObserver
@@ -67,7 +67,7 @@ def measure_video(job: Job, out: Path, *, on_progress: OnProgress = lambda share
             name=job.name,
             key=key,
             status=DONE,
-            reason="; ".join(runs_cut_short(folder)),
+            reason="; ".join(run_notes(folder)),
             num_frames=summary.num_frames,
             num_fish=len(summary.fish),
             elapsed_s=round(time.perf_counter() - began, 3),

@@ -15,6 +15,7 @@ from stream_dmr.calibration.corners import (
     find_corners,
     parse_board,
     read_grey,
+    seen_board,
 )
 from stream_dmr.calibration.lens_fit import BoardView, LensFit, fit_lens, require_determined
 from stream_dmr.camera import Calibration
@@ -149,7 +150,9 @@ def _reason(error: CalibrationError, path: Path) -> str:
 def _corners_or_refuse(picture: np.ndarray, board: Board) -> Float[np.ndarray, "N 2"]:
     found = find_corners(picture, board)
     if found is None:
-        raise CalibrationError(f"no board with {board[0]}x{board[1]} inner corners found")
+        other = seen_board(picture)
+        seen = "" if other is None else f", but one with {other[0]}x{other[1]}: check --board"
+        raise CalibrationError(f"no board with {board[0]}x{board[1]} inner corners found{seen}")
     return found
 
 

@@ -82,6 +82,20 @@ def find_corners(
     return _in_order(_refined(picture, coarse, board), board)
 
 
+def seen_board(picture: UInt8[np.ndarray, "H W"]) -> Board | None:
+    """The inner corners of whatever board is in a picture, the larger number first; None: none."""
+    scale = max(1.0, max(picture.shape) / _SEARCH_SIDE_PX)
+    found, _, meta = cv2.findChessboardCornersSBWithMeta(
+        _resized(picture, scale),
+        (3, 3),
+        cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE,
+    )
+    if not found:
+        return None
+    rows, columns = meta.shape[:2]
+    return max(rows, columns), min(rows, columns)
+
+
 def draw_corners(path: Path, corners: Float[np.ndarray, "N 2"], board: Board, out: Path) -> None:
     """Write the picture at `path`, reduced if large, with its corners drawn, to `out`."""
     picture = read_grey(path)

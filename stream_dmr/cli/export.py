@@ -55,7 +55,7 @@ def export(
             "--fish csv, --meshes ply, --masks, --tables csv"
         )
     from stream_dmr.results.export_formats import Export
-    from stream_dmr.results.finished_fish import runs_cut_short
+    from stream_dmr.results.finished_fish import run_notes
     from stream_dmr.running.config import load_config, parse_config
 
     exported = Export(recording, parse_selection(time, track), overwrite=overwrite)
@@ -75,4 +75,4 @@ def export(
         )
         print(exported.fish(out, settings.fisheries, format=fish))
     print(exported.provenance(out))
-    warn([*runs_cut_short(recording), *exported.warnings])
+    warn([*run_notes(recording), *exported.warnings])

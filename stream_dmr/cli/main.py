@@ -11,6 +11,7 @@ import typer
 
 from stream_dmr.cli.batch import batch
 from stream_dmr.cli.calibrate import calibrate
+from stream_dmr.cli.check import check
 from stream_dmr.cli.demo import demo
 from stream_dmr.cli.evaluate import evaluate
 from stream_dmr.cli.export import export
@@ -36,7 +37,7 @@ app = typer.Typer(
     rich_markup_mode=None,  # else it takes [tables] of settings for markup, and they vanish
 )
 for command in (
-    *(demo, run, calibrate, replay, recover, view, convert, export),
+    *(demo, run, calibrate, check, replay, recover, view, convert, export),
     *(report, review, verify, keygen, batch, evaluate, train, learn_template, make_template),
 ):
     app.command()(command)

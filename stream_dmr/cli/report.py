@@ -30,7 +30,7 @@ def verify(
     """Check that results are still what their run measured; exit 1 and say what was changed."""
     from stream_dmr.batch.verify_batch import verify_all
     from stream_dmr.errors import OutputError
-    from stream_dmr.results.finished_fish import runs_cut_short
+    from stream_dmr.results.finished_fish import run_notes
     from stream_dmr.results.lengths_database import NAME
     from stream_dmr.results.signatures import load_public_key
     from stream_dmr.results.verify import Change
@@ -52,7 +52,7 @@ def verify(
         print(note)
     for database in databases:
         with suppress(OutputError):  # damaged, which is said above
-            for line in runs_cut_short(database.parent):
+            for line in run_notes(database.parent):
                 print(f"{database}: {line}")
     if changes:
         raise typer.Exit(1)

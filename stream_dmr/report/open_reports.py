@@ -11,7 +11,7 @@ from stream_dmr.report.drawn_views import draw_views
 from stream_dmr.report.recorded_tracks import read_tracks
 from stream_dmr.report.report_page import render_page
 from stream_dmr.report.run_report import RunReport
-from stream_dmr.results.finished_fish import read_fish, runs_cut_short
+from stream_dmr.results.finished_fish import read_fish, run_notes
 from stream_dmr.results.provenance import add_files
 from stream_dmr.running.config import load_config, parse_config
 
@@ -33,7 +33,7 @@ def open_report(path: Path, *, source: str | None = None, config: Path | None = 
         views=draw_views(tracks, recording, source),
         config=of_run,
         settings=(of_run if config is None else load_config(config)).fisheries,
-        notes=runs_cut_short(path),
+        notes=run_notes(path),
     )
 
 

@@ -30,6 +30,7 @@ from stream_dmr.results.lengths_table import write_lengths
 from stream_dmr.results.own_files import require_writable
 from stream_dmr.results.provenance import known_files, read_origin, seal_files
 from stream_dmr.results.run_facts import run_facts
+from stream_dmr.results.scale_checks import last_checks
 
 MeshFormat = Literal["ply", "glb"]
 TableFormat = Literal["csv", "parquet"]
@@ -131,6 +132,12 @@ class Export:
             fish_record(fish, template, settings)
             for fish in read_fish(self._path, self._recording, self._selection)
         ]
+        database = database_of(self._path)
+        checks = {} if database is None else last_checks(database)
+        for record in records:
+            if (check := checks.get(record["calibration_sha256"])) is not None:
+                record["scale_error_percent"] = check.error_percent
+                record["scale_checked_ns"] = check.time_ns
         write = write_csv if format == "csv" else write_parquet
         path = write(make_folder(out) / "fish", records)
         self._written.append(path)

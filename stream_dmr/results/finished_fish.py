@@ -15,6 +15,7 @@ from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
 from stream_dmr.results.lengths_database import NAME, open_for_reading
 from stream_dmr.results.run_facts import RunFacts, cut_short, run_facts
+from stream_dmr.results.scale_checks import last_checks
 from stream_dmr.results.store_rows import MAY_COUNT_TWICE, read_estimates
 from stream_dmr.results.verdicts import NOT_REVIEWED, Review, read_verdicts, reviews_of
 
@@ -84,11 +85,18 @@ def read_runs(database: Path) -> dict[str, RunFacts]:
         return dict(_runs(connection))
 
 
-def runs_cut_short(path: Path) -> list[str]:
-    """A line for each run in a folder that measured a part of its source. Raises OutputError."""
+def run_notes(path: Path) -> list[str]:
+    """A line for each run that measured a part of its source, and for each wrong scale.
+
+    Raises OutputError.
+    """
     database = database_of(path)
-    runs = {} if database is None else read_runs(database)
-    return [line for facts in runs.values() if (line := cut_short(facts))]
+    if database is None:
+        return []
+    runs, checks = read_runs(database), last_checks(database)
+    used = {facts.calibration_sha256 for facts in runs.values()}
+    alarms = [c.alarm for sha256, c in checks.items() if c.alarm and sha256 in used]
+    return [*(line for facts in runs.values() if (line := cut_short(facts))), *alarms]
 
 
 def numbers_its_own(folder: Path) -> bool:

@@ -40,6 +40,8 @@ FISH_TABLE: dict[str, type] = {
     "template_sha256": str,
     "ended_by": str,  # of the run
     **dict.fromkeys(("frames_done", "frames_promised"), int),
+    "scale_error_percent": float,  # of the last `check` with the run's calibration
+    "scale_checked_ns": int,  # wall clock, since 1970
 }
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from stream_dmr.calibration.calibration_file import load_calibration, save_calibration
 from stream_dmr.report.open_reports import open_report
-from stream_dmr.results.finished_fish import read_runs, read_stored_fish, runs_cut_short
+from stream_dmr.results.finished_fish import read_runs, read_stored_fish, run_notes
 from stream_dmr.results.run_facts import SOURCE_ENDED
 from stream_dmr.results.verify import verify
 from stream_dmr.review.verdict_recorder import VerdictRecorder
@@ -59,7 +59,7 @@ def test_it_is_verified_exported_and_reviewed(again: Path, tmp_path: Path):
 def test_a_part_says_that_it_is_one(run: Path, tmp_path: Path):
     out = tmp_path / "out"
     assert invoke(f"replay {run}", {"--track": "1", "--out": str(out)}).code == 0
-    assert "the selected part of a recording" in runs_cut_short(out)[0]
+    assert "the selected part of a recording" in run_notes(out)[0]
 
 
 def test_the_recording_alone_is_replayed_without_them(run: Path, tmp_path: Path):

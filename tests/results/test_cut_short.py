@@ -10,7 +10,7 @@ import pytest
 from stream_dmr.errors import SourceError
 from stream_dmr.report.open_reports import open_report
 from stream_dmr.report.report_page import render_page
-from stream_dmr.results.finished_fish import read_runs, runs_cut_short
+from stream_dmr.results.finished_fish import read_runs, run_notes
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.run_facts import (
     ENDLESS_STOPPED,
@@ -62,7 +62,7 @@ def test_a_whole_run_says_so(tmp_path: Path):
     out = measure(tmp_path)
     facts = facts_of(out)
     assert (facts.ended_by, facts.frames_done, facts.frames_promised) == (SOURCE_ENDED, 6, 6)
-    assert runs_cut_short(out) == []
+    assert run_notes(out) == []
     assert "frames (" not in invoke("verify", {str(out): None}).out
 
 
@@ -72,7 +72,7 @@ def test_every_output_says_that_a_run_was_stopped(stopped: Path, tmp_path: Path)
     assert facts.frames_promised == NUM_FRAMES
     assert facts.frames_done is not None
     assert facts.frames_done < NUM_FRAMES - 1
-    (line,) = runs_cut_short(stopped)
+    (line,) = run_notes(stopped)
     assert f"{facts.frames_done} of {NUM_FRAMES} frames" in line
     (made,) = json.loads((stopped / "provenance.json").read_text())["runs"].values()
     assert (made["ended_by"], made["frames_done"]) == (STOPPED, facts.frames_done)
@@ -94,7 +94,7 @@ def test_an_error_is_what_ended_the_run(tmp_path: Path):
     asked = request(tmp_path / "clip", tmp_path / "out", overwrite=True)
     with pytest.raises(SourceError):
         measure_source(asked, stop=threading.Event(), observer=Failing())
-    assert "the disk of the clip is gone" in runs_cut_short(tmp_path / "out")[0]
+    assert "the disk of the clip is gone" in run_notes(tmp_path / "out")[0]
 
 
 def test_a_crash_leaves_what_was_done_so_far(tmp_path: Path):
@@ -103,7 +103,7 @@ def test_a_crash_leaves_what_was_done_so_far(tmp_path: Path):
     for _ in range(123):
         store.frame_done()
     store.add(fish(1))
-    (line,) = runs_cut_short(tmp_path)
+    (line,) = run_notes(tmp_path)
     assert line.startswith("123 of 660 frames (19 %) of clip.mp4 were measured")
     assert NOT_ENDED in line
     store.end(SOURCE_ENDED)

@@ -1,0 +1,64 @@
+"""Measures what has a known length in the reference plane: a chessboard, or a rod by its ends."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy.spatial.distance import pdist
+
+from stream_dmr.calibration.corners import Board, board_points_mm, find_corners, seen_board
+from stream_dmr.camera import Calibration
+from stream_dmr.errors import CalibrationError
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleError:
+    """Measured minus known lengths, over all distances that are known."""
+
+    known_mm: float  # the longest of them
+    error_mm: float  # of the longest
+    error_percent: float  # mean over all, with its sign: what a wrong scale shows as
+    worst_percent: float  # the largest, absolute
+
+
+def scale_of_points(
+    points_px: Float[np.ndarray, "N 2"],
+    known_mm: Float[np.ndarray, "N 3"],
+    calibration: Calibration,
+) -> ScaleError:
+    """Compare all distances of points that lie in the reference plane, as pixels and in mm.
+
+    Pixels are put onto the plane as a fish's keypoints would be that lay in it.
+    """
+    rays = calibration.camera.back_project(points_px)
+    measured = pdist(rays * calibration.plane.depth_mm(rays)[:, None])
+    known = pdist(known_mm)
+    percent, longest = 100 * (measured / known - 1), int(np.argmax(known))
+    return ScaleError(
+        known_mm=float(known[longest]),
+        error_mm=float(measured[longest] - known[longest]),
+        error_percent=float(percent.mean()),
+        worst_percent=float(np.abs(percent).max()),
+    )
+
+
+def scale_of_board(
+    pictures: Iterable[UInt8[np.ndarray, "H W"]],
+    calibration: Calibration,
+    *,
+    board: Board,
+    square_mm: float,
+) -> ScaleError:
+    """The scale by the first picture that shows the whole board. Raises CalibrationError."""
+    other: Board | None = None
+    for picture in pictures:
+        corners = find_corners(picture, board)
+        if corners is not None:
+            return scale_of_points(corners, board_points_mm(board, square_mm), calibration)
+        other = other or seen_board(picture)
+    seen = "" if other is None else f"; one with {other[0]}x{other[1]} was seen: check --board"
+    raise CalibrationError(
+        f"expected a picture with the whole board of {board[0]}x{board[1]} inner corners in the "
+        f"reference plane, got none{seen}"
+    )

@@ -1,0 +1,75 @@
+"""Checks of the scale by a known length: a table of its own in lengths.db, rows are only added."""
+
+import sqlite3
+import time
+from contextlib import closing
+from dataclasses import astuple, dataclass, fields, replace
+from pathlib import Path
+
+from stream_dmr.errors import OutputError
+from stream_dmr.results.lengths_database import open_for_reading, open_for_writing
+
+_TABLE = """
+CREATE TABLE IF NOT EXISTS checks (
+    number INTEGER PRIMARY KEY,
+    time_ns INTEGER NOT NULL, -- wall clock
+    source TEXT NOT NULL,
+    calibration_sha256 TEXT NOT NULL,
+    known_mm REAL NOT NULL, error_mm REAL NOT NULL,
+    error_percent REAL NOT NULL, worst_percent REAL NOT NULL,
+    limit_percent REAL NOT NULL -- an alarm beyond it
+) STRICT
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleCheck:
+    """One row: a known length, as it was measured with a calibration."""
+
+    source: str
+    calibration_sha256: str
+    known_mm: float
+    error_mm: float
+    error_percent: float  # with its sign
+    worst_percent: float
+    limit_percent: float
+    time_ns: int = 0
+
+    @property
+    def alarm(self) -> str:
+        """What a reader of lengths must know; "" where the scale is right."""
+        if abs(self.error_percent) <= self.limit_percent:
+            return ""
+        return (
+            f"a known length of {self.known_mm:.1f} mm was measured {self.error_percent:+.2f} % "
+            f"off, more than {self.limit_percent:g} %: lengths of this calibration are as wrong"
+        )
+
+
+_NAMES = [field.name for field in fields(ScaleCheck)]
+
+
+def add_check(database: Path, check: ScaleCheck) -> None:
+    """Write a check into a lengths.db, durably. Raises OutputError."""
+    row = astuple(replace(check, time_ns=time.time_ns()))
+    try:
+        with closing(open_for_writing(database)) as connection:
+            connection.execute(_TABLE)
+            marks = ", ".join("?" for _ in row)
+            connection.execute(f"INSERT INTO checks ({', '.join(_NAMES)}) VALUES ({marks})", row)
+    except sqlite3.Error as error:
+        raise OutputError(f"{database}: expected room for a check, got: {error}") from error
+
+
+def last_checks(database: Path) -> dict[str, ScaleCheck]:
+    """The last check by the SHA-256 of its calibration. Raises OutputError."""
+    try:
+        with closing(open_for_reading(database)) as connection:
+            query = "SELECT 1 FROM sqlite_master WHERE name = 'checks' AND type = 'table'"
+            if connection.execute(query).fetchone() is None:
+                return {}
+            rows = connection.execute(f"SELECT {', '.join(_NAMES)} FROM checks ORDER BY number")
+            checks = [ScaleCheck(**dict(zip(_NAMES, row, strict=True))) for row in rows]
+    except sqlite3.Error as error:
+        raise OutputError(f"{database}: expected checks of the scale, got: {error}") from error
+    return {check.calibration_sha256: check for check in checks}
