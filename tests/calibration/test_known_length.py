@@ -13,7 +13,7 @@ from stream_dmr.calibration.known_length import scale_of_board, scale_of_points
 from stream_dmr.camera import Calibration, ReferencePlane
 from stream_dmr.errors import CalibrationError
 from stream_dmr.files import sha256_of
-from stream_dmr.results.finished_fish import runs_cut_short
+from stream_dmr.results.finished_fish import run_notes
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.scale_checks import last_checks
 from tests.support.board_views import LENS, BoardRenderer, pose
@@ -82,7 +82,7 @@ def test_the_command_keeps_it_and_raises_an_alarm(files: dict[str, Path], tmp_pa
         assert ("alarm" in outcome.out) is (name == "wrong")
     checks = last_checks(out / "lengths.db")
     assert len(checks) == 2
-    assert [line for line in runs_cut_short(out) if "+5.0" in line]
+    assert [line for line in run_notes(out) if "+5.0" in line]
 
 
 def test_exports_have_the_last_check(files: dict[str, Path], tmp_path: Path):
