@@ -1,0 +1,73 @@
+"""The data set of real pictures: its manifest, and how fish are cut out of pictures for it."""
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.segmentation import real_images
+from benchmarks.segmentation.real_images import READERS, Proposal, keep, put_before, window
+
+MANIFEST = Path(real_images.__file__).parent / "real_sources.toml"
+OPEN = {"MIT", "CC BY 4.0", "Apache-2.0", "BSD-3-Clause", "CC0"}
+KEPT_FOR_CHECKS = {
+    *("Zhanglab-abe/Catfish-Segment", "WENLU-W/WENLU-W.github.io", "mooch443/trex"),
+    *("JonatanAde/underwater-detection", "emilyferguson989/FishSense_237D_SP21"),
+    *("fritzfrancisco/Fish-Measurer", "lwoiceshyn/Kaggle-Fish-Detection-with-Deep-Learning"),
+    *("MTA21634/P6_Fish_Detection", "wibuhekers/ar-salmon", "arin1405/fish_detector_edge_ML"),
+    *("kasperfg16/fish_species_detection", "briancknight/HandsFreeFishing"),
+    *("Kazuhito00/YOLOX-Colaboratory-Training-Sample",),
+}
+
+
+@pytest.fixture(scope="module")
+def manifest() -> dict:
+    return tomllib.loads(MANIFEST.read_text(encoding="utf-8"))
+
+
+def test_only_pictures_under_open_licences_are_trained_on(manifest):
+    trained = [source for source in manifest["sources"].values() if source["role"] == "train"]
+    assert len(trained) >= 6
+    assert {source["licence"] for source in [*trained, manifest["backgrounds"]]} <= OPEN
+
+
+def test_no_repository_is_used_that_is_kept_for_later_checks(manifest):
+    used = {source["repository"] for source in manifest["sources"].values()}
+    assert not used & KEPT_FOR_CHECKS
+
+
+def test_every_source_can_be_read_and_says_which_fish_were_kept(manifest):
+    for source in manifest["sources"].values():
+        assert source["kind"] in READERS
+        assert ("accepted" in source) != ("rejected" in source)
+        names = source.get("accepted", source.get("rejected"))
+        assert len(set(names)) == len(names) > 0
+
+
+def test_a_window_stays_in_the_picture_and_holds_the_box():
+    image = np.zeros((100, 200, 3), np.uint8)
+    for box in ([10.0, 20.0, 60.0, 40.0], [150.0, 0.0, 200.0, 100.0]):
+        left, top, right, bottom = window(image, np.array(box), margin=0.7)
+        assert 0 <= left <= box[0] <= box[2] <= right <= 200
+        assert 0 <= top <= box[1] <= box[3] <= bottom <= 100
+
+
+def test_a_kept_fish_has_its_surroundings_and_is_not_large():
+    image, mask = np.zeros((2000, 2000, 3), np.uint8), np.zeros((2000, 2000), bool)
+    mask[900:1100, 700:1300] = True
+    proposal = Proposal(name="x", image=image, box=np.array([700.0, 900.0, 1300.0, 1100.0]))
+    kept, kept_mask = keep(proposal, mask)
+    assert kept.shape[:2] == kept_mask.shape
+    assert max(kept.shape) <= 480
+    assert kept_mask.mean() == pytest.approx(600 * 200 / (2.4 * 600) ** 2, rel=0.05)
+
+
+def test_a_cut_out_covers_the_photograph_where_its_mask_is():
+    mask = np.zeros((60, 90), bool)
+    mask[20:40, 20:70] = True
+    fish = np.full((60, 90, 3), 250, np.uint8)
+    image, whole = put_before(np.zeros((50, 50, 3), np.uint8), fish, mask)
+    assert image.shape[:2] == whole.shape
+    assert image[whole].mean() > 150
+    assert not image[:100].any()
