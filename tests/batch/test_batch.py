@@ -57,10 +57,11 @@ def row(clip: str = "clip", **other: str) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def season(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with two clips, and what `run` makes of the first."""
+    """A folder with two clips, the first of them twice, and what `run` makes of it."""
     folder = tmp_path_factory.mktemp("season")
     write_clip(folder / "clip", fish=FISH)
     write_clip(folder / "other", fish=[[1], [1], [1], [1, 3], [3], [3]])
+    shutil.copytree(folder / "clip", folder / "again")
     (folder / "broken").mkdir()
     (folder / "broken" / "video.mp4").write_bytes(b"this is no video")
     measure_source(request(folder / "clip", folder / "alone"), stop=threading.Event())
@@ -107,7 +108,7 @@ def test_a_batch_measures_a_video_as_run_does(season: Path, tmp_path: Path):
 
 
 def test_a_bad_video_fails_alone(season: Path, tmp_path: Path):
-    lines = row(), row("other", trip="8"), row(video="broken/video.mp4"), row(masks="none")
+    lines = row(), row("other", trip="8"), row(video="broken/video.mp4"), row("again", masks="none")
     jobs = jobs_of(season, tmp_path, *lines, row(video="missing.mp4", vessel=""))
     assert [job.name for job in jobs] == ["video", "video-2", "video-3", "video-4", "missing"]
     statuses = measure(jobs, tmp_path / "out")
@@ -151,11 +152,11 @@ def test_the_data_set_holds_every_fish_and_every_frame(season: Path, tmp_path: P
 
 @pytest.fixture(scope="module")
 def finished(season: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A batch of two videos; one came without a trip, one shows no fish."""
+    """A batch of three videos: two came without a trip, one shows no fish."""
     folder = tmp_path_factory.mktemp("finished")
     write_clip(season / "sea", fish=[[]] * 3)
     (season / "sea" / "masks" / "000001.png").rename(season / "sea" / "masks" / "000009.png")
-    measure(jobs_of(season, folder, row(), row("sea", trip=""), row(trip="")), folder)
+    measure(jobs_of(season, folder, row(), row("sea", trip=""), row("again", trip="")), folder)
     return folder
 
 
@@ -290,7 +291,7 @@ def test_a_damaged_outcome_counts_as_none(season: Path, tmp_path: Path):
 def test_a_killed_worker_or_batch_loses_no_finished_video(season: Path, tmp_path: Path):
     """First its worker is killed, which one video is charged with, then the batch itself."""
     clip, out = season / "clip", tmp_path / "out"
-    manifest = write_manifest(season / f"{tmp_path.name}.csv", row(), row("other"), row("clip"))
+    manifest = write_manifest(season / f"{tmp_path.name}.csv", row(), row("other"), row("again"))
     command = [sys.executable, "-m", "stream_dmr.cli.main", "batch", str(manifest)]
     command += ["--config", str(clip / "quick.toml"), "--template", str(clip / "tiny.ply")]
     command += ["--workers", "1", "--out", str(out)]
@@ -306,7 +307,7 @@ def test_a_killed_worker_or_batch_loses_no_finished_video(season: Path, tmp_path
     done = out / "videos" / "video-2" / "recording.mcap"
     before = done.stat().st_mtime_ns
     assert not (out / "videos" / "video-3").exists()
-    jobs = jobs_of(season, tmp_path, row(), row("other"), row("clip"))
+    jobs = jobs_of(season, tmp_path, row(), row("other"), row("again"))
     statuses = measure(jobs, out)
     assert list(statuses.values()) == ["done"] * 3
     assert done.stat().st_mtime_ns == before
@@ -380,7 +381,7 @@ def test_a_batch_killed_at_random_moments_finishes_in_the_end(tmp_path: Path, se
 def test_ray_measures_all_videos_though_a_worker_dies(season: Path, tmp_path: Path):
     pytest.importorskip("ray", reason="needs Ray: pip install 'stream-dmr[ray]'")
     clip, out = season / "clip", tmp_path / "out"
-    lines = row(), row("other"), row(video="broken/video.mp4"), row("clip")
+    lines = row(), row("other"), row(video="broken/video.mp4"), row("again")
     manifest = write_manifest(season / f"{tmp_path.name}.csv", *lines)
     script = SUPPORT / "ray_cluster.py"
     command = [sys.executable, str(script), str(manifest), str(clip / "quick.toml")]
