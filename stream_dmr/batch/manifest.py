@@ -4,6 +4,7 @@ import csv
 import json
 import re
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -61,21 +62,25 @@ def read_manifest(path: Path, *, config: Path | None, template: str) -> list[Job
     names = _names([row["video"] or "" for row in rows])
     mesh = template if not Path(template).is_file() else str(Path(template).resolve())
     shared = {"config": "" if config is None else str(config.resolve()), "template": mesh}
-    jobs, home, lines = [], path.resolve().parent, dict[str, int]()
+    jobs, home = [], path.resolve().parent
     for number, (row, name) in enumerate(zip(rows, names, strict=True), start=2):
         if not row["video"] or None in row:
             raise UserError(f"{path}, line {number}: expected {len(COLUMNS)} cells with a video")
-        video = str((home / row["video"].strip()).resolve())
-        if (first := lines.setdefault(video, number)) != number:
-            raise UserError(
-                f"{path}, line {number}: expected each video once, got {row['video']} again, which "
-                f"is in line {first}; its fish would count twice"
-            )
         cells = {key: (row[key] or "").strip() for key in COLUMNS}
         files = {key: str(home / cells[key]) for key in _FILES if cells[key]}
         values: dict[str, Any] = cells | files | shared
         jobs.append(Job(name=name, **values))
     return jobs
+
+
+def repeated_videos(jobs: Sequence[Job]) -> list[str]:
+    """A line for each video that several rows name: its fish count once for each of them."""
+    counts = Counter(str(Path(job.video).resolve()) for job in jobs)
+    return [
+        f"{video}: in {count} rows of the manifest, so its fish count {count} times"
+        for video, count in counts.items()
+        if count > 1
+    ]
 
 
 def _rows(path: Path) -> list[dict[str | None, str | None]]:

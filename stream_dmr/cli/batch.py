@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from stream_dmr.cli.shared_options import ConfigOption, TemplateOption, stop_on_signals
+from stream_dmr.cli.shared_options import ConfigOption, TemplateOption, stop_on_signals, warn
 
 if TYPE_CHECKING:
     from stream_dmr.batch.engine import Engine
@@ -56,7 +56,7 @@ def batch(
     with stop_on_signals() as stop:
         from stream_dmr.batch.driver import run_batch
         from stream_dmr.batch.layout import VIDEOS, read_videos
-        from stream_dmr.batch.manifest import read_manifest
+        from stream_dmr.batch.manifest import read_manifest, repeated_videos
         from stream_dmr.batch.progress import duration
         from stream_dmr.fitting.shape.candidates import load_shapes
         from stream_dmr.running.config import load_config
@@ -66,6 +66,7 @@ def batch(
         if (out / VIDEOS).exists():
             read_videos(out)  # refuses a table that is no batch's
         jobs = read_manifest(manifest, config=config, template=template)
+        warn(repeated_videos(jobs))
         with _engine(engine, workers, address, gpus) as where:
             summary = run_batch(
                 jobs,
