@@ -126,7 +126,8 @@ def form_precision() -> Float[np.ndarray, "W W"]:
 
 def log_breadth_std(covariance: Float[np.ndarray, "W W"]) -> float:
     """Std of the mean log breadth of the trunk, the same to the last bit in every replay."""
-    return float(np.sqrt(np.einsum("i,ij,j", TRUNK, covariance, TRUNK)))
+    in_order = np.ascontiguousarray(covariance)  # sums run in the order of the memory
+    return float(np.sqrt(np.einsum("i,ij,j", TRUNK, in_order, TRUNK)))
 
 
 def individual_covariance() -> Float[np.ndarray, "W W"]:

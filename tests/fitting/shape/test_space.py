@@ -20,6 +20,7 @@ from stream_dmr.fitting.shape.space import (
     directions,
     form_precision,
     individual_covariance,
+    log_breadth_std,
     reshaped,
 )
 from stream_dmr.template.template_file import bundled_names, load_template
@@ -116,3 +117,23 @@ def test_a_stock_is_taken_to_be_broader_or_slimmer_than_its_form_by_a_tenth_and_
     assert 0.1 < std < 0.4
     assert np.sqrt(TRUNK @ individual_covariance() @ TRUNK) == pytest.approx(0.05, rel=0.1)
     assert TRUNK.sum() == pytest.approx(1.0)
+
+
+def moved_in_memory(array):
+    """The same numbers, a byte off any boundary, as a recording's bytes may lie."""
+    room = np.zeros(array.nbytes + 1, np.uint8)
+    moved = np.frombuffer(room.data, np.float64, array.size, offset=1).reshape(array.shape)
+    room[1:] = np.frombuffer(np.ascontiguousarray(array).tobytes(), np.uint8)
+    return moved
+
+
+def test_a_recorded_shape_is_the_run_s_to_the_last_bit():
+    """Wherever and in whichever order its numbers lie in memory: BLAS would round otherwise."""
+    rng, template = np.random.default_rng(5), load_template("cod")
+    covariance = np.linalg.inv(form_precision())
+    for order in (np.asfortranarray, moved_in_memory):
+        assert log_breadth_std(order(covariance)) == log_breadth_std(covariance)
+    for _ in range(20):
+        coefficients = rng.normal(0, 0.2, NUM_COEFFICIENTS)
+        again = reshaped(template, moved_in_memory(coefficients)).rest_vertices
+        np.testing.assert_array_equal(again, reshaped(template, coefficients).rest_vertices)
