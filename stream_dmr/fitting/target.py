@@ -26,7 +26,8 @@ class Target(NamedTuple):
     plane_normal: Float[np.ndarray, "3"]  # of the plane that fish hang in, camera frame
     heading: Float[np.ndarray, "2"]  # tail to head in the picture; 0: not known
     mask: Float[np.ndarray, "S S"]
-    unknown: Bool[np.ndarray, "S S"]  # what something hides: it counts neither way
+    # What something hides, which counts neither way; (0, 0) where nothing does, which is faster.
+    unknown: Bool[np.ndarray, "U U"]
     distance: Float[np.ndarray, "S S"]  # to the mask's edge, px, negative inside, 0 where unknown
     mask_area: float  # px
     contour: Float[np.ndarray, "C 2"]  # points on the mask's edge, px
@@ -36,7 +37,7 @@ class Target(NamedTuple):
     @classmethod
     def from_crop(cls, crop: FishCrop, *, plane_normal: Float[np.ndarray, "3"]) -> "Target":
         """Distance map, contour, heading and camera of a crop with a mask."""
-        unknown = np.zeros_like(crop.mask) if crop.unknown is None else crop.unknown.copy()
+        unknown = np.zeros((0, 0), bool) if crop.unknown is None else crop.unknown.copy()
         return cls(
             crop.crop_camera.K.copy(),  # see Body.from_template
             crop.crop_camera.middle_ray(),

@@ -125,14 +125,14 @@ def _add_row(
 def overlap(covered: Float[np.ndarray, "S S"], target: Target) -> tuple[float, float, float]:
     """L_iou and L_boundary of eq. (3), and the hard IoU; what is unknown is left out of all."""
     mask, distance, mask_area = target.mask, target.distance, target.mask_area
-    unknown = target.unknown
+    unknown, is_hidden = target.unknown, len(target.unknown) > 0
     size = len(mask)
     both = total = boundary = 0.0
     hard_both = hard_total = 0
     for i in range(size):
         for k in range(size):
             c = covered[i, k]
-            if c > 0.0 and not unknown[i, k]:
+            if c > 0.0 and not (is_hidden and unknown[i, k]):
                 total += c
                 boundary += c * distance[i, k]
                 both += c * mask[i, k]

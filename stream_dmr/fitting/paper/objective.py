@@ -32,7 +32,7 @@ class Objective:
         self._deformation = DEFORMATIONS[settings.deformation]
         self._K, self._anchor = tensor(target.K), tensor(target.anchor)
         self._mask, self._distance = tensor(target.mask), tensor(target.distance)
-        self._known = tensor(~target.unknown)
+        self._known = tensor(~target.unknown) if len(target.unknown) else 1.0
 
     def terms(self, vector: Float[Tensor, "B P"]) -> Terms:
         """Each term of eq. (3); the shape terms are taken in body lengths."""
