@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import closing
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -103,8 +103,7 @@ def _measure(
     first = next(pictures)
     require_size(calibration, width=first.shape[1], height=first.shape[0])
     if ends is None or length_mm is None:
-        several = (picture for group in ([first], pictures) for picture in group)
-        size = parse_board(board)
+        several, size = chain([first], pictures), parse_board(board)
         return scale_of_board(several, calibration, board=size, square_mm=square_mm)
     try:
         points = np.array([float(part) for part in ends.split(",")]).reshape(2, 2)

@@ -104,9 +104,9 @@ def simulate_command(
 ) -> None:
     """Make a scene of hooked fish with known lengths: video, boxes, masks, calibration, truth."""
     from stream_dmr.results.own_files import require_writable
-    from stream_dmr.simulation import SCENE_FILES, simulate
+    from stream_dmr.simulation import scene_files, simulate
 
-    require_writable(*(out / name for name in SCENE_FILES), overwrite=overwrite)
+    require_writable(*(out / name for name in scene_files(species)), overwrite=overwrite)
     simulate(out, num_fish=fish, num_frames=frames, preset=preset, seed=seed, species=species)
     print(f"scene in {out}: video.mp4, boxes.txt, masks, calibration.yaml, truth.csv, templates")
 

@@ -5,7 +5,6 @@ import time
 from collections.abc import Collection, Sequence
 from math import inf
 from pathlib import Path
-from types import TracebackType
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -47,12 +46,7 @@ class RunDisplay(RunObserver):
     def __enter__(self) -> "RunDisplay":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._progress.stop()
 
     def warn(self, line: str) -> None:  # noqa: D102

@@ -1,7 +1,5 @@
 """Progress of a training on the terminal."""
 
-from types import TracebackType
-
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -31,12 +29,7 @@ class TrainDisplay(TrainObserver):
         self._progress.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._progress.stop()
 
     def patches_drawn(self, num_done: int, num_all: int) -> None:  # noqa: D102

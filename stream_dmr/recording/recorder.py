@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from queue import Empty, Queue
 from threading import Lock, Thread
-from types import TracebackType
 
 from stream_dmr.errors import OutputError
 from stream_dmr.files import make_folder
@@ -117,12 +116,7 @@ class Recorder:
     def __enter__(self) -> "Recorder":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _write_queued(self) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.camera import crop_from_frame
-from stream_dmr.fitting.shape.candidates import AUTO, body_forms, load_shapes
+from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
 from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.report.drawn_views import DrawnView
 from stream_dmr.report.recorded_tracks import FishFrame
@@ -66,7 +66,9 @@ def _shape_notes(report: RunReport) -> Iterator[str]:
         return
     if not {shape.name for shape in header.candidates} <= set(bundled_names()):
         return  # learnt from a mesh of the user's own, which the recording does not have
-    yield from describe(body_forms(load_shapes(AUTO)[0]), header.candidates)
+    _, forms = load_shapes(AUTO)
+    if forms is not None:
+        yield from describe(forms, header.candidates)
 
 
 def _rows(reports: Sequence[RunReport]) -> Iterator[tuple[dict[str, Any], FishResult, RunReport]]:

@@ -10,6 +10,7 @@ from stream_dmr.results.provenance import known_files, read_origin
 
 _OF_RUN = re.compile(
     r"lengths\.(db(-\w+)?|csv|reserve)|frames(-\d+)?\.csv|provenance\.json|recording.*\.mcap.*"
+    r"|template(-\d+)?\.(ply|toml)"
 )
 _HEAD_BYTES = 4096  # in which a page or picture of ours names the command that made it
 

@@ -18,6 +18,7 @@ from stream_dmr.results.verdicts import Verdict, read_verdicts
 from stream_dmr.version import __version__
 
 NAME = "provenance.json"
+LEARNT = ("template*.ply", "template*.toml")  # what a run learnt of its fish's shapes
 
 
 @contextmanager
@@ -47,7 +48,7 @@ def seal_run(folder: Path, *, with_recordings: bool) -> None:
     """
     database = folder / DATABASE
     kinds = ("*.csv", "*.mcap", "*.rrd") if with_recordings else ("lengths.csv", "frames.csv")
-    kinds = (*kinds, "template*.ply", "template*.toml")  # what was learnt of the fish's shape
+    kinds = (*kinds, *LEARNT)
     files = [path for kind in kinds for path in folder.glob(kind)]
     sums = {
         f"{table}_sha256": {

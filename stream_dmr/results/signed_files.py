@@ -7,11 +7,11 @@ from threading import Lock
 
 from stream_dmr.files import sha256_of
 from stream_dmr.results.length_store import LengthStore
+from stream_dmr.results.provenance import LEARNT
 from stream_dmr.results.signatures import FILE, FOUND, REMOVED
 
 RECORDINGS = ("*.mcap", "*.rrd")
 TABLES = ("lengths.csv", "frames*.csv")
-LEARNT = ("template*.ply", "template*.toml")
 
 
 class SignedFiles:

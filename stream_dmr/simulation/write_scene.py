@@ -20,9 +20,9 @@ from stream_dmr.simulation.species import SPECIES, find_species
 
 _MAX_FISH = 65535  # the largest id of a 16-bit mask
 
-SCENE_FILES = (
+_SCENE_FILES = (
     *("video.mp4", "boxes.txt", "masks", "calibration.yaml"),
-    *("truth.csv", "truth_frames.csv", "species.ply", "species.toml", "species.csv"),
+    *("truth.csv", "truth_frames.csv"),
 )
 TRUTH_FRAMES_COLUMNS = (
     "frame_index",
@@ -33,6 +33,18 @@ TRUTH_FRAMES_COLUMNS = (
     "bending_ratio",
     "total_bend_deg",
 )
+
+
+def scene_files(species: str) -> tuple[str, ...]:
+    """The names of what `simulate` writes into a folder for these species."""
+    names = species.split(",")
+    meshes = ["species"] if len(names) == 1 else names
+    listed = () if len(names) == 1 else ("species.csv",)
+    return (
+        *_SCENE_FILES,
+        *listed,
+        *(f"{mesh}{suffix}" for mesh in meshes for suffix in (".ply", ".toml")),
+    )
 
 
 def simulate(

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from stream_dmr.results.own_files import is_made_by, require_writable
-from stream_dmr.simulation import SCENE_FILES
+from stream_dmr.results.own_files import is_made_by, is_of_run, require_writable
+from stream_dmr.simulation import scene_files
 from tests.support.command import Outcome, invoke
 from tests.support.fish_run import measure
 
@@ -83,13 +83,23 @@ def test_exports_are_made_again_but_not_over_files_of_others(out: Path, tmp_path
     assert (tmp_path / "masks.json").read_text() == "mine"
 
 
-def test_a_scene_knows_its_files(tmp_path: Path):
-    options = {"--out": str(tmp_path), "--fish": "1", "--frames": "1"}
+@pytest.mark.parametrize("species", ["halibut", "gar,perch"])
+def test_a_scene_knows_its_files(tmp_path: Path, species: str):
+    options = {"--out": str(tmp_path), "--fish": "1", "--frames": "1", "--species": species}
     assert invoke("simulate", options).code == 0
-    assert {path.name for path in tmp_path.iterdir()} <= set(SCENE_FILES)
+    assert {path.name for path in tmp_path.iterdir()} == set(scene_files(species))
     assert invoke("simulate", options).code == 2
     assert invoke("simulate", options | {"--overwrite": None}).code == 0
 
 
 def test_names_of_results_are_free_outside_of_a_run(tmp_path: Path):
-    require_writable(tmp_path / "lengths.csv", tmp_path / "recording.rrd")
+    names = tmp_path / "lengths.csv", tmp_path / "recording.rrd"
+    require_writable(*names)
+    assert not any(is_of_run(path) for path in names)
+
+
+def test_shapes_that_a_run_learnt_are_its_results(out: Path, tmp_path: Path):
+    for name in ("template.ply", "template-2.toml"):
+        assert is_of_run(out / name)
+        assert not is_of_run(tmp_path / name)
+    assert not is_of_run(out / "template-of-mine.ply")

@@ -10,6 +10,7 @@ from stream_dmr.errors import AnnotationError, UserError
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.annotations.annotated_box import UNKNOWN_ID, AnnotatedBox
 from stream_dmr.segmentation.annotations.box_files import load_boxes, unused_boxes
+from stream_dmr.segmentation.annotations.joined_names import joined
 from stream_dmr.segmentation.annotations.mask_folder import Labels, MaskFolder
 from stream_dmr.segmentation.detection.fish_detection import Detection
 
@@ -100,9 +101,9 @@ class AnnotatedFish:
             )
         if self._boxes is not None and self._masks is not None:
             if unmasked := sorted(self._boxed_ids - self._masked_ids):
-                lines.append(f"boxes: ids {_join(unmasked)} are in no mask, so have no outline")
+                lines.append(f"boxes: ids {joined(unmasked)} are in no mask, so have no outline")
             if unboxed := sorted(self._masked_ids - self._boxed_ids):
-                lines.append(f"masks: ids {_join(unboxed)} have no box, so were left out")
+                lines.append(f"masks: ids {joined(unboxed)} have no box, so were left out")
         return lines
 
     def _labels(self, frame: Frame, *, is_expected: bool) -> Labels | None:
@@ -160,8 +161,3 @@ def _detections_of(labels: Labels) -> list[Detection]:
 
 def _ids(labels: Integer[np.ndarray, "H W"]) -> list[int]:
     return np.unique(labels[labels > 0]).tolist()  # background is most of it: sorting it is slow
-
-
-def _join(ids: list[int]) -> str:
-    shown = ", ".join(map(str, ids[:8]))
-    return shown if len(ids) <= 8 else f"{shown} and {len(ids) - 8} more"

@@ -9,12 +9,12 @@ from jaxtyping import Float
 
 from stream_dmr.errors import AnnotationError
 from stream_dmr.messages import FishCrop, Frame
+from stream_dmr.segmentation.annotations.joined_names import joined
 from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
 from stream_dmr.segmentation.detection.detector import Detector
 from stream_dmr.segmentation.detection.fish_detection import Detection
 
 PICTURE, FISH = "picture", "fish"
-_SHOWN = 5  # names in a warning
 
 
 def names_pictures(path: Path) -> bool:
@@ -55,9 +55,9 @@ class NamedPictures:
         missing = sorted(self._fish.keys() - self._seen)
         lines = []
         if self._unnamed:
-            lines.append(f"pictures without a fish in the CSV: {_join(self._unnamed)}; left out")
+            lines.append(f"pictures without a fish in the CSV: {joined(self._unnamed)}; left out")
         if missing:
-            lines.append(f"pictures of the CSV that the source doesn't have: {_join(missing)}")
+            lines.append(f"pictures of the CSV that the source doesn't have: {joined(missing)}")
         return lines
 
     def detect(self, frame: Frame) -> list[Detection]:
@@ -120,8 +120,3 @@ def _read(path: Path) -> dict[str, int]:
 
 def _cells(line: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line]), [])]
-
-
-def _join(names: list[str]) -> str:
-    shown = ", ".join(names[:_SHOWN])
-    return shown if len(names) <= _SHOWN else f"{shown} and {len(names) - _SHOWN} more"
