@@ -13,11 +13,14 @@ from stream_dmr.messages import LengthEstimate
 from stream_dmr.recording.messages.run_inputs import RunInputs
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
+from stream_dmr.results.catch_facts import UNKNOWN_CATCH, CatchFacts
 from stream_dmr.results.lengths_database import NAME, open_for_reading
 from stream_dmr.results.run_facts import RunFacts, cut_short, run_facts
 from stream_dmr.results.scale_checks import last_checks
 from stream_dmr.results.store_rows import MAY_COUNT_TWICE, read_estimates
 from stream_dmr.results.verdicts import NOT_REVIEWED, Review, read_verdicts, reviews_of
+
+_CATCH_NAMES = [field.name for field in fields(CatchFacts)]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -29,6 +32,7 @@ class FishResult:
     run_id: str  # "": of a recording without its database
     iou: float | None = None
     flags: Sequence[str] = ()
+    catch: CatchFacts = UNKNOWN_CATCH
     review: Review = NOT_REVIEWED
 
     @property
@@ -116,11 +120,20 @@ def run_times(database: Path) -> dict[str, list[int | None]]:
 
 
 def rows_by_run(database: Path, table: Literal["fish", "events"]) -> dict[str, list[str]]:
-    """Every stored value of the fish or events of each run, as lines of JSON, for checksums."""
+    """Every stored value of the fish or events of each run, as lines of JSON, for checksums.
+
+    `CatchFacts` only where they have a value, by name: older databases lack their columns.
+    """
     lines: dict[str, list[str]] = {}
     with closing(open_for_reading(database)) as connection:
-        for row in connection.execute(f"SELECT run_id, * FROM {table} ORDER BY number"):
-            lines.setdefault(row[0], []).append(json.dumps(row[1:]))
+        rows = connection.execute(f"SELECT * FROM {table} ORDER BY number")
+        names = [column[0] for column in rows.description]
+        for values in rows:
+            row = dict(zip(names, values, strict=True))
+            added = {name: row.pop(name, None) for name in _CATCH_NAMES}
+            facts = {name: value for name, value in added.items() if value is not None}
+            line = [*row.values(), *([facts] if facts else [])]
+            lines.setdefault(row["run_id"], []).append(json.dumps(line))
     return lines
 
 
@@ -151,17 +164,20 @@ def _stored_fish(database: Path, reviews: dict[int, Review]) -> list[FishResult]
         with closing(open_for_reading(database)) as connection:
             runs = dict(_runs(connection))
             estimates = read_estimates(connection)
-            others = connection.execute("SELECT run_id, iou, flags FROM fish ORDER BY number")
+            rows = connection.execute("SELECT * FROM fish ORDER BY number")
+            names = [column[0] for column in rows.description]
+            others = [dict(zip(names, row, strict=True)) for row in rows]
             return [
                 FishResult(
                     estimate=estimate,
-                    facts=runs[run_id],
-                    run_id=run_id,
-                    iou=iou,
-                    flags=json.loads(flags),
+                    facts=runs[other["run_id"]],
+                    run_id=other["run_id"],
+                    iou=other["iou"],
+                    flags=json.loads(other["flags"]),
+                    catch=CatchFacts(**{name: other.get(name) for name in _CATCH_NAMES}),
                     review=reviews.get(estimate.track_id, NOT_REVIEWED),
                 )
-                for estimate, (run_id, iou, flags) in zip(estimates, others, strict=True)
+                for estimate, other in zip(estimates, others, strict=True)
             ]
     except (sqlite3.Error, ValueError, KeyError) as error:
         raise OutputError(

@@ -3,6 +3,7 @@
 import csv
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from stream_dmr.template.template import Template
 FISH_TABLE: dict[str, type] = {
     **dict.fromkeys(("vessel", "trip", "haul"), str),
     "track_id": int,
-    **dict.fromkeys(("template", "species", "status"), str),
+    **dict.fromkeys(("template", "species", "species_code", "fate", "status"), str),
     **dict.fromkeys(("length_mm", "length_std_mm", "ci95_low_mm", "ci95_high_mm"), float),
     "length_from": str,  # "measurement" or "review": what the five columns after it follow from
     **dict.fromkeys(("fork_length_mm", "total_length_mm"), float),
@@ -52,6 +53,7 @@ def fish_record(
     derived = derive(fish.length_mm, template, settings, species=fish.review.species)
     values: dict[str, Any] = {name: getattr(fish.facts, name, None) for name in FISH_TABLE}
     values |= {n: getattr(fish.estimate, n) for n in FISH_TABLE if hasattr(fish.estimate, n)}
+    values |= asdict(fish.catch)
     values |= {n: getattr(derived, n) for n in FISH_TABLE if hasattr(derived, n)}
     return values | {
         **_measured(fish),

@@ -8,13 +8,14 @@ import sqlite3
 import time
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from threading import RLock
 from uuid import uuid4
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate
+from stream_dmr.results.catch_facts import UNKNOWN_CATCH, CatchFacts
 from stream_dmr.results.chain_table import ChainWriter, Statement, read_chain
 from stream_dmr.results.folder_lock import FolderLock
 from stream_dmr.results.lengths_database import (
@@ -92,13 +93,18 @@ class LengthStore:
         self._reserve.reserve()
 
     def add(
-        self, estimate: LengthEstimate, *, iou: float | None = None, flags: Sequence[str] = ()
+        self,
+        estimate: LengthEstimate,
+        *,
+        iou: float | None = None,
+        flags: Sequence[str] = (),
+        catch: CatchFacts = UNKNOWN_CATCH,
     ) -> None:
         """Write a final estimate durably; `flags`: what a reader of this length must know.
 
         `iou`: median over its accepted frames, of mesh and mask.
         """
-        values = fish_row(estimate, flags) | {"iou": iou, "run_id": self.run_id}
+        values = fish_row(estimate, flags) | {"iou": iou, "run_id": self.run_id} | asdict(catch)
         values["written_ns"] = time.time_ns()
         marks = ", ".join("?" for _ in values)
         statement = f"INSERT INTO fish ({', '.join(values)}) VALUES ({marks})"

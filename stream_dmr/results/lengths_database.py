@@ -26,12 +26,15 @@ FISH_COLUMNS = [
     *("track_id", "length_mm", "length_std_mm", "frames_seen", "frames_used", "first_frame"),
     *("last_frame", "first_timestamp_ns", "last_timestamp_ns", "status"),
 ]
-# Columns of `runs` that the first databases lack. Older versions read and write tables that have
-# them, so they need no new VERSION.
-_ADDED_COLUMNS = {
-    **dict.fromkeys(("source_path", "source_sha256", "boxes_path", "boxes_sha256"), "TEXT"),
-    **dict.fromkeys(("masks_path", "masks_sha256", "calibration_path", "ended_by"), "TEXT"),
-    **dict.fromkeys(("frames_done", "frames_promised"), "INTEGER"),
+# Columns that the first databases lack. Older versions read and write tables that have them, so
+# they need no new VERSION.
+_ADDED_COLUMNS: dict[str, dict[str, str]] = {
+    "runs": {
+        **dict.fromkeys(("source_path", "source_sha256", "boxes_path", "boxes_sha256"), "TEXT"),
+        **dict.fromkeys(("masks_path", "masks_sha256", "calibration_path", "ended_by"), "TEXT"),
+        **dict.fromkeys(("frames_done", "frames_promised"), "INTEGER"),
+    },
+    "fish": dict.fromkeys(("species_code", "fate"), "TEXT"),  # `CatchFacts`
 }
 _TABLES = """
 CREATE TABLE runs (
@@ -64,7 +67,8 @@ CREATE TABLE fish (
     refused TEXT NOT NULL, -- JSON: reason -> number of frames
     iou REAL, -- median of the frames that were accepted: mesh and mask
     flags TEXT NOT NULL, -- JSON: what a reader of this length must know, such as a moved camera
-    written_ns INTEGER NOT NULL -- wall clock
+    -- wall clock; then FAO 3-alpha, and what became of it: NULL where it is not known
+    written_ns INTEGER NOT NULL, species_code TEXT, fate TEXT
 ) STRICT;
 CREATE TABLE marks (name TEXT PRIMARY KEY, value INTEGER NOT NULL) STRICT;
 CREATE TABLE clips (
@@ -225,7 +229,7 @@ def _prepare(database: sqlite3.Connection) -> None:
             f"BEGIN; {_TABLES} PRAGMA application_id = {APPLICATION_ID}; "
             f"PRAGMA user_version = {VERSION}; COMMIT;"
         )
-    known = {column[1] for column in database.execute("PRAGMA table_info(runs)")}
-    for name, kind in _ADDED_COLUMNS.items():
-        if name not in known:
-            database.execute(f"ALTER TABLE runs ADD COLUMN {name} {kind}")
+    for table, columns in _ADDED_COLUMNS.items():
+        known = {column[1] for column in database.execute(f"PRAGMA table_info({table})")}
+        for name in columns.keys() - known:
+            database.execute(f"ALTER TABLE {table} ADD COLUMN {name} {columns[name]}")
