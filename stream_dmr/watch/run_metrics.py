@@ -69,6 +69,7 @@ class RunMetrics(Collector):
         for quantile, seconds in self._state.fit_quantiles().items():
             fit.add_metric([f"{quantile:g}"], seconds)
         yield fit
+        yield _gauge("fish_per_hour", "Of the last hour.", self._state.fish_per_hour())
         yield _gauge("frames_per_second", "That left the chain.", self._state.frames_per_s())
         yield _gauge("disk_free_bytes", "Room for results.", self._state.disk_free_bytes())
         sinks = GaugeMetricFamily(

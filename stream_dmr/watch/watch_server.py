@@ -117,7 +117,7 @@ class _WatchHandler(TokenHandler):
 
 
 def health_json(state: RunState) -> dict[str, Any]:
-    """Whether a run is healthy, why not, and how each of its outputs is."""
+    """Whether a run is healthy, why not, what it warned of, and how each of its outputs is."""
     problems = state.problems()
     sinks = [
         {
@@ -128,12 +128,25 @@ def health_json(state: RunState) -> dict[str, Any]:
         }
         for sink in state.sinks.all()
     ]
-    return {"healthy": not problems, "problems": problems, "sinks": sinks}
+    return {
+        "healthy": not problems,
+        "problems": problems,
+        "warnings": _warnings_json(state),
+        "sinks": sinks,
+    }
+
+
+def _warnings_json(state: RunState) -> list[dict[str, Any]]:
+    """The warnings, the latest first; `age_s` is since the last time that it came."""
+    now_s = time.monotonic()
+    return [
+        {"line": warning.line, "count": warning.count, "age_s": now_s - warning.last_s}
+        for warning in state.warnings()
+    ]
 
 
 def status_json(state: RunState) -> dict[str, Any]:
     """What the status page shows, for JSON."""
-    now_s = time.monotonic()
     return {
         "problems": state.problems(),
         "num_fish": sum(state.num_fish.values()),
@@ -150,8 +163,5 @@ def status_json(state: RunState) -> dict[str, Any]:
             }
             for fish in reversed(list(state.finished))
         ],
-        "warnings": [
-            {"line": warning.line, "count": warning.count, "age_s": now_s - warning.last_s}
-            for warning in state.warnings()
-        ],
+        "warnings": _warnings_json(state),
     }

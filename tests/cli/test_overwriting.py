@@ -39,6 +39,7 @@ OVER_RESULTS = [
     ("calibrate OUT/a.png --plane OUT/b.png --out", "../clip/calibration.yaml"),
     ("evaluate --lengths OUT/lengths.csv --truth OUT/../truth.csv --plot", "lengths.csv"),
     ("demo --out", "."),
+    ("fleet http://127.0.0.1:1/ --out", "lengths.db"),
 ]
 
 
