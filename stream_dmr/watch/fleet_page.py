@@ -34,7 +34,8 @@ def fleet_summary(states: Sequence[BoxState]) -> str:
     counts = Counter(state.kind for state in states)
     parts = [f"{counts[kind]} {words}" for kind, words in _SUMMARY.items() if counts[kind]]
     hourly = sum(s.reading.fish_per_hour for s in states if s.reading and not s.error)
-    return f"{len(states)} box{'es' * (len(states) != 1)}: {', '.join(parts)}; {hourly:.0f} fish an hour"
+    boxes = "1 box" if len(states) == 1 else f"{len(states)} boxes"
+    return f"{boxes}: {', '.join(parts)}; {hourly:.0f} fish an hour"
 
 
 def state_text(state: BoxState) -> str:
