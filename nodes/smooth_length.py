@@ -1,14 +1,23 @@
-"""SmoothLength: from the lengths of frames to the length of a fish.
+"""SmoothLength: from the lengths of frames to the length of a fish, and what became of it.
 
 Last of the chain: LocalizedFish -> LengthEstimate, one running estimate for every frame of a fish
 and a final one when its track ends.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
+from stream_dmr.catch.fate import FateTracker
+from stream_dmr.catch.zones import ZonesSettings
 from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.lengths.track_length import TrackLength, late_estimate
 from stream_dmr.messages import LengthEstimate, LocalizedFish
+
+
+@dataclass(frozen=True)
+class _Track:
+    length: TrackLength
+    fate: FateTracker
 
 
 class SmoothLength:
@@ -18,23 +27,39 @@ class SmoothLength:
     so that no table gets a second row for it.
     """
 
-    def __init__(self, settings: SmoothLengthSettings) -> None:
+    def __init__(
+        self,
+        settings: SmoothLengthSettings,
+        *,
+        zones: ZonesSettings | None = None,
+        frame_size: tuple[int, int] | None = None,
+    ) -> None:
+        """With `zones` a final estimate has a fate; `frame_size`: width and height, px."""
         self._settings = settings
-        self._open: dict[int, TrackLength] = {}
+        self._zones, self._frame_size = zones or ZonesSettings(), frame_size
+        self._open: dict[int, _Track] = {}
         self._ended: set[int] = set()
+        self._watched_ns: tuple[int, int] | None = None  # capture times of the first frame and last
 
     def step(self, message: LocalizedFish, /) -> Sequence[LengthEstimate]:
         """Return the running estimate of this fish after one more frame."""
         if message.track_id in self._ended:
             return [late_estimate(message)]
         if message.track_id not in self._open:
-            self._open[message.track_id] = TrackLength(message, self._settings)
-        return [self._open[message.track_id].add(message)]
+            self._open[message.track_id] = _Track(
+                TrackLength(message, self._settings),
+                FateTracker(self._zones, frame_size=self._frame_size),
+            )
+        track = self._open[message.track_id]
+        track.fate.add(message)
+        return [track.length.add(message)]
 
     def tick(self, timestamp_ns: int, /) -> Sequence[LengthEstimate]:
         """Finish the tracks unseen for `track_timeout_s` at this capture time."""
+        first_ns, _ = self._watched_ns or (timestamp_ns, timestamp_ns)
+        self._watched_ns = first_ns, timestamp_ns
         earliest_ns = timestamp_ns - round(self._settings.track_timeout_s * 1e9)
-        overdue = [i for i, track in self._open.items() if track.last_timestamp_ns < earliest_ns]
+        overdue = [i for i, t in self._open.items() if t.length.last_timestamp_ns < earliest_ns]
         return [self._finish(track_id) for track_id in overdue]
 
     def close(self) -> Sequence[LengthEstimate]:
@@ -43,4 +68,10 @@ class SmoothLength:
 
     def _finish(self, track_id: int) -> LengthEstimate:
         self._ended.add(track_id)
-        return self._open.pop(track_id).finish()
+        track = self._open.pop(track_id)
+        estimate = track.length.finish()
+        if not any(self._zones.polygons()):
+            return estimate
+        first_ns, last_ns = self._watched_ns or (0, 0)
+        fate = track.fate.finish(watched_from_ns=first_ns, watched_to_ns=last_ns)
+        return replace(estimate, fate=fate.name, fate_share=fate.share)

@@ -196,6 +196,12 @@ class LengthEstimate(FishMessage):
     smoothed_frames: Int[np.ndarray, "N"]  # frame indices of the RTS series, empty until final
     smoothed_mm: Float[np.ndarray, "N"]
     smoothed_std_mm: Float[np.ndarray, "N"]
+    # What became of the fish; None until final, and where the run has no zones that say so.
+    fate: str | None = None
+    fate_share: float | None = None  # of its body in that zone; None: its end was not seen
+    # FAO 3-alpha of the species, or "unsure"; None until final, and without a classifier's look.
+    species_code: str | None = None
+    species_share: float | None = None  # posterior probability of the likeliest species
 
 
 Message = Frame | FishCrop | FittedMesh | LocalizedFish | LengthEstimate

@@ -49,6 +49,7 @@ ROOMS = [
     "stream_dmr.recording.messages.recording_settings",
     "stream_dmr.recording",
     "stream_dmr.lengths",
+    "stream_dmr.catch",
     "stream_dmr.localization",
     "stream_dmr.fitting.learn_shapes",
     "stream_dmr.fitting.compile_kernels",

@@ -2,7 +2,8 @@
 
 import sys
 import time
-from collections.abc import Collection, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
 from math import inf
 from pathlib import Path
 
@@ -94,18 +95,28 @@ class RunDisplay(RunObserver):
 
 def print_fish(fish: Sequence[LengthEstimate], *, may_count_twice: Collection[int] = ()) -> None:
     """Print the table of fish to stdout; `may_count_twice`: ids of which it says so."""
-    table = _table("fish", "length mm", "95 % interval mm", "frames used/seen", "status")
+    titles = {"species": "species_code", "fate": "fate"}  # of the run's fish, if it knows any
+    known = {t: name for t, name in titles.items() if any(getattr(one, name) for one in fish)}
+    table = _table("fish", "length mm", "95 % interval mm", "frames used/seen", *known, "status")
     for estimate in fish:
         table.add_row(
             str(estimate.track_id),
             length_text(estimate),
             interval_text(estimate),
             f"{estimate.frames_used}/{estimate.frames_seen}",
+            *(getattr(estimate, name) or "-" for name in known.values()),
             f"{status_text(estimate)}; {MAY_COUNT_TWICE}"
             if estimate.track_id in may_count_twice
             else status_text(estimate),
         )
     _stdout().print(table if fish else "no fish")
+    for title, name in known.items():
+        print(f"{title}: {counts_text(getattr(one, name) for one in fish)}")
+
+
+def counts_text(names: Iterable[str | None]) -> str:
+    """How often each name comes, the most frequent first, such as: 3 landed, 1 unknown."""
+    return ", ".join(f"{count} {name or '-'}" for name, count in Counter(names).most_common())
 
 
 def print_replay(summary: ReplaySummary, out: Path | None, *, timings: bool) -> None:

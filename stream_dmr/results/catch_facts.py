@@ -1,6 +1,8 @@
 """Facts of one caught fish beside its length, as `fish` of lengths.db holds them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+
+from stream_dmr.messages import LengthEstimate
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -11,8 +13,15 @@ class CatchFacts:
     checksum, so that a database that got the columns later stays as it was sealed.
     """
 
-    species_code: str | None = None  # FAO 3-alpha
+    species_code: str | None = None  # FAO 3-alpha, or "unsure"
+    species_share: float | None = None  # posterior probability of the likeliest species
     fate: str | None = None  # what became of it: "landed", ...
+    fate_share: float | None = None  # of its body in that zone when it was last seen
+
+    @classmethod
+    def of(cls, estimate: LengthEstimate) -> "CatchFacts":
+        """Those that a final estimate has."""
+        return cls(**{field.name: getattr(estimate, field.name) for field in fields(cls)})
 
 
 UNKNOWN_CATCH = CatchFacts()

@@ -72,7 +72,7 @@ def read_fish(
     facts = run_facts(recording.header)
     found = (message for message, _ in decoded_messages(recording, [LengthEstimate], selection))
     return [
-        FishResult(estimate=estimate, facts=facts, run_id="")
+        FishResult(estimate=estimate, facts=facts, run_id="", catch=CatchFacts.of(estimate))
         for estimate in found
         if isinstance(estimate, LengthEstimate) and estimate.is_final
     ]

@@ -20,6 +20,7 @@ FISH_TABLE: dict[str, type] = {
     **dict.fromkeys(("vessel", "trip", "haul"), str),
     "track_id": int,
     **dict.fromkeys(("template", "species", "species_code", "fate", "status"), str),
+    **dict.fromkeys(("species_share", "fate_share"), float),
     **dict.fromkeys(("length_mm", "length_std_mm", "ci95_low_mm", "ci95_high_mm"), float),
     "length_from": str,  # "measurement" or "review": what the five columns after it follow from
     **dict.fromkeys(("fork_length_mm", "total_length_mm"), float),

@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from threading import RLock
+from typing import Literal
 from uuid import uuid4
 
 from stream_dmr.errors import OutputError
@@ -216,10 +217,11 @@ class LengthStore:
         with self._lock:
             return {i for (i,) in self._database.execute(query, (f"%{MAY_COUNT_TWICE}%",))}
 
-    def counts(self) -> dict[str, int]:
-        """The number of finished fish by status."""
+    def counts(self, column: Literal["status", "species_code", "fate"]) -> dict[str, int]:
+        """The number of finished fish by what stands in a column; not of those without it."""
+        query = f"SELECT {column}, COUNT(*) FROM fish WHERE {column} NOT NULL GROUP BY {column}"
         with self._lock:
-            return dict(self._database.execute("SELECT status, COUNT(*) FROM fish GROUP BY status"))
+            return dict(self._database.execute(query))
 
     def close(self) -> None:
         """End the run and leave one file. Idempotent.

@@ -34,7 +34,10 @@ _ADDED_COLUMNS: dict[str, dict[str, str]] = {
         **dict.fromkeys(("masks_path", "masks_sha256", "calibration_path", "ended_by"), "TEXT"),
         **dict.fromkeys(("frames_done", "frames_promised"), "INTEGER"),
     },
-    "fish": dict.fromkeys(("species_code", "fate"), "TEXT"),  # `CatchFacts`
+    "fish": {  # `CatchFacts`
+        **{"species_code": "TEXT", "species_share": "REAL"},
+        **{"fate": "TEXT", "fate_share": "REAL"},
+    },
 }
 _TABLES = """
 CREATE TABLE runs (
@@ -67,8 +70,8 @@ CREATE TABLE fish (
     refused TEXT NOT NULL, -- JSON: reason -> number of frames
     iou REAL, -- median of the frames that were accepted: mesh and mask
     flags TEXT NOT NULL, -- JSON: what a reader of this length must know, such as a moved camera
-    -- wall clock; then FAO 3-alpha, and what became of it: NULL where it is not known
-    written_ns INTEGER NOT NULL, species_code TEXT, fate TEXT
+    -- wall clock; FAO 3-alpha, and what became of it, each with the share that says so, or NULL
+    written_ns INTEGER NOT NULL, species_code TEXT, species_share REAL, fate TEXT, fate_share REAL
 ) STRICT;
 CREATE TABLE marks (name TEXT PRIMARY KEY, value INTEGER NOT NULL) STRICT;
 CREATE TABLE clips (

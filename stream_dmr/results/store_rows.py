@@ -3,10 +3,12 @@
 import json
 import sqlite3
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 
 import numpy as np
 
 from stream_dmr.messages import LengthEstimate
+from stream_dmr.results.catch_facts import CatchFacts
 from stream_dmr.results.lengths_database import FISH_COLUMNS
 
 MAY_COUNT_TWICE = "may count twice"
@@ -31,6 +33,8 @@ def read_estimates(
 ) -> Iterator[LengthEstimate]:
     """The final estimates, or the `last` few; the recordings have their smoothed series."""
     names = [*FISH_COLUMNS, "ci95_low_mm", "ci95_high_mm", "refused"]
+    known = {column[1] for column in database.execute("PRAGMA table_info(fish)")}
+    names += [field.name for field in fields(CatchFacts) if field.name in known]
     wanted = "" if last is None else "WHERE number > (SELECT MAX(number) FROM fish) - ?"
     query = f"SELECT {', '.join(names)} FROM fish {wanted} ORDER BY number"
     for values in database.execute(query, () if last is None else (last,)):

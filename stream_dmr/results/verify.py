@@ -8,7 +8,7 @@ elsewhere.
 import csv
 import io
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -213,8 +213,9 @@ def _estimate(path: Path, recorded: LengthEstimate, fish: FishResult | None) -> 
     if fish is None:
         yield Change(database, f"fish {recorded.track_id} is missing; {path.name} has it")
         return
-    for name in _COMPARED:
-        stored, measured = getattr(fish.estimate, name), getattr(recorded, name)
+    compared = [(name, getattr(fish.estimate, name)) for name in _COMPARED]
+    for name, stored in [*compared, *asdict(fish.catch).items()]:
+        measured = getattr(recorded, name)
         if stored != measured:
             what = f"fish {recorded.track_id}: {name} is {stored}, {path.name} says {measured}"
             yield Change(database, what)

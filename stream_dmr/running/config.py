@@ -13,6 +13,7 @@ from pydantic import Field, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+from stream_dmr.catch.zones import ZonesSettings
 from stream_dmr.errors import ConfigError
 from stream_dmr.evaluation.length_errors import EvaluateSettings
 from stream_dmr.files import read_text
@@ -69,6 +70,9 @@ class Config(Settings):
     )
     smooth_length: SmoothLengthSettings = Field(
         default_factory=SmoothLengthSettings, description="from many frames to one length per fish"
+    )
+    zones: ZonesSettings = Field(
+        default_factory=ZonesSettings, description="what became of a fish, by where its track ends"
     )
     train: TrainSettings = Field(
         default_factory=TrainSettings, description="how `stream-dmr train` trains the U-Net"

@@ -127,6 +127,8 @@ def later_nodes(
     candidates: CandidateShapes | None = None,
 ) -> list[Node]:
     """The nodes after CropFish: fit, localization, length."""
+    camera = None if calibration is None else calibration.camera
+    frame_size = None if camera is None else (camera.width, camera.height)
     return [
         FitMesh(
             config.fit_mesh,
@@ -136,7 +138,7 @@ def later_nodes(
             with_covariance=_records_covariance(config),
         ),
         Localize(config.localize, calibration=calibration),
-        SmoothLength(config.smooth_length),
+        SmoothLength(config.smooth_length, zones=config.zones, frame_size=frame_size),
     ]
 
 

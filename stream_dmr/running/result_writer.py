@@ -7,6 +7,7 @@ from types import MappingProxyType
 
 from stream_dmr.messages import FishCrop, Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.recording.recorder import Recorder
+from stream_dmr.results.catch_facts import CatchFacts
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.lengths_table import LengthsTable
 from stream_dmr.results.store_rows import INTERRUPTED
@@ -104,4 +105,4 @@ class ResultWriter:
             flags += self._drift.take_fish(iou, estimate.timestamp_ns)
         if estimate.track_id in self._interrupted:
             flags.append(INTERRUPTED)
-        self._store.add(estimate, iou=iou, flags=flags)
+        self._store.add(estimate, iou=iou, flags=flags, catch=CatchFacts.of(estimate))

@@ -63,6 +63,14 @@ class RunMetrics(Collector):
         for status, number in dict(self._state.num_fish).items():
             fish.add_metric([status], number)
         yield fish
+        for name, text, counts in (
+            ("fates", "Finished fish by what became of them.", self._state.fates),
+            ("species", "Finished fish by FAO code.", self._state.species),
+        ):
+            family = CounterMetricFamily(f"stream_dmr_{name}", text, labels=[name])
+            for value, number in dict(counts).items():
+                family.add_metric([value], number)
+            yield family
         fit = GaugeMetricFamily(
             "stream_dmr_fit_seconds", "Time of a fit, of the last 1000.", labels=["quantile"]
         )

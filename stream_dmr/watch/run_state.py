@@ -4,7 +4,6 @@ import shutil
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import numpy as np
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.reasons import without_counts
 from stream_dmr.recording.messages.sink_states import SinkStates
+from stream_dmr.results.length_store import LengthStore
 from stream_dmr.running.pipeline import Chain
 from stream_dmr.sources.source import Source
 
@@ -64,6 +64,8 @@ class RunState:
         self.sinks = sinks or SinkStates()
         self.finished: deque[LengthEstimate] = deque(maxlen=MAX_FINISHED)  # newest last
         self.num_fish: Counter[str] = Counter()  # finished ones, by status
+        self.species: Counter[str] = Counter()  # of finished fish, by code
+        self.fates: Counter[str] = Counter()
         self.fit_s: deque[float] = deque(maxlen=_MAX_FITS)
         self._out_dir = out_dir
         self._silence_s = silence_s
@@ -77,11 +79,13 @@ class RunState:
         self._fish_done_s: deque[float] = deque(maxlen=_MAX_HOURLY_FISH)
         self._warnings: dict[str, RepeatedWarning] = {}  # the latest last
 
-    def continue_after(self, counts: Mapping[str, int], finished: Iterable[LengthEstimate]) -> None:
-        """Begin with the fish of earlier runs in the folder: their number by status, the last."""
-        for status, number in counts.items():
+    def continue_after(self, store: LengthStore) -> None:
+        """Begin with the fish of earlier runs in the folder: their numbers, and the last ones."""
+        for status, number in store.counts("status").items():
             self.num_fish[without_counts(status)] += number
-        self.finished.extend(finished)
+        self.species.update(store.counts("species_code"))
+        self.fates.update(store.counts("fate"))
+        self.finished.extend(store.estimates(last=MAX_FINISHED))
 
     def take(self, message: Message) -> None:
         """Keep what the page shows of a message; no picture is copied."""
@@ -183,5 +187,7 @@ class RunState:
     def _finish(self, estimate: LengthEstimate) -> None:
         self.finished.append(estimate)
         self.num_fish[without_counts(estimate.status)] += 1
+        self.species.update([estimate.species_code] if estimate.species_code else [])
+        self.fates.update([estimate.fate] if estimate.fate else [])
         self._fish_done_s.append(time.monotonic())
         self._lengths_mm.pop(estimate.track_id, None)

@@ -4,7 +4,7 @@ from stream_dmr.messages import Message
 from stream_dmr.running.pipeline import Chain
 from stream_dmr.running.run_observer import OpenRun, RunObserver
 from stream_dmr.watch.alerts import AlertSender
-from stream_dmr.watch.run_state import MAX_FINISHED, RunState
+from stream_dmr.watch.run_state import RunState
 from stream_dmr.watch.systemd import SystemdWatchdog
 from stream_dmr.watch.watch_server import WatchServer
 
@@ -26,7 +26,7 @@ class WatchObserver(RunObserver):
         state = RunState(
             run.source, run.out, silence_s=silence_s, stuck_s=settings.stuck_s, sinks=run.sinks
         )
-        state.continue_after(run.store.counts(), run.store.estimates(last=MAX_FINISHED))
+        state.continue_after(run.store)
         self._server = WatchServer(state, settings) if settings.port else None
         alerts = run.config.alerts
         if alerts.webhook or alerts.mail_to:

@@ -150,6 +150,8 @@ def status_json(state: RunState) -> dict[str, Any]:
     return {
         "problems": state.problems(),
         "num_fish": sum(state.num_fish.values()),
+        "species": dict(state.species.most_common()),
+        "fates": dict(state.fates.most_common()),
         "fish_per_hour": state.fish_per_hour(),
         "frames_per_s": state.frames_per_s(),
         "last_frame_age_s": state.last_frame_age_s(),
@@ -160,6 +162,7 @@ def status_json(state: RunState) -> dict[str, Any]:
                 "note": fish.status
                 if fish.length_std_mm is None
                 else f"± {1.96 * fish.length_std_mm / 10:.1f} cm",
+                "kind": ", ".join(text for text in (fish.species_code, fish.fate) if text),
             }
             for fish in reversed(list(state.finished))
         ],

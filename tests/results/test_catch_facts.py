@@ -10,7 +10,7 @@ from stream_dmr.results.fish_table import FISH_TABLE
 from stream_dmr.results.length_store import LengthStore
 from tests.support.final_estimates import FACTS, fish
 
-LANDED = CatchFacts(species_code="HAL", fate="landed")
+LANDED = CatchFacts(species_code="HAL", species_share=0.9, fate="landed", fate_share=0.8)
 NAMES = [field.name for field in fields(CatchFacts)]
 
 

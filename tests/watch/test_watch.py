@@ -29,7 +29,7 @@ from stream_dmr.running.run_settings import WatchSettings
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
 from stream_dmr.watch.json_log import JsonLog
-from stream_dmr.watch.run_state import MAX_FINISHED, RunState
+from stream_dmr.watch.run_state import RunState
 from stream_dmr.watch.systemd import SystemdWatchdog
 from stream_dmr.watch.watch_observer import WatchObserver
 from stream_dmr.watch.watch_server import WatchServer
@@ -139,7 +139,7 @@ def test_the_page_counts_on_after_a_restart(state: RunState, tmp_path: Path):
     for track_id in range(1, 30):
         store.add(finished_fish(track_id, length_mm=None if track_id == 3 else 800.0))
     before = sum(state.num_fish.values())
-    state.continue_after(store.counts(), store.estimates(last=MAX_FINISHED))
+    state.continue_after(store)
     store.close()
     assert sum(state.num_fish.values()) == before + 29
     assert [fish.track_id for fish in state.finished] == list(range(10, 30))
