@@ -6,30 +6,49 @@ from functools import cached_property
 import cv2
 import numpy as np
 from jaxtyping import Float
+from numpy.polynomial import Polynomial
 
 # By default cv2.undistortPoints stops after five coarse steps: too early for 1e-6.
 _UNDISTORT_UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 
+# A ray (X, Y, 1) at a right angle to the axis would be endless; chosen: no plane before the camera
+# is of use further out than that.
+MAX_FISHEYE_ANGLE_RAD = float(np.radians(85.0))
+_MIN_FISHEYE_SLOPE = 0.05  # chosen: of the radius by the angle; below it the model folds over
+_NEWTON_STEPS = 5  # from a table that is right to a thousandth; the third is exact
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Camera:
-    """A pinhole camera with OpenCV's lens distortion, for pictures of one size."""
+    """A camera with one of OpenCV's two lens models, for pictures of one size.
+
+    A pinhole with Brown's distortion, or a fisheye: at the angle a from the axis a point is seen at
+    f (a + k1 a^3 + k2 a^5 + k3 a^7 + k4 a^9) from the principal point (Kannala and Brandt, PAMI
+    2006), as wide lenses behind domes need it.
+    """
 
     width: int
     height: int
     K: Float[np.ndarray, "3 3"]  # intrinsics, px
-    distortion: Float[np.ndarray, "D"]  # OpenCV's k1 k2 p1 p2 k3 ..., all 0 for an ideal lens
+    # A pinhole's k1 k2 p1 p2 k3 ..., all 0 for an ideal lens; a fisheye's k1 k2 k3 k4.
+    distortion: Float[np.ndarray, "D"]
+    is_fisheye: bool = False
 
     def project(self, points_camera: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 2"]:
         """Pixels of points in the camera frame, distortion included. Depths must be positive."""
-        origin = np.zeros(3)
-        pixels, _ = cv2.projectPoints(
-            np.ascontiguousarray(points_camera, np.float64), origin, origin, self.K, self.distortion
-        )
+        points, origin = np.ascontiguousarray(points_camera, np.float64), np.zeros(3)
+        project = cv2.fisheye.projectPoints if self.is_fisheye else cv2.projectPoints
+        pixels, _ = project(points.reshape(-1, 1, 3), origin, origin, self.K, self.distortion)
         return pixels.reshape(-1, 2)
 
     def back_project(self, pixels: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
-        """Points (X, Y, 1) of the rays through pixels, distortion removed (eq. 6)."""
+        """Points (X, Y, 1) of the rays through pixels, distortion removed (eq. 6).
+
+        A fisheye's pixels beyond 85 degrees from its axis are given the rays at 85 degrees.
+        """
+        if self.is_fisheye:
+            return self._fisheye_rays(pixels)
         ideal = cv2.undistortPoints(
             np.ascontiguousarray(pixels, np.float64).reshape(-1, 1, 2),
             self.K,
@@ -37,6 +56,37 @@ class Camera:
             criteria=_UNDISTORT_UNTIL,
         ).reshape(-1, 2)
         return np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1)
+
+    def _fisheye_rays(self, pixels: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
+        # By Newton's method: cv2.fisheye.undistortPoints clips radii at pi / 2 focal lengths.
+        offsets = (np.asarray(pixels, np.float64) - self.K[:2, 2]) / self.K[[0, 1], [0, 1]]
+        angles, radii = self._fisheye_table
+        seen = np.minimum(np.hypot(offsets[:, 0], offsets[:, 1]), radii[-1])
+        angle = np.interp(seen, radii, angles)
+        for _ in range(_NEWTON_STEPS):
+            radius, slope = self._fisheye_radius(angle)
+            angle = np.clip(angle - (radius - seen) / slope, 0.0, angles[-1])
+        length = np.hypot(offsets[:, 0], offsets[:, 1])
+        scale = np.tan(angle) / np.where(length > 0, length, 1.0)
+        return np.concatenate([offsets * scale[:, None], np.ones((len(offsets), 1))], axis=1)
+
+    @cached_property
+    def _fisheye_table(self) -> tuple[Float[np.ndarray, "T"], Float[np.ndarray, "T"]]:
+        """Angles up to the widest at which the radius still grows, and their radii."""
+        angles = np.linspace(0.0, MAX_FISHEYE_ANGLE_RAD, 1000)
+        radii, slopes = self._fisheye_radius(angles)
+        folded = np.flatnonzero(slopes < _MIN_FISHEYE_SLOPE)
+        end = max(2, folded[0] if len(folded) else len(angles))
+        return angles[:end], radii[:end]
+
+    def _fisheye_radius(
+        self, angles: Float[np.ndarray, "N"]
+    ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+        """Distance from the principal point in focal lengths, and its derivative by the angle."""
+        odd = np.zeros(10)
+        odd[1], odd[3::2] = 1.0, self.distortion
+        radius = Polynomial(odd)
+        return radius(angles), radius.deriv()(angles)
 
     def crop(self, *, center_px: Float[np.ndarray, "2"], side_px: float, size: int) -> "Camera":
         """The ideal pinhole camera of a square crop, in the orientation of this camera.

@@ -129,11 +129,16 @@ def read_text(path: Path, *, encoding: str = "utf-8", max_bytes: int = MAX_TEXT_
 
     Raises OSError where it can't be read or is larger than `max_bytes`, UnicodeDecodeError.
     """
+    return read_small(path, max_bytes=max_bytes).decode(encoding)
+
+
+def read_small(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
+    """The content of a file that should be small. Raises OSError as `read_text` does."""
     with path.open("rb") as file:
         data = file.read(max_bytes + 1)
     if len(data) > max_bytes:
         raise OSError(errno.EFBIG, f"more than {max_bytes // 1000} kB")
-    return data.decode(encoding)
+    return data
 
 
 def size_if_huge(path: Path) -> str:

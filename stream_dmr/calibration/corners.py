@@ -1,6 +1,5 @@
 """Finds the inner corners of a chessboard in a photograph, and draws them."""
 
-import re
 from pathlib import Path
 
 import cv2
@@ -21,18 +20,6 @@ _WINDOW_SQUARES = 0.4
 _MAX_WINDOW_PX = 30  # larger ones took longer and were not more accurate
 _STOP_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-4)
 _DRAWN_SIDE_PX = 1600
-
-
-def parse_board(text: str) -> Board:
-    """Read "9x6" as 9 by 6 inner corners. Raises CalibrationError for anything else."""
-    match = re.fullmatch(r"\s*(\d+)\s*[xX]\s*(\d+)\s*", text)
-    board = (int(match[1]), int(match[2])) if match else (0, 0)
-    if min(board) < 3 or max(board) > 100:
-        raise CalibrationError(
-            f"--board: expected the numbers of inner corners a row and a column, 3 or more each, "
-            f"such as 9x6 for a board of 10x7 squares; got {text!r}"
-        )
-    return board
 
 
 def board_points_mm(board: Board, square_mm: float) -> Float[np.ndarray, "N 3"]:
@@ -97,12 +84,15 @@ def seen_board(picture: UInt8[np.ndarray, "H W"]) -> Board | None:
 
 
 def draw_corners(path: Path, corners: Float[np.ndarray, "N 2"], board: Board, out: Path) -> None:
-    """Write the picture at `path`, reduced if large, with its corners drawn, to `out`."""
+    """Write the picture at `path`, reduced if large, with its corners drawn, to `out`.
+
+    Lines join them where all of the board's are there.
+    """
     picture = read_grey(path)
     scale = max(1.0, max(picture.shape) / _DRAWN_SIDE_PX)
     canvas = cv2.cvtColor(_resized(picture, scale), cv2.COLOR_GRAY2BGR)
     drawn = ((corners + 0.5) / scale - 0.5).astype(np.float32).reshape(-1, 1, 2)
-    cv2.drawChessboardCorners(canvas, board, drawn, True)
+    cv2.drawChessboardCorners(canvas, board, drawn, len(drawn) == board[0] * board[1])
     _, encoded = cv2.imencode(".png", canvas)
     out.write_bytes(encoded.tobytes())
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial.distance import pdist
 
-from stream_dmr.calibration.corners import Board, board_points_mm, find_corners, seen_board
+from stream_dmr.calibration.printed_board import PrintedBoard
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import CalibrationError
 
@@ -44,21 +44,13 @@ def scale_of_points(
 
 
 def scale_of_board(
-    pictures: Iterable[UInt8[np.ndarray, "H W"]],
-    calibration: Calibration,
-    *,
-    board: Board,
-    square_mm: float,
+    pictures: Iterable[UInt8[np.ndarray, "H W"]], calibration: Calibration, board: PrintedBoard
 ) -> ScaleError:
-    """The scale by the first picture that shows the whole board. Raises CalibrationError."""
-    other: Board | None = None
+    """The scale by the first picture that shows the board. Raises CalibrationError."""
+    why = ""
     for picture in pictures:
-        corners = find_corners(picture, board)
+        corners = board.find(picture)
         if corners is not None:
-            return scale_of_points(corners, board_points_mm(board, square_mm), calibration)
-        other = other or seen_board(picture)
-    seen = "" if other is None else f"; one with {other[0]}x{other[1]} was seen: check --board"
-    raise CalibrationError(
-        f"expected a picture with the whole board of {board[0]}x{board[1]} inner corners in the "
-        f"reference plane, got none{seen}"
-    )
+            return scale_of_points(corners.pixels, corners.points_mm, calibration)
+        why = why or board.not_found(picture)
+    raise CalibrationError(f"expected a picture with the board in the reference plane, got: {why}")

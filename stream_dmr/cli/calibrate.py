@@ -1,29 +1,54 @@
-"""`stream-dmr calibrate`: photographs of a chessboard in, a calibration file out."""
+"""`stream-dmr calibrate`: photographs of a board in, a calibration file out."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stream_dmr.cli.shared_options import OverwriteOption
+from stream_dmr.cli.shared_options import (
+    BoardOption,
+    MarkerOption,
+    OverwriteOption,
+    SquareOption,
+)
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from stream_dmr.calibration.board import BoardResult
+    from stream_dmr.calibration.lens_choice import LensModel
+    from stream_dmr.calibration.printed_board import PrintedBoard
 
 
 def calibrate(
-    images: Annotated[
-        list[Path], typer.Argument(help="Photographs of the board, tilted to all sides.")
-    ],
     plane: Annotated[
         Path, typer.Option(help="Photograph of the board lying in the reference plane.")
     ],
-    board: Annotated[
-        str, typer.Option(help="Inner corners per row and column; 10x7 squares have 9x6.")
-    ] = "9x6",
-    square_mm: Annotated[float, typer.Option(help="Side of one square in mm.")] = 25.0,
+    images: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Photographs of the board, tilted to all sides; none with --lens."),
+    ] = None,
+    board: BoardOption = "9x6",
+    square_mm: SquareOption = 25.0,
+    marker_mm: MarkerOption = None,
+    model: Annotated[
+        str,
+        typer.Option(
+            help="pinhole, or fisheye for very wide lenses and domes; auto takes the fisheye where "
+            "the pinhole fits badly and the fisheye does not."
+        ),
+    ] = "auto",
+    lens: Annotated[
+        Path | None,
+        typer.Option(
+            help="A calibration of this camera, also of another program: only the plane is "
+            "measured, from --plane."
+        ),
+    ] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="Which camera of --lens: left, right, cam0, ...")
+    ] = None,
     out: Annotated[Path, typer.Option(help="Calibration file to write.")] = Path(
         "calibration.yaml"
     ),
@@ -33,29 +58,92 @@ def calibrate(
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Calibrate a camera and its reference plane from photographs of a chessboard."""
+    """Calibrate a camera and its reference plane from photographs of a board."""
     from rich.console import Console
+
+    from stream_dmr.calibration.printed_board import PrintedBoard
+    from stream_dmr.results.own_files import require_writable
+
+    if model not in ("auto", "pinhole", "fisheye"):
+        raise typer.BadParameter(f"--model: expected auto, pinhole or fisheye, got {model}")
+    if (lens is None) == (not images):
+        raise typer.BadParameter(
+            "expected photographs of the board to calibrate the lens with, or --lens FILE with a "
+            f"lens that is known, got {'neither' if lens is None else 'both'}"
+        )
+    require_writable(out, overwrite=overwrite)
+    printed = PrintedBoard.parse(board, square_mm=square_mm, marker_mm=marker_mm)
+    console = Console()
+    if lens is not None:
+        _with_known_lens(lens, camera, plane=plane, board=printed, out=out, console=console)
+        return
+    _from_photographs(
+        images or [],
+        plane=plane,
+        board=printed,
+        model=model,
+        out=out,
+        folder=corners or out.with_name(f"{out.stem}-corners"),
+        overwrite=overwrite,
+        console=console,
+    )
+
+
+def _with_known_lens(
+    lens: Path,
+    name: str | None,
+    *,
+    plane: Path,
+    board: "PrintedBoard",
+    out: Path,
+    console: "Console",
+) -> None:
+    from stream_dmr.calibration.board import calibrate_plane
+    from stream_dmr.calibration.calibration_file import save_calibration
+    from stream_dmr.calibration.lens_file import load_lens
+
+    calibration, view = calibrate_plane(plane, load_lens(lens, name=name), board)
+    save_calibration(out, calibration)
+    camera = calibration.camera
+    model = "fisheye" if camera.is_fisheye else "pinhole"
+    distance_mm = float(view.plane.rotation[:, 2] @ view.plane.translation_mm)
+    for line in (
+        f"{model} lens of {lens}, {camera.width}x{camera.height} px; board in {plane.name}: "
+        f"{view.rms_px:.3f} px RMS, distances {view.distances.mean_percent:.2f} % off",
+        f"reference plane {distance_mm:.0f} mm from the camera",
+        f"calibration: {out}",
+    ):
+        console.print(line, markup=False, soft_wrap=True)
+
+
+def _from_photographs(
+    images: list[Path],
+    *,
+    plane: Path,
+    board: "PrintedBoard",
+    model: "LensModel",
+    out: Path,
+    folder: Path,
+    overwrite: bool,
+    console: "Console",
+) -> None:
     from rich.progress import track
 
     from stream_dmr.calibration.board import calibrate as calibrate_camera
-    from stream_dmr.calibration.board import draw_views, parse_board
+    from stream_dmr.calibration.board import draw_views
     from stream_dmr.calibration.calibration_file import save_calibration
     from stream_dmr.errors import OutputError
-    from stream_dmr.results.own_files import require_writable
 
-    require_writable(out, overwrite=overwrite)
-    folder = corners or out.with_name(f"{out.stem}-corners")
     if folder.is_dir() and not overwrite and any(folder.iterdir()):
         raise OutputError(
             f"{folder}: expected an empty folder for the corners found, got one with files in it; "
             "choose another with --corners, or add --overwrite"
         )
-    console = Console()
     result = calibrate_camera(
         track(images, "Looking for the board", console=console, transient=True),
         plane_image=plane,
-        board=parse_board(board),
-        square_mm=square_mm,
+        board=board,
+        model=model,
     )
     save_calibration(out, result.calibration)
     console.print(_views_table(result))
@@ -95,6 +183,7 @@ def _summary(result: "BoardResult") -> list[str]:
         f"{camera.K[axis, axis]:.1f} ± {fit.focal_std_px[axis]:.1f} px" for axis in (0, 1)
     )
     return [
+        *([result.model_note] if result.model_note else []),
         f"{len(fit.views)} views, reprojection error {fit.rms_px:.3f} px RMS",
         f"focal length {focal}; reference plane {distance_mm:.0f} mm from the camera",
         *(f"warning: {warning}" for warning in result.warnings),

@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stream_dmr.cli.shared_options import BoardOption, MarkerOption, SquareOption
+
 if TYPE_CHECKING:
     import numpy as np
 
     from stream_dmr.calibration.known_length import ScaleError
+    from stream_dmr.calibration.printed_board import PrintedBoard
     from stream_dmr.camera import Calibration
 
 _MAX_PICTURES = 100  # of a clip or a camera, in which the board is looked for; chosen
@@ -22,10 +25,9 @@ def check(
         str, typer.Argument(help="A picture, a video, rtsp://... or a camera's index.")
     ],
     calibration: Annotated[Path, typer.Option(help="The calibration that is checked.")],
-    board: Annotated[
-        str, typer.Option(help="Inner corners a row and a column; 10x7 squares have 9x6.")
-    ] = "9x6",
-    square_mm: Annotated[float, typer.Option(help="Side of one square in mm.")] = 25.0,
+    board: BoardOption = "9x6",
+    square_mm: SquareOption = 25.0,
+    marker_mm: MarkerOption = None,
     ends: Annotated[
         str | None,
         typer.Option(help="Ends of a rod, px, instead of a board.", metavar="U,V,U,V"),
@@ -44,6 +46,7 @@ def check(
     every later export.
     """
     from stream_dmr.calibration.calibration_file import load_calibration
+    from stream_dmr.calibration.printed_board import PrintedBoard
     from stream_dmr.errors import OutputError
     from stream_dmr.files import sha256_of
     from stream_dmr.results.finished_fish import database_of
@@ -55,8 +58,7 @@ def check(
     found = _measure(
         source,
         load_calibration(calibration),
-        board=board,
-        square_mm=square_mm,
+        board=PrintedBoard.parse(board, square_mm=square_mm, marker_mm=marker_mm),
         ends=ends,
         length_mm=length_mm,
     )
@@ -86,15 +88,13 @@ def _measure(
     source: str,
     calibration: "Calibration",
     *,
-    board: str,
-    square_mm: float,
+    board: "PrintedBoard",
     ends: str | None,
     length_mm: float | None,
 ) -> "ScaleError":
     import numpy as np
 
     from stream_dmr.calibration.calibration_file import require_size
-    from stream_dmr.calibration.corners import parse_board
     from stream_dmr.calibration.known_length import scale_of_board, scale_of_points
 
     if (ends is None) != (length_mm is None):
@@ -103,8 +103,7 @@ def _measure(
     first = next(pictures)
     require_size(calibration, width=first.shape[1], height=first.shape[0])
     if ends is None or length_mm is None:
-        several, size = chain([first], pictures), parse_board(board)
-        return scale_of_board(several, calibration, board=size, square_mm=square_mm)
+        return scale_of_board(chain([first], pictures), calibration, board)
     try:
         points = np.array([float(part) for part in ends.split(",")]).reshape(2, 2)
     except ValueError as error:

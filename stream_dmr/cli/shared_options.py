@@ -36,6 +36,18 @@ TrackOption = Annotated[
     list[int] | None, typer.Option("--track", help="Only this fish; may be repeated.")
 ]
 
+BoardOption = Annotated[
+    str,
+    typer.Option(
+        help="A chessboard's inner corners per row and column; 10x7 squares have 9x6. Or a ChArUco "
+        "board by its squares, such as charuco:7x5, of which a part in view is enough."
+    ),
+]
+SquareOption = Annotated[float, typer.Option(help="Side of one square in mm.")]
+MarkerOption = Annotated[
+    float | None, typer.Option(help="Side of a ChArUco board's markers in mm.")
+]
+
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
 
 

@@ -67,9 +67,14 @@ def simulate(
     scene = make_scene(
         num_fish=num_fish, num_frames=num_frames, preset=preset, seed=seed, species=bodies
     )
+    write_scene(out, scene, species=species)
+
+
+def write_scene(out: Path, scene: RailScene, *, species: str = "halibut") -> None:
+    """Write a clip of this scene, as `simulate` does. Raises OutputError."""
     try:
         _empty_masks(out / "masks")
-        _write_all_species(out, species.split(","), num_fish=num_fish)
+        _write_all_species(out, species.split(","), num_fish=len(scene.visits))
         _write_truth(out, scene)
         save_calibration(out / "calibration.yaml", scene.calibration)
         _write_film(out, scene)

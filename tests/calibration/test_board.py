@@ -8,10 +8,11 @@ import pytest
 from scipy.spatial.distance import pdist
 from typer.testing import CliRunner
 
-from stream_dmr.calibration.board import calibrate, draw_views, parse_board
+from stream_dmr.calibration.board import calibrate, draw_views
 from stream_dmr.calibration.calibration_file import load_calibration
 from stream_dmr.calibration.corners import find_corners, read_grey
 from stream_dmr.calibration.lens_fit import fit_lens, require_determined
+from stream_dmr.calibration.printed_board import BoardCorners, PrintedBoard, parse_board
 from stream_dmr.errors import CalibrationError, OutputError
 from tests.support.board_views import (
     LENS,
@@ -104,7 +105,7 @@ def test_report_agrees_with_what_it_is_about(renderer, result):
     assert not result.left_out
     assert result.plane_view.path.name == "plane.png"
     true = renderer.corners_px(PLANE)
-    assert corner_error(result.plane_view.corners_px, true) < 0.1
+    assert corner_error(result.plane_view.corners.pixels, true) < 0.1
     for view in result.fit.views:
         assert 0.005 < view.rms_px < 0.15
         assert view.distances.mean_mm <= view.distances.max_mm < 0.5
@@ -116,15 +117,16 @@ def test_report_agrees_with_what_it_is_about(renderer, result):
 
 def exact_corners(renderer, poses, *, noise_px=0.0, seed=0):
     rng = np.random.default_rng(seed)
-    corners = [renderer.corners_px(view_pose) for view_pose in poses]
     return {
-        Path(f"{index}.png"): found + rng.normal(0, noise_px, found.shape)
-        for index, found in enumerate(corners)
+        Path(f"{index}.png"): BoardCorners(
+            pixels=found + rng.normal(0, noise_px, found.shape), points_mm=board_points()
+        )
+        for index, found in enumerate(map(renderer.corners_px, poses))
     }
 
 
 def test_exact_corners_give_the_exact_camera(renderer):
-    fit = fit_lens(exact_corners(renderer, varied_poses(6)), board_points(), SIZE)
+    fit = fit_lens(exact_corners(renderer, varied_poses(6)), SIZE)
     np.testing.assert_allclose(fit.camera.K, LENS.K, rtol=1e-4)
     np.testing.assert_allclose(fit.camera.distortion, LENS.distortion, atol=1e-3)
     assert fit.rms_px < 1e-3
@@ -137,7 +139,7 @@ def test_errors_and_deviations_are_those_of_the_noise(renderer):
     for seed in range(12):
         poses = varied_poses(8, seed=seed)
         corners = exact_corners(renderer, poses, noise_px=0.3, seed=seed)
-        fit = fit_lens(corners, board_points(), SIZE)
+        fit = fit_lens(corners, SIZE)
         assert fit.rms_px == pytest.approx(0.3 * np.sqrt(2), rel=0.1)
         scores.append((np.diag(fit.camera.K)[:2] - np.diag(LENS.K)[:2]) / fit.focal_std_px)
     assert 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.6
@@ -212,32 +214,30 @@ def test_boards_all_held_alike_are_refused(renderer, tilt, noise_px):
         for _ in range(8)
     ]
     with pytest.raises(CalibrationError, match="tilted to different sides"):
-        require_determined(
-            fit_lens(exact_corners(renderer, poses, noise_px=noise_px), board_points(), SIZE)
-        )
+        require_determined(fit_lens(exact_corners(renderer, poses, noise_px=noise_px), SIZE))
 
 
 def test_a_few_noisy_and_hardly_tilted_boards_are_refused(renderer):
     poses = [pose(tilt_deg=(tilt, 0, 0)) for tilt in (-6, -3, 0, 3, 6)]
     corners = exact_corners(renderer, poses, noise_px=0.5)
     with pytest.raises(CalibrationError, match="standard deviation"):
-        require_determined(fit_lens(corners, board_points(), SIZE))
+        require_determined(fit_lens(corners, SIZE))
 
 
 def test_the_planes_picture_must_be_usable(folder, views, tmp_path):
     blank = save(tmp_path / "blank.png", np.full((480, 640), 128, np.uint8))
-    with pytest.raises(CalibrationError, match=r"--plane .*blank.png.*no board with 9x6"):
+    with pytest.raises(CalibrationError, match=r"--plane .*blank.png.*no board of 9x6"):
         calibrate(views, plane_image=blank)
     with pytest.raises(CalibrationError, match=r"--plane .*none.png.*can't be read"):
         calibrate(views, plane_image=tmp_path / "none.png")
-    with pytest.raises(CalibrationError, match="no board with 8x5"):
-        calibrate(views, plane_image=folder / "plane.png", board=(8, 5))
+    with pytest.raises(CalibrationError, match=r"no board of 8x5 .*saw one of 9x6: check --board"):
+        calibrate(views, plane_image=folder / "plane.png", board=PrintedBoard(inner=(8, 5)))
 
 
 @pytest.mark.parametrize("square_mm", [0.0, -25.0, float("nan")])
-def test_impossible_squares_are_refused(folder, views, square_mm):
+def test_impossible_squares_are_refused(square_mm):
     with pytest.raises(CalibrationError, match="--square-mm"):
-        calibrate(views, plane_image=folder / "plane.png", square_mm=square_mm)
+        PrintedBoard(square_mm=square_mm)
 
 
 @pytest.mark.parametrize("text", ["9x6", "9X6", " 9 x 6 "])

@@ -121,7 +121,7 @@ def test_wrong_values_are_named(tmp_path, changes, named):
 def test_other_files_are_refused(tmp_path, content, capfd):
     path = tmp_path / "c.yaml"
     path.write_bytes(content)
-    with pytest.raises(CalibrationError, match="expected OpenCV FileStorage YAML"):
+    with pytest.raises(CalibrationError, match="expected"):
         load_calibration(path)
 
 

@@ -10,6 +10,7 @@ import pytest
 from stream_dmr.calibration.calibration_file import save_calibration
 from stream_dmr.calibration.corners import seen_board
 from stream_dmr.calibration.known_length import scale_of_board, scale_of_points
+from stream_dmr.calibration.printed_board import PrintedBoard
 from stream_dmr.camera import Calibration, ReferencePlane
 from stream_dmr.errors import CalibrationError
 from stream_dmr.files import sha256_of
@@ -40,7 +41,7 @@ def farther(share: float) -> Calibration:
 
 @pytest.mark.parametrize("share", [0.0, 0.05, -0.02])
 def test_the_error_is_that_of_the_scale(picture: np.ndarray, share: float):
-    found = scale_of_board([picture], farther(share), board=(9, 6), square_mm=25.0)
+    found = scale_of_board([picture], farther(share), PrintedBoard())
     assert found.error_percent == pytest.approx(100 * share, abs=0.1)
     assert found.known_mm == pytest.approx(25 * np.hypot(8, 5))
     assert found.error_mm == pytest.approx(share * found.known_mm, abs=0.3)
@@ -57,8 +58,8 @@ def test_a_rod_is_measured_by_its_ends():
 def test_a_board_of_another_size_is_named(picture: np.ndarray):
     assert seen_board(picture) == (9, 6)
     assert seen_board(np.full((480, 640), 128, np.uint8)) is None
-    with pytest.raises(CalibrationError, match="one with 9x6 was seen"):
-        scale_of_board([picture], TRUE, board=(8, 5), square_mm=25.0)
+    with pytest.raises(CalibrationError, match=r"no board of 8x5 .*saw one of 9x6"):
+        scale_of_board([picture], TRUE, PrintedBoard(inner=(8, 5)))
 
 
 @pytest.fixture

@@ -54,13 +54,34 @@ class BoardRenderer:
 
     def _colours(self, rays: np.ndarray, pose: ReferencePlane) -> np.ndarray:
         on_plane = rays @ np.linalg.inv(pose.homography(np.eye(3))).T.astype(np.float32)
-        x, y = (on_plane[..., i] / on_plane[..., 2] / self.square_mm + 1 for i in (0, 1))
+        depth = np.where(on_plane[..., 2] > 0, on_plane[..., 2], np.float32(1e-9))  # else: behind
+        x, y = (on_plane[..., i] / depth / self.square_mm + 1 for i in (0, 1))
         columns, rows = self.board[0] + 1, self.board[1] + 1
         is_square = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
         is_paper = (x >= -0.7) & (x < columns + 0.7) & (y >= -0.7) & (y < rows + 0.7)
-        is_black = (np.floor(x) + np.floor(y)) % 2 == 0
-        table = 120 + 25 * np.sin(x * 2.3)
-        return np.where(is_square & is_black, 35.0, np.where(is_paper, 215.0, table))
+        table = 120 + 25 * np.sin(np.clip(x, -50, 50) * 2.3)
+        return np.where(is_square & self._is_black(x, y), 35.0, np.where(is_paper, 215.0, table))
+
+    def _is_black(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """At a place on the board, in squares from its top-left corner."""
+        return (np.floor(x) + np.floor(y)) % 2 == 0
+
+
+class CharucoRenderer(BoardRenderer):
+    """Renders a ChArUco board as OpenCV prints it, with the inner corners of the chessboard."""
+
+    def __init__(self, camera: Camera, printed: cv2.aruco.CharucoBoard, *, square_mm, samples=3):
+        columns, rows = printed.getChessboardSize()
+        super().__init__(
+            camera, board=(columns - 1, rows - 1), square_mm=square_mm, samples=samples
+        )
+        self._print = printed.generateImage((columns * 100, rows * 100))
+
+    def _is_black(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        rows, columns = self._print.shape
+        column = np.clip(x * 100, 0, columns - 1).astype(np.int32)
+        row = np.clip(y * 100, 0, rows - 1).astype(np.int32)
+        return self._print[row, column] < 128
 
 
 def board_points(board=(9, 6), square_mm=25.0) -> np.ndarray:

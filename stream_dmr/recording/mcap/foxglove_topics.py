@@ -17,7 +17,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.camera import Calibration
+from stream_dmr.camera import Calibration, Camera
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, Frame, LocalizedFish
 from stream_dmr.recording.messages.picture_codec import compress
 from stream_dmr.recording.messages.record import Record
@@ -125,7 +125,7 @@ class FoxgloveTopics:
             frame_id=_CAMERA,
             width=camera.width // factor,
             height=camera.height // factor,
-            distortion_model="rational_polynomial" if len(camera.distortion) > 5 else "plumb_bob",
+            distortion_model=_distortion_model(camera),
             D=camera.distortion.tolist(),
             K=K.ravel().tolist(),
             R=np.eye(3).ravel().tolist(),
@@ -135,6 +135,13 @@ class FoxgloveTopics:
     def _in_view(self, pixels: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
         """Frame pixels as pixels of the shown picture; pixel centres are integers in both."""
         return (pixels + 0.5) / self._factor - 0.5
+
+
+def _distortion_model(camera: Camera) -> str:
+    """Foxglove's name; "kannala_brandt" is OpenCV's fisheye model."""
+    if camera.is_fisheye:
+        return "kannala_brandt"
+    return "rational_polynomial" if len(camera.distortion) > 5 else "plumb_bob"
 
 
 def _plane(calibration: Calibration, now: Timestamp) -> FrameTransform:

@@ -26,12 +26,13 @@ from stream_dmr.recording.messages.picture_codec import (
 )
 from stream_dmr.recording.messages.schema import proto_class
 
-CODEC_VERSION = 4
+CODEC_VERSION = 5
 """Increased when an older reader would read a new file wrongly.
 
 2: a crop may lack its picture, a fit its vertices and covariance.
 3: the JPEG of a frame may not be what the run used.
 4: a crop may say what of it is unknown.
+5: a camera may be a fisheye.
 """
 
 T = TypeVar("T")

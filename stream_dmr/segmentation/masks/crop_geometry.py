@@ -137,7 +137,8 @@ def frame_from_crop_map(
     K[:2, :2] *= samples
     K[:2, 2] = (K[:2, 2] + 0.5) * samples - 0.5  # pixel centers are integers, edges at halves
     size = (crop_camera.width * samples, crop_camera.height * samples)
-    x, y = cv2.initUndistortRectifyMap(
+    lens = cv2.fisheye if frame_camera.is_fisheye else cv2
+    x, y = lens.initUndistortRectifyMap(
         frame_camera.K, frame_camera.distortion, np.eye(3), K, size, cv2.CV_32FC1
     )
     return x, y
