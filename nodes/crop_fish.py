@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from stream_dmr.camera import Camera
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
 from stream_dmr.segmentation.masks.cropping import crop_fish
 from stream_dmr.segmentation.masks.open_segmenter import open_segmenter
+from stream_dmr.segmentation.network.species_classifier import SpeciesClassifier
 from stream_dmr.segmentation.tracking.fish_finder import FishFinder
 from stream_dmr.segmentation.tracking.track_numbering import TrackNumbering
 
@@ -16,15 +18,22 @@ class CropFish:
     """Frame -> FishCrop, one per fish. Without a calibrated camera a nominal one is assumed."""
 
     def __init__(
-        self, settings: CropFishSettings, *, camera: Camera | None, finder: FishFinder
+        self,
+        settings: CropFishSettings,
+        *,
+        camera: Camera | None,
+        finder: FishFinder,
+        species_model: str = "",
     ) -> None:
-        """Raises ModelError where the model that `settings.segmenter` names cannot be used.
+        """Raises ModelError where a model that the settings name cannot be used.
 
-        It is not opened, and torch is not imported, where the finder gives all masks.
+        The segmenter is not opened, and torch is not imported, where the finder gives all masks.
+        `species_model`: the file of a classifier; "": none.
         """
         self._finder = finder
         self._numbering = TrackNumbering(keeps_source_ids=finder.knows_ids)
         self._segmenter = None if finder.gives_masks else open_segmenter(settings.segmenter)
+        self._classifier = SpeciesClassifier(Path(species_model)) if species_model else None
         self._settings = settings
         self._camera = camera
 
@@ -47,7 +56,11 @@ class CropFish:
             for detection in self._finder.detect(frame)
         }
         fish = [
-            replace(crops[source_id], track_id=self._numbering.track_id(source_id))
+            replace(
+                crops[source_id],
+                track_id=self._numbering.track_id(source_id),
+                species=self._classifier.classify(crops[source_id]) if self._classifier else {},
+            )
             for source_id in self._finder.confirm(crops)
         ]
         return sorted(fish, key=lambda crop: crop.track_id)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from stream_dmr.camera import Calibration
+from stream_dmr.catch.species_settings import SpeciesSettings
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.tracks import TrackFitter
@@ -24,14 +25,19 @@ class FitMesh:
         calibration: Calibration | None,
         candidates: CandidateShapes | None = None,
         with_covariance: bool = False,
+        species: SpeciesSettings | None = None,
     ) -> None:
-        """`candidates`: shapes of which each fish gets the one that its masks prefer."""
+        """`candidates`: shapes of which each fish gets the one that its masks prefer.
+
+        A fish whose `species` is sure gets that of its species' body form, where there is one.
+        """
         self._tracks = TrackFitter(
             template,
             settings,
             calibration=calibration,
             candidates=candidates,
             with_covariance=with_covariance,
+            species=species,
         )
 
     def step(self, crop: FishCrop, /) -> list[FittedMesh]:

@@ -1,4 +1,4 @@
-"""SmoothLength: from the lengths of frames to the length of a fish, and what became of it.
+"""SmoothLength: from the lengths of frames to that of a fish, its species and what became of it.
 
 Last of the chain: LocalizedFish -> LengthEstimate, one running estimate for every frame of a fish
 and a final one when its track ends.
@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from stream_dmr.catch.fate import FateTracker
+from stream_dmr.catch.species_evidence import UNSURE, SpeciesEvidence
+from stream_dmr.catch.species_settings import SpeciesSettings
 from stream_dmr.catch.zones import ZonesSettings
 from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.lengths.track_length import TrackLength, late_estimate
@@ -18,6 +20,7 @@ from stream_dmr.messages import LengthEstimate, LocalizedFish
 class _Track:
     length: TrackLength
     fate: FateTracker
+    species: SpeciesEvidence
 
 
 class SmoothLength:
@@ -32,11 +35,16 @@ class SmoothLength:
         settings: SmoothLengthSettings,
         *,
         zones: ZonesSettings | None = None,
+        species: SpeciesSettings | None = None,
         frame_size: tuple[int, int] | None = None,
     ) -> None:
-        """With `zones` a final estimate has a fate; `frame_size`: width and height, px."""
+        """With `zones` a final estimate has a fate; `frame_size`: width and height, px.
+
+        It has a species where a classifier has looked at the fish.
+        """
         self._settings = settings
         self._zones, self._frame_size = zones or ZonesSettings(), frame_size
+        self._species = species or SpeciesSettings()
         self._open: dict[int, _Track] = {}
         self._ended: set[int] = set()
         self._watched_ns: tuple[int, int] | None = None  # capture times of the first frame and last
@@ -49,9 +57,11 @@ class SmoothLength:
             self._open[message.track_id] = _Track(
                 TrackLength(message, self._settings),
                 FateTracker(self._zones, frame_size=self._frame_size),
+                SpeciesEvidence(self._species),
             )
         track = self._open[message.track_id]
         track.fate.add(message)
+        track.species.add(message.species)
         return [track.length.add(message)]
 
     def tick(self, timestamp_ns: int, /) -> Sequence[LengthEstimate]:
@@ -69,9 +79,18 @@ class SmoothLength:
     def _finish(self, track_id: int) -> LengthEstimate:
         self._ended.add(track_id)
         track = self._open.pop(track_id)
-        estimate = track.length.finish()
+        return self._with_species(self._with_fate(track.length.finish(), track), track)
+
+    def _with_fate(self, estimate: LengthEstimate, track: _Track) -> LengthEstimate:
         if not any(self._zones.polygons()):
             return estimate
         first_ns, last_ns = self._watched_ns or (0, 0)
         fate = track.fate.finish(watched_from_ns=first_ns, watched_to_ns=last_ns)
         return replace(estimate, fate=fate.name, fate_share=fate.share)
+
+    def _with_species(self, estimate: LengthEstimate, track: _Track) -> LengthEstimate:
+        found = track.species.best()
+        if found is None:
+            return estimate
+        code = found.code if found.share >= self._species.min_share else UNSURE
+        return replace(estimate, species_code=code, species_share=found.share)

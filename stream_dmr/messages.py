@@ -8,7 +8,7 @@ after it pass that reason on.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 
 import numpy as np
@@ -23,8 +23,8 @@ class _ReadOnly:
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        for field in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
+        for part in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, part.name)
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 value = value.view()
                 value.flags.writeable = False
@@ -32,7 +32,7 @@ class _ReadOnly:
                 value = MappingProxyType(dict(value))
             else:
                 continue
-            object.__setattr__(self, field.name, value)
+            object.__setattr__(self, part.name, value)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -89,6 +89,8 @@ class FishCrop(FishMessage):
     ends: FishEnds | None = None  # None where the segmenter does not find them
     # What something in front of the fish may hide, neither fish nor water; None: nothing.
     unknown: Bool[np.ndarray, "S S"] | None = None
+    # Probability of each species by FAO code; empty where no classifier looked.
+    species: Mapping[str, float] = field(default_factory=dict[str, float])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -151,6 +153,7 @@ class FittedMesh(FishMessage):
     report: SolverReport | None  # None where no solver ran
     quality: CropQuality
     refusal: str  # "" when fitted, else a Reason
+    species: Mapping[str, float] = field(default_factory=dict[str, float])  # FishCrop's
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -170,6 +173,7 @@ class LocalizedFish(FishMessage):
     accepted: bool  # may this frame count towards the fish's length?
     reason: str  # "" when accepted, else a Reason
     shape_std_ratio: float | None = None  # FittedShape's
+    species: Mapping[str, float] = field(default_factory=dict[str, float])  # FishCrop's
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

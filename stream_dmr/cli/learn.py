@@ -63,6 +63,7 @@ def learn_template(
             forms,
             settings.fit_mesh,
             calibration=header.calibration,
+            species=settings.species,
             progress=lambda step: progress.update(task, description=step),
         )
     warn([line for one in opened for line in one.warnings])

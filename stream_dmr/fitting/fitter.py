@@ -264,4 +264,5 @@ def _message(
         report=report,
         quality=crop.quality,
         refusal=refusal or "",
+        species=crop.species,
     )

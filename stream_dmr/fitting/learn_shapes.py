@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable
 
 from stream_dmr.camera import Calibration
+from stream_dmr.catch.species_settings import SpeciesSettings
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.shape.samples import (
@@ -27,6 +28,7 @@ def learn_shapes(
     settings: FitMeshSettings,
     *,
     calibration: Calibration | None,
+    species: SpeciesSettings | None = None,
     progress: Callable[[str], None] = lambda step: None,
 ) -> CandidateShapes | None:
     """The stocks that these fish are of; None where none of them is seen whole.
@@ -39,6 +41,7 @@ def learn_shapes(
         settings.model_copy(update={"scan_iterations": 0}),  # shapes need no sizes
         calibration=calibration,
         candidates=forms,
+        species=species,
     )
     fish: list[FishSamples] = []
     for chosen in good_crops(crops):

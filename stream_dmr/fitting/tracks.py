@@ -1,6 +1,7 @@
 """Fits along tracks: each begins where the frame before ended, its head where that one's was.
 
-Of several candidate shapes a fish is given the one that its first good frames prefer.
+Of several candidate shapes a fish is given the one that its first good frames prefer, among those
+of its species' body form where a classifier is sure of the species.
 """
 
 from dataclasses import dataclass, field, replace
@@ -9,6 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.camera import Calibration
+from stream_dmr.catch.species_evidence import SpeciesEvidence, forms_of_species
+from stream_dmr.catch.species_settings import SpeciesSettings
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fit, Fitter, Solved
 from stream_dmr.fitting.heading import HeadTracker
@@ -31,6 +34,7 @@ class _TrackState:
     seen_ns: int = 0
     best: dict[int, Float[np.ndarray, "P"]] = field(default_factory=dict)  # last good fits
     head: HeadTracker = field(default_factory=HeadTracker)
+    species: SpeciesEvidence
 
 
 class TrackFitter:
@@ -44,10 +48,12 @@ class TrackFitter:
         calibration: Calibration | None,
         candidates: CandidateShapes | None = None,
         with_covariance: bool = False,
+        species: SpeciesSettings | None = None,
     ) -> None:
         """Fish hang in the plane of the calibration, if there is one.
 
-        `candidates` are shapes of the template; without any it has its own.
+        `candidates` are shapes of the template; without any it has its own. ConfigError for a
+        list of `species` that can't be read.
         """
         normal = None if calibration is None else calibration.plane.rotation[:, 2]
         shapes = [(None, None)] if candidates is None else list(enumerate(candidates))
@@ -64,13 +70,21 @@ class TrackFitter:
         ]
         shares = np.ones(1) if candidates is None else candidates.shares
         self._unlikely = -np.log(shares)  # nats
+        self._names = [] if candidates is None else [one.name for one in candidates]
+        self._species = species or SpeciesSettings()
+        self._forms = forms_of_species(self._species) if self._names else {}
         self._settings = settings
         self._tracks: dict[int, _TrackState] = {}
 
     def fit(self, crop: FishCrop) -> FittedMesh:
         """Fit one crop; a poor fit, or one of half a fish, warms no other."""
-        track = self._tracks.setdefault(crop.track_id, _TrackState(against=self._unlikely.copy()))
+        if crop.track_id not in self._tracks:
+            self._tracks[crop.track_id] = _TrackState(
+                against=self._unlikely.copy(), species=SpeciesEvidence(self._species)
+            )
+        track = self._tracks[crop.track_id]
         track.seen_ns = crop.timestamp_ns
+        track.species.add(crop.species)
         weighed = replace(crop, ends=track.head.correct(crop.ends))
         fitted, best = self._fit(weighed, track)
         if fitted.shape is not None:
@@ -87,17 +101,27 @@ class TrackFitter:
                 del self._tracks[track_id]
 
     def _fit(self, crop: FishCrop, track: _TrackState) -> Fit:
-        chosen = int(np.argmin(track.against))
-        if len(self.fitters) == 1 or track.num_decided >= _DECIDING_FRAMES:
+        of_species = self._of_species(track)
+        chosen = int(np.argmin(track.against + of_species))
+        if np.isfinite(of_species).sum() == 1 or track.num_decided >= _DECIDING_FRAMES:
             return self.fitters[chosen].fit(crop, track.best.get(chosen))
         solved = [fitter.solve(crop, track.best.get(n)) for n, fitter in enumerate(self.fitters)]
         self._decide(track, crop, solved)
-        chosen = int(np.argmin(track.against))
+        chosen = int(np.argmin(track.against + of_species))
         if not crop.quality.touches_border:
             for n, one in enumerate(solved):  # the next frame begins where this one ended
                 if one.solution is not None and one.solution.iou >= self._settings.cold_below_iou:
                     track.best[n] = one.solution.parameters
         return self.fitters[chosen].answer(crop, solved[chosen])
+
+    def _of_species(self, track: _TrackState) -> Float[np.ndarray, "N"]:
+        """0 for the candidates that the species leaves, infinity for those that it excludes."""
+        leaves = np.ones(len(self.fitters), bool)
+        found = track.species.best()
+        if found is not None and found.share >= self._species.min_share:
+            is_form = np.array([name == self._forms.get(found.code) for name in self._names], bool)
+            leaves = is_form if is_form.any() else leaves
+        return np.where(leaves, 0.0, np.inf)
 
     def _decide(self, track: _TrackState, crop: FishCrop, solved: list[Solved]) -> None:
         """Count what a frame of the whole fish says against each candidate."""

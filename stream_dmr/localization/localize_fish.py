@@ -312,4 +312,5 @@ def _message(
         accepted=not reason,
         reason=reason or "",
         shape_std_ratio=None if shape is None else shape.shape_std_ratio,
+        species=mesh.species,
     )

@@ -85,6 +85,13 @@ def _shapes(
     if candidates is not None:
         messages = (message for message, _ in decoded_messages(recording, [FishCrop]))
         crops = (message for message in messages if isinstance(message, FishCrop))
-        learnt = learn_shapes(crops, template, candidates, config.fit_mesh, calibration=calibration)
+        learnt = learn_shapes(
+            crops,
+            template,
+            candidates,
+            config.fit_mesh,
+            calibration=calibration,
+            species=config.species,
+        )
         candidates = learnt or candidates
     return template, candidates

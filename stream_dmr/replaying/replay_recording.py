@@ -254,5 +254,6 @@ def _open_chain(
             detect=config.detect_fish,
             track=config.track_fish,
         ),
+        species_model=config.species.model,
     )
     return frames, [crop_fish, *computed]

@@ -13,6 +13,7 @@ from pydantic import Field, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+from stream_dmr.catch.species_settings import SpeciesSettings
 from stream_dmr.catch.zones import ZonesSettings
 from stream_dmr.errors import ConfigError
 from stream_dmr.evaluation.length_errors import EvaluateSettings
@@ -70,6 +71,9 @@ class Config(Settings):
     )
     smooth_length: SmoothLengthSettings = Field(
         default_factory=SmoothLengthSettings, description="from many frames to one length per fish"
+    )
+    species: SpeciesSettings = Field(
+        default_factory=SpeciesSettings, description="which species a fish is of"
     )
     zones: ZonesSettings = Field(
         default_factory=ZonesSettings, description="what became of a fish, by where its track ends"

@@ -116,7 +116,12 @@ def _report_start(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> No
 
 def _crop_fish(inputs: Inputs) -> CropFish:
     camera = None if inputs.calibration is None else inputs.calibration.camera
-    return CropFish(inputs.config.crop_fish, camera=camera, finder=inputs.finder)
+    return CropFish(
+        inputs.config.crop_fish,
+        camera=camera,
+        finder=inputs.finder,
+        species_model=inputs.config.species.model,
+    )
 
 
 def later_nodes(
@@ -136,9 +141,15 @@ def later_nodes(
             candidates=candidates,
             calibration=calibration,
             with_covariance=_records_covariance(config),
+            species=config.species,
         ),
         Localize(config.localize, calibration=calibration),
-        SmoothLength(config.smooth_length, zones=config.zones, frame_size=frame_size),
+        SmoothLength(
+            config.smooth_length,
+            zones=config.zones,
+            species=config.species,
+            frame_size=frame_size,
+        ),
     ]
 
 

@@ -48,6 +48,7 @@ def with_learnt_shapes(
             candidates,
             config,
             calibration=inputs.calibration,
+            species=inputs.config.species,
             progress=lambda step: observer.stage(f"learning their shapes: {step}"),
         )
         if stocks is None:

@@ -133,8 +133,9 @@ def _set(proto: Proto, field: Any, item: Any) -> None:
         return
     inner = getattr(proto, field.name)
     if isinstance(item, Mapping):
-        for name, count in item.items():
-            inner.add(name=_SCALARS[FieldDescriptor.TYPE_STRING](name), count=count)
+        of_value = field.message_type.fields[1].name
+        for name, value in item.items():
+            inner.add(**{"name": _SCALARS[FieldDescriptor.TYPE_STRING](name), of_value: value})
         return
     inner.SetInParent()
     if field.message_type.name == "Picture":
@@ -168,7 +169,8 @@ def _fields(kind: type) -> list[Any]:
 def _get(proto: Proto, field: Any) -> Any:
     inner = getattr(proto, field.name)
     if field.is_repeated:
-        return {count.name: count.count for count in inner}
+        of_value = field.message_type.fields[1].name
+        return {one.name: getattr(one, of_value) for one in inner}
     if field.has_presence and not proto.HasField(field.name):
         if field.containing_oneof is None:  # so the schema doesn't say `optional`
             raise RecordingError(
