@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stream_dmr.catch.zones import ZonesSettings
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.reasons import without_counts
 from stream_dmr.recording.messages.sink_states import SinkStates
@@ -57,6 +58,7 @@ class RunState:
         silence_s: float,
         stuck_s: float,
         sinks: SinkStates | None = None,
+        zones: ZonesSettings | None = None,
     ) -> None:
         """A camera that is silent for `silence_s` and a frame that takes `stuck_s` are problems."""
         self.source = source
@@ -67,6 +69,7 @@ class RunState:
         self.species: Counter[str] = Counter()  # of finished fish, by code
         self.fates: Counter[str] = Counter()
         self.fit_s: deque[float] = deque(maxlen=_MAX_FITS)
+        self.zones = zones or ZonesSettings()
         self._out_dir = out_dir
         self._silence_s = silence_s
         self._stuck_s = stuck_s

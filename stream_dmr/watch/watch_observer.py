@@ -24,7 +24,12 @@ class WatchObserver(RunObserver):
         self._observer.open(run)
         settings, silence_s = run.config.watch, run.config.read_frames.silence_s
         state = RunState(
-            run.source, run.out, silence_s=silence_s, stuck_s=settings.stuck_s, sinks=run.sinks
+            run.source,
+            run.out,
+            silence_s=silence_s,
+            stuck_s=settings.stuck_s,
+            sinks=run.sinks,
+            zones=run.config.zones,
         )
         state.continue_after(run.store)
         self._server = WatchServer(state, settings) if settings.port else None

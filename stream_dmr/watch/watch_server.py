@@ -98,8 +98,11 @@ class _WatchHandler(TokenHandler):
         state = self.server.state
         match path:
             case "/":
-                page = files("stream_dmr.watch").joinpath("page.html").read_bytes()
-                self.answer(HTTPStatus.OK, "text/html; charset=utf-8", page)
+                self._answer_page("page.html")
+            case "/zones":
+                self._answer_page("zones.html")
+            case "/zones.json":
+                self.answer_json(HTTPStatus.OK, zones_json(state))
             case "/status.json":
                 self.answer_json(HTTPStatus.OK, status_json(state))
             case "/picture.jpg":
@@ -114,6 +117,17 @@ class _WatchHandler(TokenHandler):
                 self.answer_json(code, health)
             case _:
                 self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
+
+    def _answer_page(self, name: str) -> None:
+        page = files("stream_dmr.watch").joinpath(name).read_bytes()
+        self.answer(HTTPStatus.OK, "text/html; charset=utf-8", page)
+
+
+def zones_json(state: RunState) -> dict[str, Any]:
+    """The zones of the run by their names in config.toml, and the size of its frames, px."""
+    names = ("landed", "dropped", "cut_off")
+    zones = {name: getattr(state.zones, name) for name in names}
+    return {"size": [state.source.width, state.source.height], "zones": zones}
 
 
 def health_json(state: RunState) -> dict[str, Any]:
