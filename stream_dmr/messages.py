@@ -208,4 +208,17 @@ class LengthEstimate(FishMessage):
     species_share: float | None = None  # posterior probability of the likeliest species
 
 
-Message = Frame | FishCrop | FittedMesh | LocalizedFish | LengthEstimate
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Position(_ReadOnly):
+    """Where the vessel was, as its receiver said; degrees of WGS 84."""
+
+    frame_index: int  # of the frame before it; 0: it came before the first
+    timestamp_ns: int  # on the clock of the frames; before a video's start it is negative
+    utc_ns: int | None  # the receiver's own time, ns since 1970; None: it gave no date
+    latitude: float  # north is positive
+    longitude: float  # east is positive
+    speed_knots: float | None  # over ground
+    course_deg: float | None  # over ground, clockwise from true north
+
+
+Message = Frame | FishCrop | FittedMesh | LocalizedFish | LengthEstimate | Position

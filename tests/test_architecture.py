@@ -83,6 +83,7 @@ ROOMS = [
     "stream_dmr.evaluation",
     "stream_dmr.template",
     "stream_dmr.calibration",
+    "stream_dmr.sensors",
     "stream_dmr.sources",
     "stream_dmr.csv_file",
     "stream_dmr.files",
@@ -115,6 +116,8 @@ WHO_KNOWS = {
         "stream_dmr.batch",
         "stream_dmr.nodes",
     ],
+    "pynmeagps": ["stream_dmr.sensors"],
+    "serial": ["stream_dmr.sensors"],
     "typer": ["stream_dmr.cli"],
 }
 

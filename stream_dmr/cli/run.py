@@ -70,6 +70,13 @@ def run(
     vessel: Annotated[str, typer.Option(help="Name of the vessel, for the exports.")] = "",
     trip: Annotated[str, typer.Option(help="Name of the trip, for the exports.")] = "",
     haul: Annotated[str, typer.Option(help="Name of the haul, for the exports.")] = "",
+    nmea: Annotated[
+        str | None,
+        typer.Option(
+            help="Positions as NMEA 0183: a file (or CSV), tcp://HOST:PORT, udp://HOST:PORT or a "
+            "serial device."
+        ),
+    ] = None,
     key: Annotated[
         Path | None, typer.Option(help="Device key of `keygen`; signs all that is measured.")
     ] = None,
@@ -111,6 +118,7 @@ def run(
             vessel=vessel,
             trip=trip,
             haul=haul,
+            nmea=nmea,
             key=key,
         )
         with nullcontext(JsonLog()) if log_json else RunDisplay() as observer:

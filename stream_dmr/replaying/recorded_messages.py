@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 from stream_dmr.errors import RecordingError
-from stream_dmr.messages import FishCrop, FittedMesh, Frame, LocalizedFish, Message
+from stream_dmr.messages import FishCrop, FittedMesh, Frame, LocalizedFish, Message, Position
 from stream_dmr.recording.messages.codec import decode
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.reading.frame_images import (
@@ -43,6 +43,12 @@ class RecordedMessages:
         for message, payload in decoded_messages(self._recording, [kind], self._selection):
             if keep_payloads:
                 self._payloads[id(message)] = payload
+            yield message
+
+    def positions(self) -> Iterator[Position]:
+        """The positions of the vessel."""
+        for message in self.of_type(Position, keep_payloads=False):
+            assert isinstance(message, Position)
             yield message
 
     def frames(self) -> Iterator[Frame]:

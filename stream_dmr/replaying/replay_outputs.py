@@ -78,6 +78,7 @@ def open_replay_outputs(
         vessel="" if known is None else known.vessel,
         trip="" if known is None else known.trip,
         haul="" if known is None else known.haul,
+        utc_zero_ns=None if known is None else known.utc_zero_ns,
     )
     with ExitStack() as stack:
         stack.enter_context(sealed(out, with_recordings=True, on_notice=observer.warn))
@@ -93,13 +94,20 @@ def open_replay_outputs(
         )
         stack.enter_context(recorder)
         results = ResultWriter(
-            store, lengths, recorder, flags=recorded.flags, on_notice=observer.warn
+            store,
+            lengths,
+            recorder,
+            flags=recorded.flags,
+            sensors=inputs.config.sensors,
+            on_notice=observer.warn,
         )
         try:
             yield ReplayOutputs(recorder=recorder, results=results)
         except BaseException as error:
             store.end(f"an error: {error}")
             raise
+        finally:
+            results.finish()
         store.end(STOPPED if stop.is_set() else _end_of(request, known))
 
 

@@ -106,6 +106,7 @@ def replay(
             stop=stop,
             in_one_thread=_is_light(request),
         )
+        writer.finish()
     if comparator is not None:
         comparator.finish()
     for line in (*recording.warnings, *recorded.notes):

@@ -26,6 +26,8 @@ class ReplayWriter:
         self._outputs, self._comparator = outputs, comparator
         self._first_ns: int | None = None
         self._last_ns = 0
+        self._positions = recorded.positions() if outputs is not None else iter(())
+        self._next_position = next(self._positions, None)
         self.final: list[LengthEstimate] = []
         self.num_frames = 0
 
@@ -46,7 +48,22 @@ class ReplayWriter:
         if self._outputs is not None:
             self._outputs.results.store(message)
             self._outputs.recorder.put(Record.of_payload(message, payload))
+            if isinstance(message, Frame):
+                self._put_positions(self._outputs, message.frame_index)
         return message
+
+    def finish(self) -> None:
+        """Record the positions after the last frame."""
+        if self._outputs is not None:
+            self._put_positions(self._outputs, None)
+
+    def _put_positions(self, outputs: ReplayOutputs, until_frame: int | None) -> None:
+        """Record the positions up to a frame, as they were recorded; None: all that are left."""
+        while (position := self._next_position) is not None:
+            if until_frame is not None and position.frame_index > until_frame:
+                return
+            outputs.results.write(position)
+            self._next_position = next(self._positions, None)
 
     def frame_done(self) -> None:
         """Take note that a frame has left the last stage."""

@@ -2,6 +2,7 @@
 
 import json
 import sqlite3
+import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, fields
@@ -9,16 +10,20 @@ from pathlib import Path
 from typing import Literal
 
 from stream_dmr.errors import OutputError
-from stream_dmr.messages import LengthEstimate
+from stream_dmr.messages import LengthEstimate, Position
 from stream_dmr.recording.messages.run_inputs import RunInputs
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
+from stream_dmr.results.added_tables import added_rows, has_table
 from stream_dmr.results.catch_facts import UNKNOWN_CATCH, CatchFacts
+from stream_dmr.results.kept_positions import POSITIONS, kept_of, positions_of
 from stream_dmr.results.lengths_database import NAME, open_for_reading
 from stream_dmr.results.run_facts import RunFacts, cut_short, run_facts
 from stream_dmr.results.scale_checks import last_checks
 from stream_dmr.results.store_rows import MAY_COUNT_TWICE, read_estimates
 from stream_dmr.results.verdicts import NOT_REVIEWED, Review, read_verdicts, reviews_of
+from stream_dmr.results.vessel_track import NOWHERE, VesselTrack, Whereabouts
+from stream_dmr.sensors.sensors_settings import SensorsSettings
 
 _CATCH_NAMES = [field.name for field in fields(CatchFacts)]
 
@@ -33,7 +38,20 @@ class FishResult:
     iou: float | None = None
     flags: Sequence[str] = ()
     catch: CatchFacts = UNKNOWN_CATCH
+    where: Whereabouts = NOWHERE  # at `middle_ns`
     review: Review = NOT_REVIEWED
+
+    @property
+    def middle_ns(self) -> int:
+        """The capture time halfway between its first and its last frame."""
+        return middle_ns(self.estimate)
+
+    @property
+    def utc_ns(self) -> int | None:
+        """UTC at `middle_ns`: the receiver's, or by the time of the frames; None: unknown."""
+        if self.where.utc_ns is not None or self.facts.utc_zero_ns is None:
+            return self.where.utc_ns
+        return self.middle_ns + self.facts.utc_zero_ns
 
     @property
     def may_count_twice(self) -> bool:
@@ -45,6 +63,11 @@ class FishResult:
         """The length that a reviewer corrected, else the measured one."""
         corrected = self.review.length_mm
         return self.estimate.length_mm if corrected is None else corrected
+
+
+def middle_ns(estimate: LengthEstimate) -> int:
+    """Halfway between the capture times of a fish's first and last frame."""
+    return (estimate.first_timestamp_ns + estimate.last_timestamp_ns) // 2
 
 
 def database_of(path: Path) -> Path | None:
@@ -69,13 +92,29 @@ def read_fish(
             if selection.includes(one.estimate)
             and selection.includes_time(one.estimate.last_timestamp_ns)
         ]
-    facts = run_facts(recording.header)
+    facts, track = run_facts(recording.header), recorded_track(recording)
     found = (message for message, _ in decoded_messages(recording, [LengthEstimate], selection))
     return [
-        FishResult(estimate=estimate, facts=facts, run_id="", catch=CatchFacts.of(estimate))
+        FishResult(
+            estimate=estimate,
+            facts=facts,
+            run_id="",
+            catch=CatchFacts.of(estimate),
+            where=track.at(middle_ns(estimate)),
+        )
         for estimate in found
         if isinstance(estimate, LengthEstimate) and estimate.is_final
     ]
+
+
+def recorded_track(recording: Recording) -> VesselTrack:
+    """The vessel's track of a recording, as its run's settings cut it at gaps."""
+    settings = SensorsSettings.model_validate(
+        tomllib.loads(recording.header.config_toml).get("sensors", {})
+    )
+    found = (message for message, _ in decoded_messages(recording, [Position]))
+    positions = (message for message in found if isinstance(message, Position))
+    return VesselTrack(kept_of(positions, keep_s=settings.keep_s, max_gap_s=settings.max_gap_s))
 
 
 def read_stored_fish(database: Path) -> list[FishResult]:
@@ -119,13 +158,17 @@ def run_times(database: Path) -> dict[str, list[int | None]]:
         return {run_id: [started, ended] for run_id, started, ended in rows}
 
 
-def rows_by_run(database: Path, table: Literal["fish", "events"]) -> dict[str, list[str]]:
-    """Every stored value of the fish or events of each run, as lines of JSON, for checksums.
+def rows_by_run(
+    database: Path, table: Literal["fish", "events", "positions"]
+) -> dict[str, list[str]]:
+    """Every stored value of the rows of each run, as lines of JSON, for checksums.
 
     `CatchFacts` only where they have a value, by name: older databases lack their columns.
     """
     lines: dict[str, list[str]] = {}
     with closing(open_for_reading(database)) as connection:
+        if not has_table(connection, table):
+            return {}
         rows = connection.execute(f"SELECT * FROM {table} ORDER BY number")
         names = [column[0] for column in rows.description]
         for values in rows:
@@ -163,6 +206,7 @@ def _stored_fish(database: Path, reviews: dict[int, Review]) -> list[FishResult]
     try:
         with closing(open_for_reading(database)) as connection:
             runs = dict(_runs(connection))
+            track = VesselTrack(positions_of(added_rows(connection, POSITIONS)))
             estimates = read_estimates(connection)
             rows = connection.execute("SELECT * FROM fish ORDER BY number")
             names = [column[0] for column in rows.description]
@@ -174,6 +218,7 @@ def _stored_fish(database: Path, reviews: dict[int, Review]) -> list[FishResult]
                     run_id=other["run_id"],
                     iou=other["iou"],
                     flags=json.loads(other["flags"]),
+                    where=track.at(middle_ns(estimate)),
                     catch=CatchFacts(**{name: other.get(name) for name in _CATCH_NAMES}),
                     review=reviews.get(estimate.track_id, NOT_REVIEWED),
                 )

@@ -11,7 +11,7 @@ from stream_dmr.csv_file import safe_cell
 from stream_dmr.files import writing_to
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.fisheries import FisheriesSettings, derive
-from stream_dmr.results.table_cells import seconds
+from stream_dmr.results.table_cells import seconds, utc_text
 from stream_dmr.results.verdicts import Review
 from stream_dmr.template.template import Template
 
@@ -29,6 +29,9 @@ FISH_TABLE: dict[str, type] = {
     "is_legal_size": bool,
     **dict.fromkeys(("frames_seen", "frames_used", "first_frame", "last_frame"), int),
     **dict.fromkeys(("first_time", "last_time"), str),
+    "time_utc": str,  # at the middle of its frames
+    "time_utc_ns": int,  # the same, since 1970
+    **dict.fromkeys(("latitude", "longitude", "speed_knots", "position_gap_s"), float),
     "refused": str,  # JSON: reason -> number of frames
     "iou": float,
     "flags": str,  # JSON
@@ -36,6 +39,7 @@ FISH_TABLE: dict[str, type] = {
     "duplicate_of": int,
     **dict.fromkeys(("corrected_length_mm", "corrected_length_std_mm"), float),
     "reviewer": str,
+    "reviewed_utc": str,
     "reviewed_ns": int,  # wall clock, since 1970
     **dict.fromkeys(("weight_source", "legal_source", "source", "run_id"), str),
     **dict.fromkeys(("software_version", "config_sha256", "calibration_sha256"), str),
@@ -59,6 +63,7 @@ def fish_record(
     return values | {
         **_measured(fish),
         **_review_columns(fish.review),
+        **_place_columns(fish),
         "template": template.name,
         "species": fish.review.species or template.name,
         "weight_source": None if derived.weight_kg is None else settings.weight_source,
@@ -82,6 +87,17 @@ def _measured(fish: FishResult) -> dict[str, Any]:
     }
 
 
+def _place_columns(fish: FishResult) -> dict[str, Any]:
+    return {
+        "time_utc": utc_text(fish.utc_ns),
+        "time_utc_ns": fish.utc_ns,
+        "latitude": fish.where.latitude,
+        "longitude": fish.where.longitude,
+        "speed_knots": fish.where.speed_knots,
+        "position_gap_s": fish.where.gap_s,
+    }
+
+
 def _review_columns(review: Review) -> dict[str, Any]:
     return {
         "verdict": review.decision or None,
@@ -90,6 +106,7 @@ def _review_columns(review: Review) -> dict[str, Any]:
         "corrected_length_mm": review.length_mm,
         "corrected_length_std_mm": review.length_std_mm,
         "reviewer": review.reviewer or None,
+        "reviewed_utc": utc_text(review.written_ns or None),
         "reviewed_ns": review.written_ns or None,
     }
 

@@ -6,7 +6,7 @@ times.
 
 import sqlite3
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -16,6 +16,7 @@ from uuid import uuid4
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate
+from stream_dmr.results.added_tables import AddedTable
 from stream_dmr.results.catch_facts import UNKNOWN_CATCH, CatchFacts
 from stream_dmr.results.chain_table import ChainWriter, Statement, read_chain
 from stream_dmr.results.folder_lock import FolderLock
@@ -188,6 +189,20 @@ class LengthStore:
         with self._lock:
             signature = self._chain.row(EVENT, kind, values)
             self._write((statement, tuple(values.values())), *signature)
+
+    def append(
+        self, table: AddedTable, name: str, values: Mapping[str, object], *, is_urgent: bool = True
+    ) -> None:
+        """Add a row of this run to a table, signed by `name`.
+
+        Not `is_urgent`: it is durable with the next fish or mark.
+        """
+        row = {"run_id": self.run_id, **values, "written_ns": time.time_ns()}
+        with self._lock:
+            signature = self._chain.row(table.kind, name, row)
+            self._pending += [(table.statement, ()), table.insertion(row), *signature]
+            if is_urgent:
+                self._write_pending()
 
     def sign_file(self, kind: str, name: str, sha256: str) -> None:
         """Sign a file of the folder by its hash, durably; nothing without a signer."""

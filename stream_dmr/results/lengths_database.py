@@ -32,7 +32,8 @@ _ADDED_COLUMNS: dict[str, dict[str, str]] = {
     "runs": {
         **dict.fromkeys(("source_path", "source_sha256", "boxes_path", "boxes_sha256"), "TEXT"),
         **dict.fromkeys(("masks_path", "masks_sha256", "calibration_path", "ended_by"), "TEXT"),
-        **dict.fromkeys(("frames_done", "frames_promised"), "INTEGER"),
+        **dict.fromkeys(("frames_done", "frames_promised", "utc_zero_ns"), "INTEGER"),
+        **dict.fromkeys(("nmea_path", "nmea_sha256"), "TEXT"),
     },
     "fish": {  # `CatchFacts`
         **{"species_code": "TEXT", "species_share": "REAL"},
@@ -56,7 +57,9 @@ CREATE TABLE runs (
     masks_path TEXT, masks_sha256 TEXT, calibration_path TEXT,
     ended_by TEXT, -- why, for people; NULL: by an older stream-dmr
     frames_done INTEGER, -- that went through the whole chain
-    frames_promised INTEGER -- by the source; of a camera: that came; NULL: unknown
+    frames_promised INTEGER, -- by the source; of a camera: that came; NULL: unknown
+    utc_zero_ns INTEGER, -- added to capture times gives UTC, ns since 1970; NULL: unknown
+    nmea_path TEXT, nmea_sha256 TEXT -- as the files above
 ) STRICT;
 CREATE TABLE fish (
     number INTEGER PRIMARY KEY, -- in the order in which the tracks ended

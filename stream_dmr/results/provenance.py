@@ -54,7 +54,7 @@ def seal_run(folder: Path, *, with_recordings: bool) -> None:
         f"{table}_sha256": {
             run_id: lines_sha256(lines) for run_id, lines in rows_by_run(database, table).items()
         }
-        for table in ("fish", "events")
+        for table in ("fish", "events", "positions")
     }
     _write(
         folder,

@@ -33,12 +33,15 @@ class RunFacts:
     masks_path: str = ""
     masks_sha256: str = ""
     calibration_path: str = ""
+    nmea_path: str = ""
+    nmea_sha256: str = ""
     vessel: str = ""
     trip: str = ""
     haul: str = ""
     ended_by: str = ""  # "": an older stream-dmr, which didn't say
     frames_done: int | None = None  # that went through the whole chain
     frames_promised: int | None = None  # by the source; of a camera: that came; None: unknown
+    utc_zero_ns: int | None = None  # added to capture times gives UTC since 1970; None: unknown
 
 
 def cut_short(facts: RunFacts) -> str:
@@ -57,7 +60,14 @@ def cut_short(facts: RunFacts) -> str:
     return f"{share} of {facts.source} were measured; what ended the run: {facts.ended_by}"
 
 
-def run_facts(header: RunHeader, *, vessel: str = "", trip: str = "", haul: str = "") -> RunFacts:
+def run_facts(
+    header: RunHeader,
+    *,
+    vessel: str = "",
+    trip: str = "",
+    haul: str = "",
+    utc_zero_ns: int | None = None,
+) -> RunFacts:
     """The facts of the run with this header; each hash is of the bytes that the recording holds."""
     parts = header.attachments()
     hashes = {name: sha256(data).hexdigest() for name, data in parts.items()}
@@ -73,5 +83,6 @@ def run_facts(header: RunHeader, *, vessel: str = "", trip: str = "", haul: str 
         "vessel": vessel,
         "trip": trip,
         "haul": haul,
+        "utc_zero_ns": utc_zero_ns,
     }
     return RunFacts(**facts)

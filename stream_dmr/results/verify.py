@@ -144,7 +144,7 @@ def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
     try:
         stored, runs = rows_by_run(database, "fish"), read_runs(database)
         events, times = rows_by_run(database, "events"), run_times(database)
-        said = read_verdicts(database)
+        said, places = read_verdicts(database), rows_by_run(database, "positions")
     except OutputError:
         return  # `_changes` says so
     for run_id, expected in made["fish_sha256"].items():
@@ -158,6 +158,13 @@ def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
             yield Change(database, f"run {run_id}: events were put in")
         elif expected is not None and lines_sha256(events.get(run_id, [])) != expected:
             yield Change(database, f"the events of run {run_id} are not those that were noted")
+    sealed: dict[str, str] = made.get("positions_sha256", {})
+    run_ids = {**sealed, **places} if "positions_sha256" in made else {}  # else an older one
+    for run_id in run_ids:
+        if lines_sha256(places.get(run_id, [])) != sealed.get(run_id, lines_sha256([])):
+            yield Change(
+                database, f"the positions of run {run_id} are not those that were received"
+            )
     for run_id, facts in made["runs"].items():
         for field in fields(RunFacts):
             now = getattr(runs.get(run_id), field.name, "missing")

@@ -12,7 +12,9 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from stream_dmr.errors import OutputError
 from stream_dmr.files import is_locked, sha256_of
+from stream_dmr.results.added_tables import added_rows
 from stream_dmr.results.chain_table import read_chain
+from stream_dmr.results.kept_positions import POSITIONS
 from stream_dmr.results.lengths_database import NAME as DATABASE
 from stream_dmr.results.lengths_database import open_for_reading
 from stream_dmr.results.run_facts import END_COLUMNS, NOT_ENDED
@@ -28,6 +30,7 @@ from stream_dmr.results.signatures import (
     content_sha256,
 )
 from stream_dmr.results.signed_files import RECORDINGS
+from stream_dmr.results.verify_added import added_changes
 
 _Row = Mapping[str, Any]
 
@@ -46,6 +49,7 @@ def check_signatures(folder: Path, key: Ed25519PublicKey) -> SignatureCheck:
     try:
         with closing(open_for_reading(folder / DATABASE)) as database:
             entries = read_chain(database)
+            positions = added_rows(database, POSITIONS)
             tables = {name: _rows(database, name) for name in ("runs", "fish", "events")}
     except (sqlite3.Error, OutputError, TypeError) as error:
         check.changes.append(f"its signatures can't be read: {error}")
@@ -56,6 +60,7 @@ def check_signatures(folder: Path, key: Ed25519PublicKey) -> SignatureCheck:
     check.changes.extend(_broken_links(entries, key))
     check.changes.extend(_rows_by_name(entries, FISH, tables["fish"], "track_id"))
     check.changes.extend(_events(entries, tables["events"]))
+    check.changes.extend(added_changes(entries, POSITIONS, positions))
     check.changes.extend(_runs(entries, tables["runs"], is_going_on=is_locked(folder)))
     check.changes.extend(_files(entries, folder))
     check.notes.extend(_found(entries))

@@ -28,6 +28,7 @@ from stream_dmr.segmentation.detection.open_detector import DetectFishSettings
 from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
 from stream_dmr.segmentation.tracking.tracked_fish import TrackFishSettings
 from stream_dmr.segmentation.training.train_settings import TrainSettings
+from stream_dmr.sensors.sensors_settings import SensorsSettings
 from stream_dmr.settings import Settings
 from stream_dmr.sources.read_settings import ReadFramesSettings
 
@@ -77,6 +78,10 @@ class Config(Settings):
     )
     zones: ZonesSettings = Field(
         default_factory=ZonesSettings, description="what became of a fish, by where its track ends"
+    )
+    sensors: SensorsSettings = Field(
+        default_factory=SensorsSettings,
+        description="positions of `run --nmea`, and their time",
     )
     train: TrainSettings = Field(
         default_factory=TrainSettings, description="how `stream-dmr train` trains the U-Net"
@@ -208,7 +213,7 @@ def _unknown_table(problem: ErrorDetails) -> str:
 def _expected(field: FieldInfo, problem: ErrorDetails) -> str:
     if choices := _choices(field):
         return f"one of {_quoted(choices)}"
-    if field.annotation not in _TYPES:
+    if field.annotation not in _TYPES or problem["type"] == "value_error":
         return problem["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     bounds = [
         f"{word} {getattr(bound, name):g}"

@@ -1,7 +1,7 @@
 """Reads and checks everything that a run needs, before the first frame."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from stream_dmr.calibration.calibration_file import load_calibration, require_size
@@ -14,8 +14,10 @@ from stream_dmr.recording.messages.run_inputs import InputFile, RunInputs
 from stream_dmr.running.conditions import lying, stills
 from stream_dmr.running.config import Config, load_config, to_toml
 from stream_dmr.running.kept_crops import KeptCrops
-from stream_dmr.running.run_request import RunRequest
+from stream_dmr.running.run_request import RunRequest, without_password
 from stream_dmr.segmentation.tracking.fish_finder import FishFinder, open_finder
+from stream_dmr.sensors.open_positions import open_positions
+from stream_dmr.sensors.position_source import PositionSource
 from stream_dmr.sources.source import Source
 from stream_dmr.template.template import Template
 
@@ -32,6 +34,7 @@ class Inputs:
     calibration: Calibration | None
     finder: FishFinder
     reader: ReadFrames
+    positions: PositionSource | None = None  # None: none were asked for
     crops: KeptCrops | None = None  # of the whole source, where its fish were found before
 
     @property
@@ -43,6 +46,12 @@ class Inputs:
     def is_endless(self) -> bool:
         """True for cameras and growing folders, see `Source`."""
         return self.source.is_endless
+
+    @property
+    def utc_zero_ns(self) -> int | None:
+        """What added to a capture time gives UTC, ns since 1970; None: not known."""
+        sensors = self.config.sensors
+        return sensors.offset_ns if _is_since_1970(self.source) else sensors.zero_utc_ns
 
     @property
     def resumes(self) -> bool:
@@ -79,6 +88,7 @@ class Inputs:
             calibration=None
             if request.calibration is None
             else InputFile.read(request.calibration),
+            nmea=None if request.nmea is None else _nmea_input(request.nmea),
         )
 
 
@@ -112,10 +122,25 @@ def checked_inputs(request: RunRequest) -> Inputs:
         finder=finder,
         reader=reader,
     )
-    if calibration is not None:
-        try:
+    try:
+        if calibration is not None:
             require_size(calibration, width=inputs.source.width, height=inputs.source.height)
-        except UserError:
-            reader.close()
-            raise
-    return inputs
+        if request.nmea is None:
+            return inputs
+        positions = open_positions(
+            request.nmea, config.sensors, is_since_1970=_is_since_1970(inputs.source)
+        )
+    except UserError:
+        reader.close()
+        raise
+    return replace(inputs, positions=positions)
+
+
+def _is_since_1970(source: Source) -> bool:
+    """True where capture times are times of day, not from the start of a video."""
+    return source.is_live or source.is_endless
+
+
+def _nmea_input(address: str) -> InputFile:
+    is_file = Path(address).is_file()
+    return InputFile.read(address) if is_file else InputFile(path=without_password(address))

@@ -11,7 +11,7 @@ from stream_dmr.errors import OutputError, UserError
 from stream_dmr.fitting.compile_kernels import compile_kernels
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.shape.candidates import CandidateShapes
-from stream_dmr.messages import LengthEstimate, LocalizedFish, Message
+from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish, Message, Position
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.nodes.localize import Localize
@@ -23,6 +23,7 @@ from stream_dmr.running.error_policy import ErrorPolicy
 from stream_dmr.running.inputs import Inputs, checked_inputs
 from stream_dmr.running.outputs import Outputs, open_outputs
 from stream_dmr.running.pipeline import Node, StageCounters, run_chain
+from stream_dmr.running.position_feed import PositionFeed
 from stream_dmr.running.result_writer import ResultWriter
 from stream_dmr.running.resume import resume_source
 from stream_dmr.running.run_folder import ENDLESS_RESULTS, LEARNT, RESULTS
@@ -92,6 +93,8 @@ def measure_source(
             return _run_chain(inputs, nodes, outputs, observer, stop=stop)
     finally:
         inputs.reader.close()
+        if inputs.positions is not None:
+            inputs.positions.close()
         for line in (*inputs.source.warnings, *inputs.finder.warnings):
             observer.warn(line)
 
@@ -175,12 +178,20 @@ def _run_chain(
     outputs.store.count_frames(inputs.source.num_frames)
     writer = _result_writer(inputs, outputs, on_notice=observer.warn)
     policy = ErrorPolicy(is_endless=inputs.is_endless, on_notice=observer.warn)
+    _begin_positions(inputs, outputs, observer)
     totals = RunTotals(max_fish=_MAX_SUMMARY_FISH if inputs.is_endless else None)
+
+    def on_position(position: Position) -> None:
+        observer.take(writer.write(position))
+
+    positions = PositionFeed(inputs.positions, on_position)
 
     def on_message(message: Message) -> Message:
         message = writer.write(message)
         totals.take(message)
         observer.take(message)
+        if isinstance(message, Frame):
+            positions.take(message)
         return message
 
     def on_frame() -> None:
@@ -206,6 +217,10 @@ def _run_chain(
     except BaseException as error:
         outputs.store.end(f"an error: {type(error).__name__}: {error}")
         raise
+    finally:
+        if line := positions.finish():
+            observer.warn(line)
+        writer.finish()
     return RunSummary(
         fish=totals.fish(),
         may_count_twice=outputs.store.may_count_twice(),
@@ -215,6 +230,14 @@ def _run_chain(
         counters=counters,
         files=[request.out / name for name in (ENDLESS_RESULTS if inputs.is_endless else RESULTS)],
     )
+
+
+def _begin_positions(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> None:
+    if inputs.positions is not None:
+        inputs.positions.listen(observer.warn)
+        is_live = inputs.source.is_live
+        after_ns = outputs.store.resume_after_ns() if is_live else 0
+        inputs.positions.begin(after_ns=after_ns)
 
 
 def _end_of(inputs: Inputs, stop: threading.Event) -> str:
@@ -247,5 +270,6 @@ def _result_writer(
         drift=DriftAlarms(store, inputs.config.drift, on_notice=on_notice)
         if has_drift_alarms
         else None,
+        sensors=inputs.config.sensors,
         on_notice=on_notice,
     )

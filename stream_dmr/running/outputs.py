@@ -63,7 +63,13 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
         out, overwrite=request.overwrite, resume=resume, waits_for_room=is_endless
     )
     header, states = inputs.header(), SinkStates()
-    facts = run_facts(header, vessel=request.vessel, trip=request.trip, haul=request.haul)
+    facts = run_facts(
+        header,
+        vessel=request.vessel,
+        trip=request.trip,
+        haul=request.haul,
+        utc_zero_ns=inputs.utc_zero_ns,
+    )
     with ExitStack() as stack:
         stack.enter_context(sealed(out, with_recordings=not is_endless, on_notice=observer.warn))
         store = LengthStore(out, facts, waits_for_disk=is_endless, signer=signer)
@@ -74,7 +80,14 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
         stack.enter_context(closing(lengths))
         stack.enter_context(closing(observer))
         observer.open(
-            OpenRun(config=config, source=inputs.source, store=store, out=out, sinks=states)
+            OpenRun(
+                config=config,
+                source=inputs.source,
+                positions=inputs.positions,
+                store=store,
+                out=out,
+                sinks=states,
+            )
         )
         interrupted = interrupted_tracks(
             repairs if is_endless else [], store, on_notice=observer.warn

@@ -5,13 +5,29 @@ from collections.abc import Callable, Mapping, Sequence
 from statistics import median
 from types import MappingProxyType
 
-from stream_dmr.messages import FishCrop, Frame, LengthEstimate, LocalizedFish, Message
+from stream_dmr.messages import (
+    FishCrop,
+    Frame,
+    LengthEstimate,
+    LocalizedFish,
+    Message,
+    Position,
+)
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.results.catch_facts import CatchFacts
+from stream_dmr.results.kept_positions import (
+    POSITIONS,
+    KeptPosition,
+    PositionThinner,
+    position_values,
+)
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.lengths_table import LengthsTable
 from stream_dmr.results.store_rows import INTERRUPTED
 from stream_dmr.running.drift_alarms import DriftAlarms
+from stream_dmr.sensors.sensors_settings import SensorsSettings
+
+_SENSORS = SensorsSettings()
 
 
 class ResultWriter:
@@ -30,6 +46,7 @@ class ResultWriter:
         interrupted: Sequence[LocalizedFish] = (),
         flags: Mapping[int, Sequence[str]] = MappingProxyType({}),
         drift: DriftAlarms | None = None,
+        sensors: SensorsSettings = _SENSORS,
         on_notice: Callable[[str], None],
     ) -> None:
         """`clips`: frames done of each clip before; None where the source has no clips.
@@ -39,6 +56,7 @@ class ResultWriter:
         """
         self._store, self._lengths, self._recorder = store, lengths, recorder
         self._flags = flags
+        self._thinner = PositionThinner(keep_s=sensors.keep_s, max_gap_s=sensors.max_gap_s)
         self._drift, self._on_notice = drift, on_notice
         self._clips = None if clips is None else Counter(clips)
         self._clips_in_chain: deque[str] = deque()  # of the frames that are in the chain, in order
@@ -65,6 +83,8 @@ class ResultWriter:
                 self._take_iou(message)
             case LengthEstimate(is_final=True):
                 self._store_fish(message)
+            case Position():
+                self._take_position(message)
             case _:
                 pass
         states = self._recorder.states
@@ -85,6 +105,25 @@ class ResultWriter:
             clip = self._clips_in_chain.popleft()
             self._clips[clip] += 1
             self._store.clip_progress(clip, frames_done=self._clips[clip])
+
+    def finish(self) -> None:
+        """The last message was written: keep the last position, from which others are interpolated.
+
+        Idempotent.
+        """
+        self._keep_positions(self._thinner.finish())
+
+    def _take_position(self, position: Position) -> None:
+        kept = self._thinner.take(position)
+        if self._thinner.gap_s:
+            line = f"no positions for {self._thinner.gap_s:.0f} s"
+            self._store.note("positions", line, timestamp_ns=position.timestamp_ns)
+        self._keep_positions(kept)
+
+    def _keep_positions(self, positions: Sequence[KeptPosition]) -> None:
+        for kept in positions:
+            name = str(kept.timestamp_ns)
+            self._store.append(POSITIONS, name, position_values(kept), is_urgent=False)
 
     def _take_frame(self, frame: Frame) -> None:
         if self._clips is not None:

@@ -10,6 +10,7 @@ from stream_dmr.recording.messages.sink_states import SinkStates
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.running.config import Config
 from stream_dmr.running.pipeline import Chain
+from stream_dmr.sensors.position_source import PositionSource
 from stream_dmr.sources.source import Source
 
 
@@ -19,6 +20,7 @@ class OpenRun:
 
     config: Config
     source: Source
+    positions: PositionSource | None = None
     store: LengthStore
     out: Path
     sinks: SinkStates

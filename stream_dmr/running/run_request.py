@@ -27,6 +27,7 @@ class RunRequest:
     vessel: str = ""  # vessel, trip and haul, for the exports
     trip: str = ""
     haul: str = ""
+    nmea: str | None = None  # positions: a file, tcp://..., udp://... or a serial device
     key: Path | None = None  # of the device, to sign with
 
 

@@ -1,11 +1,13 @@
 """/metrics: the counters of a run for Prometheus, computed when they are asked for."""
 
 from collections.abc import Iterator
+from dataclasses import asdict
 
 from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from stream_dmr.sensors.fix_builder import COUNTED
 from stream_dmr.watch.run_state import RunState
 
 
@@ -19,6 +21,7 @@ class RunMetrics(Collector):
         """Give all metrics as they are now."""
         yield from self._stages()
         yield from self._camera()
+        yield from self._positions()
         yield from self._results()
 
     def _stages(self) -> Iterator[Metric]:
@@ -57,6 +60,19 @@ class RunMetrics(Collector):
         )
         age_s = self._state.last_frame_age_s()
         yield _gauge("last_frame_age_seconds", "Since the last frame came.", age_s or 0.0)
+
+    def _positions(self) -> Iterator[Metric]:
+        if self._state.positions is None:
+            return
+        sentences = CounterMetricFamily(
+            "stream_dmr_position_sentences",
+            "Sentences from the receiver of positions, and what became of them.",
+            labels=["outcome"],
+        )
+        counts = asdict(self._state.positions.counts)
+        for outcome in COUNTED:
+            sentences.add_metric([outcome], counts[outcome])
+        yield sentences
 
     def _results(self) -> Iterator[Metric]:
         fish = CounterMetricFamily("stream_dmr_fish", "Finished fish.", labels=["status"])

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from stream_dmr.catch.zones import ZonesSettings
-from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
+from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish, Message, Position
 from stream_dmr.reasons import without_counts
 from stream_dmr.recording.messages.sink_states import SinkStates
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.running.pipeline import Chain
+from stream_dmr.sensors.position_source import PositionSource
 from stream_dmr.sources.source import Source
 
 _MAX_FRAMES = 16  # more than the chain's queues hold, so that a fish finds its frame
@@ -59,9 +60,12 @@ class RunState:
         stuck_s: float,
         sinks: SinkStates | None = None,
         zones: ZonesSettings | None = None,
+        positions: PositionSource | None = None,
     ) -> None:
         """A camera that is silent for `silence_s` and a frame that takes `stuck_s` are problems."""
         self.source = source
+        self.positions = positions
+        self.position: Position | None = None  # the latest
         self.chain: Chain | None = None
         self.sinks = sinks or SinkStates()
         self.finished: deque[LengthEstimate] = deque(maxlen=MAX_FINISHED)  # newest last
@@ -96,6 +100,8 @@ class RunState:
             match message:
                 case Frame():
                     self._frames.append(message)
+                case Position():
+                    self.position = message
                 case FittedMesh(report=report) if report is not None:
                     self.fit_s.append(report.elapsed_ns / 1e9)
                 case LocalizedFish():
@@ -181,6 +187,8 @@ class RunState:
             problems.append(f"no picture from the camera for {age_s:.0f} s")
         if self.is_stuck():
             problems.append("the measurement hangs")
+        if self.positions is not None:
+            problems += self.positions.problems()
         return problems + self.sinks.problems()
 
     def is_stuck(self) -> bool:

@@ -30,6 +30,7 @@ class WatchObserver(RunObserver):
             stuck_s=settings.stuck_s,
             sinks=run.sinks,
             zones=run.config.zones,
+            positions=run.positions,
         )
         state.continue_after(run.store)
         self._server = WatchServer(state, settings) if settings.port else None

@@ -11,7 +11,9 @@ from typing import Any
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from stream_dmr.errors import ConfigError, OutputError
+from stream_dmr.results.table_cells import utc_text
 from stream_dmr.running.run_settings import WatchSettings
+from stream_dmr.sensors.fix_builder import COUNTED
 from stream_dmr.watch.frame_picture import draw_fish, encode_jpeg
 from stream_dmr.watch.run_metrics import make_registry
 from stream_dmr.watch.run_state import RunState
@@ -147,6 +149,22 @@ def health_json(state: RunState) -> dict[str, Any]:
         "problems": problems,
         "warnings": _warnings_json(state),
         "sinks": sinks,
+        "positions": positions_json(state),
+    }
+
+
+def positions_json(state: RunState) -> dict[str, Any] | None:
+    """The last position, and what came from the receiver; None of a run without positions."""
+    if state.positions is None:
+        return None
+    last, counts = state.position, state.positions.counts
+    return {
+        "latitude": None if last is None else last.latitude,
+        "longitude": None if last is None else last.longitude,
+        "speed_knots": None if last is None else last.speed_knots,
+        "utc": None if last is None else utc_text(last.utc_ns),
+        "left_out": counts.left_out(),
+        "counts": {name: getattr(counts, name) for name in COUNTED},
     }
 
 
@@ -167,6 +185,7 @@ def status_json(state: RunState) -> dict[str, Any]:
         "species": dict(state.species.most_common()),
         "fates": dict(state.fates.most_common()),
         "fish_per_hour": state.fish_per_hour(),
+        "positions": positions_json(state),
         "frames_per_s": state.frames_per_s(),
         "last_frame_age_s": state.last_frame_age_s(),
         "fish": [

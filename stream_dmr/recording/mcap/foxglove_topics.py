@@ -11,6 +11,7 @@ from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.timestamp_pb2 import Timestamp
@@ -18,7 +19,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import Calibration, Camera
-from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, Frame, LocalizedFish
+from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, Frame, LocalizedFish, Position
 from stream_dmr.recording.messages.picture_codec import compress
 from stream_dmr.recording.messages.record import Record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
@@ -42,7 +43,7 @@ _SCHEMAS = {
     schema.DESCRIPTOR.full_name: schema
     for schema in (
         *(CompressedImage, CameraCalibration, FrameTransform),
-        *(SceneUpdate, ImageAnnotations),
+        *(SceneUpdate, ImageAnnotations, LocationFix),
     )
 }
 
@@ -65,6 +66,8 @@ class FoxgloveTopics:
         if isinstance(message, Frame):
             if self._throttle.shows(message):
                 yield from self._frame(message)
+        elif isinstance(message, Position):
+            yield "/foxglove/position", _location(message)
         elif not self._throttle.has_shown(message.frame_index):
             return
         elif isinstance(message, FishCrop):
@@ -142,6 +145,15 @@ def _distortion_model(camera: Camera) -> str:
     if camera.is_fisheye:
         return "kannala_brandt"
     return "rational_polynomial" if len(camera.distortion) > 5 else "plumb_bob"
+
+
+def _location(position: Position) -> LocationFix:
+    return LocationFix(
+        timestamp=_time(max(0, position.timestamp_ns)),
+        frame_id=_CAMERA,
+        latitude=position.latitude,
+        longitude=position.longitude,
+    )
 
 
 def _plane(calibration: Calibration, now: Timestamp) -> FrameTransform:

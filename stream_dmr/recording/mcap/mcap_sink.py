@@ -20,7 +20,7 @@ from mcap_protobuf.schema import register_schema
 
 from stream_dmr.errors import OutputError
 from stream_dmr.files import TransactionalFile, rename_durably, sync_path
-from stream_dmr.messages import Frame, LocalizedFish
+from stream_dmr.messages import FishMessage, LocalizedFish
 from stream_dmr.recording.messages.record import Record
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.schema import schema_bytes
@@ -113,7 +113,7 @@ class McapSink:
         timestamp_ns = record.message.timestamp_ns
         with self._closing_on_error():
             self._add(self._channels[type(record.message)], timestamp_ns, record.payload)
-            if not isinstance(record.message, Frame):
+            if isinstance(record.message, FishMessage):
                 self._extend_span(record.message.track_id, timestamp_ns)
             for topic, drawn in chain.from_iterable(e.draw(record) for e in self._extras):
                 channel = self._extra_channels[topic]
@@ -162,9 +162,8 @@ class McapSink:
     def _add(self, channel: int, timestamp_ns: int, data: bytes) -> None:
         self._has_unflushed = True
         self._sequences[channel] += 1
-        self._writer.add_message(
-            channel, timestamp_ns, data, timestamp_ns, self._sequences[channel]
-        )
+        log_ns = max(0, timestamp_ns)  # a position before a video's start; MCAP has no time for it
+        self._writer.add_message(channel, log_ns, data, log_ns, self._sequences[channel])
 
     def _extend_span(self, track_id: int, timestamp_ns: int) -> None:
         first, last = self._spans.get(track_id, (timestamp_ns, timestamp_ns))

@@ -41,7 +41,7 @@ DATACLASSES: dict[str, type] = {
     kind.__name__: kind
     for kind in (
         *(messages.Frame, messages.FishCrop, messages.FittedMesh),
-        *(messages.LocalizedFish, messages.LengthEstimate),
+        *(messages.LocalizedFish, messages.LengthEstimate, messages.Position),
         *(messages.CropQuality, messages.FishEnds, messages.FittedShape),
         *(messages.LossTerms, messages.SolverReport),
         *(Camera, ReferencePlane, Calibration),

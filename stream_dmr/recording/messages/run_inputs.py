@@ -43,6 +43,7 @@ class RunInputs:
     boxes: InputFile | None = None
     masks: InputFile | None = None
     calibration: InputFile | None = None
+    nmea: InputFile | None = None  # positions: a file, or the address of a receiver
 
     def metadata(self) -> dict[str, str]:
         """As the recording's metadata have it: `source_path`, `source_sha256`, `boxes_path`, ..."""

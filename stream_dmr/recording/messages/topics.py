@@ -2,7 +2,15 @@
 
 from dataclasses import dataclass
 
-from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
+from stream_dmr.messages import (
+    FishCrop,
+    FittedMesh,
+    Frame,
+    LengthEstimate,
+    LocalizedFish,
+    Message,
+    Position,
+)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -33,6 +41,7 @@ KEYPOINTS_3D, MIDLINE = "scene/fish/{id}/keypoints", "scene/fish/{id}/midline"
 FRAME_LENGTH, LENGTH = "length/{id}/frame", "length/{id}/estimate"
 IOU, BENDING, FIT_MS = "iou/{id}", "bending/{id}", "fit_ms/{id}"
 LOG, REFUSALS, RESULTS = "log", "log/refusals", "log/lengths"
+VESSEL, TRACK = "map/vessel", "map/track"  # where it is; where it has been, once and static
 CAMERA, PLANE = "scene/camera", "scene/plane"  # static, from the header
 FISH_ROOTS = ("scene/camera/fish", "scene/fish")  # cleared by every new frame
 END = "messages/end"  # the last row of a whole .rrd: how many messages each payload path has
@@ -55,6 +64,7 @@ TOPICS: dict[type[Message], Topic] = {
             entities=(BOX, KEYPOINTS_2D, KEYPOINTS_3D, MIDLINE, FRAME_LENGTH, BENDING),
         ),
         Topic(message=LengthEstimate, topic="/length", entities=(LENGTH, REFUSALS, RESULTS)),
+        Topic(message=Position, topic="/position", entities=(VESSEL,)),
     )
 }
 
@@ -69,6 +79,7 @@ FOXGLOVE_TOPICS = {
     "/foxglove/fish": "foxglove.SceneUpdate",
     "/foxglove/outlines": "foxglove.ImageAnnotations",
     "/foxglove/keypoints": "foxglove.ImageAnnotations",
+    "/foxglove/position": "foxglove.LocationFix",
 }
 """Topic -> schema, in the .mcap with `foxglove = true`."""
 

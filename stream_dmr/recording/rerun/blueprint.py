@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 
 from stream_dmr.camera import Calibration, Camera
 from stream_dmr.recording.messages import topics
+from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.topics import CAMERA, LOG, PLANE
 from stream_dmr.recording.view.palette import color
 
@@ -56,11 +57,15 @@ def appearance(track_id: int, faces: Int[np.ndarray, "F 3"]) -> dict[str, rr.AsC
     }
 
 
-def blueprint(calibration: Calibration | None) -> rrb.Blueprint:
+def blueprint(header: RunHeader) -> rrb.Blueprint:
     """The layout: frame and 3D scene above; length, IoU and the log of events below.
 
-    Without a calibration there are no lengths, so the bending ratio takes their place.
+    Without a calibration there are no lengths, so the bending ratio takes their place. Where the
+    run was given positions, there is a map; its ground needs the internet.
     """
+    calibration = header.calibration
+    has_positions = header.inputs is not None and header.inputs.nmea is not None
+    maps = [rrb.MapView(origin="map", name="Map")] if has_positions else []
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
@@ -81,6 +86,7 @@ def blueprint(calibration: Calibration | None) -> rrb.Blueprint:
                     _series("fit_ms", "Time of a fit, ms", axis_y=rrb.ScalarAxis(range=(0, 100))),
                 ),
                 rrb.Tabs(
+                    *maps,
                     rrb.TextLogView(origin=LOG, name="Refusals and lengths", columns=_LOG_COLUMNS),
                     rrb.TextDocumentView(origin=RUN, name="Run"),
                 ),

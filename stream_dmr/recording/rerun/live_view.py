@@ -40,7 +40,7 @@ class LiveView:
         self.address = f"rerun+http://127.0.0.1:{port}/proxy"
         self._rec = new_stream()
         sink = rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=_MEMORY)
-        self._rec.set_sinks(sink, default_blueprint=blueprint(header.calibration))
+        self._rec.set_sinks(sink, default_blueprint=blueprint(header))
         log_run(self._rec, header)
         self._drawing = SceneDrawing(self._rec, header, settings)
         self._thread = Thread(target=self._draw_all, name="live", daemon=True)

@@ -35,7 +35,7 @@ class RrdSink:
         self._rec = new_stream()
         try:
             sink = rr.FileSink(str(path))
-            self._rec.set_sinks(sink, default_blueprint=blueprint(header.calibration))
+            self._rec.set_sinks(sink, default_blueprint=blueprint(header))
         except RuntimeError as error:
             raise self._output_error(error) from error
         self._drawing = SceneDrawing(self._rec, header, settings)
@@ -63,7 +63,7 @@ class RrdSink:
             return
         self._closed = True
         try:
-            self._drawing.send()
+            self._drawing.finish()
             if self._with_messages:
                 self._log_end()
             self._flush()

@@ -11,12 +11,14 @@ from jaxtyping import Float
 from stream_dmr.camera import Camera
 from stream_dmr.messages import (
     FishCrop,
+    FishMessage,
     FittedMesh,
     FittedShape,
     Frame,
     LengthEstimate,
     LocalizedFish,
     Message,
+    Position,
 )
 from stream_dmr.recording.messages import topics
 from stream_dmr.recording.messages.picture_codec import color_labels, compress
@@ -45,6 +47,8 @@ from stream_dmr.recording.view.view_geometry import (
 
 _HALF_PIXEL = 0.5  # Rerun's origin is the corner of the top-left pixel, ours its centre
 _JPEG_QUALITY = 70  # pictures are only for orientation
+_MAX_TRACK_POINTS = 2000
+_TRACK_COLOR = (90, 170, 230)
 
 
 class SceneDrawing:
@@ -70,6 +74,8 @@ class SceneDrawing:
         self._labels = np.zeros((0, 0), np.uint8)  # masks so far of frame `_labels_frame`
         self._labels_frame = 0
         self._no_masks = b""
+        self._track: list[list[float]] = []  # latitude and longitude of positions so far
+        self._track_every, self._num_positions = 1, 0
         rec.log("scene", rr.ViewCoordinates.RDF, static=True)
         for path, what in PICTURES.items():
             rec.log(path, what, static=True)
@@ -90,6 +96,8 @@ class SceneDrawing:
                 self._localized(fish)
             case LengthEstimate() as estimate:
                 self._length(estimate)
+            case Position() as position:
+                self._position(position)
 
     def add_payload(self, record: Record) -> None:
         """Add the encoded message to the stream, numbered, since Rerun sorts by time."""
@@ -103,6 +111,23 @@ class SceneDrawing:
     def send(self) -> None:
         """Send what was drawn to Rerun."""
         self._columns.send()
+
+    def finish(self) -> None:
+        """Draw what is known only at the end: the vessel's track."""
+        if len(self._track) > 1:
+            track = rr.GeoLineStrings(lat_lon=[self._track], colors=[_TRACK_COLOR])
+            self._rec.log(topics.TRACK, track, static=True)
+        self.send()
+
+    def _position(self, position: Position) -> None:
+        place = [position.latitude, position.longitude]
+        self._add(topics.VESSEL, rr.GeoPoints, position, positions=[place])
+        if self._num_positions % self._track_every == 0:
+            self._track.append(place)
+        self._num_positions += 1
+        if len(self._track) > _MAX_TRACK_POINTS:
+            self._track = self._track[::2]
+            self._track_every *= 2
 
     def _set_camera(self, camera: Camera, *, depth: float) -> None:
         self._factor = view_factor(camera.width, camera.height, most_px=self._settings.view_px)
@@ -214,7 +239,7 @@ class SceneDrawing:
         self._add(path, rr.TextLog, estimate, text=[line], level=[str(level)], color=tint)
 
     def _add(self, path: str, archetype: Any, message: Message, **values: Any) -> None:
-        if not isinstance(message, Frame):
+        if isinstance(message, FishMessage):
             path = path.format(id=message.track_id)
         moment = (message.frame_index, message.timestamp_ns)
         self._columns.add(path, archetype, moment, **values)

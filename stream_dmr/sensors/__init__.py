@@ -1,0 +1,1 @@
+"""Sensors beside the camera: the receiver of positions, from files and while it sends."""
