@@ -22,7 +22,7 @@ from stream_dmr.results.fish_table import FISH_TABLE, arrow_schema, fish_record
 from stream_dmr.results.frames_table import FRAMES_COLUMNS
 from stream_dmr.results.lengths_database import NAME as DATABASE
 from stream_dmr.results.provenance import add_files
-from stream_dmr.results.verdicts import read_verdicts
+from stream_dmr.results.verdicts_table import read_verdicts
 from stream_dmr.running.config import parse_config
 
 _PARTITIONS = ("vessel", "trip")

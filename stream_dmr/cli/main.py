@@ -21,7 +21,8 @@ from stream_dmr.cli.learn import learn_template
 from stream_dmr.cli.make_template import make_template
 from stream_dmr.cli.recover import recover
 from stream_dmr.cli.replay import replay
-from stream_dmr.cli.report import report, review, verify
+from stream_dmr.cli.report import report, verify
+from stream_dmr.cli.review import review
 from stream_dmr.cli.run import run
 from stream_dmr.cli.shared_options import OverwriteOption
 from stream_dmr.cli.train import train

@@ -1,12 +1,12 @@
-"""`stream-dmr verify`, `report` and `review`: the commands of a reviewer."""
+"""`stream-dmr verify` and `report`."""
 
-from contextlib import closing, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from stream_dmr.cli.shared_options import OverwriteOption, stop_on_signals, warn
+from stream_dmr.cli.shared_options import OverwriteOption, warn
 
 _Source = Annotated[
     str | None,
@@ -85,37 +85,3 @@ def report(
     size = write_report(reports, out, title=path.resolve().name, notes=failed)
     warn(line for report in reports for line in report.recording.warnings)
     print(f"{out}: {sum(len(report.fish) for report in reports)} fish, {size / 1e6:.1f} MB")
-
-
-def review(
-    folder: Annotated[Path, typer.Argument(help="The --out of a run.", metavar="DIR")],
-    reviewer: Annotated[
-        str, typer.Option(help="Your name, for the verdicts.", show_default="who is logged in")
-    ] = "",
-    port: Annotated[
-        int, typer.Option(help="Port on this machine; 0: any free one.", min=0, max=65535)
-    ] = 0,
-    source: _Source = None,
-    config: _Config = None,
-) -> None:
-    """Serve the page of `report` on this machine and take verdicts into lengths.db.
-
-    Verdicts stand beside the measurements, which stay as they are; Ctrl-C ends it.
-    """
-    with stop_on_signals() as stop:
-        from getpass import getuser
-
-        from stream_dmr.errors import UserError
-        from stream_dmr.report.open_reports import is_batch, open_report
-        from stream_dmr.review.review_server import ReviewServer
-
-        if is_batch(folder):
-            raise UserError(
-                f"{folder}: expected the --out of a run, got that of a batch; review its videos "
-                f"one by one: {folder / 'videos'}/NAME"
-            )
-        opened = open_report(folder, source=source, config=config)
-        warn(opened.recording.warnings)
-        with closing(ReviewServer(opened, reviewer=reviewer or getuser(), port=port)) as server:
-            print(f"open {server.address}\nCtrl-C ends it", flush=True)
-            stop.wait()

@@ -10,7 +10,7 @@ from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.replaying.replay_inputs import ReplayInputs
 from stream_dmr.replaying.replay_request import ReplayRequest
-from stream_dmr.results.finished_fish import database_of, read_runs, read_stored_fish
+from stream_dmr.results.finished_fish import database_of, read_measured_fish, read_runs
 from stream_dmr.results.frames_table import FramesTable
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.lengths_table import LengthsTable
@@ -36,7 +36,7 @@ def read_recorded_run(recordings: Sequence[Path], header: RunHeader) -> Original
     expected = run_facts(header)
     facts, flags = None, dict[int, Sequence[str]]()
     for database in dict.fromkeys(databases):
-        flags |= {one.estimate.track_id: one.flags for one in read_stored_fish(database)}
+        flags |= {one.estimate.track_id: one.flags for one in read_measured_fish(database)}
         made = [run for run in read_runs(database).values() if _is_same(run, expected)]
         facts = made[-1] if made else facts
     return OriginalRun(facts=facts, flags=flags)

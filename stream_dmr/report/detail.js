@@ -43,6 +43,7 @@ function factList(fish) {
     ["legal size", legal],
     ["frames", `${fish.frames_used} used of ${fish.frames_seen}, ${fish.first_frame} to ${fish.last_frame}`],
     ["refused", reasons], ["flags", fish.flags.join(", ")],
+    ["frames chosen by", { add: "a reviewer: added", split: "a reviewer: split", merge: "a reviewer: merged" }[fish.origin] ?? ""],
     ["verdict", [fish.verdict, fish.verdict_reason, fish.duplicate_of === null ? null : `of fish ${fish.duplicate_of}`, fish.reviewer && `by ${fish.reviewer}, ${new Date(fish.reviewed_ns / 1e6).toISOString().slice(0, 16)} UTC`].filter(Boolean).join(", ")],
     ["species", fish.species], ["vessel, trip, haul", [fish.vessel, fish.trip, fish.haul].filter(Boolean).join(", ")],
     ["source", run.source], ["software", run.software_version], ["config", run.config_sha256], ["calibration", run.calibration_sha256], ["template", run.template_sha256],
@@ -51,16 +52,20 @@ function factList(fish) {
     .flatMap(([name, value]) => [element("dt", { textContent: name }), element("dd", { textContent: value })]));
 }
 
-function drawDetail(fish) {
+async function drawDetail(fish) {
   const panel = document.getElementById("detail");
-  fish.detail = JSON.parse(document.getElementById(`fish-${fish.id}`).textContent);
+  fish.detail ??= fish.isLate ? await detailOfServer(fish) : JSON.parse(document.getElementById(`fish-${fish.id}`).textContent);
+  if (state.chosen !== fish.id) return;
   const views = element("div", { className: "views" }, ...fish.detail.views.map((view) => viewFigure(view, fish)));
   const overlay = element("input", { type: "checkbox", checked: true, onchange: () => views.classList.toggle("plain", !overlay.checked) });
   panel.replaceChildren(
     element("h2", { textContent: `Fish ${fish.track_id}${fish.video && ` of ${fish.video}`}: ${lengthText(fish)}` }),
+    ...(isReview() ? reviewParts(fish, views) : []),
     element("label", {}, overlay, " mask (yellow), mesh (green), head (red), center, tail (blue)"),
-    views, ...reviewTools(fish, views), element("div", { className: "pair" }, FRAMES_PLOT, MESH_PLOT), factList(fish));
-  panel.scrollTop = 0;
+    views, element("div", { className: "pair" }, FRAMES_PLOT, MESH_PLOT), factList(fish));
+  if (panel.dataset.fish !== String(fish.id)) panel.scrollTop = 0;
+  panel.dataset.fish = fish.id;
+  if (isReview()) return showParts(fish);
   drawFrames(FRAMES_PLOT, fish.detail.frames);
   setTimeout(() => state.chosen === fish.id && drawMesh(MESH_PLOT, fish.detail.mesh, fish.unit));  // last, since it is slow
 }

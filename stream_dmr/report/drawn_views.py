@@ -11,6 +11,7 @@ from jaxtyping import Float, UInt8
 
 from stream_dmr.camera import Camera
 from stream_dmr.errors import SourceError
+from stream_dmr.recording.reading.frame_lookup import FrameLookup
 from stream_dmr.recording.reading.open_recording import Recording
 from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
 from stream_dmr.recording.view.view_geometry import place_fit
@@ -46,11 +47,16 @@ DrawnViews = Mapping[int, list[DrawnView]]  # track id -> its best views, the be
 
 
 def draw_views(
-    tracks: Mapping[int, RecordedTrack], recording: Recording, source: str | None = None
+    tracks: Mapping[int, RecordedTrack],
+    recording: Recording,
+    source: str | None = None,
+    *,
+    pictures: FrameLookup | None = None,
 ) -> DrawnViews:
     """Draw the views of all tracks, with the pictures of `source` or of the recording.
 
-    Without `source`, the recorded one is tried. Fish without a picture are drawn by their masks.
+    Without `source`, the recorded one is tried. With `pictures`, which find a frame without
+    reading all before it, nothing else is read. Fish without a picture are drawn by their masks.
     Raises SourceError where a given `source` is not the recorded one.
     """
     meshes = MeshRebuilder(recording.header.template, recording.header.candidates)
@@ -59,7 +65,13 @@ def draw_views(
         for view in track.views:
             waiting[view.row.fish.frame_index].append((track_id, view))
     drawn_views: defaultdict[int, list[DrawnView]] = defaultdict(list)
-    for frame_index, image in _read_frames(recording, set(waiting), source):
+    if pictures is None:
+        images = _read_frames(recording, set(waiting), source)
+    else:
+        times = {view.row.fish.timestamp_ns for views in waiting.values() for _, view in views}
+        found = (one.frame for t in sorted(times) for one in pictures.frames((t, t + 1)))
+        images = ((frame.frame_index, frame.image) for frame in found if frame.image.size)
+    for frame_index, image in images:
         for track_id, view in waiting.pop(frame_index, []):
             drawn_views[track_id].append(_draw_view(view, meshes, recording, image))
     for views in waiting.values():

@@ -1,39 +1,90 @@
 """Opens the results of a run or a batch for a report, and writes its page."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from stream_dmr.batch.layout import DONE, FAILED, VIDEO_FOLDERS, VIDEOS, read_videos
 from stream_dmr.errors import UserError
 from stream_dmr.files import make_folder, writing_to
+from stream_dmr.recording.messages.selection import Selection
+from stream_dmr.recording.reading.frame_lookup import FrameLookup
 from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.report.drawn_views import draw_views
-from stream_dmr.report.recorded_tracks import read_tracks
+from stream_dmr.report.recorded_tracks import ReviewedTracks, read_tracks
 from stream_dmr.report.report_page import render_page
 from stream_dmr.report.run_report import RunReport
-from stream_dmr.results.finished_fish import read_fish, run_notes
+from stream_dmr.results.finished_fish import database_of, read_fish, read_measured_fish, run_notes
 from stream_dmr.results.provenance import add_files
-from stream_dmr.running.config import load_config, parse_config
+from stream_dmr.results.track_edits import NO_EDITS, edits_of
+from stream_dmr.results.verdicts_table import read_added_frames, read_verdicts
+from stream_dmr.running.config import Config, load_config, parse_config
 
 
-def open_report(path: Path, *, source: str | None = None, config: Path | None = None) -> RunReport:
-    """Read the report of a run's folder or of a recording.
+def open_report(
+    path: Path,
+    *,
+    source: str | None = None,
+    config: Path | None = None,
+    as_measured: bool = False,
+) -> RunReport:
+    """Read the report of a run's folder or of a recording; `as_measured`: without any review.
 
     Raises a UserError where they can't be read, or where `source` is not the recorded one.
     """
     recording = open_recordings([path])
     header = recording.header
     of_run = parse_config(header.config_toml, where=f"{path}: its config.toml")
-    tracks = read_tracks(recording)
+    reviewed = None if as_measured else reviewed_tracks(path, of_run)
+    database = database_of(path)
+    if as_measured and database is not None:
+        fish = read_measured_fish(database)
+    else:
+        fish = read_fish(path, recording)
+    tracks = read_tracks(recording, reviewed=reviewed)
     return RunReport(
         path=path,
         recording=recording,
-        fish=read_fish(path, recording),
+        fish=fish,
         tracks=tracks,
         views=draw_views(tracks, recording, source),
         config=of_run,
         settings=(of_run if config is None else load_config(config)).fisheries,
+        edits=NO_EDITS if reviewed is None else reviewed.edits,
+        source=source,
         notes=run_notes(path),
+    )
+
+
+def reviewed_tracks(path: Path, config: Config) -> ReviewedTracks | None:
+    """What reviewers changed of a run's tracks; None of a recording without its database."""
+    database = database_of(path)
+    if database is None:
+        return None
+    return ReviewedTracks(
+        edits=edits_of(read_verdicts(database)),
+        added=read_added_frames(database),
+        settings=config.smooth_length,
+    )
+
+
+def reread_fish(report: RunReport, changed: frozenset[int], pictures: FrameLookup) -> RunReport:
+    """The report after more edits of reviewers, with the frames and views of the `changed` fish."""
+    reviewed = reviewed_tracks(report.path, report.config)
+    if reviewed is None:
+        return report
+    parts = (part for fish in changed for part in reviewed.edits.parts_of(fish))
+    selection = Selection(tracks=frozenset(part.track_id for part in parts))
+    read = read_tracks(report.recording, selection=selection, reviewed=reviewed)
+    tracks = {fish: track for fish, track in read.items() if fish in changed}
+    views = draw_views(tracks, report.recording, pictures=pictures)
+    gone = changed - tracks.keys()
+    return replace(
+        report,
+        fish=read_fish(report.path, report.recording),
+        tracks={k: v for k, v in {**report.tracks, **tracks}.items() if k not in gone},
+        views={k: v for k, v in {**report.views, **views}.items() if k not in gone},
+        edits=reviewed.edits,
     )
 
 
@@ -42,20 +93,53 @@ def is_batch(path: Path) -> bool:
     return (path / VIDEOS).is_file()
 
 
-def open_batch(out: Path, *, config: Path | None = None) -> tuple[list[RunReport], list[str]]:
+def open_batch(
+    out: Path, *, config: Path | None = None, as_measured: bool = False
+) -> tuple[list[RunReport], list[str]]:
     """A report of each video that is done, and a line for each that failed. Raises UserError."""
     rows = read_videos(out)
     done = [row["name"] for row in rows if row["status"] == DONE]
     failed = [f"{row['name']}: {row['reason']}" for row in rows if row["status"] == FAILED]
     if not done:
         raise UserError(f"{out / VIDEOS}: expected videos that are done, got none")
-    reports = [open_report(out / VIDEO_FOLDERS / name, config=config) for name in done]
-    if len({report.recording.header.template.name for report in reports}) > 1:
-        raise UserError(
-            f"{out}: expected videos of one template, got several; report them one by one: "
-            f"{out / VIDEO_FOLDERS / done[0]}, ..."
-        )
+    folders = (out / VIDEO_FOLDERS / name for name in done)
+    reports = [open_report(one, config=config, as_measured=as_measured) for one in folders]
+    _require_one_template(reports, out)
     return reports, failed
+
+
+def open_folders(
+    folders: Sequence[Path],
+    *,
+    source: str | None = None,
+    config: Path | None = None,
+    as_measured: bool = False,
+) -> tuple[list[RunReport], list[str]]:
+    """A report of each run of several folders and batches, and a line for each video that failed.
+
+    Raises UserError, also where their fish can't stand in one page.
+    """
+    reports, failed = list[RunReport](), list[str]()
+    for folder in folders:
+        if is_batch(folder):
+            opened, lines = open_batch(folder, config=config, as_measured=as_measured)
+            failed += lines
+        else:
+            opened = [open_report(folder, source=source, config=config, as_measured=as_measured)]
+        reports += opened
+    if source is not None and len(reports) > 1:
+        raise UserError("--source: expected one run, got several, which have their own")
+    _require_one_template(reports, folders[0])
+    return reports, failed
+
+
+def _require_one_template(reports: Sequence[RunReport], where: Path) -> None:
+    names = {report.recording.header.template.name for report in reports}
+    if len(names) > 1:
+        raise UserError(
+            f"{where}: expected videos of one template, got {', '.join(sorted(names))}; take them "
+            f"one by one: {reports[0].path}, ..."
+        )
 
 
 def write_report(

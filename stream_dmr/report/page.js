@@ -2,6 +2,7 @@
 
 const DATA = JSON.parse(document.getElementById("data").textContent);
 const FACES = decodeArray(DATA.faces, Uint32Array);
+const NARROW = "(max-width: 900px)";
 const FILTERS = ["search", "status", "verdict", "shortest", "longest", "frames"];
 
 function filterValues() {
@@ -13,6 +14,8 @@ function show() {
   document.getElementById("count").textContent = `${state.shown.length} of ${DATA.fish.length} fish`;
   drawTable();
   drawSummary(state.shown);
+  if (isReview()) drawReviewBar();
+  if (isReview() && !document.getElementById("plots-too").checked) return;  // quicker from fish to fish
   drawHistogram(state.shown);
   drawTime(state.shown, choose);
 }
@@ -28,33 +31,23 @@ function choose(id) {
   if (!fish) return;
   state.chosen = id;
   drawRows(choose);
-  drawDetail(fish);
+  const drawn = drawDetail(fish);
+  const panel = document.getElementById("detail");
+  if (matchMedia(NARROW).matches) drawn.then(() => panel.scrollIntoView({ block: "start" }));
 }
 
-function replaceFish(fish) {
-  DATA.fish[DATA.fish.findIndex((one) => one.id === fish.id)] = fish;
-  show();
+// Chooses a fish and brings its row into sight.
+function showFish(fish) {
+  const table = document.getElementById("table");
+  const top = state.shown.indexOf(state.shown.find((one) => one.id === fish.id)) * ROW_PX;
+  if (top >= 0 && (top < table.scrollTop || top + ROW_PX > table.scrollTop + table.clientHeight)) table.scrollTop = top;
   choose(fish.id);
-}
-
-// Shows the verdicts given since the page was made, also by others. What is open stays as it is.
-let lastAnswer = "";
-async function refresh() {
-  const text = await fetch("reviewed.json").then((answer) => (answer.ok ? answer.text() : lastAnswer), () => lastAnswer);
-  if (text === lastAnswer) return;
-  lastAnswer = text;
-  for (const fish of JSON.parse(text)) DATA.fish[DATA.fish.findIndex((one) => one.id === fish.id)] = fish;
-  show();
 }
 
 function step(by) {
   const at = state.shown.findIndex((one) => one.id === state.chosen) + by;
   const fish = state.shown[Math.max(0, Math.min(state.shown.length - 1, at))];
-  if (!fish) return;
-  const table = document.getElementById("table");
-  const top = state.shown.indexOf(fish) * ROW_PX;
-  if (top < table.scrollTop || top + ROW_PX > table.scrollTop + table.clientHeight) table.scrollTop = top;
-  choose(fish.id);
+  if (fish) showFish(fish);
 }
 
 let waiting = 0;
@@ -71,8 +64,5 @@ document.getElementById("table").onkeydown = (event) => {
 document.getElementById("software").textContent = `stream-dmr ${DATA.software}, template ${DATA.template}`;
 document.getElementById("notes").replaceChildren(...DATA.notes.map((note) => element("li", { textContent: note })));
 show();
-if (DATA.reviewer !== null) {
-  refresh();
-  setInterval(refresh, 5000);
-}
+if (isReview()) startReview();
 if (location.hash.startsWith("#fish-")) choose(Number(location.hash.slice(6)));

@@ -4,7 +4,7 @@ const PLOT_CONFIG = { displayModeBar: false, responsive: true };
 const BLUE = "#1668a8", ORANGE = "#d55e00";
 
 function countedFish(fish) {
-  return fish.filter((f) => lengthOf(f) !== null && f.verdict !== "reject" && f.verdict !== "duplicate");
+  return fish.filter((f) => lengthOf(f) !== null && !["reject", "duplicate", "merge"].includes(f.verdict));
 }
 
 function drawSummary(fish) {

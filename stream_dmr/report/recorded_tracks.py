@@ -1,15 +1,29 @@
 """Reads each fish of a recording: all of its frames, and its best views in full."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
 
+from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate, LocalizedFish
 from stream_dmr.recording.messages.codec import decode
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
 from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
+from stream_dmr.results.edited_lengths import length_of_frames
+from stream_dmr.results.track_edits import TrackEdits
+from stream_dmr.results.verdicts_table import AddedFrame
 
 _Key = tuple[int, int]  # frame index, track id
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReviewedTracks:
+    """What reviewers changed of the tracks."""
+
+    edits: TrackEdits
+    added: Mapping[int, Sequence[AddedFrame]]  # by track id
+    settings: SmoothLengthSettings  # of the run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,16 +68,50 @@ class RecordedTrack:
         self.views.sort(key=lambda view: view.rank, reverse=True)
         del self.views[max_views:]
 
+    def filter_again(self, settings: SmoothLengthSettings) -> None:
+        """Compute the running estimates from the frames in their order."""
+        fish = sorted((row.fish for row in self.rows), key=lambda one: one.frame_index)
+        running = length_of_frames(fish, settings)[:-1]
+        self.rows = [FishFrame(fish=f, estimate=e) for f, e in zip(fish, running, strict=True)]
+
 
 def read_tracks(
-    recording: Recording, *, selection: Selection = EVERYTHING, max_views: int = 3
+    recording: Recording,
+    *,
+    selection: Selection = EVERYTHING,
+    max_views: int = 3,
+    reviewed: ReviewedTracks | None = None,
 ) -> dict[int, RecordedTrack]:
-    """Every track of a recording with its `max_views` best views. Raises RecordingError."""
+    """Every fish of a recording with its `max_views` best views. Raises RecordingError.
+
+    Without `reviewed` fish are the recorded tracks.
+    """
     tracks: dict[int, RecordedTrack] = {}
-    for row, crop, fit in _read_rows(recording, selection):
+    added = () if reviewed is None else _added_rows(reviewed, selection)
+    for row, crop, fit in chain(_read_rows(recording, selection), added):
+        fish = row.fish
+        if reviewed is not None:
+            fish_id = reviewed.edits.fish_of(fish.track_id, fish.frame_index)
+            row = replace(row, fish=replace(fish, track_id=fish_id))
         track = tracks.setdefault(row.fish.track_id, RecordedTrack())
         track.add(row, crop, fit, max_views=max_views)
+    if reviewed is not None:
+        for fish_id in tracks.keys() & reviewed.edits.fish.keys():
+            tracks[fish_id].filter_again(reviewed.settings)
     return tracks
+
+
+def _added_rows(
+    reviewed: ReviewedTracks, selection: Selection
+) -> Iterator[tuple[FishFrame, bytes | None, bytes | None]]:
+    """The frames of added fish, each with the running estimate of its fish."""
+    for track_id, frames in reviewed.added.items():
+        if selection.tracks is not None and track_id not in selection.tracks:
+            continue
+        fish = [decode(LocalizedFish, frame.fish) for frame in frames]
+        running = length_of_frames(fish, reviewed.settings)[:-1]
+        for frame, one, estimate in zip(frames, fish, running, strict=True):
+            yield FishFrame(fish=one, estimate=estimate), frame.crop, frame.fit
 
 
 def _read_rows(

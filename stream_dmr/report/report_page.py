@@ -3,8 +3,8 @@
 import json
 import math
 from base64 import b64encode
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from importlib.resources import files
 from typing import Any
 
@@ -22,7 +22,9 @@ from stream_dmr.results.fish_table import fish_record
 from stream_dmr.template.template_file import bundled_names
 from stream_dmr.version import __version__
 
-_SCRIPTS = ("table.js", "plots.js", "detail.js", "review.js", "page.js")
+_SCRIPTS = ("table.js", "plots.js", "detail.js")
+_REVIEW_SCRIPTS = ("clip.js", "boxes.js", "points.js", "review.js", "keys.js")
+_MAX_TRACKS = 10**9  # of one run, in the numbers of a page of many
 _MAX_COORDINATE = 32000  # the coordinates of a mesh are int16
 
 
@@ -31,11 +33,12 @@ def render_page(
     *,
     title: str,
     notes: Sequence[str] = (),
-    reviewer: str | None = None,
+    review: Mapping[str, Any] | None = None,
 ) -> str:
     """The page of one report, or of all reports of a batch; these have the same template.
 
-    With a `reviewer`, it takes verdicts and sends them to its server.
+    With a `review` it takes verdicts and sends them to its server; it has the `reviewer`, `blind`
+    and perhaps the `sample`.
     """
     template = reports[0].recording.header.template
     about = {
@@ -50,13 +53,18 @@ def render_page(
             *(line for one in reports for line in (*one.notes, *one.recording.warnings)),
             *(line for one in reports for line in _shape_notes(one)),
         ],
-        "reviewer": reviewer,
+        "review": review,
+        "species": [],  # names and codes that a reviewer may type
     }
     rows, details = list[dict[str, Any]](), list[str]()
-    for row, fish, report in _rows(reports):
-        rows.append(row)
-        details.append(json_element(f"fish-{row['id']}", fish_detail(fish, report)))
-    return _fill_template(title, json_element("data", about | {"fish": rows}) + "".join(details))
+    for placed in place(reports):
+        for fish in placed.report.fish:
+            row = placed.row(fish)
+            rows.append(row)
+            detail = fish_detail(fish, placed.report)
+            details.append(json_element(f"fish-{row['id']}", detail))
+    data = json_element("data", about | {"fish": rows}) + "".join(details)
+    return _fill_template(title, data, [*_SCRIPTS, *(_REVIEW_SCRIPTS if review else ()), "page.js"])
 
 
 def _shape_notes(report: RunReport) -> Iterator[str]:
@@ -71,25 +79,45 @@ def _shape_notes(report: RunReport) -> Iterator[str]:
         yield from describe(forms, header.candidates)
 
 
-def _rows(reports: Sequence[RunReport]) -> Iterator[tuple[dict[str, Any], FishResult, RunReport]]:
-    """The row of each fish; those of several videos are numbered from 1.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PlacedReport:
+    """A report among those of a page."""
 
-    Videos whose clocks start at zero follow each other in time.
-    """
-    number, end_s = 0, -math.inf
-    for report in reports:
+    report: RunReport
+    run: int  # from 0
+    is_one_of_many: bool
+    shift_s: float  # videos whose clocks start at zero follow each other in time
+
+    def row_id(self, track_id: int) -> int:
+        """The number of a fish in the page."""
+        return self.run * _MAX_TRACKS + track_id
+
+    def row(self, fish: FishResult) -> dict[str, Any]:
+        """The row of a fish in the table of the page; `id` is its number in the page."""
+        row = summary_row(fish, self.report)
+        if not self.is_one_of_many:
+            return row
+        return row | {
+            "run": self.run,
+            "id": self.row_id(fish.estimate.track_id),
+            "video": self.report.title,
+            "time_s": row["time_s"] + self.shift_s,
+        }
+
+
+def place(reports: Sequence[RunReport]) -> list[PlacedReport]:
+    """The reports of a page, with what tells their fish apart."""
+    placed, end_s = list[PlacedReport](), -math.inf
+    for run, report in enumerate(reports):
         first_s, last_s = report.span_s
         shift_s = max(0.0, end_s - first_s)
         end_s = last_s + shift_s
-        for fish in report.fish:
-            row = summary_row(fish, report)
-            number += 1
-            if len(reports) > 1:
-                row |= {"id": number, "video": report.title, "time_s": row["time_s"] + shift_s}
-            yield row, fish, report
+        many = len(reports) > 1
+        placed.append(PlacedReport(report=report, run=run, is_one_of_many=many, shift_s=shift_s))
+    return placed
 
 
-def _fill_template(title: str, data: str) -> str:
+def _fill_template(title: str, data: str, scripts: Sequence[str]) -> str:
     """page.html with its parts filled in."""
     folder = files("stream_dmr.report")
     parts = {
@@ -97,7 +125,7 @@ def _fill_template(title: str, data: str) -> str:
         "STYLE": folder.joinpath("page.css").read_text(encoding="utf-8"),
         "PLOTLY": files("plotly").joinpath("package_data/plotly.min.js").read_text("utf-8"),
         "DATA": data,
-        "CODE": "".join(folder.joinpath(name).read_text(encoding="utf-8") for name in _SCRIPTS),
+        "CODE": "".join(folder.joinpath(name).read_text(encoding="utf-8") for name in scripts),
     }
     text = folder.joinpath("page.html").read_text(encoding="utf-8")
     pieces = text.split("@@")  # text, name, text, name, ..., text
@@ -112,6 +140,7 @@ def summary_row(fish: FishResult, report: RunReport) -> dict[str, Any]:
     views = report.views.get(fish.estimate.track_id, [])
     return row | {
         "id": fish.estimate.track_id,  # in the page
+        "run": 0,
         "video": "",
         "unit": "body lengths" if report.recording.header.calibration is None else "mm",
         "vessel": fish.facts.vessel,

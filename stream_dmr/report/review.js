@@ -1,63 +1,158 @@
 // The tools for verdicts: only where the page comes from `stream-dmr review`.
 
-function reviewTools(fish, views) {
-  if (DATA.reviewer === null) return [];
-  const message = element("p", { id: "message", textContent: "" });
-  const send = async (verdict) => {
-    const showError = (text) => { message.className = "bad"; message.textContent = text; };
-    try {
-      const answer = await fetch("verdict", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ track_id: fish.track_id, ...verdict }) });
-      const content = await answer.json();
-      if (answer.ok) replaceFish(content);
-      else showError(content.error);
-    } catch {
-      showError("Not saved: stream-dmr review has ended. Start it again, and open its new address.");
-    }
-  };
-  const text = (id, placeholder, kind, name, label) => {
-    const input = element("input", { id, placeholder, size: 14 });
-    return element("span", { className: "group" }, input, element("button", { type: "button", id: `do-${kind}`, textContent: label, onclick: () => send({ kind, [name]: name === "duplicate_of" ? Number(input.value) : input.value }) }));
-  };
-  const points = makeDraggable(views);
-  return [element("div", { id: "verdicts" },
-    element("button", { type: "button", id: "do-accept", textContent: "Accept", onclick: () => send({ kind: "accept" }) }),
-    text("reason", "reason", "reject", "reason", "Reject"),
-    text("species-name", "species", "species", "species", "Set species"),
-    text("duplicate-of", "fish", "duplicate", "duplicate_of", "Is a duplicate of"),
-    element("button", { type: "button", id: "do-correct", textContent: "Save moved points", onclick: () => points.moved() ? send({ kind: "correct", ...points.moved() }) : (message.textContent = "Drag a head (red) or tail (blue) point first.") }),
-    element("button", { type: "button", id: "do-withdraw", textContent: "Withdraw verdicts", onclick: () => send({ kind: "withdraw" }) }),
-    element("small", { textContent: `as ${DATA.reviewer}; head and tail points can be dragged` }), message)];
+const DECISIONS = ["accept", "reject", "duplicate", "merge"];  // after which the next fish is shown
+
+// The frames, views and mesh of a fish that changed since the page was made.
+async function detailOfServer(fish) {
+  return fetch(`fish.json?run=${fish.run}&fish=${fish.track_id}`).then((answer) => answer.json());
 }
 
-const GRAB_RADIUS_PX = 24;  // on the screen; a fingertip covers about as much
+// What a reviewer sees of a fish before everything else. What was said last stays in sight.
+function reviewParts(fish, views) {
+  const said = document.getElementById("message");
+  const tools = reviewTools(views);
+  if (said) tools.lastChild.replaceWith(said);
+  return [CLIP_PANE, tools];
+}
 
-// Lets head and tail points be dragged. The frame that was dragged in last is saved, in crop pixels.
-function makeDraggable(views) {
-  let last = null;
-  for (const box of views.querySelectorAll("svg")) {
-    const ends = [...box.querySelectorAll('[data-name="head"], [data-name="tail"]')];
-    const place = (end) => ({ x: end.cx.baseVal.value, y: end.cy.baseVal.value });
-    const at = (event) => new DOMPoint(event.clientX, event.clientY).matrixTransform(box.getScreenCTM().inverse());
-    const distancePx = (end, p) => Math.hypot(place(end).x - p.x, place(end).y - p.y) * box.getScreenCTM().a;
-    let grabbed = null, offset = null;  // the point, and where it was grabbed
-    box.classList.add("draggable");
-    box.onpointerdown = (event) => {
-      const p = at(event);
-      const nearest = ends.reduce((one, other) => (distancePx(one, p) <= distancePx(other, p) ? one : other));
-      if (distancePx(nearest, p) > GRAB_RADIUS_PX) return;
-      grabbed = nearest;
-      offset = { x: place(grabbed).x - p.x, y: place(grabbed).y - p.y };
-      box.setPointerCapture(event.pointerId);
-    };
-    box.onpointermove = (event) => {
-      if (!grabbed) return;
-      const p = at(event);
-      grabbed.setAttribute("cx", p.x + offset.x);
-      grabbed.setAttribute("cy", p.y + offset.y);
-      last = box;
-    };
-    box.onpointerup = box.onpointercancel = () => { grabbed = null; };
+function showParts(fish) {
+  openClip(fish, 0);
+  setTimeout(() => {  // plots are slow: they come when the reviewer stays
+    if (state.chosen !== fish.id) return;
+    drawFrames(FRAMES_PLOT, fish.detail.frames);
+    drawMesh(MESH_PLOT, fish.detail.mesh, fish.unit);
+  }, 400);
+}
+
+function chosenFish() { return DATA.fish.find((one) => one.id === state.chosen) ?? null; }
+
+function say(text, isBad = false) {
+  const message = document.getElementById("message");
+  if (message) { message.className = isBad ? "bad" : ""; message.textContent = text; }
+}
+
+// The next fish without a decision in the list as it is sorted, from a fish on; null where all have one.
+function nextUnreviewed(id) {
+  const at = state.shown.findIndex((one) => one.id === id);
+  const order = [...state.shown.slice(at + 1), ...state.shown.slice(0, at + 1)];
+  return order.find((one) => one.verdict === null && one.id !== id) ?? null;
+}
+
+function goToNext() {
+  const next = nextUnreviewed(state.chosen);
+  if (next) return showFish(next);
+  const left = chosenFish()?.verdict === null ? 1 : 0;
+  say(left ? "This is the last fish without a decision." : `All ${state.shown.length} fish have a decision.`);
+}
+
+async function send(verdict) {
+  const fish = chosenFish();
+  if (!fish && verdict.kind !== "undo") return;
+  let rows;
+  try {
+    const answer = await fetch("verdict", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ run: fish?.run ?? 0, track_id: fish?.track_id ?? 0, ...verdict }) });
+    rows = await answer.json();
+    if (!answer.ok) return say(rows.error, true);
+  } catch {
+    return say("Not saved: stream-dmr review has ended. Start it again, and open its new address.", true);
   }
-  const at = (name) => { const p = last.querySelector(`[data-name="${name}"]`); return [p.cx.baseVal.value, p.cy.baseVal.value]; };
-  return { moved: () => last && { frame_index: Number(last.dataset.frame), head: at("head"), tail: at("tail") } };
+  takeRows(rows);
+  show();
+  if (DECISIONS.includes(verdict.kind) && document.getElementById("goes-on").checked) return goToNext();
+  const wanted = verdict.kind === "add" ? rows.find((row) => !DATA.seen.has(row.id)) : verdict.kind === "undo" ? rows.find((row) => !row.gone) : null;
+  const shown = wanted ?? chosenFish() ?? DATA.fish[0];
+  for (const row of rows) DATA.seen.add(row.id);
+  if (shown) showFish(shown);
+  say(verdict.kind === "undo" ? `Took back your last verdict${wanted ? `, on fish ${wanted.track_id}` : ""}.` : "Saved.");
+}
+
+// Rows of the server in place of those of the page; a fish may be new, or gone.
+function takeRows(rows) {
+  for (const row of rows) {
+    const at = DATA.fish.findIndex((one) => one.id === row.id), old = DATA.fish[at];
+    const isSame = old && ["origin", "frames_seen", "first_frame", "last_frame"].every((name) => old[name] === row[name]);
+    if (row.gone) { if (at >= 0) DATA.fish.splice(at, 1); continue; }
+    Object.assign(row, isSame ? { detail: old.detail, isLate: old.isLate } : { isLate: true });
+    if (at >= 0) DATA.fish[at] = row;
+    else DATA.fish.push(row);
+  }
+}
+
+function typed(id) { return document.getElementById(id).value.trim(); }
+
+// What was typed as a code or a name of the list, as its name; else as it was typed.
+function speciesNamed(text) {
+  const known = DATA.species.find((one) => one.code.toLowerCase() === text.toLowerCase() || one.name.toLowerCase() === text.toLowerCase());
+  return known ? known.name : text;
+}
+
+function reviewTools(views) {
+  const button = (kind, key, label, onclick) => element("button", { type: "button", id: `do-${kind}`, onclick }, ...bindKey(label, key));
+  const group = (input, ...more) => element("span", { className: "group" }, input, ...more);
+  const field = (id, placeholder, kind, other = {}) => {
+    const input = element("input", { id, placeholder, size: 12, autocomplete: "off", "aria-label": placeholder, ...other });
+    input.onkeydown = (event) => { if (event.key === "Enter") { event.preventDefault(); document.getElementById(`do-${kind}`).click(); input.blur(); } };
+    return input;
+  };
+  const points = makeDraggable(views);
+  const canEdit = !DATA.review.blind;
+  return element("div", { id: "verdicts" },
+    button("accept", "a", "Accept", () => send({ kind: "accept" })),
+    group(field("reason", "reason", "reject"), button("reject", "r", "Reject", () => send({ kind: "reject", reason: typed("reason") }))),
+    group(field("species-name", "species: code or name", "species", { list: "species-list" }), button("species", "s", "Set species", () => send({ kind: "species", species: speciesNamed(typed("species-name")) }))),
+    group(field("duplicate-of", "fish", "duplicate", { inputMode: "numeric" }), button("duplicate", "d", "Is a duplicate of", () => send({ kind: "duplicate", duplicate_of: Number(typed("duplicate-of")) }))),
+    ...(canEdit ? [
+      group(field("merge-into", "fish", "merge", { inputMode: "numeric" }), button("merge", "m", "Goes on as", () => send({ kind: "merge", other_fish: Number(typed("merge-into")) }))),
+      button("split", "x", "Another fish from this frame on", () => currentFrame() && send({ kind: "split", frame_index: currentFrame().frame })),
+      button("add", "b", "Add a missed fish", startDrawing)] : []),
+    element("button", { type: "button", id: "do-correct", onclick: () => points.moved() ? send({ kind: "correct", ...points.moved() }) : say("Drag a head (red) or tail (blue) point first.") }, ...bindKey("Save moved points", "p")),
+    button("undo", "u", "Undo", () => send({ kind: "undo" })),
+    button("next", "n", "Next unreviewed", goToNext),
+    element("button", { type: "button", id: "do-withdraw", textContent: "Withdraw verdicts", onclick: () => send({ kind: "withdraw" }) }),
+    element("div", { id: "drawing", hidden: true }, element("span", { id: "drawing-text" }),
+      element("button", { type: "button", id: "do-measure", onclick: measureDrawn }, ...bindKey("Measure it", "Enter")), element("button", { type: "button", id: "do-cancel", onclick: stopDrawing }, ...bindKey("Cancel", "Esc"))),
+    element("p", { id: "message", role: "status", textContent: "" }));
+}
+
+async function measureDrawn() {
+  if (!drawing.boxes.size) return say("Draw a box around the fish first.", true);
+  say("Measuring ...");
+  const boxes = [...drawing.boxes.values()];
+  stopDrawing();
+  await send({ kind: "add", boxes });
+}
+
+// Above the list: who reviews, how far it is, and the keys.
+function drawReviewBar() {
+  const { reviewer, blind, sample } = DATA.review;
+  const left = DATA.fish.filter((one) => one.verdict === null).length;
+  const what = [`${reviewer}${blind ? ", blind second reading" : ""}`, sample ? `random sample of ${sample.size} (seed ${sample.seed})` : "", `${left} of ${DATA.fish.length} without a decision`].filter(Boolean);
+  document.getElementById("progress").textContent = what.join("; ");
+}
+
+// Shows the verdicts given since the page was made, also by others. What is open stays as it is.
+let lastAnswer = "";
+async function refresh() {
+  const text = await fetch("reviewed.json").then((answer) => (answer.ok ? answer.text() : lastAnswer), () => lastAnswer);
+  if (text === lastAnswer) return;
+  lastAnswer = text;
+  const rows = JSON.parse(text);
+  takeRows(rows);
+  for (const row of rows) DATA.seen.add(row.id);
+  show();
+}
+
+function startReview() {
+  DATA.seen = new Set(DATA.fish.map((one) => one.id));
+  document.body.classList.add("review");
+  document.getElementById("review-bar").hidden = false;
+  document.getElementById("species-list").replaceChildren(...DATA.species.map((one) => element("option", { value: one.name, label: one.code })));
+  document.getElementById("plots-too").onchange = (event) => { document.body.classList.toggle("with-plots", event.target.checked); show(); };
+  drawKeys();
+  document.getElementById("keys").open = !matchMedia(NARROW).matches;
+  addEventListener("keydown", onKey);
+  refresh();
+  setInterval(refresh, 5000);
+  const first = state.shown.find((one) => one.verdict === null) ?? state.shown[0];
+  if (first && !location.hash) matchMedia(NARROW).matches || choose(first.id);
 }

@@ -9,6 +9,7 @@ from stream_dmr.report.drawn_views import DrawnViews
 from stream_dmr.report.recorded_tracks import RecordedTrack
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.fisheries import FisheriesSettings
+from stream_dmr.results.track_edits import NO_EDITS, TrackEdits
 from stream_dmr.running.config import Config
 
 
@@ -23,6 +24,8 @@ class RunReport:
     views: DrawnViews
     config: Config  # of the run
     settings: FisheriesSettings
+    edits: TrackEdits = NO_EDITS  # of reviewers, which `fish`, `tracks` and `views` follow
+    source: str | None = None  # where the user says that the source is
     notes: Sequence[str] = ()  # what a reader must know of the run
 
     @property

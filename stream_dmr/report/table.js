@@ -14,6 +14,8 @@ const COLUMNS = [
 
 const state = { shown: [], column: 1, descending: false, chosen: null };
 
+function isReview() { return DATA.review !== null; }
+
 function lengthOf(fish) {
   return fish.corrected_length_mm ?? fish.length_mm;
 }
@@ -36,7 +38,7 @@ function lengthText(fish) {
 function element(tag, attributes = {}, ...children) {
   const made = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
-    if (name in made) made[name] = value;
+    if (name in made && name !== "list") made[name] = value;  // `list` can only be set as an attribute
     else made.setAttribute(name, value);
   }
   made.append(...children);

@@ -3,9 +3,9 @@
 import json
 import sqlite3
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Literal
 
@@ -20,8 +20,10 @@ from stream_dmr.results.kept_positions import POSITIONS, kept_of, positions_of
 from stream_dmr.results.lengths_database import NAME, open_for_reading
 from stream_dmr.results.run_facts import RunFacts, cut_short, run_facts
 from stream_dmr.results.scale_checks import last_checks
-from stream_dmr.results.store_rows import MAY_COUNT_TWICE, read_estimates
-from stream_dmr.results.verdicts import NOT_REVIEWED, Review, read_verdicts, reviews_of
+from stream_dmr.results.store_rows import MAY_COUNT_TWICE, estimate_of, read_estimates
+from stream_dmr.results.track_edits import TrackPart, edits_of
+from stream_dmr.results.verdicts import NOT_COUNTED, NOT_REVIEWED, Review, Verdict, reviews_of
+from stream_dmr.results.verdicts_table import read_verdicts
 from stream_dmr.results.vessel_track import NOWHERE, VesselTrack, Whereabouts
 from stream_dmr.sensors.sensors_settings import SensorsSettings
 
@@ -40,6 +42,12 @@ class FishResult:
     catch: CatchFacts = UNKNOWN_CATCH
     where: Whereabouts = NOWHERE  # at `middle_ns`
     review: Review = NOT_REVIEWED
+    origin: str = "run"  # or the edit of a reviewer that made it: add, split or merge
+
+    @property
+    def counts(self) -> bool:
+        """True unless a reviewer rejected it, or said that another fish stands for it."""
+        return self.review.decision not in NOT_COUNTED
 
     @property
     def middle_ns(self) -> int:
@@ -118,8 +126,59 @@ def recorded_track(recording: Recording) -> VesselTrack:
 
 
 def read_stored_fish(database: Path) -> list[FishResult]:
-    """All fish of a lengths.db. Raises OutputError where it is damaged."""
-    return _stored_fish(database, reviews_of(read_verdicts(database)))
+    """All fish of a lengths.db as reviewed: with those that were added, split and merged.
+
+    A fish that was merged into another stays, with that decision. Raises OutputError where the
+    file is damaged.
+    """
+    verdicts = read_verdicts(database)
+    return _with_edits(database, _stored_fish(database, reviews_of(verdicts)), verdicts)
+
+
+def read_measured_fish(database: Path) -> list[FishResult]:
+    """All fish of a lengths.db as they were measured, without any review. OutputError likewise."""
+    return _stored_fish(database, {})
+
+
+def _with_edits(
+    database: Path, measured: Sequence[FishResult], verdicts: Sequence[Verdict]
+) -> list[FishResult]:
+    """The fish with those that reviewers made; each is of the run of its first frames."""
+    edits, reviews = edits_of(verdicts), reviews_of(verdicts)
+    if not edits.fish:
+        return list(measured)
+    last_run = list(read_runs(database).items())[-1]
+    with closing(open_for_reading(database)) as connection:
+        vessel = VesselTrack(positions_of(added_rows(connection, POSITIONS)))
+    tracks = {one.estimate.track_id: one for one in measured}
+    fish = dict(tracks)
+    for track_id, edited in edits.fish.items():
+        parts = sorted(edited.parts, key=lambda part: (part.last_frame, part.first_frame))
+        origins = [tracks[part.track_id] for part in parts if part.track_id in tracks]
+        run_id, facts = (origins[0].run_id, origins[0].facts) if origins else last_run
+        estimate = estimate_of(edited.row)
+        fish[track_id] = FishResult(
+            estimate=estimate,
+            facts=facts,
+            run_id=run_id,
+            iou=edited.row["iou"],
+            flags=json.loads(edited.row["flags"]),
+            where=vessel.at(middle_ns(estimate)),
+            catch=_catch_of(parts, tracks),
+            review=reviews.get(track_id, NOT_REVIEWED),
+            origin=edited.kind,
+        )
+    return list(fish.values())
+
+
+def _catch_of(parts: Sequence[TrackPart], tracks: Mapping[int, FishResult]) -> CatchFacts:
+    """Of a fish of several parts of tracks: its fate is that of the track that it ends with."""
+    known = [tracks[part.track_id] for part in parts if part.track_id in tracks]
+    if not known:
+        return UNKNOWN_CATCH
+    is_cut = parts[-1].last_frame < known[-1].estimate.last_frame
+    last = UNKNOWN_CATCH if is_cut else known[-1].catch
+    return replace(known[0].catch, fate=last.fate, fate_share=last.fate_share)
 
 
 def read_runs(database: Path) -> dict[str, RunFacts]:

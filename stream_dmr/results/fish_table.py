@@ -19,6 +19,7 @@ from stream_dmr.template.template import Template
 FISH_TABLE: dict[str, type] = {
     **dict.fromkeys(("vessel", "trip", "haul"), str),
     "track_id": int,
+    "origin": str,  # "run", or what a reviewer did to its frames: "add", "split" or "merge"
     **dict.fromkeys(("template", "species", "species_code", "fate", "status"), str),
     **dict.fromkeys(("species_share", "fate_share"), float),
     **dict.fromkeys(("length_mm", "length_std_mm", "ci95_low_mm", "ci95_high_mm"), float),
@@ -69,6 +70,7 @@ def fish_record(
         "weight_source": None if derived.weight_kg is None else settings.weight_source,
         "legal_source": None if derived.is_legal_size is None else settings.legal_source,
         "run_id": fish.run_id,
+        "origin": fish.origin,
     }
 
 

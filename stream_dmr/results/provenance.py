@@ -14,7 +14,8 @@ from stream_dmr.files import rename_durably, sha256_of, writing_to
 from stream_dmr.results.finished_fish import database_of, read_runs, rows_by_run, run_times
 from stream_dmr.results.lengths_database import NAME as DATABASE
 from stream_dmr.results.run_facts import RunFacts
-from stream_dmr.results.verdicts import Verdict, read_verdicts
+from stream_dmr.results.verdicts import Verdict
+from stream_dmr.results.verdicts_table import read_verdicts, verdict_line
 from stream_dmr.version import __version__
 
 NAME = "provenance.json"
@@ -72,7 +73,7 @@ def lines_sha256(lines: Iterable[str]) -> str:
 
 def verdicts_sum(verdicts: Sequence[Verdict]) -> dict[str, Any]:
     """The number of verdicts and their SHA-256."""
-    lines = (json.dumps(asdict(verdict)) for verdict in verdicts)
+    lines = map(verdict_line, verdicts)
     return {"count": len(verdicts), "sha256": lines_sha256(lines)}
 
 

@@ -2,8 +2,9 @@
 
 import json
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
@@ -38,17 +39,24 @@ def read_estimates(
     wanted = "" if last is None else "WHERE number > (SELECT MAX(number) FROM fish) - ?"
     query = f"SELECT {', '.join(names)} FROM fish {wanted} ORDER BY number"
     for values in database.execute(query, () if last is None else (last,)):
-        row = dict(zip(names, values, strict=True))
-        ends = row.pop("ci95_low_mm"), row.pop("ci95_high_mm")
-        yield LengthEstimate(
-            **row | {"refused": json.loads(row["refused"])},
-            ci95_mm=None if ends[0] is None else np.array(ends),
-            timestamp_ns=row["last_timestamp_ns"],
-            frame_index=row["last_frame"],
-            is_final=True,
-            is_frame_used=False,
-            frame_reason="",
-            smoothed_frames=np.zeros(0, np.int64),
-            smoothed_mm=np.zeros(0),
-            smoothed_std_mm=np.zeros(0),
-        )
+        yield estimate_of(dict(zip(names, values, strict=True)))
+
+
+def estimate_of(row: Mapping[str, Any]) -> LengthEstimate:
+    """The final estimate of a row that `fish_row` made, without its smoothed series."""
+    low, high = row["ci95_low_mm"], row["ci95_high_mm"]
+    values: dict[str, Any] = {name: row[name] for name in FISH_COLUMNS}
+    values |= {field.name: row.get(field.name) for field in fields(CatchFacts)}
+    return LengthEstimate(
+        **values,
+        refused=json.loads(row["refused"]),
+        ci95_mm=None if low is None else np.array([low, high]),
+        timestamp_ns=row["last_timestamp_ns"],
+        frame_index=row["last_frame"],
+        is_final=True,
+        is_frame_used=False,
+        frame_reason="",
+        smoothed_frames=np.zeros(0, np.int64),
+        smoothed_mm=np.zeros(0),
+        smoothed_std_mm=np.zeros(0),
+    )

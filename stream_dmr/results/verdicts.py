@@ -1,37 +1,22 @@
-"""Verdicts of reviewers on fish: a table of its own in lengths.db, to which rows are only added.
+"""Verdicts of reviewers on fish: a log, to which rows are only added (`verdicts_table`).
 
 Measurements stay as they were. The review of a fish is what its verdicts say together: the last
-decision, the last species and the last correction; `withdraw` takes back all before it.
+decision, the last species and the last correction; `withdraw` takes back all before it, `undo` one
+verdict. `add`, `split` and `merge` say which frames a fish has (`track_edits`). A blind reading
+changes no review: it is only compared with it.
 """
 
-import sqlite3
-import time
-from collections.abc import Generator, Mapping, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
-from stream_dmr.errors import OutputError, UserError
-from stream_dmr.results.lengths_database import DiskRefusal, open_for_reading, open_for_writing
+from stream_dmr.errors import UserError
 
-KINDS = ("accept", "reject", "duplicate", "species", "correct", "withdraw")
-DECISIONS = KINDS[:3]
+DECISIONS = ("accept", "reject", "duplicate", "merge")
+NOT_COUNTED = frozenset(DECISIONS[1:])  # decisions after which a fish stands in no sum
+EDITS = ("add", "split", "merge")
+KINDS = (*DECISIONS[:3], "species", "correct", "withdraw", *EDITS, "undo")
+BLIND = "blind"  # the reading of somebody who does not see what others decided
 Ends = tuple[tuple[float, float], tuple[float, float]]  # head and tail, frame pixels
-_TABLE = """
-CREATE TABLE IF NOT EXISTS verdicts (
-    number INTEGER PRIMARY KEY,
-    track_id INTEGER NOT NULL,
-    kind TEXT NOT NULL,
-    reason TEXT NOT NULL, -- of a rejection
-    species TEXT NOT NULL,
-    duplicate_of INTEGER, -- track id
-    frame_index INTEGER, -- of a correction: where its points, in frame pixels, were set
-    head_u REAL, head_v REAL, tail_u REAL, tail_v REAL,
-    length_mm REAL, length_std_mm REAL, -- of all frames that are corrected so far
-    reviewer TEXT NOT NULL,
-    written_ns INTEGER NOT NULL -- wall clock
-) STRICT
-"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +37,12 @@ class Verdict:
     length_mm: float | None = None
     length_std_mm: float | None = None
     written_ns: int = 0
+    # Columns that the first tables lack; a value of None stands in no checksum.
+    undoes: int | None = None  # number of the verdict that this one takes back, from 1
+    other_fish: int | None = None  # of a split: the new fish; of a merge: the one that goes on
+    fish: str | None = None  # of an edit: the final rows of the fish that it makes, as JSON
+    frames_sha256: str | None = None  # of an added fish: of its rows in `added_frames`
+    reading: str | None = None  # BLIND, or None
 
     @property
     def moved(self) -> dict[int, Ends]:
@@ -94,6 +85,10 @@ class Review:
                     length_std_mm=verdict.length_std_mm,
                     moved={**now.moved, **verdict.moved},
                 )
+            case "add" | "split":
+                return now
+            case "merge":
+                return replace(now, decision="merge", duplicate_of=verdict.other_fish)
             case _:
                 return replace(
                     now,
@@ -106,10 +101,39 @@ class Review:
 NOT_REVIEWED = Review()
 
 
+def standing(verdicts: Sequence[Verdict]) -> list[Verdict]:
+    """The verdicts that count: not taken back by an `undo`, and of no blind reading."""
+    return [verdict for _, verdict in _not_undone(verdicts) if verdict.reading is None]
+
+
+def blind_readings(verdicts: Sequence[Verdict]) -> dict[str, list[Verdict]]:
+    """What each blind reader said, by name, as verdicts that `reviews_of` counts."""
+    readings: dict[str, list[Verdict]] = {}
+    for _, verdict in _not_undone(verdicts):
+        if verdict.reading == BLIND:
+            readings.setdefault(verdict.reviewer, []).append(replace(verdict, reading=None))
+    return readings
+
+
+def last_of(verdicts: Sequence[Verdict], reviewer: str, reading: str | None) -> int | None:
+    """Number of the last verdict of a reviewer that was not taken back; None without any."""
+    mine = (reviewer, reading)
+    numbers = (n for n, one in _not_undone(verdicts) if (one.reviewer, one.reading) == mine)
+    return max(numbers, default=None)
+
+
+def _not_undone(verdicts: Sequence[Verdict]) -> list[tuple[int, Verdict]]:
+    """The verdicts with their numbers, without `undo` and what it takes back."""
+    undone = {verdict.undoes for verdict in verdicts}
+    numbered = enumerate(verdicts, start=1)
+    return [(n, one) for n, one in numbered if one.kind != "undo" and n not in undone]
+
+
 def check_verdict(verdict: Verdict, track_ids: set[int], reviews: Mapping[int, Review]) -> None:
     """Raise UserError where a verdict contradicts itself or the reviews so far.
 
-    `track_ids`: the fish of the run. Of fish that are duplicates of each other, one must remain.
+    `track_ids`: the fish of the run as reviewed, without those merged into others. Of fish that are
+    duplicates of each other, one must remain.
     """
     known = verdict.track_id in track_ids
     problems = {
@@ -138,56 +162,14 @@ def _originals(verdict: Verdict, reviews: Mapping[int, Review]) -> list[int]:
     return originals
 
 
-def add_verdict(path: Path, verdict: Verdict) -> Verdict:
-    """Write a verdict into a lengths.db, durably; returns it with its time. Raises OutputError."""
-    verdict = replace(verdict, written_ns=time.time_ns())
-    names = [field.name for field in fields(Verdict)]
-    values = [getattr(verdict, name) for name in names]
-    marks = ", ".join("?" for _ in names)
-    with _refusing(path), closing(_open_for_verdicts(path)) as database:
-        database.execute(_TABLE)
-        database.execute(f"INSERT INTO verdicts ({', '.join(names)}) VALUES ({marks})", values)
-    return verdict
-
-
-def read_verdicts(path: Path) -> list[Verdict]:
-    """All verdicts of a lengths.db in the order of writing. Raises OutputError."""
-    with _refusing(path), closing(open_for_reading(path)) as database:
-        if not database.execute(
-            "SELECT 1 FROM sqlite_master WHERE name = 'verdicts' AND type = 'table'"
-        ).fetchone():
-            return []
-        names = [field.name for field in fields(Verdict)]
-        rows = database.execute(f"SELECT {', '.join(names)} FROM verdicts ORDER BY number")
-        return [Verdict(**dict(zip(names, row, strict=True))) for row in rows]
-
-
 def reviews_of(verdicts: Sequence[Verdict]) -> dict[int, Review]:
-    """The review of each fish that has a verdict, by track id.
+    """The review of each fish that has a verdict which counts, by track id.
 
     A verdict that closes a circle of duplicates doesn't count: one of the fish must remain.
     """
     reviews: dict[int, Review] = {}
-    for verdict in verdicts:
+    for verdict in standing(verdicts):
         if verdict.kind == "duplicate" and verdict.track_id in _originals(verdict, reviews):
             continue
         reviews[verdict.track_id] = reviews.get(verdict.track_id, NOT_REVIEWED).after(verdict)
     return reviews
-
-
-def _open_for_verdicts(path: Path) -> sqlite3.Connection:
-    try:
-        return open_for_writing(path)
-    except DiskRefusal as error:
-        raise OutputError(
-            f"{path}: expected a disk to write verdicts to, got: {error.__cause__}; review a copy "
-            "of the folder"
-        ) from error
-
-
-@contextmanager
-def _refusing(path: Path) -> Generator[None]:
-    try:
-        yield
-    except sqlite3.Error as error:
-        raise OutputError(f"{path}: expected a database of lengths, got: {error}") from error

@@ -22,8 +22,8 @@ from stream_dmr.recording.reading.open_recording import decoded_messages, open_r
 from stream_dmr.results.finished_fish import (
     FishResult,
     database_of,
+    read_measured_fish,
     read_runs,
-    read_stored_fish,
     rows_by_run,
     run_times,
 )
@@ -33,7 +33,9 @@ from stream_dmr.results.lengths_table import LENGTHS_COLUMNS, lengths_row
 from stream_dmr.results.provenance import NAME as PROVENANCE
 from stream_dmr.results.provenance import known_files, lines_sha256, read_provenance, verdicts_sum
 from stream_dmr.results.run_facts import RunFacts, run_facts
-from stream_dmr.results.verdicts import Verdict, read_verdicts
+from stream_dmr.results.verdicts import Verdict
+from stream_dmr.results.verdicts_table import read_verdicts
+from stream_dmr.results.verify_edits import changed_edits
 
 _MADE_BY = ("config_sha256", "calibration_sha256", "template_sha256")
 _COMPARED = (
@@ -84,10 +86,11 @@ def _changes(folder: Path, others: Checks) -> Iterator[Change]:
         return
     try:
         runs = read_runs(database)
-        fish = {one.estimate.track_id: one for one in read_stored_fish(database)}
+        fish = {one.estimate.track_id: one for one in read_measured_fish(database)}
     except OutputError as error:
         yield Change(database, f"damaged: {error}")
         return
+    yield from (Change(database, line) for line in changed_edits(database, list(fish.values())))
     lengths = {
         str(track_id): lengths_row(one.estimate, may_count_twice=one.may_count_twice)
         for track_id, one in fish.items()

@@ -1,58 +1,51 @@
 """Checks the verdicts on the fish of one folder and writes them to its lengths.db."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
-from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.errors import UserError
 from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate
 from stream_dmr.recording.messages.codec import decode
+from stream_dmr.recording.reading.frame_lookup import FrameLookup
+from stream_dmr.report.open_reports import reread_fish
 from stream_dmr.report.recorded_tracks import RecordedView
-from stream_dmr.report.report_page import summary_row
 from stream_dmr.report.run_report import RunReport
-from stream_dmr.results.finished_fish import FishResult, database_of
+from stream_dmr.report.view_pictures import recorded_source
+from stream_dmr.results.finished_fish import database_of
 from stream_dmr.results.provenance import seal_verdicts
+from stream_dmr.results.track_edits import changed_fish, edits_of
 from stream_dmr.results.verdicts import (
+    BLIND,
+    EDITS,
     NOT_REVIEWED,
     Ends,
     Review,
     Verdict,
-    add_verdict,
+    blind_readings,
     check_verdict,
-    read_verdicts,
+    last_of,
     reviews_of,
+    standing,
 )
+from stream_dmr.results.verdicts_table import add_verdict, read_verdicts
 from stream_dmr.review.corrected_length import corrected_fish, corrected_length
-
-_Point = tuple[float, float]  # x, y
-
-
-class SubmittedVerdict(BaseModel):
-    """A verdict as the page sends it; points are in pixels of the frame's crop."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    track_id: int
-    kind: str = Field(max_length=20)
-    reason: str = Field(default="", max_length=500)
-    species: str = Field(default="", max_length=200)
-    duplicate_of: int | None = None
-    frame_index: int | None = None
-    head: _Point | None = None
-    tail: _Point | None = None
+from stream_dmr.review.submitted_verdict import SubmittedVerdict, drawn_boxes
+from stream_dmr.review.track_editor import TrackEdit, TrackEditor
 
 
 class VerdictRecorder:
-    """Verdicts of one reviewer. Thread-safe."""
+    """Verdicts of one reviewer on the fish of one run. Thread-safe."""
 
-    def __init__(self, report: RunReport, reviewer: str) -> None:
-        """UserError where the results have no database to write to."""
+    def __init__(self, report: RunReport, reviewer: str, *, blind: bool = False) -> None:
+        """UserError without a database to write to.
+
+        A `blind` reading sees the fish as they were measured, and changes no review.
+        """
         database = database_of(report.path)
         if database is None:
             raise UserError(
@@ -62,48 +55,131 @@ class VerdictRecorder:
         self._database: Path = database
         self._report = report
         self._reviewer = reviewer
-        self._fish = {one.estimate.track_id: one for one in report.fish}
+        self._reading = BLIND if blind else None
+        self.pictures = FrameLookup(
+            report.recording, report.source or recorded_source(report.recording)
+        )
+        self._editor = TrackEditor(database, self.pictures)
         self._lock = Lock()
 
-    def record(self, content: bytes) -> dict[str, Any]:
-        """Check and write a verdict, JSON of `SubmittedVerdict`; returns the row of its fish.
+    @property
+    def report(self) -> RunReport:
+        """The fish as they are now."""
+        return self._report
 
-        UserError where it is not one.
+    def record(self, submitted: SubmittedVerdict) -> list[int]:
+        """Check and write a verdict; returns the fish that it changes.
+
+        UserError where it contradicts itself or what is known.
         """
-        try:
-            submitted = SubmittedVerdict.model_validate_json(content)
-        except ValidationError as error:
-            raise UserError(f"verdict: {error.errors()[0]['msg']}") from error
         with self._lock:
-            verdict = Verdict(
-                track_id=submitted.track_id,
-                kind=submitted.kind,
-                reviewer=self._reviewer,
-                reason=submitted.reason.strip() if submitted.kind == "reject" else "",
-                species=submitted.species.strip() if submitted.kind == "species" else "",
-                duplicate_of=submitted.duplicate_of if submitted.kind == "duplicate" else None,
+            said = read_verdicts(self._database)
+            self._follow(said)
+            verdict = self._verdict(submitted)
+            if submitted.kind == "undo":
+                verdict = self._undo(verdict, said)
+                edit = TrackEdit(verdict=self._undo(verdict, said))
+            else:
+                edit = self._checked(verdict, submitted, said)
+            is_edit, before = verdict.kind in (*EDITS, "undo"), self._report.edits
+            add_verdict(
+                self._database,
+                edit.verdict,
+                frames=edit.frames,
+                new_fish=edit.new_fish,
+                known=len(said) if is_edit else None,
             )
-            reviews = reviews_of(read_verdicts(self._database))
-            check_verdict(verdict, set(self._fish), reviews)
-            if submitted.kind == "correct":
-                verdict = self._corrected(verdict, submitted)
-            add_verdict(self._database, verdict)
             seal_verdicts(self._database.parent)
-            return self._row(self._fish[submitted.track_id])
+            self._follow(read_verdicts(self._database))
+            return sorted({edit.verdict.track_id} | changed_fish(before, self._report.edits))
 
-    def reviewed_rows(self) -> list[dict[str, Any]]:
-        """The rows of all fish with verdicts."""
-        reviewed = reviews_of(read_verdicts(self._database))
-        return [self._row(one) for track_id, one in self._fish.items() if track_id in reviewed]
+    def said(self) -> tuple[RunReport, dict[int, Review], set[int]]:
+        """The fish as they are now, their reviews, and all fish that a verdict ever spoke of."""
+        with self._lock:
+            verdicts = read_verdicts(self._database)
+            self._follow(verdicts)
+            named = {one.track_id for one in verdicts} | {one.other_fish for one in verdicts}
+            return self._report, self._reviews(verdicts), {one for one in named if one is not None}
 
-    def _row(self, fish: FishResult) -> dict[str, Any]:
-        reviewed = replace(fish, review=self._review(fish.estimate.track_id))
-        return summary_row(reviewed, self._report)
+    def _reviews(self, verdicts: Sequence[Verdict]) -> dict[int, Review]:
+        """Of this reading: a blind reader sees no other verdicts."""
+        if self._reading is None:
+            return reviews_of(verdicts)
+        return reviews_of(blind_readings(verdicts).get(self._reviewer, []))
 
-    def _review(self, track_id: int) -> Review:
-        return reviews_of(read_verdicts(self._database)).get(track_id, NOT_REVIEWED)
+    def _follow(self, verdicts: Sequence[Verdict]) -> None:
+        """Take over what any reviewer has added, split, merged or undone."""
+        if self._reading is not None:
+            return
+        changed = changed_fish(self._report.edits, edits_of(verdicts))
+        if changed:
+            self._report = reread_fish(self._report, frozenset(changed), self.pictures)
 
-    def _corrected(self, verdict: Verdict, submitted: SubmittedVerdict) -> Verdict:
+    def _verdict(self, submitted: SubmittedVerdict) -> Verdict:
+        kind = submitted.kind
+        return Verdict(
+            track_id=submitted.track_id,
+            kind=kind,
+            reviewer=self._reviewer,
+            reason=submitted.reason.strip() if kind == "reject" else "",
+            species=submitted.species.strip() if kind == "species" else "",
+            duplicate_of=submitted.duplicate_of if kind == "duplicate" else None,
+            frame_index=submitted.frame_index if kind == "split" else None,
+            other_fish=submitted.other_fish if kind == "merge" else None,
+            reading=self._reading,
+        )
+
+    def _checked(
+        self, verdict: Verdict, submitted: SubmittedVerdict, said: Sequence[Verdict]
+    ) -> TrackEdit:
+        """The verdict with what follows from it."""
+        report = self._report
+        if verdict.kind in EDITS and self._reading is not None:
+            raise UserError(
+                "verdict: expected accept, reject, duplicate, species or moved points: a blind "
+                "reading is of the fish as they were measured"
+            )
+        if verdict.kind == "add":
+            return self._editor.add(report, verdict, *drawn_boxes(submitted.boxes))
+        there = {one.estimate.track_id for one in report.fish} - report.edits.merged.keys()
+        reviews = self._reviews(said)
+        check_verdict(verdict, there, reviews)
+        if verdict.kind in EDITS:
+            _require_unmoved(reviews, verdict.track_id, verdict.other_fish)
+        match verdict.kind:
+            case "split":
+                return self._editor.split(report, verdict)
+            case "merge":
+                return self._editor.merge(report, verdict)
+            case "correct":
+                moved = reviews.get(verdict.track_id, NOT_REVIEWED).moved
+                return TrackEdit(verdict=self._corrected(verdict, submitted, moved))
+            case _:
+                return TrackEdit(verdict=verdict)
+
+    def _undo(self, verdict: Verdict, said: Sequence[Verdict]) -> Verdict:
+        """Take back the last verdict of this reviewer. UserError where others build on it."""
+        number = last_of(said, self._reviewer, self._reading)
+        if number is None:
+            raise UserError(f"undo: expected a verdict of {self._reviewer}, got none")
+        undone = said[number - 1]
+        if undone.kind in EDITS:
+            fish, counted = {undone.track_id, undone.other_fish} - {None}, standing(said)
+            for later in said[number:]:
+                if later in counted and fish & {
+                    later.track_id,
+                    later.other_fish,
+                    later.duplicate_of,
+                }:
+                    raise UserError(
+                        f"undo: {later.reviewer} has decided on fish {later.track_id} since; that "
+                        "must be undone first"
+                    )
+        return replace(verdict, track_id=undone.track_id, undoes=number)
+
+    def _corrected(
+        self, verdict: Verdict, submitted: SubmittedVerdict, moved: Mapping[int, Ends]
+    ) -> Verdict:
         """The verdict with its points in frame pixels and the length that follows."""
         if submitted.frame_index is None or submitted.head is None or submitted.tail is None:
             raise UserError("verdict: expected a frame with its head and tail points")
@@ -121,8 +197,7 @@ class VerdictRecorder:
             tail_u=tail[0],
             tail_v=tail[1],
         )
-        moved = {**self._review(submitted.track_id).moved, **verdict.moved}
-        length = self._corrected_length(submitted.track_id, moved)
+        length = self._corrected_length(submitted.track_id, {**moved, **verdict.moved})
         return replace(verdict, length_mm=length.length_mm, length_std_mm=length.length_std_mm)
 
     def _corrected_length(self, track_id: int, moved: Mapping[int, Ends]) -> LengthEstimate:
@@ -144,3 +219,13 @@ class VerdictRecorder:
             if view.row.fish.frame_index == frame_index:
                 return view
         raise UserError(f"verdict: fish {track_id} is not shown in frame {frame_index}")
+
+
+def _require_unmoved(reviews: Mapping[int, Review], *fish: int | None) -> None:
+    """Points that were moved are of a fish as it was: UserError before it gets other frames."""
+    for one in fish:
+        if one is not None and reviews.get(one, NOT_REVIEWED).moved:
+            raise UserError(
+                f"verdict: expected a fish without moved points, but fish {one} has some; "
+                "withdraw its verdicts first"
+            )

@@ -17,7 +17,8 @@ from stream_dmr.results.export_formats import Export
 from stream_dmr.results.fish_table import FISH_TABLE
 from stream_dmr.results.fisheries import Derived, FisheriesSettings, derive, whole_cm
 from stream_dmr.results.provenance import read_provenance
-from stream_dmr.results.verdicts import Verdict, add_verdict
+from stream_dmr.results.verdicts import Verdict
+from stream_dmr.results.verdicts_table import add_verdict
 from stream_dmr.running.config import parse_config
 from stream_dmr.template.template_file import BUNDLED, load_template
 from tests.support.fish_run import measure

@@ -12,6 +12,7 @@ from stream_dmr.errors import OutputError
 from stream_dmr.report.open_reports import open_report
 from stream_dmr.results.finished_fish import read_stored_fish
 from stream_dmr.results.length_store import LengthStore
+from stream_dmr.review.submitted_verdict import parse_verdict
 from stream_dmr.review.verdict_recorder import VerdictRecorder
 from tests.support.command import invoke
 from tests.support.final_estimates import FACTS, fish
@@ -58,7 +59,7 @@ def test_an_archive_is_evaluated(archive: Path, tmp_path: Path):
 def test_verdicts_on_an_archive_are_refused_in_one_line(archive: Path):
     recorder = VerdictRecorder(open_report(archive), "Ada")
     with pytest.raises(OutputError, match="a copy") as refusal:
-        recorder.record(b'{"track_id": 1, "kind": "accept"}')
+        recorder.record(parse_verdict(b'{"track_id": 1, "kind": "accept"}'))
     assert "\n" not in str(refusal.value)
 
 

@@ -10,7 +10,8 @@ import pytest
 
 from stream_dmr.errors import UserError
 from stream_dmr.results.provenance import NAME, seal_verdicts
-from stream_dmr.results.verdicts import Verdict, add_verdict
+from stream_dmr.results.verdicts import Verdict
+from stream_dmr.results.verdicts_table import add_verdict
 from stream_dmr.results.verify import verify
 from tests.support.command import invoke
 from tests.support.fish_run import measure

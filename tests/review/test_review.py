@@ -22,11 +22,11 @@ from stream_dmr.report.open_reports import open_report
 from stream_dmr.report.report_page import render_page
 from stream_dmr.report.run_report import RunReport
 from stream_dmr.results.finished_fish import read_stored_fish
-from stream_dmr.results.verdicts import read_verdicts
+from stream_dmr.results.verdicts_table import read_verdicts
 from stream_dmr.results.verify import verify
 from stream_dmr.review.corrected_length import corrected_fish, corrected_length
+from stream_dmr.review.review_queue import ReviewQueue
 from stream_dmr.review.review_server import ReviewServer
-from stream_dmr.review.verdict_recorder import VerdictRecorder
 from tests.support.browser import Tab
 from tests.support.command import rows
 from tests.support.fish_run import measure
@@ -48,12 +48,12 @@ def report(out: Path) -> RunReport:
 
 
 @pytest.fixture
-def judge(report: RunReport) -> VerdictRecorder:
-    return VerdictRecorder(report, "Ada")
+def judge(report: RunReport) -> ReviewQueue:
+    return ReviewQueue([report], reviewer="Ada")
 
 
-def submit(judge: VerdictRecorder, **said: Any) -> dict[str, Any]:
-    return judge.record(json.dumps(said).encode())
+def submit(judge: ReviewQueue, **said: Any) -> dict[str, Any]:
+    return judge.record(json.dumps(said).encode())[0]
 
 
 def ends(report: RunReport, track_id: int) -> tuple[int, FittedMesh, list[list[float]]]:
@@ -68,7 +68,7 @@ def ends(report: RunReport, track_id: int) -> tuple[int, FittedMesh, list[list[f
 
 
 def test_points_left_where_they_are_give_the_length_of_their_frame(
-    judge: VerdictRecorder, report: RunReport
+    judge: ReviewQueue, report: RunReport
 ):
     frame_index, fit, (head, tail) = ends(report, 1)
     row = submit(judge, track_id=1, kind="correct", frame_index=frame_index, head=head, tail=tail)
@@ -78,7 +78,7 @@ def test_points_left_where_they_are_give_the_length_of_their_frame(
     assert row["length_from"] == "review"
 
 
-def test_a_tail_further_out_is_a_longer_fish(judge: VerdictRecorder, report: RunReport, out: Path):
+def test_a_tail_further_out_is_a_longer_fish(judge: ReviewQueue, report: RunReport, out: Path):
     before = rows(out / "lengths.csv")
     frame_index, _, (head, tail) = ends(report, 1)
     further = (np.array(tail) + 0.1 * (np.array(tail) - np.array(head))).tolist()
@@ -93,9 +93,7 @@ def test_a_tail_further_out_is_a_longer_fish(judge: VerdictRecorder, report: Run
     assert verify(out)[0] == []
 
 
-def test_two_corrected_frames_are_put_together_as_a_run_does(
-    judge: VerdictRecorder, report: RunReport
-):
+def test_two_corrected_frames_are_put_together_as_a_run_does(judge: ReviewQueue, report: RunReport):
     frames = {}
     row: dict[str, Any] = {}
     for view in report.tracks[1].views[:2]:
@@ -118,7 +116,7 @@ def test_two_corrected_frames_are_put_together_as_a_run_does(
     assert judge.reviewed_rows()[0]["corrected_length_mm"] is None
 
 
-def test_every_verdict_is_kept_with_its_reviewer(judge: VerdictRecorder, out: Path):
+def test_every_verdict_is_kept_with_its_reviewer(judge: ReviewQueue, out: Path):
     submit(judge, track_id=1, kind="reject", reason=" a glove ")
     submit(judge, track_id=1, kind="species", species="Gadus morhua")
     row = submit(judge, track_id=2, kind="duplicate", duplicate_of=1)
@@ -145,15 +143,13 @@ def test_every_verdict_is_kept_with_its_reviewer(judge: VerdictRecorder, out: Pa
         b'{"track_id": 1, "kind": "correct", "frame_index": 1, "head": [1, NaN], "tail": [3, 4]}',
     ],
 )
-def test_what_is_no_verdict_is_refused_and_not_kept(
-    judge: VerdictRecorder, out: Path, content: bytes
-):
+def test_what_is_no_verdict_is_refused_and_not_kept(judge: ReviewQueue, out: Path, content: bytes):
     with pytest.raises(UserError):
         judge.record(content)
     assert read_verdicts(out / "lengths.db") == []
 
 
-def test_head_and_tail_on_one_spot_give_no_length(judge: VerdictRecorder, report: RunReport):
+def test_head_and_tail_on_one_spot_give_no_length(judge: ReviewQueue, report: RunReport):
     _, fit, _ = ends(report, 1)
     assert fit.shape is not None
     with pytest.raises(UserError, match="give no length"):
@@ -165,9 +161,13 @@ def test_head_and_tail_on_one_spot_give_no_length(judge: VerdictRecorder, report
         )
 
 
+def serve(report: RunReport, *, reviewer: str, port: int = 0) -> ReviewServer:
+    return ReviewServer(ReviewQueue([report], reviewer=reviewer), title="out", port=port)
+
+
 @pytest.fixture
 def server(report: RunReport) -> Iterator[ReviewServer]:
-    served = ReviewServer(report, reviewer="Ada <Byron>")
+    served = serve(report, reviewer="Ada <Byron>")
     yield served
     served.close()
 
@@ -200,7 +200,7 @@ def test_only_who_has_the_token_may_judge(server: ReviewServer, out: Path):
 
 
 def test_two_reviews_in_one_browser_keep_their_cookies(server: ReviewServer, report: RunReport):
-    other = ReviewServer(report, reviewer="Bob")
+    other = serve(report, reviewer="Bob")
     try:
         cookies = [first_cookie(one.address) for one in (server, other)]
         for one in (server, other):
@@ -222,13 +222,13 @@ def first_cookie(address: str) -> str:
 
 def test_a_recording_alone_takes_no_verdicts(out: Path):
     with pytest.raises(UserError, match=r"with its lengths\.db"):
-        ReviewServer(open_report(out / "recording.mcap"), reviewer="Ada")
+        ReviewQueue([open_report(out / "recording.mcap")], reviewer="Ada")
 
 
 def test_a_port_in_use_is_refused(server: ReviewServer, report: RunReport):
     port = int(server.address.split(":")[2].split("/")[0])
     with pytest.raises(OutputError, match="another --port"):
-        ReviewServer(report, reviewer="Ada", port=port)
+        serve(report, reviewer="Ada", port=port)
 
 
 HELPERS = """
@@ -240,10 +240,13 @@ const answered = async (...what) => {
   return answer;
 };
 window.fetch = (...what) => { open += 1; return answered(...what).finally(() => { open -= 1; }); };
-window.press = async (id) => {
-  document.getElementById(id).click();
+window.settled = async () => {
   do await new Promise((done) => setTimeout(done, 100)); while (open);
   await new Promise((done) => setTimeout(done, 100));  // for what is done with the answer
+};
+window.press = async (id) => {
+  document.getElementById(id).click();
+  await settled();
 };
 window.fill = (id, value) => { document.getElementById(id).value = value; };
 window.where = (name) => {
@@ -266,13 +269,17 @@ def test_a_reviewer_clicks_through_it(tab: Tab, out: Path):
     shown = tab.run(
         """
         choose(1);
+        await settled();
         await press('do-reject');
         const refusal = document.getElementById('message').textContent;
         fill('reason', 'a <b>glove</b>');
         await press('do-reject');
+        choose(1);
+        await settled();
         fill('species-name', 'Gadus morhua');
         await press('do-species');
         choose(2);
+        await settled();
         fill('duplicate-of', '1');
         await press('do-duplicate');
         return { refusal, row: document.querySelector('[data-id="1"]').innerText };
@@ -288,7 +295,10 @@ def test_a_reviewer_clicks_through_it(tab: Tab, out: Path):
 
 @pytest.mark.parametrize("by_finger", [False, True])
 def test_points_are_dragged_and_stay_where_they_were_put(tab: Tab, out: Path, by_finger: bool):
-    tab.run("choose(1); return 0")
+    tab.run(
+        "choose(1); await settled(); "
+        "document.querySelector('.views').scrollIntoView({ block: 'center' }); return 0"
+    )
     x, y, *_ = tab.run("return where('tail')")
     # A finger comes down beside the point, and the point keeps that distance.
     path = [(x + 5 * by_finger, y + step + 5 * by_finger) for step in (0, 4, 9, 12)]
@@ -306,7 +316,8 @@ def test_points_are_dragged_and_stay_where_they_were_put(tab: Tab, out: Path, by
         tab.mouse("mouseMoved", x + 50, y + 50, is_down=False)
     after = tab.run("return where('tail')")
     assert after[:2] == pytest.approx([x, y + 12], abs=0.5)
-    assert tab.run("await press('do-correct'); return where('tail')") == pytest.approx(after, abs=1)
+    saved = tab.run("await press('do-correct'); return where('tail')")
+    assert saved[2:] == pytest.approx(after[2:], abs=1)
     (verdict,) = read_verdicts(out / "lengths.db")
     (measured, *_) = read_stored_fish(out / "lengths.db")
     assert measured.estimate.length_mm is not None
@@ -316,7 +327,7 @@ def test_points_are_dragged_and_stay_where_they_were_put(tab: Tab, out: Path, by
 
 
 def test_another_reviewers_verdicts_come_in(tab: Tab, report: RunReport, server: ReviewServer):
-    other = ReviewServer(report, reviewer="Bob")
+    other = serve(report, reviewer="Bob")
     try:
         assert post(other, b'{"track_id": 2, "kind": "reject", "reason": "a glove"}') == 200
         assert post(other, b'{"track_id": 2, "kind": "species", "species": "Gadus morhua"}') == 200
@@ -331,16 +342,14 @@ def test_another_reviewers_verdicts_come_in(tab: Tab, report: RunReport, server:
 
 
 def test_a_verdict_that_nobody_takes_is_said_to_be_lost(tab: Tab, server: ReviewServer, out: Path):
-    tab.run("choose(1); return 0")
+    tab.run("choose(1); await settled(); return 0")
     server.close()
     said = "return document.getElementById('message').textContent"
     assert "Not saved" in tab.run(f"await press('do-accept'); {said}")
     assert read_verdicts(out / "lengths.db") == []
 
 
-def test_a_corrected_length_has_its_own_interval(
-    tab: Tab, judge: VerdictRecorder, report: RunReport
-):
+def test_a_corrected_length_has_its_own_interval(tab: Tab, judge: ReviewQueue, report: RunReport):
     frame_index, _, (head, tail) = ends(report, 1)
     further = (np.array(tail) + 0.2 * (np.array(tail) - np.array(head))).tolist()
     row = submit(
@@ -351,7 +360,7 @@ def test_a_corrected_length_has_its_own_interval(
     assert f"{(mm - 1.96 * std) / 10:.1f} to {(mm + 1.96 * std) / 10:.1f}" in shown
 
 
-def test_moved_points_are_in_the_report(judge: VerdictRecorder, report: RunReport, out: Path):
+def test_moved_points_are_in_the_report(judge: ReviewQueue, report: RunReport, out: Path):
     frame_index, _, (head, tail) = ends(report, 1)
     further = (np.array(tail) + 0.1 * (np.array(tail) - np.array(head))).tolist()
     row = submit(

@@ -1,0 +1,74 @@
+"""`stream-dmr review` and `agreement`: what reviewers decide, and how well they agree."""
+
+from contextlib import closing
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stream_dmr.cli.shared_options import stop_on_signals, warn
+
+_Folders = Annotated[
+    list[Path], typer.Argument(help="The --out of runs or of batches.", metavar="DIR...")
+]
+
+
+def review(
+    folders: _Folders,
+    reviewer: Annotated[
+        str, typer.Option(help="Your name, for the verdicts.", show_default="who is logged in")
+    ] = "",
+    port: Annotated[
+        int, typer.Option(help="Port on this machine; 0: any free one.", min=0, max=65535)
+    ] = 0,
+    source: Annotated[
+        str | None,
+        typer.Option(
+            help="The recorded clip, for pictures of the fish.",
+            show_default="the one that was measured, if it is still there",
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="A config.toml; its [fisheries] replaces the run's.")
+    ] = None,
+    sample: Annotated[
+        int | None, typer.Option(help="Review so many fish, drawn at random, for an audit.", min=1)
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of --sample; equal seeds draw equal fish.", min=0)] = 0,
+    blind: Annotated[
+        bool,
+        typer.Option(
+            "--blind",
+            help="A second reading: earlier verdicts are hidden, and yours are only compared.",
+        ),
+    ] = False,
+) -> None:
+    """Serve the page of `report` on this machine and take verdicts into lengths.db.
+
+    Verdicts stand beside the measurements, which stay as they are; Ctrl-C ends it.
+    """
+    with stop_on_signals() as stop:
+        from getpass import getuser
+
+        from stream_dmr.errors import UserError
+        from stream_dmr.report.open_reports import open_folders
+        from stream_dmr.review.review_queue import AuditSample, ReviewQueue
+        from stream_dmr.review.review_server import ReviewServer
+
+        reports, notes = open_folders(folders, source=source, config=config, as_measured=blind)
+        for line in notes:
+            print(line)
+        warn(line for report in reports for line in report.recording.warnings)
+        name = reviewer or getuser()
+        if blind and not name.strip():
+            raise UserError("--reviewer: expected a name for the blind reading")
+        queue = ReviewQueue(
+            reports,
+            reviewer=name,
+            blind=blind,
+            sample=None if sample is None else AuditSample(size=sample, seed=seed),
+        )
+        title = ", ".join(folder.resolve().name for folder in folders)
+        with closing(ReviewServer(queue, title=title, port=port)) as server:
+            print(f"open {server.address}\nCtrl-C ends it", flush=True)
+            stop.wait()

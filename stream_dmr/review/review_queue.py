@@ -1,0 +1,129 @@
+"""The fish of one or several runs as one review: what the page shows, and what it sends."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from stream_dmr.errors import UserError
+from stream_dmr.report.report_page import PlacedReport, fish_detail, place, render_page
+from stream_dmr.report.run_report import RunReport
+from stream_dmr.results.finished_fish import FishResult, database_of, read_measured_fish
+from stream_dmr.results.verdicts import NOT_REVIEWED
+from stream_dmr.review.clip import fish_clip
+from stream_dmr.review.submitted_verdict import parse_verdict
+from stream_dmr.review.verdict_recorder import VerdictRecorder
+
+
+@dataclass(frozen=True, kw_only=True)
+class AuditSample:
+    """How many fish are drawn at random, and from which seed."""
+
+    size: int
+    seed: int = 0
+
+
+class ReviewQueue:
+    """Takes the verdicts of one reviewer on the fish of all reports. Thread-safe."""
+
+    def __init__(
+        self,
+        reports: Sequence[RunReport],
+        *,
+        reviewer: str,
+        blind: bool = False,
+        sample: AuditSample | None = None,
+    ) -> None:
+        """UserError where a report has no database."""
+        self._reviewer, self._blind = reviewer, blind
+        self._placed = place(reports)
+        self._recorders = [VerdictRecorder(report, reviewer, blind=blind) for report in reports]
+        self._chosen = None if sample is None else sampled(self._placed, sample)
+        self._about: dict[str, Any] = {"reviewer": reviewer, "blind": blind}
+        if sample is not None:
+            self._about["sample"] = {"size": sample.size, "seed": sample.seed}
+
+    def page(self, title: str) -> str:
+        """The page as it is now."""
+        reports = [
+            replace(
+                recorder.report, fish=[fish for fish, row in self._fish(run) if self._is_shown(row)]
+            )
+            for run, recorder in enumerate(self._recorders)
+        ]
+        return render_page(reports, title=title, review=self._about)
+
+    def reviewed_rows(self) -> list[dict[str, Any]]:
+        """The rows of all fish that any verdict was about, or `{"id": ..., "gone": true}`."""
+        rows: list[dict[str, Any]] = []
+        for run, recorder in enumerate(self._recorders):
+            _, _, named = recorder.said()
+            rows += self._rows(run, named) if named else []
+        return rows
+
+    def record(self, content: bytes) -> list[dict[str, Any]]:
+        """Take a verdict in JSON; the rows of the fish that it changes. UserError if it is none."""
+        submitted = parse_verdict(content)
+        recorder = self._recorder(submitted.run)
+        return self._rows(submitted.run, recorder.record(submitted))
+
+    def detail(self, run: int, track_id: int) -> dict[str, Any]:
+        """What a row opens. UserError where there is no such fish."""
+        for fish, _ in self._fish(run):
+            if fish.estimate.track_id == track_id:
+                return fish_detail(fish, self._recorder(run).report)
+        raise UserError(f"expected a fish of this review, got {track_id}")
+
+    def clip(self, run: int, track_id: int, shift: int) -> Iterator[bytes]:
+        """The clip around a fish, see `fish_clip`. UserError where there is no such fish."""
+        recorder = self._recorder(run)
+        return fish_clip(recorder.report, recorder.pictures, track_id, shift=shift)
+
+    def close(self) -> None:
+        """Release the sources."""
+        for recorder in self._recorders:
+            recorder.pictures.close()
+
+    def _recorder(self, run: int) -> VerdictRecorder:
+        if not 0 <= run < len(self._recorders):
+            raise UserError(f"expected a run of this review, got {run}")
+        return self._recorders[run]
+
+    def _rows(self, run: int, track_ids: Sequence[int] | set[int]) -> list[dict[str, Any]]:
+        rows = {fish.estimate.track_id: row for fish, row in self._fish(run, set(track_ids))}
+        placed = self._placed[run]
+        gone = [{"id": placed.row_id(one), "gone": True} for one in track_ids if one not in rows]
+        return [*(row for row in rows.values() if self._is_shown(row)), *gone]
+
+    def _fish(
+        self, run: int, wanted: set[int] | None = None
+    ) -> Iterator[tuple[FishResult, dict[str, Any]]]:
+        """The fish of a run as this reader sees them, with their rows."""
+        report, reviews, _ = self._recorder(run).said()
+        placed = replace(self._placed[run], report=report)
+        for fish in report.fish:
+            track_id = fish.estimate.track_id
+            if wanted is None or track_id in wanted:
+                seen = replace(fish, review=reviews.get(track_id, NOT_REVIEWED))
+                yield seen, placed.row(seen)
+
+    def _is_shown(self, row: dict[str, Any]) -> bool:
+        """True for the fish of the sample, and for those that reviewers have made."""
+        return self._chosen is None or row["origin"] != "run" or row["id"] in self._chosen
+
+
+def sampled(placed: Sequence[PlacedReport], sample: AuditSample) -> set[int]:
+    """The numbers, in the page, of fish that are drawn at random from those that were measured.
+
+    Equal seeds give equal fish, whatever reviewers have done meanwhile.
+    """
+    numbers = sorted(
+        one.row_id(fish.estimate.track_id)
+        for one in placed
+        if (database := database_of(one.report.path)) is not None
+        for fish in read_measured_fish(database)
+    )
+    rng = np.random.default_rng(sample.seed)
+    size = min(sample.size, len(numbers))
+    return set(rng.choice(numbers, size, replace=False).tolist())

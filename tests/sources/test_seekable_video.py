@@ -1,0 +1,33 @@
+"""Pictures of a video in any order are those of reading it from its start."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stream_dmr.sources.seekable_video import SeekableVideo
+from tests.sources.test_video import write_video
+from tests.support.sources import read
+
+
+@pytest.mark.parametrize(
+    ("name", "codec"), [("a.mp4", "mp4v"), ("b.avi", "MJPG"), ("c.mkv", "MJPG")]
+)
+def test_any_order_gives_the_pictures_of_a_run(tmp_path: Path, name: str, codec: str):
+    path = write_video(tmp_path / name, codec=codec, fps=25.0, num_frames=120)
+    _, frames = read(path)
+    video = SeekableVideo(path)
+    order = [100, 3, 4, 5, 119, 0, 60, 59, 110, 110, 1]
+    for k in order:
+        image = video.image_at(frames[k].timestamp_ns)
+        assert image is not None
+        np.testing.assert_array_equal(image, frames[k].image)
+    video.close()
+
+
+def test_a_time_outside_of_the_video_has_no_picture(tmp_path: Path):
+    path = write_video(tmp_path / "a.mp4", codec="mp4v", num_frames=5)
+    video = SeekableVideo(path)
+    assert video.image_at(10**10) is None
+    assert video.image_at(0) is not None  # a search after the end finds the start again
+    assert SeekableVideo(tmp_path / "none.mp4").image_at(0) is None
