@@ -16,6 +16,7 @@ from stream_dmr.cli.demo import demo
 from stream_dmr.cli.evaluate import evaluate
 from stream_dmr.cli.export import export
 from stream_dmr.cli.fleet import fleet
+from stream_dmr.cli.haul import haul
 from stream_dmr.cli.keygen import keygen
 from stream_dmr.cli.learn import learn_template
 from stream_dmr.cli.make_template import make_template
@@ -40,7 +41,7 @@ app = typer.Typer(
 )
 for command in (
     *(demo, run, calibrate, check, replay, recover, view, convert, export),
-    *(report, review, verify, keygen, batch, fleet, evaluate, train, learn_template),
+    *(report, review, verify, haul, keygen, batch, fleet, evaluate, train, learn_template),
     make_template,
 ):
     app.command()(command)

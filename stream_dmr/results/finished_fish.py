@@ -16,6 +16,7 @@ from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
 from stream_dmr.results.added_tables import added_rows, has_table
 from stream_dmr.results.catch_facts import UNKNOWN_CATCH, CatchFacts
+from stream_dmr.results.hauls import HAULS, haul_at, hauls_of
 from stream_dmr.results.kept_positions import POSITIONS, kept_of, positions_of
 from stream_dmr.results.lengths_database import NAME, open_for_reading
 from stream_dmr.results.run_facts import RunFacts, cut_short, run_facts
@@ -40,6 +41,7 @@ class FishResult:
     iou: float | None = None
     flags: Sequence[str] = ()
     catch: CatchFacts = UNKNOWN_CATCH
+    haul: str = ""
     where: Whereabouts = NOWHERE  # at `middle_ns`
     review: Review = NOT_REVIEWED
     origin: str = "run"  # or the edit of a reviewer that made it: add, split or merge
@@ -218,7 +220,7 @@ def run_times(database: Path) -> dict[str, list[int | None]]:
 
 
 def rows_by_run(
-    database: Path, table: Literal["fish", "events", "positions"]
+    database: Path, table: Literal["fish", "events", "positions", "watched"]
 ) -> dict[str, list[str]]:
     """Every stored value of the rows of each run, as lines of JSON, for checksums.
 
@@ -266,6 +268,7 @@ def _stored_fish(database: Path, reviews: dict[int, Review]) -> list[FishResult]
         with closing(open_for_reading(database)) as connection:
             runs = dict(_runs(connection))
             track = VesselTrack(positions_of(added_rows(connection, POSITIONS)))
+            hauls = hauls_of(added_rows(connection, HAULS))
             estimates = read_estimates(connection)
             rows = connection.execute("SELECT * FROM fish ORDER BY number")
             names = [column[0] for column in rows.description]
@@ -278,6 +281,9 @@ def _stored_fish(database: Path, reviews: dict[int, Review]) -> list[FishResult]
                     iou=other["iou"],
                     flags=json.loads(other["flags"]),
                     where=track.at(middle_ns(estimate)),
+                    haul=haul_at(hauls, middle_ns(estimate))
+                    if hauls
+                    else runs[other["run_id"]].haul,
                     catch=CatchFacts(**{name: other.get(name) for name in _CATCH_NAMES}),
                     review=reviews.get(estimate.track_id, NOT_REVIEWED),
                 )

@@ -91,6 +91,7 @@ def _measured(fish: FishResult) -> dict[str, Any]:
 
 def _place_columns(fish: FishResult) -> dict[str, Any]:
     return {
+        "haul": fish.haul,
         "time_utc": utc_text(fish.utc_ns),
         "time_utc_ns": fish.utc_ns,
         "latitude": fish.where.latitude,

@@ -11,7 +11,9 @@ from typing import Any
 
 from stream_dmr.errors import OutputError
 from stream_dmr.files import rename_durably, sha256_of, writing_to
+from stream_dmr.results.added_tables import read_added
 from stream_dmr.results.finished_fish import database_of, read_runs, rows_by_run, run_times
+from stream_dmr.results.hauls import HAULS
 from stream_dmr.results.lengths_database import NAME as DATABASE
 from stream_dmr.results.run_facts import RunFacts
 from stream_dmr.results.verdicts import Verdict
@@ -55,14 +57,15 @@ def seal_run(folder: Path, *, with_recordings: bool) -> None:
         f"{table}_sha256": {
             run_id: lines_sha256(lines) for run_id, lines in rows_by_run(database, table).items()
         }
-        for table in ("fish", "events", "positions")
+        for table in ("fish", "events", "positions", "watched")
     }
     _write(
         folder,
         _new(read_runs(database))
         | sums
         | {"run_times_ns": run_times(database), "files": _sums(folder, files)}
-        | {"verdicts": verdicts_sum(read_verdicts(database))},
+        | {"verdicts": verdicts_sum(read_verdicts(database))}
+        | {"hauls": hauls_sum(read_added(database, HAULS))},
     )
 
 
@@ -75,6 +78,23 @@ def verdicts_sum(verdicts: Sequence[Verdict]) -> dict[str, Any]:
     """The number of verdicts and their SHA-256."""
     lines = map(verdict_line, verdicts)
     return {"count": len(verdicts), "sha256": lines_sha256(lines)}
+
+
+def hauls_sum(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The number of haul events and their SHA-256."""
+    return {"count": len(rows), "sha256": lines_sha256(json.dumps(dict(row)) for row in rows)}
+
+
+def seal_hauls(folder: Path) -> None:
+    """Update the number of haul events and their SHA-256, as `seal_verdicts` does."""
+    rows = read_added(folder / DATABASE, HAULS)
+
+    def more(made: dict[str, Any]) -> dict[str, Any]:
+        known = made.get("hauls") or hauls_sum([])
+        is_sound = hauls_sum(rows[: known["count"]]) == known
+        return {"hauls": hauls_sum(rows)} if is_sound else {}
+
+    _add(folder, more)
 
 
 def seal_files(

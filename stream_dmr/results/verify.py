@@ -35,6 +35,7 @@ from stream_dmr.results.provenance import known_files, lines_sha256, read_proven
 from stream_dmr.results.run_facts import RunFacts, run_facts
 from stream_dmr.results.verdicts import Verdict
 from stream_dmr.results.verdicts_table import read_verdicts
+from stream_dmr.results.verify_added import unsealed_rows
 from stream_dmr.results.verify_edits import changed_edits
 
 _MADE_BY = ("config_sha256", "calibration_sha256", "template_sha256")
@@ -147,7 +148,7 @@ def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
     try:
         stored, runs = rows_by_run(database, "fish"), read_runs(database)
         events, times = rows_by_run(database, "events"), run_times(database)
-        said, places = read_verdicts(database), rows_by_run(database, "positions")
+        said = read_verdicts(database)
     except OutputError:
         return  # `_changes` says so
     for run_id, expected in made["fish_sha256"].items():
@@ -161,13 +162,8 @@ def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
             yield Change(database, f"run {run_id}: events were put in")
         elif expected is not None and lines_sha256(events.get(run_id, [])) != expected:
             yield Change(database, f"the events of run {run_id} are not those that were noted")
-    sealed: dict[str, str] = made.get("positions_sha256", {})
-    run_ids = {**sealed, **places} if "positions_sha256" in made else {}  # else an older one
-    for run_id in run_ids:
-        if lines_sha256(places.get(run_id, [])) != sealed.get(run_id, lines_sha256([])):
-            yield Change(
-                database, f"the positions of run {run_id} are not those that were received"
-            )
+    for what in unsealed_rows(database, made):
+        yield Change(database, what)
     for run_id, facts in made["runs"].items():
         for field in fields(RunFacts):
             now = getattr(runs.get(run_id), field.name, "missing")

@@ -1,22 +1,31 @@
-"""Rows of the tables that runs only add to, against the chain of signatures."""
+"""Rows of the tables that are only added to, against provenance.json and the signatures."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
-from stream_dmr.results.added_tables import AddedTable
+from stream_dmr.results.added_tables import AddedTable, read_added
+from stream_dmr.results.finished_fish import rows_by_run
+from stream_dmr.results.hauls import HAULS
+from stream_dmr.results.provenance import hauls_sum, lines_sha256
 from stream_dmr.results.signatures import ChainEntry, content_sha256
 
 
 def added_changes(
-    entries: Sequence[ChainEntry], table: AddedTable, rows: Sequence[Mapping[str, Any]]
+    entries: Sequence[ChainEntry],
+    table: AddedTable,
+    rows: Sequence[Mapping[str, Any]],
+    *,
+    may_be_added: bool = False,
 ) -> Iterator[str]:
-    """What was changed, removed or put in, a line each kind."""
+    """What was changed, removed or, unless it `may_be_added`, put in; a line each kind."""
     signed = Counter(entry.content_sha256 for entry in entries if entry.kind == table.kind)
     found = Counter(content_sha256(row) for row in rows)
     if missing := (signed - found).total():
         yield f"{missing} of its {table.name} are missing, or not as they were signed"
-    if surplus := unsigned_rows(entries, table, rows):
+    surplus = 0 if may_be_added else unsigned_rows(entries, table, rows)
+    if surplus:
         yield f"{surplus} of its {table.name} were put in, or are not as they were signed"
 
 
@@ -26,3 +35,25 @@ def unsigned_rows(
     """The number of rows that the device did not sign."""
     signed = Counter(entry.content_sha256 for entry in entries if entry.kind == table.kind)
     return (Counter(content_sha256(row) for row in rows) - signed).total()
+
+
+def unsealed_rows(database: Path, made: Mapping[str, Any]) -> Iterator[str]:
+    """Positions, watched times and hauls that are not as provenance.json, `made`, knows them.
+
+    An older one knows none of them. Raises OutputError.
+    """
+    tables: tuple[Literal["positions", "watched"], ...] = ("positions", "watched")
+    for table in tables:
+        sealed: dict[str, str] | None = made.get(f"{table}_sha256")
+        if sealed is None:
+            continue
+        found = rows_by_run(database, table)
+        for run_id in {**sealed, **found}:
+            if lines_sha256(found.get(run_id, [])) != sealed.get(run_id, lines_sha256([])):
+                yield f"the rows of {table} of run {run_id} are not those that it wrote"
+    known: dict[str, Any] | None = made.get("hauls")
+    rows = read_added(database, HAULS)
+    if known is not None and hauls_sum(rows[: known["count"]]) != known:
+        yield "the hauls are not those that were told"
+    elif known is not None and len(rows) > known["count"]:
+        yield f"hauls that no run and no `haul` took: {len(rows) - known['count']}"

@@ -14,6 +14,7 @@ from stream_dmr.errors import OutputError
 from stream_dmr.files import is_locked, sha256_of
 from stream_dmr.results.added_tables import added_rows
 from stream_dmr.results.chain_table import read_chain
+from stream_dmr.results.hauls import HAULS, WATCHED
 from stream_dmr.results.kept_positions import POSITIONS
 from stream_dmr.results.lengths_database import NAME as DATABASE
 from stream_dmr.results.lengths_database import open_for_reading
@@ -30,7 +31,7 @@ from stream_dmr.results.signatures import (
     content_sha256,
 )
 from stream_dmr.results.signed_files import RECORDINGS
-from stream_dmr.results.verify_added import added_changes
+from stream_dmr.results.verify_added import added_changes, unsigned_rows
 
 _Row = Mapping[str, Any]
 
@@ -49,7 +50,7 @@ def check_signatures(folder: Path, key: Ed25519PublicKey) -> SignatureCheck:
     try:
         with closing(open_for_reading(folder / DATABASE)) as database:
             entries = read_chain(database)
-            positions = added_rows(database, POSITIONS)
+            added = {table: added_rows(database, table) for table in (POSITIONS, WATCHED, HAULS)}
             tables = {name: _rows(database, name) for name in ("runs", "fish", "events")}
     except (sqlite3.Error, OutputError, TypeError) as error:
         check.changes.append(f"its signatures can't be read: {error}")
@@ -60,7 +61,11 @@ def check_signatures(folder: Path, key: Ed25519PublicKey) -> SignatureCheck:
     check.changes.extend(_broken_links(entries, key))
     check.changes.extend(_rows_by_name(entries, FISH, tables["fish"], "track_id"))
     check.changes.extend(_events(entries, tables["events"]))
-    check.changes.extend(added_changes(entries, POSITIONS, positions))
+    for table, rows in added.items():
+        told = unsigned_rows(entries, table, rows) if table is HAULS else 0
+        if told:  # people may add hauls to a folder
+            check.notes.append(f"{told} events of hauls are not signed by the device")
+        check.changes.extend(added_changes(entries, table, rows, may_be_added=table is HAULS))
     check.changes.extend(_runs(entries, tables["runs"], is_going_on=is_locked(folder)))
     check.changes.extend(_files(entries, folder))
     check.notes.extend(_found(entries))

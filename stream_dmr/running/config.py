@@ -23,6 +23,7 @@ from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.results.fisheries import FisheriesSettings
+from stream_dmr.running.hauls_settings import HaulsSettings
 from stream_dmr.running.run_settings import AlertSettings, DriftSettings, WatchSettings
 from stream_dmr.segmentation.detection.open_detector import DetectFishSettings
 from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
@@ -82,6 +83,9 @@ class Config(Settings):
     sensors: SensorsSettings = Field(
         default_factory=SensorsSettings,
         description="positions of `run --nmea`, and their time",
+    )
+    hauls: HaulsSettings = Field(
+        default_factory=HaulsSettings, description="when a run begins and ends hauls by itself"
     )
     train: TrainSettings = Field(
         default_factory=TrainSettings, description="how `stream-dmr train` trains the U-Net"

@@ -271,5 +271,6 @@ def _result_writer(
         if has_drift_alarms
         else None,
         sensors=inputs.config.sensors,
+        hauls=outputs.hauls,
         on_notice=on_notice,
     )

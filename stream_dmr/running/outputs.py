@@ -21,6 +21,7 @@ from stream_dmr.results.provenance import sealed
 from stream_dmr.results.run_facts import run_facts
 from stream_dmr.results.signatures import Signer
 from stream_dmr.results.signed_files import SignedFiles
+from stream_dmr.running.haul_log import HaulLog
 from stream_dmr.running.inputs import Inputs
 from stream_dmr.running.resume import interrupted_tracks
 from stream_dmr.running.run_folder import prepare_folder
@@ -32,6 +33,7 @@ class Outputs:
     """What a run writes to, and what it found in the folder."""
 
     store: LengthStore
+    hauls: HaulLog
     lengths: LengthsTable
     recorder: Recorder
     repairs: Sequence[Repair]  # of recordings that a crash left unfinished
@@ -79,12 +81,14 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
         lengths = LengthsTable(out, store, resume=resume, on_refusal=on_refusal)
         stack.enter_context(closing(lengths))
         stack.enter_context(closing(observer))
+        hauls = HaulLog(store, config.hauls, frames_lost=partial(_frames_lost, inputs))
         observer.open(
             OpenRun(
                 config=config,
                 source=inputs.source,
                 positions=inputs.positions,
                 store=store,
+                hauls=hauls,
                 out=out,
                 sinks=states,
             )
@@ -115,8 +119,15 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
         retention.start()
         yield Outputs(
             store=store,
+            hauls=hauls,
             lengths=lengths,
             recorder=recorder,
             repairs=repairs,
             interrupted=interrupted,
         )
+
+
+def _frames_lost(inputs: Inputs) -> int:
+    """The frames that came from a camera and that nobody measured."""
+    counts = inputs.source.counts
+    return 0 if counts is None else counts.dropped + counts.failed

@@ -25,6 +25,7 @@ from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.lengths_table import LengthsTable
 from stream_dmr.results.store_rows import INTERRUPTED
 from stream_dmr.running.drift_alarms import DriftAlarms
+from stream_dmr.running.haul_log import HaulLog
 from stream_dmr.sensors.sensors_settings import SensorsSettings
 
 _SENSORS = SensorsSettings()
@@ -47,6 +48,7 @@ class ResultWriter:
         flags: Mapping[int, Sequence[str]] = MappingProxyType({}),
         drift: DriftAlarms | None = None,
         sensors: SensorsSettings = _SENSORS,
+        hauls: HaulLog | None = None,
         on_notice: Callable[[str], None],
     ) -> None:
         """`clips`: frames done of each clip before; None where the source has no clips.
@@ -56,6 +58,7 @@ class ResultWriter:
         """
         self._store, self._lengths, self._recorder = store, lengths, recorder
         self._flags = flags
+        self._hauls = hauls
         self._thinner = PositionThinner(keep_s=sensors.keep_s, max_gap_s=sensors.max_gap_s)
         self._drift, self._on_notice = drift, on_notice
         self._clips = None if clips is None else Counter(clips)
@@ -112,8 +115,12 @@ class ResultWriter:
         Idempotent.
         """
         self._keep_positions(self._thinner.finish())
+        if self._hauls is not None:
+            self._hauls.finish()
 
     def _take_position(self, position: Position) -> None:
+        if self._hauls is not None:
+            self._hauls.take_position(position)
         kept = self._thinner.take(position)
         if self._thinner.gap_s:
             line = f"no positions for {self._thinner.gap_s:.0f} s"
@@ -126,6 +133,8 @@ class ResultWriter:
             self._store.append(POSITIONS, name, position_values(kept), is_urgent=False)
 
     def _take_frame(self, frame: Frame) -> None:
+        if self._hauls is not None:
+            self._hauls.take_frame(frame.timestamp_ns)
         if self._clips is not None:
             self._clips_in_chain.append(frame.source)
         if self._drift is not None:
@@ -144,4 +153,6 @@ class ResultWriter:
             flags += self._drift.take_fish(iou, estimate.timestamp_ns)
         if estimate.track_id in self._interrupted:
             flags.append(INTERRUPTED)
+        if self._hauls is not None:
+            self._hauls.take_fish(estimate)
         self._store.add(estimate, iou=iou, flags=flags, catch=CatchFacts.of(estimate))

@@ -9,6 +9,7 @@ from stream_dmr.messages import LengthEstimate, Message
 from stream_dmr.recording.messages.sink_states import SinkStates
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.running.config import Config
+from stream_dmr.running.haul_log import HaulLog
 from stream_dmr.running.pipeline import Chain
 from stream_dmr.sensors.position_source import PositionSource
 from stream_dmr.sources.source import Source
@@ -22,6 +23,7 @@ class OpenRun:
     source: Source
     positions: PositionSource | None = None
     store: LengthStore
+    hauls: HaulLog
     out: Path
     sinks: SinkStates
 

@@ -14,6 +14,7 @@ from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish
 from stream_dmr.reasons import without_counts
 from stream_dmr.recording.messages.sink_states import SinkStates
 from stream_dmr.results.length_store import LengthStore
+from stream_dmr.running.haul_log import HaulLog
 from stream_dmr.running.pipeline import Chain
 from stream_dmr.sensors.position_source import PositionSource
 from stream_dmr.sources.source import Source
@@ -61,10 +62,11 @@ class RunState:
         sinks: SinkStates | None = None,
         zones: ZonesSettings | None = None,
         positions: PositionSource | None = None,
+        hauls: HaulLog | None = None,
     ) -> None:
         """A camera that is silent for `silence_s` and a frame that takes `stuck_s` are problems."""
         self.source = source
-        self.positions = positions
+        self.positions, self.hauls = positions, hauls
         self.position: Position | None = None  # the latest
         self.chain: Chain | None = None
         self.sinks = sinks or SinkStates()

@@ -31,6 +31,7 @@ class WatchObserver(RunObserver):
             sinks=run.sinks,
             zones=run.config.zones,
             positions=run.positions,
+            hauls=run.hauls,
         )
         state.continue_after(run.store)
         self._server = WatchServer(state, settings) if settings.port else None

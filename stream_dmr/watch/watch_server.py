@@ -1,5 +1,6 @@
 """Serves the status page, its picture, /metrics and /health over HTTP."""
 
+import json
 import threading
 import time
 from datetime import UTC, datetime
@@ -10,7 +11,7 @@ from typing import Any
 
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
-from stream_dmr.errors import ConfigError, OutputError
+from stream_dmr.errors import ConfigError, OutputError, UserError
 from stream_dmr.results.table_cells import utc_text
 from stream_dmr.running.run_settings import WatchSettings
 from stream_dmr.sensors.fix_builder import COUNTED
@@ -21,6 +22,7 @@ from stream_dmr.web.token_server import TokenHandler, TokenServer, is_loopback
 
 _PICTURE_INTERVAL_S = 0.5  # one picture for all who ask meanwhile: measuring must not slow down
 _MIN_TOKEN_CHARACTERS = 16
+_MAX_HAUL_BYTES = 1000
 
 
 class WatchServer:
@@ -120,6 +122,21 @@ class _WatchHandler(TokenHandler):
             case _:
                 self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
 
+    def answer_post(self, path: str) -> None:
+        """Begin or end a haul. Only this page's own scripts can send JSON with the cookie."""
+        length, hauls = self.headers.get("Content-Length", ""), self.server.state.hauls
+        is_json = self.headers.get_content_type() == "application/json"
+        is_short = length.isdecimal() and int(length) <= _MAX_HAUL_BYTES
+        if path != "/haul" or hauls is None or not is_json or not is_short:
+            return self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"expected a haul as JSON\n")
+        try:
+            told = json.loads(self.rfile.read(int(length)))
+            what, name, said_by = (str(told.get(key, "")) for key in ("what", "name", "said_by"))
+            name = hauls.tell(what, name, said_by=said_by)
+        except (UserError, ValueError, AttributeError) as error:
+            return self.answer(HTTPStatus.BAD_REQUEST, "text/plain", f"{error}\n".encode())
+        self.answer_json(HTTPStatus.OK, {"name": name})
+
     def _answer_page(self, name: str) -> None:
         page = files("stream_dmr.watch").joinpath(name).read_bytes()
         self.answer(HTTPStatus.OK, "text/html; charset=utf-8", page)
@@ -177,6 +194,14 @@ def _warnings_json(state: RunState) -> list[dict[str, Any]]:
     ]
 
 
+def haul_json(state: RunState) -> dict[str, Any] | None:
+    """The haul that goes on: None of a run that takes none, with the name "" between hauls."""
+    if state.hauls is None:
+        return None
+    current = state.hauls.current()
+    return {"name": "" if current is None else current.name}
+
+
 def status_json(state: RunState) -> dict[str, Any]:
     """What the status page shows, for JSON."""
     return {
@@ -186,6 +211,7 @@ def status_json(state: RunState) -> dict[str, Any]:
         "fates": dict(state.fates.most_common()),
         "fish_per_hour": state.fish_per_hour(),
         "positions": positions_json(state),
+        "haul": haul_json(state),
         "frames_per_s": state.frames_per_s(),
         "last_frame_age_s": state.last_frame_age_s(),
         "fish": [

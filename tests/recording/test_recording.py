@@ -420,7 +420,7 @@ def test_foxglove_topics_are_written_beside_the_messages(tmp_path: Path, message
             assert item.schema is not None
             assert item.schema.name == FOXGLOVE_TOPICS[item.channel.topic]
             found.setdefault(item.channel.topic, item.decoded_message)
-    assert set(found) == set(FOXGLOVE_TOPICS)
+    assert set(found) == {*FOXGLOVE_TOPICS} - {"/foxglove/position"}  # a run without positions
     picture = cv2.imdecode(np.frombuffer(found["/foxglove/picture"].data, np.uint8), 1)
     camera = found["/foxglove/camera"]
     assert picture.shape[:2] == (camera.height, camera.width)

@@ -105,3 +105,16 @@ def test_changed_positions_are_found(folder: Path, tmp_path: Path, statement: st
     database.close()
     (change,) = verify(out)[0]
     assert "positions" in change.what
+
+
+def test_hauls_are_told_to_the_folder_and_sealed(folder: Path, tmp_path: Path):
+    out = shutil.copytree(folder / "out", tmp_path / "out")
+    for what, at in (("start", "0.1"), ("end", "2026-11-22T06:00:02.7Z")):
+        told = invoke("haul", {what: None, str(out): None, "--at": at})
+        assert told.code == 0, told.err
+    assert [one.haul for one in read_stored_fish(out / "lengths.db")] == ["1", "1"]
+    assert verify(out)[0] == []
+    with sqlite3.connect(out / "lengths.db") as database:
+        database.execute("UPDATE hauls SET timestamp_ns = 5 WHERE number = 1")
+    database.close()
+    assert [change.what for change in verify(out)[0]] == ["the hauls are not those that were told"]

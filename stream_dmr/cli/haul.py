@@ -1,0 +1,71 @@
+"""`stream-dmr haul`: begins and ends hauls, on a running box or in a folder of results."""
+
+import json
+import urllib.error
+import urllib.request
+from getpass import getuser
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+_TIMEOUT_S = 10.0
+
+
+def haul(
+    what: Annotated[Literal["start", "end"], typer.Argument(help="start or end")],
+    target: Annotated[
+        str,
+        typer.Argument(
+            help="Address of a run's status page, or the --out of a run.", metavar="URL|DIR"
+        ),
+    ],
+    name: Annotated[
+        str, typer.Option(help="Name of the haul.", show_default="the next number")
+    ] = "",
+    at: Annotated[
+        str | None,
+        typer.Option(
+            help="When: UTC as 2026-11-22T06:00:00Z, or seconds as in lengths.csv; for a DIR.",
+        ),
+    ] = None,
+    token_file: Annotated[
+        Path | None, typer.Option(help="The access token of the status page.")
+    ] = None,
+) -> None:
+    """Begin or end a haul; its fish are those whose middle frame lies in it."""
+    if target.startswith(("http://", "https://")):
+        print(_post(target, what, name, token_file))
+    else:
+        print(_write(Path(target), what, name, at))
+
+
+def _post(address: str, what: str, name: str, token_file: Path | None) -> str:
+    from stream_dmr.errors import UserError
+
+    request = urllib.request.Request(
+        f"{address.rstrip('/')}/haul",
+        data=json.dumps({"what": what, "name": name, "said_by": getuser()}).encode(),
+        headers={"Content-Type": "application/json"},
+    )
+    try:
+        if token_file is not None:
+            token = token_file.read_text(encoding="utf-8").strip()
+            request.add_header("Authorization", f"Bearer {token}")
+        with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
+            return f"haul {json.loads(answer.read())['name']}: {what}"
+    except urllib.error.HTTPError as error:
+        with error:
+            said = error.read(500).decode(errors="replace").strip()
+        raise UserError(f"{address}: expected it to take the haul, got: {said or error}") from error
+    except (OSError, ValueError, KeyError) as error:
+        raise UserError(
+            f"{address}: expected the status page of a run ([watch] port), got: {error}"
+        ) from error
+
+
+def _write(folder: Path, what: str, name: str, at: str | None) -> str:
+    from stream_dmr.results.haul_events import write_haul
+
+    written = write_haul(folder, what, name=name, at=at, said_by=getuser())
+    return f"haul {written}: {what}"

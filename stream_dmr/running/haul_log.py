@@ -1,0 +1,138 @@
+"""Takes note of hauls while a run goes on: told by people, or by rule."""
+
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+
+from stream_dmr.errors import OutputError, UserError
+from stream_dmr.messages import LengthEstimate, Position
+from stream_dmr.results.added_tables import read_added
+from stream_dmr.results.hauls import END, HAULS, START, WATCHED, Haul, haul_values, hauls_of
+from stream_dmr.results.length_store import LengthStore
+from stream_dmr.running.hauls_settings import HaulsSettings
+
+_RULE = "rule"
+_FAST_NS = 60_000_000_000  # so long must the vessel be fast; chosen
+_WATCHED_NS = 300_000_000_000  # a row of `watched` at least so often
+_PAUSE_NS = 10_000_000_000  # between two frames: what was watched is cut there
+
+
+class HaulLog:
+    """Called in the threads of the chain and of the server. Thread-safe."""
+
+    def __init__(
+        self,
+        store: LengthStore,
+        settings: HaulsSettings,
+        *,
+        frames_lost: Callable[[], int] = lambda: 0,
+    ) -> None:
+        """`frames_lost`: frames of the camera so far that the chain did not get."""
+        self._frames_lost = frames_lost
+        self._store = store
+        self._pause_ns = round(settings.pause_min * 60e9)
+        self._fast_knots = settings.end_speed_knots or float("inf")
+        self._lock = threading.RLock()
+        self._known: list[Haul] = []
+        self._ruled: str | None = None  # the haul that the rule began and has not ended
+        self._last_fish_ns = 0
+        self._fast_since_ns: int | None = None
+        self._now_ns = 0  # capture time of the latest frame
+        self._watched: list[int] | None = None  # first and last capture time, frames, lost
+        self._lost_before = 0
+
+    def hauls(self) -> list[Haul]:
+        """All hauls of the folder so far; those that others wrote into it as well."""
+        with self._lock, suppress(OutputError):
+            self._known = hauls_of(read_added(self._store.path, HAULS))
+        return self._known
+
+    def current(self) -> Haul | None:
+        """The haul that goes on."""
+        hauls = self.hauls()
+        return hauls[-1] if hauls and hauls[-1].ended_ns is None else None
+
+    def tell(self, what: str, name: str = "", *, said_by: str) -> str:
+        """Begin or end a haul now; returns its name. Raises UserError where that has no sense."""
+        with self._lock:
+            current = self.current()
+            if what == START:
+                name = name.strip() or self._next_name()
+            elif what == END and current is not None:
+                name = current.name
+            else:
+                raise UserError(
+                    f"haul: expected start, or end of a haul that goes on, got {what!r}; "
+                    "begin one first"
+                )
+            self._ruled = None
+            self._add(what, name, self._now_ns, said_by)
+            return name
+
+    def take_frame(self, timestamp_ns: int) -> None:
+        """A frame passes."""
+        with self._lock:
+            self._watch(timestamp_ns, self._frames_lost())
+            self._now_ns = timestamp_ns
+            if self._ruled is not None and timestamp_ns - self._last_fish_ns > self._pause_ns:
+                self._end_ruled(self._last_fish_ns)
+
+    def take_fish(self, estimate: LengthEstimate) -> None:
+        """A track ended."""
+        with self._lock:
+            if self._pause_ns and self._ruled is None and self.current() is None:
+                self._ruled = self._next_name()
+                self._add(START, self._ruled, estimate.first_timestamp_ns, _RULE)
+            self._last_fish_ns = max(self._last_fish_ns, estimate.last_timestamp_ns)
+
+    def take_position(self, position: Position) -> None:
+        """The vessel's speed may end a haul."""
+        with self._lock:
+            if position.speed_knots is None or position.speed_knots <= self._fast_knots:
+                self._fast_since_ns = None
+                return
+            self._fast_since_ns = self._fast_since_ns or position.timestamp_ns
+            if self._ruled and position.timestamp_ns - self._fast_since_ns >= _FAST_NS:
+                self._end_ruled(self._fast_since_ns)
+
+    def finish(self) -> None:
+        """The last frame has passed."""
+        with self._lock:
+            self._write_watched()
+            if self._ruled is not None:
+                self._end_ruled(self._last_fish_ns)
+
+    def _end_ruled(self, timestamp_ns: int) -> None:
+        if self._ruled is not None:
+            self._add(END, self._ruled, max(timestamp_ns, self._last_fish_ns) + 1, _RULE)
+        self._ruled = None
+
+    def _next_name(self) -> str:
+        numbers = [int(haul.name) for haul in self.hauls() if haul.name.isdecimal()]
+        return str(max(numbers, default=0) + 1)
+
+    def _add(self, what: str, name: str, timestamp_ns: int, said_by: str) -> None:
+        self._store.append(HAULS, name, haul_values(what, name, timestamp_ns, said_by))
+
+    def _watch(self, timestamp_ns: int, lost: int) -> None:
+        new_lost, self._lost_before = max(0, lost - self._lost_before), lost
+        if self._watched is not None:
+            first_ns, last_ns, _, _ = self._watched
+            if timestamp_ns - last_ns > _PAUSE_NS or timestamp_ns - first_ns > _WATCHED_NS:
+                is_pause = timestamp_ns - last_ns > _PAUSE_NS
+                if not is_pause:
+                    self._watched[1] = timestamp_ns
+                self._write_watched()
+        if self._watched is None:
+            self._watched = [timestamp_ns, timestamp_ns, 0, 0]
+        self._watched[1] = timestamp_ns
+        self._watched[2] += 1
+        self._watched[3] += new_lost
+
+    def _write_watched(self) -> None:
+        if self._watched is not None:
+            names = ("first_ns", "last_ns", "frames", "frames_lost")
+            values: dict[str, object] = dict(zip(names, self._watched, strict=True))
+            name = str(self._watched[0])
+            self._store.append(WATCHED, name, values, is_urgent=False)
+        self._watched = None
