@@ -49,11 +49,14 @@ def load_species(own: str = "") -> list[Species]:
 
 def find_species(text: str, species: Sequence[Species]) -> Species | None:
     """The species whose code or name is this text, whatever its capitals; None: there is none."""
+    return next((one for one in species if is_called(one, text)), None)
+
+
+def is_called(species: Species, text: str) -> bool:
+    """True where a text is the code or one of the names of a species, whatever its capitals."""
     wanted = text.strip().casefold()
-    names = ("code", "scientific_name", "english_name")
-    return next(
-        (s for name in names for s in species if getattr(s, name).casefold() == wanted), None
-    )
+    names = (species.code, species.scientific_name, species.english_name)
+    return wanted in [name.casefold() for name in names]
 
 
 @cache

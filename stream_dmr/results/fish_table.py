@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from stream_dmr.catch.species_list import CODE, Species, find_species, is_called, load_species
 from stream_dmr.csv_file import safe_cell
 from stream_dmr.files import writing_to
 from stream_dmr.results.finished_fish import FishResult
@@ -56,7 +57,10 @@ def fish_record(
     fish: FishResult, template: Template, settings: FisheriesSettings
 ) -> dict[str, Any]:
     """The values of FISH_TABLE; None where there is none."""
-    derived = derive(fish.length_mm, template, settings, species=fish.review.species)
+    found = species_of(fish)
+    species = fish.review.species or (found.english_name if found else None)
+    weighed = settings.species if found and is_called(found, settings.species) else species
+    derived = derive(fish.length_mm, template, settings, species=weighed)
     values: dict[str, Any] = {name: getattr(fish.facts, name, None) for name in FISH_TABLE}
     values |= {n: getattr(fish.estimate, n) for n in FISH_TABLE if hasattr(fish.estimate, n)}
     values |= asdict(fish.catch)
@@ -66,12 +70,27 @@ def fish_record(
         **_review_columns(fish.review),
         **_place_columns(fish),
         "template": template.name,
-        "species": fish.review.species or template.name,
+        "species": species or template.name,
+        **_species_columns(fish, found),
         "weight_source": None if derived.weight_kg is None else settings.weight_source,
         "legal_source": None if derived.is_legal_size is None else settings.legal_source,
         "run_id": fish.run_id,
         "origin": fish.origin,
     }
+
+
+def species_of(fish: FishResult) -> Species | None:
+    """The species of the list that the reviewer named, else that of the classifier."""
+    return find_species(fish.review.species or fish.catch.species_code or "", load_species())
+
+
+def _species_columns(fish: FishResult, found: Species | None) -> dict[str, Any]:
+    """The code of what the reviewer named, who says no share; else as it was measured."""
+    if not fish.review.species:
+        return {}
+    text = fish.review.species.strip()
+    code = found.code if found else text if CODE.fullmatch(text) else None
+    return {"species_code": code, "species_share": None}
 
 
 def _measured(fish: FishResult) -> dict[str, Any]:

@@ -15,7 +15,8 @@ class FisheriesSettings(Settings):
 
     species: str = Field(
         default="halibut",
-        description="template to which weight and legal size apply; others get neither",
+        description="template, or code or name of the species, to which weight and legal size "
+        "apply; others get neither",
     )
     rounding: Literal["down", "nearest"] = Field(
         default="down",

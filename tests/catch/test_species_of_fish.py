@@ -1,0 +1,51 @@
+"""Which species a fish has in exports: the reviewer's, else the classifier's, else the template."""
+
+from dataclasses import replace
+
+import pytest
+
+from stream_dmr.results.catch_facts import CatchFacts
+from stream_dmr.results.finished_fish import FishResult
+from stream_dmr.results.fish_table import fish_record, species_of
+from stream_dmr.results.fisheries import FisheriesSettings
+from stream_dmr.results.verdicts import Review
+from stream_dmr.template.template_file import load_template
+from tests.support.final_estimates import FACTS, fish
+
+SURE = CatchFacts(species_code="HAP", species_share=0.97)
+HALIBUT = FisheriesSettings(species="HAP")
+
+
+def result(catch: CatchFacts, *, named: str = "") -> FishResult:
+    return FishResult(
+        estimate=fish(1), facts=FACTS, run_id="a", catch=catch, review=Review(species=named)
+    )
+
+
+@pytest.mark.parametrize(
+    ("catch", "named", "species", "code", "share"),
+    [
+        (CatchFacts(), "", "cod", None, None),
+        (SURE, "", "Pacific halibut", "HAP", 0.97),
+        (replace(SURE, species_code="unsure"), "", "cod", "unsure", 0.97),
+        (SURE, "swordfish", "swordfish", "SWO", None),
+        (SURE, "Gadus morhua", "Gadus morhua", "COD", None),
+        (SURE, "XYZ", "XYZ", "XYZ", None),
+        (SURE, "a fish", "a fish", None, None),
+    ],
+)
+def test_the_reviewers_species_comes_first(
+    catch: CatchFacts, named: str, species: str, code: str | None, share: float | None
+):
+    record = fish_record(result(catch, named=named), load_template("cod"), HALIBUT)
+    assert (record["species"], record["species_code"]) == (species, code)
+    assert record["species_share"] == share
+
+
+def test_weight_follows_the_species_however_it_is_named():
+    assert species_of(result(SURE)) == species_of(result(CatchFacts(), named="pacific halibut"))
+    for name in ("HAP", "Pacific halibut", "hippoglossus stenolepis"):
+        settings = FisheriesSettings(species=name)
+        assert fish_record(result(SURE), load_template("cod"), settings)["weight_kg"] > 0
+        other = fish_record(result(SURE, named="COD"), load_template("cod"), settings)
+        assert other["weight_kg"] is None
