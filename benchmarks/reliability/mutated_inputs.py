@@ -229,6 +229,7 @@ def read_and_export(path: Path) -> None:
     """Every message of a recording, and all that can be made of it."""
     read_messages(path)
     out = Path("out")
+    shutil.rmtree(out, ignore_errors=True)  # no export writes over another's files
     export = Export(path)
     export.tables(out, format="csv")
     export.masks(out / "masks.json")

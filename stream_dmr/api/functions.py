@@ -148,6 +148,7 @@ def replay(
     tracks: Collection[int] = (),
     time_s: tuple[float, float] | None = None,
     overwrite: bool = False,
+    key: Location | None = None,
     observer: RunObserver | None = None,
     stop: threading.Event | None = None,
 ) -> Run:
@@ -166,6 +167,7 @@ def replay(
         selection=Selection.from_seconds(time_s, frozenset(tracks) or None),
         out=Path(out),
         overwrite=overwrite,
+        key=_path(key),
     )
     replay_recordings(
         request, stop=stop or threading.Event(), observer=observer or LoggingObserver()

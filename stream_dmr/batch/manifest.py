@@ -31,6 +31,7 @@ class Job:
     haul: str = ""
     config: str = ""
     template: str = "auto"
+    device_key: str = ""  # signs the results
 
     @property
     def key(self) -> str:
@@ -52,7 +53,9 @@ class Job:
         return path.stat().st_size if path.is_file() else 0
 
 
-def read_manifest(path: Path, *, config: Path | None, template: str) -> list[Job]:
+def read_manifest(
+    path: Path, *, config: Path | None, template: str, key: Path | None = None
+) -> list[Job]:
     """The jobs of a manifest; relative paths start from the manifest's folder.
 
     Raises UserError where it can't be read or lacks its columns. Whether the files that it names
@@ -61,7 +64,9 @@ def read_manifest(path: Path, *, config: Path | None, template: str) -> list[Job
     rows = _rows(path)
     names = _names([row["video"] or "" for row in rows])
     mesh = template if not Path(template).is_file() else str(Path(template).resolve())
-    shared = {"config": "" if config is None else str(config.resolve()), "template": mesh}
+    given = {"config": config, "device_key": key}
+    shared = {name: str(file.resolve()) for name, file in given.items() if file is not None}
+    shared["template"] = mesh
     jobs, home = [], path.resolve().parent
     for number, (row, name) in enumerate(zip(rows, names, strict=True), start=2):
         if not row["video"] or None in row:

@@ -98,6 +98,7 @@ def request_of(job: Job, out: Path) -> RunRequest:
         masks=_path(job.masks),
         template=job.template,
         config=_path(job.config),
+        key=_path(job.device_key),
         vessel=job.vessel,
         trip=job.trip,
         haul=job.haul,

@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from stream_dmr.cli.shared_options import ConfigOption, TemplateOption, stop_on_signals, warn
+from stream_dmr.cli.shared_options import (
+    ConfigOption,
+    KeyOption,
+    TemplateOption,
+    stop_on_signals,
+    warn,
+)
 
 if TYPE_CHECKING:
     from stream_dmr.batch.engine import Engine
@@ -47,6 +53,7 @@ def batch(
     ] = 0,
     template: TemplateOption = "auto",
     config: ConfigOption = None,
+    key: KeyOption = None,
 ) -> None:
     """Measure every video of a manifest, each as `run` does; call it again to go on.
 
@@ -59,13 +66,16 @@ def batch(
         from stream_dmr.batch.manifest import read_manifest, repeated_videos
         from stream_dmr.batch.progress import duration
         from stream_dmr.fitting.shape.candidates import load_shapes
+        from stream_dmr.results.signatures import Signer
         from stream_dmr.running.config import load_config
 
         load_config(config)
+        if key is not None:
+            Signer(key)  # refuses what is no key before any video
         load_shapes(template)  # refuses what it can't read before any video
         if (out / VIDEOS).exists():
             read_videos(out)  # refuses a table that is no batch's
-        jobs = read_manifest(manifest, config=config, template=template)
+        jobs = read_manifest(manifest, config=config, template=template, key=key)
         warn(repeated_videos(jobs))
         with _engine(engine, workers, address, gpus) as where:
             summary = run_batch(

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from stream_dmr.cli.shared_options import (
+    KeyOption,
     TimeOption,
     TrackOption,
     command_line,
@@ -53,6 +54,7 @@ def replay(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the results of an earlier run in --out.")
     ] = False,
+    key: KeyOption = None,
     timings: Annotated[
         bool, typer.Option("--timings", help="At the end, show the time that each stage took.")
     ] = False,
@@ -74,6 +76,7 @@ def replay(
         selection=parse_selection(time, track),
         out=out,
         overwrite=overwrite,
+        key=key,
         check=check,
         command=command_line(),
     )

@@ -11,6 +11,7 @@ import typer
 
 from stream_dmr.cli.shared_options import (
     ConfigOption,
+    KeyOption,
     TemplateOption,
     command_line,
     stop_on_signals,
@@ -77,9 +78,7 @@ def run(
             "serial device."
         ),
     ] = None,
-    key: Annotated[
-        Path | None, typer.Option(help="Device key of `keygen`; signs all that is measured.")
-    ] = None,
+    key: KeyOption = None,
     live: Annotated[
         bool, typer.Option("--live", help="Serve the view on this machine while measuring.")
     ] = False,

@@ -48,6 +48,9 @@ MarkerOption = Annotated[
     float | None, typer.Option(help="Side of a ChArUco board's markers in mm.")
 ]
 
+KeyOption = Annotated[
+    Path | None, typer.Option(help="Device key of `keygen`; signs all that is written.")
+]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
 
 

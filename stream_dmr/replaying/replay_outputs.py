@@ -4,6 +4,7 @@ import threading
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from stream_dmr.recording.messages.run_header import RunHeader
@@ -16,6 +17,8 @@ from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.lengths_table import LengthsTable
 from stream_dmr.results.provenance import sealed
 from stream_dmr.results.run_facts import SOURCE_ENDED, STOPPED, RunFacts, cut_short, run_facts
+from stream_dmr.results.signatures import Signer
+from stream_dmr.results.signed_files import SignedFiles
 from stream_dmr.running.result_writer import ResultWriter
 from stream_dmr.running.run_folder import prepare_folder
 from stream_dmr.running.run_observer import RunObserver
@@ -71,6 +74,7 @@ def open_replay_outputs(
 
     Raises OutputError where the folder can't be written to, or holds an earlier run's results.
     """
+    signer = None if request.key is None else Signer(request.key)
     prepare_folder(out, overwrite=request.overwrite)
     known = recorded.facts
     facts = run_facts(
@@ -82,7 +86,10 @@ def open_replay_outputs(
     )
     with ExitStack() as stack:
         stack.enter_context(sealed(out, with_recordings=True, on_notice=observer.warn))
-        store = stack.enter_context(closing(LengthStore(out, facts)))
+        store = stack.enter_context(closing(LengthStore(out, facts, signer=signer)))
+        files = SignedFiles(out)
+        files.attach(store, repaired=[])
+        stack.callback(partial(files.finish, with_recordings=True))
         store.count_frames(None if known is None else known.frames_promised)
         lengths = stack.enter_context(closing(LengthsTable(out, store)))
         recorder = Recorder(

@@ -30,6 +30,7 @@ class ReplayRequest:
     selection: Selection = EVERYTHING
     out: Path | None = None  # None: nothing is written
     overwrite: bool = False
+    key: Path | None = None  # of the device, to sign what is written
     check: bool = False  # compare with what was recorded
     command: str = ""  # as typed, for the new recording
 

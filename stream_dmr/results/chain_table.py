@@ -14,7 +14,8 @@ _TABLE = """
 CREATE TABLE IF NOT EXISTS chain (
     number INTEGER PRIMARY KEY, -- from 1, without gaps
     previous TEXT NOT NULL, -- SHA-256 of the entry before it
-    kind TEXT NOT NULL, name TEXT NOT NULL, -- of what: fish, event, run, end, file, found, removed
+    -- of what: fish, event, run, end, file, found, removed, state, checks
+    kind TEXT NOT NULL, name TEXT NOT NULL,
     content_sha256 TEXT NOT NULL,
     time_ns INTEGER NOT NULL, -- wall clock
     signature TEXT NOT NULL -- Ed25519, base64

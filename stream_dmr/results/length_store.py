@@ -28,8 +28,19 @@ from stream_dmr.results.lengths_database import (
 )
 from stream_dmr.results.reserved_space import ReservedSpace
 from stream_dmr.results.run_facts import END_COLUMNS, NOT_ENDED, RunFacts
-from stream_dmr.results.signatures import END, EVENT, FILE_KINDS, FISH, RUN, Signer
+from stream_dmr.results.signatures import (
+    CHECKS,
+    END,
+    EVENT,
+    FILE_KINDS,
+    FISH,
+    RUN,
+    STATE,
+    Signer,
+    lines_sha256,
+)
 from stream_dmr.results.store_rows import MAY_COUNT_TWICE, fish_row, read_estimates
+from stream_dmr.results.store_state import check_lines, read_state
 
 _MARK_EVERY_NS = 5_000_000_000  # capture times that a crash may leave unmarked; chosen
 _FRAMES_AHEAD = 1000  # frame numbers that are marked as used at a time; a crash skips the rest
@@ -161,6 +172,11 @@ class LengthStore:
         mark_ns = self.before.timestamp_ns
         return mark_ns if time.time_ns() > mark_ns else mark_ns + _MARK_EVERY_NS
 
+    @property
+    def calibration_sha256(self) -> str:
+        """Of the file that this run was given; "" without one."""
+        return self._facts.calibration_sha256
+
     def scene(self) -> bytes | None:
         """The static scene (see `DriftAlarms`) when this run's calibration was first used here."""
         query = "SELECT data FROM scenes WHERE calibration_sha256 = ?"
@@ -248,6 +264,7 @@ class LengthStore:
         values = {"ended_ns": time.time_ns()}
         values |= {name: getattr(self._facts, name) for name in END_COLUMNS if name not in values}
         with self._lock:
+            self._write(*self._signed_state())
             signature = self._chain.row(END, self.run_id, {"run_id": self.run_id} | values)
             self._write((_END, (*values.values(), self.run_id)), *signature)
         with suppress(sqlite3.Error):
@@ -259,6 +276,17 @@ class LengthStore:
                 f"{self.path}: expected room for {len(self._pending)} more rows, got: "
                 f"{self.trouble}; the recording has them: make room and run stream-dmr recover"
             )
+
+    def _signed_state(self) -> list[Statement]:
+        """Signs what else the file holds, once all of it is written."""
+        self._write_pending()
+        if not self.is_signing or self.trouble:
+            return []
+        state, checks = read_state(self._database), check_lines(self._database)
+        return [
+            *self._chain.row(STATE, self.run_id, state),
+            *self._chain.content(CHECKS, str(len(checks)), lines_sha256(checks)),
+        ]
 
     def _open(self, *, waits_for_disk: bool) -> tuple[sqlite3.Connection, bool]:
         """The file and True, or a copy of it in memory and False."""

@@ -3,9 +3,8 @@
 import json
 import os
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,10 @@ from stream_dmr.results.added_tables import read_added
 from stream_dmr.results.finished_fish import database_of, read_runs, rows_by_run, run_times
 from stream_dmr.results.hauls import HAULS
 from stream_dmr.results.lengths_database import NAME as DATABASE
+from stream_dmr.results.lengths_database import open_for_reading
 from stream_dmr.results.run_facts import RunFacts
+from stream_dmr.results.signatures import content_sha256, lines_sha256
+from stream_dmr.results.store_state import check_lines, read_state
 from stream_dmr.results.verdicts import Verdict
 from stream_dmr.results.verdicts_table import read_verdicts, verdict_line
 from stream_dmr.version import __version__
@@ -46,8 +48,8 @@ def sealed(
 def seal_run(folder: Path, *, with_recordings: bool) -> None:
     """Write the provenance of a run's own results. OutputError.
 
-    Reviewers go on writing to the database, so of it the fish of each run and the verdicts are
-    summed up.
+    Reviewers go on writing to the database, so its tables are summed up, those of fish and events
+    by their runs.
     """
     database = folder / DATABASE
     kinds = ("*.csv", "*.mcap", "*.rrd") if with_recordings else ("lengths.csv", "frames.csv")
@@ -65,13 +67,19 @@ def seal_run(folder: Path, *, with_recordings: bool) -> None:
         | sums
         | {"run_times_ns": run_times(database), "files": _sums(folder, files)}
         | {"verdicts": verdicts_sum(read_verdicts(database))}
-        | {"hauls": hauls_sum(read_added(database, HAULS))},
+        | {"hauls": hauls_sum(read_added(database, HAULS))}
+        | _state_sums(database),
     )
 
 
-def lines_sha256(lines: Iterable[str]) -> str:
-    """SHA-256 of the rows of a database, a line each."""
-    return sha256("\n".join(lines).encode()).hexdigest()
+def _state_sums(database: Path) -> dict[str, Any]:
+    with closing(open_for_reading(database)) as connection:
+        checks = check_lines(connection)
+        state = content_sha256(read_state(connection))
+    return {
+        "state_sha256": state,
+        "checks": {"count": len(checks), "sha256": lines_sha256(checks)},
+    }
 
 
 def verdicts_sum(verdicts: Sequence[Verdict]) -> dict[str, Any]:

@@ -2,9 +2,11 @@
 
 import sqlite3
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
+
+import numpy as np
 
 from stream_dmr.errors import OutputError
 from stream_dmr.results.lengths_database import open_for_reading, open_for_writing
@@ -20,6 +22,8 @@ CREATE TABLE IF NOT EXISTS checks (
     limit_percent REAL NOT NULL -- an alarm beyond it
 ) STRICT
 """
+
+_READ_EVERY_S = 5.0  # chosen: /health may be asked several times a second
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +51,26 @@ class ScaleCheck:
 
 
 _NAMES = [field.name for field in fields(ScaleCheck)]
+
+
+class ScaleAlarm:
+    """The alarm of the last check of a calibration, for a run that goes on beside `check`."""
+
+    def __init__(
+        self, database: Path, calibration_sha256: str, *, read_every_s: float = _READ_EVERY_S
+    ) -> None:
+        self._database, self._calibration_sha256 = database, calibration_sha256
+        self._read_every_s = read_every_s
+        self._line, self._read_s = "", -np.inf
+
+    def line(self) -> str:
+        """What is wrong with the scale; "" where nothing is, or nothing was checked."""
+        if time.monotonic() - self._read_s >= self._read_every_s:
+            self._read_s = time.monotonic()
+            with suppress(OutputError):  # a database that can't be read is a problem of its own
+                check = last_checks(self._database).get(self._calibration_sha256)
+                self._line = check.alarm if check else ""
+        return self._line
 
 
 def add_check(database: Path, check: ScaleCheck) -> None:

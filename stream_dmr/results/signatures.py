@@ -9,7 +9,7 @@ import os
 import stat
 import time
 from base64 import b64decode, b64encode
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -24,6 +24,7 @@ from stream_dmr.errors import OutputError, UserError
 FISH, EVENT, RUN, END, FILE, FOUND, REMOVED = (
     *("fish", "event", "run", "end", "file", "found", "removed"),
 )
+STATE, CHECKS = "state", "checks"  # at the end of a run: what `store_state` reads
 FILE_KINDS = (FILE, FOUND, REMOVED)
 
 
@@ -83,6 +84,11 @@ class Signer:
         signature = b64encode(self._key.sign(unsigned.signed_bytes)).decode()
         self._last = replace(unsigned, signature=signature)
         return self._last
+
+
+def lines_sha256(lines: Iterable[str]) -> str:
+    """SHA-256 of the rows of a database, a line each."""
+    return sha256("\n".join(lines).encode()).hexdigest()
 
 
 def content_sha256(values: Mapping[str, object]) -> str:

@@ -1,14 +1,17 @@
 """Signs the files of a run's folder as they are closed, rewritten and removed."""
 
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Sequence
+from contextlib import closing, suppress
 from pathlib import Path
 from threading import Lock
 
 from stream_dmr.files import sha256_of
+from stream_dmr.results.chain_table import ChainWriter
 from stream_dmr.results.length_store import LengthStore
+from stream_dmr.results.lengths_database import NAME as DATABASE
+from stream_dmr.results.lengths_database import open_for_writing
 from stream_dmr.results.provenance import LEARNT
-from stream_dmr.results.signatures import FILE, FOUND, REMOVED
+from stream_dmr.results.signatures import FILE, FOUND, REMOVED, Signer
 
 RECORDINGS = ("*.mcap", "*.rrd")
 TABLES = ("lengths.csv", "frames*.csv")
@@ -61,6 +64,17 @@ class SignedFiles:
                 self._store.sign_file(kind, path.name, sha256_of(path))
             else:
                 self._store.sign_file(REMOVED, path.name, "")
+
+
+def sign_found(folder: Path, paths: Sequence[Path], signer: Signer) -> None:
+    """Sign files that lie in a folder where no run is writing, as found; lengths.csv as it is."""
+    with closing(open_for_writing(folder / DATABASE)) as database:
+        chain = ChainWriter(signer, database)
+        entries = [(FOUND, path) for path in paths if path.exists()]
+        entries += [(FILE, path) for path in _matching(folder, ["lengths.csv"])]
+        for kind, path in entries:
+            for statement, values in chain.content(kind, path.name, sha256_of(path)):
+                database.execute(statement, values)
 
 
 def _matching(folder: Path, patterns: Iterable[str]) -> list[Path]:

@@ -8,6 +8,7 @@ elsewhere.
 import csv
 import io
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, fields
 from pathlib import Path
 from types import MappingProxyType
@@ -29,10 +30,13 @@ from stream_dmr.results.finished_fish import (
 )
 from stream_dmr.results.frames_table import FRAMES_COLUMNS, frames_row
 from stream_dmr.results.lengths_database import NAME as DATABASE
+from stream_dmr.results.lengths_database import open_for_reading
 from stream_dmr.results.lengths_table import LENGTHS_COLUMNS, lengths_row
 from stream_dmr.results.provenance import NAME as PROVENANCE
-from stream_dmr.results.provenance import known_files, lines_sha256, read_provenance, verdicts_sum
+from stream_dmr.results.provenance import known_files, read_provenance, verdicts_sum
 from stream_dmr.results.run_facts import RunFacts, run_facts
+from stream_dmr.results.signatures import content_sha256, lines_sha256
+from stream_dmr.results.store_state import check_lines, read_state
 from stream_dmr.results.verdicts import Verdict
 from stream_dmr.results.verdicts_table import read_verdicts
 from stream_dmr.results.verify_added import unsealed_rows
@@ -171,6 +175,20 @@ def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
             if now != was:
                 yield Change(database, f"run {run_id}: {field.name} is {now!r}, was {was!r}")
     yield from _verdicts(database, said, made.get("verdicts", {}))
+    yield from _state(database, made, is_of_last_run=set(runs) == set(made["runs"]))
+
+
+def _state(database: Path, made: dict[str, Any], *, is_of_last_run: bool) -> Iterator[Change]:
+    """The other tables against provenance.json, which older ones don't sum up."""
+    known = made.get("checks")
+    if known is None:
+        return
+    with closing(open_for_reading(database)) as connection:
+        state, checks = content_sha256(read_state(connection)), check_lines(connection)
+    if lines_sha256(checks[: known["count"]]) != known["sha256"]:
+        yield Change(database, "the checks of the scale are not those that were made")
+    if is_of_last_run and state != made["state_sha256"]:
+        yield Change(database, "its marks, clips or scenes are not as its last run left them")
 
 
 def _verdicts(database: Path, said: Sequence[Verdict], known: dict[str, Any]) -> Iterator[Change]:

@@ -20,6 +20,7 @@ from stream_dmr.results.lengths_database import NAME as DATABASE
 from stream_dmr.results.lengths_database import open_for_reading
 from stream_dmr.results.run_facts import END_COLUMNS, NOT_ENDED
 from stream_dmr.results.signatures import (
+    CHECKS,
     END,
     EVENT,
     FILE_KINDS,
@@ -27,10 +28,13 @@ from stream_dmr.results.signatures import (
     FOUND,
     REMOVED,
     RUN,
+    STATE,
     ChainEntry,
     content_sha256,
+    lines_sha256,
 )
 from stream_dmr.results.signed_files import RECORDINGS
+from stream_dmr.results.store_state import check_lines, read_state
 from stream_dmr.results.verify_added import added_changes, unsigned_rows
 
 _Row = Mapping[str, Any]
@@ -52,6 +56,7 @@ def check_signatures(folder: Path, key: Ed25519PublicKey) -> SignatureCheck:
             entries = read_chain(database)
             added = {table: added_rows(database, table) for table in (POSITIONS, WATCHED, HAULS)}
             tables = {name: _rows(database, name) for name in ("runs", "fish", "events")}
+            state, checks = content_sha256(read_state(database)), check_lines(database)
     except (sqlite3.Error, OutputError, TypeError) as error:
         check.changes.append(f"its signatures can't be read: {error}")
         return check
@@ -68,7 +73,10 @@ def check_signatures(folder: Path, key: Ed25519PublicKey) -> SignatureCheck:
         check.changes.extend(added_changes(entries, table, rows, may_be_added=table is HAULS))
     check.changes.extend(_runs(entries, tables["runs"], is_going_on=is_locked(folder)))
     check.changes.extend(_files(entries, folder))
+    check.changes.extend(_state(entries, state))
+    check.changes.extend(_checks(entries, checks))
     check.notes.extend(_found(entries))
+    check.notes.extend(_later_checks(entries, checks))
     last = entries[-1]
     when = datetime.fromtimestamp(last.time_ns / 1e9, UTC).isoformat(timespec="seconds")
     check.notes.append(f"{len(entries)} signed entries, the last of {when}: {last.sha256[:16]}")
@@ -142,6 +150,27 @@ def _runs(
             yield f"the end of run {name} is not signed"
         elif runs and name == runs[-1] and not is_going_on:
             yield f"run {name} has no end: it crashed, or what came last was removed"
+
+
+def _state(entries: Sequence[ChainEntry], state: str) -> Iterator[str]:
+    """Marks, clips and scenes as the last run left them, where it came to its end."""
+    last = [entry for entry in entries if entry.kind in (RUN, STATE)]
+    if last and last[-1].kind == STATE and last[-1].content_sha256 != state:
+        yield "its marks, clips or scenes are not as they were signed"
+
+
+def _checks(entries: Sequence[ChainEntry], checks: Sequence[str]) -> Iterator[str]:
+    """The checks of the scale: each run signs those that were there at its end."""
+    for entry in entries:
+        if entry.kind == CHECKS and lines_sha256(checks[: int(entry.name)]) != entry.content_sha256:
+            yield "the checks of the scale are not as they were signed"
+            return
+
+
+def _later_checks(entries: Sequence[ChainEntry], checks: Sequence[str]) -> Iterator[str]:
+    signed = max((int(entry.name) for entry in entries if entry.kind == CHECKS), default=0)
+    if more := len(checks) - signed:
+        yield f"checks of the scale that are not signed yet: {more}"
 
 
 def _files(entries: Sequence[ChainEntry], folder: Path) -> Iterator[str]:

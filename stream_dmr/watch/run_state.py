@@ -4,6 +4,7 @@ import shutil
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,8 +64,12 @@ class RunState:
         zones: ZonesSettings | None = None,
         positions: PositionSource | None = None,
         hauls: HaulLog | None = None,
+        scale_alarm: Callable[[], str] = str,
     ) -> None:
-        """A camera that is silent for `silence_s` and a frame that takes `stuck_s` are problems."""
+        """A camera that is silent for `silence_s` and a frame that takes `stuck_s` are problems.
+
+        So is a line of `scale_alarm`, that a known length was measured wrong.
+        """
         self.source = source
         self.positions, self.hauls = positions, hauls
         self.position: Position | None = None  # the latest
@@ -79,6 +84,7 @@ class RunState:
         self._out_dir = out_dir
         self._silence_s = silence_s
         self._stuck_s = stuck_s
+        self._scale_alarm = scale_alarm
         self._began_s = time.monotonic()
         self._lock = threading.Lock()
         self._frames: deque[Frame] = deque(maxlen=_MAX_FRAMES)
@@ -191,6 +197,8 @@ class RunState:
             problems.append("the measurement hangs")
         if self.positions is not None:
             problems += self.positions.problems()
+        if alarm := self._scale_alarm():
+            problems.append(alarm)
         return problems + self.sinks.problems()
 
     def is_stuck(self) -> bool:

@@ -1,6 +1,7 @@
 """Shows a run while it measures: its state, the server of the status page, the watchdog."""
 
 from stream_dmr.messages import Message
+from stream_dmr.results.scale_checks import ScaleAlarm
 from stream_dmr.running.pipeline import Chain
 from stream_dmr.running.run_observer import OpenRun, RunObserver
 from stream_dmr.watch.alerts import AlertSender
@@ -32,6 +33,7 @@ class WatchObserver(RunObserver):
             zones=run.config.zones,
             positions=run.positions,
             hauls=run.hauls,
+            scale_alarm=ScaleAlarm(run.store.path, run.store.calibration_sha256).line,
         )
         state.continue_after(run.store)
         self._server = WatchServer(state, settings) if settings.port else None

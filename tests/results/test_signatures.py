@@ -19,6 +19,7 @@ from stream_dmr.files import sha256_of
 from stream_dmr.results.chain_table import read_chain
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.provenance import seal_run
+from stream_dmr.results.scale_checks import ScaleCheck, add_check
 from stream_dmr.results.signatures import (
     FILE,
     REMOVED,
@@ -34,6 +35,11 @@ from tests.support.command import invoke
 from tests.support.final_estimates import FACTS, fish
 from tests.support.fish_run import FISH, request
 from tests.support.tiny_clip import write_clip
+
+CHECK = ScaleCheck(
+    **{"source": "board.png", "calibration_sha256": "c", "known_mm": 200.0, "error_mm": 10.0},
+    **{"error_percent": 5.0, "worst_percent": 5.1, "limit_percent": 1.0},
+)
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +74,9 @@ def season(tmp_path_factory: pytest.TempPathFactory, key: Path) -> Path:
             files.changed(segment)
             store.add(fish(track_id, first_timestamp_ns=track_id), flags=["dirt"])
             store.note("drift", f"bumped {track_id}", timestamp_ns=track_id)
+            store.clip_progress(f"{track_id}.mp4", frames_done=9)
+        store.keep_scene(b"rail")
+        add_check(out / "lengths.db", CHECK)
         store.end("the end of the source")
         store.close()
     files, store = SignedFiles(out), LengthStore(out, FACTS, signer=Signer(key))
@@ -263,6 +272,12 @@ TAMPERING: dict[str, Callable[[Path, Path], None]] = {
     "a signature is borrowed": borrowed_signature,
     "entries change places": swapped_entries,
     "all after some moment is removed": first_run_only,
+    "a mark of used ids is set back": sql("UPDATE marks SET value = 1 WHERE name = 'track_id'"),
+    "a clip is called done": sql("UPDATE clips SET is_done = 1 WHERE name = '6.mp4'"),
+    "a clip is forgotten": sql("DELETE FROM clips WHERE name = '2.mp4'"),
+    "the scene to compare with is another": sql("UPDATE scenes SET data = x'00'"),
+    "a check of the scale is changed": sql("UPDATE checks SET error_percent = 0 WHERE number = 1"),
+    "a check of the scale is removed": sql("DELETE FROM checks WHERE number = 1"),
     "a segment is changed": flip_byte,
     "a segment is removed": remove_segment,
     "a segment's removal is forged": forged_removal,
@@ -347,6 +362,55 @@ def test_a_rewritten_file_counts_as_it_was_signed_last(season: Path, key: Path, 
     store.end("the end of the source")
     store.close()
     assert changes(folder, key) == []
+
+
+def test_a_check_after_the_last_run_is_said_and_is_no_change(
+    season: Path, key: Path, tmp_path: Path
+):
+    folder = Path(shutil.copytree(season, tmp_path / "out"))
+    add_check(folder / "lengths.db", CHECK)
+    check = check_signatures(folder, load_public_key(key.with_name("device.pub")))
+    assert check.changes == []
+    assert "checks of the scale that are not signed yet: 1" in check.notes
+
+
+def test_a_replay_a_repair_and_a_batch_are_signed_as_well(
+    measured: Path, key: Path, tmp_path: Path
+):
+    again = tmp_path / "again"
+    options = {"--from": "localize", "--out": str(again), "--key": str(key)}
+    assert invoke("replay", {str(measured): None} | options).code == 0
+    assert changes(again, key) == []
+    assert {entry.kind for entry in entries_of(again)} >= {"run", "fish", "file", "end"}
+    clip = measured.parent / "clip"
+    manifest = tmp_path / "season.csv"
+    manifest.write_text(
+        "video,calibration,boxes,masks,vessel,trip,haul\n"
+        f"{clip / 'video.mp4'},{clip / 'calibration.yaml'},,{clip / 'masks'},a,b,c\n"
+    )
+    options = {"--out": str(tmp_path / "season"), "--key": str(key), "--workers": "1"}
+    assert invoke("batch", {str(manifest): None} | options).code == 0
+    assert changes(tmp_path / "season" / "videos" / "video", key) == []
+    with closing(sqlite3.connect(again / "lengths.db")) as database, database:
+        database.execute("DELETE FROM fish WHERE track_id = 1")
+        database.execute("DELETE FROM chain")
+    outcome = invoke("recover", {str(again): None, "--key": str(key)})
+    assert "its length was only in" in outcome.out
+    kinds = [entry.kind for entry in entries_of(again)]
+    assert kinds.count("fish") == 1
+    assert "fish 1 is not signed" not in changes(again, key)
+
+
+@pytest.mark.parametrize("command", ["batch", "replay", "recover"])
+def test_no_command_signs_with_what_is_no_key(measured: Path, tmp_path: Path, command: str):
+    manifest = tmp_path / "m.csv"
+    manifest.write_text("video,calibration,boxes,masks,vessel,trip,haul\na.mp4,,,,,,\n")
+    given = {str(manifest if command == "batch" else measured): None}
+    out = {} if command == "recover" else {"--out": str(tmp_path / "out")}
+    outcome = invoke(command, given | out | {"--key": str(tmp_path / "none")})
+    assert outcome.code == 2
+    assert "expected the private key" in outcome.error
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_private_key_is_its_owner_s_alone(key: Path, tmp_path: Path):

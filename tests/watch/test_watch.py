@@ -8,6 +8,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from http.client import HTTPResponse
 from pathlib import Path
@@ -21,6 +22,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from stream_dmr.errors import ConfigError, OutputError
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.results.length_store import LengthStore
+from stream_dmr.results.scale_checks import ScaleAlarm, ScaleCheck, add_check
 from stream_dmr.running.config import Config
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_observer import RunObserver
@@ -116,6 +118,33 @@ def test_health_says_what_is_wrong(server: WatchServer, state: RunState, problem
     assert code == 503
     assert len(json.loads(content)["problems"]) == 1
     assert metrics_of(server.address)["stream_dmr_healthy",] == 0
+
+
+def test_a_known_length_that_is_measured_wrong_is_a_problem(tmp_path: Path, state: RunState):
+    """`check --out` beside the run; another calibration's check is none of its business."""
+    with closing(LengthStore(tmp_path, FACTS)) as store:
+        alarm = ScaleAlarm(store.path, store.calibration_sha256, read_every_s=0.0)
+        watched = RunState(
+            state.source, tmp_path, silence_s=20.0, stuck_s=60.0, scale_alarm=alarm.line
+        )
+        wrong = ScaleCheck(
+            **{
+                "source": "b.png",
+                "calibration_sha256": FACTS.calibration_sha256,
+                "known_mm": 200.0,
+            },
+            **{"error_mm": 10.0, "error_percent": 5.0, "worst_percent": 5.1, "limit_percent": 1.0},
+        )
+        add_check(store.path, replace(wrong, calibration_sha256="another"))
+        assert watched.problems() == []
+        add_check(store.path, wrong)
+        (problem,) = watched.problems()
+        assert "+5.00 % off" in problem
+        server = WatchServer(watched, WatchSettings(port=free_port()))
+        with closing(server):
+            assert get(f"{server.address}health")[0] == 503
+        add_check(store.path, replace(wrong, error_percent=0.1))
+        assert watched.problems() == []
 
 
 def test_health_knows_every_output(server: WatchServer, state: RunState):
