@@ -15,6 +15,7 @@ from stream_dmr.cli.shared_options import (
 
 Meshes = Literal["ply", "glb"]
 Tables = Literal["csv", "parquet"]
+Agency = Literal["wcpfc", "rdbes"]
 
 
 def export(
@@ -37,6 +38,17 @@ def export(
             help="Table for fisheries: total and fork length, whole cm, weight, legal size."
         ),
     ] = None,
+    viame: Annotated[
+        bool,
+        typer.Option("--viame", help="tracks.viame.csv: boxes, outlines and ends, for DIVE."),
+    ] = False,
+    agency: Annotated[
+        Agency | None,
+        typer.Option(help="Table in the manner of WCPFC's longline monitoring or ICES' RDBES."),
+    ] = None,
+    hauls: Annotated[
+        bool, typer.Option("--hauls", help="hauls.csv: hours watched and fish of each haul.")
+    ] = False,
     config: Annotated[
         Path | None,
         typer.Option(help="A config.toml; its [fisheries] replaces the run's, for --fish."),
@@ -49,10 +61,10 @@ def export(
 
     provenance.json beside them says what made them; `stream-dmr verify` checks it.
     """
-    if not (meshes or masks or tables or fish):
+    if not (meshes or masks or tables or fish or viame or agency or hauls):
         raise typer.BadParameter(
             "expected a choice of what to export, got none; give some of: "
-            "--fish csv, --meshes ply, --masks, --tables csv"
+            "--fish csv, --meshes ply, --masks, --tables csv, --viame, --hauls, --agency wcpfc"
         )
     from stream_dmr.results.export_formats import Export
     from stream_dmr.results.finished_fish import run_notes
@@ -74,5 +86,12 @@ def export(
             else load_config(config)
         )
         print(exported.fish(out, settings.fisheries, format=fish))
+    if viame:
+        path = out / "tracks.viame.csv"
+        print(f"{path}: {exported.viame(path)} boxes")
+    if agency:
+        print(exported.agency(out, agency))
+    if hauls:
+        print(exported.hauls(out))
     print(exported.provenance(out))
     warn([*run_notes(recording), *exported.warnings])

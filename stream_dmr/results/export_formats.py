@@ -22,7 +22,25 @@ from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
 from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
 from stream_dmr.recording.view.view_geometry import place_fit
-from stream_dmr.results.finished_fish import database_of, read_fish, read_runs, read_stored_fish
+from stream_dmr.results.agency_tables import (
+    HAUL_COLUMNS,
+    RDBES_COLUMNS,
+    WCPFC_COLUMNS,
+    Agency,
+    counts,
+    haul_row,
+    rdbes_row,
+    wcpfc_row,
+    write_rows,
+)
+from stream_dmr.results.effort import read_effort
+from stream_dmr.results.finished_fish import (
+    FishResult,
+    database_of,
+    read_fish,
+    read_runs,
+    read_stored_fish,
+)
 from stream_dmr.results.fish_table import fish_record, write_csv, write_parquet
 from stream_dmr.results.fisheries import FisheriesSettings
 from stream_dmr.results.frames_table import FramesTable
@@ -31,6 +49,7 @@ from stream_dmr.results.own_files import require_writable
 from stream_dmr.results.provenance import known_files, read_origin, seal_files
 from stream_dmr.results.run_facts import run_facts
 from stream_dmr.results.scale_checks import last_checks
+from stream_dmr.results.viame_csv import ViameTracks
 
 MeshFormat = Literal["ply", "glb"]
 TableFormat = Literal["csv", "parquet"]
@@ -142,6 +161,64 @@ class Export:
         path = write(make_folder(out) / "fish", records)
         self._written.append(path)
         return path
+
+    def viame(self, path: Path) -> int:
+        """Write boxes, outlines, ends and lengths as VIAME CSV, for DIVE; returns their number."""
+        self._require_writable(path)
+        tracks = ViameTracks(self._all_fish(), fps=None)
+        crops: dict[tuple[int, int], FishCrop] = {}
+        for message in self._messages(FishCrop, LocalizedFish):
+            if isinstance(message, FishCrop):
+                crops[message.track_id, message.frame_index] = message
+            elif isinstance(message, LocalizedFish):
+                crop = crops.pop((message.track_id, message.frame_index), None)
+                if crop is not None:
+                    tracks.add(
+                        track_id=message.track_id,
+                        frame_index=message.frame_index,
+                        timestamp_ns=message.timestamp_ns,
+                        bbox_xyxy_px=crop.bbox_xyxy_px,
+                        mask=mask_in_frame(crop),
+                        keypoints_px=message.keypoints_px,
+                    )
+        self._write_text(path, tracks.text())
+        return tracks.count
+
+    def agency(self, out: Path, agency: Agency) -> Path:
+        """Write the fish as wcpfc.csv or rdbes.csv; rejected ones and doubles are left out."""
+        path = out / f"{agency}.csv"
+        self._require_writable(path)
+        make, columns = (
+            (wcpfc_row, WCPFC_COLUMNS) if agency == "wcpfc" else (rdbes_row, RDBES_COLUMNS)
+        )
+        template = self._recording.header.template
+        rows = [make(one, template) for one in counts(self._all_fish())]
+        self._written.append(write_rows(make_folder(out) / path.name, columns, rows))
+        return path
+
+    def hauls(self, out: Path) -> Path:
+        """Write hauls.csv: each haul with its effort. Raises OutputError without a lengths.db."""
+        path, database = out / "hauls.csv", database_of(self._path)
+        if database is None:
+            raise OutputError(
+                f"{self._path}: expected the folder of a run, which has a lengths.db; give that"
+            )
+        self._require_writable(path)
+        efforts = read_effort(database, counts(self._all_fish()))
+        zeros = {facts.utc_zero_ns for facts in read_runs(database).values()}
+        zero_ns = zeros.pop() if len(zeros) == 1 else None
+        rows = [haul_row(one, utc_zero_ns=zero_ns) for one in efforts]
+        self._written.append(write_rows(make_folder(out) / path.name, HAUL_COLUMNS, rows))
+        return path
+
+    def _all_fish(self) -> list[FishResult]:
+        return read_fish(self._path, self._recording, self._selection)
+
+    def _write_text(self, path: Path, text: str) -> None:
+        make_folder(path.parent)
+        with writing_to(path):
+            path.write_text(text, encoding="utf-8")
+        self._written.append(path)
 
     def claim(self, out: Path) -> None:
         """Raise OutputError where `out` holds exports of another recording."""
