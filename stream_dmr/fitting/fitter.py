@@ -22,11 +22,12 @@ from stream_dmr.fitting.shape.candidates import CandidateShape
 from stream_dmr.fitting.shape.evidence import nats_against
 from stream_dmr.fitting.shape.length_std import freed, shape_std_ratio, slant_std_ratio
 from stream_dmr.fitting.shape.space import (
+    TRUNK,
     directions,
     half_section,
     individual_covariance,
-    log_breadth_std,
     reshaped,
+    std_of,
 )
 from stream_dmr.fitting.size.scanner import SizeScanner
 from stream_dmr.fitting.solver import Solution, Solver
@@ -86,9 +87,9 @@ class Fitter:
         self._breadth_std = 0.0  # of the log breadth, where it is learnt
         if candidate is not None:
             template = reshaped(template, candidate.coefficients)
-            settings = freed(settings, log_breadth_std(candidate.covariance) ** 2)
+            settings = freed(settings, std_of(TRUNK, candidate.covariance) ** 2)
             self._shape_covariance += candidate.covariance
-            self._breadth_std = log_breadth_std(self._shape_covariance)
+            self._breadth_std = std_of(TRUNK, self._shape_covariance)
         self.plane_normal = np.ascontiguousarray(normal)
         self._template = template
         self._settings = settings

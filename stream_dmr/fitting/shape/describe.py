@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from stream_dmr.fitting.shape.candidates import CandidateShape, CandidateShapes
-from stream_dmr.fitting.shape.space import THICKNESS, TRUNK, log_breadth_std
+from stream_dmr.fitting.shape.space import THICKNESS, TRUNK, std_of
 
 _WORTH_SAYING = 0.02  # of a log factor: smaller differences are called none
 
@@ -20,7 +20,7 @@ def describe(forms: CandidateShapes, stocks: CandidateShapes) -> Iterator[str]:
 def difference(form: CandidateShape, stock: CandidateShape) -> str:
     """How a stock differs from its form."""
     change = stock.coefficients - form.coefficients
-    std = log_breadth_std(stock.covariance)
+    std = std_of(TRUNK, stock.covariance)
     words = [
         _factor(float(TRUNK @ change), "broader", "slimmer") + f" (+-{std:.0%})",
         _factor(float(change[THICKNESS].mean()), "thicker", "thinner"),

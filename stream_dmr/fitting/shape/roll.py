@@ -11,12 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from stream_dmr.fitting.contour.rotation_vector import rotation_and_jacobian
 from stream_dmr.fitting.parameters import ROOT_ROTATION
-from stream_dmr.fitting.shape.space import BREADTH_KNOTS, LEFT, RIGHT, reshaped
-from stream_dmr.template.template import Template
 
 # Cameras stand where the broad side of fish is seen. Chosen; of flatfish it is less.
 ROLL_STD_RAD = 0.7
-_NEAR_KNOT = 32  # vertices of a mesh around a knot: two rings
 
 
 def roll_rad(pose: Float[np.ndarray, "P"], anchor: Float[np.ndarray, "3"]) -> float:
@@ -42,27 +39,41 @@ def unrolled(
     pose: Float[np.ndarray, "P"], anchor: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "P"]:
     """The pose turned about the body's axis until the broad side faces the camera."""
+    return _turned(pose, roll_rad(pose, anchor))
+
+
+def rolled_as_seen(
+    pose: Float[np.ndarray, "P"], log_breadth: float, roundness: float
+) -> Float[np.ndarray, "P"]:
+    """An unrolled pose, rolled until this factor of the breadth is seen, as far as roll can.
+
+    `roundness` is the thickness of the body over its breadth.
+    """
+    seen = np.clip(np.exp(2 * log_breadth), min(roundness**2, 1.0), 1.0)
+    roll = np.arcsin(np.sqrt((1 - seen) / max(1 - roundness**2, 1e-9)).clip(0, 1))
+    return _turned(pose, -float(roll))
+
+
+def add_roll_prior(
+    H: Float[np.ndarray, "Z Z"],
+    g: Float[np.ndarray, "Z"],
+    pose: Float[np.ndarray, "P"],
+    anchor: Float[np.ndarray, "3"],
+    *,
+    weight: float,
+) -> None:
+    """Add half the weighted square of the roll to normal equations that begin with the pose."""
+    slope, part = roll_slope(pose, anchor), slice(0, len(pose))
+    H[part, part] += weight * np.outer(slope, slope)
+    g[part] += weight * roll_rad(pose, anchor) * slope
+
+
+def _turned(pose: Float[np.ndarray, "P"], angle: float) -> Float[np.ndarray, "P"]:
     R, _ = rotation_and_jacobian(pose[ROOT_ROTATION])
-    turn = Rotation.from_euler("x", roll_rad(pose, anchor)).as_matrix()
     turned = pose.copy()
+    turn = Rotation.from_euler("x", angle).as_matrix()
     turned[ROOT_ROTATION] = Rotation.from_matrix(R @ turn).as_rotvec()
     return turned
-
-
-def narrowed(
-    template: Template, shape: Float[np.ndarray, "W"], roll: float
-) -> Float[np.ndarray, "W"]:
-    """The coefficients of the body that shows from its side what this one shows rolled (rad)."""
-    body = reshaped(template, shape)
-    x = body.rest_vertices[:, 0] - body.keypoints[0, 0]
-    place = x / (body.keypoints[2, 0] - body.keypoints[0, 0])
-    near = np.argsort(np.abs(place - BREADTH_KNOTS[:, None]), axis=1)[:, :_NEAR_KNOT]
-    breadth, thickness = np.abs(body.rest_vertices[near, 1:]).max(axis=1).T
-    seen = np.cos(roll) ** 2 + (thickness / breadth * np.sin(roll)) ** 2
-    narrow = shape.copy()
-    narrow[LEFT] += np.log(seen) / 2
-    narrow[RIGHT] += np.log(seen) / 2
-    return narrow
 
 
 def _ray(

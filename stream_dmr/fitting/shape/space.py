@@ -32,6 +32,8 @@ _NEAR_CENTER = 0.1  # body lengths: some rings of any template
 # The mean log breadth of the trunk, between head and peduncle, as a row over the coefficients.
 TRUNK = np.zeros(NUM_COEFFICIENTS)
 TRUNK[2:8] = TRUNK[_NUM_SIDE + 2 : _NUM_SIDE + 8] = 1 / 12
+MEAN_THICKNESS = np.zeros(NUM_COEFFICIENTS)
+MEAN_THICKNESS[THICKNESS] = 1 / _NUM_THICKNESS
 
 # How far a stock may be from the body form that it is most like, as standard deviations. Chosen
 # wide: congeners in FishBase differ in body depth by about a tenth, in their fins by more.
@@ -83,6 +85,12 @@ def half_section(template: Template) -> Float[np.ndarray, "2"]:
     return np.abs(template.rest_vertices[near, 1:] - template.keypoints[1, 1:]).max(axis=0)
 
 
+def roundness(template: Template) -> float:
+    """The thickness around the center keypoint over the breadth."""
+    breadth, thickness = half_section(template)
+    return float(thickness / breadth)
+
+
 def coefficients_of(other: Template, template: Template) -> Float[np.ndarray, "W"]:
     """The coefficients that make one mesh of rings another one of the same rings.
 
@@ -124,10 +132,23 @@ def form_precision() -> Float[np.ndarray, "W W"]:
     return rows.T @ rows
 
 
-def log_breadth_std(covariance: Float[np.ndarray, "W W"]) -> float:
-    """Std of the mean log breadth of the trunk, the same to the last bit in every replay."""
+def std_of(mean: Float[np.ndarray, "W"], covariance: Float[np.ndarray, "W W"]) -> float:
+    """Std of a mean of coefficients, `TRUNK` or `MEAN_THICKNESS`.
+
+    The same to the last bit in every replay.
+    """
     in_order = np.ascontiguousarray(covariance)  # sums run in the order of the memory
-    return float(np.sqrt(np.einsum("i,ij,j", TRUNK, in_order, TRUNK)))
+    return float(np.sqrt(np.einsum("i,ij,j", mean, in_order, mean)))
+
+
+def with_std_of(
+    covariance: Float[np.ndarray, "W W"], part: slice, mean: Float[np.ndarray, "W"], std: float
+) -> Float[np.ndarray, "W W"]:
+    """The covariance with another std of the `mean` of a part, that of the rest as it was."""
+    together = np.zeros(NUM_COEFFICIENTS)
+    together[part] = 1.0
+    rest = np.eye(NUM_COEFFICIENTS) - np.outer(together, mean)
+    return rest @ covariance @ rest.T + std**2 * np.outer(together, together)
 
 
 def individual_covariance() -> Float[np.ndarray, "W W"]:

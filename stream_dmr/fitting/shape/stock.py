@@ -7,8 +7,9 @@ Adjustment: a Modern Synthesis", 2000); the frames of a fish are averaged, for t
 its own deviation is integrated out, which leaves each fish a Gaussian in s. Their product with the
 prior about a body form is solved, the template reshaped, the poses followed, and so on.
 
-What roll hides (`roll.py`) has several such solutions. `best` begins from the poses as they are and
-from unrolled ones, and takes what the masks agree with better in all poses (`evidence.py`).
+All of that in square fits (`square_fit.py`): once with all frames, then with those that show the
+fish's broad side. The factors on breadth and thickness that turned fish hide are inferred from all
+of them (`proportions.py`).
 """
 
 from collections.abc import Sequence
@@ -22,28 +23,38 @@ from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.levenberg_marquardt import WARM_DAMPING, minimise
 from stream_dmr.fitting.contour.problem import Options, Problem
 from stream_dmr.fitting.fit_settings import FitMeshSettings
-from stream_dmr.fitting.shape.equations import ShapeEquations, shape_equations
+from stream_dmr.fitting.parameters import joints_of
+from stream_dmr.fitting.shape.equations import shape_equations
 from stream_dmr.fitting.shape.evidence import nats_against
-from stream_dmr.fitting.shape.roll import ROLL_STD_RAD, narrowed, roll_rad, roll_slope, unrolled
+from stream_dmr.fitting.shape.proportions import Proportions, infer_proportions
+from stream_dmr.fitting.shape.roll import add_roll_prior, rolled_as_seen, unrolled
 from stream_dmr.fitting.shape.space import (
     BREADTH,
     LOBES,
+    MEAN_THICKNESS,
     NUM_COEFFICIENTS,
+    THICKNESS,
+    TRUNK,
     directions,
     form_precision,
     individual_covariance,
     reshaped,
+    roundness,
+    std_of,
+    with_std_of,
 )
+from stream_dmr.fitting.shape.square_fit import HELD_ROLL_RAD, square_pose, square_problem
 from stream_dmr.fitting.target import Target
 from stream_dmr.template.template import Template
 
 # Fish of a stock hang nearer to the plane on average than any one of them.
 _TILT_STD_RAD = 0.15
-# Of the breadth as a whole: what roll and slant hide, to which the equations are blind, since both
-# show in second order only. As wrong as stocks of seven simulated species were (docs/research).
-_HIDDEN_BREADTH_STD = 0.06
+# Of the joints' log scales in a square fit: while the outline is learnt, and while the breadth is
+# read off. Chosen.
+_LEARNING_SCALE_STD, _READING_SCALE_STD = 0.1, 0.4
 # Chosen by trial, as the limits below.
 _MAX_ROUNDS = 12
+_BROADSIDE, _FEWEST_BROADSIDE = 0.12, 6  # log factor, frames
 _MAX_STEP = 0.25  # of a log factor in one round: directions are those of the shape at hand
 _SETTLED = 0.01  # of a log factor
 _POSE_OPTIONS = Options(6, 1e-5, WARM_DAMPING)
@@ -60,6 +71,10 @@ class PosedTarget:
     def copy(self) -> "PosedTarget":
         """One whose pose may follow another shape."""
         return PosedTarget(self.fish, self.target, self.pose)
+
+    def unrolled(self) -> "PosedTarget":
+        """One whose broad side faces the camera."""
+        return PosedTarget(self.fish, self.target, unrolled(self.pose, self.target.anchor))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -80,24 +95,9 @@ class StockFitter:
         self._nat = settings.nat
         tilt_std_rad = min(settings.tilt_std_rad, _TILT_STD_RAD)
         self._settings = settings.model_copy(update={"tilt_std_rad": tilt_std_rad})
+        self._slant_std_rad = settings.tilt_std_rad
         self._precision = form_precision()
         self._individual = np.linalg.inv(individual_covariance())
-
-    def best(
-        self,
-        frames: Sequence[PosedTarget],
-        form: Float[np.ndarray, "W"],
-        start: Float[np.ndarray, "W"],
-    ) -> Stock:
-        """The likelier one of two fits: from the poses as they are, and from unrolled ones."""
-        rolls = [abs(roll_rad(frame.pose, frame.target.anchor)) for frame in frames]
-        flat = [
-            PosedTarget(frame.fish, frame.target, unrolled(frame.pose, frame.target.anchor))
-            for frame in frames
-        ]
-        narrow = narrowed(self._template, start, float(np.median(rolls)))
-        found = [self.fit(frames, form, start), self.fit(flat, form, narrow)]
-        return min(found, key=lambda stock: self._against(stock, form))
 
     def fit(
         self,
@@ -106,10 +106,28 @@ class StockFitter:
         start: Float[np.ndarray, "W"],
     ) -> Stock:
         """The shape of the fish of these frames, a priori near a body form."""
-        posed = [frame.copy() for frame in frames]
+        shape, _ = self._outline(frames, form, start)
+        _, seen, known = self._read(frames, shape, form)
+        shape, inverse = self._outline(_broadside(frames, seen - known.breadth), form, shape)
+        square, seen, known = self._read(frames, shape, form)
+        shape[BREADTH] += known.breadth
+        shape[THICKNESS] += known.thickness
+        inverse = with_std_of(inverse, BREADTH, TRUNK, known.breadth_std)
+        inverse = with_std_of(inverse, THICKNESS, MEAN_THICKNESS, known.thickness_std)
+        nats, posed = self._placed(frames, square, seen - known.breadth, shape)
+        return Stock(coefficients=shape, covariance=inverse, nats=nats, frames=posed)
+
+    def _outline(
+        self,
+        frames: Sequence[PosedTarget],
+        form: Float[np.ndarray, "W"],
+        start: Float[np.ndarray, "W"],
+    ) -> tuple[Float[np.ndarray, "W"], Float[np.ndarray, "W W"]]:
+        """The shape that these frames show squarely, and its covariance."""
+        square = [frame.unrolled() for frame in frames]
         shape, inverse = start.copy(), np.eye(NUM_COEFFICIENTS)
         for _ in range(_MAX_ROUNDS):
-            A, b = self._equations(posed, shape)
+            A, b = self._equations(square, shape)
             A += self._precision
             b -= self._precision @ (shape - form)
             inverse = cho_solve(cho_factor((A + A.T) / 2), np.eye(len(A)))
@@ -117,9 +135,7 @@ class StockFitter:
             shape += step
             if np.abs(step).max() < _SETTLED:
                 break
-        nats = self.nats(posed, shape)
-        inverse[BREADTH, BREADTH] += _HIDDEN_BREADTH_STD**2
-        return Stock(coefficients=shape, covariance=inverse, nats=nats, frames=posed)
+        return shape, inverse
 
     def nats(
         self, frames: Sequence[PosedTarget], shape: Float[np.ndarray, "W"]
@@ -128,17 +144,71 @@ class StockFitter:
         body = Body.from_template(reshaped(self._template, shape))
         against: dict[int, list[float]] = {}
         for frame in frames:
-            self._follow(body, frame)
-            problem = self._problem(body, frame.target)
-            against.setdefault(frame.fish, []).append(
-                nats_against(problem, frame.pose, nat=self._nat)
-            )
-        return {fish: float(np.mean(values)) for fish, values in against.items()}
+            against.setdefault(frame.fish, []).append(self._follow(body, frame))
+        return _means(against)
 
-    def _against(self, stock: Stock, form: Float[np.ndarray, "W"]) -> float:
-        """-log of the posterior of a stock, up to a constant."""
-        off = stock.coefficients - form
-        return sum(stock.nats.values()) + 0.5 * float(off @ self._precision @ off)
+    def _read(
+        self,
+        frames: Sequence[PosedTarget],
+        shape: Float[np.ndarray, "W"],
+        form: Float[np.ndarray, "W"],
+    ) -> tuple[list[PosedTarget], Float[np.ndarray, "F"], Proportions]:
+        """Read each frame's breadth off a square fit that may be arched, and what all say.
+
+        Returns the fits, the logs of the factors on the breadth, and what is known of the stock's.
+        """
+        template = reshaped(self._template, shape)
+        body, square = Body.from_template(template), [frame.unrolled() for frame in frames]
+        by_fish: dict[int, list[float]] = {}
+        for frame in square:
+            problem = square_problem(
+                self._settings,
+                body,
+                frame.target,
+                scale_std=_READING_SCALE_STD,
+                arch_std_rad=self._settings.bend_std_rad,
+            )
+            frame.pose = square_pose(problem, frame.pose, nat=self._nat)
+            by_fish.setdefault(frame.fish, []).append(_log_breadth(frame))
+        spread, off = np.linalg.inv(self._precision), form - shape
+        known = infer_proportions(
+            by_fish,
+            roundness=roundness(template),
+            slant_std_rad=self._slant_std_rad,
+            before=Proportions(
+                float(TRUNK @ off),
+                std_of(TRUNK, spread),
+                float(MEAN_THICKNESS @ off),
+                std_of(MEAN_THICKNESS, spread),
+            ),
+        )
+        return square, np.array([_log_breadth(frame) for frame in square]), known
+
+    def _placed(
+        self,
+        frames: Sequence[PosedTarget],
+        square: Sequence[PosedTarget],
+        seen: Float[np.ndarray, "F"],
+        shape: Float[np.ndarray, "W"],
+    ) -> tuple[dict[int, float], list[PosedTarget]]:
+        """What each fish says against a shape, and the better of two poses of each frame.
+
+        They follow the shape from where the frame was found, and from the square pose, rolled by
+        as much as the breadth that is seen says.
+        """
+        body = Body.from_template(reshaped(self._template, shape))
+        thin = roundness(reshaped(self._template, shape))
+        against: dict[int, list[float]] = {}
+        placed: list[PosedTarget] = []
+        for frame, flat, log_breadth in zip(frames, square, seen, strict=True):
+            rolled = rolled_as_seen(flat.pose, float(log_breadth), thin)
+            joints_of(rolled).log_scale[:] = 0.0
+            starts = frame.copy(), PosedTarget(frame.fish, frame.target, rolled)
+            nats = [self._follow(body, one) for one in starts]
+            best = int(np.argmin(nats))
+            placed.append(starts[best])
+            against.setdefault(frame.fish, []).append(nats[best])
+        return _means(against), placed
 
     def _equations(
         self, frames: Sequence[PosedTarget], shape: Float[np.ndarray, "W"]
@@ -148,9 +218,15 @@ class StockFitter:
         slopes = directions(body)
         fish: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
         for frame in frames:
-            self._follow(body, frame)
-            found = shape_equations(self._problem(body, frame.target), frame.pose, slopes)
-            parts = _without_pose(*self._with_roll(found, frame), len(frame.pose))
+            problem = square_problem(
+                self._settings, body, frame.target, scale_std=_LEARNING_SCALE_STD
+            )
+            frame.pose = square_pose(problem, frame.pose, nat=self._nat)
+            H, g = shape_equations(problem, frame.pose, slopes)
+            add_roll_prior(
+                H, g, frame.pose, frame.target.anchor, weight=self._nat / HELD_ROLL_RAD**2
+            )
+            parts = _without_pose(H, g, len(frame.pose))
             fish.setdefault(frame.fish, []).append(parts)
         A, b = np.zeros((NUM_COEFFICIENTS, NUM_COEFFICIENTS)), np.zeros(NUM_COEFFICIENTS)
         for parts in fish.values():
@@ -162,26 +238,30 @@ class StockFitter:
             b -= shrink @ g
         return A, b
 
-    def _with_roll(
-        self, found: ShapeEquations, frame: PosedTarget
-    ) -> tuple[Float[np.ndarray, "Z Z"], Float[np.ndarray, "Z"]]:
-        """H and g with the prior of the roll."""
-        H, g = found.H.copy(), found.g.copy()
-        roll = roll_rad(frame.pose, frame.target.anchor)
-        slope = roll_slope(frame.pose, frame.target.anchor)
-        weight, pose = self._nat / ROLL_STD_RAD**2, slice(0, len(slope))
-        H[pose, pose] += weight * np.outer(slope, slope)
-        g[pose] += weight * roll * slope
-        return H, g
-
-    def _follow(self, body: Body, frame: PosedTarget) -> None:
-        """Refit a frame from its last pose."""
-        problem = self._problem(body, frame.target)
+    def _follow(self, body: Body, frame: PosedTarget) -> float:
+        """Refit a frame from its last pose; what its mask says against the shape, nats."""
+        problem = Problem.from_settings(self._settings, body, frame.target, with_smoothness=False)
         nothing_held = np.zeros(len(frame.pose), np.bool_)
         frame.pose = minimise(problem, frame.pose, nothing_held, _POSE_OPTIONS).parameters
+        return nats_against(problem, frame.pose, nat=self._nat)
 
-    def _problem(self, body: Body, target: Target) -> Problem:
-        return Problem.from_settings(self._settings, body, target, with_smoothness=False)
+
+def _log_breadth(frame: PosedTarget) -> float:
+    return float(joints_of(frame.pose).log_scale.mean())
+
+
+def _broadside(frames: Sequence[PosedTarget], off: Float[np.ndarray, "F"]) -> Sequence[PosedTarget]:
+    """The frames that show about the whole breadth, or those nearest to it.
+
+    `off`: log of what each shows over the stock's breadth. Edge-on, the outline is the thickness.
+    """
+    order = np.argsort(np.abs(off), kind="stable")
+    num = max(int((np.abs(off) < _BROADSIDE).sum()), _FEWEST_BROADSIDE)
+    return [frames[n] for n in np.sort(order[:num])]
+
+
+def _means(values: dict[int, list[float]]) -> dict[int, float]:
+    return {fish: float(np.mean(each)) for fish, each in values.items()}
 
 
 def _limited(step: Float[np.ndarray, "W"]) -> Float[np.ndarray, "W"]:

@@ -144,7 +144,7 @@ class _StockLearner:
         return [
             _Group(
                 group.form,
-                self._fitter.best(own, group.form.coefficients, group.stock.coefficients),
+                self._fitter.fit(own, group.form.coefficients, group.stock.coefficients),
             )
             for group, own in zip(groups, frames, strict=True)
             if own

@@ -7,9 +7,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.fitting.parameters import ROOT_ROTATION, rest_vector
-from stream_dmr.fitting.shape.roll import narrowed, roll_rad, roll_slope, unrolled
-from stream_dmr.fitting.shape.space import BREADTH, reshaped
-from tests.support.stocks import TEMPLATE, broader
+from stream_dmr.fitting.shape.roll import (
+    add_roll_prior,
+    roll_rad,
+    roll_slope,
+    rolled_as_seen,
+    unrolled,
+)
 
 RAY = np.array([0.1, -0.05, 1.0])
 thirty = settings(max_examples=30)
@@ -58,12 +62,31 @@ def test_the_slope_is_a_finite_difference(rotation):
     assert not slope[3:].any()
 
 
-@pytest.mark.parametrize("roll", [0.0, 0.3, 0.9])
-def test_a_narrowed_body_shows_what_the_broad_one_shows_rolled(roll):
-    broad = broader(0.2)
-    body = reshaped(TEMPLATE, broad).rest_vertices
-    seen = np.abs(Rotation.from_euler("x", roll).apply(body)[:, 1])
-    narrow = reshaped(TEMPLATE, narrowed(TEMPLATE, broad, roll)).rest_vertices
-    assert np.abs(narrow[:, 1]).max() == pytest.approx(seen.max(), rel=0.03)
-    if roll == 0.0:
-        np.testing.assert_allclose(narrowed(TEMPLATE, broad, roll)[BREADTH], broad[BREADTH])
+@thirty
+@given(rotation=rotations, roll=st.floats(0.0, 1.5), thin=st.floats(0.2, 0.9))
+def test_a_pose_is_rolled_until_a_breadth_is_seen(rotation, roll, thin):
+    flat = unrolled(pose_of(rotation), RAY)
+    seen = float(np.log(np.hypot(np.cos(roll), thin * np.sin(roll))))
+    rolled = rolled_as_seen(flat, seen, thin)
+    assert abs(roll_rad(rolled, RAY)) == pytest.approx(roll, abs=1e-6)
+
+
+def test_no_roll_shows_more_than_the_breadth_or_less_than_the_thickness():
+    flat = unrolled(pose_of(Rotation.identity()), RAY)
+    np.testing.assert_allclose(rolled_as_seen(flat, 0.3, 0.5), flat, atol=1e-9)
+    edge_on = rolled_as_seen(flat, -5.0, 0.5)
+    assert abs(roll_rad(edge_on, RAY)) == pytest.approx(np.pi / 2, abs=1e-6)
+
+
+@thirty
+@given(rotation=rotations, weight=st.floats(0.1, 10.0))
+def test_the_prior_of_the_roll_leads_to_none(rotation, weight):
+    """Its own equations' step is the Gauss-Newton step of a half square."""
+    pose = pose_of(rotation)
+    H, g = np.zeros((len(pose) + 2, len(pose) + 2)), np.zeros(len(pose) + 2)
+    add_roll_prior(H, g, pose, RAY, weight=weight)
+    slope, roll = roll_slope(pose, RAY), roll_rad(pose, RAY)
+    np.testing.assert_allclose(H[:-2, :-2], weight * np.outer(slope, slope))
+    np.testing.assert_allclose(g[:-2], weight * roll * slope)
+    assert not H[-2:].any()
+    assert not g[-2:].any()

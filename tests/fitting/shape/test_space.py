@@ -12,6 +12,7 @@ from stream_dmr.fitting.shape.space import (
     BREADTH,
     LEFT,
     LOBES,
+    MEAN_THICKNESS,
     NUM_COEFFICIENTS,
     RIGHT,
     THICKNESS,
@@ -19,9 +20,12 @@ from stream_dmr.fitting.shape.space import (
     coefficients_of,
     directions,
     form_precision,
+    half_section,
     individual_covariance,
-    log_breadth_std,
     reshaped,
+    roundness,
+    std_of,
+    with_std_of,
 )
 from stream_dmr.template.template_file import bundled_names, load_template
 from tests.support.shapes import fish_template
@@ -132,8 +136,29 @@ def test_a_recorded_shape_is_the_run_s_to_the_last_bit():
     rng, template = np.random.default_rng(5), load_template("cod")
     covariance = np.linalg.inv(form_precision())
     for order in (np.asfortranarray, moved_in_memory):
-        assert log_breadth_std(order(covariance)) == log_breadth_std(covariance)
+        assert std_of(TRUNK, order(covariance)) == std_of(TRUNK, covariance)
     for _ in range(20):
         coefficients = rng.normal(0, 0.2, NUM_COEFFICIENTS)
         again = reshaped(template, moved_in_memory(coefficients)).rest_vertices
         np.testing.assert_array_equal(again, reshaped(template, coefficients).rest_vertices)
+
+
+@pytest.mark.parametrize(("part", "mean"), [(BREADTH, TRUNK), (THICKNESS, MEAN_THICKNESS)])
+def test_only_the_std_of_a_mean_is_set(part, mean):
+    covariance = np.linalg.inv(form_precision())
+    known = with_std_of(covariance, part, mean, 0.03)
+    assert std_of(mean, known) == pytest.approx(0.03)
+    assert np.linalg.eigvalsh(known).min() > -1e-12
+    differences = np.eye(NUM_COEFFICIENTS)[part][:-1] - np.eye(NUM_COEFFICIENTS)[part][1:]
+    np.testing.assert_allclose(
+        differences @ known @ differences.T, differences @ covariance @ differences.T, atol=1e-12
+    )
+
+
+def test_roundness_is_thickness_over_breadth():
+    template = load_template("cod")
+    breadth, thickness = half_section(template)
+    assert roundness(template) == pytest.approx(thickness / breadth)
+    wide = np.zeros(NUM_COEFFICIENTS)
+    wide[BREADTH] = np.log(2)
+    assert roundness(reshaped(template, wide)) == pytest.approx(roundness(template) / 2)

@@ -32,7 +32,7 @@ class TestStockFitter:
     @pytest.mark.parametrize("log_factor", [0.18, -0.15])
     def test_finds_the_known_breadth_of_a_stock(self, log_factor):
         frames = posed(fish_of(broader(log_factor), track_id=n, num_frames=1) for n in range(6))
-        stock = StockFitter(TEMPLATE, SETTINGS).best(frames, NOTHING, NOTHING)
+        stock = StockFitter(TEMPLATE, SETTINGS).fit(frames, NOTHING, NOTHING)
         std = float(np.sqrt(TRUNK @ stock.covariance @ TRUNK))
         error = float(TRUNK @ stock.coefficients) - log_factor
         assert abs(error) < 0.08
