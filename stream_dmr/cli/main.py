@@ -23,7 +23,7 @@ from stream_dmr.cli.make_template import make_template
 from stream_dmr.cli.recover import recover
 from stream_dmr.cli.replay import replay
 from stream_dmr.cli.report import report, verify
-from stream_dmr.cli.review import review
+from stream_dmr.cli.review import agreement, review
 from stream_dmr.cli.run import run
 from stream_dmr.cli.shared_options import OverwriteOption
 from stream_dmr.cli.train import train
@@ -41,8 +41,8 @@ app = typer.Typer(
 )
 for command in (
     *(demo, run, calibrate, check, replay, recover, view, convert, export),
-    *(report, review, verify, haul, keygen, batch, fleet, evaluate, train, learn_template),
-    make_template,
+    *(report, review, agreement, verify, haul, keygen, batch, fleet, evaluate, train),
+    *(learn_template, make_template),
 ):
     app.command()(command)
 

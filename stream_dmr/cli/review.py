@@ -72,3 +72,16 @@ def review(
         with closing(ReviewServer(queue, title=title, port=port)) as server:
             print(f"open {server.address}\nCtrl-C ends it", flush=True)
             stop.wait()
+
+
+def agreement(folders: _Folders) -> None:
+    """Say how well the review and blind readings agree: decisions, species, lengths."""
+    from stream_dmr.report.open_reports import run_folders
+    from stream_dmr.review.agreement import MEASUREMENT, agreements
+
+    for pair in agreements(run_folders(folders)):
+        print(f"{pair.first} and {pair.second}:")
+        if pair.first != MEASUREMENT:
+            print(f"  decisions: {pair.decisions.text}")
+            print(f"  species: {pair.species.text}")
+        print(f"  lengths: {pair.lengths.text}")

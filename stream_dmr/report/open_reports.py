@@ -108,6 +108,23 @@ def open_batch(
     return reports, failed
 
 
+def run_folders(folders: Sequence[Path]) -> list[Path]:
+    """The folders of runs, those of batches taken apart into their videos that are done."""
+    return [
+        run
+        for folder in folders
+        for run in (
+            [
+                folder / VIDEO_FOLDERS / row["name"]
+                for row in read_videos(folder)
+                if row["status"] == DONE
+            ]
+            if is_batch(folder)
+            else [folder]
+        )
+    ]
+
+
 def open_folders(
     folders: Sequence[Path],
     *,

@@ -54,7 +54,6 @@ def render_page(
             *(line for one in reports for line in _shape_notes(one)),
         ],
         "review": review,
-        "species": [],  # names and codes that a reviewer may type
     }
     rows, details = list[dict[str, Any]](), list[str]()
     for placed in place(reports):

@@ -80,10 +80,11 @@ function takeRows(rows) {
 
 function typed(id) { return document.getElementById(id).value.trim(); }
 
-// What was typed as a code or a name of the list, as its name; else as it was typed.
+// What was typed as a code or a name of the list, as the list says it; else as it was typed.
 function speciesNamed(text) {
-  const known = DATA.species.find((one) => one.code.toLowerCase() === text.toLowerCase() || one.name.toLowerCase() === text.toLowerCase());
-  return known ? known.name : text;
+  const typed = text.toLowerCase();
+  const known = DATA.review.species.find((one) => [one.code, one.name, one.scientific].some((name) => name.toLowerCase() === typed));
+  return known ? known.value : text;
 }
 
 function reviewTools(views) {
@@ -146,7 +147,7 @@ function startReview() {
   DATA.seen = new Set(DATA.fish.map((one) => one.id));
   document.body.classList.add("review");
   document.getElementById("review-bar").hidden = false;
-  document.getElementById("species-list").replaceChildren(...DATA.species.map((one) => element("option", { value: one.name, label: one.code })));
+  document.getElementById("species-list").replaceChildren(...DATA.review.species.map((one) => element("option", { value: one.name, label: `${one.code}, ${one.scientific}` })));
   document.getElementById("plots-too").onchange = (event) => { document.body.classList.toggle("with-plots", event.target.checked); show(); };
   drawKeys();
   document.getElementById("keys").open = !matchMedia(NARROW).matches;

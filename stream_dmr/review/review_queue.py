@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from stream_dmr.errors import UserError
+from stream_dmr.catch.species_list import load_species
+from stream_dmr.errors import ConfigError, UserError
 from stream_dmr.report.report_page import PlacedReport, fish_detail, place, render_page
 from stream_dmr.report.run_report import RunReport
 from stream_dmr.results.finished_fish import FishResult, database_of, read_measured_fish
@@ -37,10 +38,12 @@ class ReviewQueue:
     ) -> None:
         """UserError where a report has no database."""
         self._reviewer, self._blind = reviewer, blind
-        self._placed = place(reports)
+        self.placed = place(reports)
         self._recorders = [VerdictRecorder(report, reviewer, blind=blind) for report in reports]
-        self._chosen = None if sample is None else sampled(self._placed, sample)
+        self._measured = set[int]() if sample is None else measured_numbers(self.placed)
+        self._chosen = None if sample is None else sampled(self._measured, sample)
         self._about: dict[str, Any] = {"reviewer": reviewer, "blind": blind}
+        self._about["species"] = species_choices(reports[0].config.species.own_list)
         if sample is not None:
             self._about["sample"] = {"size": sample.size, "seed": sample.seed}
 
@@ -92,7 +95,7 @@ class ReviewQueue:
 
     def _rows(self, run: int, track_ids: Sequence[int] | set[int]) -> list[dict[str, Any]]:
         rows = {fish.estimate.track_id: row for fish, row in self._fish(run, set(track_ids))}
-        placed = self._placed[run]
+        placed = self.placed[run]
         gone = [{"id": placed.row_id(one), "gone": True} for one in track_ids if one not in rows]
         return [*(row for row in rows.values() if self._is_shown(row)), *gone]
 
@@ -101,7 +104,7 @@ class ReviewQueue:
     ) -> Iterator[tuple[FishResult, dict[str, Any]]]:
         """The fish of a run as this reader sees them, with their rows."""
         report, reviews, _ = self._recorder(run).said()
-        placed = replace(self._placed[run], report=report)
+        placed = replace(self.placed[run], report=report)
         for fish in report.fish:
             track_id = fish.estimate.track_id
             if wanted is None or track_id in wanted:
@@ -109,21 +112,43 @@ class ReviewQueue:
                 yield seen, placed.row(seen)
 
     def _is_shown(self, row: dict[str, Any]) -> bool:
-        """True for the fish of the sample, and for those that reviewers have made."""
-        return self._chosen is None or row["origin"] != "run" or row["id"] in self._chosen
+        """True for the fish of the sample, and for those that were not there to be drawn."""
+        return self._chosen is None or row["id"] in self._chosen or row["id"] not in self._measured
 
 
-def sampled(placed: Sequence[PlacedReport], sample: AuditSample) -> set[int]:
-    """The numbers, in the page, of fish that are drawn at random from those that were measured.
+def species_choices(own_list: str) -> list[dict[str, str]]:
+    """Codes and names that a reviewer may type, and the `value` that becomes the verdict.
 
-    Equal seeds give equal fish, whatever reviewers have done meanwhile.
+    A species of the user's own list stands by its code, which every reader of the verdict knows.
     """
-    numbers = sorted(
+    bundled = {one.code for one in load_species()}
+    try:
+        known = load_species(own_list)
+    except ConfigError:  # the list is not on this machine
+        known = load_species()
+    return [
+        {
+            "code": one.code,
+            "name": one.english_name or one.scientific_name,
+            "scientific": one.scientific_name,
+            "value": one.scientific_name if one.code in bundled else one.code,
+        }
+        for one in known
+    ]
+
+
+def measured_numbers(placed: Sequence[PlacedReport]) -> set[int]:
+    """The numbers, in the page, of the fish that were measured."""
+    return {
         one.row_id(fish.estimate.track_id)
         for one in placed
         if (database := database_of(one.report.path)) is not None
         for fish in read_measured_fish(database)
-    )
+    }
+
+
+def sampled(numbers: set[int], sample: AuditSample) -> set[int]:
+    """Those that are drawn at random; equal seeds draw equal ones from the same numbers."""
     rng = np.random.default_rng(sample.seed)
     size = min(sample.size, len(numbers))
-    return set(rng.choice(numbers, size, replace=False).tolist())
+    return set(rng.choice(sorted(numbers), size, replace=False).tolist())
