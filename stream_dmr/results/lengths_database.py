@@ -169,6 +169,8 @@ def _opened(address: str, path: Path, *, make_tables: bool = False) -> sqlite3.C
         _check(database, path)
         if make_tables:
             _prepare(database)
+        elif database.execute("SELECT 1 FROM sqlite_master WHERE name = 'fish'").fetchone() is None:
+            raise sqlite3.DatabaseError("it has no tables: nothing could ever be written")
     except BaseException:
         database.close()
         raise

@@ -9,6 +9,7 @@ import trimesh
 from jaxtyping import Bool, Float
 
 from stream_dmr.errors import TemplateError
+from stream_dmr.files import MAX_PIXELS, size_if_huge
 from stream_dmr.template.body_forms import CENTER, JOINTS, BodyForm, load_body_forms
 from stream_dmr.template.fish_outline import FishOutline, fish_outline
 from stream_dmr.template.ring_mesh import ring_angles, ring_mesh, ring_places
@@ -129,6 +130,10 @@ def _on_axis(*places: float) -> Float[np.ndarray, "N 3"]:
 
 def _read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
     """Pixels above 0, in any channel. Raises TemplateError."""
+    if huge := size_if_huge(path):
+        raise TemplateError(
+            f"{path}: expected a mask of {MAX_PIXELS // 10**6} megapixels or less, got {huge}"
+        )
     try:
         content = np.frombuffer(path.read_bytes(), np.uint8)
     except OSError as error:

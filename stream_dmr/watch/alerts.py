@@ -3,6 +3,7 @@
 import json
 import re
 import smtplib
+import ssl
 import threading
 import urllib.request
 from collections.abc import Callable, Sequence
@@ -138,10 +139,12 @@ def _mail(settings: AlertSettings, alert: Alert) -> None:
     message["From"], message["To"] = settings.mail_from, settings.mail_to
     message.set_content("\n".join([alert.title, *alert.problems, alert.time]))
     host, _, port = settings.mail_server.partition(":")
+    # Without a password any encryption is better than none; a password goes to that server alone.
+    context = ssl.create_default_context() if settings.mail_password_file else None
     with smtplib.SMTP(host, int(port or _MAIL_PORT), timeout=_TIMEOUT_S) as server:
         server.ehlo()
         if server.has_extn("starttls") or settings.mail_password_file:
-            server.starttls()
+            server.starttls(context=context)
         if settings.mail_password_file:
             password = Path(settings.mail_password_file).read_text(encoding="utf-8").strip()
             server.login(settings.mail_from, password)

@@ -21,6 +21,7 @@ from stream_dmr.results.finished_fish import read_runs
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.lengths_database import open_for_reading, open_for_writing
 from stream_dmr.results.lengths_table import lengths_row
+from stream_dmr.results.provenance import sealed
 from tests.support.final_estimates import FACTS, fish
 from tests.support.small_disk import fill, small_disk
 
@@ -30,6 +31,20 @@ def store(tmp_path: Path) -> Iterator[LengthStore]:
     opened = LengthStore(tmp_path, FACTS)
     yield opened
     opened.close()
+
+
+def test_a_file_that_never_got_its_tables_is_refused_in_one_line(tmp_path: Path):
+    """The disk failed right after the file was made; a run that ends then has nothing to sum up."""
+    with closing(sqlite3.connect(tmp_path / "lengths.db")) as database:
+        database.execute("PRAGMA application_id = 1")
+    with pytest.raises(OutputError, match="it has no tables"):
+        open_for_reading(tmp_path / "lengths.db")
+    said = list[str]()
+    with sealed(tmp_path, with_recordings=True, on_notice=said.append):
+        pass
+    assert len(said) == 1
+    LengthStore(tmp_path, FACTS).close()  # the next run makes them
+    assert len(read_runs(tmp_path / "lengths.db")) == 1
 
 
 lengths = st.floats(1e-3, 1e6)

@@ -7,15 +7,26 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from stream_dmr.calibration.calibration_file import load_calibration
 from stream_dmr.calibration.corners import read_grey
-from stream_dmr.errors import CalibrationError, ConfigError, SourceError, TemplateError, UserError
+from stream_dmr.errors import (
+    AnnotationError,
+    CalibrationError,
+    ConfigError,
+    SourceError,
+    TemplateError,
+    UserError,
+)
 from stream_dmr.running.config import load_config
 from stream_dmr.segmentation.annotations.box_files import load_boxes
+from stream_dmr.segmentation.training.annotated_images import read_annotated_images, read_image
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
+from stream_dmr.template.outline_template import template_from_masks
 from stream_dmr.template.template_file import load_template
 
 NESTED = {
@@ -79,6 +90,18 @@ def test_a_huge_picture_is_refused_by_its_header(tmp_path: Path):
         open_source(str(tmp_path), ReadFramesSettings())
     with pytest.raises(CalibrationError, match="too large"):
         read_grey(picture)
+    with pytest.raises(AnnotationError, match="150 megapixels or less"):
+        read_image(picture)
+    with pytest.raises(TemplateError, match="150 megapixels or less"):
+        template_from_masks(picture, thickness=0.5, name="huge")
+
+
+def test_a_huge_mask_is_refused_before_training_reads_it(tmp_path: Path):
+    (tmp_path / "masks").mkdir()
+    cv2.imwrite(str(tmp_path / "1.jpg"), np.zeros((48, 64, 3), np.uint8))
+    huge_png(tmp_path / "masks" / "1.png")
+    with pytest.raises(AnnotationError, match=r"masks/1\.png.*150 megapixels or less"):
+        list(read_annotated_images(tmp_path, tmp_path / "masks"))
 
 
 TWO_SIGNALS = """

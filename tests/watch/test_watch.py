@@ -1,6 +1,8 @@
 """Watching a run: the page, its picture, /metrics, /health, the log, and what systemd is told."""
 
 import json
+import os
+import resource
 import socket
 import subprocess
 import threading
@@ -8,11 +10,12 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from http.client import HTTPResponse
 from pathlib import Path
 from types import SimpleNamespace
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -35,6 +38,7 @@ from stream_dmr.watch.run_state import RunState
 from stream_dmr.watch.systemd import SystemdWatchdog
 from stream_dmr.watch.watch_observer import WatchObserver
 from stream_dmr.watch.watch_server import WatchServer
+from stream_dmr.web.token_server import TokenServer
 from tests.support.browser import chromium
 from tests.support.camera import free_port
 from tests.support.final_estimates import FACTS
@@ -118,6 +122,41 @@ def test_health_says_what_is_wrong(server: WatchServer, state: RunState, problem
     assert code == 503
     assert len(json.loads(content)["problems"]) == 1
     assert metrics_of(server.address)["stream_dmr_healthy",] == 0
+
+
+def test_a_thousand_half_sent_requests_leave_the_run_its_descriptors(
+    state: RunState, monkeypatch: pytest.MonkeyPatch
+):
+    """On loopback: whoever connects gets a few, and not for long; /health answers meanwhile."""
+    monkeypatch.setattr(TokenServer, "request_timeout_s", 0.5)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 4096), hard))
+    server = WatchServer(state, WatchSettings(port=free_port()))
+    try:
+        with ExitStack() as stack:
+            stack.callback(server.close)
+            host, port = urlsplit(server.address).hostname, urlsplit(server.address).port
+            before, most = len(os.listdir("/proc/self/fd")), 0
+            for count in range(1, 1001):
+                client = stack.enter_context(socket.create_connection((host, port)))
+                with suppress(OSError):  # it may be refused by now
+                    client.sendall(b"GET /health HTTP/1.0\r\nX-A: ")
+                most = max(most, len(os.listdir("/proc/self/fd")) - before - count)
+            assert most <= TokenServer.max_connections + 1
+            assert until_healthy(server.address)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def until_healthy(address: str) -> bool:
+    """/health answers 200 within ten seconds; until then it may be busy."""
+    end_s = time.monotonic() + 10.0
+    while time.monotonic() < end_s:
+        with suppress(OSError):
+            if get(f"{address}health")[0] == 200:
+                return True
+        time.sleep(0.02)
+    return False
 
 
 def test_a_known_length_that_is_measured_wrong_is_a_problem(tmp_path: Path, state: RunState):

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from stream_dmr.errors import AnnotationError
+from stream_dmr.files import MAX_PIXELS, size_if_huge
 
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 
@@ -60,6 +61,7 @@ def _read_folder(paths: dict[str, Path], masks: Path) -> Iterator[AnnotatedImage
         )
     for path in paths.values():
         image, mask = read_image(path), masks / f"{path.stem}.png"
+        _refuse_huge(mask)
         labels = cv2.imread(str(mask), cv2.IMREAD_UNCHANGED)
         if labels is None or labels.ndim != 2:
             raise AnnotationError(f"{mask}: expected a PNG of one channel, the ids of fish")
@@ -150,11 +152,19 @@ def _unpack(text: str) -> list[int]:
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
-    """The image, BGR. Raises AnnotationError where it cannot be decoded."""
+    """The image, BGR. Raises AnnotationError where it can't be decoded, or is too large for it."""
+    _refuse_huge(path)
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
         raise AnnotationError(f"{path}: expected an image, but it can't be decoded")
     return image
+
+
+def _refuse_huge(path: Path) -> None:
+    if huge := size_if_huge(path):
+        raise AnnotationError(
+            f"{path}: expected a picture of {MAX_PIXELS // 10**6} megapixels or less, got {huge}"
+        )
 
 
 def _check_size(mask: Path, shape: tuple[int, ...], image: UInt8[np.ndarray, "H W 3"]) -> None:
