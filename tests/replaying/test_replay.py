@@ -18,6 +18,7 @@ from stream_dmr.recording.messages.selection import Selection
 from stream_dmr.recording.messages.topics import TOPICS
 from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
 from stream_dmr.replaying.difference import differences
+from stream_dmr.results.folder_lock import FolderLock
 from tests.support.command import invoke, rows
 from tests.support.tiny_clip import write_clip
 
@@ -197,6 +198,21 @@ class TestDamage:
             _check_truncation(run[0] / "recording.mcap", tmp_path, float(share))
         for share in rng.random(50):
             _check_truncation(run[0] / "recording.rrd", tmp_path, float(share))
+
+    def test_a_folder_with_an_rrd_alone_is_read_beside_the_run_that_writes_it(self, run, tmp_path):
+        original = (run[0] / "recording.rrd").read_bytes()
+        (tmp_path / "recording.rrd").write_bytes(original[: len(original) // 2])
+        lock = FolderLock(tmp_path)
+        try:
+            recording = open_recordings([tmp_path])
+        finally:
+            lock.release()
+        assert "still being written" in recording.warnings[0]
+        whole = open_recordings([run[0] / "recording.rrd"])
+        for kind in TOPICS:
+            found = list(recording.payloads([kind]))
+            assert found == list(whole.payloads([kind]))[: len(found)]
+        assert list(recording.payloads(TOPICS))
 
     def test_replay_says_what_is_lost(self, run, tmp_path):
         original = (run[0] / "recording.mcap").read_bytes()

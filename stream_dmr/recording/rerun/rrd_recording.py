@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 
 from stream_dmr.errors import RecordingError
+from stream_dmr.files import is_locked
 from stream_dmr.messages import Message
 from stream_dmr.recording.messages.codec import check_version
 from stream_dmr.recording.messages.run_header import RunHeader
@@ -76,7 +77,9 @@ class RrdRecording:
         if end is None:
             whole = sum(count for entity, count in counts.items() if _HEADER not in entity)
             self.warnings.append(
-                f"{self.path}: torn; {whole} messages are whole, what came after is lost"
+                f"{self.path}: still being written; {whole} messages so far"
+                if is_locked(self.path.parent)
+                else f"{self.path}: torn; {whole} messages are whole, what came after is lost"
             )
         elif json.loads(end[0][2]) != counts:
             raise RecordingError(f"{self.path}: damaged: parts of it are missing")
