@@ -45,11 +45,19 @@ function factList(fish) {
     ["refused", reasons], ["flags", fish.flags.join(", ")],
     ["frames chosen by", { add: "a reviewer: added", split: "a reviewer: split", merge: "a reviewer: merged" }[fish.origin] ?? ""],
     ["verdict", [fish.verdict, fish.verdict_reason, fish.duplicate_of === null ? null : `of fish ${fish.duplicate_of}`, fish.reviewer && `by ${fish.reviewer}, ${new Date(fish.reviewed_ns / 1e6).toISOString().slice(0, 16)} UTC`].filter(Boolean).join(", ")],
-    ["species", fish.species], ["vessel, trip, haul", [fish.vessel, fish.trip, fish.haul].filter(Boolean).join(", ")],
+    ["species", fish.species],
+    ["when, where", [fish.time_utc, placeOf(fish)].filter(Boolean).join(", ")], ["vessel, trip, haul", [fish.vessel, fish.trip, fish.haul].filter(Boolean).join(", ")],
     ["source", run.source], ["software", run.software_version], ["config", run.config_sha256], ["calibration", run.calibration_sha256], ["template", run.template_sha256],
   ];
   return element("dl", {}, ...rows.filter(([, value]) => value !== "" && value !== undefined && value !== null)
     .flatMap(([name, value]) => [element("dt", { textContent: name }), element("dd", { textContent: value })]));
+}
+
+function placeOf(fish) {
+  if (fish.latitude === null) return fish.position_gap_s === null ? "" : `no positions for ${fish.position_gap_s.toFixed(0)} s around it`;
+  const side = (value, letters) => `${Math.abs(value).toFixed(4)}° ${letters[value < 0 ? 1 : 0]}`;
+  const knots = fish.speed_knots === null ? "" : `, ${fish.speed_knots.toFixed(1)} kn`;
+  return `${side(fish.latitude, "NS")} ${side(fish.longitude, "EW")}${knots}`;
 }
 
 async function drawDetail(fish) {

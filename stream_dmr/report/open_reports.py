@@ -14,10 +14,20 @@ from stream_dmr.report.drawn_views import draw_views
 from stream_dmr.report.recorded_tracks import ReviewedTracks, read_tracks
 from stream_dmr.report.report_page import render_page
 from stream_dmr.report.run_report import RunReport
-from stream_dmr.results.finished_fish import database_of, read_fish, read_measured_fish, run_notes
+from stream_dmr.results.agency_tables import counts
+from stream_dmr.results.effort import read_effort
+from stream_dmr.results.finished_fish import (
+    database_of,
+    read_fish,
+    read_measured_fish,
+    recorded_track,
+    run_notes,
+)
+from stream_dmr.results.kept_positions import read_positions
 from stream_dmr.results.provenance import add_files
 from stream_dmr.results.track_edits import NO_EDITS, edits_of
 from stream_dmr.results.verdicts_table import read_added_frames, read_verdicts
+from stream_dmr.results.vessel_track import VesselTrack
 from stream_dmr.running.config import Config, load_config, parse_config
 
 
@@ -52,6 +62,10 @@ def open_report(
         settings=(of_run if config is None else load_config(config)).fisheries,
         edits=NO_EDITS if reviewed is None else reviewed.edits,
         source=source,
+        efforts=[] if database is None else read_effort(database, counts(fish)),
+        track=recorded_track(recording)
+        if database is None
+        else VesselTrack(read_positions(database)),
         notes=run_notes(path),
     )
 

@@ -17,6 +17,7 @@ from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.report.drawn_views import DrawnView
 from stream_dmr.report.recorded_tracks import FishFrame
 from stream_dmr.report.run_report import RunReport
+from stream_dmr.report.trip_section import trip_section
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.fish_table import fish_record
 from stream_dmr.template.template_file import bundled_names
@@ -63,7 +64,8 @@ def render_page(
             detail = fish_detail(fish, placed.report)
             details.append(json_element(f"fish-{row['id']}", detail))
     data = json_element("data", about | {"fish": rows}) + "".join(details)
-    return _fill_template(title, data, [*_SCRIPTS, *(_REVIEW_SCRIPTS if review else ()), "page.js"])
+    scripts = [*_SCRIPTS, *(_REVIEW_SCRIPTS if review else ()), "page.js"]
+    return _fill_template(title, data, scripts, trip="" if review else trip_section(reports))
 
 
 def _shape_notes(report: RunReport) -> Iterator[str]:
@@ -116,10 +118,11 @@ def place(reports: Sequence[RunReport]) -> list[PlacedReport]:
     return placed
 
 
-def _fill_template(title: str, data: str, scripts: Sequence[str]) -> str:
+def _fill_template(title: str, data: str, scripts: Sequence[str], *, trip: str) -> str:
     """page.html with its parts filled in."""
     folder = files("stream_dmr.report")
     parts = {
+        "TRIP": trip,
         "TITLE": title.replace("&", "&amp;").replace("<", "&lt;"),
         "STYLE": folder.joinpath("page.css").read_text(encoding="utf-8"),
         "PLOTLY": files("plotly").joinpath("package_data/plotly.min.js").read_text("utf-8"),
@@ -144,7 +147,7 @@ def summary_row(fish: FishResult, report: RunReport) -> dict[str, Any]:
         "unit": "body lengths" if report.recording.header.calibration is None else "mm",
         "vessel": fish.facts.vessel,
         "trip": fish.facts.trip,
-        "haul": fish.facts.haul,
+        "haul": fish.haul,
         "time_s": fish.estimate.first_timestamp_ns / 1e9,
         "refused": dict(fish.estimate.refused),
         "flags": list(fish.flags),

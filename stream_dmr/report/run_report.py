@@ -7,9 +7,11 @@ from pathlib import Path
 from stream_dmr.recording.reading.open_recording import Recording
 from stream_dmr.report.drawn_views import DrawnViews
 from stream_dmr.report.recorded_tracks import RecordedTrack
+from stream_dmr.results.effort import HaulEffort
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.fisheries import FisheriesSettings
 from stream_dmr.results.track_edits import NO_EDITS, TrackEdits
+from stream_dmr.results.vessel_track import VesselTrack
 from stream_dmr.running.config import Config
 
 
@@ -26,6 +28,8 @@ class RunReport:
     settings: FisheriesSettings
     edits: TrackEdits = NO_EDITS  # of reviewers, which `fish`, `tracks` and `views` follow
     source: str | None = None  # where the user says that the source is
+    efforts: Sequence[HaulEffort] = ()  # of its hauls; none of a recording without its database
+    track: VesselTrack | None = None  # None: likewise
     notes: Sequence[str] = ()  # what a reader must know of the run
 
     @property

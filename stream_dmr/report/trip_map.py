@@ -1,0 +1,101 @@
+"""A map of the trip as SVG, for a page without network: track, fish, scale; no coastline."""
+
+import math
+from collections.abc import Sequence
+from html import escape
+
+from stream_dmr.results.finished_fish import FishResult
+from stream_dmr.results.vessel_track import VesselTrack
+
+_WIDTH, _HEIGHT, _MARGIN = 720.0, 360.0, 34.0
+_M_PER_DEGREE = 111_195.0  # of latitude, on a sphere of the earth's mean radius
+_MIN_SPAN_M = 200.0  # of the map: less would show the receiver's noise
+_MAX_POINTS = 3000  # of the track
+_COLOURS = ("#1668a8", "#d55e00", "#16824a", "#8a4fa3", "#b8860b", "#b3372c")
+
+
+def draw_map(tracks: Sequence[VesselTrack], fish: Sequence[FishResult]) -> str:
+    """The SVG element; "" without a position. Fish have a colour for each haul."""
+    pieces = [
+        [(kept.longitude, kept.latitude) for kept in piece]
+        for track in tracks
+        for piece in track.pieces()
+    ]
+    places = [place for piece in pieces for place in piece]
+    if not places:
+        return ""
+    view = _View(places)
+    step = max(1, len(places) // _MAX_POINTS)
+    lines = "".join(
+        f'<polyline points="{" ".join(view.point(p) for p in [*piece[::step], piece[-1]])}"/>'
+        for piece in pieces
+    )
+    hauls = sorted({one.haul for one in fish})
+    dots = "".join(_dot(one, view, _COLOURS[hauls.index(one.haul) % len(_COLOURS)]) for one in fish)
+    keys = "".join(
+        f'<text x="{_MARGIN}" y="{20 + 16 * i}" style="fill: {_COLOURS[i % len(_COLOURS)]}">'
+        f"{escape(f'haul {haul}' if haul else 'no haul')}</text>"
+        for i, haul in enumerate(hauls)
+    )
+    return (
+        f'<svg id="map" viewBox="0 0 {_WIDTH:.0f} {_HEIGHT:.0f}" role="img" '
+        f'aria-label="Track of the vessel and its fish"><g class="track">{lines}</g>{dots}{keys}'
+        f"{view.scale_bar()}{view.corners()}</svg>"
+    )
+
+
+def _dot(fish: FishResult, view: "_View", colour: str) -> str:
+    where = fish.where
+    if where.latitude is None or where.longitude is None:
+        return ""
+    x, y = view.point((where.longitude, where.latitude)).split(",")
+    length = "no length" if fish.length_mm is None else f"{fish.length_mm / 10:.1f} cm"
+    title = escape(f"fish {fish.estimate.track_id}, {length}")
+    return f'<circle cx="{x}" cy="{y}" r="4" fill="{colour}"><title>{title}</title></circle>'
+
+
+class _View:
+    """Longitude and latitude to points of the picture: equirectangular, true at its middle."""
+
+    def __init__(self, places: Sequence[tuple[float, float]]) -> None:
+        self._origin = places[0][0]
+        xs = [self._unwrapped(longitude) for longitude, _ in places]
+        ys = [latitude for _, latitude in places]
+        self._middle = (min(xs) + max(xs)) / 2, (min(ys) + max(ys)) / 2
+        self._squeeze = max(0.01, math.cos(math.radians(self._middle[1])))
+        wide_m = max(_MIN_SPAN_M, (max(xs) - min(xs)) * self._squeeze * _M_PER_DEGREE)
+        high_m = max(_MIN_SPAN_M, (max(ys) - min(ys)) * _M_PER_DEGREE)
+        self.px_per_m = min((_WIDTH - 2 * _MARGIN) / wide_m, (_HEIGHT - 2 * _MARGIN) / high_m)
+
+    def _unwrapped(self, longitude: float) -> float:
+        """Near the first one, so that no track is torn at 180 degrees."""
+        return self._origin + (longitude - self._origin + 180) % 360 - 180
+
+    def point(self, place: tuple[float, float]) -> str:
+        """`x,y` of a longitude and latitude."""
+        east = (self._unwrapped(place[0]) - self._middle[0]) * self._squeeze * _M_PER_DEGREE
+        north = (place[1] - self._middle[1]) * _M_PER_DEGREE
+        return f"{_WIDTH / 2 + east * self.px_per_m:.1f},{_HEIGHT / 2 - north * self.px_per_m:.1f}"
+
+    def scale_bar(self) -> str:
+        """A round number of metres or kilometres, about a fifth of the width."""
+        target_m = _WIDTH / 5 / self.px_per_m
+        power = 10 ** math.floor(math.log10(target_m))
+        metres = max(f for f in (power, 2 * power, 5 * power) if f <= target_m)
+        text = f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m"
+        x1, y = _WIDTH - _MARGIN, _HEIGHT - 12
+        x0 = x1 - metres * self.px_per_m
+        return (
+            f'<line x1="{x0:.1f}" y1="{y}" x2="{x1:.1f}" y2="{y}" class="scale"/>'
+            f'<text x="{x0:.1f}" y="{y - 5}">{text}</text>'
+        )
+
+    def corners(self) -> str:
+        """The place of the middle, and where north is."""
+        longitude, latitude = self._middle
+        longitude = (longitude + 180) % 360 - 180
+        place = (
+            f"{abs(latitude):.3f}° {'NS'[latitude < 0]}, {abs(longitude):.3f}° "
+            f"{'EW'[longitude < 0]}"
+        )
+        return f'<text x="{_MARGIN}" y="{_HEIGHT - 10}">middle: {place}; north is up</text>'
