@@ -45,7 +45,9 @@ function factList(fish) {
     ["refused", reasons], ["flags", fish.flags.join(", ")],
     ["frames chosen by", { add: "a reviewer: added", split: "a reviewer: split", merge: "a reviewer: merged" }[fish.origin] ?? ""],
     ["verdict", [fish.verdict, fish.verdict_reason, fish.duplicate_of === null ? null : `of fish ${fish.duplicate_of}`, fish.reviewer && `by ${fish.reviewer}, ${new Date(fish.reviewed_ns / 1e6).toISOString().slice(0, 16)} UTC`].filter(Boolean).join(", ")],
-    ["species", fish.species],
+    ["species", [fish.species, fish.species_code, fish.species_share === null ? null : `${Math.round(100 * fish.species_share)} %`].filter(Boolean).join(", ")],
+    ["fate", [fish.fate, fish.fate_share === null ? null : `${Math.round(100 * fish.fate_share)} % of the body`].filter(Boolean).join(", ")],
+    ["condition", fish.condition && `${fish.condition}, ${DATA.conditions[fish.condition]}`],
     ["when, where", [fish.time_utc, placeOf(fish)].filter(Boolean).join(", ")], ["vessel, trip, haul", [fish.vessel, fish.trip, fish.haul].filter(Boolean).join(", ")],
     ["source", run.source], ["software", run.software_version], ["config", run.config_sha256], ["calibration", run.calibration_sha256], ["template", run.template_sha256],
   ];

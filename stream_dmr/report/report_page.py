@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.camera import crop_from_frame
+from stream_dmr.catch.condition import CONDITIONS, FATES
 from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
 from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.report.drawn_views import DrawnView
@@ -55,6 +56,8 @@ def render_page(
             *(line for one in reports for line in _shape_notes(one)),
         ],
         "review": review,
+        "fates": FATES,
+        "conditions": CONDITIONS,
     }
     rows, details = list[dict[str, Any]](), list[str]()
     for placed in place(reports):

@@ -101,6 +101,8 @@ function reviewTools(views) {
     button("accept", "a", "Accept", () => send({ kind: "accept" })),
     group(field("reason", "reason", "reject"), button("reject", "r", "Reject", () => send({ kind: "reject", reason: typed("reason") }))),
     group(field("species-name", "species: code or name", "species", { list: "species-list" }), button("species", "s", "Set species", () => send({ kind: "species", species: speciesNamed(typed("species-name")) }))),
+    group(field("fate-name", "fate", "fate", { list: "fate-list" }), button("fate", "f", "Set fate", () => send({ kind: "fate", fate: typed("fate-name") }))),
+    group(field("condition-code", "condition: code", "condition", { list: "condition-list" }), button("condition", "c", "Set condition", () => send({ kind: "condition", condition: typed("condition-code") }))),
     group(field("duplicate-of", "fish", "duplicate", { inputMode: "numeric" }), button("duplicate", "d", "Is a duplicate of", () => send({ kind: "duplicate", duplicate_of: Number(typed("duplicate-of")) }))),
     ...(canEdit ? [
       group(field("merge-into", "fish", "merge", { inputMode: "numeric" }), button("merge", "m", "Goes on as", () => send({ kind: "merge", other_fish: Number(typed("merge-into")) }))),
@@ -148,6 +150,8 @@ function startReview() {
   document.body.classList.add("review");
   document.getElementById("review-bar").hidden = false;
   document.getElementById("species-list").replaceChildren(...DATA.review.species.map((one) => element("option", { value: one.name, label: `${one.code}, ${one.scientific}` })));
+  document.getElementById("fate-list").replaceChildren(...DATA.fates.map((value) => element("option", { value })));
+  document.getElementById("condition-list").replaceChildren(...Object.entries(DATA.conditions).map(([value, label]) => element("option", { value, label })));
   document.getElementById("plots-too").onchange = (event) => { document.body.classList.toggle("with-plots", event.target.checked); show(); };
   drawKeys();
   document.getElementById("keys").open = !matchMedia(NARROW).matches;

@@ -49,7 +49,7 @@ function filtered(all, wanted) {
   const words = wanted.search.toLowerCase().split(/\s+/).filter(Boolean);
   return all.filter((f) => {
     const length = lengthOf(f);
-    const text = `${f.track_id} ${f.video} ${f.haul} ${f.trip} ${f.vessel} ${f.species} ${f.status} ${f.verdict ?? ""} ${f.verdict_reason ?? ""} ${f.flags.join(" ")} ${Object.keys(f.refused).join(" ")}`.toLowerCase();
+    const text = `${f.track_id} ${f.video} ${f.haul} ${f.trip} ${f.vessel} ${f.species} ${f.species_code ?? ""} ${f.fate ?? ""} ${f.condition ?? ""} ${f.status} ${f.verdict ?? ""} ${f.verdict_reason ?? ""} ${f.flags.join(" ")} ${Object.keys(f.refused).join(" ")}`.toLowerCase();
     return words.every((word) => (/^\d+$/.test(word) ? String(f.track_id) === word || text.includes(word) : text.includes(word)))
       && (wanted.status !== "measured" || length !== null)
       && (wanted.status !== "not" || length === null)

@@ -23,6 +23,7 @@ FISH_TABLE: dict[str, type] = {
     "origin": str,  # "run", or what a reviewer did to its frames: "add", "split" or "merge"
     **dict.fromkeys(("template", "species", "species_code", "fate", "status"), str),
     **dict.fromkeys(("species_share", "fate_share"), float),
+    "condition": str,
     **dict.fromkeys(("length_mm", "length_std_mm", "ci95_low_mm", "ci95_high_mm"), float),
     "length_from": str,  # "measurement" or "review": what the five columns after it follow from
     **dict.fromkeys(("fork_length_mm", "total_length_mm"), float),
@@ -58,7 +59,8 @@ def fish_record(
 ) -> dict[str, Any]:
     """The values of FISH_TABLE; None where there is none."""
     found = species_of(fish)
-    species = fish.review.species or (found.english_name if found else None)
+    named = "" if CODE.fullmatch(fish.review.species) else fish.review.species
+    species = named or (found.english_name if found else None) or fish.review.species
     weighed = settings.species if found and is_called(found, settings.species) else species
     derived = derive(fish.length_mm, template, settings, species=weighed)
     values: dict[str, Any] = {name: getattr(fish.facts, name, None) for name in FISH_TABLE}
@@ -72,6 +74,7 @@ def fish_record(
         "template": template.name,
         "species": species or template.name,
         **_species_columns(fish, found),
+        **_fate_columns(fish.review),
         "weight_source": None if derived.weight_kg is None else settings.weight_source,
         "legal_source": None if derived.is_legal_size is None else settings.legal_source,
         "run_id": fish.run_id,
@@ -91,6 +94,12 @@ def _species_columns(fish: FishResult, found: Species | None) -> dict[str, Any]:
     text = fish.review.species.strip()
     code = found.code if found else text if CODE.fullmatch(text) else None
     return {"species_code": code, "species_share": None}
+
+
+def _fate_columns(review: Review) -> dict[str, Any]:
+    """The reviewer's condition; the reviewer's fate, which has no share, where there is one."""
+    fate = {} if review.fate is None else {"fate": review.fate, "fate_share": None}
+    return fate | {"condition": review.condition}
 
 
 def _measured(fish: FishResult) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Verdicts of reviewers on fish: a log, to which rows are only added (`verdicts_table`).
 
 Measurements stay as they were. The review of a fish is what its verdicts say together: the last
-decision, the last species and the last correction; `withdraw` takes back all before it, `undo` one
+decision, species, fate, condition and correction; `withdraw` takes back all before it, `undo` one
 verdict. `add`, `split` and `merge` say which frames a fish has (`track_edits`). A blind reading
 changes no review: it is only compared with it.
 """
@@ -9,12 +9,16 @@ changes no review: it is only compared with it.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from stream_dmr.catch.condition import CONDITIONS, FATES
 from stream_dmr.errors import UserError
 
 DECISIONS = ("accept", "reject", "duplicate", "merge")
 NOT_COUNTED = frozenset(DECISIONS[1:])  # decisions after which a fish stands in no sum
 EDITS = ("add", "split", "merge")
-KINDS = (*DECISIONS[:3], "species", "correct", "withdraw", *EDITS, "undo")
+KINDS = (
+    *(*DECISIONS[:3], "species", "fate", "condition", "correct", "withdraw"),
+    *(*EDITS, "undo"),
+)
 BLIND = "blind"  # the reading of somebody who does not see what others decided
 Ends = tuple[tuple[float, float], tuple[float, float]]  # head and tail, frame pixels
 
@@ -43,6 +47,8 @@ class Verdict:
     fish: str | None = None  # of an edit: the final rows of the fish that it makes, as JSON
     frames_sha256: str | None = None  # of an added fish: of its rows in `added_frames`
     reading: str | None = None  # BLIND, or None
+    fate: str | None = None  # of FATES
+    condition: str | None = None  # of CONDITIONS
 
     @property
     def moved(self) -> dict[int, Ends]:
@@ -63,6 +69,8 @@ class Review:
     reason: str = ""
     duplicate_of: int | None = None
     species: str = ""
+    fate: str | None = None
+    condition: str | None = None
     length_mm: float | None = None  # corrected
     length_std_mm: float | None = None
     moved: Mapping[int, Ends] = field(default_factory=dict[int, Ends])  # corrections, by frame
@@ -78,6 +86,10 @@ class Review:
                 return now
             case "species":
                 return replace(now, species=verdict.species)
+            case "fate":
+                return replace(now, fate=verdict.fate)
+            case "condition":
+                return replace(now, condition=verdict.condition)
             case "correct":
                 return replace(
                     now,
@@ -142,6 +154,11 @@ def check_verdict(verdict: Verdict, track_ids: set[int], reviews: Mapping[int, R
         "the reviewer's name": not verdict.reviewer.strip(),
         "a reason for the rejection": verdict.kind == "reject" and not verdict.reason.strip(),
         "the name of a species": verdict.kind == "species" and not verdict.species.strip(),
+        f"a fate of {', '.join(FATES)}, got {verdict.fate!r}": verdict.kind == "fate"
+        and verdict.fate not in FATES,
+        f"a condition of {', '.join(CONDITIONS)}, got {verdict.condition!r}": (
+            verdict.kind == "condition" and verdict.condition not in CONDITIONS
+        ),
         "another fish that this one repeats": verdict.kind == "duplicate"
         and (verdict.duplicate_of not in track_ids or verdict.duplicate_of == verdict.track_id),
         f"a fish that is not itself a duplicate of fish {verdict.track_id}; withdraw that first": (

@@ -15,7 +15,7 @@ from stream_dmr.results.verdicts import Verdict
 
 _ADDED_COLUMNS = {
     **dict.fromkeys(("undoes", "other_fish"), "INTEGER"),
-    **dict.fromkeys(("fish", "frames_sha256", "reading"), "TEXT"),
+    **dict.fromkeys(("fish", "frames_sha256", "reading", "fate", "condition"), "TEXT"),
 }
 _TABLES = """
 CREATE TABLE IF NOT EXISTS verdicts (

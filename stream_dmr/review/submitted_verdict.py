@@ -40,6 +40,8 @@ class SubmittedVerdict(BaseModel):
     kind: str = Field(max_length=20)
     reason: str = Field(default="", max_length=500)
     species: str = Field(default="", max_length=200)
+    fate: str = Field(default="", max_length=20)
+    condition: str = Field(default="", max_length=20)
     duplicate_of: int | None = None
     frame_index: int | None = None
     head: Point | None = None

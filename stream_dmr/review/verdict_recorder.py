@@ -123,6 +123,8 @@ class VerdictRecorder:
             reviewer=self._reviewer,
             reason=submitted.reason.strip() if kind == "reject" else "",
             species=submitted.species.strip() if kind == "species" else "",
+            fate=submitted.fate.strip().lower() if kind == "fate" else None,
+            condition=submitted.condition.strip().upper() if kind == "condition" else None,
             duplicate_of=submitted.duplicate_of if kind == "duplicate" else None,
             frame_index=submitted.frame_index if kind == "split" else None,
             other_fish=submitted.other_fish if kind == "merge" else None,
