@@ -100,6 +100,7 @@ def measure(
     vessel: str = "",
     trip: str = "",
     haul: str = "",
+    nmea: Location | None = None,
     key: Location | None = None,
     observer: RunObserver | None = None,
     stop: threading.Event | None = None,
@@ -127,6 +128,7 @@ def measure(
         vessel=vessel,
         trip=trip,
         haul=haul,
+        nmea=None if nmea is None else str(nmea),
         key=_path(key),
     )
     measure_source(

@@ -40,7 +40,7 @@ from stream_dmr.results.signatures import (
     lines_sha256,
 )
 from stream_dmr.results.store_rows import MAY_COUNT_TWICE, fish_row, read_estimates
-from stream_dmr.results.store_state import check_lines, read_state
+from stream_dmr.results.store_state import REVIEWED_ID, check_lines, read_state
 
 _MARK_EVERY_NS = 5_000_000_000  # capture times that a crash may leave unmarked; chosen
 _FRAMES_AHEAD = 1000  # frame numbers that are marked as used at a time; a crash skips the rest
@@ -378,7 +378,10 @@ class LengthStore:
 
 
 def _marks(database: sqlite3.Connection) -> Marks:
-    return Marks(**dict(database.execute("SELECT name, value FROM marks")))
+    """What was used; ids that reviewers gave to added and split fish are used as well."""
+    values = {"track_id": 0} | dict(database.execute("SELECT name, value FROM marks"))
+    reviewed = values.pop(REVIEWED_ID, 0)
+    return Marks(**values | {"track_id": max(values["track_id"], reviewed)})
 
 
 @contextmanager

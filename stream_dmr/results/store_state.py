@@ -8,8 +8,13 @@ import sqlite3
 from collections.abc import Mapping, Sequence
 from hashlib import sha256
 
+# The mark of the last id that a reviewer gave to a fish. Verdicts are summed up by themselves.
+REVIEWED_ID = "reviewed_id"
+
 # "written" counts the statements of a store, also those that sign: no sum can hold it.
-_MARKS = "SELECT name, value FROM marks WHERE name != 'written' ORDER BY name"
+_MARKS = (
+    f"SELECT name, value FROM marks WHERE name NOT IN ('written', '{REVIEWED_ID}') ORDER BY name"
+)
 _CLIPS = "SELECT name, frames_done, is_done FROM clips ORDER BY name"
 _SCENES = "SELECT calibration_sha256, data FROM scenes ORDER BY calibration_sha256"
 _HAS_CHECKS = "SELECT 1 FROM sqlite_master WHERE name = 'checks' AND type = 'table'"

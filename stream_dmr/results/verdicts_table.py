@@ -11,6 +11,7 @@ from pathlib import Path
 
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.results.lengths_database import DiskRefusal, open_for_reading, open_for_writing
+from stream_dmr.results.store_state import REVIEWED_ID
 from stream_dmr.results.verdicts import Verdict
 
 _ADDED_COLUMNS = {
@@ -37,7 +38,9 @@ CREATE TABLE IF NOT EXISTS added_frames (
     PRIMARY KEY (track_id, frame_index)
 ) STRICT;
 """
-_USED = "INSERT INTO marks VALUES ('track_id', ?1) ON CONFLICT (name) DO UPDATE SET value = ?1"
+_USED = (
+    f"INSERT INTO marks VALUES ('{REVIEWED_ID}', ?1) ON CONFLICT (name) DO UPDATE SET value = ?1"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +120,7 @@ def next_track_id(path: Path) -> int:
     with _refusing(path), closing(open_for_reading(path)) as database:
         query = (
             "SELECT MAX(n) FROM (SELECT MAX(track_id) AS n FROM fish UNION "
-            "SELECT value FROM marks WHERE name = 'track_id')"
+            f"SELECT value FROM marks WHERE name IN ('track_id', '{REVIEWED_ID}'))"
         )
         return 1 + (database.execute(query).fetchone()[0] or 0)
 

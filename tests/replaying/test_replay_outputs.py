@@ -11,6 +11,7 @@ from stream_dmr.report.open_reports import open_report
 from stream_dmr.results.finished_fish import read_runs, read_stored_fish, run_notes
 from stream_dmr.results.run_facts import SOURCE_ENDED
 from stream_dmr.results.verify import verify
+from stream_dmr.review.submitted_verdict import SubmittedVerdict
 from stream_dmr.review.verdict_recorder import VerdictRecorder
 from tests.support.command import invoke, rows
 from tests.support.fish_run import measure
@@ -52,7 +53,7 @@ def test_it_is_verified_exported_and_reviewed(again: Path, tmp_path: Path):
     assert invoke("export", {str(again): None, "--fish": "csv", "--out": str(tmp_path)}).code == 0
     assert {row["vessel"] for row in rows(tmp_path / "fish.csv")} == {"Sea Bird"}
     recorder = VerdictRecorder(open_report(again), "Ada")
-    recorder.record(b'{"track_id": 1, "kind": "accept"}')
+    recorder.record(SubmittedVerdict(track_id=1, kind="accept"))
     assert [one.review.decision for one in read_stored_fish(again / "lengths.db")] == ["accept", ""]
 
 
