@@ -74,7 +74,7 @@ def _effort(
         haul=name,
         began_ns=hauls[0].began_ns if hauls else None,
         ended_ns=hauls[0].ended_ns if hauls else None,
-        hours_watched=sum(_hours(row) * share for row, share in shares),
+        hours_watched=sum((_hours(row) * share for row, share in shares), start=0.0),
         share_measured=frames / (frames + lost) if frames + lost else None,
         num_fish=len(of_haul),
         num_measured=sum(one.length_mm is not None for one in of_haul),
