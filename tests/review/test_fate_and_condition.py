@@ -66,12 +66,12 @@ def test_a_reviewer_types_fate_condition_and_species(
     ] == [
         ("fate", "dropped", None, ""),
         ("condition", None, "A2", ""),
-        ("species", None, None, "SWO"),
+        ("species", None, None, "Xiphias gladius"),
     ]
     assert invoke("export", {str(out): None, "--fish": "csv", "--out": str(tmp_path)}).code == 0
     first, second = rows(tmp_path / "fish.csv")
     assert (first["fate"], first["fate_share"], first["condition"]) == ("dropped", "", "A2")
-    assert (first["species"], first["species_code"]) == ("Swordfish", "SWO")
+    assert (first["species"], first["species_code"]) == ("Xiphias gladius", "SWO")
     assert (second["fate"], second["condition"], second["species_code"]) == ("", "", "")
     assert verify(out)[0] == []
     with closing(sqlite3.connect(out / "lengths.db")) as database, database:
