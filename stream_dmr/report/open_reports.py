@@ -14,7 +14,6 @@ from stream_dmr.report.drawn_views import draw_views
 from stream_dmr.report.recorded_tracks import ReviewedTracks, read_tracks
 from stream_dmr.report.report_page import render_page
 from stream_dmr.report.run_report import RunReport
-from stream_dmr.results.agency_tables import counts
 from stream_dmr.results.effort import read_effort
 from stream_dmr.results.finished_fish import (
     database_of,
@@ -62,7 +61,9 @@ def open_report(
         settings=(of_run if config is None else load_config(config)).fisheries,
         edits=NO_EDITS if reviewed is None else reviewed.edits,
         source=source,
-        efforts=[] if database is None else read_effort(database, counts(fish)),
+        efforts=[]
+        if database is None
+        else read_effort(database, [one for one in fish if one.counts]),
         track=recorded_track(recording)
         if database is None
         else VesselTrack(read_positions(database)),

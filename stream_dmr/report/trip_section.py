@@ -7,7 +7,7 @@ from statistics import mean
 
 from stream_dmr.report.run_report import RunReport
 from stream_dmr.report.trip_map import draw_map
-from stream_dmr.results.agency_tables import counts, haul_row
+from stream_dmr.results.agency_tables import haul_row
 from stream_dmr.results.effort import HaulEffort
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.table_cells import utc_text
@@ -17,7 +17,7 @@ _HEAD = ("haul", "UTC", "watched", "measured", "fish", "with length", "mean", "s
 
 def trip_section(reports: Sequence[RunReport]) -> str:
     """HTML: who and when, a row for each haul, and where; "" where nothing of it is known."""
-    fish = [one for report in reports for one in counts(report.fish)]
+    fish = [one for report in reports for one in report.fish if one.counts]
     rows = [row for report in reports for row in _haul_rows(report, many=len(reports) > 1)]
     table = ""
     if rows:
@@ -59,7 +59,7 @@ def _clock(text: str) -> str:
 
 
 def _haul_rows(report: RunReport, *, many: bool) -> list[str]:
-    counted = counts(report.fish)
+    counted = [one for one in report.fish if one.counts]
     zeros = {one.facts.utc_zero_ns for one in counted}
     zero_ns = zeros.pop() if len(zeros) == 1 else None
     return [

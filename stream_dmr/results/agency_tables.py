@@ -112,11 +112,6 @@ def species_code(fish: FishResult) -> str:
     return "" if code is None or code == "unsure" else code
 
 
-def counts(fish: Sequence[FishResult]) -> list[FishResult]:
-    """The fish that count: not rejected, and not another one's double."""
-    return [one for one in fish if one.review.decision not in ("reject", "duplicate")]
-
-
 def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> Path:
     """Write a table as CSV; what a row lacks stays empty."""
     with writing_to(path), path.open("w", newline="", encoding="utf-8") as file:

@@ -27,7 +27,6 @@ from stream_dmr.results.agency_tables import (
     RDBES_COLUMNS,
     WCPFC_COLUMNS,
     Agency,
-    counts,
     haul_row,
     rdbes_row,
     wcpfc_row,
@@ -192,7 +191,7 @@ class Export:
             (wcpfc_row, WCPFC_COLUMNS) if agency == "wcpfc" else (rdbes_row, RDBES_COLUMNS)
         )
         template = self._recording.header.template
-        rows = [make(one, template) for one in counts(self._all_fish())]
+        rows = [make(one, template) for one in self._all_fish() if one.counts]
         self._written.append(write_rows(make_folder(out) / path.name, columns, rows))
         return path
 
@@ -204,7 +203,7 @@ class Export:
                 f"{self._path}: expected the folder of a run, which has a lengths.db; give that"
             )
         self._require_writable(path)
-        efforts = read_effort(database, counts(self._all_fish()))
+        efforts = read_effort(database, [one for one in self._all_fish() if one.counts])
         zeros = {facts.utc_zero_ns for facts in read_runs(database).values()}
         zero_ns = zeros.pop() if len(zeros) == 1 else None
         rows = [haul_row(one, utc_zero_ns=zero_ns) for one in efforts]

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate, Position
@@ -73,6 +73,27 @@ class FishResult:
         """The length that a reviewer corrected, else the measured one."""
         corrected = self.review.length_mm
         return self.estimate.length_mm if corrected is None else corrected
+
+
+class _Folder:
+    """What the fish of a lengths.db have in common: runs, hauls and the vessel's track."""
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self.runs = dict(_runs(connection))
+        self._hauls = hauls_of(added_rows(connection, HAULS))
+        self._track = VesselTrack(positions_of(added_rows(connection, POSITIONS)))
+
+    def fish(self, estimate: LengthEstimate, run_id: str, **values: Any) -> FishResult:
+        """A fish of a run, with its haul and its place."""
+        facts, moment_ns = self.runs[run_id], middle_ns(estimate)
+        return FishResult(
+            estimate=estimate,
+            facts=facts,
+            run_id=run_id,
+            haul=haul_at(self._hauls, moment_ns) if self._hauls else facts.haul,
+            where=self._track.at(moment_ns),
+            **values,
+        )
 
 
 def middle_ns(estimate: LengthEstimate) -> int:
@@ -149,23 +170,18 @@ def _with_edits(
     edits, reviews = edits_of(verdicts), reviews_of(verdicts)
     if not edits.fish:
         return list(measured)
-    last_run = list(read_runs(database).items())[-1]
     with closing(open_for_reading(database)) as connection:
-        vessel = VesselTrack(positions_of(added_rows(connection, POSITIONS)))
+        folder = _Folder(connection)
     tracks = {one.estimate.track_id: one for one in measured}
     fish = dict(tracks)
     for track_id, edited in edits.fish.items():
         parts = sorted(edited.parts, key=lambda part: (part.last_frame, part.first_frame))
-        origins = [tracks[part.track_id] for part in parts if part.track_id in tracks]
-        run_id, facts = (origins[0].run_id, origins[0].facts) if origins else last_run
-        estimate = estimate_of(edited.row)
-        fish[track_id] = FishResult(
-            estimate=estimate,
-            facts=facts,
-            run_id=run_id,
+        runs = [tracks[part.track_id].run_id for part in parts if part.track_id in tracks]
+        fish[track_id] = folder.fish(
+            estimate_of(edited.row),
+            [*runs, list(folder.runs)[-1]][0],
             iou=edited.row["iou"],
             flags=json.loads(edited.row["flags"]),
-            where=vessel.at(middle_ns(estimate)),
             catch=_catch_of(parts, tracks),
             review=reviews.get(track_id, NOT_REVIEWED),
             origin=edited.kind,
@@ -266,24 +282,17 @@ def _runs(connection: sqlite3.Connection) -> Iterator[tuple[str, RunFacts]]:
 def _stored_fish(database: Path, reviews: dict[int, Review]) -> list[FishResult]:
     try:
         with closing(open_for_reading(database)) as connection:
-            runs = dict(_runs(connection))
-            track = VesselTrack(positions_of(added_rows(connection, POSITIONS)))
-            hauls = hauls_of(added_rows(connection, HAULS))
+            folder = _Folder(connection)
             estimates = read_estimates(connection)
             rows = connection.execute("SELECT * FROM fish ORDER BY number")
             names = [column[0] for column in rows.description]
             others = [dict(zip(names, row, strict=True)) for row in rows]
             return [
-                FishResult(
-                    estimate=estimate,
-                    facts=runs[other["run_id"]],
-                    run_id=other["run_id"],
+                folder.fish(
+                    estimate,
+                    other["run_id"],
                     iou=other["iou"],
                     flags=json.loads(other["flags"]),
-                    where=track.at(middle_ns(estimate)),
-                    haul=haul_at(hauls, middle_ns(estimate))
-                    if hauls
-                    else runs[other["run_id"]].haul,
                     catch=CatchFacts(**{name: other.get(name) for name in _CATCH_NAMES}),
                     review=reviews.get(estimate.track_id, NOT_REVIEWED),
                 )

@@ -12,7 +12,6 @@ import pytest
 from stream_dmr.results.agency_tables import (
     RDBES_COLUMNS,
     WCPFC_COLUMNS,
-    counts,
     rdbes_row,
     species_code,
     wcpfc_row,
@@ -73,9 +72,11 @@ def test_the_reviewers_species_comes_first(reviewed: str, expected: str):
     assert species_code(replace(HALIBUT, review=Review(species=reviewed))) == expected
 
 
-def test_rejected_fish_do_not_count():
-    rejected = replace(HALIBUT, review=Review(decision="reject"))
-    assert counts([HALIBUT, rejected]) == [HALIBUT]
+@pytest.mark.parametrize("decision", ["reject", "duplicate", "merge"])
+def test_what_a_reviewer_left_out_does_not_count(decision: str):
+    assert not replace(HALIBUT, review=Review(decision=decision)).counts
+    assert replace(HALIBUT, review=Review(decision="accept")).counts
+    assert HALIBUT.counts
 
 
 def test_viame_rows_have_box_length_species_and_outline():

@@ -20,6 +20,7 @@ from stream_dmr.report.open_reports import open_report
 from stream_dmr.results.edited_lengths import edited_row
 from stream_dmr.results.finished_fish import read_measured_fish, read_stored_fish
 from stream_dmr.results.folder_lock import FolderLock
+from stream_dmr.results.haul_events import write_haul
 from stream_dmr.results.store_rows import fish_row
 from stream_dmr.results.verdicts_table import read_verdicts
 from stream_dmr.results.verify import verify
@@ -118,6 +119,14 @@ def test_a_split_fish_has_the_lengths_of_its_frames(queue: ReviewQueue, out: Pat
         assert [frame[0] for frame in detail["frames"]] == [one.frame_index for one in part]
     assert (out / "lengths.csv").read_bytes() == before
     assert verify(out)[0] == []
+
+
+def test_a_fish_that_a_reviewer_makes_has_its_haul(queue: ReviewQueue, out: Path):
+    write_haul(out, "start", name="7", at="0", said_by="Ada")
+    submit(queue, "split", 2, frame_index=5)
+    submit(queue, "add", boxes=boxes())
+    hauls = {one.estimate.track_id: one.haul for one in read_stored_fish(out / "lengths.db")}
+    assert hauls == dict.fromkeys((1, 2, 3, 4), "7")
 
 
 def test_what_was_split_and_is_merged_again_is_the_measured_fish(queue: ReviewQueue, out: Path):
