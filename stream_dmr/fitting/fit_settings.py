@@ -35,7 +35,14 @@ class FitMeshSettings(Settings):
     tilt_std_rad: float = Field(
         default=0.25, gt=0, description="std of a fish's tilt out of the reference plane, rad"
     )
-    bend_std_rad: float = Field(default=0.5, gt=0, description="std of a joint's bend, rad")
+    bend_std_rad: float = Field(
+        default=0.5, gt=0, description="std of a joint's bend within its broad side, rad"
+    )
+    arch_std_rad: float = Field(
+        default=0.5,
+        gt=0,
+        description="std of a joint's bend out of its broad side, which an outline hides, rad",
+    )
     twist_std_rad: float = Field(default=0.3, gt=0, description="std of a joint's twist, rad")
     weight_std: float = Field(
         default=0.5, gt=0, description="std of the logarithms that shape the skinning weights"
@@ -114,7 +121,7 @@ class FitMeshSettings(Settings):
     def priors(self) -> Priors:
         """Of tilt, bends and skinning weights; joints' translations and scales have L_t and L_s."""
         std = np.full(NUM_PER_JOINT, np.inf)
-        std[JOINT_ROTATION] = self.twist_std_rad, self.bend_std_rad, self.bend_std_rad
+        std[JOINT_ROTATION] = self.twist_std_rad, self.arch_std_rad, self.bend_std_rad
         std[JOINT_WEIGHT] = self.weight_std
         weights = self.prior_weight / np.square([self.tilt_std_rad, *std])
         return Priors(float(weights[0]), weights[1:].copy())

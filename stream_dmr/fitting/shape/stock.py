@@ -166,7 +166,7 @@ class StockFitter:
                 body,
                 frame.target,
                 scale_std=_READING_SCALE_STD,
-                arch_std_rad=self._settings.bend_std_rad,
+                arch_std_rad=self._settings.arch_std_rad,
             )
             frame.pose = square_pose(problem, frame.pose, nat=self._nat)
             by_fish.setdefault(frame.fish, []).append(_log_breadth(frame))
