@@ -1,7 +1,7 @@
 """Select the moving blobs that may be fish, without the lines and gaffs connected to them."""
 
+import math
 from collections import Counter
-from collections.abc import Iterator
 from enum import StrEnum
 
 import cv2
@@ -34,43 +34,45 @@ def fish_blobs(
     """
     pole_px = max(3, round(_POLE_WIDTH * max(moving.shape))) | 1
     fish, refused = [], Counter[Refusal]()
-    for component in _components(moving):
-        blob = _without_poles(component, pole_px)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(moving.view(np.uint8))
+    height, width = moving.shape
+    for label in range(1, count):
+        x, y, w, h, area = stats[label].tolist()
+        touches_edge = min(x, y, width - x - w, height - y - h) <= 1
+        if area < _MIN_BODY_AREA * pole_px**2 and math.hypot(w - 1, h - 1) + 1 < min_length_px:
+            # Most of what moves is such specks; the rest would come to the same, by opening them.
+            refused[Refusal.THIN if touches_edge else Refusal.SHORT] += 1
+            continue
+        part = np.s_[y : y + h, x : x + w]
+        blob = _without_poles(labels[part] == label, pole_px, touches_edge=touches_edge)
         refusal = Refusal.THIN
         if blob is not None:
             refusal = _refusal(blob, min_length_px, max_length_px)
         if blob is not None and refusal is None:
-            fish.append(blob)
+            shape = np.zeros_like(moving)
+            shape[part] = blob
+            fish.append(shape)
         elif refusal is not None:
             refused[refusal] += 1
     return fish, refused
 
 
-def _components(mask: Bool[np.ndarray, "H W"]) -> Iterator[Bool[np.ndarray, "H W"]]:
-    count, labels, _, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    for label in range(1, count):
-        yield labels == label
-
-
-def _without_poles(blob: Bool[np.ndarray, "H W"], pole_px: int) -> Bool[np.ndarray, "H W"] | None:
+def _without_poles(
+    blob: Bool[np.ndarray, "h w"], pole_px: int, *, touches_edge: bool
+) -> Bool[np.ndarray, "h w"] | None:
     """The thick part of a blob with a fish's thin ends; None for a mere pole or line."""
-    x, y, w, h = cv2.boundingRect(blob.view(np.uint8))
-    region = np.pad(blob[y : y + h, x : x + w], pole_px).astype(np.uint8)
+    region = np.pad(blob, pole_px).astype(np.uint8)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (pole_px, pole_px))
     body = _largest_component(cv2.morphologyEx(region, cv2.MORPH_OPEN, kernel))
     if np.count_nonzero(body) < _MIN_BODY_AREA * pole_px**2:
-        height, width = blob.shape
-        touches_edge = min(x, y, width - x - w, height - y - h) <= 1
         return None if touches_edge else blob
     body_px = max(cv2.boundingRect(body)[2:])
     end_px = round(_MAX_END_LENGTH * body_px)
-    if max(w, h) <= body_px + end_px:
+    if max(blob.shape) <= body_px + end_px:
         return blob
     for _ in range(max(1, end_px // 2)):  # grow within the blob: back to the ends, no further
         body = cv2.bitwise_and(cv2.dilate(body, np.ones((3, 3), np.uint8)), region)
-    fish = np.zeros_like(blob)
-    fish[y : y + h, x : x + w] = body[pole_px:-pole_px, pole_px:-pole_px] > 0
-    return fish
+    return body[pole_px:-pole_px, pole_px:-pole_px] > 0
 
 
 def _largest_component(mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
@@ -82,7 +84,7 @@ def _largest_component(mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w
 
 
 def _refusal(
-    blob: Bool[np.ndarray, "H W"], min_length_px: float, max_length_px: float
+    blob: Bool[np.ndarray, "h w"], min_length_px: float, max_length_px: float
 ) -> Refusal | None:
     """None where length and mean thickness (area over length) are those of a fish."""
     points = cv2.findNonZero(blob.view(np.uint8))

@@ -5,9 +5,10 @@ from collections.abc import Mapping
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Int, Int32, UInt8
 from pydantic import Field
 
+from stream_dmr.compiled import compiled
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.detection.background_model import BackgroundModel
 from stream_dmr.segmentation.detection.blobs import fish_blobs
@@ -183,14 +184,30 @@ def _find_still(
     count, labels, stats, _ = cv2.connectedComponentsWithStats(foreign)
     if before is None or count == 1:
         return np.zeros(foreign.shape, bool)
-    blue, green, red = cv2.split(cv2.absdiff(picture, before))
-    is_changed = np.asarray(cv2.max(cv2.max(blue, green), red)) > _MIN_CHANGE
-    num_changed = np.bincount(labels[is_changed], minlength=count)
+    num_changed = np.zeros(count, np.int64)
+    _count_changed(labels, picture, before, num_changed)
     is_still = num_changed < _MAX_STILL_SHARE * stats[:, cv2.CC_STAT_AREA]
     is_still[0] = False
     if not is_still.any():  # the usual case; indexing below takes ten times as long
         return np.zeros(foreign.shape, bool)
     return np.asarray(is_still)[np.asarray(labels, np.intp)]
+
+
+@compiled
+def _count_changed(
+    labels: Int32[np.ndarray, "h w"],
+    picture: UInt8[np.ndarray, "h w 3"],
+    before: UInt8[np.ndarray, "h w 3"],
+    counts: Int[np.ndarray, "N"],
+) -> None:
+    """Add up each label's pixels that changed in one of their colours."""
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            if labels[i, j] > 0:
+                for k in range(3):
+                    if abs(int(picture[i, j, k]) - int(before[i, j, k])) > _MIN_CHANGE:
+                        counts[labels[i, j]] += 1
+                        break
 
 
 def _planes(picture: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "3 h w"]:

@@ -54,7 +54,9 @@ def fraction_inside(box: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) 
 
 def oriented_extent(shape: Bool[np.ndarray, "H W"]) -> tuple[float, float]:
     """Width and length of the smallest rotated rectangle around a shape, px; zeros if empty."""
-    if not shape.any():
+    # The outlines have the hull of all pixels, of which there are fifty times as many.
+    outlines, _ = cv2.findContours(shape.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    if not outlines:
         return 0.0, 0.0
-    sides = cv2.minAreaRect(cv2.findNonZero(shape.view(np.uint8)))[1]
+    sides = cv2.minAreaRect(np.concatenate(outlines))[1]
     return min(sides), max(sides)
