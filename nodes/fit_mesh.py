@@ -40,6 +40,10 @@ class FitMesh:
             species=species,
         )
 
+    def learn(self, candidates: CandidateShapes) -> None:
+        """Take what a camera has learnt, for the fish that it sees from then on."""
+        self._tracks.learn(candidates)
+
     def step(self, crop: FishCrop, /) -> list[FittedMesh]:
         """Fit one crop; what can't be fitted is passed on with its reason."""
         return [self._tracks.fit(crop)]

@@ -221,4 +221,16 @@ class Position(_ReadOnly):
     course_deg: float | None  # over ground, clockwise from true north
 
 
-Message = Frame | FishCrop | FittedMesh | LocalizedFish | LengthEstimate | Position
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class LearntShapes(_ReadOnly):
+    """Mean shapes of the fish of a camera: those that it sees first from here on may have them."""
+
+    frame_index: int
+    timestamp_ns: int
+    names: str  # of the body form that each is like, joined by commas
+    coefficients: Float[np.ndarray, "N W"]  # see fitting/shape/space.py
+    covariances: Float[np.ndarray, "N W W"]
+    shares: Float[np.ndarray, "N"]  # of the fish; what is left of 1 is for the body forms
+
+
+Message = Frame | FishCrop | FittedMesh | LocalizedFish | LengthEstimate | Position | LearntShapes

@@ -93,8 +93,12 @@ class FitMeshSettings(Settings):
 
         Only the spine's size is its length; and the paper's solver is left as the paper has it.
         """
-        is_ours = self.deformation == "spine" and self.solver == "contour"
-        return is_ours and self.scan_iterations > 0 and self.prior_weight > 0
+        return self.learns_shapes and self.scan_iterations > 0 and self.prior_weight > 0
+
+    @property
+    def learns_shapes(self) -> bool:
+        """Whether shapes can be learnt: by the equations of our own solver and deformation."""
+        return self.deformation == "spine" and self.solver == "contour"
 
     def lambdas(self) -> Float[np.ndarray, "6"]:
         """Weights of the terms of eq. (3): iou, boundary, scale, translation, normal, laplacian."""

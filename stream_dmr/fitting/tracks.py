@@ -4,7 +4,9 @@ Of several candidate shapes a fish is given the one that its first good frames p
 of its species' body form where a classifier is sure of the species.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +17,7 @@ from stream_dmr.catch.species_settings import SpeciesSettings
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fit, Fitter, Solved
 from stream_dmr.fitting.heading import HeadTracker
-from stream_dmr.fitting.shape.candidates import CandidateShapes
+from stream_dmr.fitting.shape.candidates import CandidateShapes, Choice
 from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.template.template import Template
 
@@ -29,7 +31,8 @@ _MIN_VISIBLE = 0.9  # of a frame that decides
 class _TrackState:
     """What the next frame of a track starts from."""
 
-    against: Float[np.ndarray, "N"]  # nats against each candidate
+    candidates: Sequence[int]  # the indices of those that it may be
+    against: Float[np.ndarray, "K"]  # nats against each of them
     num_decided: int = 0  # frames that have said so
     seen_ns: int = 0
     best: dict[int, Float[np.ndarray, "P"]] = field(default_factory=dict)  # last good fits
@@ -56,32 +59,34 @@ class TrackFitter:
         list of `species` that can't be read.
         """
         normal = None if calibration is None else calibration.plane.rotation[:, 2]
-        shapes = [(None, None)] if candidates is None else list(enumerate(candidates))
-        self.fitters = [
-            Fitter(
-                template,
-                settings,
-                index=index,
-                candidate=candidate,
-                plane_normal=normal,
-                with_covariance=with_covariance,
-            )
-            for index, candidate in shapes
-        ]
-        shares = np.ones(1) if candidates is None else candidates.shares
-        self._unlikely = -np.log(shares)  # nats
-        self._names = [] if candidates is None else [one.name for one in candidates]
+        self._new_fitter = partial(
+            Fitter, template, settings, plane_normal=normal, with_covariance=with_covariance
+        )
+        self._candidates = candidates
+        self.fitters = [self._new_fitter()] if candidates is None else []
+        self._names = [""] if candidates is None else []  # of the body forms that they are like
         self._species = species or SpeciesSettings()
-        self._forms = forms_of_species(self._species) if self._names else {}
+        self._forms = {} if candidates is None else forms_of_species(self._species)
         self._settings = settings
         self._tracks: dict[int, _TrackState] = {}
+        if candidates is not None:
+            self.learn(candidates)
+
+    def learn(self, candidates: CandidateShapes) -> None:
+        """Take candidates that begin with those known before; fish of before keep their own.
+
+        May be called while another thread fits.
+        """
+        for index, candidate in enumerate(candidates):
+            if index >= len(self.fitters):
+                self.fitters.append(self._new_fitter(index=index, candidate=candidate))
+                self._names.append(candidate.name)
+        self._candidates = candidates
 
     def fit(self, crop: FishCrop) -> FittedMesh:
         """Fit one crop; a poor fit, or one of half a fish, warms no other."""
         if crop.track_id not in self._tracks:
-            self._tracks[crop.track_id] = _TrackState(
-                against=self._unlikely.copy(), species=SpeciesEvidence(self._species)
-            )
+            self._tracks[crop.track_id] = self._new_track(crop)
         track = self._tracks[crop.track_id]
         track.seen_ns = crop.timestamp_ns
         track.species.add(crop.species)
@@ -100,35 +105,45 @@ class TrackFitter:
             if track.seen_ns < before_ns:
                 del self._tracks[track_id]
 
+    def _new_track(self, crop: FishCrop) -> _TrackState:
+        choice = Choice([0], np.ones(1))
+        if self._candidates is not None:
+            choice = self._candidates.choice(crop.timestamp_ns)
+        return _TrackState(
+            candidates=choice.indices,
+            against=-np.log(choice.shares),
+            species=SpeciesEvidence(self._species),
+        )
+
     def _fit(self, crop: FishCrop, track: _TrackState) -> Fit:
         of_species = self._of_species(track)
-        chosen = int(np.argmin(track.against + of_species))
         if np.isfinite(of_species).sum() == 1 or track.num_decided >= _DECIDING_FRAMES:
+            chosen = track.candidates[int(np.argmin(track.against + of_species))]
             return self.fitters[chosen].fit(crop, track.best.get(chosen))
-        solved = [fitter.solve(crop, track.best.get(n)) for n, fitter in enumerate(self.fitters)]
+        solved = {n: self.fitters[n].solve(crop, track.best.get(n)) for n in track.candidates}
         self._decide(track, crop, solved)
-        chosen = int(np.argmin(track.against + of_species))
+        chosen = track.candidates[int(np.argmin(track.against + of_species))]
         if not crop.quality.touches_border:
-            for n, one in enumerate(solved):  # the next frame begins where this one ended
+            for n, one in solved.items():  # the next frame begins where this one ended
                 if one.solution is not None and one.solution.iou >= self._settings.cold_below_iou:
                     track.best[n] = one.solution.parameters
         return self.fitters[chosen].answer(crop, solved[chosen])
 
     def _of_species(self, track: _TrackState) -> Float[np.ndarray, "N"]:
         """0 for the candidates that the species leaves, infinity for those that it excludes."""
-        leaves = np.ones(len(self.fitters), bool)
+        leaves = np.ones(len(track.candidates), bool)
         found = track.species.best()
         if found is not None and found.share >= self._species.min_share:
-            is_form = np.array([name == self._forms.get(found.code) for name in self._names], bool)
+            form = self._forms.get(found.code)
+            is_form = np.array([self._names[n] == form for n in track.candidates], bool)
             leaves = is_form if is_form.any() else leaves
         return np.where(leaves, 0.0, np.inf)
 
-    def _decide(self, track: _TrackState, crop: FishCrop, solved: list[Solved]) -> None:
+    def _decide(self, track: _TrackState, crop: FishCrop, solved: Mapping[int, Solved]) -> None:
         """Count what a frame of the whole fish says against each candidate."""
         if crop.quality.touches_border or crop.quality.visible_fraction < _MIN_VISIBLE:
             return
-        pairs = zip(self.fitters, solved, strict=True)
-        nats = np.array([fitter.nats(one) for fitter, one in pairs])
+        nats = np.array([self.fitters[n].nats(one) for n, one in solved.items()])
         if np.isfinite(nats).all():
             track.against += np.minimum(nats - nats.min(), _MAX_AGAINST)
             track.num_decided += 1

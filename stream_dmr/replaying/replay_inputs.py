@@ -8,6 +8,7 @@ from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
 from stream_dmr.messages import FishCrop
 from stream_dmr.recording.messages.run_header import RunHeader
+from stream_dmr.recording.reading.known_shapes import known_shapes
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
 from stream_dmr.replaying.recorded_files import CropFiles, find_crop_files, inputs_with
 from stream_dmr.replaying.replay_request import ReplayRequest
@@ -80,7 +81,7 @@ def _shapes(
 ) -> tuple[Template, CandidateShapes | None]:
     """Mesh and candidate shapes; those of `auto` and of names are learnt from recorded crops."""
     if request.template is None:
-        return recording.header.template, recording.header.candidates
+        return recording.header.template, known_shapes(recording)
     template, candidates = load_shapes(request.template)
     if candidates is not None:
         messages = (message for message, _ in decoded_messages(recording, [FishCrop]))

@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 from stream_dmr.camera import Camera
 from stream_dmr.errors import SourceError
 from stream_dmr.recording.reading.frame_lookup import FrameLookup
+from stream_dmr.recording.reading.known_shapes import known_shapes
 from stream_dmr.recording.reading.open_recording import Recording
 from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
 from stream_dmr.recording.view.view_geometry import place_fit
@@ -59,7 +60,7 @@ def draw_views(
     reading all before it, nothing else is read. Fish without a picture are drawn by their masks.
     Raises SourceError where a given `source` is not the recorded one.
     """
-    meshes = MeshRebuilder(recording.header.template, recording.header.candidates)
+    meshes = MeshRebuilder(recording.header.template, known_shapes(recording))
     waiting: defaultdict[int, list[tuple[int, RecordedView]]] = defaultdict(list)
     for track_id, track in tracks.items():
         for view in track.views:

@@ -15,6 +15,7 @@ from stream_dmr.camera import crop_from_frame
 from stream_dmr.catch.condition import CONDITIONS, FATES
 from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
 from stream_dmr.fitting.shape.describe import describe
+from stream_dmr.recording.reading.known_shapes import known_shapes
 from stream_dmr.report.drawn_views import DrawnView
 from stream_dmr.report.recorded_tracks import FishFrame
 from stream_dmr.report.run_report import RunReport
@@ -73,14 +74,15 @@ def render_page(
 
 def _shape_notes(report: RunReport) -> Iterator[str]:
     """How the stocks that a run learnt differ from their body forms."""
-    header = report.recording.header
-    if header.candidates is None or not header.candidates.are_learnt:
+    shapes = known_shapes(report.recording)
+    stocks = None if shapes is None else shapes.stocks()
+    if stocks is None:
         return
-    if not {shape.name for shape in header.candidates} <= set(bundled_names()):
+    if not {shape.name for shape in stocks} <= set(bundled_names()):
         return  # learnt from a mesh of the user's own, which the recording does not have
     _, forms = load_shapes(AUTO)
     if forms is not None:
-        yield from describe(forms, header.candidates)
+        yield from describe(forms, stocks)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

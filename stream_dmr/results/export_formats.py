@@ -19,6 +19,7 @@ from stream_dmr.recording.messages.picture_codec import EncodedPicture
 from stream_dmr.recording.messages.record import make_record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
+from stream_dmr.recording.reading.known_shapes import known_shapes
 from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
 from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
 from stream_dmr.recording.view.view_geometry import place_fit
@@ -85,7 +86,7 @@ class Export:
         long.
         """
         template = self._recording.header.template
-        restored, count = MeshRebuilder(template, self._recording.header.candidates), 0
+        restored, count = MeshRebuilder(template, known_shapes(self._recording)), 0
         for fit, fish in _pairs(self._messages(FittedMesh, LocalizedFish)):
             shape = restored.with_vertices(fit).shape
             vertices = None if shape is None else place_fit(shape, fish)[0]

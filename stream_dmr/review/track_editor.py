@@ -9,6 +9,7 @@ from typing import Any
 from stream_dmr.errors import UserError
 from stream_dmr.files import is_locked
 from stream_dmr.recording.reading.frame_lookup import FrameLookup
+from stream_dmr.recording.reading.known_shapes import known_shapes
 from stream_dmr.report.run_report import RunReport
 from stream_dmr.results.edited_lengths import edited_row, frames_of_parts, frames_of_tracks
 from stream_dmr.results.finished_fish import read_measured_fish
@@ -67,7 +68,7 @@ class TrackEditor:
             list(self._pictures.frames((time_ns[0], time_ns[1] + 1))),
             drawn,
             track_id=new_fish,
-            header=report.recording.header,
+            header=replace(report.recording.header, candidates=known_shapes(report.recording)),
             config=report.config,
         )
         if not measured.fish:

@@ -23,6 +23,7 @@ from stream_dmr.running.config import Config
 from stream_dmr.running.drift_alarms import DriftAlarms
 from stream_dmr.running.error_policy import ErrorPolicy
 from stream_dmr.running.inputs import Inputs, checked_inputs
+from stream_dmr.running.live_shapes import follow_shapes
 from stream_dmr.running.outputs import Outputs, open_outputs
 from stream_dmr.running.pipeline import Node, StageCounters, run_chain
 from stream_dmr.running.position_feed import PositionFeed
@@ -189,6 +190,7 @@ def _run_chain(
         observer.take(writer.write(position))
 
     positions = PositionFeed(inputs.positions, on_position)
+    shapes = follow_shapes(inputs, outputs, nodes[1], write=writer.write, observer=observer)
 
     def on_message(message: Message) -> Message:
         message = writer.write(message)
@@ -196,6 +198,8 @@ def _run_chain(
         observer.take(message)
         if isinstance(message, Frame):
             positions.take(message)
+        if shapes is not None:
+            shapes.take(message)
         return message
 
     def on_frame() -> None:
@@ -222,6 +226,8 @@ def _run_chain(
         outputs.store.end(f"an error: {type(error).__name__}: {error}")
         raise
     finally:
+        if shapes is not None:
+            shapes.close()
         if line := positions.finish():
             observer.warn(line)
         writer.finish()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from stream_dmr.errors import OutputError
-from stream_dmr.messages import LocalizedFish
+from stream_dmr.messages import LearntShapes, LocalizedFish
 from stream_dmr.recording.messages.sink_states import SinkStates
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.segments.recording_files import open_recording_files
@@ -23,7 +23,7 @@ from stream_dmr.results.signatures import Signer
 from stream_dmr.results.signed_files import SignedFiles
 from stream_dmr.running.haul_log import HaulLog
 from stream_dmr.running.inputs import Inputs
-from stream_dmr.running.resume import interrupted_tracks
+from stream_dmr.running.resume import interrupted_tracks, learnt_before
 from stream_dmr.running.run_folder import prepare_folder
 from stream_dmr.running.run_observer import OpenRun, RunObserver
 
@@ -38,6 +38,7 @@ class Outputs:
     recorder: Recorder
     repairs: Sequence[Repair]  # of recordings that a crash left unfinished
     interrupted: Sequence[LocalizedFish]  # frames of fish that were in view at that crash
+    learnt: Sequence[LearntShapes]  # by earlier runs of a camera, of its fish
 
 
 @contextmanager
@@ -96,6 +97,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
         interrupted = interrupted_tracks(
             repairs if is_endless else [], store, on_notice=observer.warn
         )
+        learnt = learnt_before(out, header) if is_endless else []
         recorder = Recorder(
             out,
             header,
@@ -105,6 +107,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
             files=partial(
                 open_segments,
                 interrupted=interrupted,
+                learnt=learnt,
                 on_notice=observer.warn,
                 on_closed=files.changed,
                 states=states,
@@ -124,6 +127,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
             recorder=recorder,
             repairs=repairs,
             interrupted=interrupted,
+            learnt=learnt,
         )
 
 

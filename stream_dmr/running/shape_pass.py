@@ -4,6 +4,7 @@ For `--template auto`, and only for sources with an end: the last fish are learn
 first one is measured.
 """
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -31,8 +32,7 @@ def with_learnt_shapes(
     earlier run is taken up again, whose fish were measured by other shapes.
     """
     config, candidates = inputs.config.fit_mesh, inputs.candidates
-    can_learn = config.solver == "contour" and config.deformation == "spine"
-    if candidates is None or inputs.is_endless or inputs.resumes or not can_learn:
+    if candidates is None or inputs.is_endless or inputs.resumes or not config.learns_shapes:
         return inputs
     refuse_earlier(inputs.request.out, is_fine=inputs.request.overwrite)  # before the work
     observer.stage("finding the fish, for their shapes")
@@ -65,7 +65,16 @@ def with_learnt_shapes(
 def save_stocks(
     template: Template, stocks: CandidateShapes, path: Path, *, source: str
 ) -> list[Path]:
-    """Write the mesh of each stock, the largest to `path`, others beside it. Raises OutputError."""
+    """Write the mesh of each stock, the largest to `path`, others beside it. Raises OutputError.
+
+    Those that were learnt there before are replaced.
+    """
+    for number in itertools.count(len(stocks) + 1):
+        mesh = path.with_stem(f"{path.stem}-{number}")
+        if not mesh.exists():
+            break
+        for leftover in (mesh, mesh.with_suffix(".toml")):
+            leftover.unlink(missing_ok=True)
     paths = [path, *(path.with_stem(f"{path.stem}-{n}") for n in range(2, len(stocks) + 1))]
     for stock, one in zip(stocks, paths, strict=True):
         save_template(

@@ -11,7 +11,7 @@ from stream_dmr.messages import FishCrop
 
 FRAMES_PER_FISH = 4  # far apart: more of one passage say little that is new
 _TRIED_PER_FISH = 8  # frames of which the best fitted are taken; chosen
-_MAX_FISH = 60  # a stock's mean is known to an eighth of its individuals' spread, then
+MAX_FISH = 60  # a stock's mean is known to an eighth of its individuals' spread, then
 # Of a frame; chosen so that only masks of whole fish are learnt from.
 _MIN_VISIBLE = 0.99
 _MIN_CONFIDENCE = 0.8  # of a mask that was found
@@ -37,26 +37,37 @@ class FishSamples:
 
 
 @dataclass
-class _GoodCrops:
-    stride: int = 1  # every how many good crops one is kept
-    num_good: int = 0
-    kept: list[FishCrop] = field(default_factory=list)
+class GoodCrops:
+    """Crops of one fish that show it whole, evenly over all of them; memory is bounded."""
+
+    _stride: int = 1  # every how many good crops one is kept
+    _num_good: int = 0
+    _kept: list[FishCrop] = field(default_factory=list)
+
+    def add(self, crop: FishCrop) -> None:
+        """Take the next crop of the fish; its picture is not kept."""
+        if not _is_good(crop):
+            return
+        if self._num_good % self._stride == 0:
+            self._kept.append(replace(crop, image=None))
+        self._num_good += 1
+        if len(self._kept) > 2 * _TRIED_PER_FISH:
+            self._kept, self._stride = self._kept[::2], 2 * self._stride
+
+    def chosen(self) -> list[FishCrop]:
+        """A few that are far apart; none where the fish was never seen whole."""
+        return evenly(self._kept, _TRIED_PER_FISH)
 
 
 def good_crops(crops: Iterable[FishCrop]) -> list[list[FishCrop]]:
-    """An even choice of fish, and of each one's crops that show it whole; memory is bounded."""
-    tracks: dict[int, _GoodCrops] = {}
+    """An even choice of fish, and of each one's crops that show it whole."""
+    tracks: dict[int, GoodCrops] = {}
     for crop in crops:
-        if not _is_good(crop):
-            continue
-        track = tracks.setdefault(crop.track_id, _GoodCrops())
-        if track.num_good % track.stride == 0:
-            track.kept.append(replace(crop, image=None))
-        track.num_good += 1
-        if len(track.kept) > 2 * _TRIED_PER_FISH:
-            track.kept, track.stride = track.kept[::2], 2 * track.stride
-    ids = evenly(sorted(tracks), _MAX_FISH)
-    return [evenly(tracks[track_id].kept, _TRIED_PER_FISH) for track_id in ids]
+        tracks.setdefault(crop.track_id, GoodCrops()).add(crop)
+    seen_whole = {
+        track_id: chosen for track_id in sorted(tracks) if (chosen := tracks[track_id].chosen())
+    }
+    return evenly([*seen_whole.values()], MAX_FISH)
 
 
 def evenly(items: Sequence[T], most: int) -> list[T]:

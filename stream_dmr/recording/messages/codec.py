@@ -26,13 +26,14 @@ from stream_dmr.recording.messages.picture_codec import (
 )
 from stream_dmr.recording.messages.schema import proto_class
 
-CODEC_VERSION = 5
+CODEC_VERSION = 6
 """Increased when an older reader would read a new file wrongly.
 
 2: a crop may lack its picture, a fit its vertices and covariance.
 3: the JPEG of a frame may not be what the run used.
 4: a crop may say what of it is unknown.
 5: a camera may be a fisheye.
+6: a fit's candidate may be one that a camera learnt.
 """
 
 T = TypeVar("T")
@@ -42,6 +43,7 @@ DATACLASSES: dict[str, type] = {
     for kind in (
         *(messages.Frame, messages.FishCrop, messages.FittedMesh),
         *(messages.LocalizedFish, messages.LengthEstimate, messages.Position),
+        messages.LearntShapes,
         *(messages.CropQuality, messages.FishEnds, messages.FittedShape),
         *(messages.LossTerms, messages.SolverReport),
         *(Camera, ReferencePlane, Calibration),

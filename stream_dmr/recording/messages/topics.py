@@ -6,6 +6,7 @@ from stream_dmr.messages import (
     FishCrop,
     FittedMesh,
     Frame,
+    LearntShapes,
     LengthEstimate,
     LocalizedFish,
     Message,
@@ -65,6 +66,7 @@ TOPICS: dict[type[Message], Topic] = {
         ),
         Topic(message=LengthEstimate, topic="/length", entities=(LENGTH, REFUSALS, RESULTS)),
         Topic(message=Position, topic="/position", entities=(VESSEL,)),
+        Topic(message=LearntShapes, topic="/shapes", entities=()),
     )
 }
 

@@ -11,6 +11,7 @@ from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.messages.topics import TOPICS
 from stream_dmr.recording.reading.frame_images import FrameRestorer, RecordedPictures
+from stream_dmr.recording.reading.known_shapes import known_shapes
 from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
 from stream_dmr.recording.rerun.rrd_sink import RrdSink
 from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
@@ -34,7 +35,7 @@ def convert(
     written.
     """
     opened = open_recordings([recording])
-    meshes = MeshRebuilder(opened.header.template, opened.header.candidates)
+    meshes = MeshRebuilder(opened.header.template, known_shapes(opened))
     pictures = source or RecordedPictures(opened, selection)
     unfinished = rrd.with_name(f"{rrd.name}.part")
     with closing(RrdSink(unfinished, opened.header, settings)) as sink:

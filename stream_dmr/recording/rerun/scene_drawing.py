@@ -15,6 +15,7 @@ from stream_dmr.messages import (
     FittedMesh,
     FittedShape,
     Frame,
+    LearntShapes,
     LengthEstimate,
     LocalizedFish,
     Message,
@@ -98,6 +99,8 @@ class SceneDrawing:
                 self._length(estimate)
             case Position() as position:
                 self._position(position)
+            case LearntShapes():  # its fish are drawn by it
+                pass
 
     def add_payload(self, record: Record) -> None:
         """Add the encoded message to the stream, numbered, since Rerun sorts by time."""

@@ -8,9 +8,9 @@ from threading import Thread
 
 from stream_dmr.errors import OutputError
 from stream_dmr.files import free_bytes, writing_to
-from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish
+from stream_dmr.messages import Frame, LearntShapes, LengthEstimate, LocalizedFish
 from stream_dmr.recording.mcap.mcap_sink import PART, McapSink
-from stream_dmr.recording.messages.record import Record
+from stream_dmr.recording.messages.record import Record, make_record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.sink import BufferedSink, FileSink, Sink
@@ -46,12 +46,14 @@ class RotatingSink:
         settings: RecordingSettings,
         *,
         interrupted: Iterable[LocalizedFish] = (),
+        learnt: Iterable[LearntShapes] = (),
         on_notice: Callable[[str], None],
         on_closed: Callable[[Path], None] = lambda path: None,
         states: SinkStates | None = None,
     ) -> None:
         """`interrupted`: frames of tracks that an earlier run left open and this one finishes.
 
+        `learnt`: what earlier runs learnt of their fish; every segment begins with all of it.
         `on_closed` gets each file that is complete, `states` the state of the files of each kind.
         """
         self._out_dir, self._header, self._settings = out_dir, header, settings
@@ -66,6 +68,7 @@ class RotatingSink:
         self._open_tracks, self._ahead = OpenTracks(), list[Record]()
         for fish in interrupted:
             self._open_tracks.add_earlier(fish)
+        self._learnt = [make_record(one, settings) for one in learnt]
         self._unfinished: list[Path] = []
         self._repairs = Thread(target=self._repair, name="repairs")
         self._next: list[FileSink] = []
@@ -86,6 +89,8 @@ class RotatingSink:
             self._ahead.append(record)
         else:
             self._open_tracks.add(record)
+        if isinstance(message, LearntShapes):
+            self._learnt.append(record)
         sinks = self._next if is_after else self._open
         self._each(sinks, lambda sink: sink.write(record))
 
@@ -185,6 +190,9 @@ class RotatingSink:
             files = open_recording_files(
                 self._out_dir, self._header, self._settings, stem=stem, segment_number=number
             )
+            for sink in files:
+                for record in self._learnt:
+                    sink.write(record)
         except OutputError as error:
             if stem:
                 self._unfinished += [self._out_dir / f"{stem}{end}" for end in _UNFINISHED]
@@ -254,6 +262,7 @@ def open_segments(
     settings: RecordingSettings,
     *,
     interrupted: Iterable[LocalizedFish] = (),
+    learnt: Iterable[LearntShapes] = (),
     on_notice: Callable[[str], None],
     on_closed: Callable[[Path], None] = lambda path: None,
     states: SinkStates | None = None,
@@ -266,6 +275,7 @@ def open_segments(
         header,
         settings,
         interrupted=interrupted,
+        learnt=learnt,
         on_notice=on_notice,
         on_closed=on_closed,
         states=states,

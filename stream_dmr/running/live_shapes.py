@@ -1,0 +1,167 @@
+"""Learns the shapes of a camera's fish while they are measured, for those that come after.
+
+A length once given stays as it is, with the interval that was honest then; `replay --template auto`
+ashore measures all fish anew by what all of them show.
+"""
+
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from itertools import chain
+
+from stream_dmr.errors import OutputError
+from stream_dmr.fitting.learn_shapes import learn_shapes
+from stream_dmr.fitting.shape.candidates import CandidateShapes
+from stream_dmr.fitting.shape.describe import describe
+from stream_dmr.fitting.shape.samples import MAX_FISH, GoodCrops
+from stream_dmr.messages import FishCrop, Frame, LearntShapes, LengthEstimate, Message
+from stream_dmr.nodes.fit_mesh import FitMesh
+from stream_dmr.running.inputs import Inputs
+from stream_dmr.running.outputs import Outputs
+from stream_dmr.running.pipeline import Node
+from stream_dmr.running.run_folder import LEARNT
+from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.running.shape_pass import save_stocks
+
+# Finished fish after which shapes are learnt, then after twice as many, and so on. What an earlier
+# run has learnt is known from more fish than the first ones after a restart.
+_FIRST, _AFTER_RESTART = 3, 48
+_NICENESS = 10  # frames come first
+
+Learn = Callable[[Sequence[FishCrop], Callable[[str], None]], CandidateShapes | None]
+"""Crops, and what is called at each step of the work, which may raise -> the stocks, if any."""
+
+
+class LiveShapes:
+    """Keeps crops of the last fish and learns from them in a thread of its own. Thread-safe."""
+
+    def __init__(
+        self, learn: Learn, on_learnt: Callable[[LearntShapes], object], *, knows_shapes: bool
+    ) -> None:
+        """`on_learnt` gets what fish may be that are first seen in the frame at hand, or later.
+
+        `knows_shapes`: an earlier run has learnt some.
+        """
+        self._learn, self._on_learnt = learn, on_learnt
+        self._lock, self._stop = threading.Lock(), threading.Event()
+        self._tracks: dict[int, GoodCrops] = {}
+        self._fish: deque[list[FishCrop]] = deque(maxlen=MAX_FISH)
+        self._num_fish, self._next_at = 0, _AFTER_RESTART if knows_shapes else _FIRST
+        self._worker = ThreadPoolExecutor(1, "shapes", initializer=_be_nice)
+        self._work: Future[tuple[CandidateShapes | None, int]] | None = None
+
+    def take(self, message: Message) -> None:
+        """Take any message of the chain; with a frame, what was learnt is passed on."""
+        match message:
+            case FishCrop(track_id=track_id):
+                with self._lock:
+                    self._tracks.setdefault(track_id, GoodCrops()).add(message)
+            case LengthEstimate(is_final=True, track_id=track_id):
+                self._finish_fish(track_id)
+            case Frame():
+                self._pass_on(message)
+            case _:
+                pass
+
+    def close(self) -> None:
+        """End the work, whose result is lost. Idempotent."""
+        self._stop.set()
+        self._worker.shutdown()
+
+    def _finish_fish(self, track_id: int) -> None:
+        with self._lock:
+            crops = self._tracks.pop(track_id, GoodCrops()).chosen()
+            if crops:
+                self._fish.append(crops)
+                self._num_fish += 1
+
+    def _pass_on(self, frame: Frame) -> None:
+        if self._work is None:
+            with self._lock:
+                if self._num_fish >= self._next_at:
+                    self._next_at = 2 * self._num_fish
+                    self._work = self._worker.submit(self._learn_from, [*self._fish])
+        elif self._work.done():
+            work, self._work = self._work, None
+            stocks, num_fish = work.result()
+            if stocks is not None:
+                self._on_learnt(_message(stocks, num_fish, frame))
+
+    def _learn_from(self, fish: Sequence[list[FishCrop]]) -> tuple[CandidateShapes | None, int]:
+        return self._learn([*chain.from_iterable(fish)], self._go_on), len(fish)
+
+    def _go_on(self, step: str) -> None:
+        if self._stop.is_set():
+            raise InterruptedError("the run has ended")
+
+
+def follow_shapes(
+    inputs: Inputs,
+    outputs: Outputs,
+    fit_mesh: Node,
+    *,
+    write: Callable[[LearntShapes], object],
+    observer: RunObserver,
+) -> LiveShapes | None:
+    """Let `fit_mesh` know what earlier runs have learnt, and what this one learns.
+
+    None where there is nothing to learn: a mesh was given, or the source has an end, whose fish
+    were looked at before (`shape_pass.py`).
+    """
+    forms, settings = inputs.candidates, inputs.config.fit_mesh
+    if forms is None or not inputs.is_endless or not settings.learns_shapes:
+        return None
+    assert isinstance(fit_mesh, FitMesh)
+    known = forms
+    for learnt in outputs.learnt:
+        known = known.extended(learnt)
+    fit_mesh.learn(known)
+
+    def learn(crops: Sequence[FishCrop], progress: Callable[[str], None]) -> CandidateShapes | None:
+        return learn_shapes(
+            crops,
+            inputs.template,
+            forms,
+            settings,
+            calibration=inputs.calibration,
+            species=inputs.config.species,
+            progress=progress,
+        )
+
+    def on_learnt(learnt: LearntShapes) -> None:
+        nonlocal known
+        write(learnt)
+        known = known.extended(learnt)
+        fit_mesh.learn(known)
+        stocks = known.stocks()
+        assert stocks is not None
+        for line in describe(forms, stocks):
+            observer.notice(f"learnt from the fish so far: {line}")
+        path = inputs.request.out / LEARNT
+        try:
+            save_stocks(inputs.template, stocks, path, source=inputs.source.name)
+        except OutputError as error:
+            observer.warn(str(error))
+
+    return LiveShapes(learn, on_learnt, knows_shapes=bool(outputs.learnt))
+
+
+def _message(stocks: CandidateShapes, num_fish: int, frame: Frame) -> LearntShapes:
+    """The next fish is none of these stocks as likely as each of the others was (Laplace)."""
+    return LearntShapes(
+        frame_index=frame.frame_index,
+        timestamp_ns=frame.timestamp_ns,
+        names=stocks.names,
+        coefficients=stocks.coefficients,
+        covariances=stocks.covariances,
+        shares=stocks.shares * num_fish / (num_fish + 1),
+    )
+
+
+def _be_nice() -> None:
+    """Lower the priority of this thread, where the system lets one do that."""
+    with suppress(AttributeError, OSError):
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
