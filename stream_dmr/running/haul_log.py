@@ -1,6 +1,7 @@
 """Takes note of hauls while a run goes on: told by people, or by rule."""
 
 import threading
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -36,6 +37,8 @@ class HaulLog:
         self._known: list[Haul] = []
         self._ruled: str | None = None  # the haul that the rule began and has not ended
         self._last_fish_ns = 0
+        self._in_view: dict[int, int] = {}  # tracks that have not ended, and when they began
+        self._in_chain: deque[int] = deque()  # capture times of the frames there, in order
         self._fast_since_ns: int | None = None
         self._now_ns = 0  # capture time of the latest frame
         self._watched: list[int] | None = None  # first and last capture time, frames, lost
@@ -70,20 +73,34 @@ class HaulLog:
             return name
 
     def take_frame(self, timestamp_ns: int) -> None:
-        """A frame passes."""
+        """A frame passes; its fish are not known yet."""
         with self._lock:
             self._watch(timestamp_ns, self._frames_lost())
             self._now_ns = timestamp_ns
-            if self._ruled is not None and timestamp_ns - self._last_fish_ns > self._pause_ns:
+            self._in_chain.append(timestamp_ns)
+
+    def frame_done(self) -> None:
+        """A frame has left the last stage: all fish that began in it or before are known.
+
+        A rule looks at these frames alone. The camera is ahead of them, after a pause by hours.
+        """
+        with self._lock:
+            pause_ns = self._in_chain.popleft() - self._last_fish_ns
+            if self._ruled is not None and not self._in_view and pause_ns > self._pause_ns:
                 self._end_ruled(self._last_fish_ns)
 
     def take_fish(self, estimate: LengthEstimate) -> None:
-        """A track ended."""
+        """One more frame of a fish, or the end of its track."""
         with self._lock:
+            self._last_fish_ns = max(self._last_fish_ns, estimate.last_timestamp_ns)
+            self._in_view.setdefault(estimate.track_id, estimate.first_timestamp_ns)
+            if not estimate.is_final:
+                return
             if self._pause_ns and self._ruled is None and self.current() is None:
                 self._ruled = self._next_name()
-                self._add(START, self._ruled, estimate.first_timestamp_ns, _RULE)
-            self._last_fish_ns = max(self._last_fish_ns, estimate.last_timestamp_ns)
+                # With all that are in view: one of them may have been there before.
+                self._add(START, self._ruled, min(self._in_view.values()), _RULE)
+            del self._in_view[estimate.track_id]
 
     def take_position(self, position: Position) -> None:
         """The vessel's speed may end a haul."""

@@ -86,6 +86,8 @@ class ResultWriter:
                 self._take_iou(message)
             case LengthEstimate(is_final=True):
                 self._store_fish(message)
+            case LengthEstimate():
+                self._take_fish(message)
             case Position():
                 self._take_position(message)
             case _:
@@ -104,6 +106,8 @@ class ResultWriter:
     def frame_done(self) -> None:
         """Take note that a frame has left the last stage: its clip is measured so far."""
         self._store.frame_done()
+        if self._hauls is not None:
+            self._hauls.frame_done()
         if self._clips is not None:
             clip = self._clips_in_chain.popleft()
             self._clips[clip] += 1
@@ -153,6 +157,9 @@ class ResultWriter:
             flags += self._drift.take_fish(iou, estimate.timestamp_ns)
         if estimate.track_id in self._interrupted:
             flags.append(INTERRUPTED)
+        self._take_fish(estimate)
+        self._store.add(estimate, iou=iou, flags=flags, catch=CatchFacts.of(estimate))
+
+    def _take_fish(self, estimate: LengthEstimate) -> None:
         if self._hauls is not None:
             self._hauls.take_fish(estimate)
-        self._store.add(estimate, iou=iou, flags=flags, catch=CatchFacts.of(estimate))

@@ -1,5 +1,6 @@
 """Hauls: what events make of them, and the effort that counts are divided by."""
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -110,9 +111,30 @@ def test_hauls_by_rule(tmp_path: Path):
             one = at(number, fish_at[number - 1])
             log.take_fish(one)
             store.add(one)
+        log.frame_done()
     log.finish()
     store.close()
     assert [one.haul for one in read_stored_fish(store.path)] == ["1", "1", "2", "2", "3"]
+
+
+def test_a_rule_waits_for_the_fish_of_frames_before_a_pause(tmp_path: Path):
+    """Two fish in view together, and the camera's next frame an hour later is there before them."""
+    store = LengthStore(tmp_path, FACTS)
+    log = HaulLog(store, HaulsSettings(pause_min=5.0))
+    first, second = (fish(n, first_timestamp_ns=10 - n, last_timestamp_ns=20 + n) for n in (1, 2))
+    for time_ns in (10, 20, 60 * MINUTE):
+        log.take_frame(time_ns)
+    log.take_fish(replace(first, is_final=False))
+    log.take_fish(replace(second, is_final=False))
+    log.frame_done()
+    log.take_fish(first)
+    log.frame_done()
+    log.take_fish(second)
+    log.frame_done()
+    (haul,) = log.hauls()
+    log.finish()
+    store.close()
+    assert (haul.began_ns, haul.ended_ns) == (8, 23)
 
 
 def _position(second: int, knots: float) -> Position:
