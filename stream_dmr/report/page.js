@@ -62,7 +62,7 @@ document.getElementById("table").onkeydown = (event) => {
   if (by) { event.preventDefault(); step(by); }
 };
 document.getElementById("software").textContent = `stream-dmr ${DATA.software}, template ${DATA.template}`;
-document.getElementById("notes").replaceChildren(...DATA.notes.map((note) => element("li", { textContent: note })));
+for (const name of ["notes", "shapes"]) document.getElementById(name).replaceChildren(...DATA[name].map((line) => element("li", { textContent: line })));
 show();
 if (isReview()) startReview();
 if (location.hash.startsWith("#fish-")) choose(Number(location.hash.slice(6)));

@@ -3,8 +3,17 @@
 const PLOT_CONFIG = { displayModeBar: false, responsive: true };
 const BLUE = "#1668a8", ORANGE = "#d55e00";
 
+const NOT_COUNTED = ["reject", "duplicate", "merge"];
+
 function countedFish(fish) {
-  return fish.filter((f) => lengthOf(f) !== null && !["reject", "duplicate", "merge"].includes(f.verdict));
+  return fish.filter((f) => lengthOf(f) !== null && !NOT_COUNTED.includes(f.verdict));
+}
+
+// How often each name comes, the most frequent first: "31 landed, 4 dropped".
+function countOf(names) {
+  const counts = new Map();
+  for (const name of names) counts.set(name, (counts.get(name) ?? 0) + 1);
+  return [...counts].sort((a, b) => b[1] - a[1]).map(([name, count]) => `${count} ${name}`).join(", ");
 }
 
 function drawSummary(fish) {
@@ -17,6 +26,10 @@ function drawSummary(fish) {
       [`${quantile(lengths, 0.5).toFixed(1)} cm`, "median"],
       [`${quantile(lengths, 0.25).toFixed(1)} to ${quantile(lengths, 0.75).toFixed(1)} cm`, "25 % to 75 %"],
       [`${lengths[0].toFixed(1)} to ${lengths.at(-1).toFixed(1)} cm`, "shortest to longest"]);
+  }
+  for (const [name, said] of [["species", (f) => f.species_code ?? (f.species === DATA.template ? null : f.species)], ["fate", (f) => f.fate]]) {
+    const counted = countOf(fish.filter((f) => !NOT_COUNTED.includes(f.verdict)).map(said).filter(Boolean));
+    if (counted) tiles.push([counted, name]);
   }
   const weights = countedFish(fish).map((f) => f.weight_kg).filter((w) => w !== null);
   if (weights.length) tiles.push([`${weights.reduce((sum, w) => sum + w, 0).toFixed(1)} kg`, `of ${weights.length} fish, W = a L^b`]);

@@ -54,8 +54,8 @@ def render_page(
         "notes": [
             *notes,
             *(line for one in reports for line in (*one.notes, *one.recording.warnings)),
-            *(line for one in reports for line in _shape_notes(one)),
         ],
+        "shapes": [line for one in reports for line in _shape_notes(one)],
         "review": review,
         "fates": FATES,
         "conditions": CONDITIONS,
@@ -69,7 +69,7 @@ def render_page(
             details.append(json_element(f"fish-{row['id']}", detail))
     data = json_element("data", about | {"fish": rows}) + "".join(details)
     scripts = [*_SCRIPTS, *(_REVIEW_SCRIPTS if review else ()), "page.js"]
-    return _fill_template(title, data, scripts, trip="" if review else trip_section(reports))
+    return _fill_template(title, data, scripts, trip=trip_section(reports, is_folded=bool(review)))
 
 
 def _shape_notes(report: RunReport) -> Iterator[str]:

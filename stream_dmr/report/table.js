@@ -105,14 +105,15 @@ function rowOf(fish) {
   const corrected = fish.corrected_length_mm === null ? [] : [element("small", { textContent: `measured ${cm(fish.length_mm)} cm` })];
   const because = fish.verdict_reason ?? (fish.duplicate_of === null ? "" : `of ${fish.duplicate_of}`);
   const species = fish.species === DATA.template ? "" : fish.species;
-  const verdict = element("span", { textContent: fish.verdict ?? "" }, element("small", { textContent: because }), element("small", { textContent: species }));
+  const said = [because, species, fish.fate ?? ""].filter(Boolean).map((textContent) => element("small", { textContent }));
+  const verdict = element("span", { textContent: fish.verdict ?? "" }, ...said);
   if (fish.verdict) verdict.className = fish.verdict === "accept" ? "good" : "bad";
   const size = fish.is_legal_size === false ? element("small", { className: "bad", textContent: "below legal size" }) : "";
   return element(
     "div",
     { className: fish.id === state.chosen ? "row chosen" : "row", role: "row", "data-id": fish.id },
     fish.thumbnail ? element("img", { src: fish.thumbnail, alt: "", loading: "lazy" }) : element("span"),
-    element("span", {}, element("b", { textContent: fish.track_id }), element("small", { textContent: fish.video })),
+    element("span", {}, element("b", { textContent: fish.track_id }), element("small", { textContent: fish.video }), element("small", { textContent: fish.haul && `haul ${fish.haul}` })),
     element("span", {}, element("b", { textContent: lengthText(fish) }), ...corrected, element("small", { textContent: interval }), size),
     element("span", { textContent: `${fish.frames_used} of ${fish.frames_seen}` }),
     element("small", { textContent: reasons, title: reasons }),

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from html import escape
 
+from stream_dmr.results.agency_tables import species_code
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.vessel_track import VesselTrack
 
@@ -15,7 +16,7 @@ _COLOURS = ("#1668a8", "#d55e00", "#16824a", "#8a4fa3", "#b8860b", "#b3372c")
 
 
 def draw_map(tracks: Sequence[VesselTrack], fish: Sequence[FishResult]) -> str:
-    """The SVG element; "" without a position. Fish have a colour for each haul."""
+    """A figure of SVG with its key; "" without a position. Fish have a colour for each haul."""
     pieces = [
         [(kept.longitude, kept.latitude) for kept in piece]
         for track in tracks
@@ -33,14 +34,14 @@ def draw_map(tracks: Sequence[VesselTrack], fish: Sequence[FishResult]) -> str:
     hauls = sorted({one.haul for one in fish})
     dots = "".join(_dot(one, view, _COLOURS[hauls.index(one.haul) % len(_COLOURS)]) for one in fish)
     keys = "".join(
-        f'<text x="{_MARGIN}" y="{20 + 16 * i}" style="fill: {_COLOURS[i % len(_COLOURS)]}">'
-        f"{escape(f'haul {haul}' if haul else 'no haul')}</text>"
+        f'<span style="color: {_COLOURS[i % len(_COLOURS)]}">'
+        f"\u25cf {escape(f'haul {haul}' if haul else 'no haul')}</span> "
         for i, haul in enumerate(hauls)
     )
     return (
-        f'<svg id="map" viewBox="0 0 {_WIDTH:.0f} {_HEIGHT:.0f}" role="img" '
-        f'aria-label="Track of the vessel and its fish"><g class="track">{lines}</g>{dots}{keys}'
-        f"{view.scale_bar()}{view.corners()}</svg>"
+        f'<figure id="map"><svg viewBox="0 0 {_WIDTH:.0f} {_HEIGHT:.0f}" role="img" '
+        f'aria-label="Track of the vessel and its fish"><g class="track">{lines}</g>{dots}'
+        f"{view.scale_bar()}</svg><figcaption>{keys}{view.middle()}</figcaption></figure>"
     )
 
 
@@ -50,7 +51,8 @@ def _dot(fish: FishResult, view: "_View", colour: str) -> str:
         return ""
     x, y = view.point((where.longitude, where.latitude)).split(",")
     length = "no length" if fish.length_mm is None else f"{fish.length_mm / 10:.1f} cm"
-    title = escape(f"fish {fish.estimate.track_id}, {length}")
+    facts = (f"fish {fish.estimate.track_id}", length, species_code(fish), fish.fate)
+    title = escape(", ".join(fact for fact in facts if fact))
     return f'<circle cx="{x}" cy="{y}" r="4" fill="{colour}"><title>{title}</title></circle>'
 
 
@@ -83,19 +85,19 @@ class _View:
         power = 10 ** math.floor(math.log10(target_m))
         metres = max(f for f in (power, 2 * power, 5 * power) if f <= target_m)
         text = f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m"
-        x1, y = _WIDTH - _MARGIN, _HEIGHT - 12
+        x1, y = _WIDTH - _MARGIN, _HEIGHT - 12.0
         x0 = x1 - metres * self.px_per_m
         return (
             f'<line x1="{x0:.1f}" y1="{y}" x2="{x1:.1f}" y2="{y}" class="scale"/>'
             f'<text x="{x0:.1f}" y="{y - 5}">{text}</text>'
         )
 
-    def corners(self) -> str:
-        """The place of the middle, and where north is."""
+    def middle(self) -> str:
+        """The place of the middle, and where north is, in words."""
         longitude, latitude = self._middle
         longitude = (longitude + 180) % 360 - 180
         place = (
             f"{abs(latitude):.3f}° {'NS'[latitude < 0]}, {abs(longitude):.3f}° "
             f"{'EW'[longitude < 0]}"
         )
-        return f'<text x="{_MARGIN}" y="{_HEIGHT - 10}">middle: {place}; north is up</text>'
+        return f"middle: {place}; north is up"

@@ -7,7 +7,7 @@ from statistics import mean
 
 from stream_dmr.report.run_report import RunReport
 from stream_dmr.report.trip_map import draw_map
-from stream_dmr.results.agency_tables import haul_row
+from stream_dmr.results.agency_tables import haul_row, species_code
 from stream_dmr.results.effort import HaulEffort
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.table_cells import utc_text
@@ -15,8 +15,11 @@ from stream_dmr.results.table_cells import utc_text
 _HEAD = ("haul", "UTC", "watched", "measured", "fish", "with length", "mean", "species", "fate")
 
 
-def trip_section(reports: Sequence[RunReport]) -> str:
-    """HTML: who and when, a row for each haul, and where; "" where nothing of it is known."""
+def trip_section(reports: Sequence[RunReport], *, is_folded: bool = False) -> str:
+    """HTML: who and when, a row for each haul, and where; "" where nothing of it is known.
+
+    `is_folded`: only the heading, until somebody asks for more.
+    """
     fish = [one for report in reports for one in report.fish if one.counts]
     rows = [row for report in reports for row in _haul_rows(report, many=len(reports) > 1)]
     table = ""
@@ -27,35 +30,39 @@ def trip_section(reports: Sequence[RunReport]) -> str:
     heading = _heading(fish)
     if not (heading or drawn or any(one.haul for one in fish)):
         return ""
-    return f"<h2>{escape(heading)}</h2>{table}{drawn}"
+    title = f"<h2>{escape(heading)}</h2>"
+    if is_folded:
+        return f"<details><summary>{title}</summary>{table}{drawn}</details>"
+    return f"{title}{table}{drawn}"
 
 
 def _heading(fish: Sequence[FishResult]) -> str:
     """Vessel, trip and hauls, and the time from the first fish to the last."""
     parts = [
         _named("", {one.facts.vessel for one in fish}),
-        _named("trip ", {one.facts.trip for one in fish}),
-        _named("haul ", {one.haul for one in fish}),
+        _named("trip", {one.facts.trip for one in fish}),
+        _named("haul", {one.haul for one in fish}),
     ]
+    what = ", ".join(part for part in parts if part)
     times = sorted(one.utc_ns for one in fish if one.utc_ns is not None)
     if times:
-        first, last = (_minute(time_ns) for time_ns in (times[0], times[-1]))
-        parts.append(f"{first} to {last} UTC")
-    return ", ".join(part for part in parts if part)
+        span = _span(*(utc_text(time_ns) or "" for time_ns in (times[0], times[-1])))
+        what += f"{': ' if what else ''}{span} UTC"
+    return what
 
 
 def _named(what: str, names: Iterable[str]) -> str:
     known = sorted(name for name in names if name)
-    return what + ", ".join(known) if known else ""
+    plural = "s" if what and len(known) > 1 else ""
+    return f"{what}{plural} {', '.join(known)}".strip() if known else ""
 
 
-def _minute(utc_ns: int) -> str:
-    return _clock(utc_text(utc_ns) or "")
-
-
-def _clock(text: str) -> str:
-    """A time in ISO 8601 to the minute, for people."""
-    return text[:16].replace("T", " ")
+def _span(*times: str) -> str:
+    """Times in ISO 8601 to the minute, for people; the day stands once where it is the same."""
+    first, last = (time[:16].replace("T", " ") for time in times)
+    if not (first and last):
+        return first or last
+    return f"{first} to {last[11:] if last[:10] == first[:10] else last}"
 
 
 def _haul_rows(report: RunReport, *, many: bool) -> list[str]:
@@ -77,20 +84,29 @@ def _haul_row(
     name = effort.haul or "-"
     cells = [
         f"{title}: {name}" if title else name,
-        " to ".join(_clock(row[end]) for end in ("began_utc", "ended_utc") if row[end]),
+        _span(row["began_utc"], row["ended_utc"]),
         _hours(effort.hours_watched),
         "" if share is None else f"{100 * share:.0f} %",
         str(len(fish)),
         str(len(lengths)),
         f"{mean(lengths) / 10:.1f} cm" if lengths else "",
-        _counted(one.review.species or one.catch.species_code or "" for one in fish),
-        _counted(one.catch.fate or "" for one in fish),
+        _counted(_species(one) for one in fish),
+        _counted(one.fate or "" for one in fish),
     ]
-    return "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>"
+    named = zip(_HEAD, cells, strict=True)
+    row_cells = "".join(f'<td data-name="{name}">{escape(cell)}</td>' for name, cell in named)
+    return f"<tr>{row_cells}</tr>"
+
+
+def _species(fish: FishResult) -> str:
+    """Its code; without one what was said of it."""
+    return species_code(fish) or fish.review.species or fish.catch.species_code or ""
 
 
 def _hours(hours: float) -> str:
-    return f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.1f} min"
+    if hours >= 1:
+        return f"{hours:.1f} h"
+    return f"{60 * hours:.1f} min" if hours >= 1 / 60 else f"{3600 * hours:.1f} s"
 
 
 def _counted(names: Iterable[str]) -> str:

@@ -69,6 +69,11 @@ class FishResult:
         return any(MAY_COUNT_TWICE in flag for flag in self.flags)
 
     @property
+    def fate(self) -> str | None:
+        """The reviewer's, else that of the zones."""
+        return self.catch.fate if self.review.fate is None else self.review.fate
+
+    @property
     def length_mm(self) -> float | None:
         """The length that a reviewer corrected, else the measured one."""
         corrected = self.review.length_mm

@@ -1,5 +1,6 @@
 """Single pictures of a video file by their capture time, without reading all before them."""
 
+import math
 import os
 from pathlib import Path
 from threading import Lock
@@ -13,6 +14,7 @@ from jaxtyping import UInt8
 
 _LEAD_MS = 200.0  # containers round their times: a search begins a little earlier
 _AHEAD_MS = 2000.0  # reading on to a later picture is quicker than a new search up to here; chosen
+_MAX_TOLERANCE_MS = 20.0  # a picture's time is the same whenever it is read, but for rounding
 
 
 class SeekableVideo:
@@ -24,7 +26,9 @@ class SeekableVideo:
     def __init__(self, path: Path) -> None:
         self._capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
         fps = self._capture.get(cv2.CAP_PROP_FPS)
-        self._tolerance_ms = 500.0 / fps if 1e-3 < fps < 1e6 else 1.0  # half a frame
+        # Half a frame; of a film with pauses the rate, which is a mean of all, says nothing.
+        half_ms = 500.0 / fps if 1e-3 < fps < 1e6 else 1.0
+        self._tolerance_ms = min(half_ms, _MAX_TOLERANCE_MS)
         self._next_ms = 0.0  # of the picture that a read would give, about
         self._lock = Lock()
 
@@ -33,17 +37,31 @@ class SeekableVideo:
         wanted_ms = timestamp_ns / 1e6
         with self._lock:
             if not self._next_ms - self._tolerance_ms <= wanted_ms <= self._next_ms + _AHEAD_MS:
-                self._capture.set(cv2.CAP_PROP_POS_MSEC, max(0.0, wanted_ms - _LEAD_MS))
-            while self._capture.grab():
-                at_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
-                self._next_ms = at_ms + 2 * self._tolerance_ms
-                if at_ms > wanted_ms + self._tolerance_ms:
-                    return None
+                at_ms = self._seek(wanted_ms - _LEAD_MS)
+                if at_ms > wanted_ms + self._tolerance_ms:  # FFmpeg searches by the mean rate
+                    at_ms = self._seek(0.0)
+            else:
+                at_ms = self._grab()
+            while at_ms <= wanted_ms + self._tolerance_ms:
                 if at_ms > wanted_ms - self._tolerance_ms:
                     is_read, image = self._capture.retrieve()
                     return image if is_read and image.ndim == 3 else None
-            self._next_ms = float("inf")  # at the end: search anew
+                at_ms = self._grab()
             return None
+
+    def _seek(self, time_ms: float) -> float:
+        """Search, and take the next picture; its time."""
+        self._capture.set(cv2.CAP_PROP_POS_MSEC, max(0.0, time_ms))
+        return self._grab()
+
+    def _grab(self) -> float:
+        """Take the next picture; its time in ms, infinite at the end, after which is searched."""
+        if not self._capture.grab():
+            self._next_ms = math.inf
+            return math.inf
+        at_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
+        self._next_ms = at_ms + 2 * self._tolerance_ms
+        return at_ms
 
     def close(self) -> None:
         """Release the file."""

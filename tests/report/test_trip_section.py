@@ -51,8 +51,8 @@ def test_hauls_and_vessel_stand_in_the_page(tmp_path: Path):
     report = open_report(out)
     section = trip_section([report])
     assert "Sea &lt;Bird&gt;, trip T1, haul north" in section
-    assert "<td>north</td>" in section
-    assert "<td>100 %</td><td>2</td>" in section
+    assert ">north</td>" in section
+    assert '<td data-name="measured">100 %</td><td data-name="fish">2</td>' in section
     page = tmp_path / "report.html"
     write_report([report], page, title="trip")
     assert section in page.read_text(encoding="utf-8")

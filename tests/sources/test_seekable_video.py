@@ -8,6 +8,7 @@ import pytest
 from stream_dmr.sources.seekable_video import SeekableVideo
 from tests.sources.test_video import write_video
 from tests.support.sources import read
+from tests.support.trip import delay_frames
 
 
 @pytest.mark.parametrize(
@@ -22,6 +23,19 @@ def test_any_order_gives_the_pictures_of_a_run(tmp_path: Path, name: str, codec:
         image = video.image_at(frames[k].timestamp_ns)
         assert image is not None
         np.testing.assert_array_equal(image, frames[k].image)
+    video.close()
+
+
+def test_pictures_of_a_film_with_hours_between_them(tmp_path: Path):
+    path = write_video(tmp_path / "a.mp4", codec="mp4v", fps=15.0, num_frames=30)
+    delay_frames(path, [3600.0 * (k // 10) for k in range(30)])
+    _, frames = read(path)
+    video = SeekableVideo(path)
+    for k in (25, 3, 4, 15, 29, 0, 10, 9):
+        image = video.image_at(frames[k].timestamp_ns)
+        assert image is not None
+        np.testing.assert_array_equal(image, frames[k].image)
+    assert video.image_at(1800 * 10**9) is None
     video.close()
 
 

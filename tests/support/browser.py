@@ -72,6 +72,7 @@ class _Browser:
         for fd in (reads, writes, *theirs):
             os.close(fd)
         self._text, self._count = b"", 0
+        self.asked: list[tuple[str | None, str]] = []  # tab and address of each request
 
     def send(self, method: str, *, session: str | None = None, **params: Any) -> dict[str, Any]:
         """A command of the protocol, to a tab or to the browser itself; its result."""
@@ -93,13 +94,33 @@ class _Browser:
             assert data, "the browser has ended"
             self._text += data
         text, _, self._text = self._text.partition(b"\0")
-        return json.loads(text)
+        said = json.loads(text)
+        if said.get("method") == "Network.requestWillBeSent":
+            self.asked.append((said.get("sessionId"), said["params"]["request"]["url"]))
+        return said
 
 
 @cache
 def _browser() -> _Browser:
     """One for all tabs of this process, since it takes seconds to start."""
     return _Browser()
+
+
+# Parts that are wider than the window, and text that its box hides.
+_CUT = """
+const cut = [];
+if (document.documentElement.scrollWidth > innerWidth) cut.push("the page");
+const parts = ["button, input, select, canvas, #map svg, .views svg, h1, h2, .tile, dd, dt, li",
+  "th, td, small, figcaption, .row, .row > *, #head > *"].join();
+for (const one of document.querySelectorAll(parts)) {
+  const box = one.getBoundingClientRect();
+  const isOutside = box.width > 0 && (box.left < -1 || box.right > innerWidth + 1);
+  const hides = getComputedStyle(one).overflow === "hidden" && one.matches(".row, #head > *")
+    && (one.scrollWidth > one.clientWidth + 1 || one.scrollHeight > one.clientHeight + 1);
+  if (isOutside || hides) cut.push(one.outerHTML.slice(0, 120));
+}
+return cut;
+"""
 
 
 class Tab:
@@ -120,6 +141,7 @@ class Tab:
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.send("Emulation.setDeviceMetricsOverride", **size)
         self.send("Page.enable")
+        self.send("Network.enable")
         self.send("Page.navigate", url=address)
         loaded = ("Page.loadEventFired", self._session)
         while ((said := browser.hear()).get("method"), said.get("sessionId")) != loaded:
@@ -151,6 +173,15 @@ class Tab:
         """`kind`: touchStart, touchMove or touchEnd; no places where no finger is left."""
         fingers = [{"x": x, "y": y} for x, y in places]
         self.send("Input.dispatchTouchEvent", type=kind, touchPoints=fingers)
+
+    def asked(self) -> list[str]:
+        """The addresses that the page has asked for, but for what it holds itself."""
+        mine = [url for session, url in self._browser.asked if session == self._session]
+        return [url for url in mine if not url.startswith(("data:", "blob:", "file:"))]
+
+    def cut(self) -> list[str]:
+        """What is not whole within the window's width, or not within its own box; the page too."""
+        return self.run(_CUT)
 
     def picture(self, path: Path) -> None:
         """A screenshot, as PNG."""

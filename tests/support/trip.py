@@ -1,6 +1,7 @@
 """A simulated trip: three hauls hours apart, two species, fish that come aboard or fall off."""
 
 import csv
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import cos, sin
 from pathlib import Path
@@ -10,7 +11,6 @@ import numpy as np
 
 from stream_dmr.camera import Calibration, Camera
 from stream_dmr.sensors.sensors_settings import utc_ns_of
-from stream_dmr.simulation.pose_sequence import FPS
 from stream_dmr.simulation.rail_scene import RailScene, Visit, make_scene
 from stream_dmr.simulation.species import find_species
 from stream_dmr.simulation.write_scene import write_scene
@@ -20,9 +20,10 @@ START_UTC = "2026-11-22T06:00:00Z"
 CODES = {"halibut": "HAL", "conger": "COE"}
 NAMES = ",".join(CODES)
 VISIT_FRAMES, PAUSE_FRAMES = 16, 8
+_SECOND_AFTER = 3  # frames after the first fish of a haul
+HAUL_FRAMES = VISIT_FRAMES + _SECOND_AFTER + PAUSE_FRAMES
 HAUL_S = 3600.0  # from one haul to the next
 SENTENCES_S = 10.0
-_FRAME_NS = 1_000_000_000 // FPS
 # By haul what becomes of its fish; species take turns.
 FATES = (("landed", "dropped"), ("landed", "landed"), ("dropped", "landed"))
 
@@ -54,11 +55,12 @@ def place_at(seconds: float) -> tuple[float, float]:
     return 57.40 + 0.06 * sin(turn), -150.90 + 0.11 * (1 - cos(turn)) + 0.02 * turn
 
 
-def make_trip(folder: Path, *, seed: int = 3) -> Trip:
+def make_trip(folder: Path, *, seed: int = 5) -> Trip:
     """Film a trip into a folder."""
-    scene = _in_three_hauls(small_scene(num_fish=6, num_frames=10, seed=seed))
+    scene = _in_three_hauls(small_scene(num_fish=6, num_frames=6 * VISIT_FRAMES, seed=seed))
     write_scene(folder, scene, species=NAMES)
-    times_ns = _move_hauls_apart(folder / "video.mp4", scene.num_frames)
+    delays_s = [HAUL_S * min(2, k // HAUL_FRAMES) for k in range(scene.num_frames)]
+    times_ns = delay_frames(folder / "video.mp4", delays_s)
     _write_positions(folder / "track.nmea", times_ns[-1] / 1e9)
     seen: dict[int, list[int]] = {}
     for row in _rows(folder / "boxes.txt"):
@@ -102,44 +104,37 @@ def small_scene(*, num_fish: int, num_frames: int, seed: int) -> RailScene:
 
 def _in_three_hauls(scene: RailScene) -> RailScene:
     """Two fish a haul, side by side; one that is dropped goes down again, half turned about."""
-    longer = small_scene(num_fish=6, num_frames=6 * VISIT_FRAMES, seed=scene.seed)
     visits = list[Visit]()
-    for index, visit in enumerate(longer.visits):
+    for index, visit in enumerate(scene.visits):
         haul, place = divmod(index, 2)
         at = np.linspace(0, len(visit.poses) - 1, VISIT_FRAMES).round().astype(int)
         way = [visit.poses[k] for k in at]
         if FATES[haul][place] == "dropped":
             half = way[: VISIT_FRAMES // 2]
             way = [*half, *half[::-1]]
-        first = 1 + PAUSE_FRAMES // 2 + haul * (VISIT_FRAMES + PAUSE_FRAMES + 3) + 3 * place
+        first = 1 + PAUSE_FRAMES // 2 + haul * HAUL_FRAMES + _SECOND_AFTER * place
         lane = np.array([-700.0 if place == 0 else 700.0, 0.0, 0.0])
-        poses = [
-            replace(p, center_world_mm=p.center_world_mm * [0.2, 1, 1] + lane) for p in way
-        ]
+        poses = [replace(p, center_world_mm=p.center_world_mm * [0.2, 1, 1] + lane) for p in way]
         visits.append(replace(visit, first_frame=first, poses=poses))
     num_frames = visits[-1].first_frame + VISIT_FRAMES + PAUSE_FRAMES
     return replace(scene, num_frames=num_frames, visits=visits)
 
 
-def _move_hauls_apart(video: Path, num_frames: int) -> list[int]:
-    """Give the frames of each haul times an hour after the last one; all times, ns."""
-    each = VISIT_FRAMES + PAUSE_FRAMES + 3
-    apart = video.with_name("apart.mp4")
-    times_ns = list[int]()
-    with av.open(video) as old, av.open(apart, "w") as new:
+def delay_frames(video: Path, delays_s: Sequence[float]) -> list[int]:
+    """Let each frame of an MP4 come so much later; the times of all frames, ns."""
+    delayed, times_ns = video.with_name("delayed.mp4"), list[int]()
+    with av.open(video) as old, av.open(delayed, "w") as new:
         stream = new.add_stream_from_template(old.streams.video[0])
-        for number, packet in enumerate(old.demux(video=0)):
-            if packet.pts is None:
-                continue
-            later_s = HAUL_S * min(2, number // each)
+        packets = (packet for packet in old.demux(video=0) if packet.pts is not None)
+        for packet, delay_s in zip(packets, delays_s, strict=True):
+            assert packet.pts is not None
             assert packet.time_base is not None
-            packet.pts += round(later_s / packet.time_base)
+            packet.pts += round(delay_s / packet.time_base)
             packet.dts = packet.pts
             times_ns.append(round(packet.pts * packet.time_base * 1_000_000_000))
             packet.stream = stream
             new.mux(packet)
-    assert len(times_ns) == num_frames
-    apart.replace(video)
+    delayed.replace(video)
     return times_ns
 
 
