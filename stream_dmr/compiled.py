@@ -36,6 +36,17 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
         setattr(config, "CACHE_DIR", users_own)  # noqa: B010
 
 
+def inlined(function: Callable[P, R]) -> Callable[P, R]:
+    """As `compiled`, but as a part of the kernel that calls it.
+
+    LLVM works through a kernel with all that it calls, so that the innermost loops are compiled
+    once more at each level. This is for large kernels with one caller, at one place.
+    """
+    if getattr(config, "DISABLE_JIT", False):
+        return function
+    return numba.njit(inline="always", nogil=True, error_model="numpy")(inspect.unwrap(function))
+
+
 @cache
 def _cache_folder() -> Path:
     """A folder for just this version of the sources.

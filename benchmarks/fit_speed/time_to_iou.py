@@ -21,8 +21,9 @@ from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.cold_start import cold_starts
 from stream_dmr.fitting.contour import contour_solver
 from stream_dmr.fitting.contour.contour_solver import ContourSolver
-from stream_dmr.fitting.contour.levenberg_marquardt import Minimum, minimise
+from stream_dmr.fitting.contour.levenberg_marquardt import Minimum
 from stream_dmr.fitting.contour.problem import Problem
+from stream_dmr.fitting.contour.scan import descend
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.mesh_levels import MeshLevels
@@ -212,12 +213,12 @@ def _stopping_contour(body: Body) -> Iterator[None]:
     """Stops as soon as a minimisation of this body, not of a coarse one, ends at the goal."""
 
     def watched(problem: Problem, *rest: Any) -> Minimum:
-        found = minimise(problem, *rest)
+        found = descend(problem, *rest)
         if problem.body is body:
             _stop_at_goal(found.iou)
         return found
 
-    with patch.object(contour_solver, "minimise", watched):
+    with patch.object(contour_solver, "descend", watched):
         yield
 
 

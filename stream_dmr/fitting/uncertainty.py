@@ -13,7 +13,7 @@ from jaxtyping import Float
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.contour_residuals import Residuals
-from stream_dmr.fitting.contour.deformation import jacobian
+from stream_dmr.fitting.contour.deformation import Kind, jacobian
 from stream_dmr.fitting.contour.normal_equations import weighted_squares
 from stream_dmr.fitting.contour.outline import Rendering
 from stream_dmr.fitting.contour.problem import Problem
@@ -106,7 +106,7 @@ def _information(
 
 @compiled
 def _log_length_slope(
-    body: Body, kind: int, parameters: Float[np.ndarray, "P"], points: Float[np.ndarray, "N 3"]
+    body: Body, kind: Kind, parameters: Float[np.ndarray, "P"], points: Float[np.ndarray, "N 3"]
 ) -> Float[np.ndarray, "P"]:
     """Slope of the log of the midline's arc length, at the fixed depth of the root."""
     chosen = np.arange(body.num_vertices + 3, len(points))

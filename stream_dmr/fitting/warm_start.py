@@ -20,7 +20,10 @@ def recentered(problem: Problem, parameters: Float[np.ndarray, "P"]) -> Float[np
     moved = parameters.copy()
     shift = moved[ROOT_TRANSLATION]
     for i in range(2):
-        gap = middle[i] - (np.min(pixels[:, i]) + np.max(pixels[:, i])) / 2
+        low, high = np.inf, -np.inf
+        for v in range(len(pixels)):
+            low, high = min(low, pixels[v, i]), max(high, pixels[v, i])
+        gap = middle[i] - (low + high) / 2
         shift[i] += gap / (np.exp(parameters[LOG_SIZE]) * target.K[i, i])
     return moved
 

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour import levenberg_marquardt
+from stream_dmr.fitting.contour import scan
 from stream_dmr.fitting.contour.contour_residuals import Residuals
 from stream_dmr.fitting.contour.contour_solver import ContourSolver, mirror
 from stream_dmr.fitting.contour.deformation import KINDS, deform
@@ -22,7 +22,6 @@ from stream_dmr.fitting.contour.levenberg_marquardt import (
     SETTLED,
     STUCK,
     evaluate,
-    minimise,
     solve,
 )
 from stream_dmr.fitting.contour.normal_equations import normal_equations, weighted_squares
@@ -98,7 +97,7 @@ def energy(target, flat, *, kind="spine"):
 
 def descend(target, start, *, iterations=30, tolerance=1e-4, damping=1e-2, kind="spine"):
     options = Options(iterations, tolerance, damping)
-    return minimise(problem_of(target, kind=kind), start, FREE, options)
+    return scan.descend(problem_of(target, kind=kind), start, FREE, options)
 
 
 class TestNormalEquations:
@@ -262,7 +261,7 @@ class TestDescent:
         with ThreadPoolExecutor(4) as pool:
             assert list(pool.map(bits, jobs)) == alone
 
-    @pytest.mark.parametrize("function", [levenberg_marquardt.minimise, evaluate])
+    @pytest.mark.parametrize("function", [scan.scan_sizes, evaluate])
     def test_releases_the_gil(self, function):
         assert function.targetoptions["nogil"]
 

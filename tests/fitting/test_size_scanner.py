@@ -8,14 +8,14 @@ from scipy.interpolate import PchipInterpolator
 
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.contour_solver import ContourSolver
-from stream_dmr.fitting.contour.levenberg_marquardt import WARM_DAMPING, evaluate, minimise
+from stream_dmr.fitting.contour.levenberg_marquardt import WARM_DAMPING, evaluate
 from stream_dmr.fitting.contour.problem import Options, Problem
 from stream_dmr.fitting.contour.regularisers import prior_loss
+from stream_dmr.fitting.contour.scan import descend, only_size, scan_sizes
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import LOG_SIZE, rest_vector
 from stream_dmr.fitting.size.density import mean_and_std
-from stream_dmr.fitting.size.scan import only_size, scan_sizes
 from stream_dmr.fitting.size.scanner import SizeScanner
 from stream_dmr.fitting.target import Target
 from stream_dmr.template.template_file import load_template
@@ -95,7 +95,7 @@ def known():
 
 def scanned(target, flat, *, max_excess=np.inf):
     options = Options(4, SETTINGS.tolerance, WARM_DAMPING)
-    return scan_sizes(problem_of(target), flat, FIVE, max_excess, options)
+    return scan_sizes(problem_of(target), flat, only_size(len(flat)), FIVE, max_excess, options)
 
 
 def problem_of(target):
@@ -104,7 +104,7 @@ def problem_of(target):
 
 def test_every_fit_of_a_scan_has_the_size_it_is_to_have(known):
     for target, best, _ in known:
-        fits, losses, log_volumes, _ = scanned(target, best.parameters)
+        fits, losses, log_volumes, *_ = scanned(target, best.parameters)
         np.testing.assert_allclose(fits[:, LOG_SIZE], best.parameters[LOG_SIZE] + FIVE, atol=1e-12)
         assert np.isfinite(losses).all()
         assert np.isfinite(log_volumes).all()
@@ -117,14 +117,14 @@ def test_where_sizes_are_likely_a_scan_is_nearly_as_good_as_a_long_fit(known):
         for offset, loss in zip(FIVE, losses, strict=True):
             start = best.parameters.copy()
             start[LOG_SIZE] += offset
-            alone = minimise(problem_of(target), start, held, options).loss
+            alone = descend(problem_of(target), start, held, options).loss
             if alone < losses[2] + 8 * SETTINGS.nat:
                 assert loss <= alone + 2 * SETTINGS.nat
 
 
 def test_a_size_is_looked_for_where_its_neighbour_is_headed(known):
     for target, best, _ in known:
-        fits, _, _, next_steps = scanned(target, best.parameters)
+        fits, _, _, next_steps, _ = scanned(target, best.parameters)
         straight, ahead = fits[2].copy(), fits[2] + 0.04 * next_steps[2]
         straight[LOG_SIZE] += 0.04
         assert ahead[LOG_SIZE] == pytest.approx(straight[LOG_SIZE])

@@ -10,10 +10,10 @@ from stream_dmr.fitting.contour.levenberg_marquardt import (
     WARM_DAMPING,
     Minimum,
     evaluate,
-    minimise,
 )
 from stream_dmr.fitting.contour.problem import Options, Problem
 from stream_dmr.fitting.contour.regularisers import prior_loss
+from stream_dmr.fitting.contour.scan import descend
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import ROOT_ROTATION, joints_of
@@ -71,7 +71,7 @@ class ContourSolver:
     ) -> Solution:
         options = Options(iterations, self._settings.tolerance, damping)
         nothing = np.zeros(len(start), np.bool_)
-        return solution_of(minimise(problem, start, nothing, options))
+        return solution_of(descend(problem, start, nothing, options))
 
 
 def loss_of(problem: Problem, parameters: Float[np.ndarray, "P"]) -> float:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from stream_dmr.compiled import compiled
+from stream_dmr.compiled import compiled, inlined
 from stream_dmr.fitting.contour.deformation import deform
 from stream_dmr.fitting.contour.mesh_terms import smoothness
 from stream_dmr.fitting.contour.normal_equations import normal_equations
@@ -74,19 +74,22 @@ def evaluate(
     return Iterate(terms, hard_iou, Rendering(points, pixels, rim, covered))
 
 
-@compiled
+@inlined
 def minimise(
     problem: Problem,
     start: Float[np.ndarray, "P"],
     held: Bool[np.ndarray, "P"],
     options: Options,
 ) -> Minimum:
-    """Down from the start; parameters that are `held` keep their value."""
+    """Down from the start; parameters that are `held` keep their value.
+
+    Part of the scan of sizes: from Python, `scan.descend` is the same without a compilation more.
+    """
     lambdas, tolerance, damping = problem.lambdas, options.tolerance, options.damping
     with_smoothness = lambdas[NORMAL] > 0 or lambdas[LAPLACIAN] > 0
     best = start.copy()
     here = evaluate(problem, best, with_smoothness)
-    loss = np.sum(here.terms * lambdas) + prior_loss(problem, best)
+    loss = _total(here.terms, lambdas) + prior_loss(problem, best)
     H, g = normal_equations(problem, best, here.rendering)
     num_calm, num_refused = 0, 0
     for iteration in range(1, options.iterations + 1):
@@ -95,7 +98,7 @@ def minimise(
             return Minimum(best, loss, here.iou, iteration - 1, SETTLED, H)
         trial = best - step
         there = evaluate(problem, trial, with_smoothness)
-        gain = loss - np.sum(there.terms * lambdas) - prior_loss(problem, trial)
+        gain = loss - _total(there.terms, lambdas) - prior_loss(problem, trial)
         if gain > 0:
             best, here = trial, there
             loss -= gain
@@ -115,6 +118,14 @@ def minimise(
 
 
 @compiled
+def _total(terms: Float[np.ndarray, "6"], lambdas: Float[np.ndarray, "6"]) -> float:
+    total = 0.0
+    for k in range(len(terms)):
+        total += terms[k] * lambdas[k]
+    return total
+
+
+@compiled
 def solve(
     H: Float[np.ndarray, "P P"],
     g: Float[np.ndarray, "P"],
@@ -122,7 +133,16 @@ def solve(
     held: Bool[np.ndarray, "P"],
 ) -> Float[np.ndarray, "P"]:
     """(H + damping diag H)^-1 g, with steps of 0 in the parameters that are held."""
-    return solve_factorised(factorise(H, damping, held), np.where(held, 0.0, g))
+    return solve_factorised(factorise(H, damping, held), without(g, held))
+
+
+@compiled
+def without(g: Float[np.ndarray, "P"], held: Bool[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
+    """A copy with zeros where parameters are held."""
+    free = np.empty_like(g)
+    for p in range(len(g)):
+        free[p] = 0.0 if held[p] else g[p]
+    return free
 
 
 @compiled

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.body import Body
+from stream_dmr.fitting.contour.deformation import Kind
 from stream_dmr.fitting.contour.pull_back import pull_back
 from stream_dmr.fitting.parameters import LOG_SIZE
 
@@ -55,7 +56,7 @@ def _face_normals(
 @compiled
 def smoothness_slope(
     body: Body,
-    kind: int,
+    kind: Kind,
     parameters: Float[np.ndarray, "P"],
     points: Float[np.ndarray, "N 3"],
     normal_weight: float,

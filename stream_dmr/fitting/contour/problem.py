@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.deformation import KINDS
+from stream_dmr.fitting.contour.deformation import KINDS, Kind
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.parameters import Priors, rest_vector
 from stream_dmr.fitting.target import Target
@@ -22,7 +22,7 @@ class Problem(NamedTuple):
     """
 
     body: Body
-    kind: int  # of the deformation: SPINE or LINEAR_BLEND
+    kind: Kind  # of the deformation: SPINE or LINEAR_BLEND
     target: Target
     lambdas: Float[np.ndarray, "6"]
     priors: Priors

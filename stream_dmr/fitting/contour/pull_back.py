@@ -7,9 +7,9 @@ points, each cross-section of the spine carries one push and one turn to its joi
 import numpy as np
 from jaxtyping import Float
 
-from stream_dmr.compiled import compiled
+from stream_dmr.compiled import compiled, inlined
 from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.deformation import SPINE, jacobian
+from stream_dmr.fitting.contour.deformation import SPINE, Kind, jacobian
 from stream_dmr.fitting.contour.joints import blend, cholesky_factors, skinning_weights
 from stream_dmr.fitting.contour.rotation_vector import (
     dot,
@@ -19,16 +19,16 @@ from stream_dmr.fitting.contour.rotation_vector import (
 from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION, ROOT_TRANSLATION, joints_of
 
 
-@compiled
+@inlined
 def pull_back(
     body: Body,
-    kind: int,
+    kind: Kind,
     parameters: Float[np.ndarray, "P"],
     points: Float[np.ndarray, "N 3"],
     forces: Float[np.ndarray, "V 3"],
 ) -> Float[np.ndarray, "P"]:
     """J^T f of forces on the vertices; `points` are those that `deform` gives."""
-    if kind == SPINE:
+    if kind is SPINE:
         return _through_spine(body, parameters, points, forces)
     slopes = jacobian(body, kind, parameters, np.arange(len(forces)))
     out = np.zeros(len(parameters))
@@ -39,7 +39,7 @@ def pull_back(
     return out
 
 
-@compiled
+@inlined
 def _through_spine(
     body: Body,
     parameters: Float[np.ndarray, "P"],

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from stream_dmr.compiled import compiled
+from stream_dmr.compiled import compiled, inlined
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.joints import (
     blend,
@@ -30,7 +30,7 @@ from stream_dmr.fitting.parameters import (
 )
 
 
-@compiled
+@inlined
 def spine_points(body: Body, parameters: Float[np.ndarray, "P"]) -> Float[np.ndarray, "N 3"]:
     """Points swept along the bent midline, before the root's own motion."""
     num_joints, joints, places = len(body.joints), joints_of(parameters), body.places
@@ -64,7 +64,7 @@ def spine_points(body: Body, parameters: Float[np.ndarray, "P"]) -> Float[np.nda
     return out
 
 
-@compiled
+@inlined
 def spine_jacobian(
     body: Body,
     parameters: Float[np.ndarray, "P"],
@@ -163,7 +163,9 @@ def spine_nodes(
             continue
         fill_rotation_and_jacobian(omega, R, J)
         rotated_slope(R, J, step, A)
-        slope[k + 1] = slope[k]
+        for i in range(3):  # in whole rows it would compile the text of an error for a second
+            for p in range(NUM_PER_JOINT * num_joints):
+                slope[k + 1, i, p] = slope[k, i, p]
         for j in range(num_joints):
             for i in range(3):
                 along = 0.0

@@ -43,8 +43,8 @@ def visible_rim(rendering: Rendering) -> VisibleRim:
         if length < 1e-9:
             continue
         nx, ny = dy / length, -dx / length
-        column = int(np.round((pixels[a, 0] + pixels[b, 0]) / 2 + nx))
-        row = int(np.round((pixels[a, 1] + pixels[b, 1]) / 2 + ny))
+        column = int(np.rint((pixels[a, 0] + pixels[b, 0]) / 2 + nx))
+        row = int(np.rint((pixels[a, 1] + pixels[b, 1]) / 2 + ny))
         if 0 <= row < size and 0 <= column < size and covered[row, column] >= COVERED:
             continue
         keep[count, 0], keep[count, 1] = a, b

@@ -16,6 +16,7 @@ from stream_dmr.fitting.contour.deformation import jacobian
 from stream_dmr.fitting.contour.joints import blend, cholesky_factors, skinning_weights
 from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.normal_equations import weighted_squares
+from stream_dmr.fitting.contour.outline import Rendering
 from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.contour.regularisers import regularise
 from stream_dmr.fitting.contour.rotation_vector import dot, fill_rotation, rotation_and_jacobian
@@ -35,26 +36,41 @@ class ShapeEquations(NamedTuple):
     g: Float[np.ndarray, "Z"]
 
 
-@compiled
 def shape_equations(
     problem: Problem,
     parameters: Float[np.ndarray, "P"],
     directions: Float[np.ndarray, "V 3 W"],
 ) -> ShapeEquations:
     """H and g of a fit by the spine; `directions` are those of its body's vertices."""
-    rendering = evaluate(problem, parameters, False).rendering
+    rendering = evaluate(problem, parameters, False).rendering  # compiled once, for all
+    return _equations(problem, parameters, rendering, directions)
+
+
+@compiled
+def _equations(
+    problem: Problem,
+    parameters: Float[np.ndarray, "P"],
+    rendering: Rendering,
+    directions: Float[np.ndarray, "V 3 W"],
+) -> ShapeEquations:
     visible = visible_rim(rendering)
     row_of, chosen = rim_vertices(problem.body.num_vertices, visible.edges)
     num_pose, num_shape = len(parameters), directions.shape[2]
     slopes = np.empty((len(chosen), 3, num_pose + num_shape))
-    slopes[:, :, :num_pose] = jacobian(problem.body, problem.kind, parameters, chosen)
+    to_pose = jacobian(problem.body, problem.kind, parameters, chosen)
+    for c in range(len(chosen)):
+        for i in range(3):
+            for p in range(num_pose):
+                slopes[c, i, p] = to_pose[c, i, p]
     _carry(problem.body, parameters, directions, chosen, slopes[:, :, num_pose:])
     moved = RimSlopes(row_of, pixel_slopes(rendering.points, chosen, slopes, problem.target))
     H, g = weighted_squares(contour_residuals(problem.target, rendering.pixels, visible, moved))
     pose_H, pose_g = np.zeros((num_pose, num_pose)), np.zeros(num_pose)
     regularise(problem, parameters, pose_H, pose_g)
-    H[:num_pose, :num_pose] += pose_H
-    g[:num_pose] += pose_g
+    for p in range(num_pose):
+        g[p] += pose_g[p]
+        for q in range(num_pose):
+            H[p, q] += pose_H[p, q]
     return ShapeEquations(H, g)
 
 

@@ -20,8 +20,9 @@ from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve
 
 from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.levenberg_marquardt import WARM_DAMPING, minimise
+from stream_dmr.fitting.contour.levenberg_marquardt import WARM_DAMPING
 from stream_dmr.fitting.contour.problem import Options, Problem
+from stream_dmr.fitting.contour.scan import descend
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.parameters import joints_of
 from stream_dmr.fitting.shape.equations import shape_equations
@@ -242,7 +243,7 @@ class StockFitter:
         """Refit a frame from its last pose; what its mask says against the shape, nats."""
         problem = Problem.from_settings(self._settings, body, frame.target, with_smoothness=False)
         nothing_held = np.zeros(len(frame.pose), np.bool_)
-        frame.pose = minimise(problem, frame.pose, nothing_held, _POSE_OPTIONS).parameters
+        frame.pose = descend(problem, frame.pose, nothing_held, _POSE_OPTIONS).parameters
         return nats_against(problem, frame.pose, nat=self._nat)
 
 

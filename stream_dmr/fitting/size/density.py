@@ -25,7 +25,9 @@ def mean_and_std(
         falling = max(-(nats[1] - nats[0]) / (offsets[1] - offsets[0]), falling)
         rising = max((nats[last] - nats[last - 1]) / (offsets[last] - offsets[last - 1]), rising)
     count = int(np.ceil((offsets[last] - offsets[0] + 2 * _BEYOND) / _STEP))
-    likeliest = np.min(nats)
+    likeliest = nats[0]
+    for one in nats:
+        likeliest = min(likeliest, one)
     total = first = second = 0.0
     k = 0
     for n in range(count):

@@ -11,13 +11,13 @@ import numpy as np
 
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.contour_solver import solution_of
-from stream_dmr.fitting.contour.levenberg_marquardt import WARM_DAMPING, minimise
+from stream_dmr.fitting.contour.levenberg_marquardt import WARM_DAMPING
 from stream_dmr.fitting.contour.problem import Options, Problem
+from stream_dmr.fitting.contour.scan import descend, only_size, scan_sizes
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import LOG_SIZE
 from stream_dmr.fitting.size.density import mean_and_std
-from stream_dmr.fitting.size.scan import only_size, scan_sizes
 from stream_dmr.fitting.solver import Solution
 from stream_dmr.fitting.target import Target
 
@@ -46,16 +46,15 @@ class SizeScanner:
         """The fit at the expected size of the fish, and the std of the log size."""
         start, nat = best.parameters, self._settings.nat
         problem = self._problem(self._coarse, target.coarse())
-        scan = scan_sizes(problem, start, _OFFSETS, _MAX_NATS * nat, self._options)
+        held = only_size(len(start))
+        scan = scan_sizes(problem, start, held, _OFFSETS, _MAX_NATS * nat, self._options)
         tried = np.isfinite(scan.losses)
         nats = scan.losses[tried] / nat + LOG_VOLUME_WEIGHT * scan.log_volumes[tried]
         mean, std = mean_and_std(_OFFSETS[tried], nats)
         nearest = np.argmin(np.where(tried, np.abs(_OFFSETS - mean), np.inf))
         guess = scan.parameters[nearest] + (mean - _OFFSETS[nearest]) * scan.next_steps[nearest]
         guess[LOG_SIZE] = start[LOG_SIZE] + mean
-        found = minimise(
-            self._problem(self._body, target), guess, only_size(len(guess)), self._options
-        )
+        found = descend(self._problem(self._body, target), guess, held, self._options)
         return solution_of(found), STD_SCALE * std
 
     def _problem(self, body: Body, target: Target) -> Problem:

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.deformation import KINDS, deform
+from stream_dmr.fitting.contour.deformation import KINDS, Kind, deform
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.messages import FittedMesh, FittedShape
@@ -26,7 +26,7 @@ class MeshRebuilder:
             return fit
         return replace(fit, shape=self._deformed(shape, KINDS[report.deformation]))
 
-    def _deformed(self, shape: FittedShape, kind: int) -> FittedShape:
+    def _deformed(self, shape: FittedShape, kind: Kind) -> FittedShape:
         body = self._bodies[shape.candidate or 0]
         points = deform(body, kind, shape.parameters)
         v = body.num_vertices

@@ -5,8 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.levenberg_marquardt import COLD_DAMPING, minimise
+from stream_dmr.fitting.contour.levenberg_marquardt import COLD_DAMPING
 from stream_dmr.fitting.contour.problem import Options, Problem
+from stream_dmr.fitting.contour.scan import descend
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.parameters import ROOT_ROTATION
 from stream_dmr.fitting.shape.evidence import nats_against
@@ -27,7 +28,7 @@ def fitted(log_breadth, sample, *, rolled_by=0.0):
     turned = Rotation.from_rotvec(start[ROOT_ROTATION]) * Rotation.from_euler("x", rolled_by)
     start[ROOT_ROTATION] = turned.as_rotvec()
     nothing = np.zeros(len(start), np.bool_)
-    return problem, minimise(problem, start, nothing, Options(60, 1e-9, COLD_DAMPING))
+    return problem, descend(problem, start, nothing, Options(60, 1e-9, COLD_DAMPING))
 
 
 @pytest.mark.parametrize("track_id", [3, 8])
