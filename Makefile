@@ -4,7 +4,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-slow bench faults soak table1 check format golden config docs clean
+.PHONY: setup demo test test-slow bench faults soak table1 check format golden config docs clean
+
+setup: $(STAMP)  ## compile the numeric loops, half a minute; without it the first run does
+	$(BIN)/stream-dmr setup
 
 demo: $(STAMP)  ## the main job on the embedded scene, lengths beside the truth
 	$(BIN)/stream-dmr demo

@@ -26,10 +26,10 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     function comes wrapped, which can't be compiled, and is unwrapped first; they are checked where
     nothing is compiled, under NUMBA_DISABLE_JIT=1.
     """
-    if getattr(config, "DISABLE_JIT", False):
+    if not is_compiling():
         return function
     users_own = getattr(config, "CACHE_DIR", "")  # NUMBA_CACHE_DIR
-    setattr(config, "CACHE_DIR", users_own or str(_cache_folder()))  # noqa: B010
+    setattr(config, "CACHE_DIR", str(cache_folder()))  # noqa: B010
     try:
         return numba.njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function))
     finally:
@@ -42,9 +42,20 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
     LLVM works through a kernel with all that it calls, so that the innermost loops are compiled
     once more at each level. This is for large kernels with one caller, at one place.
     """
-    if getattr(config, "DISABLE_JIT", False):
+    if not is_compiling():
         return function
     return numba.njit(inline="always", nogil=True, error_model="numpy")(inspect.unwrap(function))
+
+
+def is_compiling() -> bool:
+    """False under NUMBA_DISABLE_JIT=1."""
+    return not getattr(config, "DISABLE_JIT", False)
+
+
+def cache_folder() -> Path:
+    """Where compiled functions are kept: NUMBA_CACHE_DIR, or a folder of this version's own."""
+    users_own = getattr(config, "CACHE_DIR", "")
+    return Path(users_own) if users_own else _cache_folder()
 
 
 @cache

@@ -27,6 +27,7 @@ from stream_dmr.cli.replay import replay
 from stream_dmr.cli.report import report, verify
 from stream_dmr.cli.review import agreement, review
 from stream_dmr.cli.run import run
+from stream_dmr.cli.setup import setup
 from stream_dmr.cli.shared_options import OverwriteOption
 from stream_dmr.cli.train import train
 from stream_dmr.cli.view import convert, view
@@ -44,7 +45,7 @@ app = typer.Typer(
 for command in (
     *(demo, run, calibrate, check, replay, recover, view, convert, export),
     *(report, review, agreement, verify, haul, keygen, batch, fleet, evaluate, train),
-    *(learn_template, make_template),
+    *(learn_template, make_template, setup),
 ):
     app.command()(command)
 

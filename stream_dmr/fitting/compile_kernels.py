@@ -16,11 +16,12 @@ _SIZE_PX = 128
 
 def compile_kernels(fitter: Fitter) -> None:
     """Fit a drawn fish once from cold and once from warm, which calls every kernel."""
-    crop = _drawn_fish()
+    crop = drawn_fish()
     fitter.fit(crop, fitter.fit(crop, None).best)
 
 
-def _drawn_fish() -> FishCrop:
+def drawn_fish() -> FishCrop:
+    """The crop of an ellipse."""
     mask = np.zeros((_SIZE_PX, _SIZE_PX), np.uint8)
     middle = _SIZE_PX // 2
     cv2.ellipse(mask, (middle, middle), (_SIZE_PX // 3, _SIZE_PX // 8), 30, 0, 360, 1, cv2.FILLED)

@@ -27,6 +27,7 @@ from stream_dmr.running.live_shapes import follow_shapes
 from stream_dmr.running.outputs import Outputs, open_outputs
 from stream_dmr.running.pipeline import Node, StageCounters, run_chain
 from stream_dmr.running.position_feed import PositionFeed
+from stream_dmr.running.prepare_kernels import prepare_kernels
 from stream_dmr.running.result_writer import ResultWriter
 from stream_dmr.running.resume import resume_source
 from stream_dmr.running.run_folder import ENDLESS_RESULTS, LEARNT, RESULTS
@@ -65,6 +66,7 @@ def measure_source(
     cv2.setNumThreads(1)
     inputs = checked_inputs(request)
     try:
+        prepare_kernels(observer.stage, stop=stop)
         crop_fish = _crop_fish(inputs)
         inputs = with_learnt_shapes(inputs, crop_fish, stop=stop, observer=observer)
         nodes = [

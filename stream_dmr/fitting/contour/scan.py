@@ -36,7 +36,8 @@ def descend(
     options: Options,
 ) -> Minimum:
     """`minimise`, as the scan of one size: so that it is compiled once for both."""
-    return scan_sizes(problem, start, held, _ONE_SIZE, 0.0, options).start
+    # Copied, since arrays of messages are read-only: for numba another type, compiled once more.
+    return scan_sizes(problem, start.copy(), held, _ONE_SIZE, 0.0, options).start
 
 
 @compiled

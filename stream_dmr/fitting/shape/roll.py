@@ -69,7 +69,7 @@ def add_roll_prior(
 
 
 def _turned(pose: Float[np.ndarray, "P"], angle: float) -> Float[np.ndarray, "P"]:
-    R, _ = rotation_and_jacobian(pose[ROOT_ROTATION])
+    R, _ = rotation_and_jacobian(pose[ROOT_ROTATION].copy())
     turned = pose.copy()
     turn = Rotation.from_euler("x", angle).as_matrix()
     turned[ROOT_ROTATION] = Rotation.from_matrix(R @ turn).as_rotvec()
@@ -80,6 +80,7 @@ def _ray(
     pose: Float[np.ndarray, "P"], anchor: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
     """The right Jacobian of the root, and the camera's ray in the body's axes, its z positive."""
-    R, J = rotation_and_jacobian(pose[ROOT_ROTATION])
+    # Copied, since arrays of messages are read-only: for numba another type, compiled once more.
+    R, J = rotation_and_jacobian(pose[ROOT_ROTATION].copy())
     ray = R.T @ (anchor / np.linalg.norm(anchor))
     return J, ray if ray[2] >= 0 else -ray

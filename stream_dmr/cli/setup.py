@@ -1,0 +1,22 @@
+"""`stream-dmr setup`: what is done once after an installation."""
+
+import time
+
+import typer
+
+
+def setup() -> None:
+    """Compile the numeric loops, so that the first run need not; a run does it by itself else."""
+    from rich.console import Console
+
+    from stream_dmr.cli.shared_options import stop_on_signals
+    from stream_dmr.running.prepare_kernels import prepare_kernels
+
+    began, console = time.monotonic(), Console(stderr=True, highlight=False)
+    with stop_on_signals() as stop, console.status("") as status:
+        if not console.is_terminal:
+            console.print("compiling the numeric loops, once on this machine: half a minute")
+        prepare_kernels(status.update, stop=stop)
+    if stop.signal_number:
+        raise typer.Exit(128 + stop.signal_number)
+    print(f"ready, after {time.monotonic() - began:.0f} s")

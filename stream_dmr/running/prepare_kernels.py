@@ -1,0 +1,163 @@
+"""Compiles all kernels of a run, once on a machine, before its first frame waits for one of them.
+
+Two processes share the work. Each takes from the cache what the other has put there: this one
+compiles the largest kernel of a descent first, the other what comes before and after it.
+"""
+
+import fcntl
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from threading import Event
+from typing import IO, Any
+
+import llvmlite.binding
+import numba
+import numpy as np
+
+from stream_dmr.compiled import cache_folder, is_compiling
+from stream_dmr.fitting.compile_kernels import compile_kernels, drawn_fish
+from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
+from stream_dmr.fitting.contour.normal_equations import normal_equations
+from stream_dmr.fitting.contour.outline import Rendering
+from stream_dmr.fitting.contour.problem import Problem
+from stream_dmr.fitting.fit_settings import FitMeshSettings
+from stream_dmr.fitting.fitter import Fitter
+from stream_dmr.fitting.mesh_levels import MeshLevels
+from stream_dmr.fitting.parameters import rest_vector
+from stream_dmr.fitting.target import Target
+from stream_dmr.fitting.warm_start import recentered
+from stream_dmr.messages import Frame
+from stream_dmr.segmentation.detection.motion_detector import MotionDetector, MotionSettings
+from stream_dmr.template.template_file import load_template
+
+_TEMPLATE = "halibut"
+_PAUSE_S = 0.3  # between two looks at what the processes have done
+_ABOUT = 85  # kernels in the cache when all are; for the reader of the progress alone
+
+
+def prepare_kernels(on_progress: Callable[[str], None], *, stop: Event) -> None:
+    """Compile what the cache lacks; `on_progress` gets a line about it now and then.
+
+    Where that fails or `stop` is set, functions are compiled when they are first called.
+    """
+    folder = cache_folder()
+    if not is_compiling() or _is_complete(folder):
+        return
+    with suppress(OSError), (folder / "lock").open("w") as lock:
+        began = time.monotonic()
+        while not stop.is_set() and not _is_complete(folder):
+            if _takes(lock):
+                _compile_all(folder, on_progress, stop=stop)
+                return
+            on_progress(_progress(folder, began))
+            stop.wait(_PAUSE_S)
+
+
+def _compile_all(folder: Path, on_progress: Callable[[str], None], *, stop: Event) -> None:
+    began = time.monotonic()
+    command = [sys.executable, "-P", "-m", __name__]
+    workers = [
+        subprocess.Popen([*command, part], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        for part in _PARTS
+    ]
+    try:
+        while not stop.is_set() and any(worker.poll() is None for worker in workers):
+            on_progress(_progress(folder, began))
+            stop.wait(_PAUSE_S)
+    finally:
+        for worker in workers:
+            worker.terminate()
+            worker.wait()
+    if all(worker.returncode == 0 for worker in workers):
+        (folder / "complete").write_text(kernels_of_machine())
+
+
+def _is_complete(folder: Path) -> bool:
+    try:
+        return (folder / "complete").read_text() == kernels_of_machine()
+    except OSError:
+        return False
+
+
+def kernels_of_machine() -> str:
+    """What compiled functions depend on beside their sources."""
+    return f"numba {numba.__version__}, {llvmlite.binding.get_host_cpu_name()}"
+
+
+def _takes(lock: IO[str]) -> bool:
+    """False while another process compiles."""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _progress(folder: Path, began: float) -> str:
+    count = sum(1 for _ in folder.rglob("*.nbc"))
+    return (
+        f"compiling the numeric loops, once on this machine: {count} of about {_ABOUT}, "
+        f"{time.monotonic() - began:.0f} s"
+    )
+
+
+def _compile_largest() -> None:
+    """The normal equations: by the types of what they take, since none of it is at hand yet."""
+    template, settings = load_template(_TEMPLATE), FitMeshSettings()
+    body = MeshLevels.from_template(template, max_faces=settings.max_faces).fine
+    points, flat, lengths = np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0)
+    picture = np.zeros((0, 0))
+    target = Target(
+        np.eye(3),
+        np.zeros(3),
+        np.zeros(3),
+        np.zeros(2),
+        picture,
+        np.zeros((0, 0), bool),
+        picture,
+        0.0,
+        flat,
+        flat,
+        lengths,
+    )
+    problem = Problem.from_settings(settings, body, target, with_smoothness=True)
+    rendering = Rendering(points, flat, np.zeros((0, 2), np.int64), picture)
+    arguments = (problem, rest_vector(len(body.joints)), rendering)
+    kernel: Any = normal_equations
+    kernel.compile(tuple(numba.typeof(one) for one in arguments))
+
+
+def _compile_rest() -> None:
+    """Targets, the loss and detection, and then whole fits, which need the largest as well."""
+    template, settings = load_template(_TEMPLATE), FitMeshSettings()
+    fitter = Fitter(template, settings)
+    body = MeshLevels.from_template(template, max_faces=settings.max_faces).fine
+    problem = Problem.from_settings(
+        settings, body, fitter.target(drawn_fish()), with_smoothness=True
+    )
+    evaluate(problem, recentered(problem, rest_vector(len(body.joints))), True)
+    _detect()
+    compile_kernels(fitter)
+    # Shapes are learnt from fits without a scan, whose std is that of their covariance.
+    unscanned = settings.model_copy(update={"scan_iterations": 0})
+    Fitter(template, unscanned, with_covariance=True).fit(drawn_fish(), None)
+
+
+def _detect() -> None:
+    """Find a square that moves before a textured background."""
+    detector = MotionDetector(MotionSettings())
+    texture = np.random.default_rng(0).integers(0, 200, (240, 320, 3), np.uint8)
+    for index in range(3):
+        image = texture.copy()
+        image[80:140, 60 + 30 * index : 160 + 30 * index] = 255
+        detector.find(Frame(frame_index=index + 1, timestamp_ns=index, image=image, source=""))
+
+
+_PARTS: dict[str, Callable[[], None]] = {"largest": _compile_largest, "rest": _compile_rest}
+
+if __name__ == "__main__":
+    _PARTS[sys.argv[1]]()
