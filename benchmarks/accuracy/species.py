@@ -105,11 +105,11 @@ def main() -> None:
     names = arguments.templates.split(",")
     tasks = [(catch, FIRST_SEED + k, names) for catch in CATCHES for k in range(arguments.scenes)]
     with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
-        done = pool.map(measure, tasks, chunksize=1)
-    print(f"| | {' | '.join(names)} |\n|{'---|' * (1 + len(names))}")
-    for catch in CATCHES:
-        scenes = [found for (one, *_), found in zip(tasks, done, strict=True) if one == catch]
-        print(f"| {catch} | {' | '.join(_cell(scenes, name) for name in names)} |")
+        done = pool.imap(measure, tasks)
+        print(f"| | {' | '.join(names)} |\n|{'---|' * (1 + len(names))}", flush=True)
+        for catch in CATCHES:
+            scenes = [next(done) for _ in range(arguments.scenes)]
+            print(f"| {catch} | {' | '.join(_cell(scenes, name) for name in names)} |", flush=True)
 
 
 def _cell(scenes: Sequence[dict[str, Measured]], name: str) -> str:
