@@ -2,11 +2,10 @@
 
 import sys
 import traceback
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from contextlib import contextmanager
 from importlib.abc import MetaPathFinder
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated
 
 import typer
@@ -64,9 +63,7 @@ class _WithoutPandas(MetaPathFinder):
     one of its series. No command needs it, and pyarrow does without.
     """
 
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> None:
+    def find_spec(self, fullname: str, path: object, target: object = None) -> None:
         """Raises ModuleNotFoundError for pandas; leaves all else to the other finders."""
         if fullname == "pandas":
             raise ModuleNotFoundError("hidden: see stream_dmr.cli.main", name=fullname)

@@ -9,6 +9,7 @@ from typing import Any
 
 from stream_dmr.errors import OutputError
 from stream_dmr.results.lengths_database import open_for_reading
+from stream_dmr.results.sql import has_table, rows_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,12 +28,6 @@ class AddedTable:
             "STRICT"
         )
 
-    def insertion(self, values: Mapping[str, object]) -> tuple[str, tuple[object, ...]]:
-        """The SQL that adds a row, and its values."""
-        marks = ", ".join("?" for _ in values)
-        statement = f"INSERT INTO {self.name} ({', '.join(values)}) VALUES ({marks})"
-        return statement, tuple(values.values())
-
 
 def read_added(database: Path, table: AddedTable) -> Sequence[Mapping[str, Any]]:
     """The rows of a table in the order of writing, without their numbers; none where it is missing.
@@ -50,12 +45,7 @@ def added_rows(connection: sqlite3.Connection, table: AddedTable) -> list[dict[s
     """As `read_added`, of an open database."""
     if not has_table(connection, table.name):
         return []
-    rows = connection.execute(f"SELECT * FROM {table.name} ORDER BY number")
-    names = [column[0] for column in rows.description]
-    return [dict(zip(names[1:], row[1:], strict=True)) for row in rows]
-
-
-def has_table(connection: sqlite3.Connection, name: str) -> bool:
-    """True where an open database has a table of this name."""
-    query = "SELECT 1 FROM sqlite_master WHERE name = ? AND type = 'table'"
-    return connection.execute(query, (name,)).fetchone() is not None
+    rows = list(rows_of(connection, f"SELECT * FROM {table.name} ORDER BY number"))
+    for row in rows:
+        del row["number"]
+    return rows

@@ -2,14 +2,12 @@
 
 import sqlite3
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, fields
+from dataclasses import asdict, fields
 
 from stream_dmr.results.signatures import ChainEntry, Signer, content_sha256
-
-Statement = tuple[str, tuple[object, ...]]
+from stream_dmr.results.sql import Statement, has_table, insertion, rows_of
 
 _NAMES = ", ".join(field.name for field in fields(ChainEntry))
-_MARKS = ", ".join("?" for _ in fields(ChainEntry))
 _TABLE = """
 CREATE TABLE IF NOT EXISTS chain (
     number INTEGER PRIMARY KEY, -- from 1, without gaps
@@ -47,14 +45,12 @@ class ChainWriter:
         begin: list[Statement] = [] if self._is_begun else [(_TABLE, ())]
         self._is_begun = True
         entry = self._signer.sign(kind, name, sha256)
-        return [*begin, (f"INSERT INTO chain ({_NAMES}) VALUES ({_MARKS})", astuple(entry))]
+        return [*begin, insertion("chain", asdict(entry))]
 
 
 def read_chain(database: sqlite3.Connection) -> Sequence[ChainEntry]:
     """All entries in their order; none where nothing was signed."""
-    query = "SELECT 1 FROM sqlite_master WHERE name = 'chain' AND type = 'table'"
-    if database.execute(query).fetchone() is None:
+    if not has_table(database, "chain"):
         return []
-    rows = database.execute(f"SELECT {_NAMES} FROM chain ORDER BY number")
-    names = [field.name for field in fields(ChainEntry)]
-    return [ChainEntry(**dict(zip(names, row, strict=True))) for row in rows]
+    query = f"SELECT {_NAMES} FROM chain ORDER BY number"
+    return [ChainEntry(**row) for row in rows_of(database, query)]

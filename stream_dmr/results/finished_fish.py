@@ -14,13 +14,14 @@ from stream_dmr.messages import LengthEstimate, Position
 from stream_dmr.recording.messages.run_inputs import RunInputs
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
-from stream_dmr.results.added_tables import added_rows, has_table
+from stream_dmr.results.added_tables import added_rows
 from stream_dmr.results.catch_facts import UNKNOWN_CATCH, CatchFacts
 from stream_dmr.results.hauls import HAULS, haul_at, hauls_of
 from stream_dmr.results.kept_positions import POSITIONS, kept_of, positions_of
 from stream_dmr.results.lengths_database import NAME, open_for_reading
 from stream_dmr.results.run_facts import RunFacts, cut_short, run_facts
 from stream_dmr.results.scale_checks import last_checks
+from stream_dmr.results.sql import has_table, rows_of
 from stream_dmr.results.store_rows import MAY_COUNT_TWICE, estimate_of, read_estimates
 from stream_dmr.results.track_edits import TrackPart, edits_of
 from stream_dmr.results.verdicts import NOT_COUNTED, NOT_REVIEWED, Review, Verdict, reviews_of
@@ -251,10 +252,7 @@ def rows_by_run(
     with closing(open_for_reading(database)) as connection:
         if not has_table(connection, table):
             return {}
-        rows = connection.execute(f"SELECT * FROM {table} ORDER BY number")
-        names = [column[0] for column in rows.description]
-        for values in rows:
-            row = dict(zip(names, values, strict=True))
+        for row in rows_of(connection, f"SELECT * FROM {table} ORDER BY number"):
             added = {name: row.pop(name, None) for name in _CATCH_NAMES}
             facts = {name: value for name, value in added.items() if value is not None}
             line = [*row.values(), *([facts] if facts else [])]
@@ -276,10 +274,8 @@ def flagged_fish(out_dir: Path) -> set[int]:
 
 
 def _runs(connection: sqlite3.Connection) -> Iterator[tuple[str, RunFacts]]:
-    rows = connection.execute("SELECT * FROM runs ORDER BY started_ns")
-    columns = [column[0] for column in rows.description]
-    for values in rows:
-        row = dict(zip(columns, values, strict=True))  # an older database has fewer columns
+    for row in rows_of(connection, "SELECT * FROM runs ORDER BY started_ns"):
+        # An older database has fewer columns.
         known = {f.name: row[f.name] for f in fields(RunFacts) if row.get(f.name) is not None}
         yield row["run_id"], RunFacts(**known)
 
@@ -289,9 +285,7 @@ def _stored_fish(database: Path, reviews: dict[int, Review]) -> list[FishResult]
         with closing(open_for_reading(database)) as connection:
             folder = _Folder(connection)
             estimates = read_estimates(connection)
-            rows = connection.execute("SELECT * FROM fish ORDER BY number")
-            names = [column[0] for column in rows.description]
-            others = [dict(zip(names, row, strict=True)) for row in rows]
+            others = rows_of(connection, "SELECT * FROM fish ORDER BY number")
             return [
                 folder.fish(
                     estimate,

@@ -10,6 +10,7 @@ from typing import Any
 from stream_dmr.errors import OutputError
 from stream_dmr.results.added_tables import AddedTable
 from stream_dmr.results.lengths_database import open_for_writing
+from stream_dmr.results.sql import insertion
 
 START, END = "start", "end"
 HAULS = AddedTable(
@@ -83,6 +84,6 @@ def add_haul(database: Path, values: Mapping[str, Any]) -> None:
     try:
         with closing(open_for_writing(database)) as connection:
             connection.execute(HAULS.statement)
-            connection.execute(*HAULS.insertion(row))
+            connection.execute(*insertion(HAULS.name, row))
     except OSError as error:
         raise OutputError(f"{database}: expected room for a haul, got: {error}") from error

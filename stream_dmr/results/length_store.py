@@ -18,7 +18,7 @@ from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.results.added_tables import AddedTable
 from stream_dmr.results.catch_facts import UNKNOWN_CATCH, CatchFacts
-from stream_dmr.results.chain_table import ChainWriter, Statement, read_chain
+from stream_dmr.results.chain_table import ChainWriter, read_chain
 from stream_dmr.results.folder_lock import FolderLock
 from stream_dmr.results.lengths_database import (
     NAME,
@@ -39,6 +39,7 @@ from stream_dmr.results.signatures import (
     Signer,
     lines_sha256,
 )
+from stream_dmr.results.sql import Statement, insertion
 from stream_dmr.results.store_rows import MAY_COUNT_TWICE, fish_row, read_estimates
 from stream_dmr.results.store_state import REVIEWED_ID, check_lines, read_state
 
@@ -119,11 +120,9 @@ class LengthStore:
         """
         values = fish_row(estimate, flags) | {"iou": iou, "run_id": self.run_id} | asdict(catch)
         values["written_ns"] = time.time_ns()
-        marks = ", ".join("?" for _ in values)
-        statement = f"INSERT INTO fish ({', '.join(values)}) VALUES ({marks})"
         with self._lock:
             signature = self._chain.row(FISH, str(estimate.track_id), values)
-            self._write((statement, tuple(values.values())), *signature)
+            self._write(insertion("fish", values), *signature)
 
     def reserve_track(self, track_id: int) -> None:
         """Mark an id as used, durably: no later run in this folder uses it again."""
@@ -201,10 +200,9 @@ class LengthStore:
         """Write an event that readers of the lengths must know."""
         values = {"run_id": self.run_id, "kind": kind, "text": text}
         values |= {"timestamp_ns": timestamp_ns, "written_ns": time.time_ns()}
-        statement = f"INSERT INTO events ({', '.join(values)}) VALUES (?, ?, ?, ?, ?)"
         with self._lock:
             signature = self._chain.row(EVENT, kind, values)
-            self._write((statement, tuple(values.values())), *signature)
+            self._write(insertion("events", values), *signature)
 
     def append(
         self, table: AddedTable, name: str, values: Mapping[str, object], *, is_urgent: bool = True
@@ -216,7 +214,7 @@ class LengthStore:
         row = {"run_id": self.run_id, **values, "written_ns": time.time_ns()}
         with self._lock:
             signature = self._chain.row(table.kind, name, row)
-            self._pending += [(table.statement, ()), table.insertion(row), *signature]
+            self._pending += [(table.statement, ()), insertion(table.name, row), *signature]
             if is_urgent:
                 self._write_pending()
 
@@ -304,11 +302,9 @@ class LengthStore:
     def _begin_run(self, *, waits_for_disk: bool) -> None:
         values = {"run_id": self.run_id, "started_ns": time.time_ns()}
         values |= {field.name: getattr(self._facts, field.name) for field in fields(self._facts)}
-        marks = ", ".join("?" for _ in values)
-        statement = f"INSERT INTO runs ({', '.join(values)}) VALUES ({marks})"
         begun = {k: v for k, v in values.items() if k not in END_COLUMNS}
         signature = self._chain.row(RUN, self.run_id, begun)
-        self._pending += [(statement, tuple(values.values())), *signature]
+        self._pending += [insertion("runs", values), *signature]
         if self._is_reached:
             self._write_pending()
             if self.trouble and not waits_for_disk:

@@ -12,6 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from stream_dmr.errors import OutputError
+from stream_dmr.results.sql import add_columns, has_table
 
 NAME = "lengths.db"
 VERSION = 1  # PRAGMA user_version
@@ -169,7 +170,7 @@ def _opened(address: str, path: Path, *, make_tables: bool = False) -> sqlite3.C
         _check(database, path)
         if make_tables:
             _prepare(database)
-        elif database.execute("SELECT 1 FROM sqlite_master WHERE name = 'fish'").fetchone() is None:
+        elif not has_table(database, "fish"):
             raise sqlite3.DatabaseError("it has no tables: nothing could ever be written")
     except BaseException:
         database.close()
@@ -238,6 +239,4 @@ def _prepare(database: sqlite3.Connection) -> None:
             f"PRAGMA user_version = {VERSION}; COMMIT;"
         )
     for table, columns in _ADDED_COLUMNS.items():
-        known = {column[1] for column in database.execute(f"PRAGMA table_info({table})")}
-        for name in columns.keys() - known:
-            database.execute(f"ALTER TABLE {table} ADD COLUMN {name} {columns[name]}")
+        add_columns(database, table, columns)

@@ -3,13 +3,14 @@
 import sqlite3
 import time
 from contextlib import closing, suppress
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 
 from stream_dmr.errors import OutputError
 from stream_dmr.results.lengths_database import open_for_reading, open_for_writing
+from stream_dmr.results.sql import has_table, insertion, rows_of
 
 _TABLE = """
 CREATE TABLE IF NOT EXISTS checks (
@@ -75,12 +76,11 @@ class ScaleAlarm:
 
 def add_check(database: Path, check: ScaleCheck) -> None:
     """Write a check into a lengths.db, durably. Raises OutputError."""
-    row = astuple(replace(check, time_ns=time.time_ns()))
+    row = asdict(replace(check, time_ns=time.time_ns()))
     try:
         with closing(open_for_writing(database)) as connection:
             connection.execute(_TABLE)
-            marks = ", ".join("?" for _ in row)
-            connection.execute(f"INSERT INTO checks ({', '.join(_NAMES)}) VALUES ({marks})", row)
+            connection.execute(*insertion("checks", row))
     except sqlite3.Error as error:
         raise OutputError(f"{database}: expected room for a check, got: {error}") from error
 
@@ -89,11 +89,10 @@ def last_checks(database: Path) -> dict[str, ScaleCheck]:
     """The last check by the SHA-256 of its calibration. Raises OutputError."""
     try:
         with closing(open_for_reading(database)) as connection:
-            query = "SELECT 1 FROM sqlite_master WHERE name = 'checks' AND type = 'table'"
-            if connection.execute(query).fetchone() is None:
+            if not has_table(connection, "checks"):
                 return {}
-            rows = connection.execute(f"SELECT {', '.join(_NAMES)} FROM checks ORDER BY number")
-            checks = [ScaleCheck(**dict(zip(_NAMES, row, strict=True))) for row in rows]
+            query = f"SELECT {', '.join(_NAMES)} FROM checks ORDER BY number"
+            checks = [ScaleCheck(**row) for row in rows_of(connection, query)]
     except sqlite3.Error as error:
         raise OutputError(f"{database}: expected checks of the scale, got: {error}") from error
     return {check.calibration_sha256: check for check in checks}

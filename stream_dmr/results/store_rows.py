@@ -11,6 +11,7 @@ import numpy as np
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.results.catch_facts import CatchFacts
 from stream_dmr.results.lengths_database import FISH_COLUMNS
+from stream_dmr.results.sql import columns_of, rows_of
 
 MAY_COUNT_TWICE = "may count twice"
 # A flag of a fish that was in view at a crash: it came into view again, with another number.
@@ -34,12 +35,12 @@ def read_estimates(
 ) -> Iterator[LengthEstimate]:
     """The final estimates, or the `last` few; the recordings have their smoothed series."""
     names = [*FISH_COLUMNS, "ci95_low_mm", "ci95_high_mm", "refused"]
-    known = {column[1] for column in database.execute("PRAGMA table_info(fish)")}
+    known = columns_of(database, "fish")
     names += [field.name for field in fields(CatchFacts) if field.name in known]
     wanted = "" if last is None else "WHERE number > (SELECT MAX(number) FROM fish) - ?"
     query = f"SELECT {', '.join(names)} FROM fish {wanted} ORDER BY number"
-    for values in database.execute(query, () if last is None else (last,)):
-        yield estimate_of(dict(zip(names, values, strict=True)))
+    for row in rows_of(database, query, () if last is None else (last,)):
+        yield estimate_of(row)
 
 
 def estimate_of(row: Mapping[str, Any]) -> LengthEstimate:

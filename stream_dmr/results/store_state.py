@@ -8,6 +8,8 @@ import sqlite3
 from collections.abc import Mapping, Sequence
 from hashlib import sha256
 
+from stream_dmr.results.sql import has_table
+
 # The mark of the last id that a reviewer gave to a fish. Verdicts are summed up by themselves.
 REVIEWED_ID = "reviewed_id"
 
@@ -17,7 +19,6 @@ _MARKS = (
 )
 _CLIPS = "SELECT name, frames_done, is_done FROM clips ORDER BY name"
 _SCENES = "SELECT calibration_sha256, data FROM scenes ORDER BY calibration_sha256"
-_HAS_CHECKS = "SELECT 1 FROM sqlite_master WHERE name = 'checks' AND type = 'table'"
 
 
 def read_state(database: sqlite3.Connection) -> Mapping[str, object]:
@@ -31,6 +32,6 @@ def read_state(database: sqlite3.Connection) -> Mapping[str, object]:
 
 def check_lines(database: sqlite3.Connection) -> Sequence[str]:
     """The checks of the scale in their order, each as a line of JSON; rows are only added."""
-    if database.execute(_HAS_CHECKS).fetchone() is None:
+    if not has_table(database, "checks"):
         return []
     return [json.dumps(row) for row in database.execute("SELECT * FROM checks ORDER BY number")]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.results.lengths_database import DiskRefusal, open_for_reading, open_for_writing
+from stream_dmr.results.sql import add_columns, columns_of, has_table, insertion, rows_of
 from stream_dmr.results.store_state import REVIEWED_ID
 from stream_dmr.results.verdicts import Verdict
 
@@ -83,9 +84,9 @@ def add_verdict(
                     "verdict: expected the fish as this page shows them, but another reviewer "
                     "has changed them meanwhile; look again, and repeat it"
                 )
-            _insert(database, "verdicts", asdict(verdict))
+            database.execute(*insertion("verdicts", asdict(verdict)))
             for frame in frames:
-                _insert(database, "added_frames", asdict(frame))
+                database.execute(*insertion("added_frames", asdict(frame)))
             if new_fish is not None:
                 database.execute(_USED, (new_fish,))  # no later run may use it
     return verdict
@@ -94,23 +95,23 @@ def add_verdict(
 def read_verdicts(path: Path) -> list[Verdict]:
     """All verdicts of a lengths.db in the order of writing. Raises OutputError."""
     with _refusing(path), closing(open_for_reading(path)) as database:
-        if not (there := _columns(database, "verdicts")):
+        if not (there := columns_of(database, "verdicts")):
             return []
         names = [field.name for field in fields(Verdict) if field.name in there]
-        rows = database.execute(f"SELECT {', '.join(names)} FROM verdicts ORDER BY number")
-        return [Verdict(**dict(zip(names, row, strict=True))) for row in rows]
+        query = f"SELECT {', '.join(names)} FROM verdicts ORDER BY number"
+        return [Verdict(**row) for row in rows_of(database, query)]
 
 
 def read_added_frames(path: Path) -> dict[int, list[AddedFrame]]:
     """The frames of the fish that reviewers added, by track id. Raises OutputError."""
     frames: dict[int, list[AddedFrame]] = {}
     with _refusing(path), closing(open_for_reading(path)) as database:
-        if not _columns(database, "added_frames"):
+        if not has_table(database, "added_frames"):
             return {}
         names = [field.name for field in fields(AddedFrame)]
         query = f"SELECT {', '.join(names)} FROM added_frames ORDER BY track_id, frame_index"
-        for row in database.execute(query):
-            frame = AddedFrame(**dict(zip(names, row, strict=True)))
+        for row in rows_of(database, query):
+            frame = AddedFrame(**row)
             frames.setdefault(frame.track_id, []).append(frame)
     return frames
 
@@ -131,22 +132,9 @@ def verdict_line(verdict: Verdict) -> str:
     return json.dumps({n: v for n, v in values.items() if v is not None or n not in _ADDED_COLUMNS})
 
 
-def _insert(database: sqlite3.Connection, table: str, values: dict[str, object]) -> None:
-    marks = ", ".join("?" for _ in values)
-    statement = f"INSERT INTO {table} ({', '.join(values)}) VALUES ({marks})"
-    database.execute(statement, list(values.values()))
-
-
 def _prepare(database: sqlite3.Connection) -> None:
     database.executescript(_TABLES)
-    there = _columns(database, "verdicts")
-    for name, kind in _ADDED_COLUMNS.items():
-        if name not in there:
-            database.execute(f"ALTER TABLE verdicts ADD COLUMN {name} {kind}")
-
-
-def _columns(database: sqlite3.Connection, table: str) -> set[str]:
-    return {column[1] for column in database.execute(f"PRAGMA table_info({table})")}
+    add_columns(database, "verdicts", _ADDED_COLUMNS)
 
 
 @contextmanager

@@ -34,6 +34,7 @@ from stream_dmr.results.signatures import (
     lines_sha256,
 )
 from stream_dmr.results.signed_files import RECORDINGS
+from stream_dmr.results.sql import rows_of
 from stream_dmr.results.store_state import check_lines, read_state
 from stream_dmr.results.verify_added import added_changes, unsigned_rows
 
@@ -85,9 +86,7 @@ def check_signatures(folder: Path, key: Ed25519PublicKey) -> SignatureCheck:
 
 def _rows(database: sqlite3.Connection, table: str) -> list[_Row]:
     order = "started_ns" if table == "runs" else "number"
-    rows = database.execute(f"SELECT * FROM {table} ORDER BY {order}")
-    names = [column[0] for column in rows.description]
-    return [dict(zip(names, row, strict=True)) for row in rows]
+    return list(rows_of(database, f"SELECT * FROM {table} ORDER BY {order}"))
 
 
 def _broken_links(entries: Sequence[ChainEntry], key: Ed25519PublicKey) -> Iterator[str]:

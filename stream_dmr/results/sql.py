@@ -1,0 +1,40 @@
+"""Statements and questions that every table of a lengths.db needs."""
+
+import sqlite3
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+Statement = tuple[str, tuple[object, ...]]
+"""SQL, and the values of its marks."""
+
+
+def insertion(table: str, values: Mapping[str, object]) -> Statement:
+    """The statement that adds a row; `values` by column."""
+    marks = ", ".join("?" for _ in values)
+    return f"INSERT INTO {table} ({', '.join(values)}) VALUES ({marks})", tuple(values.values())
+
+
+def rows_of(
+    database: sqlite3.Connection, query: str, values: tuple[object, ...] = ()
+) -> Iterator[dict[str, Any]]:
+    """The rows that a query finds, by column."""
+    found = database.execute(query, values)
+    names = [column[0] for column in found.description]
+    return (dict(zip(names, row, strict=True)) for row in found)
+
+
+def has_table(database: sqlite3.Connection, name: str) -> bool:
+    """True where there is a table of this name."""
+    query = "SELECT 1 FROM sqlite_master WHERE name = ? AND type = 'table'"
+    return database.execute(query, (name,)).fetchone() is not None
+
+
+def add_columns(database: sqlite3.Connection, table: str, columns: Mapping[str, str]) -> None:
+    """Add the columns (name -> type) that a table of an earlier version lacks."""
+    for name in columns.keys() - columns_of(database, table):
+        database.execute(f"ALTER TABLE {table} ADD COLUMN {name} {columns[name]}")
+
+
+def columns_of(database: sqlite3.Connection, table: str) -> set[str]:
+    """The names of a table's columns; none where there is no such table."""
+    return {column[1] for column in database.execute(f"PRAGMA table_info({table})")}
