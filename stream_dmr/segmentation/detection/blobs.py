@@ -11,6 +11,7 @@ from jaxtyping import Bool, UInt8
 # Chosen on simulated scenes (seeds 900 to 903) and the trout clip; see docs/research/raw-video.md.
 _POLE_WIDTH = 1 / 50  # of the longer side; what is thinner throughout may be a gaff or a line
 _MIN_BODY_AREA = 3.0  # pole widths squared; a smaller thick part is a bend of a thin object
+_MIN_BODY_RATIO = 0.3  # of the largest thick part; smaller ones are fins and hooks
 _MAX_END_LENGTH = 0.35  # of the thick part's length, that tail and snout may add
 _MIN_THICKNESS = 0.06  # mean thickness over length; fish seen edge-on are thicker
 _MIN_THICKNESS_PX = 3.5
@@ -44,43 +45,61 @@ def fish_blobs(
             refused[Refusal.THIN if touches_edge else Refusal.SHORT] += 1
             continue
         part = np.s_[y : y + h, x : x + w]
-        blob = _without_poles(labels[part] == label, pole_px, touches_edge=touches_edge)
-        refusal = Refusal.THIN
-        if blob is not None:
+        blobs = _without_poles(labels[part] == label, pole_px, touches_edge=touches_edge)
+        refused[Refusal.THIN] += not blobs
+        for blob in blobs:
             refusal = _refusal(blob, min_length_px, max_length_px)
-        if blob is not None and refusal is None:
-            shape = np.zeros_like(moving)
-            shape[part] = blob
-            fish.append(shape)
-        elif refusal is not None:
-            refused[refusal] += 1
-    return fish, refused
+            if refusal is None:
+                shape = np.zeros_like(moving)
+                shape[part] = blob
+                fish.append(shape)
+            else:
+                refused[refusal] += 1
+    return fish, +refused
 
 
 def _without_poles(
     blob: Bool[np.ndarray, "h w"], pole_px: int, *, touches_edge: bool
-) -> Bool[np.ndarray, "h w"] | None:
-    """The thick part of a blob with a fish's thin ends; None for a mere pole or line."""
+) -> list[Bool[np.ndarray, "h w"]]:
+    """The thick parts of a blob, each with a fish's thin ends; none for a mere pole or line.
+
+    Two thick parts that only a thin bridge joins are two fish that touch each other.
+    """
     region = np.pad(blob, pole_px).astype(np.uint8)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (pole_px, pole_px))
-    body = _largest_component(cv2.morphologyEx(region, cv2.MORPH_OPEN, kernel))
-    if np.count_nonzero(body) < _MIN_BODY_AREA * pole_px**2:
-        return None if touches_edge else blob
-    body_px = max(cv2.boundingRect(body)[2:])
-    end_px = round(_MAX_END_LENGTH * body_px)
-    if max(blob.shape) <= body_px + end_px:
-        return blob
-    for _ in range(max(1, end_px // 2)):  # grow within the blob: back to the ends, no further
-        body = cv2.bitwise_and(cv2.dilate(body, np.ones((3, 3), np.uint8)), region)
-    return body[pole_px:-pole_px, pole_px:-pole_px] > 0
+    bodies = _bodies(cv2.morphologyEx(region, cv2.MORPH_OPEN, kernel), _MIN_BODY_AREA * pole_px**2)
+    if not bodies:
+        return [] if touches_edge else [blob]
+    body_px = [max(cv2.boundingRect(body)[2:]) for body in bodies]
+    if len(bodies) == 1 and max(blob.shape) <= body_px[0] + round(_MAX_END_LENGTH * body_px[0]):
+        return [blob]
+    fish = _with_ends(bodies, [round(_MAX_END_LENGTH * px) for px in body_px], region)
+    return [one[pole_px:-pole_px, pole_px:-pole_px] > 0 for one in fish]
 
 
-def _largest_component(mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
-    if count < 3:
-        return mask
-    largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-    return (labels == largest).astype(np.uint8)
+def _bodies(opened: UInt8[np.ndarray, "h w"], min_area_px: float) -> list[UInt8[np.ndarray, "h w"]]:
+    """The largest component, and those that are nearly as large; a tail fin is not."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    least = max(min_area_px, _MIN_BODY_RATIO * max(areas, default=0))
+    return [(labels == i).astype(np.uint8) for i in range(1, count) if areas[i - 1] >= least]
+
+
+def _with_ends(
+    bodies: list[UInt8[np.ndarray, "h w"]], ends_px: list[int], region: UInt8[np.ndarray, "h w"]
+) -> list[UInt8[np.ndarray, "h w"]]:
+    """Bodies grown within a region, back to the ends and no further, each before the others."""
+    free = region.copy()
+    for body in bodies:
+        free[body > 0] = 0
+    grown = [body.copy() for body in bodies]
+    for step in range(max(1, max(ends_px) // 2)):
+        for body, end_px in zip(grown, ends_px, strict=True):
+            if step < max(1, end_px // 2):
+                new = cv2.bitwise_and(cv2.dilate(body, np.ones((3, 3), np.uint8)), free)
+                body[new > 0] = 1
+                free[new > 0] = 0
+    return grown
 
 
 def _refusal(

@@ -18,6 +18,9 @@ class Candidate:
     score: float  # 0 to 1
     # Silhouette within `whole_pixels` of the box; None from a detector of boxes alone.
     foreground: Bool[np.ndarray, "h w"] | None = None
+    # Of a shape found by its looks and not by its motion: the middle, x and y in px of a view that
+    # does not move with the camera. It counts as a fish once it has moved there. None: it moves.
+    unmoved_at_px: Float[np.ndarray, "2"] | None = None
 
 
 @runtime_checkable
@@ -38,3 +41,9 @@ def whole_pixels(bbox_xyxy_px: Float[np.ndarray, "4"]) -> tuple[int, int, int, i
     """x0, y0, x1, y1 of a box rounded to pixel edges, at least one pixel wide and high."""
     x0, y0, x1, y1 = np.round(bbox_xyxy_px).astype(int).tolist()
     return x0, y0, max(x1, x0 + 1), max(y1, y0 + 1)
+
+
+def fraction_inside(box: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> float:
+    """The fraction of the area of `box` that lies inside `other`, 0 to 1."""
+    overlap = np.minimum(box[2:], other[2:]) - np.maximum(box[:2], other[:2])
+    return float(np.prod(np.maximum(overlap, 0)) / max(np.prod(box[2:] - box[:2]), 1e-9))

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 from pydantic import Field
 
 from stream_dmr.compiled import compiled
@@ -86,6 +86,13 @@ class MotionDetector:
         )
         self._refused.update(refused)
         return [_candidate(blob, width=width, height=height) for blob in blobs]
+
+    def scene_point(
+        self, point: Float[np.ndarray, "2"], *, shape: tuple[int, ...]
+    ) -> Float[np.ndarray, "2"]:
+        """A point of the last frame, of shape (H, W), without the camera's motion; px."""
+        scale = min(1.0, self._settings.motion_working_px / max(shape))
+        return self._background_from_picture @ [*(point * scale), 1.0] / scale
 
     def _find_moving(self, small: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
         """True where a picture differs from its background and moves; learns the background."""

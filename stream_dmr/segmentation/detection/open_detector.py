@@ -1,11 +1,13 @@
 """Open the detector that `[detect_fish] detector` names."""
 
+from functools import partial
 from pathlib import Path
 
 from pydantic import Field
 
 from stream_dmr.errors import ModelError
 from stream_dmr.segmentation.detection.detector import Detector
+from stream_dmr.segmentation.detection.fused_detector import FusedDetector
 from stream_dmr.segmentation.detection.motion_detector import MotionDetector, MotionSettings
 from stream_dmr.segmentation.detection.onnx_detector import OnnxDetector, OnnxSettings
 from stream_dmr.segmentation.detection.unet_detector import UNetDetector
@@ -43,14 +45,18 @@ def open_detector(settings: DetectFishSettings) -> Detector:
     cannot be used.
     """
     if settings.detector == "motion":
-        return MotionDetector(settings)
+        return FusedDetector(MotionDetector(settings), partial(_open_unet, SHIPPED, settings))
     suffix = Path(settings.detector).suffix.lower()
     path = SHIPPED if settings.detector == "unet" else Path(settings.detector)
     if path == SHIPPED or suffix == ".pt" or (suffix == ".onnx" and is_unet_file(path)):
-        return UNetDetector(UNetSegmenter.load(path), longer_px=settings.unet_working_px)
+        return _open_unet(path, settings)
     if suffix == ".onnx":
         return OnnxDetector(Path(settings.detector), settings)
     raise ModelError(
         f'[detect_fish] detector: expected "motion", "unet" or a path that ends in .pt or .onnx, '
         f'got "{settings.detector}"'
     )
+
+
+def _open_unet(path: Path, settings: UNetDetectorSettings) -> UNetDetector:
+    return UNetDetector(UNetSegmenter.load(path), longer_px=settings.unet_working_px)

@@ -51,11 +51,11 @@ class FishConfirmation:
         self._confirmed: set[int] = set()  # track numbers
         self._num_clear_frames: Counter[int] = Counter()  # of unconfirmed tracks
 
-    def update(self, number: int, crop: FishCrop) -> bool:
+    def update(self, number: int, crop: FishCrop, *, may_count: bool = True) -> bool:
         """Take a track's crop of one frame into account; returns True once it is confirmed.
 
-        A confirmed fish remains one outside the zone. A crop without `mask_confidence` (a given
-        mask) counts as clearly seen.
+        `may_count`: False while its looks alone speak for a fish. A confirmed fish remains one
+        outside the zone. A crop without `mask_confidence` (a given mask) counts as clearly seen.
         """
         if number not in self._confirmed:
             confidence = crop.quality.mask_confidence
@@ -63,7 +63,7 @@ class FishConfirmation:
                 self._num_clear_frames[number] += 1
                 if len(self._num_clear_frames) > _MAX_UNCONFIRMED_TRACKS:
                     del self._num_clear_frames[min(self._num_clear_frames)]
-            if not self._is_confirmed_by(number, crop):
+            if not (may_count and self._is_confirmed_by(number, crop)):
                 return False
             self._confirmed.add(number)
             del self._num_clear_frames[number]

@@ -4,8 +4,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from stream_dmr.segmentation.detection.detector import Candidate, whole_pixels
+from stream_dmr.segmentation.detection.detector import Candidate, fraction_inside, whole_pixels
 from stream_dmr.segmentation.masks.crop_quality import touches_border
+from stream_dmr.segmentation.tracking.appearance import root_histogram
 
 
 class Observation:
@@ -32,7 +33,7 @@ class Observation:
         self.length = oriented_extent(silhouette > 0)[1]
         region = image[y0:y1, x0:x1]
         inside = silhouette[: region.shape[0], : region.shape[1]].astype(np.uint8)
-        self.colour = np.array(cv2.mean(region, inside)[:3])  # mean B, G, R; grey levels
+        self.histogram = root_histogram(region, inside > 0)
         edges = np.array([x0, y0, x1, y1], np.float64)
         self.touches_border = touches_border(edges, shape=image.shape[:2])
 
@@ -44,12 +45,6 @@ class Observation:
     def fraction_inside(self, box: Float[np.ndarray, "4"]) -> float:
         """The fraction of this observation's box that lies inside `box`."""
         return fraction_inside(self.box, box)
-
-
-def fraction_inside(box: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> float:
-    """The fraction of the area of `box` that lies inside `other`, 0 to 1."""
-    overlap = np.minimum(box[2:], other[2:]) - np.maximum(box[:2], other[:2])
-    return float(np.prod(np.maximum(overlap, 0)) / max(np.prod(box[2:] - box[:2]), 1e-9))
 
 
 def oriented_extent(shape: Bool[np.ndarray, "H W"]) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 While several fish form one blob, nothing tells which part is whose. Each track therefore keeps a
 snapshot from before they met, predicted at the speed that it had then. When blobs separate, all
-snapshots are assigned to all observations at once, by position, length, area and colour, so that
+snapshots are assigned to all observations at once, by position, length, area and colours, so that
 even a swap made in the meantime is undone. The same re-identifies a fish that was behind something.
 """
 
@@ -10,9 +10,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from scipy.optimize import linear_sum_assignment
 
+from stream_dmr.segmentation.tracking.appearance import dissimilarity
 from stream_dmr.segmentation.tracking.observation import Observation
 
 IMPOSSIBLE = 1e6  # cost of an assignment that is ruled out; above any sum of real costs
@@ -22,8 +23,8 @@ _MAX_DISTANCE = 1.5  # lengths between the predicted and the observed center
 _POSITION_STD = 0.25  # lengths
 _LOG_LENGTH_STD = 0.3  # fish turn and bend
 _LOG_AREA_STD = 0.7
-_COLOUR_STD = 25.0  # grey levels
-_MAX_COST = 12.0  # of seven squares (x, y, length, area, three colours), each about 1
+_DISSIMILARITY = 0.02  # of colours that costs as much as one standard deviation; fish turn
+_MAX_COST = 12.0  # of four squares (x, y, length, area), each about 1, and the colours
 _MAX_COST_OF_NEW = 5.0  # for an observation that no track has followed yet
 _OWNER_DISCOUNT = 0.5  # keeps an observation with its track unless another fits clearly better
 _SPEED_DECAY = 0.95  # per frame, of a fish that no visible blob hides
@@ -37,7 +38,7 @@ class TrackSnapshot:
     covariance: Float[np.ndarray, "4 4"]
     area: float  # px^2
     length: float  # px
-    colour: Float[np.ndarray, "3"]  # mean B, G, R; grey levels
+    histogram: Float32[np.ndarray, "N"]  # of colours, from `root_histogram`
     is_covered: bool = False  # predicted inside a visible blob, which hides it
 
     def predict(self, F: Float[np.ndarray, "4 4"], Q: Float[np.ndarray, "4 4"]) -> None:
@@ -66,7 +67,7 @@ class TrackSnapshot:
         cost = offset @ offset / (_POSITION_STD * self.length) ** 2
         cost += (np.log(observation.length / self.length) / _LOG_LENGTH_STD) ** 2
         cost += (np.log(observation.area / self.area) / _LOG_AREA_STD) ** 2
-        cost += np.sum((observation.colour - self.colour) ** 2) / _COLOUR_STD**2
+        cost += dissimilarity(observation.histogram, self.histogram) / _DISSIMILARITY
         return float(cost) if cost < _MAX_COST else IMPOSSIBLE
 
     def is_inside(self, box: Float[np.ndarray, "4"]) -> bool:

@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.kalman_equations import predict, update
-from stream_dmr.segmentation.detection.detector import Candidate
-from stream_dmr.segmentation.tracking.observation import Observation, fraction_inside
+from stream_dmr.segmentation.detection.detector import Candidate, fraction_inside
+from stream_dmr.segmentation.tracking.appearance import dissimilarity
+from stream_dmr.segmentation.tracking.observation import Observation
 from stream_dmr.segmentation.tracking.occlusion import IMPOSSIBLE, TrackSnapshot
 from stream_dmr.segmentation.tracking.split_blobs import PredictedSilhouette
 
@@ -18,14 +19,17 @@ _POSITION_STD = 0.08  # of a candidate's center
 _SPEED_STD = 0.5  # of a new fish, per frame
 _ACCELERATION_STD = 0.06  # per frame squared
 _LOG_AREA_STD = 0.5  # from frame to frame: flatfish turn edge-on within three
-_COLOUR_STD = 25.0  # grey levels: one side of a flatfish is dark, and turning shades it
-_MAX_COST = 25.0  # of six squares (x, y, area, three colours), each about 1
-_MAX_DISTANCE = 1.2  # sizes between the predicted and the observed center
+_DISSIMILARITY = 0.003  # of colours, per frame, that costs as much as one standard deviation
+_MAX_DISSIMILAR_FRAMES = 10  # over which colours go on changing: fish turn, and are shaded
+_PART_RATIO = 3.0  # of the colours of a part of a fish, likewise
+_MAX_COST = 25.0  # of three squares (x, y, area), each about 1, and the colours
+_MAX_DISTANCE = 0.7  # sizes between the predicted and the observed center
 _MAX_SHORTENING = 0.93  # of the length, per frame: a fish that turns seems shorter than it is
 _PIECE_VARIANCE_RATIO = 9.0  # variance of a piece's center over that of a whole candidate's
-_LEARNING_RATE = 0.35  # of area and colour, per frame
+_LEARNING_RATE = 0.35  # of the area, per frame
 _MIN_HIDEABLE_FRAMES = 3  # frames seen from which on a track is kept while another fish hides it
 _MAX_MERGED_FRAMES = 30  # that fish may stay merged in one candidate
+_MIN_MOTION = 0.35  # sizes, from where looks alone first found a fish
 _SNAPSHOT_DELAY = 3  # frames: silhouettes are wrong some frames before a merge shows
 _H = np.eye(2, 4)  # of the state, the center is seen
 _SETTLING_FRAMES = 5  # consecutive frames seen separately after which an identity is certain
@@ -38,6 +42,7 @@ class TrackedCandidate:
     track_number: int  # from 1; a fish id is given at confirmation
     candidate: Candidate
     visible_fraction: float  # 0 to 1
+    has_moved: bool  # False: it may be a mark that looks like a fish
 
 
 class Track:
@@ -48,13 +53,16 @@ class Track:
         self.observation, self.number, self.frame_index = observation, number, frame_index
         # As last seen separately: following pieces, position and size would drift.
         self._whole = observation
-        self.area, self.colour = observation.area, observation.colour
+        self.area, self.histogram = observation.area, observation.histogram
         self.length = observation.length
-        self.was_separate = not observation.is_piece  # what is always a piece may be no fish
+        self.was_separate = not observation.is_piece
+        self._unmoved_from = observation.candidate.unmoved_at_px
+        self._has_moved = self._unmoved_from is None
         self.lost_frames, self.frames_seen, self._merged_frames = 0, 1, 0
         self.snapshot: TrackSnapshot | None = None  # None while the identity is certain
         self._history: deque[TrackSnapshot] = deque(maxlen=_SNAPSHOT_DELAY)
         self._separate_frames = 1
+        self._histogram_frame = frame_index  # in which `histogram` was seen
         self._x = np.array([*observation.center, 0.0, 0.0])[:, None]  # center x, y; speed per frame
         self._P = np.diag([_POSITION_STD**2] * 2 + [_SPEED_STD**2] * 2) * self.size**2
         self._R = np.eye(2) * (_POSITION_STD * self.size) ** 2
@@ -109,6 +117,7 @@ class Track:
         """Take an observation for this fish."""
         self.observation, self.lost_frames, self._merged_frames = observation, 0, 0
         self.frames_seen += 1
+        self._has_moved = self._has_moved or self._is_moving(observation)
         self._separate_frames = 0 if observation.is_piece else self._separate_frames + 1
         if observation.is_piece and self.was_separate:
             self._move_towards(observation, R=_PIECE_VARIANCE_RATIO * self._R)
@@ -120,12 +129,19 @@ class Track:
         rate = max(_LEARNING_RATE, 1 / self.frames_seen)
         if not observation.touches_border or observation.area > self.area:  # else it is cut off
             self.area *= (observation.area / self.area) ** rate
-        self.colour = self.colour + rate * (observation.colour - self.colour)
+        self.histogram, self._histogram_frame = observation.histogram, self.frame_index
         if self.snapshot is None:
             self._history.append(self._current_snapshot())
 
     def _move_towards(self, observation: Observation, *, R: Float[np.ndarray, "2 2"]) -> None:
         self._x, self._P = update(self._x, self._P, observation.center[:, None], R=R, H=_H)
+
+    def _is_moving(self, observation: Observation) -> bool:
+        """True where it is found by its motion, or away from where it was first seen unmoved."""
+        place = observation.candidate.unmoved_at_px
+        if place is None or self._unmoved_from is None:
+            return True
+        return bool(np.hypot(*(place - self._unmoved_from)) > _MIN_MOTION * self.size)
 
     def _current_snapshot(self) -> TrackSnapshot:
         return TrackSnapshot(
@@ -133,7 +149,7 @@ class Track:
             covariance=self._P.copy(),
             area=self.area,
             length=self.length,
-            colour=self.colour,
+            histogram=self.histogram,
         )
 
     def make_uncertain(self) -> TrackSnapshot:
@@ -152,7 +168,8 @@ class Track:
         """Continue as another fish: with its number and features, at this track's position."""
         if number != self.number:
             self.number, self.snapshot = number, snapshot
-            self.area, self.length, self.colour = snapshot.area, snapshot.length, snapshot.colour
+            self.area, self.length = snapshot.area, snapshot.length
+            self.histogram = snapshot.histogram
 
     def resume(self, observation: Observation) -> None:
         """Continue from the snapshot with an observation after a gap."""
@@ -171,8 +188,16 @@ class Track:
             growth = max(growth, 0.0)
         num_steps = float(max(1, self.lost_frames))  # in which an unseen fish may have turned
         cost = offset @ np.linalg.solve(S, offset) + (growth / _LOG_AREA_STD) ** 2 / num_steps
-        cost += np.sum((observation.colour - self.colour) ** 2) / _COLOUR_STD**2
+        cost += self._cost_of_colours(observation)
         return float(cost) if cost < _MAX_COST else IMPOSSIBLE
+
+    def _cost_of_colours(self, observation: Observation) -> float:
+        passed = max(1, self.frame_index - self._histogram_frame)
+        is_part = observation.is_piece or observation.touches_border
+        allowed = (
+            _DISSIMILARITY * min(passed, _MAX_DISSIMILAR_FRAMES) * (_PART_RATIO if is_part else 1.0)
+        )
+        return dissimilarity(observation.histogram, self.histogram) / allowed
 
     def fraction_inside(self, box: Float[np.ndarray, "4"]) -> float:
         """The fraction of this fish's predicted box that lies inside `box`."""
@@ -207,4 +232,5 @@ class Track:
             track_number=self.number,
             candidate=self.observation.candidate,
             visible_fraction=min(1.0, self.observation.area / self.area) if is_cut else 1.0,
+            has_moved=self._has_moved,
         )

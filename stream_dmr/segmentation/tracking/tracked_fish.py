@@ -26,6 +26,7 @@ class TrackedFish:
         self._corrector = BoxCorrector()
         self._settings = settings
         self._seen = Sightings()
+        self._unmoved: set[int] = set()  # tracks that may be marks that look like fish
         self._found_any = False
 
     def detect(self, frame: Frame) -> list[Detection]:
@@ -36,6 +37,7 @@ class TrackedFish:
         self._seen.candidates += len(candidates)
         boxes = {one.track_number: one.candidate.bbox_xyxy_px for one in tracked}
         visible = {one.track_number: one.visible_fraction for one in tracked}
+        self._unmoved = {one.track_number for one in tracked if not one.has_moved}
         return self._corrector.correct(boxes, visible, frame)
 
     @property
@@ -46,7 +48,11 @@ class TrackedFish:
     def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:
         """The track numbers of confirmed fish; `crops` are those of all detections of the frame."""
         self._corrector.update(crops)
-        fish = [track for track, crop in crops.items() if self._confirmation.update(track, crop)]
+        fish = [
+            track
+            for track, crop in crops.items()
+            if self._confirmation.update(track, crop, may_count=track not in self._unmoved)
+        ]
         self._found_any = self._found_any or bool(fish)
         self._seen.tracks = max(self._seen.tracks, *crops) if crops else self._seen.tracks
         for crop in crops.values():

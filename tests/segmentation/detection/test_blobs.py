@@ -35,6 +35,29 @@ def test_a_connected_gaff_is_removed_from_a_fish():
     assert 235 < y + h < 245
 
 
+def test_two_fish_that_touch_by_their_tails_are_two():
+    def draw(picture: np.ndarray) -> None:
+        cv2.ellipse(picture, (200, 120), (40, 14), 90, 0, 360, 1, -1)
+        cv2.ellipse(picture, (203, 208), (40, 12), 90, 0, 360, 1, -1)
+        cv2.line(picture, (200, 150), (203, 175), 1, 4)
+
+    boxes = sorted(cv2.boundingRect(fish.view(np.uint8)) for fish in drawn(draw))
+    assert len(boxes) == 2
+    tops = sorted(top for _, top, _, _ in boxes)
+    assert [abs(top - true) < 12 for top, true in zip(tops, (80, 168), strict=True)] == [True] * 2
+    assert all(70 < height < 100 for _, _, _, height in boxes)
+
+
+def test_a_tail_behind_a_thin_stalk_is_part_of_its_fish():
+    def draw(picture: np.ndarray) -> None:
+        cv2.ellipse(picture, (200, 200), (50, 18), 0, 0, 360, 1, -1)
+        cv2.line(picture, (240, 200), (262, 200), 1, 5)
+        cv2.ellipse(picture, (266, 200), (5, 14), 0, 0, 360, 1, -1)
+
+    [fish] = drawn(draw)
+    assert cv2.boundingRect(fish.view(np.uint8))[2] > 115
+
+
 def test_a_bent_fish_seen_edge_on_is_kept_whole():
     for width in (6, 8, 10, 12):
         [fish] = drawn(lambda p, w=width: cv2.ellipse(p, (200, 200), (60, 40), 0, 0, 110, 1, w))

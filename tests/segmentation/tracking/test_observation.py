@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.segmentation.detection.detector import Candidate
+from stream_dmr.segmentation.detection.detector import Candidate, fraction_inside
+from stream_dmr.segmentation.tracking.appearance import dissimilarity, root_histogram
 from stream_dmr.segmentation.tracking.observation import (
     Observation,
-    fraction_inside,
     oriented_extent,
 )
 from tests.support.frames import ellipse_mask
@@ -33,7 +33,8 @@ def test_area_length_and_colour_are_those_of_the_silhouette():
     observation = Observation(image, candidate)
     assert observation.area == mask.sum() == pytest.approx(np.pi * 60 * 15, rel=0.05)
     assert observation.length == pytest.approx(120, abs=2)
-    np.testing.assert_allclose(observation.colour, [50, 100, 150])
+    alone = root_histogram(np.full((9, 9, 3), (50, 100, 150), np.uint8), np.ones((9, 9), bool))
+    assert dissimilarity(observation.histogram, alone) == pytest.approx(0, abs=1e-6)
     np.testing.assert_allclose(observation.center, [150, 100], atol=1)
     assert not observation.touches_border
     assert not observation.is_piece
@@ -43,7 +44,8 @@ def test_of_a_box_alone_the_corners_do_not_count():
     image = np.full((100, 100, 3), 20, np.uint8)
     cv2.ellipse(image, (50, 50), (30, 15), 0, 0, 360, (90, 90, 90), cv2.FILLED)
     box = Candidate(bbox_xyxy_px=np.array([20.0, 35, 80, 65]), score=1.0)
-    np.testing.assert_allclose(Observation(image, box).colour, [90, 90, 90])
+    alone = root_histogram(np.full((9, 9, 3), 90, np.uint8), np.ones((9, 9), bool))
+    assert dissimilarity(Observation(image, box).histogram, alone) == pytest.approx(0, abs=1e-6)
 
 
 def test_a_piece_knows_the_box_of_the_whole():

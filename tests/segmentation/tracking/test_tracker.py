@@ -148,6 +148,27 @@ def test_merged_fish_are_reidentified_by_their_motion(a: float, b: float, late: 
     assert middles == pytest.approx({1: places[-1][0], 2: places[-1][1]})
 
 
+def unmoved(i: int, *, speed: float) -> Candidate:
+    """A shape found by its looks alone, in its i-th frame."""
+    x = 200.0 + speed * i
+    box = np.array([x - 30, 140.0, x + 30, 160.0])
+    return Candidate(bbox_xyxy_px=box, score=1.0, unmoved_at_px=np.array([x, 150.0]))
+
+
+@pytest.mark.parametrize(("speed", "has_moved"), [(0.0, False), (0.5, False), (4.0, True)])
+def test_what_only_looks_like_a_fish_counts_once_it_has_moved(speed: float, has_moved: bool):
+    found = track([[unmoved(i, speed=speed)] for i in range(12)])
+    assert [one.track_number for frame in found for one in frame] == [1] * 12
+    assert not found[0][0].has_moved
+    assert found[-1][0].has_moved == has_moved
+
+
+def test_a_fish_of_another_colour_in_the_same_place_is_another_fish():
+    frames = [[climbing(i)] for i in range(10)]
+    frames += [[(*climbing(i)[:4], 120)] for i in range(10, 20)]
+    assert ids(follow(frames))[-1] == [2]
+
+
 def test_dropped_frames_are_a_gap_like_any_other():
     frames = [[climbing(i)] for i in range(30)]
     kept = [i for i in range(1, 31) if i not in (9, 10, 11, 20)]

@@ -1,0 +1,35 @@
+"""How alike two views of fish look: histograms of the colours of their pixels.
+
+Of seven cues that were compared (mean colour, area, length, silhouette, picture patch, histograms
+of one and of three channels), the joint histogram separates fish best; see
+docs/research/tracking.md.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+from scipy.ndimage import gaussian_filter
+
+_BINS = 12  # of each channel of L*a*b*
+_SMOOTHING_BINS = 0.8  # so that a slight change of light moves no pixel to a bin that counts as new
+_SIDE_PX = 64  # of a larger picture every n-th pixel is enough
+
+
+def root_histogram(
+    region: UInt8[np.ndarray, "h w 3"], silhouette: Bool[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "N"]:
+    """Square roots of the shares of a silhouette's pixels by colour; zeros without pixels.
+
+    `region` is BGR.
+    """
+    step = max(1, max(region.shape[:2]) // _SIDE_PX)
+    lab = cv2.cvtColor(np.ascontiguousarray(region[::step, ::step]), cv2.COLOR_BGR2LAB)
+    inside = np.ascontiguousarray(silhouette[::step, ::step]).astype(np.uint8)
+    counts = cv2.calcHist([lab], [0, 1, 2], inside, [_BINS] * 3, [0, 256] * 3)
+    smooth = gaussian_filter(counts, _SMOOTHING_BINS, mode="constant").ravel()
+    return np.sqrt(smooth / max(float(smooth.sum()), 1e-6))
+
+
+def dissimilarity(a: Float32[np.ndarray, "N"], b: Float32[np.ndarray, "N"]) -> float:
+    """1 less the Bhattacharyya coefficient: 0 for equal colours, 1 for none in common."""
+    return max(0.0, 1.0 - float(a @ b))
