@@ -95,6 +95,10 @@ def run(
     ends the run early and keeps what was done.
     """
     with stop_on_signals() as stop:
+        from stream_dmr.sources.decoder import start_ahead
+
+        if Path(source).is_file():
+            start_ahead(Path(source))  # and then import the rest, a second and a half
         from stream_dmr.cli.terminal import RunDisplay
         from stream_dmr.running.measure_source import measure_source
         from stream_dmr.watch.json_log import JsonLog

@@ -6,7 +6,13 @@ from pathlib import Path
 
 from stream_dmr.errors import SourceError
 from stream_dmr.messages import Frame
-from stream_dmr.sources.decoder import DecodedPicture, Decoder, DecodingError, ResizedError
+from stream_dmr.sources.decoder import (
+    DecodedPicture,
+    Decoder,
+    DecodingError,
+    ResizedError,
+    decoding_address,
+)
 from stream_dmr.sources.read_settings import ReadFramesSettings
 from stream_dmr.sources.source import Source, nominal_ns, size_error
 
@@ -27,8 +33,7 @@ class VideoFile(Source):
         self._timeout_s = settings.silence_s
         self._is_closed = False
         start = _first_bytes(path)
-        # Absolute, since FFmpeg takes what stands before a colon in a relative path for a protocol.
-        self._decoder = Decoder(str(path.resolve()))
+        self._decoder = Decoder(decoding_address(path))
         try:
             self._first = self._decoder.read(timeout_s=self._timeout_s)
         except DecodingError:

@@ -15,7 +15,7 @@ import pytest
 
 from stream_dmr.errors import SourceError
 from stream_dmr.messages import Frame
-from stream_dmr.sources.decoder import Decoder, DecodingError
+from stream_dmr.sources.decoder import Decoder, DecodingError, start_ahead
 from stream_dmr.sources.decoder_process import NUM_SLOTS
 from stream_dmr.sources.live_stream import LiveStream
 from stream_dmr.sources.read_settings import ReadFramesSettings
@@ -218,3 +218,15 @@ def test_a_decoder_takes_nothing_with_it_and_leaves_nothing(tmp_path: Path):
 def test_an_address_where_nothing_is_is_refused():
     with pytest.raises(SourceError, match=r"rtsp://127\.0\.0\.1:9/rail: expected"):
         LiveStream("rtsp://mate:secret@127.0.0.1:9/rail", QUICK)
+
+
+def test_a_decoder_takes_over_what_was_started_ahead(tmp_path: Path):
+    path = write_video(tmp_path / "a.avi", num_frames=3)
+    before = children()
+    start_ahead(path)
+    ahead = children() - before
+    assert len(ahead) == 1
+    with contextlib.closing(VideoFile(path, ReadFramesSettings())) as video:
+        assert children() - before == ahead
+        assert len(list(video)) == 3
+    assert children() == before
