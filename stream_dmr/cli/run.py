@@ -14,6 +14,7 @@ from stream_dmr.cli.shared_options import (
     KeyOption,
     TemplateOption,
     command_line,
+    importing,
     stop_on_signals,
 )
 from stream_dmr.running.run_request import RunRequest, default_out
@@ -99,10 +100,11 @@ def run(
 
         if Path(source).is_file():
             start_ahead(Path(source))  # and then import the rest, a second and a half
-        from stream_dmr.cli.terminal import RunDisplay
-        from stream_dmr.running.measure_source import measure_source
-        from stream_dmr.watch.json_log import JsonLog
-        from stream_dmr.watch.watch_observer import WatchObserver
+        with importing():
+            from stream_dmr.cli.terminal import RunDisplay
+            from stream_dmr.running.measure_source import measure_source
+            from stream_dmr.watch.json_log import JsonLog
+            from stream_dmr.watch.watch_observer import WatchObserver
 
         request = RunRequest(
             source=source,
