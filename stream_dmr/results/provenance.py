@@ -15,10 +15,10 @@ from stream_dmr.results.finished_fish import database_of, read_runs, rows_by_run
 from stream_dmr.results.hauls import HAULS
 from stream_dmr.results.lengths_database import NAME as DATABASE
 from stream_dmr.results.lengths_database import open_for_reading
+from stream_dmr.results.log_sums import begins_as, log_sum
 from stream_dmr.results.run_facts import RunFacts
 from stream_dmr.results.signatures import content_sha256, lines_sha256
 from stream_dmr.results.store_state import check_lines, read_state
-from stream_dmr.results.verdicts import Verdict
 from stream_dmr.results.verdicts_table import read_verdicts, verdict_line
 from stream_dmr.version import __version__
 
@@ -66,8 +66,8 @@ def seal_run(folder: Path, *, with_recordings: bool) -> None:
         _new(read_runs(database))
         | sums
         | {"run_times_ns": run_times(database), "files": _sums(folder, files)}
-        | {"verdicts": verdicts_sum(read_verdicts(database))}
-        | {"hauls": hauls_sum(read_added(database, HAULS))}
+        | {"verdicts": log_sum(verdict_lines(database))}
+        | {"hauls": log_sum(haul_lines(database))}
         | _state_sums(database),
     )
 
@@ -76,33 +76,17 @@ def _state_sums(database: Path) -> dict[str, Any]:
     with closing(open_for_reading(database)) as connection:
         checks = check_lines(connection)
         state = content_sha256(read_state(connection))
-    return {
-        "state_sha256": state,
-        "checks": {"count": len(checks), "sha256": lines_sha256(checks)},
-    }
+    return {"state_sha256": state, "checks": log_sum(checks)}
 
 
-def verdicts_sum(verdicts: Sequence[Verdict]) -> dict[str, Any]:
-    """The number of verdicts and their SHA-256."""
-    lines = map(verdict_line, verdicts)
-    return {"count": len(verdicts), "sha256": lines_sha256(lines)}
+def verdict_lines(database: Path) -> list[str]:
+    """The verdicts as lines of JSON, for sums. Raises OutputError."""
+    return [verdict_line(verdict) for verdict in read_verdicts(database)]
 
 
-def hauls_sum(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The number of haul events and their SHA-256."""
-    return {"count": len(rows), "sha256": lines_sha256(json.dumps(dict(row)) for row in rows)}
-
-
-def seal_hauls(folder: Path) -> None:
-    """Update the number of haul events and their SHA-256, as `seal_verdicts` does."""
-    rows = read_added(folder / DATABASE, HAULS)
-
-    def more(made: dict[str, Any]) -> dict[str, Any]:
-        known = made.get("hauls") or hauls_sum([])
-        is_sound = hauls_sum(rows[: known["count"]]) == known
-        return {"hauls": hauls_sum(rows)} if is_sound else {}
-
-    _add(folder, more)
+def haul_lines(database: Path) -> list[str]:
+    """The events of hauls as lines of JSON, for sums. Raises OutputError."""
+    return [json.dumps(dict(row)) for row in read_added(database, HAULS)]
 
 
 def seal_files(
@@ -133,16 +117,22 @@ def add_files(folder: Path, files: Iterable[Path]) -> None:
 
 
 def seal_verdicts(folder: Path) -> None:
-    """Update the number of verdicts and their SHA-256, as `add_files` does.
+    """Update the sum of the verdicts, as `add_files` does.
 
     Where those that were known have been changed, it stays at them, for `verify` to find.
     """
-    said = read_verdicts(folder / DATABASE)
+    _seal_log(folder, "verdicts", verdict_lines(folder / DATABASE))
 
+
+def seal_hauls(folder: Path) -> None:
+    """Update the sum of the hauls' events, as `seal_verdicts` does."""
+    _seal_log(folder, "hauls", haul_lines(folder / DATABASE))
+
+
+def _seal_log(folder: Path, name: str, lines: Sequence[str]) -> None:
     def more(made: dict[str, Any]) -> dict[str, Any]:
-        known = made.get("verdicts") or verdicts_sum([])
-        is_sound = verdicts_sum(said[: known["count"]]) == known
-        return {"verdicts": verdicts_sum(said)} if is_sound else {}
+        known = made.get(name) or log_sum([])
+        return {name: log_sum(lines)} if begins_as(lines, known) else {}
 
     _add(folder, more)
 

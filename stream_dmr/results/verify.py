@@ -32,13 +32,12 @@ from stream_dmr.results.frames_table import FRAMES_COLUMNS, frames_row
 from stream_dmr.results.lengths_database import NAME as DATABASE
 from stream_dmr.results.lengths_database import open_for_reading
 from stream_dmr.results.lengths_table import LENGTHS_COLUMNS, lengths_row
+from stream_dmr.results.log_sums import begins_as, log_sum
 from stream_dmr.results.provenance import NAME as PROVENANCE
-from stream_dmr.results.provenance import known_files, read_provenance, verdicts_sum
+from stream_dmr.results.provenance import known_files, read_provenance, verdict_lines
 from stream_dmr.results.run_facts import RunFacts, run_facts
 from stream_dmr.results.signatures import content_sha256, lines_sha256
 from stream_dmr.results.store_state import check_lines, read_state
-from stream_dmr.results.verdicts import Verdict
-from stream_dmr.results.verdicts_table import read_verdicts
 from stream_dmr.results.verify_added import unsealed_rows
 from stream_dmr.results.verify_edits import changed_edits
 
@@ -152,7 +151,7 @@ def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
     try:
         stored, runs = rows_by_run(database, "fish"), read_runs(database)
         events, times = rows_by_run(database, "events"), run_times(database)
-        said = read_verdicts(database)
+        said = verdict_lines(database)
     except OutputError:
         return  # `_changes` says so
     for run_id, expected in made["fish_sha256"].items():
@@ -174,7 +173,7 @@ def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
             was = facts.get(field.name, field.default)  # older ones have fewer
             if now != was:
                 yield Change(database, f"run {run_id}: {field.name} is {now!r}, was {was!r}")
-    yield from _verdicts(database, said, made.get("verdicts", {}))
+    yield from _verdicts(database, said, made.get("verdicts") or log_sum([]))
     yield from _state(database, made, is_of_last_run=set(runs) == set(made["runs"]))
 
 
@@ -185,19 +184,18 @@ def _state(database: Path, made: dict[str, Any], *, is_of_last_run: bool) -> Ite
         return
     with closing(open_for_reading(database)) as connection:
         state, checks = content_sha256(read_state(connection)), check_lines(connection)
-    if lines_sha256(checks[: known["count"]]) != known["sha256"]:
+    if not begins_as(checks, known):
         yield Change(database, "the checks of the scale are not those that were made")
     if is_of_last_run and state != made["state_sha256"]:
         yield Change(database, "its marks, clips or scenes are not as its last run left them")
 
 
-def _verdicts(database: Path, said: Sequence[Verdict], known: dict[str, Any]) -> Iterator[Change]:
+def _verdicts(database: Path, said: Sequence[str], known: dict[str, Any]) -> Iterator[Change]:
     """The verdicts against provenance.json: rows are only added."""
-    count = known.get("count", 0)
-    if verdicts_sum(said[:count]) != (known or verdicts_sum([])):
+    if not begins_as(said, known):
         yield Change(database, "the verdicts are not those that reviewers gave")
-    elif len(said) > count:
-        yield Change(database, f"verdicts that no `review` took: {len(said) - count}")
+    elif len(said) > known["count"]:
+        yield Change(database, f"verdicts that no `review` took: {len(said) - known['count']}")
 
 
 def _recording(

@@ -5,11 +5,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from stream_dmr.results.added_tables import AddedTable, read_added
+from stream_dmr.results.added_tables import AddedTable
 from stream_dmr.results.finished_fish import rows_by_run
-from stream_dmr.results.hauls import HAULS
-from stream_dmr.results.provenance import hauls_sum, lines_sha256
-from stream_dmr.results.signatures import ChainEntry, content_sha256
+from stream_dmr.results.log_sums import begins_as
+from stream_dmr.results.provenance import haul_lines
+from stream_dmr.results.signatures import ChainEntry, content_sha256, lines_sha256
 
 
 def added_changes(
@@ -52,8 +52,8 @@ def unsealed_rows(database: Path, made: Mapping[str, Any]) -> Iterator[str]:
             if lines_sha256(found.get(run_id, [])) != sealed.get(run_id, lines_sha256([])):
                 yield f"the rows of {table} of run {run_id} are not those that it wrote"
     known: dict[str, Any] | None = made.get("hauls")
-    rows = read_added(database, HAULS)
-    if known is not None and hauls_sum(rows[: known["count"]]) != known:
+    lines = haul_lines(database)
+    if known is not None and not begins_as(lines, known):
         yield "the hauls are not those that were told"
-    elif known is not None and len(rows) > known["count"]:
-        yield f"hauls that no run and no `haul` took: {len(rows) - known['count']}"
+    elif known is not None and len(lines) > known["count"]:
+        yield f"hauls that no run and no `haul` took: {len(lines) - known['count']}"

@@ -19,6 +19,7 @@ from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.fitting.shape.samples import MAX_FISH, GoodCrops
 from stream_dmr.messages import FishCrop, Frame, LearntShapes, LengthEstimate, Message
 from stream_dmr.nodes.fit_mesh import FitMesh
+from stream_dmr.results.provenance import add_files
 from stream_dmr.running.inputs import Inputs
 from stream_dmr.running.outputs import Outputs
 from stream_dmr.running.pipeline import Node
@@ -142,7 +143,8 @@ def follow_shapes(
             observer.notice(f"learnt from the fish so far: {line}")
         path = inputs.request.out / LEARNT
         try:
-            save_stocks(inputs.template, stocks, path, source=inputs.source.name)
+            meshes = save_stocks(inputs.template, stocks, path, source=inputs.source.name)
+            add_files(path.parent, [*meshes, *(mesh.with_suffix(".toml") for mesh in meshes)])
         except OutputError as error:
             observer.warn(str(error))
 
