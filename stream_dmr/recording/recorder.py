@@ -10,7 +10,8 @@ from threading import Lock, Thread
 
 from stream_dmr.errors import OutputError
 from stream_dmr.files import make_folder
-from stream_dmr.messages import Message
+from stream_dmr.messages import FishCrop, Message
+from stream_dmr.recording.messages.photographs import PhotographChooser
 from stream_dmr.recording.messages.record import Record, make_record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.run_header import RunHeader
@@ -46,6 +47,7 @@ class Recorder:
         on_refusal: Callable[[str], None] | None = None,
         states: SinkStates | None = None,
         in_one_thread: bool = False,
+        photographs: bool = False,
     ) -> None:
         """Open all sinks: `sinks`, which get each record first, then those that `files` opens.
 
@@ -53,7 +55,8 @@ class Recorder:
         `live` the view is served as well, at `live_address`. `on_refusal` is called with what the
         disk refuses, instead of an exception, and the sink is tried again with the next record;
         after a failure of any other kind later and later. `states` gets the state of each sink.
-        With `in_one_thread` everything is written in the caller's thread.
+        With `in_one_thread` everything is written in the caller's thread. With `photographs` a few
+        crops of each fish keep their pictures, as JPEG.
         """
         self.live_address: str | None = None
         self.states = states or SinkStates()
@@ -61,6 +64,8 @@ class Recorder:
         self._pauses_s: dict[str, float] = {}  # by sink, after unexpected failures
         self._retry_at_s: dict[str, float] = {}  # monotonic clock
         self._settings = settings
+        self._of_photographs = settings.model_copy(update={"crops": "jpeg"})
+        self._chooser = PhotographChooser() if photographs else None
         self._sinks: list[Sink] = [*sinks]
         self._failed_sinks: list[Sink] = []
         self._failure: BaseException | None = None
@@ -88,9 +93,14 @@ class Recorder:
         """
         if not self._is_open:
             raise ValueError("the recorder is closed")
-        record = make_record(message, self._settings)
+        settings = self._of_photographs if self._is_photograph(message) else self._settings
+        record = make_record(message, settings)
         self.put(record)
         return record.message
+
+    def _is_photograph(self, message: Message) -> bool:
+        chooser = self._chooser
+        return chooser is not None and isinstance(message, FishCrop) and chooser.takes(message)
 
     def put(self, record: Record) -> None:
         """Record a message that is encoded already."""

@@ -119,8 +119,8 @@ def _report_start(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> No
         observer.warn("without --calibration there are relative shapes, no millimetres")
     if inputs.source.is_live and inputs.config.recording.frames == "reference":
         observer.warn(
-            "a live source can't be read again, so its pictures are not kept but for the "
-            'view; record them with [recording] frames = "jpeg" or "h264"'
+            "a live source can't be read again, so its pictures are not kept but for the view and "
+            'a few of each fish; record them with [recording] frames = "jpeg" or "h264"'
         )
 
 

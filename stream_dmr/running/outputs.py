@@ -116,6 +116,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
             else open_recording_files,
             on_refusal=on_refusal,
             states=states,
+            photographs=config.recording.keeps_photographs(is_live=inputs.source.is_live),
         )
         stack.enter_context(recorder)
         stack.enter_context(closing(retention))

@@ -50,7 +50,7 @@ def make_record(message: Message, settings: RecordingSettings) -> Record:
         case FishCrop(image=image) if image is not None and settings.crops == "jpeg":
             picture = compress(image, format="jpeg", jpeg_quality=settings.jpeg_quality)
             recorded = replace(message, image=decompress(picture))
-        case FishCrop() if settings.crops == "none":
+        case FishCrop() if not settings.keeps_crops:
             recorded = replace(message, image=None)
         case FittedMesh(shape=shape) if shape is not None and settings.meshes == "parameters":
             recorded = replace(message, shape=replace(shape, vertices=None, covariance=None))
@@ -70,7 +70,7 @@ def _record_frame(frame: Frame, settings: RecordingSettings) -> Record:
     """A frame by reference or with a picture for viewing keeps its own pixels in the run."""
     if settings.frames != "jpeg":
         encoding = partial(_encode_by_reference, frame)
-    elif settings.crops != "none":
+    elif settings.keeps_crops:
         encoding = partial(_encode_for_viewing, frame, settings.jpeg_quality)
     else:
         picture = compress(frame.image, format="jpeg", jpeg_quality=settings.jpeg_quality)

@@ -21,9 +21,10 @@ class RecordingSettings(Settings):
         description='the source\'s pictures: "reference" (number and checksum), "jpeg", '
         '"h264" (small, for the eye)',
     )
-    crops: Literal["none", "jpeg", "png"] = Field(
-        default="none",
-        description='pictures of the crops beside their masks: "none", "jpeg", "png" (exact)',
+    crops: Literal["few", "none", "jpeg", "png"] = Field(
+        default="few",
+        description='pictures of the crops beside their masks: "few" (of each fish of a camera '
+        'whose frames are not kept), "none", "jpeg", "png" (exact)',
     )
     meshes: Literal["parameters", "vertices"] = Field(
         default="parameters",
@@ -69,3 +70,12 @@ class RecordingSettings(Settings):
         ge=0,
         description="free space below which the oldest of these files are deleted, GB; 0: never",
     )
+
+    @property
+    def keeps_crops(self) -> bool:
+        """True where the pictures of all crops are recorded."""
+        return self.crops in ("jpeg", "png")
+
+    def keeps_photographs(self, *, is_live: bool) -> bool:
+        """True where some crops of each fish are all that will be left to see of it."""
+        return is_live and self.crops == "few" and self.frames == "reference"

@@ -13,12 +13,13 @@ from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.recording.mcap.mcap_recording import McapRecording
 from stream_dmr.recording.mcap.mcap_sink import PART
 from stream_dmr.recording.mcap.rewrite import rewrite
-from stream_dmr.recording.messages.codec import without_picture
+from stream_dmr.recording.messages.codec import decode, without_picture
+from stream_dmr.recording.messages.photographs import PhotographChooser
 from stream_dmr.recording.messages.topics import FOXGLOVE_TOPICS, THINNED, TOPICS, VIDEO
 from stream_dmr.recording.rerun.rrd_recording import is_closed
 from stream_dmr.recording.segments.recording_files import STEM
 
-_THINNED_TOPICS = {TOPICS[FishCrop].topic, VIDEO, *FOXGLOVE_TOPICS}
+_THINNED_TOPICS = {VIDEO, *FOXGLOVE_TOPICS}
 _PERIOD_S = 5.0  # chosen: a run writes some 10 MB in that time
 
 
@@ -26,8 +27,8 @@ class Retention:
     """Frees space in the folder of a run whenever the disk has less than `free_bytes` left.
 
     Deleted first are old tables of frames, whose rows the segments have, then the views and the
-    pictures and masks of the oldest segments, then whole segments; segments with a track of
-    `flagged()` after all others. Files that are being written are kept.
+    pictures and masks of the oldest segments but for some photographs, then whole segments;
+    segments with a track of `flagged()` after all others. Files that are being written are kept.
     """
 
     def __init__(
@@ -122,8 +123,8 @@ class Retention:
         tracks, is_thinned = self._facts(path.with_suffix(""))
         if is_thinned:
             return
-        with suppress(OSError):
-            copy, _ = rewrite(path, note=THINNED, edit=_without_pictures)
+        with suppress(OSError, RecordingError):
+            copy, _ = rewrite(path, note=THINNED, edit=_Thinning().edit)
             rename_durably(copy, path)
             self._on_changed(path)
             self._known[path.stem] = tracks, True
@@ -137,7 +138,17 @@ def _is_open(stem: Path) -> bool:
     )
 
 
-def _without_pictures(topic: str, data: bytes) -> bytes | None:
-    if topic in _THINNED_TOPICS:
-        return None
-    return without_picture(data) if topic == TOPICS[Frame].topic else data
+class _Thinning:
+    """Takes pictures and masks out of one segment, but for a few photographs of each fish."""
+
+    def __init__(self) -> None:
+        self._chooser = PhotographChooser()
+
+    def edit(self, topic: str, data: bytes) -> bytes | None:
+        """What a message becomes; None: it goes."""
+        if topic == TOPICS[FishCrop].topic:
+            crop = decode(FishCrop, data)
+            return data if crop.image is not None and self._chooser.takes(crop) else None
+        if topic in _THINNED_TOPICS:
+            return None
+        return without_picture(data) if topic == TOPICS[Frame].topic else data
