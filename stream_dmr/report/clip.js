@@ -29,7 +29,8 @@ function loadClip(fish, shift) {
   if (clips.has(key)) return clips.get(key);
   const clip = { frames: [], isDone: false, error: "", stop: new AbortController() };
   clips.set(key, clip);
-  for (const [old, one] of [...clips].slice(0, -MAX_CLIPS)) {
+  // One clip is read at a time: two would take turns in searching the same video.
+  for (const [old, one] of [...clips].filter(([, one], k) => one !== clip && (!one.isDone || k < clips.size - MAX_CLIPS))) {
     one.stop.abort();
     clips.delete(old);
   }

@@ -2,8 +2,9 @@
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -57,9 +58,14 @@ def draw_views(
     """Draw the views of all tracks, with the pictures of `source` or of the recording.
 
     Without `source`, the recorded one is tried. With `pictures`, which find a frame without
-    reading all before it, nothing else is read. Fish without a picture are drawn by their masks.
-    Raises SourceError where a given `source` is not the recorded one.
+    reading all before it, nothing else is read; so a video that was recorded is searched. Fish
+    without a picture are drawn by their masks. Raises SourceError where a given `source` is not the
+    recorded one.
     """
+    path = recorded_source(recording) if pictures is None and source is None else None
+    if path is not None and Path(path).is_file():
+        with closing(FrameLookup(recording, path)) as found:
+            return draw_views(tracks, recording, pictures=found)
     meshes = MeshRebuilder(recording.header.template, known_shapes(recording))
     waiting: defaultdict[int, list[tuple[int, RecordedView]]] = defaultdict(list)
     for track_id, track in tracks.items():
