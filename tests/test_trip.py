@@ -5,6 +5,7 @@ import shutil
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from stream_dmr.report.open_reports import open_folders
+from stream_dmr.results.finished_fish import read_runs
 from stream_dmr.results.verdicts_table import read_verdicts
 from stream_dmr.results.verify import verify
 from stream_dmr.review.review_queue import ReviewQueue
@@ -82,6 +84,11 @@ def test_the_run_counts_species_and_fates(measured: Measured):
     assert "species: 3 HAL, 3 COE" in measured.printed
     assert "fate: 4 landed, 2 dropped" in measured.printed
     assert verify(measured.out)[0] == []
+    (facts,) = read_runs(measured.out / "lengths.db").values()
+    model = measured.trip.folder / "learnt" / "species.onnx"
+    assert facts.species_model_sha256 == sha256(model.read_bytes()).hexdigest()
+    for folder in (measured.out, measured.exported):
+        assert facts.species_model_sha256 in (folder / "provenance.json").read_text()
     assert invoke("verify", {str(measured.exported): None}).code == 0
 
 
@@ -90,6 +97,7 @@ def test_the_table_of_fish_has_the_truth(measured: Measured):
     assert len(table) == len(measured.trip.fish)
     for row, true in zip(table, measured.trip.fish, strict=True):
         assert row["track_id"] == str(true.track_id)
+        assert row["length_type"] == "LengthFork"
         found = (row["haul"], row["species_code"], row["fate"], row["vessel"], row["trip"])
         assert found == (true.haul, true.species_code, true.fate, "Sea Bird", "26-11")
         assert int(row["time_utc_ns"]) == pytest.approx(true.utc_ns, abs=1)
@@ -136,6 +144,10 @@ def test_tracks_and_masks_have_each_fish_in_its_frames(measured: Measured):
         masks = [one for one in coco["annotations"] if one["track_id"] == true.track_id]
         assert len(of_fish) == len(masks) > 10
         assert {cells[9] for cells in of_fish} == {true.species_code}
+        (category,) = {one["category_id"] for one in masks}
+        names = {one["id"]: one["name"] for one in coco["categories"]}
+        assert names[category] == true.species_code
+    assert "# metadata,fps: 15" in lines
 
 
 @pytest.fixture(params=[1400, 390])

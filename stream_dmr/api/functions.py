@@ -101,6 +101,7 @@ def measure(
     trip: str = "",
     haul: str = "",
     nmea: Location | None = None,
+    start_utc: str = "",
     key: Location | None = None,
     observer: RunObserver | None = None,
     stop: threading.Event | None = None,
@@ -129,6 +130,7 @@ def measure(
         trip=trip,
         haul=haul,
         nmea=None if nmea is None else str(nmea),
+        start_utc=start_utc,
         key=_path(key),
     )
     measure_source(

@@ -14,7 +14,8 @@ from stream_dmr.errors import UserError, reason_of
 from stream_dmr.version import __version__
 
 COLUMNS = ("video", "calibration", "boxes", "masks", "vessel", "trip", "haul")
-_FILES = COLUMNS[:4]
+MORE_COLUMNS = ("nmea", "start_utc")  # that a manifest may have as well
+_FILES = (*COLUMNS[:4], "nmea")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +30,8 @@ class Job:
     vessel: str = ""
     trip: str = ""
     haul: str = ""
+    nmea: str = ""  # positions: a file
+    start_utc: str = ""  # when the video began
     config: str = ""
     template: str = "auto"
     device_key: str = ""  # signs the results
@@ -40,11 +43,15 @@ class Job:
         Videos and masks count by size and time of change, since reading them takes too long.
         """
         stamps = [_size_and_time(path) for path in (self.video, self.masks)]
-        hashes = [_content_hash(path) for path in (self.calibration, self.boxes, self.config)]
+        hashes = [_content_hash(path) for path in self._small_files]
         mesh = Path(self.template)
         hashes += [_content_hash(str(path)) for path in (mesh, mesh.with_suffix(".toml"))]
         inputs = [__version__, asdict(self), stamps, hashes]
         return sha256(json.dumps(inputs).encode()).hexdigest()
+
+    @property
+    def _small_files(self) -> tuple[str, ...]:
+        return self.calibration, self.boxes, self.nmea, self.config
 
     @property
     def num_bytes(self) -> int:
@@ -70,8 +77,10 @@ def read_manifest(
     jobs, home = [], path.resolve().parent
     for number, (row, name) in enumerate(zip(rows, names, strict=True), start=2):
         if not row["video"] or None in row:
-            raise UserError(f"{path}, line {number}: expected {len(COLUMNS)} cells with a video")
-        cells = {key: (row[key] or "").strip() for key in COLUMNS}
+            raise UserError(
+                f"{path}, line {number}: expected {len(row.keys() - {None})} cells with a video"
+            )
+        cells = {key: (row.get(key) or "").strip() for key in (*COLUMNS, *MORE_COLUMNS)}
         files = {key: str(home / cells[key]) for key in _FILES if cells[key]}
         values: dict[str, Any] = cells | files | shared
         jobs.append(Job(name=name, **values))
@@ -97,9 +106,10 @@ def _rows(path: Path) -> list[dict[str | None, str | None]]:
         raise UserError(
             f"{path}: expected a manifest as CSV in UTF-8, got: {reason_of(error)}"
         ) from error
-    if sorted(columns) != sorted(COLUMNS):
+    if sorted(columns) != sorted({*COLUMNS, *(set(columns) & set(MORE_COLUMNS))}):
         raise UserError(
-            f"{path}: expected the columns {','.join(COLUMNS)}, got {','.join(columns) or 'none'}"
+            f"{path}: expected the columns {','.join(COLUMNS)}, and {','.join(MORE_COLUMNS)} where "
+            f"there are positions, got {','.join(columns) or 'none'}"
         )
     if not rows:
         raise UserError(f"{path}: expected a row for each video, got none")

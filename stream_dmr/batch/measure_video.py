@@ -4,7 +4,9 @@ import json
 import shutil
 import threading
 import time
-from dataclasses import asdict, dataclass, replace
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from stream_dmr.batch.dataset import write_tables
@@ -32,6 +34,8 @@ class Outcome:
     num_frames: int = 0
     num_fish: int = 0
     elapsed_s: float = 0.0
+    species: Mapping[str, int] = field(default_factory=dict[str, int])  # fish by code
+    fates: Mapping[str, int] = field(default_factory=dict[str, int])  # fish by fate
 
     @classmethod
     def failed(cls, job: Job, key: str, reason: str) -> "Outcome":
@@ -71,6 +75,8 @@ def measure_video(job: Job, out: Path, *, on_progress: OnProgress = lambda share
             num_frames=summary.num_frames,
             num_fish=len(summary.fish),
             elapsed_s=round(time.perf_counter() - began, 3),
+            species=dict(Counter(one.species_code for one in summary.fish if one.species_code)),
+            fates=dict(Counter(one.fate for one in summary.fish if one.fate)),
         )
     except UserError as error:
         shutil.rmtree(folder, ignore_errors=True)
@@ -102,6 +108,8 @@ def request_of(job: Job, out: Path) -> RunRequest:
         vessel=job.vessel,
         trip=job.trip,
         haul=job.haul,
+        nmea=job.nmea or None,
+        start_utc=job.start_utc,
     )
     return replace(command_of(request), out=unfinished_folder(job, out))
 

@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+from collections import Counter
 from collections.abc import Generator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -28,7 +29,7 @@ def batch(
     manifest: Annotated[
         Path,
         typer.Argument(
-            help="CSV with video,calibration,boxes,masks,vessel,trip,haul.",
+            help="CSV with video,calibration,boxes,masks,vessel,trip,haul, perhaps nmea,start_utc.",
             metavar="MANIFEST.csv",
         ),
     ],
@@ -65,6 +66,7 @@ def batch(
         from stream_dmr.batch.layout import VIDEOS, read_videos
         from stream_dmr.batch.manifest import read_manifest, repeated_videos
         from stream_dmr.batch.progress import duration
+        from stream_dmr.cli.terminal import counts_text
         from stream_dmr.fitting.shape.candidates import load_shapes
         from stream_dmr.results.signatures import Signer
         from stream_dmr.running.config import load_config
@@ -90,6 +92,10 @@ def batch(
         f"{len(summary.outcomes) - failed} of {len(jobs)} videos are done, {summary.num_before} of "
         f"them before, {failed} failed; {duration(summary.elapsed_s)}; results in {out}"
     )
+    for title, name in (("species", "species"), ("fate", "fates")):
+        total = sum((Counter(getattr(outcome, name)) for outcome in summary.outcomes), Counter())
+        if total:
+            print(f"{title}: {counts_text(total.elements())}")
     if stop.signal_number:
         print(f"stopped by {signal.Signals(stop.signal_number).name}", file=sys.stderr)
         raise typer.Exit(128 + stop.signal_number)

@@ -79,6 +79,13 @@ def run(
             "serial device."
         ),
     ] = None,
+    start_utc: Annotated[
+        str,
+        typer.Option(
+            help="When the video began, such as 2026-11-22T06:00:00Z.",
+            show_default="[sensors] start_utc",
+        ),
+    ] = "",
     key: KeyOption = None,
     live: Annotated[
         bool, typer.Option("--live", help="Serve the view on this machine while measuring.")
@@ -124,6 +131,7 @@ def run(
             trip=trip,
             haul=haul,
             nmea=nmea,
+            start_utc=start_utc,
             key=key,
         )
         with nullcontext(JsonLog()) if log_json else RunDisplay() as observer:

@@ -1,6 +1,8 @@
 """Tables in the manner of WCPFC's longline monitoring and of ICES' RDBES; docs/trip.md maps them.
 
-What a camera can't know stays empty: nothing is guessed.
+What a camera can't know stays empty: nothing is guessed. Sources: draft longline EM fields
+(WCPFC-SC16-2020/ST-IP-07) and the SPC/FFA longline observer form; the RDBES data model and the ICES
+vocabularies TypeMeasured and ValueUnitOrScale.
 """
 
 import csv
@@ -36,7 +38,7 @@ HAUL_COLUMNS = [
     "num_measured",
 ]
 _WCPFC_LENGTHS = {"fork": "UF", "total": "TL"}  # upper jaw to fork; tip of snout to end of tail
-_RDBES_LENGTHS = {"fork": "LengthFork", "total": "LengthTotal"}
+ICES_LENGTHS = {"fork": "LengthFork", "total": "LengthTotal"}
 
 
 def wcpfc_row(fish: FishResult, template: Template) -> Row:
@@ -44,7 +46,7 @@ def wcpfc_row(fish: FishResult, template: Template) -> Row:
     date, _, time = (utc_text(fish.utc_ns) or "").partition("T")
     length_mm, where = fish.length_mm, fish.where
     notes = [
-        fish.catch.fate and f"fate by zones: {fish.catch.fate}",
+        fish.fate and f"fate by {'zones' if fish.review.fate is None else 'review'}: {fish.fate}",
         fish.review.decision and f"review: {fish.review.decision}",
     ]
     return {
@@ -66,7 +68,7 @@ def wcpfc_row(fish: FishResult, template: Template) -> Row:
 
 def rdbes_row(fish: FishResult, template: Template) -> Row:
     """One measured length, as a biological variable with the sample's and the haul's keys."""
-    kind, length_mm = _RDBES_LENGTHS.get(template.tail_gives or "", ""), fish.length_mm
+    kind, length_mm = ICES_LENGTHS.get(template.tail_gives or "", ""), fish.length_mm
     is_measured = length_mm is not None
     place = fish.where.latitude, fish.where.longitude
     return {

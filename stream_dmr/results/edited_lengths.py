@@ -1,5 +1,6 @@
 """The length of a fish that reviewers made: its frames, filtered as in a run."""
 
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,12 @@ from stream_dmr.results.track_edits import TrackPart
 from stream_dmr.results.verdicts_table import AddedFrame, read_added_frames
 
 Frames = Mapping[int, Sequence[LocalizedFish]]  # by recorded or added track, in order
+
+
+def settings_of(recording: Recording) -> SmoothLengthSettings:
+    """The filter's settings of the run that was recorded."""
+    config = tomllib.loads(recording.header.config_toml)
+    return SmoothLengthSettings.model_validate(config.get("smooth_length", {}))
 
 
 def frames_of_tracks(

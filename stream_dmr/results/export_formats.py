@@ -30,9 +30,11 @@ from stream_dmr.results.agency_tables import (
     Agency,
     haul_row,
     rdbes_row,
+    species_code,
     wcpfc_row,
     write_rows,
 )
+from stream_dmr.results.edited_messages import ReviewedMessages
 from stream_dmr.results.effort import read_effort
 from stream_dmr.results.finished_fish import (
     FishResult,
@@ -65,6 +67,7 @@ class Export:
         self._path = recording
         self._recording = open_recordings([recording])
         self._selection = selection
+        self._reviewed = ReviewedMessages(self._recording, database_of(recording), selection)
         self._written: list[Path] = []
         self._overwrite = overwrite
         self._earlier: set[Path] = set()  # exported before from the same recording
@@ -106,18 +109,26 @@ class Export:
         """Write every mask as COCO JSON with run lengths; returns their number.
 
         They are in the pixels of the frame, lens distortion included. Frames without fish are
-        listed too.
+        listed too. Categories are the FAO codes of the fish, and "fish" where there is none.
         """
         self._require_writable(path)
-        images, annotations = list[dict[str, Any]](), list[dict[str, Any]]()
-        for message, payload in decoded_messages(
-            self._recording, (Frame, FishCrop), self._selection
-        ):
-            if isinstance(message, Frame):
-                images.append(_image(message.frame_index, stored_picture(payload)))
-            elif isinstance(message, FishCrop):
-                annotations.append(_annotation(message, number=len(annotations) + 1))
-        categories = [{"id": 1, "name": "fish"}]
+        codes = {one.estimate.track_id: species_code(one) for one in self._all_fish()}
+        names = ["fish", *sorted({code for code in codes.values() if code})]
+        images = [
+            _image(message.frame_index, stored_picture(payload))
+            for message, payload in decoded_messages(self._recording, [Frame], self._selection)
+        ]
+        crops = (crop for crop in self._messages(FishCrop) if isinstance(crop, FishCrop))
+        annotations = [
+            _annotation(
+                crop, number=k, category=1 + names.index(codes.get(crop.track_id) or "fish")
+            )
+            for k, crop in enumerate(crops, start=1)
+        ]
+        categories = [
+            {"id": k, "name": name, "supercategory": "fish"}
+            for k, name in enumerate(names, start=1)
+        ]
         coco = {"images": images, "annotations": annotations, "categories": categories}
         make_folder(path.parent)
         with writing_to(path):
@@ -126,17 +137,27 @@ class Export:
         return len(annotations)
 
     def tables(self, out: Path, *, format: TableFormat) -> list[Path]:
-        """Write lengths and frames (keypoints, one row a fish and frame) into `out`, as `run`."""
+        """Write lengths and frames (keypoints, one row a fish and frame) into `out`, as `run`.
+
+        Fish that reviewers added, split or merged have the frames that they have since.
+        """
         paths = [out / "lengths.csv", out / "frames.csv"]
         self._require_writable(*paths, *(path.with_suffix(".parquet") for path in paths))
-        frames, finished = FramesTable(make_folder(out)), list[LengthEstimate]()
+        frames, edits = FramesTable(make_folder(out)), self._reviewed.edits
+        edited, finished = self._reviewed.estimates(), list[LengthEstimate]()
         for message in self._messages(LocalizedFish, LengthEstimate):
+            if isinstance(message, LengthEstimate):
+                if message.track_id in edited or message.track_id in edits.merged:
+                    continue
+                finished += [message] if message.is_final else []
             frames.write(make_record(message, RecordingSettings()))
-            if isinstance(message, LengthEstimate) and message.is_final:
-                finished.append(message)
+            running = edited.get(message.track_id) if isinstance(message, LocalizedFish) else None
+            if running is not None:
+                frames.write(make_record(running[message.frame_index], RecordingSettings()))
         frames.close()
         database = database_of(self._path)
         fish = [] if database is None else read_stored_fish(database)
+        finished += [one.estimate for one in fish if one.estimate.track_id in edited]
         doubtful = {one.estimate.track_id for one in fish if one.may_count_twice}
         write_lengths(out / "lengths.csv", finished, may_count_twice=doubtful)
         paths = paths if format == "csv" else [_as_parquet(path) for path in paths]
@@ -165,7 +186,7 @@ class Export:
     def viame(self, path: Path) -> int:
         """Write boxes, outlines, ends and lengths as VIAME CSV, for DIVE; returns their number."""
         self._require_writable(path)
-        tracks = ViameTracks(self._all_fish(), fps=None)
+        tracks = ViameTracks(self._all_fish(), fps=self._fps())
         crops: dict[tuple[int, int], FishCrop] = {}
         for message in self._messages(FishCrop, LocalizedFish):
             if isinstance(message, FishCrop):
@@ -211,6 +232,12 @@ class Export:
         self._written.append(write_rows(make_folder(out) / path.name, HAUL_COLUMNS, rows))
         return path
 
+    def _fps(self) -> float | None:
+        """Frames per second, by the median time between frames; None of fewer than two."""
+        frames = decoded_messages(self._recording, [Frame], self._selection)
+        steps = np.diff(np.array([frame.timestamp_ns for frame, _ in frames], np.int64))
+        return round(1e9 / float(np.median(steps)), 3) if len(steps) else None
+
     def _all_fish(self) -> list[FishResult]:
         return read_fish(self._path, self._recording, self._selection)
 
@@ -240,8 +267,7 @@ class Export:
         require_writable(*paths, overwrite=self._overwrite, is_own=self._earlier.__contains__)
 
     def _messages(self, *kinds: type[Message]) -> Iterator[Message]:
-        for message, _ in decoded_messages(self._recording, kinds, self._selection):
-            yield message
+        yield from self._reviewed.of(kinds)
 
 
 def mask_in_frame(crop: FishCrop) -> Bool[np.ndarray, "H W"]:
@@ -295,13 +321,13 @@ def _image(frame_index: int, picture: EncodedPicture) -> dict[str, Any]:
     return {"id": frame_index, "file_name": name, **size}
 
 
-def _annotation(crop: FishCrop, *, number: int) -> dict[str, Any]:
+def _annotation(crop: FishCrop, *, number: int, category: int) -> dict[str, Any]:
     mask = mask_in_frame(crop)
     x0, y0, x1, y1 = crop.bbox_xyxy_px.tolist()
     return {
         "id": number,
         "image_id": crop.frame_index,
-        "category_id": 1,
+        "category_id": category,
         "track_id": crop.track_id,
         "bbox": [x0, y0, x1 - x0, y1 - y0],
         "area": int(mask.sum()),

@@ -10,6 +10,7 @@ from typing import Any
 from stream_dmr.catch.species_list import CODE, Species, find_species, is_called, load_species
 from stream_dmr.csv_file import safe_cell
 from stream_dmr.files import writing_to
+from stream_dmr.results.agency_tables import ICES_LENGTHS
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.fisheries import FisheriesSettings, derive
 from stream_dmr.results.table_cells import seconds, utc_text
@@ -51,6 +52,7 @@ FISH_TABLE: dict[str, type] = {
     **dict.fromkeys(("frames_done", "frames_promised"), int),
     "scale_error_percent": float,  # of the last `check` with the run's calibration
     "scale_checked_ns": int,  # wall clock, since 1970
+    "length_type": str,  # which length `length_mm` is, by the ICES vocabulary; None: not known
 }
 
 
@@ -78,6 +80,7 @@ def fish_record(
         "weight_source": None if derived.weight_kg is None else settings.weight_source,
         "legal_source": None if derived.is_legal_size is None else settings.legal_source,
         "run_id": fish.run_id,
+        "length_type": ICES_LENGTHS.get(template.tail_gives or ""),
         "origin": fish.origin,
     }
 

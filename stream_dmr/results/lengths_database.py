@@ -35,6 +35,7 @@ _ADDED_COLUMNS: dict[str, dict[str, str]] = {
         **dict.fromkeys(("masks_path", "masks_sha256", "calibration_path", "ended_by"), "TEXT"),
         **dict.fromkeys(("frames_done", "frames_promised", "utc_zero_ns"), "INTEGER"),
         **dict.fromkeys(("nmea_path", "nmea_sha256"), "TEXT"),
+        **dict.fromkeys(("species_model_path", "species_model_sha256"), "TEXT"),
     },
     "fish": {  # `CatchFacts`
         **{"species_code": "TEXT", "species_share": "REAL"},
@@ -60,7 +61,8 @@ CREATE TABLE runs (
     frames_done INTEGER, -- that went through the whole chain
     frames_promised INTEGER, -- by the source; of a camera: that came; NULL: unknown
     utc_zero_ns INTEGER, -- added to capture times gives UTC, ns since 1970; NULL: unknown
-    nmea_path TEXT, nmea_sha256 TEXT -- as the files above
+    nmea_path TEXT, nmea_sha256 TEXT, -- as the files above
+    species_model_path TEXT, species_model_sha256 TEXT
 ) STRICT;
 CREATE TABLE fish (
     number INTEGER PRIMARY KEY, -- in the order in which the tracks ended

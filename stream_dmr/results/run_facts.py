@@ -35,6 +35,8 @@ class RunFacts:
     calibration_path: str = ""
     nmea_path: str = ""
     nmea_sha256: str = ""
+    species_model_path: str = ""
+    species_model_sha256: str = ""
     vessel: str = ""
     trip: str = ""
     haul: str = ""

@@ -1,13 +1,16 @@
 """Verifies the fish that reviewers added, split and merged: their frames give their lengths."""
 
-import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from stream_dmr.errors import RecordingError, UserError
-from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.recording.reading.open_recording import open_recordings
-from stream_dmr.results.edited_lengths import edited_row, frames_of_parts, frames_of_tracks
+from stream_dmr.results.edited_lengths import (
+    edited_row,
+    frames_of_parts,
+    frames_of_tracks,
+    settings_of,
+)
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.track_edits import TrackEdits, edits_of
 from stream_dmr.results.verdicts import Verdict
@@ -39,8 +42,7 @@ def _added_frames(database: Path, verdicts: Sequence[Verdict]) -> Iterator[str]:
 def _lengths(database: Path, edits: TrackEdits, measured: Sequence[FishResult]) -> Iterator[str]:
     """Compare each fish with what its frames give, where the recording still has them all."""
     recording = open_recordings([database.parent])
-    config = tomllib.loads(recording.header.config_toml)
-    settings = SmoothLengthSettings.model_validate(config.get("smooth_length", {}))
+    settings = settings_of(recording)
     tracks = {part.track_id for one in edits.fish.values() for part in one.parts}
     last = {one.estimate.track_id: one.estimate.last_frame for one in measured}
     frames = frames_of_tracks(recording, database, tracks, last)

@@ -1,8 +1,10 @@
-"""What `--pose lying` and `--stills` say of a source, as settings; the user's own come first."""
+"""What options of `run` say of a source, as settings; mostly the user's own come first."""
 
 from typing import Any
 
+from stream_dmr.errors import UserError
 from stream_dmr.running.config import Config
+from stream_dmr.sensors.sensors_settings import utc_ns_of
 from stream_dmr.settings import Settings
 
 # Fish that lie on the reference plane, by table: gravity holds them flat to a degree or two, so
@@ -41,6 +43,16 @@ def stills(config: Config, *, is_calibrated: bool) -> Config:
     """The settings for independent pictures; one calibration holds for one size of them."""
     sizes = "leave_out" if is_calibrated else "take"
     return _with(config, _STILLS | {"read_frames": {"images_fps": 0.1, "other_sizes": sizes}})
+
+
+def started_at(config: Config, start_utc: str) -> Config:
+    """The settings for a video that began then. Raises UserError where it is no time."""
+    try:
+        utc_ns_of(start_utc)
+    except ValueError as error:
+        raise UserError(f"--start-utc: expected {error}") from error
+    sensors = config.sensors.model_copy(update={"start_utc": start_utc})
+    return config.model_copy(update={"sensors": sensors})
 
 
 def _with(config: Config, changes: dict[str, dict[str, Any]]) -> Config:

@@ -11,7 +11,7 @@ from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.run_inputs import InputFile, RunInputs
-from stream_dmr.running.conditions import lying, stills
+from stream_dmr.running.conditions import lying, started_at, stills
 from stream_dmr.running.config import Config, load_config, to_toml
 from stream_dmr.running.kept_crops import KeptCrops
 from stream_dmr.running.run_request import RunRequest, without_password
@@ -89,6 +89,7 @@ class Inputs:
             if request.calibration is None
             else InputFile.read(request.calibration),
             nmea=None if request.nmea is None else _nmea_input(request.nmea),
+            species_model=InputFile.read(model) if (model := self.config.species.model) else None,
         )
 
 
@@ -100,6 +101,8 @@ def checked_inputs(request: RunRequest) -> Inputs:
     config = load_config(request.config)
     if request.pose == "lying":
         config = lying(config)
+    if request.start_utc:
+        config = started_at(config, request.start_utc)
     if request.stills:
         config = stills(config, is_calibrated=request.calibration is not None)
     notices: list[str] = []

@@ -28,6 +28,7 @@ class RunRequest:
     trip: str = ""
     haul: str = ""
     nmea: str | None = None  # positions: a file, tcp://..., udp://... or a serial device
+    start_utc: str = ""  # when a video began, in the place of [sensors] start_utc
     key: Path | None = None  # of the device, to sign with
 
 
@@ -52,5 +53,6 @@ def command_of(request: RunRequest) -> RunRequest:
     for field in fields(request):
         value = getattr(request, field.name)
         if value != field.default:
-            arguments += [f"--{field.name}"] if value is True else [f"--{field.name}", str(value)]
+            option = f"--{field.name.replace('_', '-')}"
+            arguments += [option] if value is True else [option, str(value)]
     return replace(request, command=without_password(shlex.join(arguments)))

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -25,12 +26,14 @@ from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
 from stream_dmr.batch.measure_video import Outcome, measure_video, read_outcome
 from stream_dmr.batch.progress import BatchProgress
 from stream_dmr.batch.verify_batch import verify_all
+from stream_dmr.results.finished_fish import read_stored_fish
 from stream_dmr.results.provenance import seal_verdicts
 from stream_dmr.results.verdicts import Verdict
 from stream_dmr.results.verdicts_table import add_verdict
 from stream_dmr.running.measure_source import measure_source
 from tests.support.command import invoke, rows
 from tests.support.fish_run import FISH, request
+from tests.support.nmea import START_NS, straight_way
 from tests.support.tiny_clip import write_clip
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
@@ -106,6 +109,35 @@ def test_a_batch_measures_a_video_as_run_does(season: Path, tmp_path: Path):
     assert shares[-1] == 1.0
     assert verify_all(folder)[0] == []
     assert read_outcome(job, tmp_path) == outcome
+
+
+def test_a_video_of_a_batch_has_positions_and_its_fish_have_fates(season: Path, tmp_path: Path):
+    (season / "way.nmea").write_text(straight_way(10), newline="")
+    zones = season / "zones.toml"
+    whole = "[[0, 0], [160, 0], [160, 120], [0, 120]]"
+    zones.write_text(
+        (season / "clip" / "quick.toml").read_text() + f"\n[zones]\nlanded = {whole}\n"
+    )
+    manifest = season / "positions.csv"
+    header = ",".join([*COLUMNS, "nmea", "start_utc"])
+    cells = [*(row().get(name, "") for name in COLUMNS), "way.nmea", "2026-11-22T06:00:02Z"]
+    manifest.write_text(f"{header}\n{','.join(cells)}\n")
+    outcome = invoke(
+        "batch",
+        {str(manifest): None, "--out": str(tmp_path), "--config": str(zones), "--workers": "1"}
+        | {"--template": str(season / "clip" / "tiny.ply")},
+    )
+    assert outcome.code == 0, outcome.err
+    folder = tmp_path / "videos" / "video"
+    fish = read_stored_fish(folder / "lengths.db")
+    for one in fish:
+        assert one.utc_ns == START_NS + 2_000_000_000 + one.middle_ns
+        assert one.where.latitude == pytest.approx(57.0)
+    counted = Counter(one.fate for one in fish)
+    said = ", ".join(f"{count} {name}" for name, count in counted.most_common())
+    assert f"fate: {said}" in outcome.out
+    assert json.loads((folder / "outcome.json").read_text())["fates"] == counted
+    assert verify_all(folder)[0] == []
 
 
 def test_a_bad_video_fails_alone(season: Path, tmp_path: Path):

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
+from stream_dmr.batch.measure_video import request_of
 from stream_dmr.errors import UserError
 
 HEADER = ",".join(COLUMNS) + "\n"
@@ -42,6 +43,20 @@ def test_relative_paths_start_from_the_manifest(tmp_path: Path):
     assert (job.video, job.calibration) == (str(tmp_path / "a.mp4"), str(tmp_path / "b.yaml"))
     assert (job.boxes, job.masks) == ("", "/masks")
     assert (job.vessel, job.trip, job.haul) == ("v", "t", "h")
+
+
+def test_positions_and_the_start_of_a_video_may_be_given(tmp_path: Path):
+    header = f"{HEADER.strip()},start_utc,nmea\n"
+    first, second = read(
+        tmp_path / "m.csv", f"{header}a.mp4,,,,,,,2026-11-22T06:00:00Z,way.nmea\nb.mp4,,,,,,,,\n"
+    )
+    assert (first.nmea, first.start_utc) == (str(tmp_path / "way.nmea"), "2026-11-22T06:00:00Z")
+    assert (second.nmea, second.start_utc) == ("", "")
+    key = first.key
+    (tmp_path / "way.nmea").write_text("$GPRMC,1")
+    assert first.key != key
+    command = request_of(first, tmp_path / "out").command
+    assert "--start-utc 2026-11-22T06:00:00Z" in command
 
 
 @given(st.lists(st.text("aä./-1", min_size=1, max_size=4), min_size=1, max_size=6, unique=True))

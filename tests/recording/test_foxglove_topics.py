@@ -1,13 +1,18 @@
 """What Foxglove Studio draws: metres, pixels of the shown picture, the rate of the view."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
 
-from stream_dmr.messages import FishCrop, LocalizedFish
+from stream_dmr.messages import FishCrop, LocalizedFish, Position
 from stream_dmr.recording.mcap.foxglove_topics import FoxgloveTopics
 from stream_dmr.recording.messages.record import make_record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
+from stream_dmr.recording.recorder import Recorder
 from tests.support.recorded_run import header, run
 
 SETTINGS = RecordingSettings(view_px=640)
@@ -54,6 +59,30 @@ def test_frames_between_two_shown_ones_draw_nothing():
     assert 2 <= len(pictures) <= 4
     outlines = [name for name, _ in drawn(rate_hz=10.0, num_frames=9) if "outlines" in name]
     assert len(outlines) == len(pictures)
+
+
+def test_positions_are_location_fixes_in_the_file(tmp_path: Path):
+    settings = RecordingSettings(foxglove=True, rrd=False)
+    known = Position(
+        frame_index=1,
+        timestamp_ns=1_500_000_000,
+        utc_ns=1_795_327_200_000_000_000,
+        latitude=57.25,
+        longitude=-150.5,
+        speed_knots=5.0,
+        course_deg=90.0,
+    )
+    with Recorder(tmp_path, header(), settings) as recorder:
+        recorder.write(known)
+    with (tmp_path / "recording.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        found = list(reader.iter_decoded_messages(topics=["/foxglove/position"]))
+    ((schema, _, message, fix),) = found
+    assert schema is not None
+    assert schema.name == "foxglove.LocationFix"
+    assert message.log_time == known.timestamp_ns
+    assert (fix.latitude, fix.longitude) == (57.25, -150.5)
+    assert (fix.timestamp.seconds, fix.timestamp.nanos) == (1, 500_000_000)
 
 
 def test_without_a_calibration_there_is_no_plane():

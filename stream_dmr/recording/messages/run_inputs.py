@@ -44,6 +44,7 @@ class RunInputs:
     masks: InputFile | None = None
     calibration: InputFile | None = None
     nmea: InputFile | None = None  # positions: a file, or the address of a receiver
+    species_model: InputFile | None = None  # the classifier of `[species] model`
 
     def metadata(self) -> dict[str, str]:
         """As the recording's metadata have it: `source_path`, `source_sha256`, `boxes_path`, ..."""

@@ -1,0 +1,81 @@
+"""Hauls begun and ended on the status page, in a browser, by mouse on two widths."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from stream_dmr.messages import Frame
+from stream_dmr.results.length_store import LengthStore
+from stream_dmr.running.haul_log import HaulLog
+from stream_dmr.running.hauls_settings import HaulsSettings
+from stream_dmr.running.run_settings import WatchSettings
+from stream_dmr.sources.open_source import open_source
+from stream_dmr.sources.read_settings import ReadFramesSettings
+from stream_dmr.watch.run_state import RunState
+from stream_dmr.watch.watch_server import WatchServer
+from tests.support.browser import Tab
+from tests.support.camera import free_port
+from tests.support.final_estimates import FACTS
+
+# Until the page says what it must; it asks for news every second or so.
+UNTIL = """
+const now = () => document.getElementById("haul-now").textContent;
+for (let k = 0; k < 500 && now() !== WANTED; k += 1)
+  await new Promise(done => setTimeout(done, 20));
+return now();
+"""
+
+
+@pytest.fixture
+def hauls(tmp_path: Path) -> Iterator[HaulLog]:
+    (tmp_path / "out").mkdir()
+    store = LengthStore(tmp_path / "out", FACTS)
+    yield HaulLog(store, HaulsSettings())
+    store.close()
+
+
+@pytest.fixture
+def server(tmp_path: Path, hauls: HaulLog) -> Iterator[WatchServer]:
+    image = np.full((90, 160, 3), 90, np.uint8)
+    (tmp_path / "pictures").mkdir()
+    cv2.imwrite(str(tmp_path / "pictures" / "1.png"), image)
+    source = open_source(str(tmp_path / "pictures"), ReadFramesSettings())
+    state = RunState(source, tmp_path, silence_s=20.0, stuck_s=120.0, hauls=hauls)
+    for k in range(1, 4):
+        state.take(Frame(frame_index=k, timestamp_ns=k, image=image, source="camera"))
+        hauls.take_frame(k)
+    served = WatchServer(state, WatchSettings(port=free_port()))
+    yield served
+    served.close()
+
+
+def press(tab: Tab, name: str, says: str) -> None:
+    """Press a button where it is on the screen, and wait for what the page then says."""
+    x, y = tab.run(
+        f"const one = document.getElementById('{name}'); one.scrollIntoView();"
+        "const b = one.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]"
+    )
+    tab.mouse("mousePressed", x, y)
+    tab.mouse("mouseReleased", x, y)
+    assert tab.run(UNTIL.replace("WANTED", repr(says))) == says
+
+
+@pytest.mark.parametrize("width", [390, 1400])
+def test_a_haul_is_begun_and_ended(server: WatchServer, hauls: HaulLog, width: int):
+    tab = Tab(server.address, width=width, height=900)
+    try:
+        assert tab.run(UNTIL.replace("WANTED", "'No haul'")) == "No haul"
+        press(tab, "haul-start", "Haul 1")
+        hauls.take_frame(10)
+        press(tab, "haul-end", "No haul")
+        press(tab, "haul-start", "Haul 2")
+        assert tab.cut() == []
+    finally:
+        tab.close()
+    assert [(one.name, one.began_ns, one.ended_ns) for one in hauls.hauls()] == [
+        ("1", 3, 10),
+        ("2", 10, None),
+    ]
