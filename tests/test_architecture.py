@@ -91,7 +91,6 @@ ROOMS = [
     "stream_dmr.messages",
     "stream_dmr.reasons",
     "stream_dmr.camera",
-    "stream_dmr.kalman_equations",
     "stream_dmr.geometry",
     "stream_dmr.settings",
     "stream_dmr.errors",
@@ -108,6 +107,7 @@ WHO_KNOWS = {
     "prometheus_client": ["stream_dmr.watch"],
     "sqlite3": ["stream_dmr.results"],
     "cryptography": ["stream_dmr.results"],
+    "filterpy": ["stream_dmr.lengths", "stream_dmr.segmentation"],
     "onnxruntime": ["stream_dmr.segmentation.network"],
     "ray": ["stream_dmr.batch"],
     "stream_dmr.nodes": [

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
+from filterpy.kalman import predict, rts_smoother, update
 from jaxtyping import Float
 from pydantic import Field
 
-from stream_dmr.kalman_equations import predict, smooth, update
 from stream_dmr.settings import Settings
 
 _ONE = np.eye(1)
@@ -176,8 +176,8 @@ class ConstantLengthFilter:
         z = np.array([measurement.length_mm])
         R = _ONE * self._start.measurement_variance(measurement)
         if self.frames:
-            Q = _ONE * (self._process_variance * (measurement.frame_index - self.frames[-1]))
-            x, P = predict(self._x[-1], self._P[-1], F=_ONE, Q=Q)
+            Q = self._process_variance * (measurement.frame_index - self.frames[-1])
+            x, P = predict(self._x[-1], self._P[-1], Q=Q)  # pyright: ignore[reportArgumentType]
         else:
             x, P = np.array([self._start.length_mm]), _ONE * self._start.variance
         # y = z - Hx, S = HPH' + R; y^2 / S is chi-square with one degree of freedom
@@ -185,7 +185,7 @@ class ConstantLengthFilter:
         if y**2 > self._gate * S:
             return False
         # The start serves the gate only: the first frame used is the whole state (no prior).
-        x, P = update(x, P, z, R=R, H=_ONE) if self.frames else (z, R)
+        x, P = update(x, P, z, R, _ONE)[:2] if self.frames else (z, R)
         self.frames.append(measurement.frame_index)
         self._correlation.add(measurement.timestamp_ns)
         self._x.append(x)
@@ -196,9 +196,11 @@ class ConstantLengthFilter:
         """Length in mm and variance in mm^2 at each used frame, given all of them (RTS)."""
         if not self.frames:
             return np.zeros(0), np.zeros(0)
-        gaps = np.append(np.diff(self.frames), 1)  # the last is not read
+        gaps = np.append(np.diff(self.frames), 1)  # rts_smoother ignores the last
         Qs = self._process_variance * gaps[:, None, None] * _ONE
-        x, P = smooth(np.array(self._x), np.array(self._P), Fs=[_ONE] * len(gaps), Qs=list(Qs))
+        x, P, _, _ = rts_smoother(
+            np.array(self._x), np.array(self._P), [_ONE] * len(gaps), list(Qs)
+        )
         return x[:, 0], P[:, 0, 0]
 
 

@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.stats import mannwhitneyu
 
 from stream_dmr.running.run_settings import DriftSettings
 
@@ -41,6 +42,4 @@ class FitMonitor:
 
 def _p_value(recent: Sequence[float], reference: Sequence[float]) -> float:
     """One-sided p-value that `recent` is not lower than `reference` (Mann and Whitney, 1947)."""
-    from scipy.stats import mannwhitneyu  # 20 MB and a quarter of a second, for few runs
-
     return float(mannwhitneyu(recent, reference, alternative="less").pvalue)

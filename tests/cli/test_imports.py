@@ -1,9 +1,9 @@
 import subprocess
 import sys
 
-# What a run needs not, in MB and seconds: torch 200 and 1, pandas 40 and 0.2, SciPy's statistics 20
-# and 0.25, matplotlib 15 and 0.2; onnx for training and the paper's solver alone.
-UNNEEDED = ["torch", "onnx", "pandas", "scipy.stats", "matplotlib", "ray", "trimesh.viewer"]
+# What a run needs not, in MB and seconds: torch 200 and 1, pandas 40 and 0.2, matplotlib 15, 0.2;
+# onnx for training and the paper's solver alone.
+UNNEEDED = ["torch", "onnx", "pandas", "matplotlib", "ray", "trimesh.viewer"]
 
 CODE = """
 import sys

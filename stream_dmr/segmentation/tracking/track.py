@@ -4,9 +4,9 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
+from filterpy.kalman import KalmanFilter
 from jaxtyping import Float
 
-from stream_dmr.kalman_equations import predict, update
 from stream_dmr.segmentation.detection.detector import Candidate, fraction_inside
 from stream_dmr.segmentation.tracking.appearance import dissimilarity
 from stream_dmr.segmentation.tracking.observation import Observation
@@ -31,7 +31,6 @@ _MIN_HIDEABLE_FRAMES = 3  # frames seen from which on a track is kept while anot
 _MAX_MERGED_FRAMES = 30  # that fish may stay merged in one candidate
 _MIN_MOTION = 0.35  # sizes, from where looks alone first found a fish
 _SNAPSHOT_DELAY = 3  # frames: silhouettes are wrong some frames before a merge shows
-_H = np.eye(2, 4)  # of the state, the center is seen
 _SETTLING_FRAMES = 5  # consecutive frames seen separately after which an identity is certain
 
 
@@ -63,9 +62,11 @@ class Track:
         self._history: deque[TrackSnapshot] = deque(maxlen=_SNAPSHOT_DELAY)
         self._separate_frames = 1
         self._histogram_frame = frame_index  # in which `histogram` was seen
-        self._x = np.array([*observation.center, 0.0, 0.0])[:, None]  # center x, y; speed per frame
-        self._P = np.diag([_POSITION_STD**2] * 2 + [_SPEED_STD**2] * 2) * self.size**2
-        self._R = np.eye(2) * (_POSITION_STD * self.size) ** 2
+        self._filter = KalmanFilter(dim_x=4, dim_z=2)  # center x, y; speed per frame
+        self._filter.x = np.array([*observation.center, 0.0, 0.0])[:, None]
+        self._filter.H = np.eye(2, 4)
+        self._filter.R = np.eye(2) * (_POSITION_STD * self.size) ** 2
+        self._filter.P = np.diag([_POSITION_STD**2] * 2 + [_SPEED_STD**2] * 2) * self.size**2
         self._history.append(self._current_snapshot())
 
     @property
@@ -76,7 +77,7 @@ class Track:
     @property
     def center(self) -> Float[np.ndarray, "2"]:
         """Where the fish is, or is predicted to be; frame x, y in px."""
-        return self._x[:2, 0]
+        return self._filter.x[:2, 0]
 
     @property
     def may_be_hidden(self) -> bool:
@@ -98,7 +99,7 @@ class Track:
         # Q = G G' sigma_a^2 for a constant acceleration within the step
         G = np.vstack([dt**2 / 2 * np.eye(2), dt * np.eye(2)])
         Q = G @ G.T * (_ACCELERATION_STD * self.size) ** 2
-        self._x, self._P = predict(self._x, self._P, F=F, Q=Q)
+        self._filter.predict(F=F, Q=Q)
         for snapshot in self._history if self.snapshot is None else [self.snapshot]:
             snapshot.predict(F, Q)
 
@@ -110,7 +111,7 @@ class Track:
         self.lost_frames = 1
         own, other = self.observation.box, observation.box
         quarter = np.minimum(own[2:] - own[:2], other[2:] - other[:2]) / 4
-        self._x[:2, 0] = self.center.clip(other[:2] + quarter, other[2:] - quarter)
+        self._filter.x[:2, 0] = self.center.clip(other[:2] + quarter, other[2:] - quarter)
         self.make_uncertain()
 
     def update(self, observation: Observation) -> None:
@@ -120,21 +121,20 @@ class Track:
         self._has_moved = self._has_moved or self._is_moving(observation)
         self._separate_frames = 0 if observation.is_piece else self._separate_frames + 1
         if observation.is_piece and self.was_separate:
-            self._move_towards(observation, R=_PIECE_VARIANCE_RATIO * self._R)
+            self._filter.update(
+                observation.center[:, None], R=_PIECE_VARIANCE_RATIO * self._filter.R
+            )
             return
         self._whole = observation
         self.was_separate = not observation.is_piece
         self.length = max(observation.length, _MAX_SHORTENING * self.length)
-        self._move_towards(observation, R=self._R)
+        self._filter.update(observation.center[:, None])
         rate = max(_LEARNING_RATE, 1 / self.frames_seen)
         if not observation.touches_border or observation.area > self.area:  # else it is cut off
             self.area *= (observation.area / self.area) ** rate
         self.histogram, self._histogram_frame = observation.histogram, self.frame_index
         if self.snapshot is None:
             self._history.append(self._current_snapshot())
-
-    def _move_towards(self, observation: Observation, *, R: Float[np.ndarray, "2 2"]) -> None:
-        self._x, self._P = update(self._x, self._P, observation.center[:, None], R=R, H=_H)
 
     def _is_moving(self, observation: Observation) -> bool:
         """True where it is found by its motion, or away from where it was first seen unmoved."""
@@ -145,8 +145,8 @@ class Track:
 
     def _current_snapshot(self) -> TrackSnapshot:
         return TrackSnapshot(
-            state=self._x.copy(),
-            covariance=self._P.copy(),
+            state=self._filter.x.copy(),
+            covariance=self._filter.P.copy(),
             area=self.area,
             length=self.length,
             histogram=self.histogram,
@@ -174,7 +174,7 @@ class Track:
     def resume(self, observation: Observation) -> None:
         """Continue from the snapshot with an observation after a gap."""
         snapshot = self.make_uncertain()
-        self._x, self._P = snapshot.state.copy(), snapshot.covariance.copy()
+        self._filter.x, self._filter.P = snapshot.state.copy(), snapshot.covariance.copy()
         self.update(observation)
 
     def cost(self, observation: Observation) -> float:
@@ -182,7 +182,7 @@ class Track:
         offset = observation.center - self.center
         if np.hypot(*offset) > _MAX_DISTANCE * max(self.size, 1.0):
             return IMPOSSIBLE
-        S = self._P[:2, :2] + self._R  # S = HPH' + R
+        S = self._filter.P[:2, :2] + self._filter.R  # S = HPH' + R
         growth = np.log(observation.area / self.area)
         if observation.touches_border:
             growth = max(growth, 0.0)
