@@ -67,14 +67,19 @@ def report(
     out: Annotated[Path, typer.Option(help="The page to write.")] = Path("report.html"),
     source: _Source = None,
     config: _Config = None,
+    coast: Annotated[
+        Path | None, typer.Option(help="Coastlines for the map, as GeoJSON in degrees.")
+    ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Write results as one page that opens offline: plots, a table of fish, their best frames."""
     from stream_dmr.errors import UserError
+    from stream_dmr.report.coastline import load_coast
     from stream_dmr.report.open_reports import is_batch, open_batch, open_report, write_report
     from stream_dmr.results.own_files import is_made_by, require_writable
 
     require_writable(out, overwrite=overwrite, is_own=is_made_by("report"))
+    shores = [] if coast is None else load_coast(coast)
     failed = list[str]()
     if is_batch(path):
         if source is not None:
@@ -82,6 +87,6 @@ def report(
         reports, failed = open_batch(path, config=config)
     else:
         reports = [open_report(path, source=source, config=config)]
-    size = write_report(reports, out, title=path.resolve().name, notes=failed)
+    size = write_report(reports, out, title=path.resolve().name, notes=failed, coast=shores)
     warn(line for report in reports for line in report.recording.warnings)
     print(f"{out}: {sum(len(report.fish) for report in reports)} fish, {size / 1e6:.1f} MB")

@@ -10,6 +10,7 @@ from stream_dmr.files import make_folder, writing_to
 from stream_dmr.recording.messages.selection import Selection
 from stream_dmr.recording.reading.frame_lookup import FrameLookup
 from stream_dmr.recording.reading.open_recording import open_recordings
+from stream_dmr.report.coastline import Line
 from stream_dmr.report.drawn_views import draw_views
 from stream_dmr.report.recorded_tracks import ReviewedTracks, read_tracks
 from stream_dmr.report.report_page import render_page
@@ -175,11 +176,21 @@ def _require_one_template(reports: Sequence[RunReport], where: Path) -> None:
 
 
 def write_report(
-    reports: Sequence[RunReport], out: Path, *, title: str, notes: Sequence[str] = ()
+    reports: Sequence[RunReport],
+    out: Path,
+    *,
+    title: str,
+    notes: Sequence[str] = (),
+    coast: Sequence[Line] = (),
 ) -> int:
-    """Write the page and return its bytes; beside results, `verify` checks it as one of them."""
+    """Write the page and return its bytes; beside results, `verify` checks it as one of them.
+
+    `coast` is drawn on the map.
+    """
     make_folder(out.parent)
     with writing_to(out):
-        out.write_text(render_page(reports, title=title, notes=notes), encoding="utf-8")
+        out.write_text(
+            render_page(reports, title=title, notes=notes, coast=coast), encoding="utf-8"
+        )
     add_files(out.parent, [out])
     return out.stat().st_size

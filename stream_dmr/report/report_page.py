@@ -16,6 +16,7 @@ from stream_dmr.catch.condition import CONDITIONS, FATES
 from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
 from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.recording.reading.known_shapes import known_shapes
+from stream_dmr.report.coastline import Line
 from stream_dmr.report.drawn_views import DrawnView
 from stream_dmr.report.recorded_tracks import FishFrame
 from stream_dmr.report.run_report import RunReport
@@ -37,6 +38,7 @@ def render_page(
     title: str,
     notes: Sequence[str] = (),
     review: Mapping[str, Any] | None = None,
+    coast: Sequence[Line] = (),
 ) -> str:
     """The page of one report, or of all reports of a batch; these have the same template.
 
@@ -69,7 +71,9 @@ def render_page(
             details.append(json_element(f"fish-{row['id']}", detail))
     data = json_element("data", about | {"fish": rows}) + "".join(details)
     scripts = [*_SCRIPTS, *(_REVIEW_SCRIPTS if review else ()), "page.js"]
-    return _fill_template(title, data, scripts, trip=trip_section(reports, is_folded=bool(review)))
+    return _fill_template(
+        title, data, scripts, trip=trip_section(reports, coast=coast, is_folded=bool(review))
+    )
 
 
 def _shape_notes(report: RunReport) -> Iterator[str]:

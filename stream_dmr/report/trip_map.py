@@ -1,9 +1,10 @@
-"""A map of the trip as SVG, for a page without network: track, fish, scale; no coastline."""
+"""A map of the trip as SVG, for a page without network: track, fish, scale, and a given coast."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from html import escape
 
+from stream_dmr.report.coastline import Line
 from stream_dmr.results.agency_tables import species_code
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.vessel_track import VesselTrack
@@ -15,7 +16,9 @@ _MAX_POINTS = 3000  # of the track
 _COLOURS = ("#1668a8", "#d55e00", "#16824a", "#8a4fa3", "#b8860b", "#b3372c")
 
 
-def draw_map(tracks: Sequence[VesselTrack], fish: Sequence[FishResult]) -> str:
+def draw_map(
+    tracks: Sequence[VesselTrack], fish: Sequence[FishResult], coast: Sequence[Line] = ()
+) -> str:
     """A figure of SVG with its key; "" without a position. Fish have a colour for each haul."""
     pieces = [
         [(kept.longitude, kept.latitude) for kept in piece]
@@ -31,6 +34,8 @@ def draw_map(tracks: Sequence[VesselTrack], fish: Sequence[FishResult]) -> str:
         f'<polyline points="{" ".join(view.point(p) for p in [*piece[::step], piece[-1]])}"/>'
         for piece in pieces
     )
+    shores = "".join(f'<polyline points="{p}"/>' for one in coast for p in view.pieces(one))
+    shores = f'<g class="coast">{shores}</g>' if shores else ""
     hauls = sorted({one.haul for one in fish})
     dots = "".join(_dot(one, view, _COLOURS[hauls.index(one.haul) % len(_COLOURS)]) for one in fish)
     keys = "".join(
@@ -40,7 +45,7 @@ def draw_map(tracks: Sequence[VesselTrack], fish: Sequence[FishResult]) -> str:
     )
     return (
         f'<figure id="map"><svg viewBox="0 0 {_WIDTH:.0f} {_HEIGHT:.0f}" role="img" '
-        f'aria-label="Track of the vessel and its fish"><g class="track">{lines}</g>{dots}'
+        f'aria-label="Track of the vessel and its fish">{shores}<g class="track">{lines}</g>{dots}'
         f"{view.scale_bar()}</svg><figcaption>{keys}{view.middle()}</figcaption></figure>"
     )
 
@@ -75,9 +80,35 @@ class _View:
 
     def point(self, place: tuple[float, float]) -> str:
         """`x,y` of a longitude and latitude."""
+        x, y = self._xy(place)
+        return f"{x:.1f},{y:.1f}"
+
+    def pieces(self, line: Line) -> Iterator[str]:
+        """The points of each part of a line that comes into the picture, or near it."""
+        points, near = [self._xy(place) for place in line], list[int]()
+        for k in range(1, len(points) + 1):
+            if k < len(points) and self._is_near(points[k - 1], points[k]):
+                near.append(k)
+            elif near:
+                yield " ".join(f"{x:.1f},{y:.1f}" for x, y in points[near[0] - 1 : near[-1] + 1])
+                near.clear()
+
+    def _is_near(self, a: tuple[float, float], b: tuple[float, float]) -> bool:
+        """True where the box around two points meets the picture; False across the other side."""
+        half_px = 180 * self._squeeze * _M_PER_DEGREE * self.px_per_m
+        return (
+            abs(b[0] - a[0]) <= half_px
+            and min(a[0], b[0]) <= _WIDTH
+            and max(a[0], b[0]) >= 0
+            and min(a[1], b[1]) <= _HEIGHT
+            and max(a[1], b[1]) >= 0
+        )
+
+    def _xy(self, place: tuple[float, float]) -> tuple[float, float]:
+        """Pixels of the picture, to the right and down."""
         east = (self._unwrapped(place[0]) - self._middle[0]) * self._squeeze * _M_PER_DEGREE
         north = (place[1] - self._middle[1]) * _M_PER_DEGREE
-        return f"{_WIDTH / 2 + east * self.px_per_m:.1f},{_HEIGHT / 2 - north * self.px_per_m:.1f}"
+        return _WIDTH / 2 + east * self.px_per_m, _HEIGHT / 2 - north * self.px_per_m
 
     def scale_bar(self) -> str:
         """A round number of metres or kilometres, about a fifth of the width."""

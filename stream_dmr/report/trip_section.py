@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from statistics import mean
 
+from stream_dmr.report.coastline import Line
 from stream_dmr.report.run_report import RunReport
 from stream_dmr.report.trip_map import draw_map
 from stream_dmr.results.agency_tables import haul_row, species_code
@@ -15,7 +16,9 @@ from stream_dmr.results.table_cells import utc_text
 _HEAD = ("haul", "UTC", "watched", "measured", "fish", "with length", "mean", "species", "fate")
 
 
-def trip_section(reports: Sequence[RunReport], *, is_folded: bool = False) -> str:
+def trip_section(
+    reports: Sequence[RunReport], *, coast: Sequence[Line] = (), is_folded: bool = False
+) -> str:
     """HTML: who and when, a row for each haul, and where; "" where nothing of it is known.
 
     `is_folded`: only the heading, until somebody asks for more.
@@ -26,7 +29,7 @@ def trip_section(reports: Sequence[RunReport], *, is_folded: bool = False) -> st
     if rows:
         head = "".join(f"<th>{name}</th>" for name in _HEAD)
         table = f'<div class="wide"><table><tr>{head}</tr>{"".join(rows)}</table></div>'
-    drawn = draw_map([report.track for report in reports if report.track is not None], fish)
+    drawn = draw_map([report.track for report in reports if report.track is not None], fish, coast)
     heading = _heading(fish)
     if not (heading or drawn or any(one.haul for one in fish)):
         return ""
