@@ -13,7 +13,6 @@ import re
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
 from itertools import repeat
 from pathlib import Path
@@ -28,6 +27,15 @@ DOCS = Path(__file__).parents[1] / "docs"
 BEGIN, END = "<!-- begin of what `python -m benchmarks.growth` writes -->", "<!-- end of it -->"
 _SIZE = (1280, 960)
 _RATE = re.compile(r"^(\d+).* frames in .* s, ([\d.]+) frames/s", re.MULTILINE)
+# A process's peak memory begins with that of its parent, so the parent must be small.
+_LAUNCHER = """
+import resource, subprocess, sys, time
+began = time.perf_counter()
+code = subprocess.call(sys.argv[1:])
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(used.ru_utime + used.ru_stime, used.ru_maxrss / 1024, time.perf_counter() - began)
+sys.exit(code)
+"""
 Pictures = Iterator[np.ndarray]
 
 
@@ -88,20 +96,14 @@ def run(video: Path, template: Path, out: Path) -> Point:
 
 def measured(command: Sequence[str]) -> tuple[str, float, float, float]:
     """Output, CPU seconds, peak memory and wall seconds of a command with its children."""
-    began = time.perf_counter()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "stream_dmr.cli.main", *command],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
+    done = subprocess.run(
+        [sys.executable, "-c", _LAUNCHER, sys.executable, "-m", "stream_dmr.cli.main", *command],
+        capture_output=True,
         text=True,
     )
-    assert process.stdout is not None
-    output = process.stdout.read()
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    assert process.returncode == 0, output
-    wall_s = time.perf_counter() - began
-    return output, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024, wall_s
+    assert done.returncode == 0, done.stderr
+    cpu_s, peak_mb, wall_s = (float(value) for value in done.stdout.splitlines()[-1].split())
+    return done.stdout, cpu_s, peak_mb, wall_s
 
 
 def by_fish(folder: Path, num_frames: int) -> Plot:
@@ -149,7 +151,7 @@ def by_length(folder: Path, num_frames: int) -> Plot:
     clip.mkdir()
     write_clip(clip, num_frames=num_frames)
     points = []
-    for times in (1, 4, 16, 32):
+    for times in (1, 4, 16, 48):
         video = folder / f"loop-{times}.mp4"
         write_video(video, pictures(clip / "video.mp4"), num_frames=times * num_frames)
         point = run(video, clip / "species.ply", folder / f"out-loop-{times}")
@@ -162,9 +164,9 @@ def by_workers(folder: Path, num_frames: int) -> Plot:
     clip = folder / "batch"
     clip.mkdir()
     write_clip(clip, num_frames=num_frames)
-    rows = [f"{clip / 'video.mp4'},{clip / 'calibration.yaml'},v,t{n}" for n in range(4)]
+    rows = [f"{clip / 'video.mp4'},{clip / 'calibration.yaml'},,,v,t{n}," for n in range(4)]
     manifest = folder / "manifest.csv"
-    manifest.write_text("\n".join(["video,calibration,vessel,trip", *rows]) + "\n")
+    manifest.write_text("\n".join(["video,calibration,boxes,masks,vessel,trip,haul", *rows]) + "\n")
     points = []
     for workers in (1, 2, 4):
         out = folder / f"out-batch-{workers}"
