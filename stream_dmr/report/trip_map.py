@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 from html import escape
 
 from stream_dmr.report.coastline import Line
-from stream_dmr.results.agency_tables import species_code
 from stream_dmr.results.finished_fish import FishResult
+from stream_dmr.results.fish_species import sure_code
 from stream_dmr.results.vessel_track import VesselTrack
 
 _WIDTH, _HEIGHT, _MARGIN = 720.0, 360.0, 34.0
@@ -56,7 +56,7 @@ def _dot(fish: FishResult, view: "_View", colour: str) -> str:
         return ""
     x, y = view.point((where.longitude, where.latitude)).split(",")
     length = "no length" if fish.length_mm is None else f"{fish.length_mm / 10:.1f} cm"
-    facts = (f"fish {fish.estimate.track_id}", length, species_code(fish), fish.fate)
+    facts = (f"fish {fish.estimate.track_id}", length, sure_code(fish), fish.fate)
     title = escape(", ".join(fact for fact in facts if fact))
     return f'<circle cx="{x}" cy="{y}" r="4" fill="{colour}"><title>{title}</title></circle>'
 

@@ -8,9 +8,10 @@ from statistics import mean
 from stream_dmr.report.coastline import Line
 from stream_dmr.report.run_report import RunReport
 from stream_dmr.report.trip_map import draw_map
-from stream_dmr.results.agency_tables import haul_row, species_code
+from stream_dmr.results.agency_tables import haul_row
 from stream_dmr.results.effort import HaulEffort
 from stream_dmr.results.finished_fish import FishResult
+from stream_dmr.results.fish_species import sure_code
 from stream_dmr.results.table_cells import utc_text
 
 _HEAD = ("haul", "UTC", "watched", "measured", "fish", "with length", "mean", "species", "fate")
@@ -103,7 +104,7 @@ def _haul_row(
 
 def _species(fish: FishResult) -> str:
     """Its code; without one what was said of it."""
-    return species_code(fish) or fish.review.species or fish.catch.species_code or ""
+    return sure_code(fish) or fish.review.species or fish.catch.species_code or ""
 
 
 def _hours(hours: float) -> str:

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from stream_dmr.catch.species_list import find_species, load_species
 from stream_dmr.csv_file import safe_cell
 from stream_dmr.files import writing_to
 from stream_dmr.results.effort import HaulEffort
 from stream_dmr.results.finished_fish import FishResult
+from stream_dmr.results.fish_species import sure_code
 from stream_dmr.results.table_cells import utc_text
 from stream_dmr.template.template import Template
 
@@ -57,7 +57,7 @@ def wcpfc_row(fish: FishResult, template: Template) -> Row:
         "catch_time_utc": time[:8],
         "latitude": _degrees(where.latitude, "NS", digits=2),
         "longitude": _degrees(where.longitude, "EW", digits=3),
-        "species_code": species_code(fish),
+        "species_code": sure_code(fish),
         "length_cm": "" if length_mm is None else str(int(length_mm // 10)),
         "length_code": ""
         if length_mm is None
@@ -75,7 +75,7 @@ def rdbes_row(fish: FishResult, template: Template) -> Row:
         "FOstationNumber": fish.haul,
         "FOlatitude": "" if place[0] is None else f"{place[0]:.5f}",
         "FOlongitude": "" if place[1] is None else f"{place[1]:.5f}",
-        "SAspeciesCodeFAO": species_code(fish),
+        "SAspeciesCodeFAO": sure_code(fish),
         "BVrecordType": "BV",
         "BVnationalUniqueFishId": f"{fish.run_id[:8]}-{fish.estimate.track_id}",
         "BVtypeMeasured": kind if is_measured else "",
@@ -103,15 +103,6 @@ def haul_row(effort: HaulEffort, *, utc_zero_ns: int | None) -> Row:
         "num_fish": str(effort.num_fish),
         "num_measured": str(effort.num_measured),
     }
-
-
-def species_code(fish: FishResult) -> str:
-    """FAO 3-alpha: the reviewer's, else the classifier's; "" where that is unsure."""
-    if fish.review.species:
-        found = find_species(fish.review.species, load_species())
-        return "" if found is None else found.code
-    code = fish.catch.species_code
-    return "" if code is None or code == "unsure" else code
 
 
 def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> Path:

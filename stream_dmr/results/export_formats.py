@@ -30,7 +30,6 @@ from stream_dmr.results.agency_tables import (
     Agency,
     haul_row,
     rdbes_row,
-    species_code,
     wcpfc_row,
     write_rows,
 )
@@ -43,6 +42,7 @@ from stream_dmr.results.finished_fish import (
     read_runs,
     read_stored_fish,
 )
+from stream_dmr.results.fish_species import sure_code
 from stream_dmr.results.fish_table import fish_record, write_csv, write_parquet
 from stream_dmr.results.fisheries import FisheriesSettings
 from stream_dmr.results.frames_table import FramesTable
@@ -112,7 +112,7 @@ class Export:
         listed too. Categories are the FAO codes of the fish, and "fish" where there is none.
         """
         self._require_writable(path)
-        codes = {one.estimate.track_id: species_code(one) for one in self._all_fish()}
+        codes = {one.estimate.track_id: sure_code(one) for one in self._all_fish()}
         names = ["fish", *sorted({code for code in codes.values() if code})]
         images = [
             _image(message.frame_index, stored_picture(payload))

@@ -7,11 +7,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from stream_dmr.catch.species_list import CODE, Species, find_species, is_called, load_species
+from stream_dmr.catch.species_list import CODE, is_called
 from stream_dmr.csv_file import safe_cell
 from stream_dmr.files import writing_to
 from stream_dmr.results.agency_tables import ICES_LENGTHS
 from stream_dmr.results.finished_fish import FishResult
+from stream_dmr.results.fish_species import code_of, species_of
 from stream_dmr.results.fisheries import FisheriesSettings, derive
 from stream_dmr.results.table_cells import seconds, utc_text
 from stream_dmr.results.verdicts import Review
@@ -75,7 +76,7 @@ def fish_record(
         **_place_columns(fish),
         "template": template.name,
         "species": species or template.name,
-        **_species_columns(fish, found),
+        **_species_columns(fish),
         **_fate_columns(fish.review),
         "weight_source": None if derived.weight_kg is None else settings.weight_source,
         "legal_source": None if derived.is_legal_size is None else settings.legal_source,
@@ -85,18 +86,10 @@ def fish_record(
     }
 
 
-def species_of(fish: FishResult) -> Species | None:
-    """The species of the list that the reviewer named, else that of the classifier."""
-    return find_species(fish.review.species or fish.catch.species_code or "", load_species())
-
-
-def _species_columns(fish: FishResult, found: Species | None) -> dict[str, Any]:
-    """The code of what the reviewer named, who says no share; else as it was measured."""
-    if not fish.review.species:
-        return {}
-    text = fish.review.species.strip()
-    code = found.code if found else text if CODE.fullmatch(text) else None
-    return {"species_code": code, "species_share": None}
+def _species_columns(fish: FishResult) -> dict[str, Any]:
+    """The code; a reviewer says no share."""
+    share = None if fish.review.species else fish.catch.species_share
+    return {"species_code": code_of(fish), "species_share": share}
 
 
 def _fate_columns(review: Review) -> dict[str, Any]:

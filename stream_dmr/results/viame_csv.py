@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from stream_dmr.results.finished_fish import FishResult
+from stream_dmr.results.fish_species import sure_code
 
 _HEADER = (
     "# 1: Detection or Track-id,2: Video or Image Identifier,3: Unique Frame Identifier,"
@@ -75,8 +76,8 @@ def _species(fish: FishResult | None) -> tuple[str, float]:
         return "fish", 1.0
     if fish.review.species:
         return fish.review.species, 1.0
-    code, share = fish.catch.species_code, fish.catch.species_share
-    return ("fish", 1.0) if code in (None, "unsure") else (str(code), share or 1.0)
+    code = sure_code(fish)
+    return (code, fish.catch.species_share or 1.0) if code else ("fish", 1.0)
 
 
 def _time(timestamp_ns: int) -> str:

@@ -6,7 +6,8 @@ import pytest
 
 from stream_dmr.results.catch_facts import CatchFacts
 from stream_dmr.results.finished_fish import FishResult
-from stream_dmr.results.fish_table import fish_record, species_of
+from stream_dmr.results.fish_species import species_of
+from stream_dmr.results.fish_table import fish_record
 from stream_dmr.results.fisheries import FisheriesSettings
 from stream_dmr.results.verdicts import Review
 from stream_dmr.template.template_file import load_template

@@ -13,11 +13,11 @@ from stream_dmr.results.agency_tables import (
     RDBES_COLUMNS,
     WCPFC_COLUMNS,
     rdbes_row,
-    species_code,
     wcpfc_row,
 )
 from stream_dmr.results.catch_facts import CatchFacts
 from stream_dmr.results.finished_fish import FishResult
+from stream_dmr.results.fish_species import sure_code
 from stream_dmr.results.verdicts import Review
 from stream_dmr.results.vessel_track import Whereabouts
 from stream_dmr.results.viame_csv import ViameTracks
@@ -69,7 +69,7 @@ def test_what_is_not_known_stays_empty():
     ("reviewed", "expected"), [("", "HAL"), ("COD", "COD"), ("Albacore", "ALB"), ("sea hag", "")]
 )
 def test_the_reviewers_species_comes_first(reviewed: str, expected: str):
-    assert species_code(replace(HALIBUT, review=Review(species=reviewed))) == expected
+    assert sure_code(replace(HALIBUT, review=Review(species=reviewed))) == expected
 
 
 @pytest.mark.parametrize("decision", ["reject", "duplicate", "merge"])
