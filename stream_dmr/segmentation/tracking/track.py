@@ -54,7 +54,7 @@ class Track:
         self._whole = observation
         self.area, self.histogram = observation.area, observation.histogram
         self.length = observation.length
-        self.was_separate = not observation.is_piece
+        self.was_separate = not observation.is_piece  # what is always a piece may be no fish
         self._unmoved_from = observation.candidate.unmoved_at_px
         self._has_moved = self._unmoved_from is None
         self.lost_frames, self.frames_seen, self._merged_frames = 0, 1, 0

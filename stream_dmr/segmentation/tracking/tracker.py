@@ -69,7 +69,9 @@ class Tracker:
         self._keep_covered(observations)
         self._drop_lost(frame)
         self._start_tracks(self._reidentify(unassigned), frame.frame_index)
-        return [t.tracked_candidate() for t in self._tracks if t.lost_frames == 0]
+        return [
+            t.tracked_candidate() for t in self._tracks if t.lost_frames == 0 and t.was_separate
+        ]
 
     def _fish_inside(self, observation: Observation) -> list[Track]:
         """The tracks whose predicted box lies mostly inside an observation's."""
