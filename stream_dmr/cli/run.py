@@ -102,12 +102,11 @@ def run(
     Writes lengths.db, lengths.csv, frames.csv, recording.mcap and recording.rrd into --out. Ctrl-C
     ends the run early and keeps what was done.
     """
-    with stop_on_signals() as stop:
-        from stream_dmr.sources.decoder import start_ahead
+    from stream_dmr.sources.decoder import decoding_ahead
 
-        if Path(source).is_file():
-            start_ahead(Path(source))  # and then import the rest, a second and a half
-        with importing():
+    is_file = Path(source).is_file()
+    with stop_on_signals() as stop, decoding_ahead(Path(source)) if is_file else nullcontext():
+        with importing():  # a second and a half
             from stream_dmr.cli.terminal import RunDisplay
             from stream_dmr.running.measure_source import measure_source
             from stream_dmr.watch.json_log import JsonLog

@@ -7,11 +7,12 @@ import select
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -41,44 +42,6 @@ class DecodedPicture:
     image: UInt8[np.ndarray, "H W 3"]  # BGR
 
 
-class _Child(NamedTuple):
-    """A decoding process, and the shared memory that it puts pictures into."""
-
-    process: subprocess.Popen[bytes]
-    memory: int  # file descriptor
-
-
-_started: dict[str, _Child] = {}  # by address: not yet taken
-
-
-def start_ahead(path: Path) -> None:
-    """Begin to decode a video file, which a `Decoder` of it will take over.
-
-    A process and its first picture take half a second, in which this one can import the rest.
-    """
-    address = decoding_address(path)
-    _started[address] = _start(address)
-
-
-def decoding_address(path: Path) -> str:
-    """Absolute: FFmpeg takes what stands before a colon in a relative path for a protocol."""
-    return str(path.resolve())
-
-
-def _start(address: str) -> _Child:
-    memory = os.memfd_create("pictures")  # nameless: nothing is left after a crash
-    process = subprocess.Popen(
-        [sys.executable, "-P", str(_PROGRAM), address, str(memory)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        bufsize=0,
-        pass_fds=[memory],
-        start_new_session=True,  # Ctrl-C must not reach the decoder
-    )
-    return _Child(process, memory)
-
-
 class Decoder:
     """Pictures of one video, stream or camera, in order, from a child process.
 
@@ -94,7 +57,16 @@ class Decoder:
         self._reading = Lock()
         self._slots: np.ndarray | None = None
         self._received = b""  # of the pipe, not yet a whole line
-        self._process, self._memory = _started.pop(address, None) or _start(address)
+        self._memory = os.memfd_create("pictures")  # nameless: nothing is left after a crash
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", str(_PROGRAM), address, str(self._memory)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            bufsize=0,
+            pass_fds=[self._memory],
+            start_new_session=True,  # Ctrl-C must not reach the decoder
+        )
 
     def read(self, *, timeout_s: float) -> DecodedPicture | None:
         """Wait for the next picture; None at the end.
@@ -167,3 +139,32 @@ class Decoder:
             self._received += data
         line, _, self._received = self._received.partition(b"\n")
         return json.loads(line)
+
+
+_ahead: dict[str, Decoder] = {}  # by address: not yet asked for
+
+
+@contextmanager
+def decoding_ahead(path: Path) -> Generator[None]:
+    """Begin to decode a video file; the next `open_decoder` of it inside takes that over.
+
+    A process and its first picture take half a second, in which this one can import the rest.
+    """
+    address = _address_of(path)
+    _ahead[address] = Decoder(address)
+    try:
+        yield
+    finally:
+        if (left := _ahead.pop(address, None)) is not None:
+            left.close()
+
+
+def open_decoder(path: Path) -> Decoder:
+    """The decoder of a video file, from its first picture."""
+    address = _address_of(path)
+    return _ahead.pop(address, None) or Decoder(address)
+
+
+def _address_of(path: Path) -> str:
+    """Absolute: FFmpeg takes what stands before a colon in a relative path for a protocol."""
+    return str(path.resolve())

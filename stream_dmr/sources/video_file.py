@@ -8,10 +8,9 @@ from stream_dmr.errors import SourceError
 from stream_dmr.messages import Frame
 from stream_dmr.sources.decoder import (
     DecodedPicture,
-    Decoder,
     DecodingError,
     ResizedError,
-    decoding_address,
+    open_decoder,
 )
 from stream_dmr.sources.read_settings import ReadFramesSettings
 from stream_dmr.sources.source import Source, nominal_ns, size_error
@@ -33,7 +32,7 @@ class VideoFile(Source):
         self._timeout_s = settings.silence_s
         self._is_closed = False
         start = _first_bytes(path)
-        self._decoder = Decoder(decoding_address(path))
+        self._decoder = open_decoder(path)
         try:
             self._first = self._decoder.read(timeout_s=self._timeout_s)
         except DecodingError:

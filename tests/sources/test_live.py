@@ -15,7 +15,7 @@ import pytest
 
 from stream_dmr.errors import SourceError
 from stream_dmr.messages import Frame
-from stream_dmr.sources.decoder import Decoder, DecodingError, start_ahead
+from stream_dmr.sources.decoder import Decoder, DecodingError, decoding_ahead
 from stream_dmr.sources.decoder_process import NUM_SLOTS
 from stream_dmr.sources.live_stream import LiveStream
 from stream_dmr.sources.read_settings import ReadFramesSettings
@@ -223,10 +223,18 @@ def test_an_address_where_nothing_is_is_refused():
 def test_a_decoder_takes_over_what_was_started_ahead(tmp_path: Path):
     path = write_video(tmp_path / "a.avi", num_frames=3)
     before = children()
-    start_ahead(path)
-    ahead = children() - before
-    assert len(ahead) == 1
-    with contextlib.closing(VideoFile(path, ReadFramesSettings())) as video:
-        assert children() - before == ahead
-        assert len(list(video)) == 3
+    with decoding_ahead(path):
+        ahead = children() - before
+        assert len(ahead) == 1
+        with contextlib.closing(VideoFile(path, ReadFramesSettings())) as video:
+            assert children() - before == ahead
+            assert len(list(video)) == 3
+    assert children() == before
+
+
+def test_a_decoder_that_nobody_takes_over_is_ended(tmp_path: Path):
+    path = write_video(tmp_path / "a.avi", num_frames=3)
+    before = children()
+    with decoding_ahead(path):
+        assert len(children() - before) == 1
     assert children() == before
