@@ -29,6 +29,22 @@ return now();
 """
 
 
+# Where a button is, once the pictures and figures above it have moved it for the last time.
+PLACE = """
+const one = document.getElementById("NAME");
+one.scrollIntoView();
+let place = [], before = [], still = 0;
+for (let k = 0; k < 500 && still < 15; k += 1) {
+  const b = one.getBoundingClientRect();
+  [before, place] = [place, [b.x + b.width / 2, b.y + b.height / 2]];
+  const is_same = place.every((value, n) => value === before[n]);
+  still = is_same && [...document.images].every(image => image.complete) ? still + 1 : 0;
+  await new Promise(done => setTimeout(done, 20));
+}
+return place;
+"""
+
+
 @pytest.fixture
 def hauls(tmp_path: Path) -> Iterator[HaulLog]:
     (tmp_path / "out").mkdir()
@@ -54,10 +70,7 @@ def server(tmp_path: Path, hauls: HaulLog) -> Iterator[WatchServer]:
 
 def press(tab: Tab, name: str, says: str) -> None:
     """Press a button where it is on the screen, and wait for what the page then says."""
-    x, y = tab.run(
-        f"const one = document.getElementById('{name}'); one.scrollIntoView();"
-        "const b = one.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]"
-    )
+    x, y = tab.run(PLACE.replace("NAME", name))
     tab.mouse("mousePressed", x, y)
     tab.mouse("mouseReleased", x, y)
     assert tab.run(UNTIL.replace("WANTED", repr(says))) == says
