@@ -33,7 +33,8 @@ def invoke(command: str, options: Mapping[str, str | None] | None = None) -> Out
     arguments = [part for item in (options or {}).items() for part in item if part is not None]
     out, err, code = io.StringIO(), io.StringIO(), 0
     argv = ["stream-dmr", *command.split(), *arguments]
-    with redirect_stdout(out), redirect_stderr(err), patch.object(sys, "argv", argv):
+    finders = patch.object(sys, "meta_path", [*sys.meta_path])  # a command hides what it needs not
+    with redirect_stdout(out), redirect_stderr(err), patch.object(sys, "argv", argv), finders:
         try:
             main()
         except SystemExit as exit_:

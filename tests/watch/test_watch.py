@@ -124,6 +124,7 @@ def test_health_says_what_is_wrong(server: WatchServer, state: RunState, problem
     assert metrics_of(server.address)["stream_dmr_healthy",] == 0
 
 
+@pytest.mark.slow
 def test_a_thousand_half_sent_requests_leave_the_run_its_descriptors(
     state: RunState, monkeypatch: pytest.MonkeyPatch
 ):

@@ -24,6 +24,7 @@ _MAX_DISSIMILAR_FRAMES = 10  # over which colours go on changing: fish turn, and
 _PART_RATIO = 3.0  # of the colours of a part of a fish, likewise
 _MAX_COST = 25.0  # of three squares (x, y, area), each about 1, and the colours
 _MAX_DISTANCE = 0.7  # sizes between the predicted and the observed center
+_MAX_FIRST_DISTANCE = 1.2  # the same where the fish was seen once, so that its speed is not known
 _MAX_SHORTENING = 0.93  # of the length, per frame: a fish that turns seems shorter than it is
 _PIECE_VARIANCE_RATIO = 9.0  # variance of a piece's center over that of a whole candidate's
 _LEARNING_RATE = 0.35  # of the area, per frame
@@ -180,7 +181,8 @@ class Track:
     def cost(self, observation: Observation) -> float:
         """Sum of squared deviations over their variances; `IMPOSSIBLE` beyond the gates."""
         offset = observation.center - self.center
-        if np.hypot(*offset) > _MAX_DISTANCE * max(self.size, 1.0):
+        farthest = _MAX_FIRST_DISTANCE if self.frames_seen == 1 else _MAX_DISTANCE
+        if np.hypot(*offset) > farthest * max(self.size, 1.0):
             return IMPOSSIBLE
         S = self._filter.P[:2, :2] + self._filter.R  # S = HPH' + R
         growth = np.log(observation.area / self.area)

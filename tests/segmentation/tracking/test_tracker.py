@@ -169,6 +169,11 @@ def test_a_fish_of_another_colour_in_the_same_place_is_another_fish():
     assert ids(follow(frames))[-1] == [2]
 
 
+def test_a_fish_that_is_hauled_by_its_own_length_a_frame_is_one_from_the_first():
+    frames = [blobs_of((70 + 110 * i, 150)) for i in range(3)]
+    assert [[one.track_number for one in found] for found in track(frames)] == [[1]] * 3
+
+
 def test_dropped_frames_are_a_gap_like_any_other():
     frames = [[climbing(i)] for i in range(30)]
     kept = [i for i in range(1, 31) if i not in (9, 10, 11, 20)]
