@@ -29,7 +29,9 @@ class Body(NamedTuple):
     faces: Int[np.ndarray, "F 3"]
     edges: Int[np.ndarray, "E 2"]  # each once, in the direction in which its first face runs
     edge_faces: Int[np.ndarray, "E 2"]  # the faces that run along and against the edge
-    num_neighbors: Int[np.ndarray, "V"]  # of each vertex along the edges
+    edge_starts: Int[np.ndarray, "V+1"]  # where each vertex's neighbors begin, and their end
+    neighbors: Int[np.ndarray, "2*E"]  # of each vertex along the edges, in the order of the edges
+    face_neighbors: Int[np.ndarray, "F 3"]  # across the edges, in the order of the edges
     num_vertices: int
 
     @classmethod
@@ -62,7 +64,9 @@ class Body(NamedTuple):
             faces=template.faces.copy(),
             edges=edges,
             edge_faces=edge_faces,
-            num_neighbors=np.bincount(edges.ravel()),
+            edge_starts=np.concatenate([[0], np.cumsum(np.bincount(edges.ravel()))]),
+            neighbors=_others(edges),
+            face_neighbors=_others(edge_faces).reshape(-1, 3),
             num_vertices=len(template.rest_vertices),
         )
 
@@ -89,3 +93,9 @@ def _edges(faces: Int[np.ndarray, "F 3"]) -> tuple[np.ndarray, np.ndarray]:
     edges = [(a, b) for a, b in face_of if a < b]
     edge_faces = [(face_of[a, b], face_of[b, a]) for a, b in edges]
     return np.array(edges, np.int64), np.array(edge_faces, np.int64)
+
+
+def _others(pairs: Int[np.ndarray, "E 2"]) -> Int[np.ndarray, "2*E"]:
+    """The partners of each number, sorted by it, and then in the order of the pairs."""
+    order = np.argsort(pairs.ravel(), kind="stable")
+    return pairs[:, ::-1].ravel()[order]

@@ -38,15 +38,14 @@ def skinning_weights(
     top = -np.inf
     for j in range(num_joints):
         u0, u1, u2 = place[0] - joints[j, 0], place[1] - joints[j, 1], place[2] - joints[j, 2]
-        Lj = L[j]
-        y0 = Lj[0, 0] * u0 + Lj[1, 0] * u1 + Lj[2, 0] * u2
-        y1 = Lj[1, 1] * u1 + Lj[2, 1] * u2
-        y2 = Lj[2, 2] * u2
+        y0 = L[j, 0, 0] * u0 + L[j, 1, 0] * u1 + L[j, 2, 0] * u2
+        y1 = L[j, 1, 1] * u1 + L[j, 2, 1] * u2
+        y2 = L[j, 2, 2] * u2
         W[j] = -0.5 * (y0 * y0 + y1 * y1 + y2 * y2)
         top = max(top, W[j])
-        dE[j, 0] = -y0 * u0 * Lj[0, 0]
-        dE[j, 1] = -y1 * u1 * Lj[1, 1]
-        dE[j, 2] = -y2 * u2 * Lj[2, 2]
+        dE[j, 0] = -y0 * u0 * L[j, 0, 0]
+        dE[j, 1] = -y1 * u1 * L[j, 1, 1]
+        dE[j, 2] = -y2 * u2 * L[j, 2, 2]
         dE[j, 3] = -y0 * u1
         dE[j, 4] = -y0 * u2
         dE[j, 5] = -y1 * u2
@@ -63,10 +62,10 @@ def blend(
     W: Float[np.ndarray, "J"], values: Float[np.ndarray, "J 3"], out: Float[np.ndarray, "3"]
 ) -> None:
     """sum_j W_j x_j into `out`."""
-    out[:] = 0.0
+    x = y = z = 0.0
     for j in range(len(W)):
-        for k in range(3):
-            out[k] += W[j] * values[j, k]
+        x, y, z = x + W[j] * values[j, 0], y + W[j] * values[j, 1], z + W[j] * values[j, 2]
+    out[0], out[1], out[2] = x, y, z
 
 
 class Root(NamedTuple):
@@ -91,21 +90,21 @@ def root_slope(
     v: Float[np.ndarray, "3"],
     shift: Float[np.ndarray, "3"],
     scale: float,
-    out: Float[np.ndarray, "3 P"],
+    c: int,
+    out: Float[np.ndarray, "C 3 P"],
     A: Float[np.ndarray, "3 3"],
 ) -> None:
-    """Slope of scale size (R v + shift + T_0) to the root's parameters into `out`.
+    """Slope of scale size (R v + shift + T_0) to the root's parameters into `out[c]`.
 
     A is overwritten.
     """
     R, size = root.R, root.size
     rotated_slope(R, root.J, v, A)
-    to_rotation, to_translation = out[:, ROOT_ROTATION], out[:, ROOT_TRANSLATION]
     for i in range(3):
         moved = R[i, 0] * v[0] + R[i, 1] * v[1] + R[i, 2] * v[2] + shift[i]
         if i < 2:
             moved += root.shift[i]
-            to_translation[i, i] = size * scale
+            out[c, i, ROOT_TRANSLATION.start + i] = size * scale
         for m in range(3):
-            to_rotation[i, m] = size * scale * A[i, m]
-        out[i, LOG_SIZE] = size * scale * moved
+            out[c, i, ROOT_ROTATION.start + m] = size * scale * A[i, m]
+        out[c, i, LOG_SIZE] = size * scale * moved

@@ -93,7 +93,7 @@ def blend_jacobian(
         v = np.zeros(3)
         for j in range(num_joints):
             v += W[j] * (turns[j] @ point)
-        root_slope(root, v, shift, scale, out[c], A)
+        root_slope(root, v, shift, scale, c, out, A)
         for i in range(3):
             moved[i] = out[c, i, LOG_SIZE] / (size * scale)
         for j in range(num_joints):

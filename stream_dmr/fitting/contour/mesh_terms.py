@@ -15,32 +15,37 @@ from stream_dmr.fitting.parameters import LOG_SIZE
 
 
 @compiled
-def smoothness(body: Body, points: Float[np.ndarray, "N 3"], size: float) -> tuple[float, float]:
-    """L_normal and L_lap of eq. (5) of a body of this size, so that they are in body lengths."""
-    edges, edge_faces = body.edges, body.edge_faces
-    normals = _face_normals(points, body.faces)
+def smoothness(
+    body: Body, points: Float[np.ndarray, "N 3"], normals: Float[np.ndarray, "F 3"], size: float
+) -> tuple[float, float]:
+    """L_normal and L_lap of eq. (5) of a body of this size, so that they are in body lengths.
+
+    `normals` are those of its faces.
+    """
+    edge_faces, starts, neighbors = body.edge_faces, body.edge_starts, body.neighbors
     normal = 0.0
-    mean = np.zeros((body.num_vertices, 3))
-    for e in range(len(edges)):
+    for e in range(len(edge_faces)):
         p, q = edge_faces[e, 0], edge_faces[e, 1]
         cosine = normals[p, 0] * normals[q, 0] + normals[p, 1] * normals[q, 1]
         normal += 1.0 - cosine - normals[p, 2] * normals[q, 2]
-        a, b = edges[e, 0], edges[e, 1]
-        for i in range(3):
-            mean[a, i] += points[b, i]
-            mean[b, i] += points[a, i]
     laplacian = 0.0
     for v in range(body.num_vertices):
-        share = 1.0 / body.num_neighbors[v]
-        for i in range(3):
-            laplacian += (points[v, i] - share * mean[v, i]) ** 2
+        x = y = z = 0.0
+        for k in range(starts[v], starts[v + 1]):
+            w = neighbors[k]
+            x, y, z = x + points[w, 0], y + points[w, 1], z + points[w, 2]
+        share = 1.0 / (starts[v + 1] - starts[v])
+        laplacian += (points[v, 0] - share * x) ** 2
+        laplacian += (points[v, 1] - share * y) ** 2
+        laplacian += (points[v, 2] - share * z) ** 2
     return normal, laplacian / size**2
 
 
 @compiled
-def _face_normals(
+def face_normals(
     points: Float[np.ndarray, "N 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "F 3"]:
+    """Normals of length 1."""
     normals = np.empty((len(faces), 3))
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -59,13 +64,14 @@ def smoothness_slope(
     kind: Kind,
     parameters: Float[np.ndarray, "P"],
     points: Float[np.ndarray, "N 3"],
+    normals: Float[np.ndarray, "F 3"],
     normal_weight: float,
     laplacian_weight: float,
 ) -> Float[np.ndarray, "P"]:
     """Slope of the weighted sum of both terms to the parameters."""
     size = np.exp(parameters[LOG_SIZE])
     forces = np.zeros((body.num_vertices, 3))
-    _normal_forces(body, points, normal_weight, forces)
+    _normal_forces(body, points, normals, normal_weight, forces)
     laplacian = _laplacian_forces(body, points, laplacian_weight / size**2, forces)
     slope = pull_back(body, kind, parameters, points, forces)
     slope[LOG_SIZE] -= 2 * laplacian  # L_lap is of the body at size 1
@@ -74,18 +80,21 @@ def smoothness_slope(
 
 @compiled
 def _normal_forces(
-    body: Body, points: Float[np.ndarray, "N 3"], weight: float, forces: Float[np.ndarray, "V 3"]
+    body: Body,
+    points: Float[np.ndarray, "N 3"],
+    normals: Float[np.ndarray, "F 3"],
+    weight: float,
+    forces: Float[np.ndarray, "V 3"],
 ) -> None:
     """Slope of sum_e (1 - n_p . n_q), by that of each face's normal n = N / |N|, N = u x v."""
-    faces, edges, edge_faces = body.faces, body.edges, body.edge_faces
-    normals = _face_normals(points, faces)
-    pulls = np.zeros((len(faces), 3))
-    for e in range(len(edges)):
-        p, q = edge_faces[e, 0], edge_faces[e, 1]
-        for i in range(3):
-            pulls[p, i] -= weight * normals[q, i]
-            pulls[q, i] -= weight * normals[p, i]
+    faces, beside = body.faces, body.face_neighbors
     for f in range(len(faces)):
+        p0 = p1 = p2 = 0.0
+        for k in range(3):
+            q = beside[f, k]
+            p0 -= weight * normals[q, 0]
+            p1 -= weight * normals[q, 1]
+            p2 -= weight * normals[q, 2]
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         u0, v0 = points[b, 0] - points[a, 0], points[c, 0] - points[a, 0]
         u1, v1 = points[b, 1] - points[a, 1], points[c, 1] - points[a, 1]
@@ -93,10 +102,10 @@ def _normal_forces(
         n0, n1, n2 = normals[f, 0], normals[f, 1], normals[f, 2]
         doubled = n0 * (u1 * v2 - u2 * v1) + n1 * (u2 * v0 - u0 * v2) + n2 * (u0 * v1 - u1 * v0)
         scale = 1.0 / max(doubled, 1e-300)
-        along = pulls[f, 0] * n0 + pulls[f, 1] * n1 + pulls[f, 2] * n2
-        w0 = scale * (pulls[f, 0] - along * n0)
-        w1 = scale * (pulls[f, 1] - along * n1)
-        w2 = scale * (pulls[f, 2] - along * n2)
+        along = p0 * n0 + p1 * n1 + p2 * n2
+        w0 = scale * (p0 - along * n0)
+        w1 = scale * (p1 - along * n1)
+        w2 = scale * (p2 - along * n2)
         _add_force(forces, a, b, v1 * w2 - v2 * w1, v2 * w0 - v0 * w2, v0 * w1 - v1 * w0)
         _add_force(forces, a, c, w1 * u2 - w2 * u1, w2 * u0 - w0 * u2, w0 * u1 - w1 * u0)
 
@@ -119,22 +128,29 @@ def _laplacian_forces(
     body: Body, points: Float[np.ndarray, "N 3"], weight: float, forces: Float[np.ndarray, "V 3"]
 ) -> float:
     """Slope of sum_v |p_v - mean of its neighbours|^2; returns the weighted sum itself."""
-    edges, shares = body.edges, 1.0 / body.num_neighbors
-    off = points[: body.num_vertices].copy()
-    for e in range(len(edges)):
-        a, b = edges[e, 0], edges[e, 1]
-        for i in range(3):
-            off[a, i] -= shares[a] * points[b, i]
-            off[b, i] -= shares[b] * points[a, i]
+    starts, neighbors = body.edge_starts, body.neighbors
+    pulls = np.empty((body.num_vertices, 3))  # of each vertex on its neighbours
     total = 0.0
-    for v in range(len(off)):
-        for i in range(3):
-            total += weight * off[v, i] ** 2
-            off[v, i] *= 2 * weight
-            forces[v, i] += off[v, i]
-    for e in range(len(edges)):
-        a, b = edges[e, 0], edges[e, 1]
-        for i in range(3):
-            forces[b, i] -= shares[a] * off[a, i]
-            forces[a, i] -= shares[b] * off[b, i]
+    for v in range(len(pulls)):
+        share = 1.0 / (starts[v + 1] - starts[v])
+        x, y, z = points[v, 0], points[v, 1], points[v, 2]
+        for k in range(starts[v], starts[v + 1]):
+            w = neighbors[k]
+            x -= share * points[w, 0]
+            y -= share * points[w, 1]
+            z -= share * points[w, 2]
+        total += weight * x**2
+        total += weight * y**2
+        total += weight * z**2
+        x, y, z = x * (2 * weight), y * (2 * weight), z * (2 * weight)
+        forces[v, 0] += x
+        forces[v, 1] += y
+        forces[v, 2] += z
+        pulls[v, 0], pulls[v, 1], pulls[v, 2] = share * x, share * y, share * z
+    for v in range(len(pulls)):
+        x, y, z = forces[v, 0], forces[v, 1], forces[v, 2]
+        for k in range(starts[v], starts[v + 1]):
+            w = neighbors[k]
+            x, y, z = x - pulls[w, 0], y - pulls[w, 1], z - pulls[w, 2]
+        forces[v, 0], forces[v, 1], forces[v, 2] = x, y, z
     return total

@@ -24,7 +24,13 @@ def normal_equations(
     regularise(problem, parameters, H, g)
     if lambdas[NORMAL] > 0 or lambdas[LAPLACIAN] > 0:
         g += smoothness_slope(
-            body, kind, parameters, rendering.points, lambdas[NORMAL], lambdas[LAPLACIAN]
+            body,
+            kind,
+            parameters,
+            rendering.points,
+            rendering.normals,
+            lambdas[NORMAL],
+            lambdas[LAPLACIAN],
         )
     return H, g
 

@@ -23,6 +23,7 @@ class Rendering(NamedTuple):
     pixels: Float[np.ndarray, "V 2"]  # of the vertices
     rim: Int[np.ndarray, "R 2"]  # vertices of the edges between faces seen from the front and back
     covered: Float[np.ndarray, "S S"]  # share of each pixel
+    normals: Float[np.ndarray, "F 3"]  # of the faces; none of them without smoothness
 
 
 @compiled
@@ -78,10 +79,18 @@ def coverage(
         row = int(np.floor(top))
         while top < bottom:
             low = min(bottom, row + 1.0)
-            _add_row(grid[row], x0 + (top - y0) * slope, x0 + (low - y0) * slope, low - top, sign)
+            _add_row(grid, row, x0 + (top - y0) * slope, x0 + (low - y0) * slope, low - top, sign)
             top = low
             row += 1
-    for i in range(size):
+    whole = size // 4 * 4
+    for i in range(0, whole, 4):  # four rows at a time: each sum waits for the addition before it
+        a = b = c = d = 0.0
+        for k in range(size):
+            a, b = a + grid[i, k], b + grid[i + 1, k]
+            c, d = c + grid[i + 2, k], d + grid[i + 3, k]
+            grid[i, k], grid[i + 1, k] = min(max(a, 0.0), 1.0), min(max(b, 0.0), 1.0)
+            grid[i + 2, k], grid[i + 3, k] = min(max(c, 0.0), 1.0), min(max(d, 0.0), 1.0)
+    for i in range(whole, size):
         total = 0.0
         for k in range(size):
             total += grid[i, k]
@@ -91,21 +100,26 @@ def coverage(
 
 @compiled
 def _add_row(
-    row: Float[np.ndarray, "columns"], xa: float, xb: float, height: float, sign: float
+    grid: Float[np.ndarray, "rows columns"],
+    row: int,
+    xa: float,
+    xb: float,
+    height: float,
+    sign: float,
 ) -> None:
     """Signed area right of one piece of an edge within one row of pixels."""
-    size = len(row) - 1
+    size = grid.shape[1] - 1
     if xa > xb:
         xa, xb = xb, xa
     if xa >= size:
         return
     if xb <= 0.0:
-        row[0] += sign * height
+        grid[row, 0] += sign * height
         return
     per_x = height / (xb - xa) if xb > xa else 0.0
     left = xa
     if xa < 0.0:
-        row[0] += sign * per_x * -xa
+        grid[row, 0] += sign * per_x * -xa
         left = 0.0
     right = min(xb, float(size))
     column = int(np.floor(left))
@@ -113,8 +127,8 @@ def _add_row(
         end = min(right, column + 1.0)
         share = per_x * (end - left) if xb > xa else height
         own = share * (column + 1.0 - (left + end) / 2)
-        row[column] += sign * own
-        row[column + 1] += sign * (share - own)
+        grid[row, column] += sign * own
+        grid[row, column + 1] += sign * (share - own)
         if end >= right:
             break
         left = end

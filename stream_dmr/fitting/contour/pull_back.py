@@ -70,22 +70,26 @@ def _through_root(
     """Slopes to the root's parameters into `out`; the forces as the body feels them."""
     root, J = rotation_and_jacobian(parameters[ROOT_ROTATION])
     size, shift = np.exp(parameters[LOG_SIZE]), parameters[ROOT_TRANSLATION]
-    to_rotation, to_translation = out[ROOT_ROTATION], out[ROOT_TRANSLATION]
-    local, torque, q = np.empty_like(forces), np.zeros(3), np.empty(3)
+    local, torque, q, f = np.empty_like(forces), np.zeros(3), np.empty(3), np.empty(3)
+    along = right = down = 0.0
     for n in range(len(forces)):
         x = points[n, 0] / size - shift[0]
         y = points[n, 1] / size - shift[1]
         z = points[n, 2] / size
         for i in range(3):
             q[i] = root[0, i] * x + root[1, i] * y + root[2, i] * z
-            f = root[0, i] * forces[n, 0] + root[1, i] * forces[n, 1] + root[2, i] * forces[n, 2]
-            local[n, i] = size * f
-            out[LOG_SIZE] += forces[n, i] * points[n, i]
-        to_translation[0] += size * forces[n, 0]
-        to_translation[1] += size * forces[n, 1]
-        _add_cross(q, local[n], torque)
+            felt = root[0, i] * forces[n, 0] + root[1, i] * forces[n, 1] + root[2, i] * forces[n, 2]
+            f[i] = size * felt
+            local[n, i] = f[i]
+            along += forces[n, i] * points[n, i]
+        right += size * forces[n, 0]
+        down += size * forces[n, 1]
+        _add_cross(q, f, torque)
+    out[LOG_SIZE] = along
+    to_rotation, to_translation = out[ROOT_ROTATION], out[ROOT_TRANSLATION]
+    to_translation[0], to_translation[1] = right, down
     for m in range(3):
-        to_rotation[m] += J[0, m] * torque[0] + J[1, m] * torque[1] + J[2, m] * torque[2]
+        to_rotation[m] = J[0, m] * torque[0] + J[1, m] * torque[1] + J[2, m] * torque[2]
     return local
 
 

@@ -37,7 +37,7 @@ def spine_points(body: Body, parameters: Float[np.ndarray, "P"]) -> Float[np.nda
     rotations, translations, rest_joints = joints.rotation, joints.translation, body.joints
     L, S = cholesky_factors(joints.weight), np.exp(joints.log_scale)
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
-    blended = np.empty(3)
+    blended, base, R = np.empty(3), np.empty(3), np.empty((3, 3))
     nodes, _ = spine_nodes(body, parameters, L, False)
     center = _at_place(body, nodes, body.place_of[body.num_vertices + 1])
     turns = np.empty((len(body.places), 3, 3))
@@ -46,12 +46,15 @@ def spine_points(body: Body, parameters: Float[np.ndarray, "P"]) -> Float[np.nda
     for u in range(len(body.places)):
         skinning_weights(places[u], rest_joints, L, W, dE)
         blend(W, rotations, blended)
-        fill_rotation(blended, turns[u])
+        fill_rotation(blended, R)
         blend(W, translations, blended)
-        multiply(turns[u], blended, bases[u])
+        multiply(R, blended, base)
         k, t = body.segments[u], body.fractions[u]
         for i in range(3):
-            bases[u, i] += (1.0 - t) * nodes[k, i] + t * nodes[k + 1, i] - center[i]
+            node = (1.0 - t) * nodes[k, i] + t * nodes[k + 1, i] - center[i]
+            bases[u, i] = base[i] + node
+            for m in range(3):
+                turns[u, i, m] = R[i, m]
         scales[u] = dot(W, S)
     out = np.empty_like(body.points)
     for n in range(len(out)):
@@ -83,51 +86,58 @@ def spine_jacobian(
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
     omega, shift, off, o = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     v, Roff = np.empty(3), np.empty(3)
-    A, along, none = np.empty((3, 3)), np.empty(3), np.zeros(3)
+    A, none, scale = np.empty((3, 3)), np.zeros(3), 0.0
     R, J = np.empty((3, 3)), np.empty((3, 3))
-    # Slopes to the joints' parameters before the root's own motion.
+    # Slopes to the joints' parameters before the root's own motion: all of a point, and what those
+    # of one place have in common.
     local = np.empty((3, NUM_PER_JOINT * num_joints))
-    blocks = local.reshape(3, num_joints, NUM_PER_JOINT)
-    to_rotation, to_translation = blocks[:, :, JOINT_ROTATION], blocks[:, :, JOINT_TRANSLATION]
-    to_weight = blocks[:, :, JOINT_WEIGHT]
+    shared = np.empty((3, NUM_PER_JOINT * num_joints))
+    before = -1
     for c in range(len(chosen)):
         n = chosen[c]
         u = body.place_of[n]
-        skinning_weights(places[u], rest_joints, L, W, dE)
-        blend(W, rotations, omega)
-        blend(W, translations, shift)
-        scale = dot(W, S)
-        fill_rotation_and_jacobian(omega, R, J)
+        k, t = body.segments[u], body.fractions[u]
+        if u != before:
+            before = u
+            skinning_weights(places[u], rest_joints, L, W, dE)
+            blend(W, rotations, omega)
+            blend(W, translations, shift)
+            scale = dot(W, S)
+            fill_rotation_and_jacobian(omega, R, J)
+            for i in range(3):
+                for p in range(NUM_PER_JOINT * num_joints):
+                    shared[i, p] = (
+                        (1.0 - t) * slopes[k, i, p] + t * slopes[k + 1, i, p] - center_slope[i, p]
+                    )
         for i in range(3):
             off[i] = body.points[n, i] - places[u, i]
             o[i] = scale * off[i] + shift[i]
         rotated_slope(R, J, o, A)
         multiply(R, off, Roff)
-        k, t = body.segments[u], body.fractions[u]
         for i in range(3):
             for p in range(NUM_PER_JOINT * num_joints):
-                local[i, p] = (
-                    (1.0 - t) * slopes[k, i, p] + t * slopes[k + 1, i, p] - center_slope[i, p]
-                )
+                local[i, p] = shared[i, p]
         for j in range(num_joints):
+            first = NUM_PER_JOINT * j
             for i in range(3):
-                along[i] = (S[j] - scale) * Roff[i]
+                along = (S[j] - scale) * Roff[i]
                 for m in range(3):
-                    to_rotation[i, j, m] += W[j] * A[i, m]
-                    to_translation[i, j, m] += W[j] * R[i, m]
-                    along[i] += A[i, m] * (rotations[j, m] - omega[m])
-                    along[i] += R[i, m] * (translations[j, m] - shift[m])
-                blocks[i, j, JOINT_LOG_SCALE] += W[j] * S[j] * Roff[i]
+                    local[i, first + JOINT_ROTATION.start + m] += W[j] * A[i, m]
+                    local[i, first + JOINT_TRANSLATION.start + m] += W[j] * R[i, m]
+                    along += A[i, m] * (rotations[j, m] - omega[m])
+                    along += R[i, m] * (translations[j, m] - shift[m])
+                local[i, first + JOINT_LOG_SCALE] += W[j] * S[j] * Roff[i]
                 for q in range(6):
-                    to_weight[i, j, q] += W[j] * along[i] * dE[j, q]
+                    local[i, first + JOINT_WEIGHT.start + q] += W[j] * along * dE[j, q]
         multiply(R, o, v)
         for i in range(3):
             v[i] += (1.0 - t) * nodes[k, i] + t * nodes[k + 1, i] - center[i]
-        root_slope(root, v, none, 1.0, out[c], A)
+        root_slope(root, v, none, 1.0, c, out, A)
         for i in range(3):
+            r0, r1, r2 = R0[i, 0], R0[i, 1], R0[i, 2]
             for p in range(NUM_PER_JOINT * num_joints):
                 out[c, i, NUM_ROOT + p] = root.size * (
-                    R0[i, 0] * local[0, p] + R0[i, 1] * local[1, p] + R0[i, 2] * local[2, p]
+                    r0 * local[0, p] + r1 * local[1, p] + r2 * local[2, p]
                 )
 
 

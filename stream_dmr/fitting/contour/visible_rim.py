@@ -94,12 +94,13 @@ def pixel_slopes(
 ) -> Float[np.ndarray, "C 2 P"]:
     """Slopes of the chosen vertices' pixels to the parameters, from those of their points."""
     out = np.empty((len(chosen), 2, slopes.shape[2]))
+    fx, fy = target.K[0, 0], target.K[1, 1]
     for c in range(len(chosen)):
         n = chosen[c]
         x, y = points[n, 0] + target.anchor[0], points[n, 1] + target.anchor[1]
         z = points[n, 2] + target.anchor[2]
         for p in range(slopes.shape[2]):
             dz = slopes[c, 2, p] / z
-            out[c, 0, p] = target.K[0, 0] * (slopes[c, 0, p] - x * dz) / z
-            out[c, 1, p] = target.K[1, 1] * (slopes[c, 1, p] - y * dz) / z
+            out[c, 0, p] = fx * (slopes[c, 0, p] - x * dz) / z
+            out[c, 1, p] = fy * (slopes[c, 1, p] - y * dz) / z
     return out

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -103,7 +104,7 @@ class Rig:
             "faces": body.faces,
             "edges": body.edges,
             "edge_faces": body.edge_faces,
-            "num_neighbors": body.num_neighbors.astype(float),
+            "num_neighbors": np.diff(body.edge_starts).astype(float),
             "joints": body.joints,
             "midline": body.midline,
             "feet": body.places[body.place_of],
