@@ -3,8 +3,9 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Integer
+from jaxtyping import Bool
 
 from stream_dmr.errors import AnnotationError, UserError
 from stream_dmr.messages import FishCrop, Frame
@@ -112,7 +113,7 @@ class AnnotatedFish:
         height, width = frame.image.shape[:2]
         labels = self._masks.labels(frame.frame_index, width=width, height=height)
         if labels is not None:
-            self._masked_ids.update(_ids(labels.ids))
+            self._masked_ids.update(labels.present())
         elif is_expected:  # a frame without boxes needs no mask
             self._frames_without_mask.append(frame.frame_index)
         return labels
@@ -143,21 +144,16 @@ class AnnotatedFish:
 def _detections_of(labels: Labels) -> list[Detection]:
     """One detection per id in a label picture, with its tightest box."""
     detections = []
-    for source_id in _ids(labels.ids):
+    for source_id in labels.present():
         mask = labels.ids == source_id
-        columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
-        box = np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.float64)
+        x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
         detections.append(
             Detection(
                 source_id=source_id,
-                bbox_xyxy_px=box,
+                bbox_xyxy_px=np.array([x, y, x + width, y + height], np.float64),
                 mask=mask,
                 visible_fraction=1.0,
                 unknown=labels.unknown,
             )
         )
     return detections
-
-
-def _ids(labels: Integer[np.ndarray, "H W"]) -> list[int]:
-    return np.unique(labels[labels > 0]).tolist()  # background is most of it: sorting it is slow

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Integer
 from PIL import Image
@@ -25,6 +26,13 @@ class Labels(NamedTuple):
 
     ids: Integer[np.ndarray, "H W"]  # of a fish; 0: background, or unknown
     unknown: Bool[np.ndarray, "H W"] | None  # hidden by something in front; None: no such pixel
+
+    def present(self) -> list[int]:
+        """The fish that have a pixel, ascending."""
+        if self.ids.dtype == np.uint8:  # counting is ten times as fast as sorting
+            counts = cv2.calcHist([self.ids], [0], None, [256], [0, 256])
+            return [int(one) for one in np.flatnonzero(counts) if one > 0]
+        return np.unique(self.ids[self.ids > 0]).tolist()
 
 
 class MaskFolder:

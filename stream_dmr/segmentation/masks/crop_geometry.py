@@ -7,6 +7,7 @@ is right to a pixel for any usable lens.
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -59,14 +60,13 @@ def _box_of_midpoints(midpoints: Float[np.ndarray, "4 2"]) -> Float[np.ndarray, 
 
 def visible_bbox(
     bbox_xyxy_px: Float[np.ndarray, "4"],
-    mask: Bool[np.ndarray, "H W"] | None,
+    extent: Float[np.ndarray, "4"] | None,
     *,
     width: int,
     height: int,
 ) -> Float[np.ndarray, "4"]:
-    """The smallest box around a box, clipped to the frame's size, and around a mask if given."""
+    """The smallest box around a box, clipped to the frame's size, and around a mask's, if any."""
     box = np.clip(bbox_xyxy_px, 0, [width, height, width, height])
-    extent = None if mask is None else mask_bbox(mask)
     if extent is None:
         return box
     return np.concatenate([np.minimum(box[:2], extent[:2]), np.maximum(box[2:], extent[2:])])
@@ -106,10 +106,17 @@ def camera_around(
     )
 
 
+class Layer(NamedTuple):
+    """A picture of the frame, or of a part of it outside of which it is 0."""
+
+    image: UInt8[np.ndarray, "h w *_"]
+    corner: tuple[int, int] = (0, 0)  # frame pixel of its top left one
+
+
 def resample(
-    images: Sequence[UInt8[np.ndarray, "H W *_"]], *, crop_camera: Camera, frame_camera: Camera
+    layers: Sequence[Layer], *, crop_camera: Camera, frame_camera: Camera
 ) -> list[UInt8[np.ndarray, "S S *_"]]:
-    """Images of the frame as the crop camera sees them; 0 outside the frame.
+    """Layers as the crop camera sees them; 0 outside the frame.
 
     A crop pixel is the mean of n x n samples, about one per frame pixel: single samples of a
     shrunken mask jump along its outline. Known shapes through a strong lens come out with an area
@@ -119,10 +126,19 @@ def resample(
     scale = float((frame_camera.K[[0, 1], [0, 1]] / crop_camera.K[[0, 1], [0, 1]]).max())
     samples = min(max(math.ceil(scale), 1), _MAX_SAMPLES)
     x, y = frame_from_crop_map(crop_camera, frame_camera=frame_camera, samples=samples)
-    fine = [
-        cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) for image in images
-    ]
+    fine = [_remapped(layer, x, y) for layer in layers]
     return [cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA) for image in fine]
+
+
+def _remapped(
+    layer: Layer, x: Float32[np.ndarray, "N N"], y: Float32[np.ndarray, "N N"]
+) -> UInt8[np.ndarray, "N N *_"]:
+    if layer.image.size == 0:
+        return np.zeros_like(x, np.uint8)
+    left, top = layer.corner
+    if left or top:
+        x, y = x - np.float32(left), y - np.float32(top)
+    return cv2.remap(layer.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
 
 def frame_from_crop_map(

@@ -21,12 +21,15 @@ def clean_mask(mask: Bool[np.ndarray, "H W"], *, min_area_px: int) -> Bool[np.nd
         return cleaned
     region = mask[y : y + height, x : x + width]
     parts, areas = _components(region, connectivity=8)
-    region = (areas >= _MIN_PART_RATIO * areas.max())[parts] & region
+    is_part = areas >= _MIN_PART_RATIO * areas.max()
+    if not is_part[1:].all():
+        region = is_part[parts] & region
     # Padding makes the background one component, that of pixel (0, 0); all others are holes.
     gaps, areas = _components(~np.pad(region, 1), connectivity=4)
     is_hole = areas < _MAX_HOLE_RATIO * np.count_nonzero(region)
     is_hole[[0, gaps[0, 0]]] = False
-    region = region | is_hole[gaps][1:-1, 1:-1]
+    if is_hole.any():
+        region = region | is_hole[gaps][1:-1, 1:-1]
     if np.count_nonzero(region) >= min_area_px:
         cleaned[y : y + height, x : x + width] = region
     return cleaned

@@ -3,12 +3,14 @@
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from stream_dmr.camera import Camera
 from stream_dmr.messages import FishEnds
 from stream_dmr.segmentation.masks.crop_geometry import (
+    Layer,
     box_in_crop,
     box_iou,
     camera_around,
@@ -72,12 +74,18 @@ def crop_given_mask(
     unknown: Bool[np.ndarray, "H W"] | None = None,
 ) -> MaskedCrop:
     """The crop around a box and a mask of the frame, of which something may hide a part."""
-    given = clean_mask(given, min_area_px=view.settings.min_mask_area_px)
+    x, y, w, h = cv2.boundingRect(given.view(np.uint8))
+    # Only within its own box is there anything to do, which is a small part of the frame.
+    given = clean_mask(given[y : y + h, x : x + w], min_area_px=view.settings.min_mask_area_px)
+    extent = mask_bbox(given)
+    extent = None if extent is None else extent + np.array([x, y, x, y])
     height, width = view.shape
-    crop_camera = view.camera_around(visible_bbox(bbox_xyxy_px, given, width=width, height=height))
-    layers = [view.image, given * np.uint8(255)]
+    crop_camera = view.camera_around(visible_bbox(bbox_xyxy_px, extent, width=width, height=height))
+    layers = [Layer(view.image), Layer(given * np.uint8(255), (x, y))]
     if unknown is not None:
-        layers.append((unknown | given) * np.uint8(255))
+        possible = unknown * np.uint8(255)
+        possible[y : y + h, x : x + w][given] = 255
+        layers.append(Layer(possible))
     image, coverage, *possible = resample(layers, crop_camera=crop_camera, frame_camera=view.camera)
     mask = coverage > 127  # by majority
     hidden = (possible[0] > 127) & ~mask if possible else np.zeros_like(mask)
@@ -87,7 +95,7 @@ def crop_given_mask(
         mask=mask,
         unknown=hidden if hidden.any() else None,
         area_px=float(np.count_nonzero(given)),
-        extent=mask_bbox(given),
+        extent=extent,
         is_cut=False,
         confidence=None,
         ends=None,
@@ -119,7 +127,7 @@ def _segment(
     """The crop around a box, with the mask that a segmenter finds in it at once."""
     crop_camera = view.camera_around(bbox_xyxy_px)
     cameras = {"crop_camera": crop_camera, "frame_camera": view.camera}
-    [image] = resample([view.image], **cameras)
+    [image] = resample([Layer(view.image)], **cameras)
     found = segmenter.segment(image, box_in_crop(bbox_xyxy_px, **cameras))
     x, y = frame_from_crop_map(crop_camera, frame_camera=view.camera)
     height, width = view.shape

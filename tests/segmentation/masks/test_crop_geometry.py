@@ -7,11 +7,13 @@ from hypothesis import strategies as st
 
 from stream_dmr.camera import Camera, frame_from_crop
 from stream_dmr.segmentation.masks.crop_geometry import (
+    Layer,
     box_in_crop,
     box_iou,
     frame_from_crop_map,
     mask_bbox,
     mask_bbox_in_frame,
+    resample,
     visible_bbox,
 )
 from tests.support.frames import lens_cameras
@@ -72,7 +74,7 @@ def test_a_visible_box_is_clipped_and_encloses_the_mask():
     mask[2:5, 20:38] = True
     box = np.array([-10.0, 10, 15, 50])
     assert visible_bbox(box, None, width=40, height=30).tolist() == [0, 10, 15, 30]
-    assert visible_bbox(box, mask, width=40, height=30).tolist() == [0, 2, 38, 30]
+    assert visible_bbox(box, mask_bbox(mask), width=40, height=30).tolist() == [0, 2, 38, 30]
 
 
 boxes = st.tuples(*[st.floats(0, 50)] * 2, *[st.floats(1, 50)] * 2).map(
@@ -85,3 +87,18 @@ def test_iou_is_symmetric_from_0_to_1_and_1_for_the_same_box(one: np.ndarray, ot
     assert 0 <= box_iou(one, other) <= 1
     assert box_iou(one, other) == pytest.approx(box_iou(other, one))
     assert box_iou(one, one) == pytest.approx(1)
+
+
+@given(lens_cameras, st.floats(100, 500), st.floats(100, 400), st.floats(20, 500), st.data())
+@settings(max_examples=30, deadline=None)
+def test_a_part_of_a_picture_is_seen_as_the_whole_one(camera, x, y, side, data):
+    """As long as the rest of the picture is 0."""
+    left, top = data.draw(st.integers(0, 600)), data.draw(st.integers(0, 440))
+    part = np.random.default_rng(left).integers(0, 256, (40, 40), np.uint8)
+    whole = np.zeros((480, 640), np.uint8)
+    whole[top : top + 40, left : left + 40] = part
+    crop = camera.crop(center_px=np.array([x, y]), side_px=side, size=32)
+    one, other = resample(
+        [Layer(whole), Layer(part, (left, top))], crop_camera=crop, frame_camera=camera
+    )
+    np.testing.assert_array_equal(one, other)
