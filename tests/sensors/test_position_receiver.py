@@ -107,6 +107,9 @@ def test_a_receiver_that_is_away_is_no_reason_to_stop():
         port = server.getsockname()[1]
     source = receiver(f"tcp://127.0.0.1:{port}")
     wait_for(lambda: any("refused" in line for line in source.problems()))
+    [problem] = source.problems()
+    assert problem.startswith("the receiver of positions has been silent for ")
+    assert list(source.finish()) == []
     source.close()
 
 
@@ -122,6 +125,7 @@ def test_a_serial_line():
         return source.counts.positions > 0
 
     wait_for(sent)
+    assert taken(source, 1)[0].latitude == pytest.approx(57.0)
     source.close()
     os.close(ours)
     os.close(theirs)
