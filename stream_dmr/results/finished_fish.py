@@ -185,7 +185,7 @@ def _with_edits(
         runs = [tracks[part.track_id].run_id for part in parts if part.track_id in tracks]
         fish[track_id] = folder.fish(
             estimate_of(edited.row),
-            [*runs, list(folder.runs)[-1]][0],
+            runs[0] if runs else list(folder.runs)[-1],
             iou=edited.row["iou"],
             flags=json.loads(edited.row["flags"]),
             catch=_catch_of(parts, tracks),
