@@ -106,6 +106,20 @@ def measured(command: Sequence[str]) -> tuple[str, float, float, float]:
     return done.stdout, cpu_s, peak_mb, wall_s
 
 
+def three_fish(clip: Path, num_frames: int) -> Path:
+    """Write a clip of three fish with their species into a new folder, which is returned."""
+    clip.mkdir()
+    write_clip(clip, num_frames=num_frames)
+    return clip
+
+
+def run_frames(frames: Pictures, clip: Path, name: str, *, num_frames: int) -> Point:
+    """Measure the first of these frames, whose fish are those of `clip`."""
+    video = clip.with_name(f"{name}.mp4")
+    write_video(video, frames, num_frames=num_frames)
+    return run(video, clip / "species.ply", clip.with_name(f"out-{name}"))
+
+
 def by_fish(folder: Path, num_frames: int) -> Plot:
     """1 to 8 fish in a picture of 1280 x 960."""
     clips = {}
@@ -123,47 +137,37 @@ def by_fish(folder: Path, num_frames: int) -> Plot:
     for num_fish, names in rows.items():
         tiles = [pictures(clips[name] / "video.mp4") for name in names]
         tiles += [repeat(empty.astype(np.uint8))] * (4 - len(names))
-        video = folder / f"fish-{num_fish}.mp4"
-        write_video(video, mosaic(tiles), num_frames=num_frames)
-        point = run(video, clips["one"] / "species.ply", folder / f"out-fish-{num_fish}")
+        name = f"fish-{num_fish}"
+        point = run_frames(mosaic(tiles), clips["one"], name, num_frames=num_frames)
         points.append(point._replace(x=num_fish))
     return Plot("fish in view, 1280 x 960", "fish", points)
 
 
 def by_size(folder: Path, num_frames: int) -> Plot:
     """Three fish, from VGA to 4K."""
-    clip = folder / "three"
-    clip.mkdir()
-    write_clip(clip, num_frames=num_frames)
+    clip = three_fish(folder / "three", num_frames)
     points = []
     for size in [(640, 480), (1280, 960), (1920, 1080), (3840, 2160)]:
-        video = folder / f"{size[0]}.mp4"
         scaled = (cv2.resize(frame, size) for frame in pictures(clip / "video.mp4"))
-        write_video(video, scaled, num_frames=num_frames)
-        point = run(video, clip / "species.ply", folder / f"out-{size[0]}")
+        point = run_frames(scaled, clip, f"{size[0]}", num_frames=num_frames)
         points.append(point._replace(x=size[0] * size[1] / 1e6))
     return Plot("size of the picture, three fish", "megapixels", points)
 
 
 def by_length(folder: Path, num_frames: int) -> Plot:
     """A looped clip of three fish."""
-    clip = folder / "loop"
-    clip.mkdir()
-    write_clip(clip, num_frames=num_frames)
+    clip = three_fish(folder / "loop", num_frames)
     points = []
     for times in (1, 4, 16, 48):
-        video = folder / f"loop-{times}.mp4"
-        write_video(video, pictures(clip / "video.mp4"), num_frames=times * num_frames)
-        point = run(video, clip / "species.ply", folder / f"out-loop-{times}")
-        points.append(point._replace(x=times * num_frames))
+        count = times * num_frames
+        point = run_frames(pictures(clip / "video.mp4"), clip, f"loop-{times}", num_frames=count)
+        points.append(point._replace(x=count))
     return Plot("length of the run, three fish", "frames", points)
 
 
 def by_workers(folder: Path, num_frames: int) -> Plot:
     """A batch of four videos by 1, 2 and 4 processes; frames/s with all starts."""
-    clip = folder / "batch"
-    clip.mkdir()
-    write_clip(clip, num_frames=num_frames)
+    clip = three_fish(folder / "batch", num_frames)
     rows = [f"{clip / 'video.mp4'},{clip / 'calibration.yaml'},,,v,t{n}," for n in range(4)]
     manifest = folder / "manifest.csv"
     manifest.write_text("\n".join(["video,calibration,boxes,masks,vessel,trip,haul", *rows]) + "\n")
