@@ -13,7 +13,6 @@ from contextlib import suppress
 from itertools import chain
 
 from stream_dmr.errors import OutputError
-from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.fitting.shape.samples import MAX_FISH, GoodCrops
@@ -25,7 +24,7 @@ from stream_dmr.running.outputs import Outputs
 from stream_dmr.running.pipeline import Node
 from stream_dmr.running.run_folder import LEARNT
 from stream_dmr.running.run_observer import RunObserver
-from stream_dmr.running.shape_pass import save_stocks
+from stream_dmr.running.shape_pass import save_stocks, shapes_of
 
 # Finished fish after which shapes are learnt, then after twice as many, and so on. What an earlier
 # run has learnt is known from more fish than the first ones after a restart.
@@ -112,8 +111,8 @@ def follow_shapes(
     None where there is nothing to learn: a mesh was given, or the source has an end, whose fish
     were looked at before (`shape_pass.py`).
     """
-    forms, settings = inputs.candidates, inputs.config.fit_mesh
-    if forms is None or not inputs.is_endless or not settings.learns_shapes:
+    forms = inputs.candidates
+    if forms is None or not inputs.is_endless or not inputs.config.fit_mesh.learns_shapes:
         return None
     assert isinstance(fit_mesh, FitMesh)
     known = forms
@@ -122,15 +121,7 @@ def follow_shapes(
     fit_mesh.learn(known)
 
     def learn(crops: Sequence[FishCrop], progress: Callable[[str], None]) -> CandidateShapes | None:
-        return learn_shapes(
-            crops,
-            inputs.template,
-            forms,
-            settings,
-            calibration=inputs.calibration,
-            species=inputs.config.species,
-            progress=progress,
-        )
+        return shapes_of(inputs, crops, progress=progress)
 
     def on_learnt(learnt: LearntShapes) -> None:
         nonlocal known

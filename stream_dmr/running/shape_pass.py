@@ -5,6 +5,7 @@ first one is measured.
 """
 
 import itertools
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -13,6 +14,7 @@ from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.fitting.shape.space import reshaped
+from stream_dmr.messages import FishCrop
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.running.inputs import Inputs
@@ -31,8 +33,8 @@ def with_learnt_shapes(
     As they are where nothing is to be learnt: a mesh was given, the source has no end, or an
     earlier run is taken up again, whose fish were measured by other shapes.
     """
-    config, candidates = inputs.config.fit_mesh, inputs.candidates
-    if candidates is None or inputs.is_endless or inputs.resumes or not config.learns_shapes:
+    candidates, learns_shapes = inputs.candidates, inputs.config.fit_mesh.learns_shapes
+    if candidates is None or inputs.is_endless or inputs.resumes or not learns_shapes:
         return inputs
     refuse_earlier(inputs.request.out, is_fine=inputs.request.overwrite)  # before the work
     observer.stage("finding the fish, for their shapes")
@@ -42,14 +44,8 @@ def with_learnt_shapes(
     inputs.reader.close()
     stocks = None
     if not stop.is_set():
-        stocks = learn_shapes(
-            crops,
-            inputs.template,
-            candidates,
-            config,
-            calibration=inputs.calibration,
-            species=inputs.config.species,
-            progress=lambda step: observer.stage(f"learning their shapes: {step}"),
+        stocks = shapes_of(
+            inputs, crops, progress=lambda step: observer.stage(f"learning their shapes: {step}")
         )
         if stocks is None:
             observer.warn("no fish was seen whole: each is measured as the form it is most like")
@@ -60,6 +56,22 @@ def with_learnt_shapes(
     for line in describe(candidates, stocks):
         observer.notice(line)
     return replace(inputs, candidates=stocks)
+
+
+def shapes_of(
+    inputs: Inputs, crops: Iterable[FishCrop], *, progress: Callable[[str], None]
+) -> CandidateShapes | None:
+    """The stocks of a run's fish, see `learn_shapes`; the run has body forms to begin from."""
+    assert inputs.candidates is not None
+    return learn_shapes(
+        crops,
+        inputs.template,
+        inputs.candidates,
+        inputs.config.fit_mesh,
+        calibration=inputs.calibration,
+        species=inputs.config.species,
+        progress=progress,
+    )
 
 
 def save_stocks(
