@@ -6,8 +6,8 @@ times.
 
 import sqlite3
 import time
-from collections.abc import Generator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from threading import RLock
@@ -39,7 +39,7 @@ from stream_dmr.results.signatures import (
     Signer,
     lines_sha256,
 )
-from stream_dmr.results.sql import Statement, insertion
+from stream_dmr.results.sql import Statement, insertion, transaction
 from stream_dmr.results.store_rows import MAY_COUNT_TWICE, fish_row, read_estimates
 from stream_dmr.results.store_state import REVIEWED_ID, check_lines, read_state
 
@@ -341,7 +341,7 @@ class LengthStore:
 
     def _commit(self) -> None:
         marks = replace(self._used, written=self._used.written + len(self._pending))
-        with _transaction(self._database):
+        with transaction(self._database):
             for statement, values in self._pending:
                 self._database.execute(statement, values)
             if self._clip is not None:
@@ -378,15 +378,3 @@ def _marks(database: sqlite3.Connection) -> Marks:
     values = {"track_id": 0} | dict(database.execute("SELECT name, value FROM marks"))
     reviewed = values.pop(REVIEWED_ID, 0)
     return Marks(**values | {"track_id": max(values["track_id"], reviewed)})
-
-
-@contextmanager
-def _transaction(database: sqlite3.Connection) -> Generator[None]:
-    database.execute("BEGIN IMMEDIATE")
-    try:
-        yield
-        database.execute("COMMIT")
-    except BaseException:
-        with suppress(sqlite3.Error):
-            database.execute("ROLLBACK")
-        raise

@@ -1,11 +1,25 @@
 """Statements and questions that every table of a lengths.db needs."""
 
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from typing import Any
 
 Statement = tuple[str, tuple[object, ...]]
 """SQL, and the values of its marks."""
+
+
+@contextmanager
+def transaction(database: sqlite3.Connection) -> Generator[None]:
+    """All that is executed within is written, or nothing of it where any of it raises."""
+    database.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+        database.execute("COMMIT")
+    except BaseException:
+        with suppress(sqlite3.Error):
+            database.execute("ROLLBACK")
+        raise
 
 
 def insertion(table: str, values: Mapping[str, object]) -> Statement:

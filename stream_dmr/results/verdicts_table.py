@@ -11,7 +11,14 @@ from pathlib import Path
 
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.results.lengths_database import DiskRefusal, open_for_reading, open_for_writing
-from stream_dmr.results.sql import add_columns, columns_of, has_table, insertion, rows_of
+from stream_dmr.results.sql import (
+    add_columns,
+    columns_of,
+    has_table,
+    insertion,
+    rows_of,
+    transaction,
+)
 from stream_dmr.results.store_state import REVIEWED_ID
 from stream_dmr.results.verdicts import Verdict
 
@@ -77,7 +84,7 @@ def add_verdict(
     verdict = replace(verdict, written_ns=time.time_ns())
     with _refusing(path), closing(_open_for_verdicts(path)) as database:
         _prepare(database)
-        with _transaction(database):
+        with transaction(database):
             (count,) = database.execute("SELECT COUNT(*) FROM verdicts").fetchone()
             if known is not None and count != known:
                 raise UserError(
@@ -135,17 +142,6 @@ def verdict_line(verdict: Verdict) -> str:
 def _prepare(database: sqlite3.Connection) -> None:
     database.executescript(_TABLES)
     add_columns(database, "verdicts", _ADDED_COLUMNS)
-
-
-@contextmanager
-def _transaction(database: sqlite3.Connection) -> Generator[None]:
-    database.execute("BEGIN IMMEDIATE")
-    try:
-        yield
-    except BaseException:
-        database.execute("ROLLBACK")
-        raise
-    database.execute("COMMIT")
 
 
 def _open_for_verdicts(path: Path) -> sqlite3.Connection:
