@@ -7,7 +7,7 @@ from stream_dmr.errors import UserError
 from stream_dmr.files import is_locked
 from stream_dmr.results.added_tables import read_added
 from stream_dmr.results.finished_fish import database_of, read_runs
-from stream_dmr.results.hauls import END, HAULS, add_haul, haul_values, hauls_of
+from stream_dmr.results.hauls import END, HAULS, add_haul, haul_values, hauls_of, next_name
 from stream_dmr.results.provenance import seal_hauls
 from stream_dmr.sensors.sensors_settings import utc_ns_of
 
@@ -24,8 +24,7 @@ def write_haul(folder: Path, what: str, *, name: str, at: str | None, said_by: s
         if not hauls or hauls[-1].ended_ns is not None:
             raise UserError(f"{folder}: expected a haul that goes on, got none; begin one first")
         name = hauls[-1].name
-    numbers = [int(haul.name) for haul in hauls if haul.name.isdecimal()]
-    name = name.strip() or str(max(numbers, default=0) + 1)
+    name = name.strip() or next_name(hauls)
     timestamp_ns = _timestamp_ns(folder, database, at)
     add_haul(database, haul_values(what, name, timestamp_ns, said_by))
     if not is_locked(folder):

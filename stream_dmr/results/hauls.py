@@ -73,6 +73,12 @@ def haul_at(hauls: Sequence[Haul], timestamp_ns: int) -> str:
     return next((haul.name for haul in hauls if haul.includes(timestamp_ns)), "")
 
 
+def next_name(hauls: Iterable[Haul]) -> str:
+    """The number of a haul that nobody gives a name: that after the highest so far."""
+    numbers = [int(haul.name) for haul in hauls if haul.name.isdecimal()]
+    return str(max(numbers, default=0) + 1)
+
+
 def haul_values(what: str, name: str, timestamp_ns: int, said_by: str) -> dict[str, Any]:
     """The columns of an event, without the run and the time of writing."""
     return {"what": what, "name": name, "timestamp_ns": timestamp_ns, "said_by": said_by}

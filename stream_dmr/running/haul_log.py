@@ -8,7 +8,16 @@ from contextlib import suppress
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.messages import LengthEstimate, Position
 from stream_dmr.results.added_tables import read_added
-from stream_dmr.results.hauls import END, HAULS, START, WATCHED, Haul, haul_values, hauls_of
+from stream_dmr.results.hauls import (
+    END,
+    HAULS,
+    START,
+    WATCHED,
+    Haul,
+    haul_values,
+    hauls_of,
+    next_name,
+)
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.running.hauls_settings import HaulsSettings
 
@@ -60,7 +69,7 @@ class HaulLog:
         with self._lock:
             current = self.current()
             if what == START:
-                name = name.strip() or self._next_name()
+                name = name.strip() or next_name(self.hauls())
             elif what == END and current is not None:
                 name = current.name
             else:
@@ -97,7 +106,7 @@ class HaulLog:
             if not estimate.is_final:
                 return
             if self._pause_ns and self._ruled is None and self.current() is None:
-                self._ruled = self._next_name()
+                self._ruled = next_name(self.hauls())
                 # With all that are in view: one of them may have been there before.
                 self._add(START, self._ruled, min(self._in_view.values()), _RULE)
             del self._in_view[estimate.track_id]
@@ -124,10 +133,6 @@ class HaulLog:
             self._add(END, self._ruled, max(timestamp_ns, self._last_fish_ns) + 1, _RULE)
         self._ruled = None
 
-    def _next_name(self) -> str:
-        numbers = [int(haul.name) for haul in self.hauls() if haul.name.isdecimal()]
-        return str(max(numbers, default=0) + 1)
-
     def _add(self, what: str, name: str, timestamp_ns: int, said_by: str) -> None:
         self._store.append(HAULS, name, haul_values(what, name, timestamp_ns, said_by))
 
@@ -135,10 +140,10 @@ class HaulLog:
         new_lost, self._lost_before = max(0, lost - self._lost_before), lost
         if self._watched is not None:
             first_ns, last_ns, _, _ = self._watched
-            if timestamp_ns - last_ns > _PAUSE_NS or timestamp_ns - first_ns > _WATCHED_NS:
-                is_pause = timestamp_ns - last_ns > _PAUSE_NS
-                if not is_pause:
-                    self._watched[1] = timestamp_ns
+            if timestamp_ns - last_ns > _PAUSE_NS:
+                self._write_watched()
+            elif timestamp_ns - first_ns > _WATCHED_NS:
+                self._watched[1] = timestamp_ns
                 self._write_watched()
         if self._watched is None:
             self._watched = [timestamp_ns, timestamp_ns, 0, 0]
