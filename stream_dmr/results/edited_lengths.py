@@ -1,6 +1,5 @@
 """The length of a fish that reviewers made: its frames, filtered as in a run."""
 
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from stream_dmr.messages import LengthEstimate, LocalizedFish
 from stream_dmr.recording.messages.codec import decode
 from stream_dmr.recording.messages.selection import Selection
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
+from stream_dmr.results.recorded_settings import recorded_settings
 from stream_dmr.results.store_rows import fish_row
 from stream_dmr.results.track_edits import TrackPart
 from stream_dmr.results.verdicts_table import AddedFrame, read_added_frames
@@ -23,8 +23,7 @@ Frames = Mapping[int, Sequence[LocalizedFish]]  # by recorded or added track, in
 
 def settings_of(recording: Recording) -> SmoothLengthSettings:
     """The filter's settings of the run that was recorded."""
-    config = tomllib.loads(recording.header.config_toml)
-    return SmoothLengthSettings.model_validate(config.get("smooth_length", {}))
+    return recorded_settings(recording, "smooth_length", SmoothLengthSettings)
 
 
 def frames_of_tracks(

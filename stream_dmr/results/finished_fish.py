@@ -2,7 +2,6 @@
 
 import json
 import sqlite3
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, fields, replace
@@ -19,6 +18,7 @@ from stream_dmr.results.catch_facts import UNKNOWN_CATCH, CatchFacts
 from stream_dmr.results.hauls import HAULS, haul_at, hauls_of
 from stream_dmr.results.kept_positions import POSITIONS, kept_of, positions_of
 from stream_dmr.results.lengths_database import NAME, open_for_reading
+from stream_dmr.results.recorded_settings import recorded_settings
 from stream_dmr.results.run_facts import RunFacts, cut_short, run_facts
 from stream_dmr.results.scale_checks import last_checks
 from stream_dmr.results.sql import has_table, rows_of
@@ -146,9 +146,7 @@ def read_fish(
 
 def recorded_track(recording: Recording) -> VesselTrack:
     """The vessel's track of a recording, as its run's settings cut it at gaps."""
-    settings = SensorsSettings.model_validate(
-        tomllib.loads(recording.header.config_toml).get("sensors", {})
-    )
+    settings = recorded_settings(recording, "sensors", SensorsSettings)
     found = (message for message, _ in decoded_messages(recording, [Position]))
     positions = (message for message in found if isinstance(message, Position))
     return VesselTrack(kept_of(positions, keep_s=settings.keep_s, max_gap_s=settings.max_gap_s))
