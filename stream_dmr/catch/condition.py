@@ -6,6 +6,7 @@ were compared with the codes in public code that reads SPC's observer data, not 
 """
 
 from stream_dmr.catch.fate import UNKNOWN_FATE
+from stream_dmr.catch.zones import FATE_OF_ZONE
 
 CONDITIONS: dict[str, str] = {
     "A0": "alive, not described further",
@@ -15,4 +16,4 @@ CONDITIONS: dict[str, str] = {
     "D": "dead",
     "U": "unknown",
 }
-FATES = ("landed", "dropped", "cut off", UNKNOWN_FATE)
+FATES = (*FATE_OF_ZONE.values(), UNKNOWN_FATE)

@@ -10,6 +10,8 @@ from pydantic import Field, field_validator
 from stream_dmr.settings import Settings
 
 Points = list[list[float]]
+FATE_OF_ZONE = {"landed": "landed", "dropped": "dropped", "cut_off": "cut off"}
+"""Each zone by its key in config.toml, with what it says of a fish."""
 
 
 class ZonesSettings(Settings):
@@ -40,7 +42,7 @@ class ZonesSettings(Settings):
         "an unknown fate; so has one in view within this time of the end, s",
     )
 
-    @field_validator("landed", "dropped", "cut_off")
+    @field_validator(*FATE_OF_ZONE)
     @classmethod
     def _is_polygon(cls, points: Points) -> Points:
         if points and (len(points) < 3 or any(len(point) != 2 for point in points)):
@@ -51,13 +53,9 @@ class ZonesSettings(Settings):
 
     def polygons(self) -> Iterator[tuple[str, Float[np.ndarray, "N 2"]]]:
         """The fates that have a zone, and its corners."""
-        for name, points in (
-            ("landed", self.landed),
-            ("dropped", self.dropped),
-            ("cut off", self.cut_off),
-        ):
-            if points:
-                yield name, np.array(points, float)
+        for key, fate in FATE_OF_ZONE.items():
+            if points := getattr(self, key):
+                yield fate, np.array(points, float)
 
 
 def shares_in(settings: ZonesSettings, points: Float[np.ndarray, "N 2"]) -> dict[str, float]:

@@ -11,6 +11,7 @@ from typing import Any
 
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
+from stream_dmr.catch.zones import FATE_OF_ZONE
 from stream_dmr.errors import ConfigError, OutputError, UserError
 from stream_dmr.results.table_cells import utc_text
 from stream_dmr.running.run_settings import WatchSettings
@@ -144,8 +145,7 @@ class _WatchHandler(TokenHandler):
 
 def zones_json(state: RunState) -> dict[str, Any]:
     """The zones of the run by their names in config.toml, and the size of its frames, px."""
-    names = ("landed", "dropped", "cut_off")
-    zones = {name: getattr(state.zones, name) for name in names}
+    zones = {name: getattr(state.zones, name) for name in FATE_OF_ZONE}
     return {"size": [state.source.width, state.source.height], "zones": zones}
 
 
