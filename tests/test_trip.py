@@ -117,6 +117,10 @@ def test_hauls_and_agency_tables_have_the_truth(measured: Measured):
     assert [(h["haul"], h["num_fish"], h["num_measured"]) for h in hauls] == [
         (number, "2", "2") for number in "123"
     ]
+    for haul in hauls:
+        fates = [one.fate for one in fish if one.haul == haul["haul"]]
+        for fate in ("landed", "dropped", "cut off"):
+            assert haul[f"num_{fate.replace(' ', '_')}"] == str(fates.count(fate))
     assert [haul["began_utc"][:16] for haul in hauls] == [
         f"2026-11-22T0{6 + k}:00" for k in range(3)
     ]

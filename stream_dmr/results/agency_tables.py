@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+from stream_dmr.catch.zones import FATE_OF_ZONE
 from stream_dmr.csv_file import safe_cell
 from stream_dmr.files import writing_to
 from stream_dmr.results.effort import HaulEffort
@@ -33,9 +34,10 @@ RDBES_COLUMNS = [
     *("BVspecimensState", "BVtypeMeasured", "BVtypeAssessment", "BVvalueMeasured"),
     *("BVvalueUnitOrScale", "BVmethod", "BVmeasurementEquipment", "BVaccuracy", "BVsampler"),
 ]
+_FATE_COLUMNS = {f"num_{zone}": fate for zone, fate in FATE_OF_ZONE.items()}
 HAUL_COLUMNS = [
     *("haul", "began_utc", "ended_utc", "hours_watched", "share_measured", "num_fish"),
-    "num_measured",
+    *("num_measured", *_FATE_COLUMNS),
 ]
 _WCPFC_LENGTHS = {"fork": "UF", "total": "TL"}  # upper jaw to fork; tip of snout to end of tail
 ICES_LENGTHS = {"fork": "LengthFork", "total": "LengthTotal"}
@@ -93,7 +95,7 @@ def haul_row(effort: HaulEffort, *, utc_zero_ns: int | None) -> Row:
             return ""
         return utc_text(time_ns + utc_zero_ns) or ""
 
-    share = effort.share_measured
+    share, fates = effort.share_measured, effort.fates
     return {
         "haul": effort.haul,
         "began_utc": utc(effort.began_ns),
@@ -102,6 +104,10 @@ def haul_row(effort: HaulEffort, *, utc_zero_ns: int | None) -> Row:
         "share_measured": "" if share is None else f"{share:.4f}",
         "num_fish": str(effort.num_fish),
         "num_measured": str(effort.num_measured),
+        **{
+            column: "" if fates is None else str(fates.get(fate, 0))
+            for column, fate in _FATE_COLUMNS.items()
+        },
     }
 
 

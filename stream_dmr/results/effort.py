@@ -1,7 +1,8 @@
 """How much was watched and measured, by haul: what counts of fish are to be divided by."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ class HaulEffort:
     share_measured: float | None = None  # of the frames that came; None: not known
     num_fish: int = 0
     num_measured: int = 0  # with a length
+    fates: Mapping[str, int] | None = None  # number of fish; None: nobody looked for any's fate
 
 
 def read_effort(database: Path, fish: Sequence[FishResult]) -> list[HaulEffort]:
@@ -32,21 +34,13 @@ def read_effort(database: Path, fish: Sequence[FishResult]) -> list[HaulEffort]:
     if hauls:
         efforts = [_effort(haul.name, [haul], watched, fish) for haul in _joined(hauls)]
         inside = sum(one.hours_watched for one in efforts)
-        rest = _effort("", [], watched, fish)
         hours = max(0.0, sum(_hours(row) for row in watched) - inside)
-        outside = HaulEffort(
-            haul="",
-            hours_watched=hours,
-            share_measured=rest.share_measured,
-            num_fish=rest.num_fish,
-            num_measured=rest.num_measured,
-        )
+        outside = replace(_effort("", [], watched, fish), hours_watched=hours)
         return [*efforts, *([outside] if outside.num_fish or hours > 1e-3 else [])]
-    names = dict.fromkeys(facts.haul for facts in read_runs(database).values())
     by_run = {run_id: facts.haul for run_id, facts in read_runs(database).items()}
     return [
         _effort(name, None, [row for row in watched if by_run.get(row["run_id"]) == name], fish)
-        for name in names
+        for name in dict.fromkeys(by_run.values())
     ]
 
 
@@ -70,6 +64,7 @@ def _effort(
     frames = sum(row["frames"] * share for row, share in shares)
     lost = sum(row["frames_lost"] * share for row, share in shares)
     of_haul = [one for one in fish if one.haul == name]
+    has_fates = any(one.fate is not None for one in fish)
     return HaulEffort(
         haul=name,
         began_ns=hauls[0].began_ns if hauls else None,
@@ -78,6 +73,7 @@ def _effort(
         share_measured=frames / (frames + lost) if frames + lost else None,
         num_fish=len(of_haul),
         num_measured=sum(one.length_mm is not None for one in of_haul),
+        fates=Counter(one.fate for one in of_haul if one.fate) if has_fates else None,
     )
 
 

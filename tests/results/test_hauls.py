@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 from stream_dmr.errors import UserError
 from stream_dmr.messages import LengthEstimate, Position
+from stream_dmr.results.agency_tables import haul_row
+from stream_dmr.results.catch_facts import CatchFacts
 from stream_dmr.results.effort import read_effort
 from stream_dmr.results.finished_fish import read_stored_fish
 from stream_dmr.results.haul_events import write_haul
@@ -72,6 +74,21 @@ def test_a_run_that_is_told_of_hauls(tmp_path: Path):
     assert efforts[""].hours_watched == pytest.approx(120 / 3600)
     assert [efforts[name].num_fish for name in ("north", "1", "")] == [2, 1, 1]
     assert efforts["north"].share_measured == 1.0
+
+
+def test_fish_are_counted_by_fate_with_each_haul(tmp_path: Path):
+    store = LengthStore(tmp_path, replace(FACTS, haul="7"))
+    fates = ["landed", "unknown", "cut off", "landed", None]
+    for track_id, fate in enumerate(fates, start=1):
+        store.add(at(track_id, 10.0 * track_id), catch=CatchFacts(fate=fate))
+    store.close()
+    found = read_stored_fish(store.path)
+    (effort,) = read_effort(store.path, found)
+    row = haul_row(effort, utc_zero_ns=None)
+    assert [row[f"num_{zone}"] for zone in ("landed", "dropped", "cut_off")] == ["2", "0", "1"]
+    (effort,) = read_effort(store.path, found[4:])
+    row = haul_row(effort, utc_zero_ns=None)
+    assert [row[f"num_{zone}"] for zone in ("landed", "dropped", "cut_off")] == ["", "", ""]
 
 
 def test_frames_that_were_lost_lower_the_share(tmp_path: Path):
