@@ -4,8 +4,10 @@ import sys
 import traceback
 from collections.abc import Generator
 from contextlib import contextmanager
-from importlib.abc import MetaPathFinder
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated
 
 import typer
@@ -56,17 +58,20 @@ def main() -> None:
         app(prog_name="stream-dmr")
 
 
-class _WithoutPandas(MetaPathFinder):
+class _WithoutPandas(MetaPathFinder, Loader):
     """Hides pandas, which only our development packages and users install.
 
     PyArrow would import it, 40 MB and a fifth of a second of every run, to ask whether a list is
     one of its series. No command needs it, and pyarrow does without.
     """
 
-    def find_spec(self, fullname: str, path: object, target: object = None) -> None:
-        """Raises ModuleNotFoundError for pandas; leaves all else to the other finders."""
-        if fullname == "pandas":
-            raise ModuleNotFoundError("hidden: see stream_dmr.cli.main", name=fullname)
+    def find_spec(self, fullname: str, path: object, target: object = None) -> ModuleSpec | None:
+        """A spec that cannot be imported: torch only looks whether there is one."""
+        return ModuleSpec(fullname, self) if fullname == "pandas" else None
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Raises ModuleNotFoundError."""
+        raise ModuleNotFoundError("hidden: see stream_dmr.cli.main", name=module.__name__)
 
 
 @contextmanager

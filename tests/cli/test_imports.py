@@ -25,3 +25,22 @@ def test_a_run_imports_only_what_it_needs():
     code = CODE.replace("{unneeded}", repr(UNNEEDED))
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert answer.stdout.splitlines()[-1:] == ["[]"], answer.stderr
+
+
+def test_what_looks_whether_pandas_is_there_goes_on_without_it():
+    code = """
+import importlib.util, sys
+import stream_dmr.cli.main as program
+sys.argv = ["stream-dmr", "--version"]
+try:
+    program.main()
+except SystemExit:
+    pass
+importlib.util.find_spec("pandas")  # as torch does
+try:
+    import pandas
+except ModuleNotFoundError:
+    print("hidden")
+"""
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert answer.stdout.splitlines()[-1:] == ["hidden"], answer.stderr
