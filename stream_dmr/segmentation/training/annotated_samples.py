@@ -13,7 +13,7 @@ from stream_dmr.segmentation.training.annotated_images import (
     read_annotated_images,
     read_image,
 )
-from stream_dmr.segmentation.training.box_crops import crop_affine, jitter_box
+from stream_dmr.segmentation.training.box_crops import crop_affine, draw_part_box, jitter_box
 from stream_dmr.segmentation.training.fish_patches import PATCH_PX, RIM_PX
 from stream_dmr.segmentation.training.image_degradation import add_weather, simulate_camera
 from stream_dmr.segmentation.training.random_backgrounds import BACKGROUND_PX
@@ -22,6 +22,7 @@ from stream_dmr.segmentation.training.training_sample import TrainingSample
 _CUTOUT_PX = 320  # width and height of a cutout-out: the fish is longer than in a crop
 _MARGIN = 0.6  # on each side, of the fish's longer side: room to rotate it
 _MIN_AREA_PX = 64  # of a fish's mask, as `[crop_fish] min_mask_area_px`
+_PART_SHARE = 0.055  # of the crops, whose box is around a part of the fish
 _VALIDATION_EVERY = 5  # images, of which one is kept for validation
 
 
@@ -63,6 +64,8 @@ def draw_annotated_sample(rng: np.random.Generator, cutout: Cutout) -> TrainingS
     rows, columns = np.nonzero(cutout[..., 3])
     points = np.column_stack([columns, rows]) @ rotation[:, :2].T + rotation[:, 2]
     box = np.concatenate([points.min(axis=0) - 0.5, points.max(axis=0) + 0.5])
+    if rng.random() < _PART_SHARE:
+        box = draw_part_box(rng, box, points)
     everywhere = np.array([-np.inf, -np.inf, np.inf, np.inf])
     box = jitter_box(rng, box, limits=everywhere)
     crop_from_rotated = crop_affine(box, margin=rng.uniform(0.08, 0.22), size=SIZE_PX)

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from stream_dmr.segmentation.network.unet_interface import SIZE_PX, box_coverage
-from stream_dmr.segmentation.training.box_crops import crop_affine, jitter_box
+from stream_dmr.segmentation.training.background_spots import draw_spot_sample
+from stream_dmr.segmentation.training.box_crops import crop_affine, draw_part_box, jitter_box
 from stream_dmr.segmentation.training.occluders import draw_into
 from stream_dmr.segmentation.training.patch_bank import PatchBank
 from stream_dmr.segmentation.training.scene_rendering import (
@@ -23,7 +24,9 @@ from stream_dmr.segmentation.training.training_scene import SceneFish, TrainingS
 _OVERVIEW_PX = 96  # of a coarse rendering of the scene, in which the boxes are found
 _OVERVIEW = np.array([-1.0, -1.0, 1.0, 1.0])  # scene units
 _NO_BOX_SHARE = 0.12  # of the examples: no box, the mask is of all fish
-_NO_FISH_SHARE = 0.07  # of the examples: the box is around no fish, as detectors' boxes may be
+_NO_FISH_SHARE = 0.10  # of the examples: the box is around no fish, as detectors' boxes may be
+_SPOT_SHARE = 0.45  # of those without a fish: around what stands out in a background
+_PART_SHARE = 0.055  # of the examples: the box is around a part of the fish
 _MIN_VISIBLE = 0.2  # of the target fish; with less visible the scene is drawn again
 
 
@@ -31,9 +34,12 @@ def draw_sample(rng: np.random.Generator, bank: PatchBank) -> TrainingSample:
     """One crop with its true mask and ends."""
     kind = rng.random()
     is_boxed, is_empty = kind >= _NO_BOX_SHARE, kind >= 1 - _NO_FISH_SHARE
+    is_part = not is_empty and kind >= 1 - _NO_FISH_SHARE - _PART_SHARE
+    if is_empty and rng.random() < _SPOT_SHARE and (spot := draw_spot_sample(rng, bank)):
+        return spot
     while True:
         scene = draw_scene(rng, bank)
-        box = _empty_box(rng, bank, scene) if is_empty else _visible_box(bank, scene)
+        box = _empty_box(rng, bank, scene) if is_empty else _visible_box(rng, bank, scene, is_part)
         if box is not None:
             break
     box = jitter_box(rng, box, limits=scene.frame)
@@ -57,8 +63,13 @@ def draw_sample(rng: np.random.Generator, bank: PatchBank) -> TrainingSample:
     )
 
 
-def _visible_box(bank: PatchBank, scene: TrainingScene) -> Float[np.ndarray, "4"] | None:
-    """The tight box around the visible part of the target fish; None where that is too little."""
+def _visible_box(
+    rng: np.random.Generator, bank: PatchBank, scene: TrainingScene, is_part: bool
+) -> Float[np.ndarray, "4"] | None:
+    """The tight box around the visible part of the target fish; None where that is too little.
+
+    With `is_part` the box of a part of it.
+    """
     overview = crop_affine(_OVERVIEW, margin=0.0, size=_OVERVIEW_PX)
     whole = warp_fish(bank, scene.target, overview, size=_OVERVIEW_PX)[..., 3]
     visible = whole * frame_coverage(scene.frame, overview, size=_OVERVIEW_PX)
@@ -70,7 +81,14 @@ def _visible_box(bank: PatchBank, scene: TrainingScene) -> Float[np.ndarray, "4"
     if visible.sum() < _MIN_VISIBLE * whole.sum():
         return None
     x, y, width, height = cv2.boundingRect((visible > 0.5).astype(np.uint8))
-    return _scene_box(x, y, width, height, overview) if width else None
+    if not width:
+        return None
+    box = _scene_box(x, y, width, height, overview)
+    if not is_part:
+        return box
+    rows, columns = np.nonzero(visible > 0.5)
+    points = (np.column_stack([columns, rows]) - overview[:, 2]) / overview[0, 0]
+    return draw_part_box(rng, box, points)
 
 
 def _empty_box(

@@ -16,7 +16,7 @@ from stream_dmr.segmentation.training.fish_patches import PATCH_PX, draw_fish_pa
 from stream_dmr.segmentation.training.random_backgrounds import BACKGROUND_PX, draw_background
 
 _PHOTOGRAPHED_SHARE = 0.4  # of fish, and of backgrounds, where there are any; chosen by hand
-_BANK_VERSION = 2  # part of the file's name; raised when fish or backgrounds are drawn differently
+_BANK_VERSION = 3  # part of the file's name; raised when fish or backgrounds are drawn differently
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

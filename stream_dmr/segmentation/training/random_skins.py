@@ -20,6 +20,9 @@ _BASE_COLOURS_BGR = np.array(  # browns, greys, olive, silver, gold, red, blue-g
     np.float32,
 )
 
+# Of the sides, chosen by hand: of yellow and black reef fish the network took one colour only.
+_TWO_COLOURS_SHARE = 0.08
+
 
 def draw_skin_pair(
     rng: np.random.Generator, *, is_flatfish: bool
@@ -34,11 +37,12 @@ def draw_skin_pair(
 
 def _draw_side(rng: np.random.Generator, *, is_countershaded: bool) -> Float32[np.ndarray, "S Y 3"]:
     """One side of a fish; a countershaded one is pale below."""
-    """One side of a fish; a countershaded one is pale below."""
     s, y = _grid()
     colour = _BASE_COLOURS_BGR[rng.integers(len(_BASE_COLOURS_BGR))] * rng.uniform(0.6, 1.3)
     colour = colour * rng.uniform(0.8, 1.2, 3)
     side = np.broadcast_to(colour, (_ALONG, _ACROSS, 3)).astype(np.float32)
+    if rng.random() < _TWO_COLOURS_SHARE:
+        side = _draw_second_colour(rng, side, s, y)
     if is_countershaded and rng.random() < 0.85:
         belly = colour + rng.uniform(0.2, 1.0) * (np.array([215.0, 220.0, 220.0]) - colour)
         at, width = rng.uniform(-0.3, 0.7), rng.uniform(0.1, 0.6)
@@ -53,8 +57,21 @@ def _draw_side(rng: np.random.Generator, *, is_countershaded: bool) -> Float32[n
     return np.clip(side, 4, 255).astype(np.float32)
 
 
+def _draw_second_colour(
+    rng: np.random.Generator,
+    side: Float32[np.ndarray, "S Y 3"],
+    s: Float[np.ndarray, "S 1"],
+    y: Float[np.ndarray, "1 Y"],
+) -> Float32[np.ndarray, "S Y 3"]:
+    """Another colour behind, before, above or below a slanting edge."""
+    other = _BASE_COLOURS_BGR[rng.integers(len(_BASE_COLOURS_BGR))] * rng.uniform(0.5, 1.4, 3)
+    slant, at = rng.normal(0.0, 0.25), rng.uniform(0.15, 0.85)
+    along = (s - at) * rng.choice([-1.0, 1.0]) + slant * y + 0.02 * _noise(rng, 10.0)
+    covered = 1 / (1 + np.exp(-along / rng.uniform(0.004, 0.03)))
+    return (side + covered[..., None] * (other - side)).astype(np.float32)
+
+
 def _draw_blind_side(rng: np.random.Generator) -> Float32[np.ndarray, "S Y 3"]:
-    """The pale lower side of a flatfish, with red spots."""
     """The pale lower side of a flatfish, with red spots."""
     s, y = _grid()
     colour = np.array([205.0, 214.0, 218.0]) * rng.uniform(0.75, 1.1) * rng.uniform(0.93, 1.07, 3)
@@ -65,7 +82,6 @@ def _draw_blind_side(rng: np.random.Generator) -> Float32[np.ndarray, "S Y 3"]:
 
 
 def _draw_mottling(rng: np.random.Generator) -> Float[np.ndarray, "S Y"]:
-    """Noise of three grain sizes, around 0."""
     """Noise of three grain sizes, around 0."""
     sizes = rng.uniform(0.0, 1.0, 3) * [0.30, 0.22, 0.18]
     grains = (rng.uniform(9.0, 22.0), rng.uniform(3.0, 8.0), rng.uniform(0.8, 2.0))
@@ -117,7 +133,6 @@ def _draw_marks(
 
 
 def _draw_eyes(rng: np.random.Generator, is_round: bool) -> list[tuple[float, float]]:
-    """Places (s, y) of the eyes on one side: one of a round fish, both of a flatfish."""
     """Places (s, y) of the eyes on one side: one of a round fish, both of a flatfish."""
     if is_round:
         return [(rng.uniform(0.06, 0.12), rng.uniform(-0.6, -0.1))]

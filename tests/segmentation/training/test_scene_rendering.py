@@ -12,6 +12,7 @@ from stream_dmr.segmentation.training.scene_rendering import (
     CastShadow,
     cast_shadow,
     frame_coverage,
+    recolour_backdrop,
     render_scene,
     warp_fish,
 )
@@ -83,3 +84,14 @@ def test_the_target_fish_is_one_long_and_at_the_origin(bank: PatchBank, seed: in
     np.testing.assert_allclose(corner + opposite, 0, atol=1e-9)
     side = target.to_scene(np.array([[0.0, 0.0], [PATCH_PX, 0.0]]))
     assert np.linalg.norm(side[1] - side[0]) == pytest.approx(1)
+
+
+def test_a_recoloured_backdrop_comes_close_to_a_colour_of_the_fish():
+    backdrop = np.random.default_rng(2).uniform(120, 160, (128, 128, 3)).astype(np.float32)
+    fish = np.zeros((128, 128, 4), np.float32)
+    fish[40:60, 30:70] = (20, 40, 90, 1)
+    recoloured = recolour_backdrop(np.random.default_rng(3), backdrop, fish)
+    near = np.abs(recoloured.mean(axis=(0, 1)) - [20, 40, 90]).max()
+    assert near < 0.6 * np.abs(backdrop.mean(axis=(0, 1)) - [20, 40, 90]).max()
+    assert recoloured.std() > 0  # its texture is kept
+    assert recolour_backdrop(np.random.default_rng(3), backdrop, 0 * fish) is backdrop
