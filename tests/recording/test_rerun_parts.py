@@ -19,8 +19,9 @@ from stream_dmr.recording.rerun.blueprint import middle_mm
 from stream_dmr.recording.rerun.column_buffer import ColumnBuffer, payload_columns
 from stream_dmr.recording.rerun.rerun_program import copy_readable_chunks, rerun_program
 from stream_dmr.recording.rerun.rrd_recording import RrdRecording, is_closed
-from stream_dmr.recording.rerun.rrd_sink import RrdSink, new_stream
+from stream_dmr.recording.rerun.rrd_sink import RrdSink
 from stream_dmr.recording.rerun.scene_drawing import SceneDrawing
+from stream_dmr.recording.rerun.streams import new_stream
 from tests.support.recorded_run import calibration, header, run
 
 MESSAGES = list(run(3, num_fish=1))
@@ -49,6 +50,19 @@ def test_messages_come_back_by_kind_and_in_order(recording: RrdRecording):
     for kind in TOPICS:
         recorded = [make_record(m, SETTINGS).payload for m in MESSAGES if isinstance(m, kind)]
         assert [payload for _, payload in recording.payloads([kind])] == recorded
+
+
+def test_closed_recordings_leave_no_threads(tmp_path: Path):
+    """A batch and a camera write one recording after the other."""
+
+    def write_one(name: str) -> int:
+        sink = RrdSink(tmp_path / name, header(), SETTINGS)
+        sink.write(make_record(MESSAGES[0], SETTINGS))
+        sink.close()
+        return len(list(Path("/proc/self/task").iterdir()))
+
+    first, *others = [write_one(f"{n}.rrd") for n in range(8)]
+    assert others[-1] - first < len(others)  # a moment later the last ones have ended too
 
 
 def test_a_file_without_its_footer_is_torn_and_its_chunks_can_be_copied(rrd: Path):
@@ -98,8 +112,9 @@ def test_rows_are_sent_once():
     assert len(sent) == 2
 
 
-def test_every_message_is_drawn_and_numbered():
-    drawing = SceneDrawing(new_stream(), header(), SETTINGS)
+def test_every_message_is_drawn_and_numbered(tmp_path: Path):
+    rec = new_stream(rr.FileSink(str(tmp_path / "drawn.rrd")), header())
+    drawing = SceneDrawing(rec, header(), SETTINGS)
     for message in MESSAGES:
         record = make_record(message, SETTINGS)
         drawing.draw(record)

@@ -4,9 +4,9 @@ The schema is `messages.proto`; a dataclass and its protobuf message have the sa
 """
 
 import re
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
-from functools import cache
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from functools import cache, partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -57,6 +57,8 @@ def _encodable(text: str) -> str:
     # A file name of undecodable bytes must not stop a run.
     return text.encode("utf-8", "backslashreplace").decode()
 
+
+_PICTURE_PARTS = [part.name for part in fields(EncodedPicture)]
 
 _SCALARS = {
     FieldDescriptor.TYPE_BOOL: bool,
@@ -121,35 +123,58 @@ def check_version(version: int) -> None:
 
 
 def _fill(proto: Proto, value: object, picture: EncodedPicture | None = None) -> None:
-    for field in proto.DESCRIPTOR.fields:
-        item = getattr(value, field.name)
-        if field.name == "image" and item is not None:
+    for name, put in _puts(type(proto)):
+        item = getattr(value, name)
+        if name == "image" and item is not None:
             item = picture or compress(item, format="png")
         if item is not None:
-            _set(proto, field, item)
+            put(proto, name, item)
 
 
-def _set(proto: Proto, field: Any, item: Any) -> None:
+@cache
+def _puts(kind: type[Proto]) -> list[tuple[str, Callable[[Any, str, Any], None]]]:
+    """How to put a value into each field, by its name: finding out takes longer than doing it."""
+    return [(field.name, _put_of(field)) for field in kind.DESCRIPTOR.fields]
+
+
+def _put_of(field: Any) -> Callable[[Any, str, Any], None]:
     if field.message_type is None:
-        setattr(proto, field.name, _SCALARS[field.type](item))
-        return
-    inner = getattr(proto, field.name)
-    if isinstance(item, Mapping):
-        of_value = field.message_type.fields[1].name
-        for name, value in item.items():
-            inner.add(**{"name": _SCALARS[FieldDescriptor.TYPE_STRING](name), of_value: value})
-        return
+        return partial(_put_scalar, _SCALARS[field.type])
+    if field.is_repeated:
+        return partial(_put_mapping, field.message_type.fields[1].name)
+    puts = {"Picture": _put_picture, "Array": _put_array}
+    return puts.get(field.message_type.name, _put_message)
+
+
+def _put_scalar(kind: Callable[[Any], Any], proto: Any, name: str, item: Any) -> None:
+    setattr(proto, name, kind(item))
+
+
+def _put_mapping(of_value: str, proto: Any, name: str, item: Mapping[str, Any]) -> None:
+    inner = getattr(proto, name)
+    for key, value in item.items():
+        inner.add(**{"name": _encodable(key), of_value: value})
+
+
+def _put_picture(proto: Any, name: str, item: EncodedPicture | np.ndarray) -> None:
+    inner = getattr(proto, name)
+    picture = item if isinstance(item, EncodedPicture) else compress_mask(item)
     inner.SetInParent()
-    if field.message_type.name == "Picture":
-        item = item if isinstance(item, EncodedPicture) else compress_mask(item)
-        for part in fields(EncodedPicture):
-            setattr(inner, part.name, getattr(item, part.name))
-    elif is_dataclass(item):
-        _fill(inner, item)
-    else:
-        little = item.astype(item.dtype.newbyteorder("<"), copy=False)
-        inner.dtype, inner.data = little.dtype.str, little.tobytes()
-        inner.shape.extend(item.shape)
+    for part in _PICTURE_PARTS:
+        setattr(inner, part, getattr(picture, part))
+
+
+def _put_array(proto: Any, name: str, item: np.ndarray) -> None:
+    inner = getattr(proto, name)
+    little = item.astype(item.dtype.newbyteorder("<"), copy=False)
+    inner.dtype, inner.data = little.dtype.str, little.tobytes()
+    inner.shape.extend(item.shape)
+
+
+def _put_message(proto: Any, name: str, item: Any) -> None:
+    inner = getattr(proto, name)
+    inner.SetInParent()
+    _fill(inner, item)
 
 
 def _build(kind: type[T], proto: Proto) -> T:
@@ -190,9 +215,7 @@ def _get(proto: Proto, field: Any) -> Any:
 
 
 def _picture(proto: Any) -> EncodedPicture:
-    return EncodedPicture(
-        **{part.name: getattr(proto, part.name) for part in fields(EncodedPicture)}
-    )
+    return EncodedPicture(**{part: getattr(proto, part) for part in _PICTURE_PARTS})
 
 
 def _array(proto: Any) -> np.ndarray:

@@ -57,7 +57,26 @@ def appearance(track_id: int, faces: Int[np.ndarray, "F 3"]) -> dict[str, rr.AsC
     }
 
 
-def blueprint(header: RunHeader) -> rrb.Blueprint:
+class Layout(rrb.Blueprint):
+    """A layout that can end the stream that Rerun writes it to, which holds itself else.
+
+    That would be two threads and some 8 MB for each video or segment.
+    """
+
+    _stream: rr.RecordingStream | None = None
+
+    def _log_to_stream(self, stream: rr.RecordingStream) -> None:
+        self._stream = stream
+        super()._log_to_stream(stream)
+
+    def end(self) -> None:
+        """Call it when the layout has been sent."""
+        if self._stream is not None:
+            self._stream.disconnect()
+            self._stream = None
+
+
+def blueprint(header: RunHeader) -> Layout:
     """The layout: frame and 3D scene above; length, IoU and the log of events below.
 
     Without a calibration there are no lengths, so the bending ratio takes their place. Where the
@@ -66,7 +85,7 @@ def blueprint(header: RunHeader) -> rrb.Blueprint:
     calibration = header.calibration
     has_positions = header.inputs is not None and header.inputs.nmea is not None
     maps = [rrb.MapView(origin="map", name="Map")] if has_positions else []
-    return rrb.Blueprint(
+    return Layout(
         rrb.Vertical(
             rrb.Horizontal(
                 rrb.Spatial2DView(origin=CAMERA, name="Frame: masks, outlines, keypoints"),

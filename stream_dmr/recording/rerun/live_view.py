@@ -12,9 +12,9 @@ from stream_dmr.errors import OutputError
 from stream_dmr.recording.messages.record import Record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.run_header import RunHeader
-from stream_dmr.recording.rerun.blueprint import blueprint
-from stream_dmr.recording.rerun.rrd_sink import log_run, new_stream
+from stream_dmr.recording.rerun.rrd_sink import log_run
 from stream_dmr.recording.rerun.scene_drawing import SceneDrawing
+from stream_dmr.recording.rerun.streams import new_stream
 
 _PORT = 9876  # Rerun's default
 _MEMORY = "256MiB"  # of the server, for viewers that connect late; what is older is dropped
@@ -38,9 +38,8 @@ class LiveView:
         self._stop = Event()
         port = _free_port()
         self.address = f"rerun+http://127.0.0.1:{port}/proxy"
-        self._rec = new_stream()
         sink = rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=_MEMORY)
-        self._rec.set_sinks(sink, default_blueprint=blueprint(header))
+        self._rec = new_stream(sink, header)
         log_run(self._rec, header)
         self._drawing = SceneDrawing(self._rec, header, settings)
         self._thread = Thread(target=self._draw_all, name="live", daemon=True)

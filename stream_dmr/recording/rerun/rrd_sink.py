@@ -12,9 +12,10 @@ from stream_dmr.recording.messages.record import Record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.topics import END
-from stream_dmr.recording.rerun.blueprint import RUN, blueprint
+from stream_dmr.recording.rerun.blueprint import RUN
 from stream_dmr.recording.rerun.column_buffer import payload_columns
 from stream_dmr.recording.rerun.scene_drawing import SceneDrawing
+from stream_dmr.recording.rerun.streams import end_streams, new_stream
 
 _HEADER = ["messages", "header"]
 _FLUSH_TIMEOUT_S = 30.0  # chosen: a slow disk is waited for, a hanging one is not
@@ -32,10 +33,8 @@ class RrdSink:
         self._with_messages = settings.rrd_messages
         self._closed = False
         self._counts: dict[str, int] = {}  # rows of the header, by entity
-        self._rec = new_stream()
         try:
-            sink = rr.FileSink(str(path))
-            self._rec.set_sinks(sink, default_blueprint=blueprint(header))
+            self._rec = new_stream(rr.FileSink(str(path)), header)
         except RuntimeError as error:
             raise self._output_error(error) from error
         self._drawing = SceneDrawing(self._rec, header, settings)
@@ -69,6 +68,8 @@ class RrdSink:
             self._flush()
         finally:
             self._rec.disconnect()
+            del self._rec, self._drawing
+            end_streams()
 
     def _log_header(self, header: RunHeader) -> None:
         parts = {"run.json": json.dumps(header.metadata()).encode(), **header.attachments()}
@@ -101,14 +102,6 @@ class RrdSink:
             f"{self.path}: expected a file with room to write to, got: {error}; "
             "make room or choose another --out"
         )
-
-
-def new_stream() -> rr.RecordingStream:
-    """A Rerun stream without the timelines of logging time."""
-    rec = rr.RecordingStream("stream-dmr")
-    rec.set_log_time_enabled(False)
-    rec.set_log_tick_enabled(False)
-    return rec
 
 
 def log_run(rec: rr.RecordingStream, header: RunHeader) -> None:

@@ -72,8 +72,9 @@ class SceneDrawing:
         self._tracks: set[int] = set()
         self.num_payloads: Counter[str] = Counter()  # by entity
         self._factor: int | None = None  # frame pixels per pixel of the view
-        self._labels = np.zeros((0, 0), np.uint8)  # masks so far of frame `_labels_frame`
+        self._labels = np.zeros((0, 0), np.uint8)  # masks of one frame
         self._labels_frame = 0
+        self._labelled: FishCrop | None = None  # the last one in it; None: all are drawn
         self._no_masks = b""
         self._track: list[list[float]] = []  # latitude and longitude of positions so far
         self._track_every, self._num_positions = 1, 0
@@ -113,6 +114,7 @@ class SceneDrawing:
 
     def send(self) -> None:
         """Send what was drawn to Rerun."""
+        self._draw_masks()
         self._columns.send()
 
     def finish(self) -> None:
@@ -164,12 +166,20 @@ class SceneDrawing:
         self._mask(strips, crop)
 
     def _mask(self, strips: Sequence[Float[np.ndarray, "_ 2"]], crop: FishCrop) -> None:
-        """Draw the masks of a frame so far; it replaces the picture of the same moment."""
-        if crop.frame_index != self._labels_frame:
-            self._labels_frame = crop.frame_index
+        """Add a mask to those of its frame, which are drawn together."""
+        if self._labelled is not None and self._labelled.frame_index != crop.frame_index:
+            self._draw_masks()
+        if self._labelled is None and self._labels_frame != crop.frame_index:
             self._labels = np.zeros_like(self._labels)
+        self._labels_frame, self._labelled = crop.frame_index, crop
         fill_outlines(self._labels, strips, label=crop.track_id % len(PALETTE) + 1)
-        self._add(topics.MASKS, rr.EncodedImage, crop, blob=[color_labels(self._labels, PALETTE)])
+
+    def _draw_masks(self) -> None:
+        """Draw the masks of a frame so far; it replaces the picture of the same moment."""
+        if self._labelled is not None:
+            picture = color_labels(self._labels, PALETTE)
+            self._add(topics.MASKS, rr.EncodedImage, self._labelled, blob=[picture])
+            self._labelled = None
 
     def _fit(self, fit: FittedMesh) -> None:
         if fit.shape is not None:

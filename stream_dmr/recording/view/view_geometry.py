@@ -59,10 +59,11 @@ def shades(
 
     A vertex's normal is the area-weighted mean of its faces' normals, the sum of cross products.
     """
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    weighted = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    a, b, c = (vertices.T[:, corner] for corner in faces.T)
+    u, v = b - a, c - a
+    weighted = [u[k] * v[m] - u[m] * v[k] for k, m in ((1, 2), (2, 0), (0, 1))]
     corners = faces.ravel()
-    sums = [np.bincount(corners, weighted[:, axis], len(vertices)) for axis in range(3)]
+    sums = [np.bincount(corners, np.repeat(one, 3), len(vertices)) for one in weighted]
     normals = np.stack(sums, axis=1)
     lit = normals @ _LIGHT / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
     grey = 255 * (_AMBIENT + (1 - _AMBIENT) * (0.5 + 0.5 * lit))
