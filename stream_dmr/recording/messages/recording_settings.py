@@ -55,7 +55,8 @@ class RecordingSettings(Settings):
         default=0.5,
         gt=0,
         le=60,
-        description="longest time that data wait for the disk, s: what a crash may lose",
+        description="longest time that data wait for the disk, s: what a crash may lose; those of "
+        "the .rrd ten times as long",
     )
     segment_s: float = Field(
         default=60.0,
