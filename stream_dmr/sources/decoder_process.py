@@ -44,13 +44,20 @@ def main(address: str, memory: int) -> None:
         fps=capture.get(cv2.CAP_PROP_FPS),
         promised=capture.get(cv2.CAP_PROP_FRAME_COUNT),
     )
-    while is_read and image.shape == slots[0].shape:
-        milliseconds = capture.get(cv2.CAP_PROP_POS_MSEC)
-        slot = free.get()
-        np.copyto(slots[slot], image)
-        _send(slot=slot, milliseconds=milliseconds)
-        is_read, image = capture.read(image)
-    _send(resized=image.shape) if is_read else _send(end=True)
+    slot = free.get()
+    np.copyto(slots[slot], image)
+    _send(slot=slot, milliseconds=capture.get(cv2.CAP_PROP_POS_MSEC))
+    while capture.grab():
+        slot = free.get()  # while a slot is waited for, the next picture is decoded already
+        is_read, image = capture.retrieve(slots[slot])
+        if not is_read:
+            break
+        if image.shape != slots[0].shape:
+            return _send(resized=image.shape)
+        if not np.shares_memory(image, slots[slot]):
+            np.copyto(slots[slot], image)
+        _send(slot=slot, milliseconds=capture.get(cv2.CAP_PROP_POS_MSEC))
+    return _send(end=True)
 
 
 def _open(address: str) -> cv2.VideoCapture:
