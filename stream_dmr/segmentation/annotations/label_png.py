@@ -58,7 +58,7 @@ def _unfilter(rows: UInt8[np.ndarray, "N"], labels: UInt8[np.ndarray, "H W"]) ->
     height, width = labels.shape
     for i in range(height):
         first = i * (width + 1) + 1
-        kind = rows[first - 1]
+        kind = int(rows[first - 1])
         if kind > 4:
             return False
         if kind == 1:  # most writers' choice

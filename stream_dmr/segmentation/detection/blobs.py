@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from stream_dmr.segmentation.detection.components import components
+
 # Chosen on simulated scenes (seeds 900 to 903) and the trout clip; see docs/research/raw-video.md.
 _POLE_WIDTH = 1 / 50  # of the longer side; what is thinner throughout may be a gaff or a line
 _MIN_BODY_AREA = 3.0  # pole widths squared; a smaller thick part is a bend of a thin object
@@ -35,7 +37,7 @@ def fish_blobs(
     """
     pole_px = max(3, round(_POLE_WIDTH * max(moving.shape))) | 1
     fish, refused = [], Counter[Refusal]()
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(moving.view(np.uint8))
+    count, labels, stats = components(moving.view(np.uint8))
     height, width = moving.shape
     for label in range(1, count):
         x, y, w, h, area = stats[label].tolist()
@@ -79,7 +81,7 @@ def _without_poles(
 
 def _bodies(opened: UInt8[np.ndarray, "h w"], min_area_px: float) -> list[UInt8[np.ndarray, "h w"]]:
     """The largest component, and those that are nearly as large; a tail fin is not."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
+    count, labels, stats = components(opened)
     areas = stats[1:, cv2.CC_STAT_AREA]
     least = max(min_area_px, _MIN_BODY_RATIO * max(areas, default=0))
     return [(labels == i).astype(np.uint8) for i in range(1, count) if areas[i - 1] >= least]

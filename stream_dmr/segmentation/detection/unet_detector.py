@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from stream_dmr.messages import Frame
+from stream_dmr.segmentation.detection.components import components
 from stream_dmr.segmentation.detection.detector import Candidate
 from stream_dmr.segmentation.network.unet_interface import SIZE_MULTIPLE_PX
 from stream_dmr.segmentation.network.unet_segmenter import UNetSegmenter
@@ -48,7 +49,7 @@ class UNetDetector:
 def _large_components(
     fish: Bool[np.ndarray, "H W"], min_area_px: float
 ) -> list[Bool[np.ndarray, "H W"]]:
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(fish.astype(np.uint8))
+    count, labels, stats = components(fish.astype(np.uint8))
     large = [i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] >= min_area_px]
     return [labels == i for i in large]
 

@@ -152,8 +152,15 @@ def _pixel_areas(
     x: Float32[np.ndarray, "S S"], y: Float32[np.ndarray, "S S"]
 ) -> Float32[np.ndarray, "S S"]:
     """Area of each crop pixel in frame pixels: |det| of the Jacobian of the crop-to-frame map."""
-    (x_down, x_right), (y_down, y_right) = np.gradient(x), np.gradient(y)
-    return np.abs(x_right * y_down - x_down * y_right)
+    return np.abs(_slope(x.T).T * _slope(y) - _slope(x) * _slope(y.T).T)
+
+
+def _slope(values: Float32[np.ndarray, "S S"]) -> Float32[np.ndarray, "S S"]:
+    """Along the first axis: what `np.gradient` gives, in half of its time."""
+    slope = np.empty_like(values)
+    slope[1:-1] = (values[2:] - values[:-2]) / 2
+    slope[0], slope[-1] = values[1] - values[0], values[-1] - values[-2]
+    return slope
 
 
 def _extent(

@@ -10,6 +10,7 @@ from stream_dmr.messages import FishEnds
 from stream_dmr.segmentation.network.unet_interface import ENDS_STRIDE
 
 _MIN_DISTANCE = 3.0  # cells between head and tail: three of the training target's spreads
+_NEAR = 2  # rows and columns: of the cells this near all are nearer than that
 _PEAK_RADIUS = 2  # cells around a peak whose mean locates it between the cells
 _MAX_LOG_ODDS = 50.0  # keeps the exponential finite; the confidence is 1 long before
 
@@ -35,11 +36,12 @@ def find_ends(maps: Float32[np.ndarray, "2 s s"], *, scale: float) -> FishEnds:
 
 def _peaks(log_probability: Float32[np.ndarray, "s s"]) -> list[tuple[int, int]]:
     """Row and column of the highest cell, and of the highest one away from it."""
-    rows, columns = np.indices(log_probability.shape)
-    first = divmod(int(log_probability.argmax()), len(log_probability))
-    is_near = np.hypot(rows - first[0], columns - first[1]) < _MIN_DISTANCE
-    second = divmod(int(np.where(is_near, -np.inf, log_probability).argmax()), len(is_near))
-    return [first, second]
+    row, column = divmod(int(log_probability.argmax()), len(log_probability))
+    away = log_probability.copy()
+    away[
+        max(0, row - _NEAR) : row + _NEAR + 1, max(0, column - _NEAR) : column + _NEAR + 1
+    ] = -np.inf
+    return [(row, column), divmod(int(away.argmax()), len(away))]
 
 
 def _refine(
