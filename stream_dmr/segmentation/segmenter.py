@@ -25,6 +25,11 @@ class SegmentedFish:
 class Segmenter(Protocol):
     """Finds the mask of the fish in a box."""
 
+    @property
+    def knows_fish(self) -> bool:
+        """True where what is no fish gets no mask; False where whatever fills the box gets one."""
+        ...
+
     def segment(
         self, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
     ) -> SegmentedFish:

@@ -18,9 +18,9 @@ class Candidate:
     score: float  # 0 to 1
     # Silhouette within `whole_pixels` of the box; None from a detector of boxes alone.
     foreground: Bool[np.ndarray, "h w"] | None = None
-    # Of a shape found by its looks and not by its motion: the middle, x and y in px of a view that
-    # does not move with the camera. It counts as a fish once it has moved there. None: it moves.
-    unmoved_at_px: Float[np.ndarray, "2"] | None = None
+    # Middle of the box, x and y in px of a view that does not move with the camera. It counts as a
+    # fish once it has moved there; None: it need not move, since somebody found it.
+    place_px: Float[np.ndarray, "2"] | None = None
 
 
 @runtime_checkable

@@ -15,5 +15,6 @@ class Detection:
     # Of the frame's size, all False for an empty mask; None: the segmenter is to find it.
     mask: Bool[np.ndarray, "H W"] | None
     visible_fraction: float  # 0 to 1
+    may_be_no_fish: bool = False  # found by a detector, and not yet known to be a fish
     # Pixels that something in front of fish hides: neither fish nor water; None: no such pixel.
     unknown: Bool[np.ndarray, "H W"] | None = None

@@ -1,8 +1,8 @@
 """Fish by their motion; in the first frames, whose background is not known, also by their looks.
 
 A fish of the first picture is taken for background, and is seen only when it has moved by its own
-length. Looks alone also find marks and reflections, so a shape that only they find starts a track,
-and counts as a fish once it has moved.
+length. Looks also find marks and reflections, and motion finds plants that sway. What either finds
+starts a track, and counts as a fish once it has moved from its place.
 """
 
 from collections.abc import Callable, Mapping
@@ -35,14 +35,14 @@ class FusedDetector:
 
     def find(self, frame: Frame) -> list[Candidate]:
         """The candidates of one frame."""
-        moving = self._motion.find(frame)
+        found = self._motion.find(frame)
         self._num_frames += 1
         if self._num_frames > _FIRST_FRAMES:
             self._looks = None
-            return moving
-        if self._looks is None:
-            self._looks = self._open_looks()
-        return [*moving, *self._unmoved(frame, self._looks, moving)]
+        else:
+            self._looks = self._looks or self._open_looks()
+            found += self._unmoved(frame, self._looks, found)
+        return [self._placed(one, frame) for one in found]
 
     def _unmoved(self, frame: Frame, looks: Detector, moving: list[Candidate]) -> list[Candidate]:
         """What looks like fish where nothing moves."""
@@ -54,7 +54,11 @@ class FusedDetector:
                 max(fraction_inside(box, other), fraction_inside(other, box)) for other in boxes
             ]
             if max(overlaps, default=0.0) <= _MAX_OVERLAP:
-                middle = (box[:2] + box[2:]) / 2
-                place = self._motion.scene_point(middle, shape=frame.image.shape[:2])
-                found.append(replace(one, unmoved_at_px=np.asarray(place)))
+                found.append(one)
         return found
+
+    def _placed(self, one: Candidate, frame: Frame) -> Candidate:
+        """A candidate with its place in the scene."""
+        middle = (one.bbox_xyxy_px[:2] + one.bbox_xyxy_px[2:]) / 2
+        place = self._motion.scene_point(middle, shape=frame.image.shape[:2])
+        return replace(one, place_px=np.asarray(place))

@@ -1,14 +1,26 @@
 """Cut a fish out of a frame: image and mask as an ideal pinhole camera would have seen them."""
 
+from dataclasses import replace
+
 from stream_dmr.camera import Camera
 from stream_dmr.messages import CropQuality, FishCrop, Frame
 from stream_dmr.segmentation.detection.fish_detection import Detection
 from stream_dmr.segmentation.masks.crop_quality import glare, sharpness, touches_border
 from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
-from stream_dmr.segmentation.masks.masked_crop import FrameView, crop_given_mask, crop_segmented
+from stream_dmr.segmentation.masks.masked_crop import (
+    FrameView,
+    MaskedCrop,
+    agreement_in_wider_view,
+    crop_given_mask,
+    crop_segmented,
+)
 from stream_dmr.segmentation.segmenter import Segmenter
 
 NOT_NUMBERED = 0  # track ids begin with 1
+
+# Of masks in a view and in a wider one; those of simulated fish nearly always agree. See
+# docs/research/tracking.md.
+_MIN_AGREEMENT = 0.4
 
 
 def crop_fish(
@@ -29,6 +41,8 @@ def crop_fish(
         crop = crop_given_mask(view, detection.bbox_xyxy_px, detection.mask, detection.unknown)
     elif segmenter is not None:
         crop = crop_segmented(view, detection.bbox_xyxy_px, segmenter)
+        if detection.may_be_no_fish and segmenter.knows_fish:
+            crop = _doubted(view, crop, segmenter)
     else:
         raise ValueError("expected a detection with a mask or a segmenter, got neither")
     return FishCrop(
@@ -51,3 +65,9 @@ def crop_fish(
         ),
         ends=crop.ends,
     )
+
+
+def _doubted(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> MaskedCrop:
+    """A crop of what may be no fish: of little confidence where a wider view shows another mask."""
+    agreement = agreement_in_wider_view(view, crop, segmenter)
+    return crop if agreement >= _MIN_AGREEMENT else replace(crop, confidence=agreement)

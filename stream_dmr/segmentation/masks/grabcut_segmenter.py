@@ -20,6 +20,8 @@ _NUM_ITERATIONS = 5
 class GrabCutSegmenter:
     """A `Segmenter` without weights, which locates no ends."""
 
+    knows_fish = False
+
     def segment(
         self, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
     ) -> SegmentedFish:

@@ -121,6 +121,26 @@ def crop_segmented(
     return max(crops, key=lambda crop: (not crop.is_cut, crop.confidence or 0.0))
 
 
+def agreement_in_wider_view(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> float:
+    """IoU of a crop's mask with the one that a segmenter finds in a wider box around it.
+
+    An eye, a fin, a leaf or a letter looks like a fish while its surroundings are cut off. Seen
+    with them it is nothing, or a part of something larger. The box grows by half its shorter side
+    on each side: by more, a thin fish gets too small to be recognised. 0 for an empty mask.
+    """
+    if crop.extent is None:
+        return 0.0
+    low, high = crop.extent[:2], crop.extent[2:]
+    rim = (high - low).min() / 2
+    wider = _segment(view, np.concatenate([low - rim, high + rim]), segmenter)
+    wider_from_crop = wider.crop_camera.K @ np.linalg.inv(crop.crop_camera.K)
+    mask = cv2.warpAffine(
+        crop.mask.view(np.uint8) * np.uint8(255), wider_from_crop[:2], wider.mask.shape[::-1]
+    )
+    both, either = wider.mask & (mask > 127), wider.mask | (mask > 127)
+    return np.count_nonzero(both) / max(np.count_nonzero(either), 1)
+
+
 def _segment(
     view: FrameView, bbox_xyxy_px: Float[np.ndarray, "4"], segmenter: Segmenter
 ) -> MaskedCrop:

@@ -23,6 +23,8 @@ _CORNER_LABELS = np.array([2.0, 3.0], np.float32)  # top left and bottom right, 
 class PromptableSegmenter:
     """A `Segmenter` from an ONNX file, which locates no ends."""
 
+    knows_fish = False
+
     def __init__(self, path: Path) -> None:
         """Raises ModelError for a file that is no such model; it is tried on three images."""
         self._path = path

@@ -28,6 +28,8 @@ _THREADS = 1  # the layers are too small to share, and other stages need the cor
 class UNetSegmenter:
     """A `Segmenter` that also locates the fish's ends."""
 
+    knows_fish = True
+
     def __init__(self, session: Any) -> None:
         """`session` is onnxruntime's, of a model by `unet_export`."""
         self._session = session

@@ -51,10 +51,14 @@ class FishConfirmation:
         self._confirmed: set[int] = set()  # track numbers
         self._num_clear_frames: Counter[int] = Counter()  # of unconfirmed tracks
 
+    def is_confirmed(self, number: int) -> bool:
+        """True for a track that counts as a fish."""
+        return number in self._confirmed
+
     def update(self, number: int, crop: FishCrop, *, may_count: bool = True) -> bool:
         """Take a track's crop of one frame into account; returns True once it is confirmed.
 
-        `may_count`: False while its looks alone speak for a fish. A confirmed fish remains one
+        `may_count`: False while it has not moved from its place. A confirmed fish remains one
         outside the zone. A crop without `mask_confidence` (a given mask) counts as clearly seen.
         """
         if number not in self._confirmed:

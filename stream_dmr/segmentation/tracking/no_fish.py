@@ -11,6 +11,7 @@ class Sightings:
     frames: int = 0
     candidates: int = 0  # shapes that a detector took for possible fish, over all frames
     tracks: int = 0  # followed ones
+    any_moved: bool = False  # one of them moved from its place
     best_confidence: float = 0.0  # highest `mask_confidence` of any crop
 
 
@@ -37,6 +38,12 @@ def explain_no_fish(
         return begin + (
             f"all {sum(refused.values())} moving shapes were refused ({shapes}); change that "
             "setting where these were fish"
+        )
+    if seen.tracks > 0 and not seen.any_moved:
+        return begin + (
+            f"{seen.tracks} shapes were followed, none left its place by a quarter of its size, "
+            "as plants and glitter don't; fish that stay need a detector of your own (.onnx) or "
+            "--boxes; --stills for single pictures"
         )
     if seen.best_confidence < min_confidence:
         return begin + (

@@ -30,7 +30,6 @@ _PIECE_VARIANCE_RATIO = 9.0  # variance of a piece's center over that of a whole
 _LEARNING_RATE = 0.35  # of the area, per frame
 _MIN_HIDEABLE_FRAMES = 3  # frames seen from which on a track is kept while another fish hides it
 _MAX_MERGED_FRAMES = 30  # that fish may stay merged in one candidate
-_MIN_MOTION = 0.35  # sizes, from where looks alone first found a fish
 _SNAPSHOT_DELAY = 3  # frames: silhouettes are wrong some frames before a merge shows
 _SETTLING_FRAMES = 5  # consecutive frames seen separately after which an identity is certain
 
@@ -42,7 +41,7 @@ class TrackedCandidate:
     track_number: int  # from 1; a fish id is given at confirmation
     candidate: Candidate
     visible_fraction: float  # 0 to 1
-    has_moved: bool  # False: it may be a mark that looks like a fish
+    motion: float  # farthest from where it was first seen, in sizes; infinite: it need not move
 
 
 class Track:
@@ -56,8 +55,8 @@ class Track:
         self.area, self.histogram = observation.area, observation.histogram
         self.length = observation.length
         self.was_separate = not observation.is_piece  # what is always a piece may be no fish
-        self._unmoved_from = observation.candidate.unmoved_at_px
-        self._has_moved = self._unmoved_from is None
+        self._first_place = observation.candidate.place_px
+        self._motion = np.inf if self._first_place is None else 0.0
         self.lost_frames, self.frames_seen, self._merged_frames = 0, 1, 0
         self.snapshot: TrackSnapshot | None = None  # None while the identity is certain
         self._history: deque[TrackSnapshot] = deque(maxlen=_SNAPSHOT_DELAY)
@@ -119,7 +118,7 @@ class Track:
         """Take an observation for this fish."""
         self.observation, self.lost_frames, self._merged_frames = observation, 0, 0
         self.frames_seen += 1
-        self._has_moved = self._has_moved or self._is_moving(observation)
+        self._motion = max(self._motion, self._motion_to(observation))
         self._separate_frames = 0 if observation.is_piece else self._separate_frames + 1
         if observation.is_piece and self.was_separate:
             self._filter.update(
@@ -137,12 +136,12 @@ class Track:
         if self.snapshot is None:
             self._history.append(self._current_snapshot())
 
-    def _is_moving(self, observation: Observation) -> bool:
-        """True where it is found by its motion, or away from where it was first seen unmoved."""
-        place = observation.candidate.unmoved_at_px
-        if place is None or self._unmoved_from is None:
-            return True
-        return bool(np.hypot(*(place - self._unmoved_from)) > _MIN_MOTION * self.size)
+    def _motion_to(self, observation: Observation) -> float:
+        """Sizes from where it was first seen; 0 for pieces of a shape, which have no place."""
+        place = observation.candidate.place_px
+        if place is None or self._first_place is None:
+            return 0.0
+        return float(np.hypot(*(place - self._first_place)) / self.size)
 
     def _current_snapshot(self) -> TrackSnapshot:
         return TrackSnapshot(
@@ -234,5 +233,5 @@ class Track:
             track_number=self.number,
             candidate=self.observation.candidate,
             visible_fraction=min(1.0, self.observation.area / self.area) if is_cut else 1.0,
-            has_moved=self._has_moved,
+            motion=self._motion,
         )

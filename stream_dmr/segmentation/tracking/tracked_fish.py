@@ -1,6 +1,7 @@
 """Fish found in the video alone: detected in every frame, tracked, and confirmed by their masks."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.annotations.box_detector import BoxDetector
@@ -10,6 +11,12 @@ from stream_dmr.segmentation.tracking.box_correction import BoxCorrector
 from stream_dmr.segmentation.tracking.confirmation import ConfirmationSettings, FishConfirmation
 from stream_dmr.segmentation.tracking.no_fish import Sightings, explain_no_fish
 from stream_dmr.segmentation.tracking.tracker import Tracker, TrackerSettings
+
+# Sizes from where a track was first seen; see docs/research/tracking.md. Plants sway and marks
+# glitter in their places. What went far is looked at in its own box alone, since the network loses
+# a thin fish in a wider one.
+_MIN_MOTION = 0.25
+_FAR = 0.5
 
 
 class TrackFishSettings(TrackerSettings, ConfirmationSettings):
@@ -26,7 +33,7 @@ class TrackedFish:
         self._corrector = BoxCorrector()
         self._settings = settings
         self._seen = Sightings()
-        self._unmoved: set[int] = set()  # tracks that may be marks that look like fish
+        self._motion: dict[int, float] = {}  # of the frame's tracks, sizes
         self._found_any = False
 
     def detect(self, frame: Frame) -> list[Detection]:
@@ -37,8 +44,16 @@ class TrackedFish:
         self._seen.candidates += len(candidates)
         boxes = {one.track_number: one.candidate.bbox_xyxy_px for one in tracked}
         visible = {one.track_number: one.visible_fraction for one in tracked}
-        self._unmoved = {one.track_number for one in tracked if not one.has_moved}
-        return self._corrector.correct(boxes, visible, frame)
+        self._motion = {one.track_number: one.motion for one in tracked}
+        self._seen.any_moved |= any(one.motion > _MIN_MOTION for one in tracked)
+        return [
+            replace(one, may_be_no_fish=not self._is_surely_fish(one.source_id))
+            for one in self._corrector.correct(boxes, visible, frame)
+        ]
+
+    def _is_surely_fish(self, track: int) -> bool:
+        """True for a confirmed track, and for one that went far or that need not move."""
+        return self._motion[track] > _FAR or self._confirmation.is_confirmed(track)
 
     @property
     def knows_ids(self) -> bool:
@@ -51,7 +66,7 @@ class TrackedFish:
         fish = [
             track
             for track, crop in crops.items()
-            if self._confirmation.update(track, crop, may_count=track not in self._unmoved)
+            if self._confirmation.update(track, crop, may_count=self._motion[track] > _MIN_MOTION)
         ]
         self._found_any = self._found_any or bool(fish)
         self._seen.tracks = max(self._seen.tracks, *crops) if crops else self._seen.tracks

@@ -1,4 +1,4 @@
-"""Looks help motion in the first frames, and say of what they find that it has not moved."""
+"""Looks help motion in the first frames, and every candidate has its place in the scene."""
 
 import numpy as np
 
@@ -28,15 +28,19 @@ def frame(i: int) -> Frame:
     return frame_of(image, i)
 
 
-def test_what_looks_alone_find_has_not_moved_and_ends_with_the_first_frames():
+def is_still(one: Candidate) -> bool:
+    return np.array_equal(one.bbox_xyxy_px, STILL.bbox_xyxy_px)
+
+
+def test_looks_help_in_the_first_frames_and_candidates_have_places():
     detector = FusedDetector(MotionDetector(MotionSettings()), lambda: Looks(STILL))
     found = [detector.find(frame(i % 8)) for i in range(1, 40)]
-    alone = [[one for one in some if one.unmoved_at_px is not None] for some in found]
+    alone = [[one for one in some if is_still(one)] for some in found]
     assert all(len(some) == 1 for some in alone[:20])
     assert not any(alone[20:])
-    for some in alone[:20]:
-        np.testing.assert_allclose(some[0].unmoved_at_px, [50, 40], atol=1)
-        np.testing.assert_array_equal(some[0].bbox_xyxy_px, STILL.bbox_xyxy_px)
+    for one in (one for some in found for one in some):
+        middle = one.bbox_xyxy_px.reshape(2, 2).mean(axis=0)
+        np.testing.assert_allclose(one.place_px, middle, atol=1)  # the camera is at rest
 
 
 def test_a_shape_that_moves_is_found_once():
@@ -44,6 +48,4 @@ def test_a_shape_that_moves_is_found_once():
     both = Looks(STILL, Candidate(bbox_xyxy_px=box, score=0.9))
     detector = FusedDetector(MotionDetector(MotionSettings()), lambda: both)
     found = [detector.find(frame(i)) for i in range(5)][-1]
-    moving = [one for one in found if one.unmoved_at_px is None]
-    assert len(moving) == 1
-    assert len(found) == 2
+    assert [is_still(one) for one in found] == [False, True]

@@ -19,14 +19,20 @@ SETTINGS = CropFishSettings()
 class Painter:
     """A segmenter that takes every white pixel for fish, and half believes the grey ones."""
 
+    knows_fish = True
+
     def segment(self, image, bbox_xyxy_px):
         self.bbox_xyxy_px = bbox_xyxy_px
         return SegmentedFish(probability=image[..., 0].astype(np.float32) / 255, ends=None)
 
 
-def segmented(picture, box, camera, **knobs):
+def segmented(picture, box, camera, *, may_be_no_fish=False, **knobs):
     detection = Detection(
-        source_id=1, bbox_xyxy_px=np.array(box, np.float64), mask=None, visible_fraction=1.0
+        source_id=1,
+        bbox_xyxy_px=np.array(box, np.float64),
+        mask=None,
+        visible_fraction=1.0,
+        may_be_no_fish=may_be_no_fish,
     )
     painter = Painter()
     crop = crop_fish(
@@ -103,6 +109,8 @@ def test_a_mask_found_beyond_the_frame_does_not_count():
     camera = Camera.nominal(width=100, height=80)
 
     class Everywhere:
+        knows_fish = False
+
         def segment(self, image, bbox_xyxy_px):
             return SegmentedFish(probability=np.ones(image.shape[:2], np.float32), ends=None)
 
@@ -115,3 +123,59 @@ def test_a_mask_found_beyond_the_frame_does_not_count():
     )
     np.testing.assert_array_equal(crop.mask, crop.image[..., 0] > 127)
     assert crop.quality.touches_border
+
+
+@given(st.integers(200, 400), st.integers(150, 300), st.integers(30, 90), st.integers(30, 90))
+@settings(max_examples=10, deadline=None)
+def test_what_looks_alike_in_a_wider_view_keeps_its_confidence(x, y, w, h):
+    camera = Camera.nominal(width=640, height=480)
+    picture = np.zeros((480, 640), np.uint8)
+    picture[y : y + h, x : x + w] = 255
+    box = [x, y, x + w, y + h]
+    known, _ = segmented(picture, box, camera)
+    found, _ = segmented(picture, box, camera, may_be_no_fish=True)
+    assert found.quality.mask_confidence == known.quality.mask_confidence > 0.9
+    np.testing.assert_array_equal(found.mask, known.mask)
+
+
+class Shortsighted(Painter):
+    """Takes for fish what is white, unless it sees at least so many px of the frame at once."""
+
+    def segment(self, image, bbox_xyxy_px):
+        found = super().segment(image, bbox_xyxy_px)
+        white = np.count_nonzero(image[..., 0] > 127) / image[..., 0].size
+        return found if white > 0.3 else SegmentedFish(probability=0 * found.probability, ends=None)
+
+
+@pytest.mark.parametrize("knows_fish", [True, False])
+def test_what_vanishes_in_a_wider_view_is_doubted_by_a_segmenter_that_knows_fish(knows_fish):
+    camera = Camera.nominal(width=640, height=480)
+    picture = np.zeros((480, 640), np.uint8)
+    picture[200:260, 300:360] = 255
+    segmenter = Shortsighted()
+    segmenter.knows_fish = knows_fish
+    crop = crop_fish(
+        frame_of(np.repeat(picture[..., None], 3, axis=2)),
+        Detection(
+            source_id=1,
+            bbox_xyxy_px=np.array([300.0, 200.0, 360.0, 260.0]),
+            mask=None,
+            visible_fraction=1.0,
+            may_be_no_fish=True,
+        ),
+        frame_camera=camera,
+        settings=SETTINGS,
+        segmenter=segmenter,
+    )
+    assert crop.mask.any()
+    assert (crop.quality.mask_confidence < 0.1) == knows_fish
+
+
+def test_a_part_of_something_larger_is_doubted():
+    camera = Camera.nominal(width=640, height=480)
+    picture = np.zeros((480, 640), np.uint8)
+    picture[200:300, 200:500] = 255
+    whole, _ = segmented(picture, [200, 200, 500, 300], camera, may_be_no_fish=True)
+    part, _ = segmented(picture, [300, 220, 340, 250], camera, may_be_no_fish=True)
+    assert whole.quality.mask_confidence > 0.9
+    assert part.quality.mask_confidence < 0.4

@@ -17,7 +17,16 @@ LIMITS = {"min_frames": 4, "min_confidence": 0.8}
         (Sightings(frames=9), {}, "nothing stood out"),
         (Sightings(frames=9), {"shorter than [detect_fish] motion_min_length": 14}, "all 14"),
         (Sightings(frames=9, candidates=5, best_confidence=0.5), {}, "min_mask_confidence = 0.8"),
-        (Sightings(frames=9, candidates=5, tracks=2, best_confidence=0.9), {}, "min_track_frames"),
+        (
+            Sightings(frames=9, candidates=5, tracks=2, best_confidence=0.9),
+            {},
+            "none left its place",
+        ),
+        (
+            Sightings(frames=9, candidates=5, tracks=2, any_moved=True, best_confidence=0.9),
+            {},
+            "min_track_frames",
+        ),
     ],
 )
 def test_the_line_names_what_was_seen_and_the_setting(seen, refused, words):

@@ -39,6 +39,8 @@ class ScriptedDetector:
 class WholeBox:
     """A segmenter that takes every box for fish, with this probability."""
 
+    knows_fish = False
+
     def __init__(self, confidence: float) -> None:
         self._confidence = confidence
 
@@ -122,6 +124,8 @@ def test_a_box_is_corrected_by_the_last_confident_mask_by_a_tenth_at_most(
     class Longer:
         """Sees the fish reach on below every box, by an eighth of the box's height."""
 
+        knows_fish = False
+
         def segment(self, image: np.ndarray, bbox_xyxy_px: np.ndarray) -> SegmentedFish:
             probability = np.zeros(image.shape[:2], np.float32)
             x0, y0, x1, y1 = bbox_xyxy_px.round().astype(int)
@@ -133,3 +137,38 @@ def test_a_box_is_corrected_by_the_last_confident_mask_by_a_tenth_at_most(
         x, y, w, h, _ = climbing(i - 1)
         edges = [x - w / 2, y - h / 2, x + w / 2, y + h / 2 + beyond]
         np.testing.assert_allclose(found[i][0].bbox_xyxy_px, edges, atol=0.5)
+
+
+def doubts_of(speed: float, *, has_place: bool = True) -> list[bool]:
+    """For each of eight frames, whether a shape of 60 px at this speed may be no fish."""
+
+    class OneShape:
+        refused: ClassVar[dict[str, int]] = {}
+
+        def find(self, frame: Frame) -> list[Candidate]:
+            x = 200.0 + speed * frame.frame_index
+            box, place = np.array([x - 30, 140.0, x + 30, 160.0]), np.array([x, 150.0])
+            return [Candidate(bbox_xyxy_px=box, score=1.0, place_px=place if has_place else None)]
+
+    fish = TrackedFish(OneShape(), TrackFishSettings(min_track_frames=4))
+    doubts = []
+    for index in range(1, 9):
+        frame = spots_frame([], index)
+        [detection] = fish.detect(frame)
+        doubts.append(detection.may_be_no_fish)
+        crop = crop_fish(
+            frame,
+            detection,
+            frame_camera=Camera.nominal(width=WIDTH, height=HEIGHT),
+            settings=CropFishSettings(crop_size_px=32),
+            segmenter=WholeBox(1.0),
+        )
+        fish.confirm({detection.source_id: crop})
+    return doubts
+
+
+def test_a_shape_may_be_no_fish_until_it_is_confirmed_or_went_far():
+    assert doubts_of(1.0) == [True] * 8  # stays in its place
+    assert doubts_of(8.0) == [True] * 4 + [False] * 4  # confirmed after four clear frames
+    assert doubts_of(20.0) == [True] * 2 + [False] * 6  # farther than half its length
+    assert doubts_of(1.0, has_place=False) == [False] * 8  # somebody else found it

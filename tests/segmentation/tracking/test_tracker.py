@@ -148,19 +148,32 @@ def test_merged_fish_are_reidentified_by_their_motion(a: float, b: float, late: 
     assert middles == pytest.approx({1: places[-1][0], 2: places[-1][1]})
 
 
-def unmoved(i: int, *, speed: float) -> Candidate:
-    """A shape found by its looks alone, in its i-th frame."""
-    x = 200.0 + speed * i
+def placed(x: float) -> Candidate:
+    """A shape of 60 px at a place of the scene."""
     box = np.array([x - 30, 140.0, x + 30, 160.0])
-    return Candidate(bbox_xyxy_px=box, score=1.0, unmoved_at_px=np.array([x, 150.0]))
+    return Candidate(bbox_xyxy_px=box, score=1.0, place_px=np.array([x, 150.0]))
 
 
-@pytest.mark.parametrize(("speed", "has_moved"), [(0.0, False), (0.5, False), (4.0, True)])
-def test_what_only_looks_like_a_fish_counts_once_it_has_moved(speed: float, has_moved: bool):
-    found = track([[unmoved(i, speed=speed)] for i in range(12)])
+@pytest.mark.parametrize(
+    ("place", "motion"),
+    [
+        (lambda i: 200.0, 0.0),
+        (lambda i: 200.0 + 0.5 * i, 5.5 / 60),
+        (lambda i: 200.0 + 12 * np.sin(i), 12 / 60),  # a plant sways
+        (lambda i: 200.0 + 4.0 * i, 44 / 60),
+    ],
+)
+def test_motion_is_the_greatest_distance_from_the_first_place(place, motion: float):
+    found = track([[placed(place(i))] for i in range(12)])
     assert [one.track_number for frame in found for one in frame] == [1] * 12
-    assert not found[0][0].has_moved
-    assert found[-1][0].has_moved == has_moved
+    assert found[0][0].motion == 0
+    assert found[-1][0].motion == pytest.approx(motion, abs=0.003)
+
+
+def test_what_somebody_found_need_not_move():
+    box = np.array([170.0, 140.0, 230.0, 160.0])
+    found = track([[Candidate(bbox_xyxy_px=box, score=1.0)] for _ in range(3)])
+    assert all(np.isinf(one.motion) for frame in found for one in frame)
 
 
 def test_a_fish_of_another_colour_in_the_same_place_is_another_fish():
