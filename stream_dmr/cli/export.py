@@ -1,7 +1,7 @@
 """`stream-dmr export`: a recording's contents for other programs."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -12,10 +12,7 @@ from stream_dmr.cli.shared_options import (
     parse_selection,
     warn,
 )
-
-Meshes = Literal["ply", "glb"]
-Tables = Literal["csv", "parquet"]
-Agency = Literal["wcpfc", "rdbes"]
+from stream_dmr.results.export_choices import Agency, MeshFormat, TableFormat
 
 
 def export(
@@ -24,16 +21,17 @@ def export(
     ],
     out: Annotated[Path, typer.Option(help="Folder to write to.")],
     meshes: Annotated[
-        Meshes | None, typer.Option(help="A mesh per fish and frame, in mm, in the camera frame.")
+        MeshFormat | None,
+        typer.Option(help="A mesh per fish and frame, in mm, in the camera frame."),
     ] = None,
     masks: Annotated[
         bool, typer.Option("--masks", help="masks.json: every mask as COCO run lengths.")
     ] = False,
     tables: Annotated[
-        Tables | None, typer.Option(help="lengths, and frames with the keypoints.")
+        TableFormat | None, typer.Option(help="lengths, and frames with the keypoints.")
     ] = None,
     fish: Annotated[
-        Tables | None,
+        TableFormat | None,
         typer.Option(
             help="Table for fisheries: total and fork length, whole cm, weight, legal size."
         ),

@@ -8,7 +8,6 @@ vocabularies TypeMeasured and ValueUnitOrScale.
 import csv
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 from stream_dmr.catch.zones import FATE_OF_ZONE
 from stream_dmr.csv_file import safe_cell
@@ -19,7 +18,6 @@ from stream_dmr.results.fish_species import sure_code
 from stream_dmr.results.table_cells import utc_text
 from stream_dmr.template.template import Template
 
-Agency = Literal["wcpfc", "rdbes"]
 Row = dict[str, str]
 
 WCPFC_COLUMNS = [

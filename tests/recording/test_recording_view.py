@@ -26,7 +26,7 @@ from stream_dmr.recording.rerun.live_view import LiveView
 from stream_dmr.recording.rerun.scene_drawing import SceneDrawing
 from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
 from stream_dmr.recording.view.view_geometry import shrink_by_halves, view_factor
-from stream_dmr.results.export_formats import mask_in_frame, run_lengths
+from stream_dmr.results.coco_masks import mask_in_frame, run_lengths
 from tests.support.command import invoke, rows
 from tests.support.reading import read_header, read_messages
 from tests.support.recorded_run import assert_same, header, run
