@@ -53,15 +53,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
     on_refusal = observer.warn if is_endless else None
     signer = None if request.key is None else Signer(request.key)
     files = SignedFiles(out)
-    retention = Retention(
-        out,
-        free_bytes=round(config.recording.keep_free_gb * 1e9) if is_endless else 0,
-        flagged=partial(flagged_fish, out),
-        on_notice=observer.warn,
-        on_changed=files.changed,
-    )
-    with suppress(OSError, OutputError):  # it tries again while the run goes on
-        retention.free_space()
+    retention = _free_space(inputs, files, observer)
     repairs = prepare_folder(
         out, overwrite=request.overwrite, resume=resume, waits_for_room=is_endless
     )
@@ -98,22 +90,21 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
             repairs if is_endless else [], store, on_notice=observer.warn
         )
         learnt = learnt_before(out, header) if is_endless else []
+        segments = partial(
+            open_segments,
+            interrupted=interrupted,
+            learnt=learnt,
+            on_notice=observer.warn,
+            on_closed=files.changed,
+            states=states,
+        )
         recorder = Recorder(
             out,
             header,
             config.recording,
             live=request.live,
             sinks=[FramesTable(out, resume=resume, is_endless=is_endless)],
-            files=partial(
-                open_segments,
-                interrupted=interrupted,
-                learnt=learnt,
-                on_notice=observer.warn,
-                on_closed=files.changed,
-                states=states,
-            )
-            if is_endless
-            else open_recording_files,
+            files=segments if is_endless else open_recording_files,
             on_refusal=on_refusal,
             states=states,
             photographs=config.recording.keeps_photographs(is_live=inputs.source.is_live),
@@ -130,6 +121,21 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
             interrupted=interrupted,
             learnt=learnt,
         )
+
+
+def _free_space(inputs: Inputs, files: SignedFiles, observer: RunObserver) -> Retention:
+    """Make room for the run, before anything of it is written; what keeps it free, not started."""
+    out, keep_free_gb = inputs.request.out, inputs.config.recording.keep_free_gb
+    retention = Retention(
+        out,
+        free_bytes=round(keep_free_gb * 1e9) if inputs.is_endless else 0,
+        flagged=partial(flagged_fish, out),
+        on_notice=observer.warn,
+        on_changed=files.changed,
+    )
+    with suppress(OSError, OutputError):  # it tries again while the run goes on
+        retention.free_space()
+    return retention
 
 
 def _frames_lost(inputs: Inputs) -> int:
