@@ -1,11 +1,9 @@
 import os
-import resource
 import subprocess
 import sys
 import time
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -46,6 +44,7 @@ from stream_dmr.recording.view.view_geometry import place_fit
 from stream_dmr.results.frames_table import FramesTable
 from tests.support.reading import read_header, read_messages, read_metadata
 from tests.support.recorded_run import assert_same, header, run, template
+from tests.support.small_disk import file_size_limit
 from tests.support.vulkan import needs_vulkan
 
 EXACT = RecordingSettings(rrd=False, crops="png", meshes="vertices")
@@ -228,17 +227,6 @@ def test_a_folder_that_cannot_be_made_is_refused_in_one_line(tmp_path: Path):
     assert "\n" not in str(refusal.value)
 
 
-@contextmanager
-def files_no_longer_than(size: int) -> Iterator[None]:
-    """A full disk, near enough: writes beyond `size` fail, after a partial one."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 def test_a_view_that_has_no_room_to_be_repaired_stays(tmp_path: Path, messages: list[Message]):
     record(tmp_path, messages, RecordingSettings())
     rrd = tmp_path / "recording.rrd"
@@ -256,7 +244,7 @@ def test_a_view_that_has_no_room_to_be_repaired_stays(tmp_path: Path, messages: 
 @pytest.mark.parametrize("size", [400_000, 543_210, 700_000])
 def test_a_full_disk_keeps_what_was_written(tmp_path: Path, messages: list[Message], size: int):
     messages = messages * 3
-    with files_no_longer_than(size):
+    with file_size_limit(size):
         recorder = Recorder(tmp_path, header(), EXACT)
         with pytest.raises(OutputError, match="room") as refusal, recorder:
             write_all(recorder, messages)
@@ -272,14 +260,14 @@ def test_a_full_disk_keeps_what_was_written(tmp_path: Path, messages: list[Messa
 def test_a_disk_that_fills_up_at_the_very_end_keeps_what_was_written(
     tmp_path: Path, messages: list[Message]
 ):
-    with files_no_longer_than(2**40):
+    with file_size_limit(2**40):
         sink = McapSink(tmp_path / "recording.mcap", header(), flush_s=1e-9)
     settings = EXACT.model_copy(update={"flush_s": 1e-9})
     recorder = Recorder(tmp_path / "b", header(), settings, in_one_thread=True)
     sink.close()
     write_all(recorder, messages)
     size = os.path.getsize(tmp_path / "b" / "recording.mcap.part")
-    with files_no_longer_than(size + 200), pytest.raises(OutputError):  # no room for the index
+    with file_size_limit(size + 200), pytest.raises(OutputError):  # no room for the index
         recorder.close()
     kept = list(read_messages(tmp_path / "b" / "recording.mcap"))
     assert len(kept) == len(messages)

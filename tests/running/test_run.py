@@ -18,8 +18,8 @@ from stream_dmr.running.config import load_config, to_toml
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_folder import RESULTS
 from stream_dmr.running.run_observer import RunObserver
-from stream_dmr.running.run_request import RunRequest
 from tests.support.command import invoke, rows
+from tests.support.fish_run import request
 from tests.support.reading import read_header, read_messages
 from tests.support.tiny_clip import draw_mask, draw_picture, write_clip
 
@@ -247,14 +247,7 @@ def test_a_run_stopped_at_any_frame_leaves_valid_results(tmp_path: Path, num_fra
     write_clip(clip, fish=[[1, 2]] * 12)
     observer = StopAt(num_frames)
     summary = measure_source(
-        RunRequest(
-            source=str(clip / "video.mp4"),
-            masks=clip / "masks",
-            calibration=clip / "calibration.yaml",
-            template=str(clip / "tiny.ply"),
-            config=clip / "quick.toml",
-            out=tmp_path / "out",
-        ),
+        request(clip, tmp_path / "out"),
         stop=observer.stop,
         observer=observer,
     )

@@ -29,7 +29,6 @@ from stream_dmr.results.scale_checks import ScaleAlarm, ScaleCheck, add_check
 from stream_dmr.running.config import Config
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_observer import RunObserver
-from stream_dmr.running.run_request import RunRequest
 from stream_dmr.running.run_settings import WatchSettings
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
@@ -43,6 +42,7 @@ from tests.support.browser import chromium
 from tests.support.camera import free_port
 from tests.support.final_estimates import FACTS
 from tests.support.final_estimates import fish as finished_fish
+from tests.support.fish_run import request
 from tests.support.recorded_run import HEIGHT, WIDTH
 from tests.support.recorded_run import run as recorded_messages
 from tests.support.tiny_clip import write_clip
@@ -51,9 +51,9 @@ TOKEN = "0123456789abcdef0123"
 
 
 def get(address: str, **headers: str) -> tuple[int, HTTPResponse, bytes]:
-    request = urllib.request.Request(address, headers=headers)
+    asked = urllib.request.Request(address, headers=headers)
     try:
-        with urllib.request.urlopen(request, timeout=10) as answer:
+        with urllib.request.urlopen(asked, timeout=10) as answer:
             return answer.status, answer, answer.read()
     except urllib.error.HTTPError as error:
         with error:
@@ -289,15 +289,8 @@ def test_a_run_counts_every_frame_of_every_stage(tmp_path: Path):
         (clip / "quick.toml").read_text() + f"\n[watch]\nport = {port}\n"
     )
     observer = Watcher(f"http://127.0.0.1:{port}/")
-    request = RunRequest(
-        source=str(clip / "video.mp4"),
-        masks=clip / "masks",
-        calibration=clip / "calibration.yaml",
-        template=str(clip / "tiny.ply"),
-        config=clip / "quick.toml",
-        out=tmp_path / "out",
-    )
-    measure_source(request, stop=threading.Event(), observer=WatchObserver(observer))
+    asked = request(clip, tmp_path / "out")
+    measure_source(asked, stop=threading.Event(), observer=WatchObserver(observer))
     assert observer.served == observer.address
     for number, metrics in enumerate(observer.seen, start=1):
         frames = {k[1:]: v for k, v in metrics.items() if k[0] == "stream_dmr_frames_total"}
