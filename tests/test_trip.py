@@ -72,7 +72,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Measured:
 
 def _classifier(folder: Path) -> Path:
     """Trained on other fish of the two species."""
-    write_scene(folder, small_scene(num_fish=12, num_frames=60, seed=1), species=NAMES)
+    write_scene(folder, small_scene(num_fish=10, num_frames=50, seed=1), species=NAMES)
     names, pictures = NAMES.split(","), defaultdict[str, list[np.ndarray]](list)
     for crop in crops_of(folder):
         assert crop.image is not None

@@ -172,20 +172,18 @@ class TestDamage:
                 open_recordings([run[0]]).payloads(TOPICS, selection)
             )
 
-    @settings(max_examples=2, deadline=None)  # a process each; more in the slow test
-    @given(seed=st.integers(0, 2**32))
-    def test_a_flipped_byte_of_an_rrd_changes_no_message(self, run, tmp_path_factory, seed):
-        _check_flip(run[0] / "recording.rrd", tmp_path_factory.mktemp("flip"), seed)
+    def test_a_flipped_byte_of_an_rrd_changes_no_message(self, run, tmp_path):
+        # A process each; more in the slow test.
+        _check_flip(run[0] / "recording.rrd", tmp_path, seed=1)
 
     @settings(max_examples=30, deadline=None)
     @given(share=st.floats(0.0, 0.999))
     def test_what_is_whole_of_a_torn_file_is_used(self, run, tmp_path_factory, share):
         _check_truncation(run[0] / "recording.mcap", tmp_path_factory.mktemp("torn"), share)
 
-    @settings(max_examples=2, deadline=None)  # a process each; more in the slow test
-    @given(share=st.floats(0.3, 0.95))
-    def test_what_is_whole_of_a_torn_rrd_is_used(self, run, tmp_path_factory, share):
-        _check_truncation(run[0] / "recording.rrd", tmp_path_factory.mktemp("torn"), share)
+    def test_what_is_whole_of_a_torn_rrd_is_used(self, run, tmp_path):
+        # A process each; more in the slow test.
+        _check_truncation(run[0] / "recording.rrd", tmp_path, share=0.6)
 
     @pytest.mark.slow
     def test_a_thousand_flips_and_two_hundred_truncations(self, run, tmp_path):
@@ -240,7 +238,7 @@ def _check_flip(whole: Path, scratch: Path, seed: int) -> None:
         recording = open_recordings([path])
         found += recording.payloads(TOPICS)
         assert whole.suffix == ".rrd" or recording.warnings
-    original = contents(whole)
+    original = contents(whole.with_suffix(".mcap"))  # the .rrd holds the same
     if whole.suffix == ".mcap":
         assert found == original[: len(found)]
     else:

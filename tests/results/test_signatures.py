@@ -389,6 +389,7 @@ def test_a_replay_a_repair_and_a_batch_are_signed_as_well(
         f"{clip / 'video.mp4'},{clip / 'calibration.yaml'},,{clip / 'masks'},a,b,c\n"
     )
     options = {"--out": str(tmp_path / "season"), "--key": str(key), "--workers": "1"}
+    options |= {"--template": str(clip / "tiny.ply"), "--config": str(clip / "quick.toml")}
     assert invoke("batch", {str(manifest): None} | options).code == 0
     assert changes(tmp_path / "season" / "videos" / "video", key) == []
     with closing(sqlite3.connect(again / "lengths.db")) as database, database:

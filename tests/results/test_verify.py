@@ -15,6 +15,7 @@ from stream_dmr.results.verdicts_table import add_verdict
 from stream_dmr.results.verify import verify
 from tests.support.command import invoke
 from tests.support.fish_run import measure
+from tests.support.tiny_clip import write_template
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +153,10 @@ def test_a_recording_that_nothing_sums_up_is_read(out: Path):
 
 
 def test_another_runs_recording(out: Path, tmp_path: Path):
-    other = measure(tmp_path / "other", template="halibut")
+    write_template(tmp_path)
+    for part in (tmp_path / "tiny.ply", tmp_path / "tiny.toml"):
+        part.rename(part.with_stem("another"))
+    other = measure(tmp_path / "other", template=str(tmp_path / "another.ply"))
     shutil.copy(other / "recording.mcap", out / "recording.mcap")
     (out / NAME).unlink()
     assert any("template_sha256" in line for line in changed(out))

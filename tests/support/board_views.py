@@ -32,7 +32,7 @@ class BoardView:
 class BoardRenderer:
     """Renders one board through one camera; the camera's rays are computed once."""
 
-    def __init__(self, camera: Camera, *, board=(9, 6), square_mm=25.0, samples=4):
+    def __init__(self, camera: Camera, *, board=(9, 6), square_mm=25.0, samples=3):
         self.camera, self.board, self.square_mm = camera, board, square_mm
         offsets = (np.arange(samples) + 0.5) / samples - 0.5
         x = np.arange(camera.width)[:, None] + offsets
@@ -70,11 +70,9 @@ class BoardRenderer:
 class CharucoRenderer(BoardRenderer):
     """Renders a ChArUco board as OpenCV prints it, with the inner corners of the chessboard."""
 
-    def __init__(self, camera: Camera, printed: cv2.aruco.CharucoBoard, *, square_mm, samples=3):
+    def __init__(self, camera: Camera, printed: cv2.aruco.CharucoBoard, *, square_mm):
         columns, rows = printed.getChessboardSize()
-        super().__init__(
-            camera, board=(columns - 1, rows - 1), square_mm=square_mm, samples=samples
-        )
+        super().__init__(camera, board=(columns - 1, rows - 1), square_mm=square_mm)
         self._print = printed.generateImage((columns * 100, rows * 100))
 
     def _is_black(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from stream_dmr.segmentation.tracking.fish_finder import open_finder
 from stream_dmr.sources.open_source import open_source
 
 SIDE_PX = 24
-_STEPS, _BATCH = 150, 32
+_STEPS, _BATCH = 100, 32
 
 
 def crops_of(scene: Path, *, boxes: str | None = None) -> list[FishCrop]:
