@@ -12,13 +12,14 @@ setup: $(STAMP)  ## compile the numeric loops, half a minute; without it the fir
 demo: $(STAMP)  ## the main job on the embedded scene, lengths beside the truth
 	$(BIN)/stream-dmr demo
 
+# One worker more than two cores: for a quarter of the time tests wait for others.
 test: $(STAMP)  ## the tests of a few minutes
-	$(BIN)/pytest -n 2 --dist worksteal
+	$(BIN)/pytest -n 3 --dist worksteal
 
 test-slow: $(STAMP)  ## the long ones, and those on material outside the repository
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[ray]'
 	$(BIN)/pytest -m "slow or scenes"
-	$(BIN)/pytest -n 2 --dist worksteal --hypothesis-profile new
+	$(BIN)/pytest -n 3 --dist worksteal --hypothesis-profile new
 
 bench: $(STAMP)  ## the fit beside other renderers, and the chain: docs/research/fit-speed.md, six minutes
 	$(BIN)/python -m benchmarks.fit_speed
