@@ -6,8 +6,7 @@ times.
 
 import sqlite3
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from threading import RLock
@@ -20,12 +19,7 @@ from stream_dmr.results.added_tables import AddedTable
 from stream_dmr.results.catch_facts import UNKNOWN_CATCH, CatchFacts
 from stream_dmr.results.chain_table import ChainWriter, read_chain
 from stream_dmr.results.folder_lock import FolderLock
-from stream_dmr.results.lengths_database import (
-    NAME,
-    DiskRefusal,
-    copy_in_memory,
-    open_for_writing,
-)
+from stream_dmr.results.lengths_database import NAME
 from stream_dmr.results.reserved_space import ReservedSpace
 from stream_dmr.results.run_facts import END_COLUMNS, NOT_ENDED, RunFacts
 from stream_dmr.results.signatures import (
@@ -39,13 +33,13 @@ from stream_dmr.results.signatures import (
     Signer,
     lines_sha256,
 )
-from stream_dmr.results.sql import Statement, insertion, transaction
+from stream_dmr.results.sql import Statement, insertion
 from stream_dmr.results.store_rows import MAY_COUNT_TWICE, fish_row, read_estimates
 from stream_dmr.results.store_state import REVIEWED_ID, check_lines, read_state
+from stream_dmr.results.waiting_rows import MARK, WRITTEN, WaitingRows
 
 _MARK_EVERY_NS = 5_000_000_000  # capture times that a crash may leave unmarked; chosen
 _FRAMES_AHEAD = 1000  # frame numbers that are marked as used at a time; a crash skips the rest
-_MARK = "INSERT INTO marks VALUES (?1, ?2) ON CONFLICT (name) DO UPDATE SET value = ?2"
 _COUNTS = "UPDATE runs SET frames_done = ?, frames_promised = ? WHERE run_id = ?"
 _END = (
     "UPDATE runs SET ended_ns = ?, ended_by = ?, frames_done = ?, frames_promised = ? "
@@ -61,7 +55,6 @@ class Marks:
     track_id: int = 0
     frame_index: int = 0
     timestamp_ns: int = 0  # capture time
-    written: int = 0  # statements committed: shows whether a commit that failed was one after all
 
 
 class LengthStore:
@@ -86,25 +79,29 @@ class LengthStore:
         """
         self.path = out_dir / NAME
         self.run_id = uuid4().hex
-        self.trouble = ""  # why the last row could not be written; "" when all are
         self._facts = replace(facts, ended_by=NOT_ENDED)
         self._reserve = ReservedSpace(out_dir)
         self._lock = RLock()
-        self._pending: list[Statement] = []
         self._clip: tuple[str, int] | None = None  # in work, and its frames done
         self._lock_of_folder = FolderLock(out_dir)
         try:
-            self._database, self._is_reached = self._open(waits_for_disk=waits_for_disk)
-            self._is_stand_in = not self._is_reached
-            self.before = self._used = _marks(self._database)
+            self._rows = WaitingRows(
+                self.path, self._reserve, waits_for_disk=waits_for_disk, state=self._state
+            )
+            self.before = self._used = _marks(self._rows.database)
             self.is_signing = signer is not None
-            self._chain = ChainWriter(signer, self._database)
+            self._chain = ChainWriter(signer, self._rows.database)
             self._begin_run(waits_for_disk=waits_for_disk)
         except BaseException:
             self._lock_of_folder.release()
             raise
         self._marked_at_ns = time.monotonic_ns()
         self._reserve.reserve()
+
+    @property
+    def trouble(self) -> str:
+        """Why the last row could not be written; "" when all are."""
+        return self._rows.trouble
 
     def add(
         self,
@@ -157,12 +154,14 @@ class LengthStore:
         """
         with self._lock:
             if self._clip is not None and self._clip[0] != name:
-                self._pending.append((_CLIP, (*self._clip, 1)))
+                self._rows.pending.append((_CLIP, (*self._clip, 1)))
             self._clip = name, frames_done
 
     def clips_before(self) -> tuple[set[str], dict[str, int]]:
         """The clips that earlier runs have finished, and the frames done of others."""
-        rows = self._database.execute("SELECT name, frames_done, is_done FROM clips").fetchall()
+        rows = self._rows.database.execute(
+            "SELECT name, frames_done, is_done FROM clips"
+        ).fetchall()
         done = {name for name, _, is_done in rows if is_done}
         return done, {name: frames for name, frames, is_done in rows if not is_done}
 
@@ -179,7 +178,7 @@ class LengthStore:
     def scene(self) -> bytes | None:
         """The static scene (see `DriftAlarms`) when this run's calibration was first used here."""
         query = "SELECT data FROM scenes WHERE calibration_sha256 = ?"
-        row = self._database.execute(query, (self._facts.calibration_sha256,)).fetchone()
+        row = self._rows.database.execute(query, (self._facts.calibration_sha256,)).fetchone()
         return None if row is None else row[0]
 
     def keep_scene(self, data: bytes) -> None:
@@ -193,7 +192,7 @@ class LengthStore:
             "SELECT iou FROM fish JOIN runs USING (run_id) "
             "WHERE calibration_sha256 = ? AND iou IS NOT NULL ORDER BY number LIMIT ?"
         )
-        rows = self._database.execute(query, (self._facts.calibration_sha256, count))
+        rows = self._rows.database.execute(query, (self._facts.calibration_sha256, count))
         return [iou for (iou,) in rows]
 
     def note(self, kind: str, text: str, *, timestamp_ns: int) -> None:
@@ -214,9 +213,9 @@ class LengthStore:
         row = {"run_id": self.run_id, **values, "written_ns": time.time_ns()}
         with self._lock:
             signature = self._chain.row(table.kind, name, row)
-            self._pending += [(table.statement, ()), insertion(table.name, row), *signature]
+            self._rows.pending += [(table.statement, ()), insertion(table.name, row), *signature]
             if is_urgent:
-                self._write_pending()
+                self._rows.write()
 
     def sign_file(self, kind: str, name: str, sha256: str) -> None:
         """Sign a file of the folder by its hash, durably; nothing without a signer."""
@@ -226,14 +225,14 @@ class LengthStore:
     def signed_files(self) -> set[str]:
         """The names of all files that were ever signed here."""
         with self._lock:
-            entries = read_chain(self._database)
+            entries = read_chain(self._rows.database)
         return {entry.name for entry in entries if entry.kind in FILE_KINDS}
 
     def estimates(self, *, last: int | None = None) -> list[LengthEstimate]:
         """The finished fish of this folder, in the order in which tracks ended; the `last` few."""
         with self._lock:
             try:
-                return list(read_estimates(self._database, last=last))
+                return list(read_estimates(self._rows.database, last=last))
             except sqlite3.Error as error:
                 raise OutputError(
                     f"{self.path}: expected a database of lengths, got: {error}; make room, or "
@@ -244,13 +243,13 @@ class LengthStore:
         """The track ids of the fish that were in view at a crash."""
         query = "SELECT track_id FROM fish WHERE flags LIKE ?"
         with self._lock:
-            return {i for (i,) in self._database.execute(query, (f"%{MAY_COUNT_TWICE}%",))}
+            return {i for (i,) in self._rows.database.execute(query, (f"%{MAY_COUNT_TWICE}%",))}
 
     def counts(self, column: Literal["status", "species_code", "fate"]) -> dict[str, int]:
         """The number of finished fish by what stands in a column; not of those without it."""
         query = f"SELECT {column}, COUNT(*) FROM fish WHERE {column} NOT NULL GROUP BY {column}"
         with self._lock:
-            return dict(self._database.execute(query))
+            return dict(self._rows.database.execute(query))
 
     def close(self) -> None:
         """End the run and leave one file. Idempotent.
@@ -265,48 +264,34 @@ class LengthStore:
             self._write(*self._signed_state())
             signature = self._chain.row(END, self.run_id, {"run_id": self.run_id} | values)
             self._write((_END, (*values.values(), self.run_id)), *signature)
-        with suppress(sqlite3.Error):
-            self._database.close()
+        self._rows.close()
         self._reserve.release()
         self._lock_of_folder.release()
         if self.trouble:
             raise OutputError(
-                f"{self.path}: expected room for {len(self._pending)} more rows, got: "
+                f"{self.path}: expected room for {len(self._rows.pending)} more rows, got: "
                 f"{self.trouble}; the recording has them: make room and run stream-dmr recover"
             )
 
     def _signed_state(self) -> list[Statement]:
         """Signs what else the file holds, once all of it is written."""
-        self._write_pending()
+        self._rows.write()
         if not self.is_signing or self.trouble:
             return []
-        state, checks = read_state(self._database), check_lines(self._database)
+        state, checks = read_state(self._rows.database), check_lines(self._rows.database)
         return [
             *self._chain.row(STATE, self.run_id, state),
             *self._chain.content(CHECKS, str(len(checks)), lines_sha256(checks)),
         ]
-
-    def _open(self, *, waits_for_disk: bool) -> tuple[sqlite3.Connection, bool]:
-        """The file and True, or a copy of it in memory and False."""
-        try:
-            return open_for_writing(self.path), True
-        except DiskRefusal as error:
-            if not waits_for_disk:
-                raise
-            self.trouble = str(error.__cause__)
-        self._reserve.release()
-        with suppress(DiskRefusal):
-            return open_for_writing(self.path), True
-        return copy_in_memory(self.path), False
 
     def _begin_run(self, *, waits_for_disk: bool) -> None:
         values = {"run_id": self.run_id, "started_ns": time.time_ns()}
         values |= {field.name: getattr(self._facts, field.name) for field in fields(self._facts)}
         begun = {k: v for k, v in values.items() if k not in END_COLUMNS}
         signature = self._chain.row(RUN, self.run_id, begun)
-        self._pending += [insertion("runs", values), *signature]
-        if self._is_reached:
-            self._write_pending()
+        self._rows.pending += [insertion("runs", values), *signature]
+        if self._rows.is_reached:
+            self._rows.write()
             if self.trouble and not waits_for_disk:
                 raise OutputError(
                     f"{self.path}: expected a database of lengths to write to, got: "
@@ -317,64 +302,24 @@ class LengthStore:
         with self._lock:
             higher = {n: max(v, getattr(self._used, n)) for n, v in marks.items()}
             self._used = replace(self._used, **higher)
-            self._write_pending()
+            self._rows.write()
 
     def _write(self, *statements: Statement) -> None:
         with self._lock:
-            self._pending += statements
-            self._write_pending()
+            self._rows.write(*statements)
 
-    def _write_pending(self) -> None:
-        """Commit all that waits; where that fails, release the reserved space and try once more."""
-        for is_last in (False, True):
-            try:
-                self._reach_file()
-                self._commit()
-                return
-            except sqlite3.IntegrityError:  # a fish that is there already: our own mistake
-                raise
-            except (sqlite3.Error, OutputError) as error:
-                self.trouble = str(error.__cause__ or error)
-            self._is_reached = False
-            if not is_last:
-                self._reserve.release()
-
-    def _commit(self) -> None:
-        marks = replace(self._used, written=self._used.written + len(self._pending))
-        with transaction(self._database):
-            for statement, values in self._pending:
-                self._database.execute(statement, values)
-            if self._clip is not None:
-                self._database.execute(_CLIP, (*self._clip, 0))
-            counts = self._facts.frames_done, self._facts.frames_promised
-            self._database.execute(_COUNTS, (*counts, self.run_id))
-            for field in fields(marks):
-                self._database.execute(_MARK, (field.name, getattr(marks, field.name)))
-        self._used = marks
-        self._pending.clear()
-        self.trouble = ""
-
-    def _reach_file(self) -> None:
-        """Open the file again after an error; forget rows that were committed in spite of it."""
-        if self._is_reached:
-            return
-        if not self._is_stand_in:
-            self._database.close()  # SQLite may hold on to a state of the file that never was
-        try:
-            fresh = open_for_writing(self.path)
-        except DiskRefusal:
-            if not self._is_stand_in:
-                self._database, self._is_stand_in = copy_in_memory(self.path), True
-            raise
-        self._database.close()
-        self._database, self._is_reached, self._is_stand_in = fresh, True, False
-        written = _marks(fresh).written
-        del self._pending[: max(0, written - self._used.written)]
-        self._used = replace(self._used, written=written)
+    def _state(self) -> Iterator[Statement]:
+        """What every commit writes as it is then: the clip in work, frames done, what is used."""
+        if self._clip is not None:
+            yield _CLIP, (*self._clip, 0)
+        yield _COUNTS, (self._facts.frames_done, self._facts.frames_promised, self.run_id)
+        for field in fields(self._used):
+            yield MARK, (field.name, getattr(self._used, field.name))
 
 
 def _marks(database: sqlite3.Connection) -> Marks:
     """What was used; ids that reviewers gave to added and split fish are used as well."""
     values = {"track_id": 0} | dict(database.execute("SELECT name, value FROM marks"))
     reviewed = values.pop(REVIEWED_ID, 0)
+    values.pop(WRITTEN, None)
     return Marks(**values | {"track_id": max(values["track_id"], reviewed)})

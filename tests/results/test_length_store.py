@@ -284,7 +284,7 @@ def test_a_commit_that_failed_and_yet_came_to_be_is_not_written_twice(
         opened.append(LateError(path, isolation_level=None, check_same_thread=False))
         return opened[-1]
 
-    monkeypatch.setattr("stream_dmr.results.length_store.open_for_writing", open_late)
+    monkeypatch.setattr("stream_dmr.results.waiting_rows.open_for_writing", open_late)
     store = LengthStore(tmp_path, FACTS)
     opened[0].is_armed = True
     store.note("camera", "moved by 4 px", timestamp_ns=7)
