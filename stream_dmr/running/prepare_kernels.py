@@ -14,7 +14,6 @@ from pathlib import Path
 from threading import Event
 from typing import IO, Any
 
-import cv2
 import llvmlite.binding
 import numba
 import numpy as np
@@ -32,13 +31,12 @@ from stream_dmr.fitting.parameters import rest_vector
 from stream_dmr.fitting.target import Target
 from stream_dmr.fitting.warm_start import recentered
 from stream_dmr.messages import Frame
-from stream_dmr.segmentation.annotations.label_png import read_label_png
 from stream_dmr.segmentation.detection.motion_detector import MotionDetector, MotionSettings
 from stream_dmr.template.template_file import load_template
 
 _TEMPLATE = "halibut"
 _PAUSE_S = 0.3  # between two looks at what the processes have done
-_ABOUT = 90  # kernels in the cache when all are; for the reader of the progress alone
+_ABOUT = 85  # kernels in the cache when all are; for the reader of the progress alone
 
 
 def prepare_kernels(on_progress: Callable[[str], None], *, stop: Event) -> None:
@@ -134,7 +132,7 @@ def _compile_largest() -> None:
 
 
 def _compile_rest() -> None:
-    """Targets, the loss, masks and detection, and then whole fits, which need the largest too."""
+    """Targets, the loss and detection, and then whole fits, which need the largest as well."""
     template, settings = load_template(_TEMPLATE), FitMeshSettings()
     fitter = Fitter(template, settings)
     body = MeshLevels.from_template(template, max_faces=settings.max_faces).fine
@@ -143,8 +141,6 @@ def _compile_rest() -> None:
     )
     evaluate(problem, recentered(problem, rest_vector(len(body.joints))), True)
     _detect()
-    label_png = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
-    read_label_png(label_png, width=8, height=8)
     compile_kernels(fitter)
     # Shapes are learnt from fits without a scan, whose std is that of their covariance.
     unscanned = settings.model_copy(update={"scan_iterations": 0})

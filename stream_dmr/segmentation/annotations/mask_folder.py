@@ -13,7 +13,6 @@ from jaxtyping import Bool, Integer
 from PIL import Image
 
 from stream_dmr.errors import AnnotationError
-from stream_dmr.segmentation.annotations.label_png import read_label_png
 
 _FILE_NAME = re.compile(r"\d{6,}\.png")
 # What Pillow raises for a PNG that it cannot decode.
@@ -70,9 +69,10 @@ class MaskFolder:
         """
         path = self.folder / f"{frame_index:06d}.png"
         try:
-            labels = read_label_png(path.read_bytes(), width=width, height=height)
-            if labels is None:
-                labels = _read_by_pillow(path, width=width, height=height)
+            with Image.open(path) as picture:
+                _check_labels(picture, path, size=(width, height))
+                # A 1-bit picture is decoded as bool, every other mode as unsigned integers.
+                labels = np.asarray(picture)
         except FileNotFoundError:
             return None
         except _DECODING_ERRORS:
@@ -101,13 +101,6 @@ class MaskFolder:
             f"{self.folder}: expected fish ids from 1 on, found only 0 and {largest}, which means "
             "unknown; write the mask of a single fish with the value 1"
         )
-
-
-def _read_by_pillow(path: Path, *, width: int, height: int) -> np.ndarray:
-    with Image.open(path) as picture:
-        _check_labels(picture, path, size=(width, height))
-        # A 1-bit picture is decoded as bool, every other mode as unsigned integers.
-        return np.asarray(picture)
 
 
 def _check_labels(picture: Image.Image, path: Path, *, size: tuple[int, int]) -> None:
