@@ -56,7 +56,7 @@ class RecordingSettings(Settings):
         gt=0,
         le=60,
         description="longest time that data wait for the disk, s: what a crash may lose; those of "
-        "the .rrd ten times as long",
+        "the .rrd four times as long",
     )
     segment_s: float = Field(
         default=60.0,

@@ -20,14 +20,14 @@ from stream_dmr.recording.rerun.streams import end_streams, new_stream
 _HEADER = ["messages", "header"]
 # One for so many of the .mcap, which is the record of truth: what is flushed together is sent in a
 # third of the time, and Rerun keeps some kilobytes of each piece until the file is closed.
-_MCAP_FLUSHES = 10
+_MCAP_FLUSHES = 4
 _FLUSH_TIMEOUT_S = 30.0  # chosen: a slow disk is waited for, a hanging one is not
 
 
 class RrdSink:
     """Draws every record into a stream of its own; Rerun's global stream is not touched.
 
-    Rerun reports a full disk only when it is flushed, which is done every ten times `flush_s`.
+    Rerun reports a full disk only when it is flushed, which is done every four times `flush_s`.
     """
 
     def __init__(self, path: Path, header: RunHeader, settings: RecordingSettings) -> None:
