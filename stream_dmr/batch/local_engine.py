@@ -20,13 +20,17 @@ from stream_dmr.batch.worker import FINISHED
 
 _MAX_STDERR_BYTES = 300  # of a crashed process, for the table of videos: about two lines
 _POLL_S = 0.2  # how soon `stop` is seen
+# What a process has freed lies in pieces between what it keeps: some 5 MB more with each video. A
+# new one takes two seconds to start.
+_VIDEOS_A_PROCESS = 20
 
 
 class LocalEngine:
     """Runs worker processes: a video that crashes its process fails alone."""
 
-    def __init__(self, workers: int) -> None:
+    def __init__(self, workers: int, *, videos_a_process: int = _VIDEOS_A_PROCESS) -> None:
         self._num_workers = workers
+        self._videos_a_process = videos_a_process
 
     def outcomes(
         self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, progress: BatchProgress
@@ -35,7 +39,8 @@ class LocalEngine:
         waiting, finished = queue.Queue[Job](), queue.Queue[Outcome]()
         for job in jobs:
             waiting.put(job)
-        workers = [_Worker(out, stop) for _ in range(min(self._num_workers, len(jobs)))]
+        count = min(self._num_workers, len(jobs))
+        workers = [_Worker(out, stop, self._videos_a_process) for _ in range(count)]
         threads = [
             threading.Thread(target=worker.work, args=(waiting, finished, progress), name="worker")
             for worker in workers
@@ -58,12 +63,16 @@ class LocalEngine:
 
 
 class _Worker:
-    """A worker process, started again after a crash; `work` runs in a thread of its own."""
+    """A worker process, started again after a crash and after so many videos.
+
+    `work` runs in a thread of its own.
+    """
 
     _errors: IO[bytes]  # stderr of the process
 
-    def __init__(self, out: Path, stop: threading.Event) -> None:
+    def __init__(self, out: Path, stop: threading.Event, videos_a_process: int) -> None:
         self._out, self._stop = out, stop
+        self._videos_a_process, self._num_videos = videos_a_process, 0  # of this process
         self._process: subprocess.Popen[str] | None = None
 
     def work(
@@ -101,6 +110,9 @@ class _Worker:
                 break
             on_progress(float(line))
         if is_finished:
+            self._num_videos += 1
+            if self._num_videos >= self._videos_a_process:
+                self._end()
             return read_outcome(job, self._out) or Outcome.failed(
                 job, job.key, "its files changed meanwhile"
             )
@@ -123,7 +135,7 @@ class _Worker:
 
     def _end(self) -> int:
         """Close the process' stdin, which ends it, and wait; return its exit code."""
-        process, self._process = self._process, None
+        process, self._process, self._num_videos = self._process, None, 0
         if process is None:
             return 0
         with suppress(BrokenPipeError), process:

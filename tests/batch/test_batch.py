@@ -379,6 +379,23 @@ def test_the_command_exits_with_2_where_a_video_failed(season: Path, tmp_path: P
     assert "missing: failed: " in outcome.err
 
 
+def test_a_process_measures_so_many_videos(season: Path, tmp_path: Path):
+    """What a process keeps of its videos must not add up over a season."""
+    names = ("one.mp4", "two.mp4", "three.mp4")  # none is there, which takes no time to say
+    jobs = jobs_of(season, tmp_path, *(row(video=name) for name in names))
+    seen = set[int]()
+
+    class Watching(BatchProgress):
+        def update(self) -> None:
+            seen.update(workers(tmp_path))
+
+    engine = LocalEngine(1, videos_a_process=2)
+    progress = Watching(jobs, print)
+    outcomes = engine.outcomes(jobs, tmp_path, stop=threading.Event(), progress=progress)
+    assert sorted(outcome.name for outcome in outcomes) == ["one", "three", "two"]
+    assert len(seen) == 2
+
+
 def test_a_stopped_batch_leaves_nothing_unfinished(season: Path, tmp_path: Path):
     jobs = jobs_of(season, tmp_path, row(), row("other"))
     stop = threading.Event()
