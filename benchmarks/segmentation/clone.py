@@ -27,12 +27,14 @@ class Clone:
         """The paths that match a pattern, in order; not of files that the clone lacks."""
         command = [*self._git, "ls-tree", "-r", "-z", "--name-only", self._commit]
         listed = subprocess.run(command, check=True, capture_output=True).stdout.decode()
-        paths = sorted(path for path in listed.split("\0") if fnmatch(path, pattern))
-        return [path for path in paths if self._has(path)]
+        return self._present(sorted(path for path in listed.split("\0") if fnmatch(path, pattern)))
 
-    def _has(self, path: str) -> bool:
-        command = [*self._git, "cat-file", "-e", f"{self._commit}:{path}"]
-        return subprocess.run(command, check=False, capture_output=True).returncode == 0
+    def _present(self, paths: list[str]) -> list[str]:
+        names = "".join(f"{self._commit}:{path}\n" for path in paths)
+        command = [*self._git, "cat-file", "--batch-check=%(objecttype)"]
+        lines = subprocess.run(command, check=True, capture_output=True, input=names.encode())
+        kinds = lines.stdout.decode().splitlines()
+        return [path for path, kind in zip(paths, kinds, strict=True) if kind == "blob"]
 
     def content(self, path: str) -> bytes:
         """A file's bytes."""

@@ -21,13 +21,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from benchmarks.segmentation.clone import Clone
-from stream_dmr.segmentation.network.onnx_session import open_session
+from benchmarks.segmentation.mask_proposer import MaskProposer, box_of, largest_shape, window
 
 _MANIFEST = Path(__file__).parent / "real_sources.toml"
-_U2NET_PX = 320  # its input's side
-_BOX_MARGIN = 0.18  # around a given box, where a mask is looked for; of its longer side
 _KEPT_MARGIN = 0.7  # of the surroundings that are kept; room to rotate the fish
 _KEPT_PX = 480  # longest side of a kept picture
+_BLACK = 24  # brighter pixels are no padding
+_BLUR_PX = 2  # by which a picture reaches into its padding
 _TILE_GAP_PX = 9  # from the edge of a tile's cell to its picture
 _MIN_BLOB_PX = 250  # of a given mask; smaller ones are specks
 _CANVAS_PX = 384  # side of the photographs that cut-outs are put before
@@ -74,7 +74,7 @@ def read_overlays(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
                 tile, given = tile[:, :half], given[:, half + 2 :]
                 given = cv2.resize(given, (half, len(tile)), interpolation=cv2.INTER_NEAREST)
             for number, mask in enumerate(_blobs(given), start=1):
-                box = _box_of(mask)
+                box = box_of(mask)
                 yield Proposal(
                     name=f"{sheet['name']}{name}_{number}", image=tile, box=box, mask=mask
                 )
@@ -82,23 +82,28 @@ def read_overlays(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
 
 def read_pictures(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
     """Whole pictures, or the boxes that the manifest gives for some of them."""
-    for path in clone.paths(source["files"]):
+    for stem, path in _first_versions(clone.paths(source["files"])).items():
         image = clone.image(path)
-        boxes = source.get("boxes", {}).get(Path(path).stem)
+        boxes = source.get("boxes", {}).get(stem)
         if boxes is None:
-            yield Proposal(name=Path(path).stem, image=image, box=_whole(image))
+            yield Proposal(name=stem, image=image, box=_whole(image))
             continue
         height, width = image.shape[:2]
         for number, box in enumerate(boxes):
             edges = np.array(box) * [width, height, width, height]
-            yield Proposal(name=f"{Path(path).stem}_{number}", image=image, box=edges)
+            yield Proposal(name=f"{stem}_{number}", image=image, box=edges)
 
 
 def read_boxes(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
-    """Boxes of labels in YOLO's format: class, middle and size as fractions of the picture."""
-    for path in clone.paths(source["files"]):
+    """Boxes of labels in YOLO's format: class, middle and size as fractions of the picture.
+
+    A source may say which sizes its pictures had before they were padded with black, right and
+    below; the fractions are of those.
+    """
+    for stem, path in _first_versions(clone.paths(source["files"])).items():
         labels = clone.text(path.replace("/images/", "/labels/").rsplit(".", 1)[0] + ".txt")
         image = clone.image(path)
+        image = _without_padding(image, source.get("sizes_before_padding", []))
         scale = np.tile(image.shape[1::-1], 2)
         for number, line in enumerate(labels.splitlines()):
             kind, *values = map(float, line.split())
@@ -107,8 +112,26 @@ def read_boxes(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
             x, y, width, height = np.array(values) * scale
             box = np.array([x - width / 2, y - height / 2, x + width / 2, y + height / 2])
             if max(width, height) >= source["min_side_px"]:
-                name = Path(path).name.split(".rf.")[0]
-                yield Proposal(name=f"{name}_{number}", image=image, box=box)
+                yield Proposal(name=f"{stem}_{number}", image=image, box=box)
+
+
+def _without_padding(image: Image, sizes: list[tuple[int, int]]) -> Image:
+    """The smallest upper left part, of these widths and heights, with all that is bright."""
+    bright = image.max(axis=2) > _BLACK
+    [rows], [columns] = (np.nonzero(bright.mean(axis=axis) > 0.02) for axis in (1, 0))
+    for width, height in sorted(sizes, key=lambda size: size[0] * size[1]):
+        if len(rows) and columns[-1] < width + _BLUR_PX and rows[-1] < height + _BLUR_PX:
+            return image[:height, :width]
+    return image
+
+
+def _first_versions(paths: list[str]) -> dict[str, str]:
+    """By name, the first of several versions of a picture, which Roboflow numbers after `.rf.`."""
+    versions: dict[str, str] = {}
+    for path in paths:
+        name = Path(path).name
+        versions.setdefault(name.split(".rf.")[0] if ".rf." in name else Path(path).stem, path)
+    return versions
 
 
 def read_labelled(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
@@ -119,7 +142,7 @@ def read_labelled(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
         labels = cv2.resize(labels, image.shape[1::-1])[..., 0] > 127
         for number, mask in enumerate(_blobs(labels), start=1):
             name = f"{Path(path).stem.strip('_')}_{number}"
-            yield Proposal(name=name, image=image, box=_box_of(mask), mask=mask)
+            yield Proposal(name=name, image=image, box=box_of(mask), mask=mask)
 
 
 def read_cutouts(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
@@ -129,7 +152,9 @@ def read_cutouts(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
     for name, (x0, y0, x1, y1) in _cells(image, source["rows"], source["columns"], gap=0):
         tile = image[y0:y1, x0:x1]
         bright = (tile.max(axis=2) > 14).astype(np.uint8)  # JPEG's noise is darker
-        mask = _largest(cv2.morphologyEx(bright, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0)
+        mask = largest_shape(
+            cv2.morphologyEx(bright, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
+        )
         if mask is not None:
             yield Proposal(name=name, image=tile, box=_whole(tile), mask=mask)
 
@@ -144,37 +169,9 @@ READERS = {
 }
 
 
-def propose_mask(session: Any, proposal: Proposal) -> Mask | None:
-    """The largest shape that stands out in a box, by U2-Net; None without any."""
-    x0, y0, x1, y1 = window(proposal.image, proposal.box, margin=_BOX_MARGIN)
-    part = proposal.image[y0:y1, x0:x1]
-    small = cv2.resize(part, (_U2NET_PX, _U2NET_PX), interpolation=cv2.INTER_AREA)
-    rgb = small[..., ::-1] / max(float(small.max()), 1.0)
-    rgb = (rgb - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
-    blob = rgb.transpose(2, 0, 1)[None].astype(np.float32)
-    output = session.run(None, {session.get_inputs()[0].name: blob})[0][0, 0]
-    output = (output - output.min()) / max(float(np.ptp(output)), 1e-6)
-    salient = np.zeros(proposal.image.shape[:2], bool)
-    salient[y0:y1, x0:x1] = cv2.resize(output, part.shape[1::-1]) > 0.5
-    grow = 0.06 * float((proposal.box[2:] - proposal.box[:2]).max())
-    left, top, right, bottom = proposal.box + grow * np.array([-1, -1, 1, 1])
-    rows, columns = np.indices(salient.shape)
-    salient &= (columns >= left) & (columns <= right) & (rows >= top) & (rows <= bottom)
-    return _largest(salient)
-
-
-def window(image: Image, box: Float[np.ndarray, "4"], *, margin: float) -> tuple[int, ...]:
-    """Left, top, right, bottom of a square around a box, within the picture."""
-    half = float((box[2:] - box[:2]).max()) * (1 + 2 * margin) / 2
-    center, size = (box[:2] + box[2:]) / 2, image.shape[1::-1]
-    low = np.floor(center - half).astype(int).clip(0)
-    high = np.minimum(np.ceil(center + half).astype(int), size)
-    return (*low.tolist(), *high.tolist())
-
-
 def keep(proposal: Proposal, mask: Mask) -> tuple[Image, Mask]:
     """The fish with its surroundings, not larger than `_KEPT_PX`."""
-    x0, y0, x1, y1 = window(proposal.image, _box_of(mask), margin=_KEPT_MARGIN)
+    x0, y0, x1, y1 = window(proposal.image, box_of(mask), margin=_KEPT_MARGIN)
     image, kept = proposal.image[y0:y1, x0:x1], mask[y0:y1, x0:x1] * np.uint8(255)
     scale = _KEPT_PX / max(image.shape[:2])
     if scale < 1:
@@ -200,7 +197,7 @@ def build(repositories: Path, saliency: Path, out: Path, *, only: list[str], she
     """Write the data set, or only some of its sources."""
     manifest = tomllib.loads(_MANIFEST.read_text(encoding="utf-8"))
     backgrounds = write_backgrounds(repositories, manifest["backgrounds"], out / "backgrounds")
-    session = open_session(saliency)
+    proposer = MaskProposer(saliency)
     rng = np.random.default_rng(5)
     for name in only or manifest["sources"]:
         source = manifest["sources"][name]
@@ -215,13 +212,16 @@ def build(repositories: Path, saliency: Path, out: Path, *, only: list[str], she
             )
             if not (is_kept or sheets):
                 continue
-            mask = proposal.mask if proposal.mask is not None else propose_mask(session, proposal)
+            mask, note = proposal.mask, ""
             if mask is None:
-                continue
+                proposed = proposer.propose(proposal.image, proposal.box)
+                if proposed is None:
+                    continue
+                mask, note = proposed.mask, f"{proposed.agreement:.2f} "
             image, mask = keep(proposal, mask)
             if source["kind"] == "cutouts":
                 image, mask = put_before(_photograph(rng, backgrounds), image, mask)
-            shown.append(_outlined(image, mask, proposal.name))
+            shown.append(_outlined(image, mask, note + proposal.name))
             if is_kept:
                 num_kept += 1
                 stem = f"{name.replace('-', '_')}-{proposal.name}.png"
@@ -276,16 +276,6 @@ def _red(image: Image) -> UInt8[np.ndarray, "H W"]:
 def _blobs(mask: np.ndarray) -> list[Mask]:
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     return [labels == i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] >= _MIN_BLOB_PX]
-
-
-def _largest(mask: Mask) -> Mask | None:
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    return labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()) if count > 1 else None
-
-
-def _box_of(mask: Mask) -> Float[np.ndarray, "4"]:
-    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    return np.array([x, y, x + width, y + height], np.float64)
 
 
 def _whole(image: Image) -> Float[np.ndarray, "4"]:
