@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from stream_dmr.segmentation.masks.masked_crop import expected_iou
+from stream_dmr.segmentation.masks.masked_crop import mask_confidence
 from stream_dmr.segmentation.network.unet_interface import SIZE_PX
 from stream_dmr.segmentation.network.unet_segmenter import SHIPPED, UNetSegmenter
 from stream_dmr.segmentation.training.annotated_images import read_annotated_images
@@ -27,7 +27,7 @@ _BOXES = 3  # per fish
 _MARGIN = 0.15  # as `[crop_fish] margin`
 _SPREAD = 0.03  # of a box's edges, as a fraction of its sides
 _SHOWN = 12  # worst crops of a source on the sheet
-_CLAIMS = (0.5, 0.7, 0.8, 0.9)
+_CLAIMS = (0.6, 0.7, 0.8, 0.9)
 
 Crop = tuple[UInt8[np.ndarray, "S S 3"], Bool[np.ndarray, "S S"], Float[np.ndarray, "4"]]
 
@@ -66,7 +66,7 @@ def judge(network: UNetSegmenter, crops: list[Crop]) -> tuple[np.ndarray, np.nda
         probability = network.segment(image, box).probability
         mask = probability > 0.5
         ious.append(np.count_nonzero(mask & truth) / max(np.count_nonzero(mask | truth), 1))
-        claims.append(expected_iou(probability, mask))
+        claims.append(mask_confidence(probability, mask))
         found.append(mask)
     return np.array(ious), np.array(claims), found
 
