@@ -62,7 +62,7 @@ class CropQuality:
     visible_fraction: float  # of the fish, 0 to 1, as the annotations or the tracker say
     sharpness: float  # variance of the Laplacian inside the mask, grey levels squared
     mask_area_px: float  # of the mask, in frame pixels
-    # The IoU that the mask should have by its segmenter's own probabilities; None: given, not found
+    # The IoU with the truth that nine in ten masks like this one reach; None: given, not found
     mask_confidence: float | None = None
     glare: float | None = None  # share of the mask that is blown out; None: an older recording
 

@@ -34,7 +34,7 @@ class LocalizeSettings(Settings):
         default=0.7, ge=0, le=1, description="least visible part of a fish that counts, 0 to 1"
     )
     min_mask_confidence: float = Field(
-        default=0.7,
+        default=0.36,
         ge=0,
         le=1,
         description="least mask confidence that counts; given masks have none",

@@ -239,7 +239,7 @@ def quality(**changes):
         ({"touches_border": True}, {}, Reason.TOUCHES_BORDER),
         ({"visible_fraction": 0.69}, {}, Reason.MOSTLY_HIDDEN),
         ({"visible_fraction": np.nan}, {}, Reason.MOSTLY_HIDDEN),
-        ({"mask_confidence": 0.69}, {}, Reason.UNSURE_MASK),
+        ({"mask_confidence": 0.35}, {}, Reason.UNSURE_MASK),
         ({"mask_confidence": np.nan}, {}, Reason.UNSURE_MASK),
         ({}, {"iou": 0.84}, Reason.POOR_FIT),
         ({}, {"iou": np.nan}, Reason.POOR_FIT),

@@ -14,7 +14,7 @@ _TRIED_PER_FISH = 8  # frames of which the best fitted are taken; chosen
 MAX_FISH = 60  # a stock's mean is known to an eighth of its individuals' spread, then
 # Of a frame; chosen so that only masks of whole fish are learnt from.
 _MIN_VISIBLE = 0.99
-_MIN_CONFIDENCE = 0.8  # of a mask that was found
+_MIN_CONFIDENCE = 0.52  # of a mask that was found
 
 T = TypeVar("T")
 

@@ -14,7 +14,7 @@ from stream_dmr.segmentation.detection.fish_detection import Detection
 from stream_dmr.segmentation.masks.crop_geometry import mask_bbox_in_frame
 
 # Chosen on simulated scenes (seeds 950 to 953) by mask IoU; see docs/research/raw-video.md.
-_MIN_MASK_CONFIDENCE = 0.9  # a mask below it corrects no box
+_MIN_MASK_CONFIDENCE = 0.74  # a mask below it corrects no box
 _MIN_OFFSET = 0.03  # of the box's longer side; smaller offsets are outline noise
 _MAX_OFFSET = 0.1  # likewise; a larger one would cut a fish off for good where the mask lost a part
 

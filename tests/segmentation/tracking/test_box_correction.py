@@ -57,5 +57,5 @@ def test_a_corrected_box_stays_in_the_frame():
 
 
 def test_masks_of_low_confidence_correct_no_box():
-    moved = corrected(BOX, mask_box=[80, 100, 320, 200], confidence=0.85)
+    moved = corrected(BOX, mask_box=[80, 100, 320, 200], confidence=0.73)
     np.testing.assert_array_equal(moved, BOX)

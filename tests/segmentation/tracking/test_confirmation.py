@@ -30,7 +30,7 @@ def confirmed(crops: Sequence[FishCrop], **settings: object) -> list[bool]:
 
 
 def test_a_track_is_confirmed_after_enough_clear_frames():
-    unclear, clear = crop_at(50, 50, confidence=0.79), crop_at(50, 50, confidence=0.8)
+    unclear, clear = crop_at(50, 50, confidence=0.51), crop_at(50, 50, confidence=0.52)
     crops = [clear, unclear, clear, unclear, unclear, clear, unclear]
     assert confirmed(crops, min_track_frames=3) == [False] * 5 + [True] * 2
 

@@ -97,7 +97,7 @@ def test_a_track_counts_once_it_is_long_enough():
 def test_what_never_looks_like_a_fish_does_not_count():
     frames = [[climbing(i)] for i in range(20)]
     assert ids(follow(frames, confidence=0.7, min_track_frames=4)) == [[]] * 20
-    assert ids(follow(frames, confidence=0.7, min_mask_confidence=0.6)) == [[1]] * 20
+    assert ids(follow(frames, confidence=0.7, min_mask_confidence=0.3)) == [[1]] * 20
 
 
 def test_fish_count_in_the_zone_and_keep_their_ids_outside():
