@@ -23,7 +23,7 @@ from stream_dmr.sources.source import ResumePoint
 from stream_dmr.sources.video_file import VideoFile
 from tests.support.camera import Camera, camera, require_server
 
-QUICK = ReadFramesSettings(silence_s=1.5, connect_s=4.0, retry_s=0.5)
+QUICK = ReadFramesSettings(silence_s=1.5, connect_s=20.0, retry_s=0.5)
 NUM_PICTURES = 32
 BURST = 30  # on connecting, FFmpeg looks through a second of the stream, then hands it out at once
 
