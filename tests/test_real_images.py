@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.segmentation import real_images
+from benchmarks.segmentation.mask_proposer import MaskProposer, ProposedMask
 from benchmarks.segmentation.real_images import READERS, Proposal, keep, put_before, window
 
 MANIFEST = Path(real_images.__file__).parent / "real_sources.toml"
@@ -71,3 +72,40 @@ def test_a_cut_out_covers_the_photograph_where_its_mask_is():
     assert image.shape[:2] == whole.shape
     assert image[whole].mean() > 150
     assert not image[:100].any()
+
+
+def test_padding_is_cut_off_and_dark_pictures_keep_their_size():
+    sizes = [(40, 60), (60, 40)]
+    image = np.zeros((60, 60, 3), np.uint8)
+    image[:40] = 90
+    assert real_images.without_padding(image, sizes).shape[:2] == (40, 60)
+    image[:] = 90
+    assert real_images.without_padding(image, sizes).shape[:2] == (60, 60)
+    assert real_images.without_padding(image, []).shape[:2] == (60, 60)
+
+
+def test_of_several_versions_of_a_picture_the_first_is_read():
+    paths = ["a/x_jpg.rf.1.jpg", "a/x_jpg.rf.2.jpg", "a/y.jpg"]
+    assert real_images.first_versions(paths) == {"x_jpg": paths[0], "y": paths[2]}
+
+
+def test_a_mask_on_which_both_views_agree_is_proposed(monkeypatch: pytest.MonkeyPatch):
+    class Session:
+        """Marks what is bright."""
+
+        def get_inputs(self):
+            return [type("Input", (), {"name": "input"})]
+
+        get_outputs = get_inputs
+
+        def run(self, _names: list, inputs: dict) -> list:
+            return [inputs["input"].mean(axis=1, keepdims=True)]
+
+    monkeypatch.setattr("benchmarks.segmentation.mask_proposer.open_session", lambda _: Session())
+    image = np.full((100, 200, 3), 20, np.uint8)
+    image[40:60, 50:120] = 220
+    proposed = MaskProposer(Path("u2net.onnx")).propose(image, np.array([48.0, 38.0, 122.0, 62.0]))
+    assert isinstance(proposed, ProposedMask)
+    assert (proposed.mask & (image[..., 0] > 100)).sum() > 0.95 * proposed.mask.sum()
+    assert proposed.mask.sum() > 0.9 * 20 * 70
+    assert proposed.agreement > 0.9

@@ -82,7 +82,7 @@ def read_overlays(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
 
 def read_pictures(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
     """Whole pictures, or the boxes that the manifest gives for some of them."""
-    for stem, path in _first_versions(clone.paths(source["files"])).items():
+    for stem, path in first_versions(clone.paths(source["files"])).items():
         image = clone.image(path)
         boxes = source.get("boxes", {}).get(stem)
         if boxes is None:
@@ -100,10 +100,10 @@ def read_boxes(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
     A source may say which sizes its pictures had before they were padded with black, right and
     below; the fractions are of those.
     """
-    for stem, path in _first_versions(clone.paths(source["files"])).items():
+    for stem, path in first_versions(clone.paths(source["files"])).items():
         labels = clone.text(path.replace("/images/", "/labels/").rsplit(".", 1)[0] + ".txt")
         image = clone.image(path)
-        image = _without_padding(image, source.get("sizes_before_padding", []))
+        image = without_padding(image, source.get("sizes_before_padding", []))
         scale = np.tile(image.shape[1::-1], 2)
         for number, line in enumerate(labels.splitlines()):
             kind, *values = map(float, line.split())
@@ -115,7 +115,7 @@ def read_boxes(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
                 yield Proposal(name=f"{stem}_{number}", image=image, box=box)
 
 
-def _without_padding(image: Image, sizes: list[tuple[int, int]]) -> Image:
+def without_padding(image: Image, sizes: list[tuple[int, int]]) -> Image:
     """The smallest upper left part, of these widths and heights, with all that is bright."""
     bright = image.max(axis=2) > _BLACK
     [rows], [columns] = (np.nonzero(bright.mean(axis=axis) > 0.02) for axis in (1, 0))
@@ -125,7 +125,7 @@ def _without_padding(image: Image, sizes: list[tuple[int, int]]) -> Image:
     return image
 
 
-def _first_versions(paths: list[str]) -> dict[str, str]:
+def first_versions(paths: list[str]) -> dict[str, str]:
     """By name, the first of several versions of a picture, which Roboflow numbers after `.rf.`."""
     versions: dict[str, str] = {}
     for path in paths:
