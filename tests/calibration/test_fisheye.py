@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -77,8 +77,16 @@ def test_projection_follows_the_lens_equation(camera, depth):
     np.testing.assert_allclose(camera.project(points), expected, atol=1e-7)
 
 
+def least_slope(camera: Camera, *, up_to_deg: float) -> float:
+    """Of the radius over the angle: where a lens all but folds over, there is no way back."""
+    k1, k2, k3, k4 = camera.distortion
+    a = np.radians(np.linspace(0, up_to_deg, 200)) ** 2
+    return float((1 + 3 * k1 * a + 5 * k2 * a**2 + 7 * k3 * a**3 + 9 * k4 * a**4).min())
+
+
 @given(domes())
 def test_a_ray_undoes_the_projection(camera):
+    assume(least_slope(camera, up_to_deg=84.5) > 0.05)  # as the camera asks
     points = directions(up_to_deg=84)
     rays = camera.back_project(camera.project(points))
     np.testing.assert_allclose(rays, points, rtol=1e-9, atol=1e-9)
