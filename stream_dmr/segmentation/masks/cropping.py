@@ -69,5 +69,7 @@ def crop_fish(
 
 def _doubted(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> MaskedCrop:
     """A crop of what may be no fish: of little confidence where a wider view shows another mask."""
+    if (crop.confidence or 0.0) < _MIN_AGREEMENT:
+        return crop  # doubted already, and the wider view costs as much as a crop
     agreement = agreement_in_wider_view(view, crop, segmenter)
     return crop if agreement >= _MIN_AGREEMENT else replace(crop, confidence=agreement)
