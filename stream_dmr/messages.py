@@ -9,6 +9,7 @@ after it pass that reason on.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from functools import cache
 from types import MappingProxyType
 
 import numpy as np
@@ -23,8 +24,8 @@ class _ReadOnly:
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        for part in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, part.name)
+        for name in _field_names(type(self)):
+            value = getattr(self, name)
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 value = value.view()
                 value.flags.writeable = False
@@ -32,7 +33,13 @@ class _ReadOnly:
                 value = MappingProxyType(dict(value))
             else:
                 continue
-            object.__setattr__(self, part.name, value)
+            object.__setattr__(self, name, value)
+
+
+@cache
+def _field_names(kind: type) -> list[str]:
+    """Of a message's dataclass: finding out takes longer than all else that is done with them."""
+    return [part.name for part in fields(kind)]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

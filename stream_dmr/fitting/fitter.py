@@ -141,12 +141,16 @@ class Fitter:
         target, solution, is_cold, refusal, since_ns = solved
         if target is None or solution is None:
             return Fit(_message(crop, refusal=refusal), None)
-        sized, size_std = solution, None
-        if _is_finite(solution) and self._settings.scans_sizes:
-            sized, size_std = self._scanner.expected(target, solution)
-        if not _is_finite(sized):
+        if not _is_finite(solution):
             return Fit(_message(crop, refusal=Reason.FIT_DIVERGED), None)
-        shape = self._shape(target, sized, crop, size_std)
+        sized, size_std, shape_std = solution, None, None
+        if self._settings.scans_sizes:  # the paper's solver and blend scan no sizes
+            coarse = target.coarse()
+            sized, size_std = self._scanner.expected(target, solution, coarse=coarse)
+            if not _is_finite(sized):
+                return Fit(_message(crop, refusal=Reason.FIT_DIVERGED), None)
+            shape_std = self._shape_std(coarse, sized.parameters)
+        shape = self._shape(target, sized, crop, size_std, shape_std)
         report = self._report(solution, is_cold=is_cold, since_ns=since_ns)
         return Fit(_message(crop, shape, report), solution.parameters)
 
@@ -162,10 +166,10 @@ class Fitter:
         )
 
     def _refusal(self, crop: FishCrop) -> Reason | None:
-        area = int(crop.mask.sum())
+        area = np.count_nonzero(crop.mask)
         if area == 0:
             return Reason.NO_MASK
-        if crop.mask.all():
+        if area == crop.mask.size:
             return Reason.MASK_FILLS_CROP
         return Reason.MASK_TOO_SMALL if area < self._settings.min_mask_px else None
 
@@ -186,7 +190,12 @@ class Fitter:
         return cold, True
 
     def _shape(
-        self, target: Target, solution: Solution, crop: FishCrop, size_std: float | None
+        self,
+        target: Target,
+        solution: Solution,
+        crop: FishCrop,
+        size_std: float | None,
+        shape_std: float | None,
     ) -> FittedShape:
         """`size_std` of the log size, where it is known better than by the covariance."""
         parameters, v = solution.parameters, self._levels.full.num_vertices
@@ -212,15 +221,12 @@ class Fitter:
             covariance=spread if self._with_covariance else None,
             length_std_ratio=size_std,
             candidate=self._index,
-            shape_std_ratio=self._shape_std(target, parameters),
+            shape_std_ratio=shape_std,
             height_ratio=self._height_ratio(parameters),
         )
 
-    def _shape_std(self, target: Target, parameters: Float[np.ndarray, "P"]) -> float | None:
-        """None for the paper's solver and blend, which scan no sizes."""
-        if not self._settings.scans_sizes:
-            return None
-        problem = self._problem(self._levels.coarse, target.coarse())
+    def _shape_std(self, coarse: Target, parameters: Float[np.ndarray, "P"]) -> float:
+        problem = self._problem(self._levels.coarse, coarse)
         std = shape_std_ratio(problem, parameters, self._directions, self._shape_covariance)
         return float(np.hypot(std, self._hidden_slant_std(parameters)))
 

@@ -46,7 +46,7 @@ class Target(NamedTuple):
             crop.mask.astype(np.float64),
             unknown,
             _distance(crop.mask, crop.unknown),
-            float(crop.mask.sum()),
+            float(np.count_nonzero(crop.mask)),
             *mask_contour(crop.mask, crop.unknown),
         )
 

@@ -90,7 +90,9 @@ class TrackFitter:
         track = self._tracks[crop.track_id]
         track.seen_ns = crop.timestamp_ns
         track.species.add(crop.species)
-        weighed = replace(crop, ends=track.head.correct(crop.ends))
+        weighed = crop
+        if crop.ends is not None:
+            weighed = replace(crop, ends=track.head.correct(crop.ends))
         fitted, best = self._fit(weighed, track)
         if fitted.shape is not None:
             track.head.update(fitted.shape.keypoints_px)
@@ -116,10 +118,12 @@ class TrackFitter:
         )
 
     def _fit(self, crop: FishCrop, track: _TrackState) -> Fit:
+        if len(track.candidates) == 1:
+            return self._fit_by(track.candidates[0], crop, track)
         of_species = self._of_species(track)
         if np.isfinite(of_species).sum() == 1 or track.num_decided >= _DECIDING_FRAMES:
             chosen = track.candidates[int(np.argmin(track.against + of_species))]
-            return self.fitters[chosen].fit(crop, track.best.get(chosen))
+            return self._fit_by(chosen, crop, track)
         solved = {n: self.fitters[n].solve(crop, track.best.get(n)) for n in track.candidates}
         self._decide(track, crop, solved)
         chosen = track.candidates[int(np.argmin(track.against + of_species))]
@@ -128,6 +132,9 @@ class TrackFitter:
                 if one.solution is not None and one.solution.iou >= self._settings.cold_below_iou:
                     track.best[n] = one.solution.parameters
         return self.fitters[chosen].answer(crop, solved[chosen])
+
+    def _fit_by(self, chosen: int, crop: FishCrop, track: _TrackState) -> Fit:
+        return self.fitters[chosen].fit(crop, track.best.get(chosen))
 
     def _of_species(self, track: _TrackState) -> Float[np.ndarray, "N"]:
         """0 for the candidates that the species leaves, infinity for those that it excludes."""

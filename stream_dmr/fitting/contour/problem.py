@@ -1,5 +1,6 @@
 """What a descent minimises and how long it may take: the tuples that the kernels pass on."""
 
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -33,17 +34,26 @@ class Problem(NamedTuple):
         cls, settings: FitMeshSettings, body: Body, target: Target, *, with_smoothness: bool
     ) -> "Problem":
         """Without smoothness: no L_normal and L_lap, expensive terms that separate no poses."""
-        lambdas = settings.lambdas()
-        if not with_smoothness:
-            lambdas[[NORMAL, LAPLACIAN]] = 0.0
-        return cls(
-            body,
-            KINDS[settings.deformation],
-            target,
-            lambdas,
-            settings.priors(),
-            rest_vector(len(body.joints)),
-        )
+        # Frozen settings have a hash, which pydantic does not declare.
+        lambdas, priors = _weights(settings, with_smoothness)  # pyright: ignore[reportArgumentType]
+        kind, rest = KINDS[settings.deformation], _rest(len(body.joints))
+        return cls(body, kind, target, lambdas, priors, rest)
+
+
+@lru_cache(maxsize=64)
+def _weights(
+    settings: FitMeshSettings, with_smoothness: bool
+) -> tuple[Float[np.ndarray, "6"], Priors]:
+    """The lambdas and priors of these settings: six problems of each crop have the same ones."""
+    lambdas = settings.lambdas()
+    if not with_smoothness:
+        lambdas[[NORMAL, LAPLACIAN]] = 0.0
+    return lambdas, settings.priors()
+
+
+@cache
+def _rest(num_joints: int) -> Float[np.ndarray, "P"]:
+    return rest_vector(num_joints)
 
 
 class Options(NamedTuple):

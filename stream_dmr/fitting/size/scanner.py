@@ -42,10 +42,15 @@ class SizeScanner:
         self._body, self._coarse, self._settings = bodies.fine, bodies.coarse, settings
         self._options = Options(settings.scan_iterations, settings.tolerance, WARM_DAMPING)
 
-    def expected(self, target: Target, best: Solution) -> tuple[Solution, float]:
-        """The fit at the expected size of the fish, and the std of the log size."""
+    def expected(
+        self, target: Target, best: Solution, *, coarse: Target | None = None
+    ) -> tuple[Solution, float]:
+        """The fit at the expected size of the fish, and the std of the log size.
+
+        `coarse`: that of the target, where it is at hand.
+        """
         start, nat = best.parameters, self._settings.nat
-        problem = self._problem(self._coarse, target.coarse())
+        problem = self._problem(self._coarse, coarse or target.coarse())
         held = only_size(len(start))
         scan = scan_sizes(problem, start, held, _OFFSETS, _MAX_NATS * nat, self._options)
         tried = np.isfinite(scan.losses)

@@ -113,7 +113,7 @@ class AnnotatedFish:
         height, width = frame.image.shape[:2]
         labels = self._masks.labels(frame.frame_index, width=width, height=height)
         if labels is not None:
-            self._masked_ids.update(labels.present())
+            self._masked_ids.update(labels.present)
         elif is_expected:  # a frame without boxes needs no mask
             self._frames_without_mask.append(frame.frame_index)
         return labels
@@ -144,14 +144,18 @@ class AnnotatedFish:
 def _detections_of(labels: Labels) -> list[Detection]:
     """One detection per id in a label picture, with its tightest box."""
     detections = []
-    for source_id in labels.present():
-        mask = labels.ids == source_id
+    rows, columns = labels.window
+    ids = labels.ids[rows, columns]
+    for source_id in labels.present:
+        mask = ids == source_id
         x, y, width, height = cv2.boundingRect(mask.view(np.uint8))
+        left, top = columns.start + x, rows.start + y
         detections.append(
             Detection(
                 source_id=source_id,
-                bbox_xyxy_px=np.array([x, y, x + width, y + height], np.float64),
-                mask=mask,
+                bbox_xyxy_px=np.array([left, top, left + width, top + height], np.float64),
+                mask=mask[y : y + height, x : x + width],
+                mask_corner=(left, top),
                 visible_fraction=1.0,
                 unknown=labels.unknown,
             )

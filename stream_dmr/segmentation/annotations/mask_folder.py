@@ -4,8 +4,9 @@ Pont-Tuset et al., "The 2017 DAVIS Challenge on Video Object Segmentation", arXi
 """
 
 import re
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,18 +22,30 @@ _MAX_LOOKED_AT = 20  # pictures, for ids where the first one has none
 _LABEL_MODES = {"1", "L", "P", "I", "I;16", "I;16B"}  # one channel; "P": palette indices
 
 
-class Labels(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Labels:
     """What each pixel of a frame shows."""
 
     ids: Integer[np.ndarray, "H W"]  # of a fish; 0: background, or unknown
     unknown: Bool[np.ndarray, "H W"] | None  # hidden by something in front; None: no such pixel
 
+    @cached_property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns with all the fish: a small part of most frames."""
+        if self.ids.dtype != np.uint8:
+            height, width = self.ids.shape
+            return slice(0, height), slice(0, width)
+        x, y, width, height = cv2.boundingRect(self.ids)
+        return slice(y, y + height), slice(x, x + width)
+
+    @cached_property
     def present(self) -> list[int]:
         """The fish that have a pixel, ascending."""
-        if self.ids.dtype == np.uint8:  # counting is ten times as fast as sorting
-            counts = cv2.calcHist([self.ids], [0], None, [256], [0, 256])
+        ids = self.ids[self.window]
+        if ids.dtype == np.uint8 and ids.size:  # counting is ten times as fast as sorting
+            counts = cv2.calcHist([ids], [0], None, [256], [0, 256])
             return [int(one) for one in np.flatnonzero(counts) if one > 0]
-        return np.unique(self.ids[self.ids > 0]).tolist()
+        return np.unique(ids[ids > 0]).tolist()
 
 
 class MaskFolder:

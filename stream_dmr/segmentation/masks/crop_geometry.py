@@ -18,6 +18,7 @@ from stream_dmr.messages import FishCrop
 
 _MAX_SAMPLES = 4  # per crop pixel and axis; more changed no mask in tests and cost time
 _RAYS_PER_EDGE = 9  # of a box, to measure it after undistortion
+_ALONG_EDGE = np.linspace(0, 1, _RAYS_PER_EDGE)
 
 
 def mask_bbox(mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "4"] | None:
@@ -89,13 +90,10 @@ def camera_around(
     there than in the frame.
     """
     x0, y0, x1, y1 = bbox_xyxy_px - 0.5
-    along = np.linspace(0, 1, _RAYS_PER_EDGE)
-    x, y = x0 + along * (x1 - x0), y0 + along * (y1 - y0)
-    outline = np.concatenate(
-        [np.column_stack([x, np.full(_RAYS_PER_EDGE, edge)]) for edge in (y0, y1)]
-        + [np.column_stack([np.full(_RAYS_PER_EDGE, edge), y]) for edge in (x0, x1)]
-    )
-    rays = frame_camera.back_project(outline)
+    edges = np.empty((4, _RAYS_PER_EDGE, 2))
+    edges[:2, :, 0], edges[2:, :, 1] = x0 + _ALONG_EDGE * (x1 - x0), y0 + _ALONG_EDGE * (y1 - y0)
+    edges[0, :, 1], edges[1, :, 1], edges[2, :, 0], edges[3, :, 0] = y0, y1, x0, x1
+    rays = frame_camera.back_project(edges.reshape(-1, 2))
     low, high = rays.min(axis=0), rays.max(axis=0)
     extent_px = (high - low)[:2] * frame_camera.K[[0, 1], [0, 1]]
     side_px = max(1.0, *extent_px)  # boxes of no size come from stray clicks of annotators
@@ -107,9 +105,9 @@ def camera_around(
 
 
 class Layer(NamedTuple):
-    """A picture of the frame, or of a part of it outside of which it is 0."""
+    """A picture or mask of the frame, or of a part of it outside of which it is 0."""
 
-    image: UInt8[np.ndarray, "h w *_"]
+    image: UInt8[np.ndarray, "h w *_"] | Bool[np.ndarray, "h w"]
     corner: tuple[int, int] = (0, 0)  # frame pixel of its top left one
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 from stream_dmr.camera import Camera
 from stream_dmr.messages import CropQuality, FishCrop, Frame
 from stream_dmr.segmentation.detection.fish_detection import Detection
+from stream_dmr.segmentation.masks.crop_geometry import Layer
 from stream_dmr.segmentation.masks.crop_quality import glare, sharpness, touches_border
 from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
 from stream_dmr.segmentation.masks.masked_crop import (
@@ -38,7 +39,8 @@ def crop_fish(
     """
     view = FrameView(image=frame.image, camera=frame_camera, settings=settings)
     if detection.mask is not None:
-        crop = crop_given_mask(view, detection.bbox_xyxy_px, detection.mask, detection.unknown)
+        given = Layer(detection.mask, detection.mask_corner)
+        crop = crop_given_mask(view, detection.bbox_xyxy_px, given, detection.unknown)
     elif segmenter is not None:
         crop = crop_segmented(view, detection.bbox_xyxy_px, segmenter)
         if detection.may_be_no_fish and segmenter.knows_fish:

@@ -74,13 +74,15 @@ class MaskedCrop:
 def crop_given_mask(
     view: FrameView,
     bbox_xyxy_px: Float[np.ndarray, "4"],
-    given: Bool[np.ndarray, "H W"],
+    mask_layer: Layer,
     unknown: Bool[np.ndarray, "H W"] | None = None,
 ) -> MaskedCrop:
     """The crop around a box and a mask of the frame, of which something may hide a part."""
+    given, (left, top) = mask_layer.image, mask_layer.corner
     x, y, w, h = cv2.boundingRect(given.view(np.uint8))
     # Only within its own box is there anything to do, which is a small part of the frame.
     given = clean_mask(given[y : y + h, x : x + w], min_area_px=view.settings.min_mask_area_px)
+    x, y = left + x, top + y
     extent = mask_bbox(given)
     extent = None if extent is None else extent + np.array([x, y, x, y])
     height, width = view.shape

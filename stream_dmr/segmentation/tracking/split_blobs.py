@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from stream_dmr.segmentation.detection.components import components
 from stream_dmr.segmentation.detection.detector import Candidate, whole_pixels
 from stream_dmr.segmentation.tracking.observation import oriented_extent
 
@@ -111,13 +112,13 @@ def _opened(mask: Bool[np.ndarray, "H W"], diameter_px: int) -> UInt8[np.ndarray
 
 
 def _components(mask: UInt8[np.ndarray, "H W"]) -> list[Bool[np.ndarray, "H W"]]:
-    count, labels, _, _ = cv2.connectedComponentsWithStats(mask)
+    count, labels, _ = components(mask)
     return [labels == label for label in range(1, count)]
 
 
 def _largest_component(mask: UInt8[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    components = _components(mask)
-    return max(components, key=np.count_nonzero) if components else mask > 0
+    parts = _components(mask)
+    return max(parts, key=np.count_nonzero) if parts else mask > 0
 
 
 def _piece(piece: Bool[np.ndarray, "H W"], whole: Candidate, corner: tuple[int, int]) -> Candidate:

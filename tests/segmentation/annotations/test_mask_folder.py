@@ -36,6 +36,18 @@ def test_a_1_bit_mask_is_fish_1(tmp_path):
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_fish_lie_within_the_window(tmp_path, dtype):
+    labels = labels_of(id1=(2, 1, 4, 3), id3=(5, 4, 7, 5)).astype(dtype)
+    cv2.imwrite(str(tmp_path / "000001.png"), labels)
+    cv2.imwrite(str(tmp_path / "000002.png"), np.zeros_like(labels))
+    masks = MaskFolder(tmp_path)
+    found = masks.labels(1, **LABELS_SIZE)
+    assert found.present == [1, 3]
+    assert np.count_nonzero(found.ids[found.window]) == np.count_nonzero(labels)
+    assert masks.labels(2, **LABELS_SIZE).present == []
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_the_largest_value_is_no_fish_but_unknown(tmp_path, dtype):
     labels = labels_of(id1=(0, 0, 4, 3)).astype(dtype)
     labels[1] = np.iinfo(dtype).max

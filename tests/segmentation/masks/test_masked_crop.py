@@ -1,5 +1,7 @@
 """Masks found by a segmenter: in the whole fish, in frame pixels, with a confidence."""
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -43,6 +45,28 @@ def segmented(picture, box, camera, *, may_be_no_fish=False, **knobs):
         segmenter=painter,
     )
     return crop, painter.bbox_xyxy_px
+
+
+def test_a_mask_of_a_part_of_the_frame_gives_the_same_crop():
+    whole = np.zeros((480, 640), bool)
+    whole[200:260, 300:420] = True
+    whole[230:250, 330:340] = False
+    camera, box = Camera.nominal(width=640, height=480), np.array([300.0, 200.0, 420.0, 260.0])
+    crops = [
+        crop_fish(
+            grey_frame(camera),
+            Detection(
+                source_id=1, bbox_xyxy_px=box, mask=mask, mask_corner=corner, visible_fraction=1.0
+            ),
+            frame_camera=camera,
+            settings=SETTINGS,
+            segmenter=None,
+        )
+        for mask, corner in ((whole, (0, 0)), (whole[190:270, 290:430], (290, 190)))
+    ]
+    np.testing.assert_array_equal(crops[0].mask, crops[1].mask)
+    np.testing.assert_array_equal(crops[0].crop_camera.K, crops[1].crop_camera.K)
+    assert asdict(crops[0].quality) == asdict(crops[1].quality)
 
 
 @given(lens_cameras, st.floats(30, 400), st.floats(30, 300), st.floats(40, 200), st.floats(40, 200))
