@@ -180,7 +180,7 @@ def iteration_parts(setup: Setup, pair: FramePair) -> dict[str, Callable[[], obj
     target, start = setup.start(pair)
     problem, size = setup.problem(target), np.exp(start[LOG_SIZE])
     rendering = evaluate(problem, start, True).rendering
-    points, pixels, rim, covered, normals = rendering
+    points, pixels, rim, covered, normals, offsets = rendering
     edges = visible_rim(rendering).edges
     chosen, vertices = np.unique(edges), points[: body.num_vertices]
     rows = np.random.default_rng(0).normal(size=(len(edges) + len(target.contour), len(start)))
@@ -193,7 +193,7 @@ def iteration_parts(setup: Setup, pair: FramePair) -> dict[str, Callable[[], obj
         "- rim": lambda: out.rim_edges(pixels, body),
         "- coverage": lambda: out.coverage(pixels, rim, len(target.mask)),
         "- overlap": lambda: out.overlap(covered, target),
-        "- smoothness": lambda: mesh_terms.smoothness(body, points, normals, size),
+        "- smoothness": lambda: mesh_terms.smoothness(body, normals, offsets, size),
         "normal equations": lambda: normal_equations(problem, start, rendering),
         "- visible rim": lambda: visible_rim(rendering),
         "- jacobian": lambda: deformation.jacobian(body, SPINE, start, chosen),

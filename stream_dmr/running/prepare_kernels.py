@@ -125,7 +125,7 @@ def _compile_largest() -> None:
         lengths,
     )
     problem = Problem.from_settings(settings, body, target, with_smoothness=True)
-    rendering = Rendering(points, flat, np.zeros((0, 2), np.int64), picture, points)
+    rendering = Rendering(points, flat, np.zeros((0, 2), np.int64), picture, points, points)
     arguments = (problem, rest_vector(len(body.joints)), rendering)
     kernel: Any = normal_equations
     kernel.compile(tuple(numba.typeof(one) for one in arguments))

@@ -8,7 +8,7 @@ from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.linear_blend import blend_jacobian, blend_points, move_and_scale
 from stream_dmr.fitting.contour.rotation_vector import rotation_and_jacobian
 from stream_dmr.fitting.contour.spine import spine_jacobian, spine_points
-from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION, ROOT_TRANSLATION
+from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION
 
 # None is a type of its own, by which a kernel is compiled for one deformation and not for both.
 SPINE, LINEAR_BLEND = None, 1
@@ -19,21 +19,15 @@ KINDS: dict[str, Kind] = {"spine": SPINE, "linear-blend": LINEAR_BLEND}
 @compiled
 def deform(body: Body, kind: Kind, parameters: Float[np.ndarray, "P"]) -> Float[np.ndarray, "N 3"]:
     """Deformed points, centered on the root, in units of the root's depth."""
-    out = spine_points(body, parameters) if kind is SPINE else blend_points(body, parameters)
+    if kind is SPINE:
+        return spine_points(body, parameters)
+    out = blend_points(body, parameters)
     root, _ = rotation_and_jacobian(parameters[ROOT_ROTATION])
-    size = np.exp(parameters[LOG_SIZE])
     for n in range(len(out)):
         x, y, z = out[n, 0], out[n, 1], out[n, 2]
         for i in range(3):
             out[n, i] = root[i, 0] * x + root[i, 1] * y + root[i, 2] * z
-    if kind is SPINE:
-        shift = parameters[ROOT_TRANSLATION]
-        for n in range(len(out)):
-            out[n, 0] = size * (out[n, 0] + shift[0])
-            out[n, 1] = size * (out[n, 1] + shift[1])
-            out[n, 2] = size * out[n, 2]
-    else:
-        move_and_scale(body, parameters, size, out)
+    move_and_scale(body, parameters, np.exp(parameters[LOG_SIZE]), out)
     return out
 
 

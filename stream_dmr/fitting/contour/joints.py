@@ -51,7 +51,7 @@ def skinning_weights(
         dE[j, 5] = -y1 * u2
     total = 0.0
     for j in range(num_joints):
-        W[j] = np.exp(W[j] - top)
+        W[j] = 1.0 if W[j] == top else np.exp(W[j] - top)
         total += W[j]
     for j in range(num_joints):
         W[j] /= total

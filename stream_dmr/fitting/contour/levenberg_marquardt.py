@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 
 from stream_dmr.compiled import compiled, inlined
 from stream_dmr.fitting.contour.deformation import deform
-from stream_dmr.fitting.contour.mesh_terms import face_normals, smoothness
+from stream_dmr.fitting.contour.mesh_terms import face_normals, neighbor_offsets, smoothness
 from stream_dmr.fitting.contour.normal_equations import normal_equations
 from stream_dmr.fitting.contour.outline import Rendering, coverage, overlap, project, rim_edges
 from stream_dmr.fitting.contour.problem import LAPLACIAN, NORMAL, Options, Problem
@@ -61,10 +61,10 @@ def evaluate(
     rim = rim_edges(pixels, body)
     covered = coverage(pixels, rim, len(target.mask))
     iou, boundary, hard_iou = overlap(covered, target)
-    normal, laplacian, normals = 0.0, 0.0, np.empty((0, 3))
+    normal, laplacian, normals, offsets = 0.0, 0.0, np.empty((0, 3)), np.empty((0, 3))
     if with_smoothness:
-        normals = face_normals(points, body.faces)
-        normal, laplacian = smoothness(body, points, normals, np.exp(parameters[LOG_SIZE]))
+        normals, offsets = face_normals(points, body.faces), neighbor_offsets(body, points)
+        normal, laplacian = smoothness(body, normals, offsets, np.exp(parameters[LOG_SIZE]))
     scale, translation = 0.0, 0.0
     joints = joints_of(parameters)
     for j in range(len(body.joints)):
@@ -72,7 +72,7 @@ def evaluate(
         for i in range(3):
             translation += joints.translation[j, i] ** 2
     terms = np.array([iou, boundary, scale, translation, normal, laplacian])
-    return Iterate(terms, hard_iou, Rendering(points, pixels, rim, covered, normals))
+    return Iterate(terms, hard_iou, Rendering(points, pixels, rim, covered, normals, offsets))
 
 
 @inlined

@@ -16,29 +16,43 @@ from stream_dmr.fitting.parameters import LOG_SIZE
 
 @compiled
 def smoothness(
-    body: Body, points: Float[np.ndarray, "N 3"], normals: Float[np.ndarray, "F 3"], size: float
+    body: Body,
+    normals: Float[np.ndarray, "F 3"],
+    offsets: Float[np.ndarray, "V 3"],
+    size: float,
 ) -> tuple[float, float]:
     """L_normal and L_lap of eq. (5) of a body of this size, so that they are in body lengths.
 
-    `normals` are those of its faces.
+    By the normals of its faces and the `neighbor_offsets` of its vertices.
     """
-    edge_faces, starts, neighbors = body.edge_faces, body.edge_starts, body.neighbors
+    edge_faces = body.edge_faces
     normal = 0.0
     for e in range(len(edge_faces)):
         p, q = edge_faces[e, 0], edge_faces[e, 1]
         cosine = normals[p, 0] * normals[q, 0] + normals[p, 1] * normals[q, 1]
         normal += 1.0 - cosine - normals[p, 2] * normals[q, 2]
     laplacian = 0.0
-    for v in range(body.num_vertices):
+    for v in range(len(offsets)):
+        x, y, z = offsets[v, 0], offsets[v, 1], offsets[v, 2]
+        laplacian += x * x + y * y + z * z
+    return normal, laplacian / size**2
+
+
+@compiled
+def neighbor_offsets(body: Body, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "V 3"]:
+    """Of each vertex from the mean of its neighbours."""
+    starts, neighbors = body.edge_starts, body.neighbors
+    offsets = np.empty((body.num_vertices, 3))
+    for v in range(len(offsets)):
         x = y = z = 0.0
         for k in range(starts[v], starts[v + 1]):
             w = neighbors[k]
             x, y, z = x + points[w, 0], y + points[w, 1], z + points[w, 2]
         share = 1.0 / (starts[v + 1] - starts[v])
-        laplacian += (points[v, 0] - share * x) ** 2
-        laplacian += (points[v, 1] - share * y) ** 2
-        laplacian += (points[v, 2] - share * z) ** 2
-    return normal, laplacian / size**2
+        offsets[v, 0] = points[v, 0] - share * x
+        offsets[v, 1] = points[v, 1] - share * y
+        offsets[v, 2] = points[v, 2] - share * z
+    return offsets
 
 
 @compiled
@@ -65,16 +79,17 @@ def smoothness_slope(
     parameters: Float[np.ndarray, "P"],
     points: Float[np.ndarray, "N 3"],
     normals: Float[np.ndarray, "F 3"],
+    offsets: Float[np.ndarray, "V 3"],
     normal_weight: float,
     laplacian_weight: float,
 ) -> Float[np.ndarray, "P"]:
-    """Slope of the weighted sum of both terms to the parameters."""
+    """Slope of the weighted sum of both terms to the parameters, by what `smoothness` takes."""
     size = np.exp(parameters[LOG_SIZE])
     forces = np.zeros((body.num_vertices, 3))
     _normal_forces(body, points, normals, normal_weight, forces)
-    laplacian = _laplacian_forces(body, points, laplacian_weight / size**2, forces)
-    slope = pull_back(body, kind, parameters, points, forces)
-    slope[LOG_SIZE] -= 2 * laplacian  # L_lap is of the body at size 1
+    _laplacian_forces(body, offsets, laplacian_weight / size**2, forces)
+    slope = pull_back(body, kind, parameters, forces)
+    slope[LOG_SIZE] = 0.0  # normals don't change with the size, and L_lap is in body lengths
     return slope
 
 
@@ -106,42 +121,29 @@ def _normal_forces(
         w0 = scale * (p0 - along * n0)
         w1 = scale * (p1 - along * n1)
         w2 = scale * (p2 - along * n2)
-        _add_force(forces, a, b, v1 * w2 - v2 * w1, v2 * w0 - v0 * w2, v0 * w1 - v1 * w0)
-        _add_force(forces, a, c, w1 * u2 - w2 * u1, w2 * u0 - w0 * u2, w0 * u1 - w1 * u0)
-
-
-@compiled
-def _add_force(
-    forces: Float[np.ndarray, "V 3"], a: int, b: int, x: float, y: float, z: float
-) -> None:
-    """On b, and against it on a."""
-    forces[b, 0] += x
-    forces[b, 1] += y
-    forces[b, 2] += z
-    forces[a, 0] -= x
-    forces[a, 1] -= y
-    forces[a, 2] -= z
+        b0, b1, b2 = v1 * w2 - v2 * w1, v2 * w0 - v0 * w2, v0 * w1 - v1 * w0
+        c0, c1, c2 = w1 * u2 - w2 * u1, w2 * u0 - w0 * u2, w0 * u1 - w1 * u0
+        forces[b, 0] += b0
+        forces[b, 1] += b1
+        forces[b, 2] += b2
+        forces[c, 0] += c0
+        forces[c, 1] += c1
+        forces[c, 2] += c2
+        forces[a, 0] -= b0 + c0
+        forces[a, 1] -= b1 + c1
+        forces[a, 2] -= b2 + c2
 
 
 @compiled
 def _laplacian_forces(
-    body: Body, points: Float[np.ndarray, "N 3"], weight: float, forces: Float[np.ndarray, "V 3"]
-) -> float:
-    """Slope of sum_v |p_v - mean of its neighbours|^2; returns the weighted sum itself."""
+    body: Body, offsets: Float[np.ndarray, "V 3"], weight: float, forces: Float[np.ndarray, "V 3"]
+) -> None:
+    """Slope of sum_v |p_v - mean of its neighbours|^2."""
     starts, neighbors = body.edge_starts, body.neighbors
     pulls = np.empty((body.num_vertices, 3))  # of each vertex on its neighbours
-    total = 0.0
     for v in range(len(pulls)):
         share = 1.0 / (starts[v + 1] - starts[v])
-        x, y, z = points[v, 0], points[v, 1], points[v, 2]
-        for k in range(starts[v], starts[v + 1]):
-            w = neighbors[k]
-            x -= share * points[w, 0]
-            y -= share * points[w, 1]
-            z -= share * points[w, 2]
-        total += weight * x**2
-        total += weight * y**2
-        total += weight * z**2
+        x, y, z = offsets[v, 0], offsets[v, 1], offsets[v, 2]
         x, y, z = x * (2 * weight), y * (2 * weight), z * (2 * weight)
         forces[v, 0] += x
         forces[v, 1] += y
@@ -153,4 +155,3 @@ def _laplacian_forces(
             w = neighbors[k]
             x, y, z = x - pulls[w, 0], y - pulls[w, 1], z - pulls[w, 2]
         forces[v, 0], forces[v, 1], forces[v, 2] = x, y, z
-    return total

@@ -29,6 +29,7 @@ def normal_equations(
             parameters,
             rendering.points,
             rendering.normals,
+            rendering.offsets,
             lambdas[NORMAL],
             lambdas[LAPLACIAN],
         )

@@ -23,7 +23,9 @@ class Rendering(NamedTuple):
     pixels: Float[np.ndarray, "V 2"]  # of the vertices
     rim: Int[np.ndarray, "R 2"]  # vertices of the edges between faces seen from the front and back
     covered: Float[np.ndarray, "S S"]  # share of each pixel
-    normals: Float[np.ndarray, "F 3"]  # of the faces; none of them without smoothness
+    # Of faces, and of vertices from the mean of their neighbours; none of them without smoothness.
+    normals: Float[np.ndarray, "F 3"]
+    offsets: Float[np.ndarray, "V 3"]
 
 
 @compiled

@@ -10,13 +10,9 @@ from jaxtyping import Float
 from stream_dmr.compiled import compiled, inlined
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.deformation import SPINE, Kind, jacobian
-from stream_dmr.fitting.contour.joints import blend, cholesky_factors, skinning_weights
-from stream_dmr.fitting.contour.rotation_vector import (
-    dot,
-    fill_rotation_and_jacobian,
-    rotation_and_jacobian,
-)
-from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION, ROOT_TRANSLATION, joints_of
+from stream_dmr.fitting.contour.joints import blend, cholesky_factors, root_of, skinning_weights
+from stream_dmr.fitting.contour.rotation_vector import dot, fill_rotation_and_jacobian
+from stream_dmr.fitting.parameters import joints_of
 
 
 @inlined
@@ -24,12 +20,15 @@ def pull_back(
     body: Body,
     kind: Kind,
     parameters: Float[np.ndarray, "P"],
-    points: Float[np.ndarray, "N 3"],
     forces: Float[np.ndarray, "V 3"],
 ) -> Float[np.ndarray, "P"]:
-    """J^T f of forces on the vertices; `points` are those that `deform` gives."""
+    """J^T f of forces on the vertices; for the spine without the root's share, which is left at 0.
+
+    The spine's root moves, turns and scales the body as a whole: what depends on its form alone
+    does not change by that.
+    """
     if kind is SPINE:
-        return _through_spine(body, parameters, points, forces)
+        return _through_spine(body, parameters, forces)
     slopes = jacobian(body, kind, parameters, np.arange(len(forces)))
     out = np.zeros(len(parameters))
     for n in range(len(forces)):
@@ -41,18 +40,14 @@ def pull_back(
 
 @inlined
 def _through_spine(
-    body: Body,
-    parameters: Float[np.ndarray, "P"],
-    points: Float[np.ndarray, "N 3"],
-    forces: Float[np.ndarray, "V 3"],
+    body: Body, parameters: Float[np.ndarray, "P"], forces: Float[np.ndarray, "V 3"]
 ) -> Float[np.ndarray, "P"]:
     out = np.zeros(len(parameters))
-    local = _through_root(parameters, points, forces, out)
     num_places, num_segments = len(body.places), len(body.midline) - 1
     # Of each place and then each segment of the midline: sum of f, and of d f^T.
     push = np.zeros((num_places + num_segments, 3))
     offsets = np.zeros((num_places + num_segments, 3, 3))
-    _through_places(body, local, push, offsets)
+    _through_places(body, parameters, forces, push[:num_places], offsets[:num_places])
     _through_midline(body, push[:num_places], offsets[num_places:])
     middles = (body.midline[1:] + body.midline[:-1]) / 2
     places = np.concatenate((body.places, middles))
@@ -61,52 +56,39 @@ def _through_spine(
 
 
 @compiled
-def _through_root(
-    parameters: Float[np.ndarray, "P"],
-    points: Float[np.ndarray, "N 3"],
-    forces: Float[np.ndarray, "V 3"],
-    out: Float[np.ndarray, "P"],
-) -> Float[np.ndarray, "V 3"]:
-    """Slopes to the root's parameters into `out`; the forces as the body feels them."""
-    root, J = rotation_and_jacobian(parameters[ROOT_ROTATION])
-    size, shift = np.exp(parameters[LOG_SIZE]), parameters[ROOT_TRANSLATION]
-    local, torque, q, f = np.empty_like(forces), np.zeros(3), np.empty(3), np.empty(3)
-    along = right = down = 0.0
-    for n in range(len(forces)):
-        x = points[n, 0] / size - shift[0]
-        y = points[n, 1] / size - shift[1]
-        z = points[n, 2] / size
-        for i in range(3):
-            q[i] = root[0, i] * x + root[1, i] * y + root[2, i] * z
-            felt = root[0, i] * forces[n, 0] + root[1, i] * forces[n, 1] + root[2, i] * forces[n, 2]
-            f[i] = size * felt
-            local[n, i] = f[i]
-            along += forces[n, i] * points[n, i]
-        right += size * forces[n, 0]
-        down += size * forces[n, 1]
-        _add_cross(q, f, torque)
-    out[LOG_SIZE] = along
-    to_rotation, to_translation = out[ROOT_ROTATION], out[ROOT_TRANSLATION]
-    to_translation[0], to_translation[1] = right, down
-    for m in range(3):
-        to_rotation[m] = J[0, m] * torque[0] + J[1, m] * torque[1] + J[2, m] * torque[2]
-    return local
-
-
-@compiled
 def _through_places(
     body: Body,
+    parameters: Float[np.ndarray, "P"],
     forces: Float[np.ndarray, "V 3"],
-    push: Float[np.ndarray, "U+M-1 3"],
-    offsets: Float[np.ndarray, "U+M-1 3 3"],
+    push: Float[np.ndarray, "U 3"],
+    offsets: Float[np.ndarray, "U 3 3"],
 ) -> None:
+    """Sums over the vertices of each place, of forces as the body feels them without its root."""
     place_of, points, places = body.place_of, body.points, body.places
     for n in range(len(forces)):
         u = place_of[n]
+        x, y, z = forces[n, 0], forces[n, 1], forces[n, 2]
+        push[u, 0] += x
+        push[u, 1] += y
+        push[u, 2] += z
         for i in range(3):
-            push[u, i] += forces[n, i]
-            for k in range(3):
-                offsets[u, i, k] += (points[n, i] - places[u, i]) * forces[n, k]
+            off = points[n, i] - places[u, i]
+            offsets[u, i, 0] += off * x
+            offsets[u, i, 1] += off * y
+            offsets[u, i, 2] += off * z
+    root = root_of(parameters)
+    for u in range(len(push)):
+        _turn_back(root.R, root.size, push[u])
+        for i in range(3):
+            _turn_back(root.R, root.size, offsets[u, i])
+
+
+@compiled
+def _turn_back(R: Float[np.ndarray, "3 3"], size: float, force: Float[np.ndarray, "3"]) -> None:
+    """Size R^T f, in place."""
+    x, y, z = size * force[0], size * force[1], size * force[2]
+    for i in range(3):
+        force[i] = R[0, i] * x + R[1, i] * y + R[2, i] * z
 
 
 @compiled

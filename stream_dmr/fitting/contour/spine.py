@@ -32,7 +32,7 @@ from stream_dmr.fitting.parameters import (
 
 @inlined
 def spine_points(body: Body, parameters: Float[np.ndarray, "P"]) -> Float[np.ndarray, "N 3"]:
-    """Points swept along the bent midline, before the root's own motion."""
+    """Points swept along the bent midline, and moved and scaled with the root."""
     num_joints, joints, places = len(body.joints), joints_of(parameters), body.places
     rotations, translations, rest_joints = joints.rotation, joints.translation, body.joints
     L, S = cholesky_factors(joints.weight), np.exp(joints.log_scale)
@@ -40,9 +40,10 @@ def spine_points(body: Body, parameters: Float[np.ndarray, "P"]) -> Float[np.nda
     blended, base, R = np.empty(3), np.empty(3), np.empty((3, 3))
     nodes, _ = spine_nodes(body, parameters, L, False)
     center = _at_place(body, nodes, body.place_of[body.num_vertices + 1])
+    root = root_of(parameters)
+    R0 = root.R
     turns = np.empty((len(body.places), 3, 3))
     bases = np.empty((len(body.places), 3))
-    scales = np.empty(len(body.places))
     for u in range(len(body.places)):
         skinning_weights(places[u], rest_joints, L, W, dE)
         blend(W, rotations, blended)
@@ -51,17 +52,20 @@ def spine_points(body: Body, parameters: Float[np.ndarray, "P"]) -> Float[np.nda
         multiply(R, blended, base)
         k, t = body.segments[u], body.fractions[u]
         for i in range(3):
-            node = (1.0 - t) * nodes[k, i] + t * nodes[k + 1, i] - center[i]
-            bases[u, i] = base[i] + node
+            base[i] += (1.0 - t) * nodes[k, i] + t * nodes[k + 1, i] - center[i]
+        size = root.size * dot(W, S)
+        for i in range(3):
+            moved = R0[i, 0] * base[0] + R0[i, 1] * base[1] + R0[i, 2] * base[2]
+            bases[u, i] = root.size * (moved + root.shift[i] if i < 2 else moved)
             for m in range(3):
-                turns[u, i, m] = R[i, m]
-        scales[u] = dot(W, S)
+                turned = R0[i, 0] * R[0, m] + R0[i, 1] * R[1, m] + R0[i, 2] * R[2, m]
+                turns[u, i, m] = size * turned
     out = np.empty_like(body.points)
     for n in range(len(out)):
         u = body.place_of[n]
-        x = scales[u] * (body.points[n, 0] - body.places[u, 0])
-        y = scales[u] * (body.points[n, 1] - body.places[u, 1])
-        z = scales[u] * (body.points[n, 2] - body.places[u, 2])
+        x = body.points[n, 0] - body.places[u, 0]
+        y = body.points[n, 1] - body.places[u, 1]
+        z = body.points[n, 2] - body.places[u, 2]
         for i in range(3):
             out[n, i] = bases[u, i] + turns[u, i, 0] * x + turns[u, i, 1] * y + turns[u, i, 2] * z
     return out
@@ -80,17 +84,17 @@ def spine_jacobian(
     L, S = cholesky_factors(joints.weight), np.exp(joints.log_scale)
     nodes, slopes = spine_nodes(body, parameters, L, True)
     middle = body.place_of[body.num_vertices + 1]
-    center, center_slope = _at_place(body, nodes, middle), _at_place(body, slopes, middle)
+    center = _at_place(body, nodes, middle)
     root = root_of(parameters)
+    _turn_rows(root.R, root.size, slopes)
+    center_slope = _at_place(body, slopes, middle)
     R0 = root.R
     W, dE = np.empty(num_joints), np.empty((num_joints, 6))
     omega, shift, off, o = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    v, Roff = np.empty(3), np.empty(3)
+    v, turned_off = np.empty(3), np.empty(3)
     A, none, scale = np.empty((3, 3)), np.zeros(3), 0.0
-    R, J = np.empty((3, 3)), np.empty((3, 3))
-    # Slopes to the joints' parameters before the root's own motion: all of a point, and what those
-    # of one place have in common.
-    local = np.empty((3, NUM_PER_JOINT * num_joints))
+    R, J, turned = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    # Slopes to the joints' parameters that the points of one place have in common.
     shared = np.empty((3, NUM_PER_JOINT * num_joints))
     before = -1
     for c in range(len(chosen)):
@@ -105,6 +109,9 @@ def spine_jacobian(
             scale = dot(W, S)
             fill_rotation_and_jacobian(omega, R, J)
             for i in range(3):
+                for m in range(3):  # with the root's own motion
+                    inner = R0[i, 0] * R[0, m] + R0[i, 1] * R[1, m] + R0[i, 2] * R[2, m]
+                    turned[i, m] = root.size * inner
                 for p in range(NUM_PER_JOINT * num_joints):
                     shared[i, p] = (
                         (1.0 - t) * slopes[k, i, p] + t * slopes[k + 1, i, p] - center_slope[i, p]
@@ -112,33 +119,40 @@ def spine_jacobian(
         for i in range(3):
             off[i] = body.points[n, i] - places[u, i]
             o[i] = scale * off[i] + shift[i]
-        rotated_slope(R, J, o, A)
-        multiply(R, off, Roff)
+        rotated_slope(turned, J, o, A)
+        multiply(turned, off, turned_off)
         for i in range(3):
             for p in range(NUM_PER_JOINT * num_joints):
-                local[i, p] = shared[i, p]
+                out[c, i, NUM_ROOT + p] = shared[i, p]
         for j in range(num_joints):
-            first = NUM_PER_JOINT * j
+            first = NUM_ROOT + NUM_PER_JOINT * j
             for i in range(3):
-                along = (S[j] - scale) * Roff[i]
+                along = (S[j] - scale) * turned_off[i]
                 for m in range(3):
-                    local[i, first + JOINT_ROTATION.start + m] += W[j] * A[i, m]
-                    local[i, first + JOINT_TRANSLATION.start + m] += W[j] * R[i, m]
+                    out[c, i, first + JOINT_ROTATION.start + m] += W[j] * A[i, m]
+                    out[c, i, first + JOINT_TRANSLATION.start + m] += W[j] * turned[i, m]
                     along += A[i, m] * (rotations[j, m] - omega[m])
-                    along += R[i, m] * (translations[j, m] - shift[m])
-                local[i, first + JOINT_LOG_SCALE] += W[j] * S[j] * Roff[i]
+                    along += turned[i, m] * (translations[j, m] - shift[m])
+                out[c, i, first + JOINT_LOG_SCALE] += W[j] * S[j] * turned_off[i]
                 for q in range(6):
-                    local[i, first + JOINT_WEIGHT.start + q] += W[j] * along * dE[j, q]
+                    out[c, i, first + JOINT_WEIGHT.start + q] += W[j] * along * dE[j, q]
         multiply(R, o, v)
         for i in range(3):
             v[i] += (1.0 - t) * nodes[k, i] + t * nodes[k + 1, i] - center[i]
         root_slope(root, v, none, 1.0, c, out, A)
-        for i in range(3):
-            r0, r1, r2 = R0[i, 0], R0[i, 1], R0[i, 2]
-            for p in range(NUM_PER_JOINT * num_joints):
-                out[c, i, NUM_ROOT + p] = root.size * (
-                    r0 * local[0, p] + r1 * local[1, p] + r2 * local[2, p]
-                )
+
+
+@compiled
+def _turn_rows(
+    R: Float[np.ndarray, "3 3"], size: float, slopes: Float[np.ndarray, "M 3 joints"]
+) -> None:
+    """Slopes as the root turns and scales them, in place."""
+    for k in range(len(slopes)):
+        for p in range(slopes.shape[2]):
+            x, y, z = size * slopes[k, 0, p], size * slopes[k, 1, p], size * slopes[k, 2, p]
+            slopes[k, 0, p] = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
+            slopes[k, 1, p] = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
+            slopes[k, 2, p] = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
 
 
 @compiled
