@@ -82,11 +82,11 @@ class TrackLength:
 
         A bad start must not shut out the good frames after it, so the whole track is filtered
         again, from the median of all frames so far: at each frame at first, then at growing
-        intervals (1/16 of the track), which keeps the mean work per frame bounded.
+        intervals (1/8 of the track), which keeps the mean work per frame bounded.
         """
         self._measurements.append(measurement)
         count = len(self._measurements)
-        if self._filter is not None and count < self._filtered_whole + max(1, count // 16):
+        if self._filter is not None and count < self._filtered_whole + max(1, count // 8):
             self._filter.offer(measurement)
         else:
             self._filter = run_filter(self._measurements, self._settings)
