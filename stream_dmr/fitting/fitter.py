@@ -17,7 +17,7 @@ from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.heading import is_reversed
 from stream_dmr.fitting.mesh_levels import MeshLevels
-from stream_dmr.fitting.parameters import ROOT_ROTATION
+from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION
 from stream_dmr.fitting.shape.candidates import CandidateShape
 from stream_dmr.fitting.shape.evidence import nats_against
 from stream_dmr.fitting.shape.length_std import freed, shape_std_ratio, slant_std_ratio
@@ -136,8 +136,17 @@ class Fitter:
         )
         return nats_against(problem, solved.solution.parameters, nat=self._settings.nat)
 
-    def answer(self, crop: FishCrop, solved: Solved) -> Fit:
-        """The second half: the message, at the size that is to be expected of the fish."""
+    def log_size(self, solved: Solved) -> float:
+        """The log size of the likeliest pose; NaN: nothing was fitted."""
+        if solved.solution is None:
+            return float("nan")
+        return float(solved.solution.parameters[LOG_SIZE])
+
+    def answer(self, crop: FishCrop, solved: Solved, *, form_std_ratio: float = 0.0) -> Fit:
+        """The second half: the message, at the size that is to be expected of the fish.
+
+        `form_std_ratio`: std of its log length, since it may be of another candidate's shape.
+        """
         target, solution, is_cold, refusal, since_ns = solved
         if target is None or solution is None:
             return Fit(_message(crop, refusal=refusal), None)
@@ -149,7 +158,8 @@ class Fitter:
             sized, size_std = self._scanner.expected(target, solution, coarse=coarse)
             if not _is_finite(sized):
                 return Fit(_message(crop, refusal=Reason.FIT_DIVERGED), None)
-            shape_std = self._shape_std(coarse, sized.parameters)
+            own_std = self._shape_std(coarse, sized.parameters)
+            shape_std = float(np.hypot(own_std, form_std_ratio))
         shape = self._shape(target, sized, crop, size_std, shape_std)
         report = self._report(solution, is_cold=is_cold, since_ns=since_ns)
         return Fit(_message(crop, shape, report), solution.parameters)

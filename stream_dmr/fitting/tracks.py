@@ -18,6 +18,7 @@ from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fit, Fitter, Solved
 from stream_dmr.fitting.heading import HeadTracker
 from stream_dmr.fitting.shape.candidates import CandidateShapes, Choice
+from stream_dmr.fitting.shape.length_std import form_std_ratio
 from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.template.template import Template
 
@@ -33,6 +34,7 @@ class _TrackState:
 
     candidates: Sequence[int]  # the indices of those that it may be
     against: Float[np.ndarray, "K"]  # nats against each of them
+    log_sizes: Float[np.ndarray, "K"]  # by each of them, summed over the frames that said so
     num_decided: int = 0  # frames that have said so
     seen_ns: int = 0
     best: dict[int, Float[np.ndarray, "P"]] = field(default_factory=dict)  # last good fits
@@ -114,6 +116,7 @@ class TrackFitter:
         return _TrackState(
             candidates=choice.indices,
             against=-np.log(choice.shares),
+            log_sizes=np.zeros(len(choice.indices)),
             species=SpeciesEvidence(self._species),
         )
 
@@ -131,10 +134,20 @@ class TrackFitter:
             for n, one in solved.items():  # the next frame begins where this one ended
                 if one.solution is not None and one.solution.iou >= self._settings.cold_below_iou:
                     track.best[n] = one.solution.parameters
-        return self.fitters[chosen].answer(crop, solved[chosen])
+        return self._answer(crop, solved[chosen], track, chosen)
 
     def _fit_by(self, chosen: int, crop: FishCrop, track: _TrackState) -> Fit:
-        return self.fitters[chosen].fit(crop, track.best.get(chosen))
+        solved = self.fitters[chosen].solve(crop, track.best.get(chosen))
+        return self._answer(crop, solved, track, chosen)
+
+    def _answer(self, crop: FishCrop, solved: Solved, track: _TrackState, chosen: int) -> Fit:
+        """The fit by the chosen candidate, its length as uncertain as the choice."""
+        if track.num_decided == 0:
+            return self.fitters[chosen].answer(crop, solved)
+        std = form_std_ratio(
+            track.log_sizes / track.num_decided, track.against + self._of_species(track)
+        )
+        return self.fitters[chosen].answer(crop, solved, form_std_ratio=std)
 
     def _of_species(self, track: _TrackState) -> Float[np.ndarray, "N"]:
         """0 for the candidates that the species leaves, infinity for those that it excludes."""
@@ -153,4 +166,5 @@ class TrackFitter:
         nats = np.array([self.fitters[n].nats(one) for n, one in solved.items()])
         if np.isfinite(nats).all():
             track.against += np.minimum(nats - nats.min(), _MAX_AGAINST)
+            track.log_sizes += [self.fitters[n].log_size(one) for n, one in solved.items()]
             track.num_decided += 1

@@ -46,6 +46,19 @@ def test_less_is_known_of_a_length_where_the_stock_is_not_known():
     assert unknown.shape_std_ratio > known.shape_std_ratio
 
 
+def test_less_is_known_of_a_length_where_the_fish_may_be_of_another_stock():
+    sample = fish_of(broader(0.0), track_id=4, num_frames=1)
+    stds = []
+    for share in (0.55, 1 - 1e-12):
+        pair = candidates((share, 1 - share), this=tapered(-0.12), that=tapered(0.12))
+        fitter = TrackFitter(TEMPLATE, SETTINGS, calibration=None, candidates=pair)
+        (shape,) = shapes_of(fitter, sample)
+        stds.append((shape.candidate, shape.shape_std_ratio))
+    (doubted, more), (certain, less) = stds
+    assert doubted == certain
+    assert more > less
+
+
 def test_a_solver_that_scans_no_sizes_says_nothing_of_the_shape():
     settings = SETTINGS.model_copy(update={"scan_iterations": 0})
     (shape,) = shapes_of(

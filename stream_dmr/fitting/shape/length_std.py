@@ -59,3 +59,15 @@ def shape_std_ratio(
     pose_H = H[:num_pose, :num_pose] + 1e-12 * np.eye(num_pose)
     slope = -np.linalg.solve(pose_H, unit) @ H[:num_pose, num_pose:]
     return float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
+
+
+def form_std_ratio(log_sizes: Float[np.ndarray, "K"], nats: Float[np.ndarray, "K"]) -> float:
+    """Std of a log size since any of K shapes may be the fish's own.
+
+    The second term of the law of total variance: that of the sizes by each shape, weighed by its
+    probability, exp(-nats) over their sum. The first is the variance by the likeliest shape. `nats`
+    may be infinite.
+    """
+    weights = np.exp(nats.min() - nats)
+    weights /= weights.sum()
+    return float(np.sqrt(weights @ (log_sizes - weights @ log_sizes) ** 2))

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.fitting.fit_settings import FitMeshSettings
-from stream_dmr.fitting.shape.length_std import freed, slant_std_ratio
+from stream_dmr.fitting.shape.length_std import form_std_ratio, freed, slant_std_ratio
 
 
 def test_with_a_known_breadth_no_slant_is_hidden():
@@ -34,3 +34,22 @@ def test_joints_are_as_free_as_the_breadth_is_unknown():
     variance = settings.nat / (2 * settings.lambda_scale)
     loose = freed(settings, 0.1**2)
     assert settings.nat / (2 * loose.lambda_scale) == pytest.approx(variance + 0.1**2)
+
+
+def test_where_the_form_is_certain_the_choice_adds_nothing():
+    sizes = np.log([1.0, 1.2, 0.7])
+    assert form_std_ratio(sizes, np.array([0.0, np.inf, 60.0])) == pytest.approx(0, abs=1e-9)
+
+
+def test_two_forms_that_masks_prefer_alike_make_a_length_as_uncertain_as_they_differ():
+    sizes = np.array([0.0, 0.12, 5.0])
+    assert form_std_ratio(sizes, np.array([3.0, 3.0, np.inf])) == pytest.approx(0.06)
+
+
+@given(nats=st.floats(0, 10), more=st.floats(0, 10))
+def test_the_surer_the_form_the_surer_the_length(nats, more):
+    sizes = np.array([0.0, 0.1])
+    less_sure, surer = (
+        form_std_ratio(sizes, np.array([0.0, against])) for against in (nats, nats + more)
+    )
+    assert surer <= less_sure + 1e-12
