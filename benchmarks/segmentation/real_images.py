@@ -21,7 +21,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from benchmarks.segmentation.clone import Clone
-from benchmarks.segmentation.mask_proposer import MaskProposer, box_of, largest_shape, window
+from benchmarks.segmentation.empty_squares import largest_empty_square
+from benchmarks.segmentation.mask_proposer import Box, MaskProposer, box_of, largest_shape, window
 
 _MANIFEST = Path(__file__).parent / "real_sources.toml"
 _KEPT_MARGIN = 0.7  # of the surroundings that are kept; room to rotate the fish
@@ -101,18 +102,26 @@ def read_boxes(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
     below; the fractions are of those.
     """
     for stem, path in first_versions(clone.paths(source["files"])).items():
-        labels = clone.text(path.replace("/images/", "/labels/").rsplit(".", 1)[0] + ".txt")
-        image = clone.image(path)
-        image = without_padding(image, source.get("sizes_before_padding", []))
-        scale = np.tile(image.shape[1::-1], 2)
-        for number, line in enumerate(labels.splitlines()):
-            kind, *values = map(float, line.split())
-            if len(values) != 4 or (source["classes"] and int(kind) not in source["classes"]):
-                continue
-            x, y, width, height = np.array(values) * scale
-            box = np.array([x - width / 2, y - height / 2, x + width / 2, y + height / 2])
-            if max(width, height) >= source["min_side_px"]:
+        image = without_padding(clone.image(path), source.get("sizes_before_padding", []))
+        for number, (kind, box) in enumerate(labelled_boxes(clone, path, image)):
+            is_wanted = kind in source["classes"] or not source["classes"]
+            if is_wanted and (box[2:] - box[:2]).max() >= source["min_side_px"]:
                 yield Proposal(name=f"{stem}_{number}", image=image, box=box)
+
+
+def labelled_boxes(clone: Clone, path: str, image: Image) -> list[tuple[int, Box]]:
+    """Classes and boxes of a picture's labels; polygons among them have class -1 and its size."""
+    labels = clone.text(path.replace("/images/", "/labels/").rsplit(".", 1)[0] + ".txt")
+    scale, boxes = np.tile(image.shape[1::-1], 2), []
+    for line in labels.splitlines():
+        kind, *values = map(float, line.split())
+        if len(values) != 4:
+            boxes.append((-1, _whole(image)))
+            continue
+        x, y, width, height = np.array(values) * scale
+        edges = np.array([x - width / 2, y - height / 2, x + width / 2, y + height / 2])
+        boxes.append((int(kind), edges))
+    return boxes
 
 
 def without_padding(image: Image, sizes: list[tuple[int, int]]) -> Image:
@@ -197,6 +206,7 @@ def build(repositories: Path, saliency: Path, out: Path, *, only: list[str], she
     """Write the data set, or only some of its sources."""
     manifest = tomllib.loads(_MANIFEST.read_text(encoding="utf-8"))
     backgrounds = write_backgrounds(repositories, manifest["backgrounds"], out / "backgrounds")
+    write_empty_squares(repositories, manifest, out / "backgrounds")
     proposer = MaskProposer(saliency)
     rng = np.random.default_rng(5)
     for name in only or manifest["sources"]:
@@ -246,6 +256,20 @@ def write_backgrounds(repositories: Path, source: dict[str, Any], folder: Path) 
             written.append(folder / f"{category}_{Path(path).name}")
             written[-1].write_bytes(clone.content(path))
     return written
+
+
+def write_empty_squares(repositories: Path, manifest: dict[str, Any], folder: Path) -> None:
+    """What is in pictures with boxes where no box is: of every so many pictures one square."""
+    for name, chosen in manifest["empty_squares"].items():
+        source = manifest["sources"][name]
+        clone = Clone(repositories, source["repository"], source["commit"])
+        pictures = list(first_versions(clone.paths(source["files"])).items())
+        for stem, path in pictures[:: chosen["every"]]:
+            image = without_padding(clone.image(path), source.get("sizes_before_padding", []))
+            boxes = [box for _, box in labelled_boxes(clone, path, image)]
+            square = largest_empty_square(image, boxes)
+            if square is not None and stem not in chosen["without"]:
+                cv2.imwrite(str(folder / f"{name}_{stem}.png"), square)
 
 
 def _photograph(rng: np.random.Generator, paths: list[Path]) -> Image:

@@ -1,0 +1,177 @@
+"""Frames with boxes around their fish: photographs, and fish put before backgrounds."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from benchmarks.segmentation.clone import Clone
+from benchmarks.segmentation.real_images import first_versions, labelled_boxes, without_padding
+from stream_dmr.segmentation.training.annotated_images import read_annotated_images
+from stream_dmr.segmentation.training.image_degradation import add_weather, simulate_camera
+from stream_dmr.segmentation.training.patch_bank import PatchBank
+
+SIDE_PX = 352  # of a training frame: between the sides of a detector's input
+_KEPT_PX = 640  # longer side of the photographs that are kept in memory
+_FRAME_SHARE, _SINGLE_SHARE = 0.4, 0.15  # of the examples; the others are put together
+_SIZES_PX = (18.0, 560.0)  # of fish put before a background
+_MOST_FISH = 12
+_MIN_VISIBLE = 0.35  # of a fish; with less it has no box
+_MIN_BOX_PX = 5.0
+_GREY = 114.0  # beyond a photograph's edges
+
+Image = UInt8[np.ndarray, "H W 3"]
+Boxes = Float[np.ndarray, "N 4"]  # left, top, right, bottom, px
+
+
+@dataclass(frozen=True, eq=False)
+class AnnotatedFrame:
+    """A photograph and the boxes of all fish in it."""
+
+    image: Image
+    boxes: Boxes
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSource:
+    """Draws training frames; a class, since worker processes receive it pickled."""
+
+    frames: list[AnnotatedFrame]
+    singles: list[AnnotatedFrame]
+    bank: PatchBank
+
+    def __call__(self, rng: np.random.Generator) -> tuple[UInt8[np.ndarray, "S S 3"], Boxes]:
+        """A frame of `SIDE_PX` and its boxes."""
+        kind = rng.random()
+        if kind < _FRAME_SHARE:
+            picture, boxes = _zoomed(rng, self.frames[rng.integers(len(self.frames))])
+        elif kind < _FRAME_SHARE + _SINGLE_SHARE:
+            picture, boxes = _zoomed(rng, self.singles[rng.integers(len(self.singles))])
+        else:
+            picture, boxes = _composed(rng, self.bank)
+        if rng.random() < 0.5:
+            picture, boxes = picture[:, ::-1].copy(), boxes.copy()
+            boxes[:, [0, 2]] = SIDE_PX - boxes[:, [2, 0]]
+        if rng.random() < 0.4:
+            picture = add_weather(rng, picture)
+        if rng.random() < 0.7:
+            return simulate_camera(rng, picture), boxes
+        return np.clip(np.round(picture), 0, 255).astype(np.uint8), boxes
+
+
+def read_frames(repositories: Path, source: dict[str, Any], *, every: int) -> list[AnnotatedFrame]:
+    """Every so many pictures of a source with boxes; its classes `fish_classes` are fish."""
+    clone = Clone(repositories, source["repository"], source["commit"])
+    frames = []
+    for path in list(first_versions(clone.paths(source["files"])).values())[::every]:
+        image = without_padding(clone.image(path), source.get("sizes_before_padding", []))
+        fish = source.get("fish_classes", source["classes"])
+        found = labelled_boxes(clone, path, image)
+        boxes = [box for kind, box in found if kind in fish or not fish]
+        frames.append(_kept(image, np.array(boxes).reshape(-1, 4)))
+    return frames
+
+
+def read_singles(images: Path, masks: Path, *, sources: list[str]) -> list[AnnotatedFrame]:
+    """Photographs of single fish with masks, of the sources whose names these are."""
+    return [
+        _kept(one.image, np.array([_edges(mask) for mask in one.masks], np.float64))
+        for one in read_annotated_images(images, masks)
+        if one.path.stem.split("-")[0] in sources
+    ]
+
+
+def _kept(image: Image, boxes: Boxes) -> AnnotatedFrame:
+    scale = min(1.0, _KEPT_PX / max(image.shape[:2]))
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return AnnotatedFrame(small, boxes * scale)
+
+
+def _edges(mask: np.ndarray) -> list[int]:
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    return [x, y, x + width, y + height]
+
+
+def _zoomed(
+    rng: np.random.Generator, frame: AnnotatedFrame
+) -> tuple[Float32[np.ndarray, "S S 3"], Boxes]:
+    """A part of a photograph, or all of it and what is around it in grey."""
+    height, width = frame.image.shape[:2]
+    whole = SIDE_PX / max(height, width)
+    scale = whole * float(np.exp(rng.uniform(np.log(0.6), np.log(3.0))))
+    room = np.array([SIDE_PX - scale * width, SIDE_PX - scale * height])
+    shift = np.minimum(room, 0) + rng.random(2) * np.abs(room)
+    stretch = np.exp(rng.normal(0.0, 0.08, 2))
+    affine = np.column_stack([np.diag(scale * stretch), shift])
+    picture = cv2.warpAffine(
+        frame.image,
+        affine,
+        (SIDE_PX, SIDE_PX),
+        flags=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR,
+        borderValue=(_GREY,) * 3,
+    )
+    moved = frame.boxes * np.tile(scale * stretch, 2) + np.tile(shift, 2)
+    inside = moved.clip(0, SIDE_PX)
+    visible = _areas(inside) / np.maximum(_areas(moved), 1e-6)
+    return picture.astype(np.float32), inside[(visible > _MIN_VISIBLE) & _are_large(inside)]
+
+
+def _composed(
+    rng: np.random.Generator, bank: PatchBank
+) -> tuple[Float32[np.ndarray, "S S 3"], Boxes]:
+    """Fish of many sizes before a background, those drawn later before the others."""
+    background = bank.draw_background(rng)
+    side = int(rng.uniform(0.5, 1.0) * len(background))
+    row, column = rng.integers(0, len(background) - side + 1, 2)
+    part = background[row : row + side, column : column + side]
+    picture = cv2.resize(part, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_LINEAR)
+    picture = picture.astype(np.float32)
+    count = int(rng.integers(0, _MOST_FISH + 1) if rng.random() < 0.6 else rng.integers(0, 4))
+    usual = np.exp(rng.uniform(*np.log(_SIZES_PX)))
+    owner = np.full((SIDE_PX, SIDE_PX), -1)
+    areas = []
+    for index in range(count):
+        size = float(np.clip(usual * np.exp(rng.normal(0.0, 0.35)), *_SIZES_PX))
+        layer = _placed_fish(rng, bank, size)
+        cover = layer[..., 3:] / 255
+        picture = picture * (1 - cover) + layer[..., :3] * rng.uniform(0.7, 1.2)
+        is_here = cover[..., 0] > 0.5
+        owner[is_here] = index
+        areas.append(int(is_here.sum()))
+    boxes = [
+        _edges(owner == index)
+        for index, area in enumerate(areas)
+        if area and (owner == index).sum() > _MIN_VISIBLE * area
+    ]
+    found = np.array(boxes, np.float64).reshape(-1, 4)
+    return picture.clip(0, 255).astype(np.float32), found[_are_large(found)]
+
+
+def _placed_fish(
+    rng: np.random.Generator, bank: PatchBank, size: float
+) -> Float32[np.ndarray, "S S 4"]:
+    """A fish of that length at a random place: BGR times coverage, and coverage."""
+    patch = bank.fish[bank.draw_fish(rng)]
+    side = patch.shape[0]
+    angle_deg = rng.normal(0.0, 25.0) + 180 * rng.integers(2)
+    if rng.random() < 0.3:
+        angle_deg = rng.uniform(0, 360)
+    affine = cv2.getRotationMatrix2D((side / 2, side / 2), angle_deg, size / side)
+    affine[:, 2] += rng.uniform(-0.1, 1.1, 2) * SIDE_PX - side / 2
+    shrink = int(side / size)
+    if shrink > 1:  # average pixels that would be skipped
+        patch = cv2.blur(patch, (shrink, shrink))
+    return cv2.warpAffine(patch, affine, (SIDE_PX, SIDE_PX), flags=cv2.INTER_LINEAR).astype(
+        np.float32
+    )
+
+
+def _areas(boxes: Boxes) -> Float[np.ndarray, "N"]:
+    return (boxes[:, 2:] - boxes[:, :2]).clip(0).prod(axis=1)
+
+
+def _are_large(boxes: Boxes) -> np.ndarray:
+    return (boxes[:, 2:] - boxes[:, :2]).max(axis=1, initial=0.0) >= _MIN_BOX_PX
