@@ -28,7 +28,7 @@ _LYING: dict[str, dict[str, Any]] = {
 # Independent pictures: none follows another, and one good one gives a length. Ten
 # seconds between them are more than anything in `[smooth_length]` remembers, but for the track.
 _STILLS: dict[str, dict[str, Any]] = {
-    "detect_fish": {"detector": "unet"},  # nothing moves
+    "detect_fish": {"detector": "looks"},  # nothing moves
     "track_fish": {"min_track_frames": 1, "max_lost_frames": 0},
     "smooth_length": {"min_frames": 1, "track_timeout_s": 1e9},
 }

@@ -21,6 +21,7 @@ class Candidate:
     # Middle of the box, x and y in px of a view that does not move with the camera. It counts as a
     # fish once it has moved there; None: it need not move, since somebody found it.
     place_px: Float[np.ndarray, "2"] | None = None
+    looks: float | None = None  # how much it looks like a fish, 0 to 1; None: nothing judged that
 
 
 @runtime_checkable

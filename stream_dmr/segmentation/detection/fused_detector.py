@@ -1,32 +1,30 @@
-"""Fish by their motion; in the first frames, whose background is not known, also by their looks.
+"""Fish by their motion and by their looks.
 
-A fish of the first picture is taken for background, and is seen only when it has moved by its own
-length. Looks also find marks and reflections, and motion finds plants that sway. What either finds
-starts a track, and counts as a fish once it has moved from its place.
+Motion finds what a network has never seen, with an outline, and also plants that sway; it misses
+what hangs still, and of a fish that fills the picture it sees parts. Looks find fish that don't
+move, and also marks that look like fish. What either finds is followed; what counts is said by
+`tracking.fish_evidence`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.detection.detector import Candidate, Detector, fraction_inside
 from stream_dmr.segmentation.detection.motion_detector import MotionDetector
 
-_FIRST_FRAMES = 20  # in which looks are needed: as long as the background takes to be learnt
-_MAX_OVERLAP = 0.3  # of a shape found by its looks with a moving one; above, it is that one
+_MIN_IOU = 0.3  # of what moves with the box that says how much it looks like a fish
 
 
 class FusedDetector:
-    """A `Detector` of what moves and, at first, of what looks like fish."""
+    """A `Detector` of what moves, and of what looks like fish."""
 
-    def __init__(self, motion: MotionDetector, open_looks: Callable[[], Detector]) -> None:
-        """`open_looks` opens the detector by looks, at the first frame."""
+    def __init__(self, motion: MotionDetector, looks: Detector) -> None:
         self._motion = motion
-        self._open_looks = open_looks
-        self._looks: Detector | None = None
-        self._num_frames = 0
+        self._looks = looks
 
     @property
     def refused(self) -> Mapping[str, int]:
@@ -35,30 +33,29 @@ class FusedDetector:
 
     def find(self, frame: Frame) -> list[Candidate]:
         """The candidates of one frame."""
-        found = self._motion.find(frame)
-        self._num_frames += 1
-        if self._num_frames > _FIRST_FRAMES:
-            self._looks = None
-        else:
-            self._looks = self._looks or self._open_looks()
-            found += self._unmoved(frame, self._looks, found)
-        return [self._placed(one, frame) for one in found]
+        seen = self._looks.find(frame)
+        return [
+            replace(one, place_px=self._place(one, frame), looks=_looks(one, seen))
+            for one in fuse(self._motion.find(frame), seen)
+        ]
 
-    def _unmoved(self, frame: Frame, looks: Detector, moving: list[Candidate]) -> list[Candidate]:
-        """What looks like fish where nothing moves."""
-        boxes = [one.bbox_xyxy_px for one in moving]
-        found = []
-        for one in looks.find(frame):
-            box = one.bbox_xyxy_px
-            overlaps = [
-                max(fraction_inside(box, other), fraction_inside(other, box)) for other in boxes
-            ]
-            if max(overlaps, default=0.0) <= _MAX_OVERLAP:
-                found.append(one)
-        return found
-
-    def _placed(self, one: Candidate, frame: Frame) -> Candidate:
-        """A candidate with its place in the scene."""
+    def _place(self, one: Candidate, frame: Frame) -> Float[np.ndarray, "2"]:
         middle = (one.bbox_xyxy_px[:2] + one.bbox_xyxy_px[2:]) / 2
-        place = self._motion.scene_point(middle, shape=frame.image.shape[:2])
-        return replace(one, place_px=np.asarray(place))
+        return np.asarray(self._motion.scene_point(middle, shape=frame.image.shape[:2]))
+
+
+def fuse(moving: Sequence[Candidate], seen: Sequence[Candidate]) -> list[Candidate]:
+    """What moves, whose outline is known, and what is seen where nothing moves."""
+    still = [fish for fish in seen if all(_iou(fish, one) < _MIN_IOU for one in moving)]
+    return [*moving, *still]
+
+
+def _looks(one: Candidate, seen: Sequence[Candidate]) -> float:
+    """How much a candidate looks like a fish: the best score of the boxes around it."""
+    return max((fish.score for fish in seen if _iou(one, fish) >= _MIN_IOU), default=0.0)
+
+
+def _iou(one: Candidate, other: Candidate) -> float:
+    boxes = one.bbox_xyxy_px, other.bbox_xyxy_px
+    inside, covered = fraction_inside(*boxes), fraction_inside(*boxes[::-1])
+    return 0.0 if inside == 0 else 1 / (1 / inside + 1 / covered - 1)

@@ -59,10 +59,17 @@ class OnnxSettings(Settings):
 class OnnxDetector:
     """A `Detector` of boxes and scores, without silhouettes."""
 
-    def __init__(self, path: Path, settings: OnnxSettings) -> None:
-        """Raises ModelError for a file that is no usable detector."""
-        self._path, self._settings = path, settings
-        self._session = open_session(path)
+    def __init__(
+        self,
+        path: Path,
+        settings: OnnxSettings,
+        *,
+        min_score: float = _SCORE_TOLERANCE,
+        threads: int = 2,  # users' models may be large
+    ) -> None:
+        """`min_score`: of the boxes that are found. Raises ModelError for no usable detector."""
+        self._path, self._settings, self._min_score = path, settings, min_score
+        self._session = open_session(path, threads=threads)
         self._input_name, self._input_size = self._read_input()
         if len(self._session.get_outputs()) != NUM_OUTPUTS[settings.onnx_layout]:
             raise self._refusal(
@@ -81,18 +88,19 @@ class OnnxDetector:
         return {}
 
     def find(self, frame: Frame) -> list[Candidate]:
-        """The boxes of a frame after non-maximum suppression, of any score."""
+        """The boxes of a frame after non-maximum suppression."""
         height, width = frame.image.shape[:2]
         letterbox = Letterbox.from_sizes(frame_size=(width, height), input_size=self._input_size)
         boxes, scores = self._run(letterbox.apply(frame.image))
         boxes = letterbox.to_frame(boxes).clip(0, [width, height, width, height])
         sides = boxes[:, 2:] - boxes[:, :2]
-        usable = np.isfinite(boxes).all(axis=1) & np.isfinite(scores) & (sides >= 1).all(axis=1)
+        usable = np.isfinite(boxes).all(axis=1) & (sides >= 1).all(axis=1)
+        usable &= scores >= self._min_score  # not NaN
         boxes, scores = boxes[usable], scores[usable]
         kept = cv2.dnn.NMSBoxes(
             np.column_stack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]]).tolist(),
             scores.tolist(),
-            _SCORE_TOLERANCE,
+            self._min_score,
             self._settings.onnx_overlap,
         )
         return [

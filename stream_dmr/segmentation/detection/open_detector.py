@@ -1,6 +1,5 @@
 """Open the detector that `[detect_fish] detector` names."""
 
-from functools import partial
 from pathlib import Path
 
 from pydantic import Field
@@ -14,6 +13,10 @@ from stream_dmr.segmentation.detection.unet_detector import UNetDetector
 from stream_dmr.segmentation.network.unet_segmenter import SHIPPED, UNetSegmenter, is_unet_file
 from stream_dmr.settings import Settings
 
+_MIN_LOOKS_SCORE = 0.15  # of the hundreds of boxes below it none is used
+_LOOKS_THREADS = 1  # two take 9.6 ms of the cores instead of 5.2, which other stages need
+_LOOKS = SHIPPED.with_name("fish.onnx")
+
 
 class DetectorSettings(Settings):
     """The part of `[detect_fish]` that names the detector."""
@@ -21,8 +24,8 @@ class DetectorSettings(Settings):
     detector: str = Field(
         default="motion",
         min_length=1,
-        description='what finds fish in the picture: "motion", "unet", a network of '
-        "`stream-dmr train` (.onnx), or a detector's file (.onnx)",
+        description='what finds fish in the picture: "motion" (and looks), "looks", "unet", a '
+        "network of `stream-dmr train` (.onnx), or a detector's file (.onnx)",
     )
 
 
@@ -45,7 +48,9 @@ def open_detector(settings: DetectFishSettings) -> Detector:
     cannot be used.
     """
     if settings.detector == "motion":
-        return FusedDetector(MotionDetector(settings), partial(_open_unet, SHIPPED, settings))
+        return FusedDetector(MotionDetector(settings), _open_looks())
+    if settings.detector == "looks":
+        return _open_looks()
     suffix = Path(settings.detector).suffix.lower()
     path = SHIPPED if settings.detector == "unet" else Path(settings.detector)
     if path == SHIPPED or suffix == ".pt" or (suffix == ".onnx" and is_unet_file(path)):
@@ -53,9 +58,15 @@ def open_detector(settings: DetectFishSettings) -> Detector:
     if suffix == ".onnx":
         return OnnxDetector(Path(settings.detector), settings)
     raise ModelError(
-        f'[detect_fish] detector: expected "motion", "unet" or a path that ends in .pt or .onnx, '
-        f'got "{settings.detector}"'
+        '[detect_fish] detector: expected "motion", "looks", "unet" or a path that ends in .pt or '
+        f'.onnx, got "{settings.detector}"'
     )
+
+
+def _open_looks() -> OnnxDetector:
+    """The detector that ships, see docs/model-card.md."""
+    settings = OnnxSettings(onnx_layout="yolov5")
+    return OnnxDetector(_LOOKS, settings, min_score=_MIN_LOOKS_SCORE, threads=_LOOKS_THREADS)
 
 
 def _open_unet(path: Path, settings: UNetDetectorSettings) -> UNetDetector:

@@ -24,6 +24,12 @@ class ConfirmationSettings(Settings):
     min_track_frames: int = Field(
         default=4, ge=1, description="frames in which a fish is clearly seen before it counts"
     )
+    min_fish_like_frames: int = Field(
+        default=2,
+        ge=0,
+        description="frames in which what moves has to look like a fish to the network as well; "
+        "0: motion and a mask are enough",
+    )
     min_mask_confidence: float = Field(
         default=0.52, ge=0, le=1, description="mask_confidence from which on a fish is clearly seen"
     )
@@ -58,7 +64,7 @@ class FishConfirmation:
     def update(self, number: int, crop: FishCrop, *, may_count: bool = True) -> bool:
         """Take a track's crop of one frame into account; returns True once it is confirmed.
 
-        `may_count`: False while it has not moved from its place. A confirmed fish remains one
+        `may_count`: False while the other evidence doubts it. A confirmed fish remains one
         outside the zone. A crop without `mask_confidence` (a given mask) counts as clearly seen.
         """
         if number not in self._confirmed:

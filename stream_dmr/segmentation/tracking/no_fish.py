@@ -12,6 +12,7 @@ class Sightings:
     candidates: int = 0  # shapes that a detector took for possible fish, over all frames
     tracks: int = 0  # followed ones
     any_moved: bool = False  # one of them moved from its place
+    any_fish_like: bool = False  # one of those looked like a fish
     best_confidence: float = 0.0  # highest `mask_confidence` of any crop
 
 
@@ -30,8 +31,8 @@ def explain_no_fish(
     begin = f"no fish in {seen.frames} frames: "
     if seen.candidates == 0 and not refused:
         return begin + (
-            "nothing stood out; fish that hardly move need [detect_fish] detector = "
-            '"unet", a detector of your own (.onnx), or --boxes'
+            "nothing moved or looked like a fish; fish that hardly move and look unlike others "
+            "need a detector of your own (.onnx), or --boxes"
         )
     if seen.candidates == 0:
         shapes = ", ".join(f"{count} {reason}" for reason, count in _commonest(refused))
@@ -44,6 +45,11 @@ def explain_no_fish(
             f"{seen.tracks} shapes were followed, none left its place by a quarter of its size, "
             "as plants and glitter don't; fish that stay need a detector of your own (.onnx) or "
             "--boxes; --stills for single pictures"
+        )
+    if seen.tracks > 0 and not seen.any_fish_like:
+        return begin + (
+            f"{seen.tracks} shapes were followed, none looked like a fish to the network; set "
+            "[track_fish] min_fish_like_frames = 0 where they are fish"
         )
     if seen.best_confidence < min_confidence:
         return begin + (

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from stream_dmr.segmentation.detection.detector import Candidate, fraction_inside
 from stream_dmr.segmentation.tracking.appearance import dissimilarity
+from stream_dmr.segmentation.tracking.fish_evidence import FishEvidence
 from stream_dmr.segmentation.tracking.observation import Observation
 from stream_dmr.segmentation.tracking.occlusion import IMPOSSIBLE, TrackSnapshot
 from stream_dmr.segmentation.tracking.split_blobs import PredictedSilhouette
@@ -41,7 +42,7 @@ class TrackedCandidate:
     track_number: int  # from 1; a fish id is given at confirmation
     candidate: Candidate
     visible_fraction: float  # 0 to 1
-    motion: float  # farthest from where it was first seen, in sizes; infinite: it need not move
+    evidence: FishEvidence  # of all frames so far
 
 
 class Track:
@@ -55,8 +56,7 @@ class Track:
         self.area, self.histogram = observation.area, observation.histogram
         self.length = observation.length
         self.was_separate = not observation.is_piece  # what is always a piece may be no fish
-        self._first_place = observation.candidate.place_px
-        self._motion = np.inf if self._first_place is None else 0.0
+        self._evidence = FishEvidence(observation.candidate, self.size)
         self.lost_frames, self.frames_seen, self._merged_frames = 0, 1, 0
         self.snapshot: TrackSnapshot | None = None  # None while the identity is certain
         self._history: deque[TrackSnapshot] = deque(maxlen=_SNAPSHOT_DELAY)
@@ -118,7 +118,7 @@ class Track:
         """Take an observation for this fish."""
         self.observation, self.lost_frames, self._merged_frames = observation, 0, 0
         self.frames_seen += 1
-        self._motion = max(self._motion, self._motion_to(observation))
+        self._evidence.add(observation.candidate, self.size)
         self._separate_frames = 0 if observation.is_piece else self._separate_frames + 1
         if observation.is_piece and self.was_separate:
             self._filter.update(
@@ -135,13 +135,6 @@ class Track:
         self.histogram, self._histogram_frame = observation.histogram, self.frame_index
         if self.snapshot is None:
             self._history.append(self._current_snapshot())
-
-    def _motion_to(self, observation: Observation) -> float:
-        """Sizes from where it was first seen; 0 for pieces of a shape, which have no place."""
-        place = observation.candidate.place_px
-        if place is None or self._first_place is None:
-            return 0.0
-        return float(np.hypot(*(place - self._first_place)) / self.size)
 
     def _current_snapshot(self) -> TrackSnapshot:
         return TrackSnapshot(
@@ -233,5 +226,5 @@ class Track:
             track_number=self.number,
             candidate=self.observation.candidate,
             visible_fraction=min(1.0, self.observation.area / self.area) if is_cut else 1.0,
-            motion=self._motion,
+            evidence=self._evidence,
         )

@@ -9,14 +9,9 @@ from stream_dmr.segmentation.detection.detector import Detector
 from stream_dmr.segmentation.detection.fish_detection import Detection
 from stream_dmr.segmentation.tracking.box_correction import BoxCorrector
 from stream_dmr.segmentation.tracking.confirmation import ConfirmationSettings, FishConfirmation
+from stream_dmr.segmentation.tracking.fish_evidence import FishEvidence
 from stream_dmr.segmentation.tracking.no_fish import Sightings, explain_no_fish
 from stream_dmr.segmentation.tracking.tracker import Tracker, TrackerSettings
-
-# Sizes from where a track was first seen; see docs/research/tracking.md. Plants sway and marks
-# glitter in their places. What went far is looked at in its own box alone, since the network loses
-# a thin fish in a wider one.
-_MIN_MOTION = 0.25
-_FAR = 0.5
 
 
 class TrackFishSettings(TrackerSettings, ConfirmationSettings):
@@ -33,7 +28,7 @@ class TrackedFish:
         self._corrector = BoxCorrector()
         self._settings = settings
         self._seen = Sightings()
-        self._motion: dict[int, float] = {}  # of the frame's tracks, sizes
+        self._evidence: dict[int, FishEvidence] = {}  # of the frame's tracks
         self._found_any = False
 
     def detect(self, frame: Frame) -> list[Detection]:
@@ -44,8 +39,9 @@ class TrackedFish:
         self._seen.candidates += len(candidates)
         boxes = {one.track_number: one.candidate.bbox_xyxy_px for one in tracked}
         visible = {one.track_number: one.visible_fraction for one in tracked}
-        self._motion = {one.track_number: one.motion for one in tracked}
-        self._seen.any_moved |= any(one.motion > _MIN_MOTION for one in tracked)
+        self._evidence = {one.track_number: one.evidence for one in tracked}
+        self._seen.any_moved |= any(one.has_moved for one in self._evidence.values())
+        self._seen.any_fish_like |= any(map(self._may_count, self._evidence))
         return [
             replace(one, may_be_no_fish=not self._is_surely_fish(one.source_id))
             for one in self._corrector.correct(boxes, visible, frame)
@@ -53,7 +49,12 @@ class TrackedFish:
 
     def _is_surely_fish(self, track: int) -> bool:
         """True for a confirmed track, and for one that went far or that need not move."""
-        return self._motion[track] > _FAR or self._confirmation.is_confirmed(track)
+        return self._evidence[track].went_far or self._confirmation.is_confirmed(track)
+
+    def _may_count(self, track: int) -> bool:
+        evidence = self._evidence[track]
+        min_frames = self._settings.min_fish_like_frames
+        return evidence.has_moved and evidence.looks_like_a_fish(min_frames)
 
     @property
     def knows_ids(self) -> bool:
@@ -66,7 +67,7 @@ class TrackedFish:
         fish = [
             track
             for track, crop in crops.items()
-            if self._confirmation.update(track, crop, may_count=self._motion[track] > _MIN_MOTION)
+            if self._confirmation.update(track, crop, may_count=self._may_count(track))
         ]
         self._found_any = self._found_any or bool(fish)
         self._seen.tracks = max(self._seen.tracks, *crops) if crops else self._seen.tracks

@@ -1,10 +1,14 @@
-"""Looks help motion in the first frames, and every candidate has its place in the scene."""
+"""Motion and looks find each fish once, and every candidate has its place in the scene."""
+
+from dataclasses import replace
 
 import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
 
 from stream_dmr.messages import Frame
-from stream_dmr.segmentation.detection.detector import Candidate
-from stream_dmr.segmentation.detection.fused_detector import FusedDetector
+from stream_dmr.segmentation.detection.detector import Candidate, fraction_inside
+from stream_dmr.segmentation.detection.fused_detector import FusedDetector, fuse
 from stream_dmr.segmentation.detection.motion_detector import MotionDetector, MotionSettings
 from tests.support.frames import frame_of
 
@@ -32,20 +36,51 @@ def is_still(one: Candidate) -> bool:
     return np.array_equal(one.bbox_xyxy_px, STILL.bbox_xyxy_px)
 
 
-def test_looks_help_in_the_first_frames_and_candidates_have_places():
-    detector = FusedDetector(MotionDetector(MotionSettings()), lambda: Looks(STILL))
+def test_what_hangs_still_is_found_by_its_looks_and_candidates_have_places():
+    detector = FusedDetector(MotionDetector(MotionSettings()), Looks(STILL))
     found = [detector.find(frame(i % 8)) for i in range(1, 40)]
-    alone = [[one for one in some if is_still(one)] for some in found]
-    assert all(len(some) == 1 for some in alone[:20])
-    assert not any(alone[20:])
+    assert all(sum(is_still(one) for one in some) == 1 for some in found)
+    assert any(len(some) == 2 for some in found)
     for one in (one for some in found for one in some):
         middle = one.bbox_xyxy_px.reshape(2, 2).mean(axis=0)
         np.testing.assert_allclose(one.place_px, middle, atol=1)  # the camera is at rest
 
 
+def test_it_is_said_how_much_everything_looks_like_a_fish():
+    detector = FusedDetector(MotionDetector(MotionSettings()), Looks(replace(STILL, score=0.7)))
+    found = [detector.find(frame(i)) for i in range(8)][-1]
+    assert {is_still(one): one.looks for one in found} == {True: 0.7, False: 0.0}
+
+
 def test_a_shape_that_moves_is_found_once():
     box = np.array([140.0, 150.0, 210.0, 180.0])
     both = Looks(STILL, Candidate(bbox_xyxy_px=box, score=0.9))
-    detector = FusedDetector(MotionDetector(MotionSettings()), lambda: both)
+    detector = FusedDetector(MotionDetector(MotionSettings()), both)
     found = [detector.find(frame(i)) for i in range(5)][-1]
-    assert [is_still(one) for one in found] == [False, True]
+    assert sorted(is_still(one) for one in found) == [False, True]
+
+
+def at(x0: float, y0: float, x1: float, y1: float) -> Candidate:
+    return Candidate(bbox_xyxy_px=np.array([x0, y0, x1, y1], np.float64), score=0.9)
+
+
+def test_the_outline_of_what_moves_is_kept_where_a_fish_is_seen_as_well():
+    fish, moving, other = at(10, 10, 210, 90), at(20, 5, 200, 85), at(300, 10, 400, 50)
+    assert fuse([moving], [fish, other]) == [moving, other]
+
+
+boxes = st.lists(
+    st.tuples(st.floats(0, 300), st.floats(0, 200), st.floats(5, 200), st.floats(5, 200)),
+    max_size=5,
+)
+
+
+@given(boxes, boxes)
+def test_nothing_is_invented_and_nothing_seen_is_lost(moving, seen):
+    moves, looks = ([at(x, y, x + w, y + h) for x, y, w, h in some] for some in (moving, seen))
+    found = fuse(moves, looks)
+    assert all(one in [*moves, *looks] for one in found)
+    for fish in looks:  # it is there, or something in its place
+        inside = (fraction_inside(fish.bbox_xyxy_px, one.bbox_xyxy_px) for one in found)
+        assert max(inside, default=0.0) > 0.29
+    assert fuse(moves, []) == moves

@@ -14,7 +14,7 @@ LIMITS = {"min_frames": 4, "min_confidence": 0.8}
 @pytest.mark.parametrize(
     ("seen", "refused", "words"),
     [
-        (Sightings(frames=9), {}, "nothing stood out"),
+        (Sightings(frames=9), {}, "nothing moved or looked like a fish"),
         (Sightings(frames=9), {"shorter than [detect_fish] motion_min_length": 14}, "all 14"),
         (Sightings(frames=9, candidates=5, best_confidence=0.5), {}, "min_mask_confidence = 0.8"),
         (
@@ -24,6 +24,18 @@ LIMITS = {"min_frames": 4, "min_confidence": 0.8}
         ),
         (
             Sightings(frames=9, candidates=5, tracks=2, any_moved=True, best_confidence=0.9),
+            {},
+            "min_fish_like_frames = 0",
+        ),
+        (
+            Sightings(
+                frames=9,
+                candidates=5,
+                tracks=2,
+                any_moved=True,
+                any_fish_like=True,
+                best_confidence=0.9,
+            ),
             {},
             "min_track_frames",
         ),
@@ -58,7 +70,7 @@ def test_small_things_that_move_are_said_to_be_too_short():
 
 def test_a_still_picture_is_said_to_show_nothing():
     [line] = finder_after([None] * 8).warnings
-    assert "nothing stood out" in line
+    assert "nothing moved" in line
 
 
 def test_nothing_is_said_before_the_first_frame():

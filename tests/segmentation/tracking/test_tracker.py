@@ -148,32 +148,19 @@ def test_merged_fish_are_reidentified_by_their_motion(a: float, b: float, late: 
     assert middles == pytest.approx({1: places[-1][0], 2: places[-1][1]})
 
 
-def placed(x: float) -> Candidate:
-    """A shape of 60 px at a place of the scene."""
-    box = np.array([x - 30, 140.0, x + 30, 160.0])
-    return Candidate(bbox_xyxy_px=box, score=1.0, place_px=np.array([x, 150.0]))
+def test_a_track_has_the_evidence_of_all_its_frames():
+    def placed(i: int) -> Candidate:
+        x = 200.0 + 4.0 * i
+        box = np.array([x - 30, 140.0, x + 30, 160.0])
+        looks = 0.9 if i % 2 else None
+        return Candidate(bbox_xyxy_px=box, score=1.0, place_px=np.array([x, 150.0]), looks=looks)
 
-
-@pytest.mark.parametrize(
-    ("place", "motion"),
-    [
-        (lambda i: 200.0, 0.0),
-        (lambda i: 200.0 + 0.5 * i, 5.5 / 60),
-        (lambda i: 200.0 + 12 * np.sin(i), 12 / 60),  # a plant sways
-        (lambda i: 200.0 + 4.0 * i, 44 / 60),
-    ],
-)
-def test_motion_is_the_greatest_distance_from_the_first_place(place, motion: float):
-    found = track([[placed(place(i))] for i in range(12)])
-    assert [one.track_number for frame in found for one in frame] == [1] * 12
-    assert found[0][0].motion == 0
-    assert found[-1][0].motion == pytest.approx(motion, abs=0.003)
-
-
-def test_what_somebody_found_need_not_move():
-    box = np.array([170.0, 140.0, 230.0, 160.0])
-    found = track([[Candidate(bbox_xyxy_px=box, score=1.0)] for _ in range(3)])
-    assert all(np.isinf(one.motion) for frame in found for one in frame)
+    found = [one for frame in track([[placed(i)] for i in range(12)]) for one in frame]
+    assert len(found) == 12
+    [evidence] = {one.evidence for one in found}
+    assert evidence.went_far  # 44 of 60 px
+    assert evidence.looks_like_a_fish(6)
+    assert not evidence.looks_like_a_fish(7)
 
 
 def test_a_fish_of_another_colour_in_the_same_place_is_another_fish():
