@@ -17,6 +17,7 @@ from stream_dmr.sources.capture_clock import CaptureClock
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 30.0  # between attempts to connect
 _MAX_WAITING = 100_000  # positions that no frame has passed yet: a day without pictures
 _CLOCK_ERROR_S = 5.0  # between this machine's clock and the receiver's, that is worth a word
+_JITTER = random.Random()  # its own: `random` may have been seeded by whoever uses this as a library
 
 
 class PositionReceiver(PositionSource):
@@ -110,7 +111,7 @@ class PositionReceiver(PositionSource):
             finally:
                 if stream is not None:
                     stream.close()
-            if self._closing.wait(pause_s * random.uniform(0.5, 1.0)):
+            if self._closing.wait(pause_s * _JITTER.uniform(0.5, 1.0)):
                 return
             pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
 

@@ -18,6 +18,7 @@ from stream_dmr.sources.video_file import plausible_fps, promised_frames
 
 _FIRST_PAUSE_S = 0.25  # before the first attempt to reconnect; doubled up to `retry_s`
 _CLOCK_STEP_NS = 1_000_000_000  # smaller corrections of the system's clock are not reported
+_JITTER = random.Random()  # its own: `random` may have been seeded by whoever uses this as a library
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -199,7 +200,7 @@ class LiveStream(Source):
         pause_s, picture = _FIRST_PAUSE_S, None
         while picture is None:
             self._decoder.close()
-            if self._closing.wait(pause_s * random.uniform(0.5, 1.0)):
+            if self._closing.wait(pause_s * _JITTER.uniform(0.5, 1.0)):
                 return
             pause_s = min(2 * pause_s, self._settings.retry_s)
             try:

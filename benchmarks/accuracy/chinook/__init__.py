@@ -1,0 +1,1 @@
+"""Photographs of one live fish before a grid: do their lengths agree?"""
