@@ -37,9 +37,9 @@ class _ReadOnly:
 
 
 @cache
-def _field_names(kind: type) -> list[str]:
+def _field_names(kind: type) -> frozenset[str]:
     """Of a message's dataclass: finding out takes longer than all else that is done with them."""
-    return [part.name for part in fields(kind)]
+    return frozenset(part.name for part in fields(kind))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

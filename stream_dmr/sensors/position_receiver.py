@@ -17,7 +17,7 @@ from stream_dmr.sources.capture_clock import CaptureClock
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 30.0  # between attempts to connect
 _MAX_WAITING = 100_000  # positions that no frame has passed yet: a day without pictures
 _CLOCK_ERROR_S = 5.0  # between this machine's clock and the receiver's, that is worth a word
-_JITTER = random.Random()  # its own: `random` may have been seeded by whoever uses this as a library
+_JITTER = random.Random()  # its own: a user of the library may have seeded `random`
 
 
 class PositionReceiver(PositionSource):

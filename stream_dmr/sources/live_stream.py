@@ -18,7 +18,7 @@ from stream_dmr.sources.video_file import plausible_fps, promised_frames
 
 _FIRST_PAUSE_S = 0.25  # before the first attempt to reconnect; doubled up to `retry_s`
 _CLOCK_STEP_NS = 1_000_000_000  # smaller corrections of the system's clock are not reported
-_JITTER = random.Random()  # its own: `random` may have been seeded by whoever uses this as a library
+_JITTER = random.Random()  # its own: a user of the library may have seeded `random`
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

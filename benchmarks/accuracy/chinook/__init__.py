@@ -1,1 +1,1 @@
-"""Photographs of one live fish before a grid: do their lengths agree?"""
+"""Whether the lengths of one live fish agree between photographs before a grid."""
