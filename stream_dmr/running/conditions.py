@@ -29,7 +29,7 @@ _LYING: dict[str, dict[str, Any]] = {
 # seconds between them are more than anything in `[smooth_length]` remembers, but for the track.
 _STILLS: dict[str, dict[str, Any]] = {
     "detect_fish": {"detector": "looks"},  # nothing moves
-    "track_fish": {"min_track_frames": 1, "max_lost_frames": 0},
+    "track_fish": {"min_track_frames": 1, "across_frames": False},
     "smooth_length": {"min_frames": 1, "track_timeout_s": 1e9},
 }
 

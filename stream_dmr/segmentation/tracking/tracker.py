@@ -40,6 +40,10 @@ class TrackerSettings(Settings):
         description="a fish lost in the open is re-identified within so many frames; 0 at a rail, "
         "where the next fish soon hangs in its place",
     )
+    across_frames: bool = Field(
+        default=True,
+        description="false: each picture stands for itself, as with --stills",
+    )
     min_score: float = Field(
         default=0.3, ge=0, le=1, description="least score of a detector's candidate that counts"
     )
@@ -61,6 +65,8 @@ class Tracker:
             for candidate in candidates
             if candidate.score >= self._settings.min_score
         ]
+        if not self._settings.across_frames:
+            self._tracks, self._hidden = [], []
         for track in (*self._tracks, *self._hidden):
             track.predict(frame.frame_index)
         observations = [piece for one in observations for piece in self._split(frame, one)]

@@ -148,6 +148,15 @@ def test_merged_fish_are_reidentified_by_their_motion(a: float, b: float, late: 
     assert middles == pytest.approx({1: places[-1][0], 2: places[-1][1]})
 
 
+def test_pictures_that_stand_for_themselves_show_other_fish():
+    tracker = Tracker(TrackerSettings(across_frames=False))
+    boxes = np.array([[170.0, 140.0, 230.0, 160.0], [20.0, 20.0, 80.0, 40.0]])
+    candidates = [Candidate(bbox_xyxy_px=box, score=1.0) for box in boxes]
+    image = np.zeros((300, 400, 3), np.uint8)
+    found = [tracker.step(frame_of(image, i), candidates) for i in range(3)]
+    assert [[one.track_number for one in some] for some in found] == [[1, 2], [3, 4], [5, 6]]
+
+
 def test_a_track_has_the_evidence_of_all_its_frames():
     def placed(i: int) -> Candidate:
         x = 200.0 + 4.0 * i
