@@ -25,9 +25,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.accuracy.oracles import scene_of
 from benchmarks.table1.filmed_scene import (
     FISH_PER_SCENE,
-    FRAMES_PER_SCENE,
     FilmedScene,
     Sighting,
     film_passages,
@@ -44,7 +44,6 @@ from stream_dmr.running.config import Config
 from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.segmentation.tracking.fish_finder import open_finder
 from stream_dmr.simulation.pose_sequence import FPS
-from stream_dmr.simulation.rail_scene import make_scene
 from stream_dmr.simulation.species import SPECIES
 
 FIRST_SEED = 9400
@@ -71,16 +70,8 @@ def measure_catch(seed: int) -> list[MeasuredFish]:
     rng = np.random.default_rng(seed)
     kinds = rng.choice(sorted(SPECIES), SPECIES_PER_CATCH, replace=False)
     order = rng.choice(kinds, FISH_PER_SCENE)
-    filmed = film_passages(
-        make_scene(
-            num_fish=FISH_PER_SCENE,
-            num_frames=FRAMES_PER_SCENE,
-            preset="realistic",
-            seed=seed,
-            species=[SPECIES[name] for name in order],
-        ),
-        with_second=False,
-    )
+    scene = scene_of(("realistic", seed), species=[SPECIES[name] for name in order])
+    filmed = film_passages(scene, with_second=False)
     return [
         fish._replace(scene=seed, species=str(order[int(fish.species) - 1]))
         for fish in _Camera(filmed).run()

@@ -61,10 +61,17 @@ def errors_of(task: tuple[str, int]) -> dict[str, list[float]]:
     return found
 
 
-def scene_of(task: tuple[str, int], *, num_frames: int = FRAMES_PER_SCENE) -> RailScene:
-    """The scene of a preset and a seed."""
+def scene_of(
+    task: tuple[str, int],
+    *,
+    num_frames: int = FRAMES_PER_SCENE,
+    species: Sequence[SimulatedBody] = (HALIBUT,),
+) -> RailScene:
+    """The scene of a preset and a seed; several `species` take turns."""
     preset, seed = task
-    return make_scene(num_fish=FISH_PER_SCENE, num_frames=num_frames, preset=preset, seed=seed)
+    return make_scene(
+        num_fish=FISH_PER_SCENE, num_frames=num_frames, preset=preset, seed=seed, species=species
+    )
 
 
 def tracks_of(filmed: FilmedScene) -> dict[int, list[FishCrop]]:

@@ -19,16 +19,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.accuracy.oracles import scene_of
 from benchmarks.fit_speed.targets import body_template
 from benchmarks.table1.dmr import through_all
-from benchmarks.table1.filmed_scene import FISH_PER_SCENE, FRAMES_PER_SCENE, film_passages
+from benchmarks.table1.filmed_scene import film_passages
 from stream_dmr.camera import Calibration
 from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
 from stream_dmr.messages import FishCrop, LengthEstimate
 from stream_dmr.running.config import Config
 from stream_dmr.running.measure_source import later_nodes
-from stream_dmr.simulation.rail_scene import make_scene
 from stream_dmr.simulation.species import SPECIES, find_species
 from stream_dmr.template.template import Template
 from stream_dmr.template.template_file import bundled_names
@@ -49,16 +49,8 @@ def measure(task: tuple[str, int, Sequence[str]]) -> dict[str, Measured]:
     """One scene of a catch by each of the templates."""
     catch, seed, names = task
     species = find_species(catch)
-    filmed = film_passages(
-        make_scene(
-            num_fish=FISH_PER_SCENE,
-            num_frames=FRAMES_PER_SCENE,
-            preset="realistic",
-            seed=seed,
-            species=species,
-        ),
-        with_second=False,
-    )
+    scene = scene_of(("realistic", seed), species=species)
+    filmed = film_passages(scene, with_second=False)
     crops = [sighting.crop for frame in filmed.frames for sighting in frame]
     found: dict[str, Measured] = {}
     for name in names:

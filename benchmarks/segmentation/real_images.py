@@ -33,6 +33,8 @@ _TILE_GAP_PX = 9  # from the edge of a tile's cell to its picture
 _MIN_BLOB_PX = 250  # of a given mask; smaller ones are specks
 _CANVAS_PX = 384  # side of the photographs that cut-outs are put before
 
+POLYGON = -1  # the class of labels that are no boxes
+
 Image = UInt8[np.ndarray, "H W 3"]
 Mask = Bool[np.ndarray, "H W"]
 
@@ -104,19 +106,26 @@ def read_boxes(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
     for stem, path in first_versions(clone.paths(source["files"])).items():
         image = without_padding(clone.image(path), source.get("sizes_before_padding", []))
         for number, (kind, box) in enumerate(labelled_boxes(clone, path, image)):
-            is_wanted = kind in source["classes"] or not source["classes"]
-            if is_wanted and (box[2:] - box[:2]).max() >= source["min_side_px"]:
+            if (
+                is_of(kind, source["classes"])
+                and (box[2:] - box[:2]).max() >= source["min_side_px"]
+            ):
                 yield Proposal(name=f"{stem}_{number}", image=image, box=box)
 
 
+def is_of(kind: int, classes: list[int]) -> bool:
+    """True for a box of these classes; of any, where none is named."""
+    return kind in classes if classes else kind != POLYGON
+
+
 def labelled_boxes(clone: Clone, path: str, image: Image) -> list[tuple[int, Box]]:
-    """Classes and boxes of a picture's labels; polygons among them have class -1 and its size."""
+    """Classes and boxes of a picture's labels; polygons among them have its size."""
     labels = clone.text(path.replace("/images/", "/labels/").rsplit(".", 1)[0] + ".txt")
     scale, boxes = np.tile(image.shape[1::-1], 2), []
     for line in labels.splitlines():
         kind, *values = map(float, line.split())
         if len(values) != 4:
-            boxes.append((-1, _whole(image)))
+            boxes.append((POLYGON, _whole(image)))
             continue
         x, y, width, height = np.array(values) * scale
         edges = np.array([x - width / 2, y - height / 2, x + width / 2, y + height / 2])

@@ -25,8 +25,8 @@ import numpy as np
 from benchmarks.segmentation.tracking_metrics import score
 from stream_dmr.messages import Frame
 from stream_dmr.nodes.crop_fish import CropFish
+from stream_dmr.segmentation.detection.detector import box_iou
 from stream_dmr.segmentation.detection.open_detector import DetectFishSettings, open_detector
-from stream_dmr.segmentation.masks.crop_geometry import box_iou
 from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
 from stream_dmr.segmentation.tracking.tracked_fish import TrackedFish, TrackFishSettings
 from stream_dmr.simulation.film import film

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from benchmarks.segmentation.detector.training_frames import AnnotatedFrame
 from stream_dmr.messages import Frame
+from stream_dmr.segmentation.detection.detector import box_iou
 from stream_dmr.segmentation.detection.onnx_detector import OnnxDetector, OnnxSettings
 
 _MIN_SCORE = 0.01  # of the boxes that count
@@ -24,7 +24,7 @@ def equal_error_score(detector: Path, pictures: list[AnnotatedFrame]) -> str:
         found = sorted(found, key=lambda one: -one.score)
         taken: set[int] = set()
         for one in found:
-            overlaps = _ious(one.bbox_xyxy_px, picture.boxes)
+            overlaps = np.array([box_iou(one.bbox_xyxy_px, box) for box in picture.boxes])
             overlaps[list(taken)] = 0
             best = int(overlaps.argmax()) if len(overlaps) else -1
             is_hit = best >= 0 and overlaps[best] >= _SAME
@@ -42,10 +42,3 @@ def equal_error_score(detector: Path, pictures: list[AnnotatedFrame]) -> str:
         np.sum(np.diff(recall, prepend=0) * np.maximum.accumulate(precision[::-1])[::-1])
     )
     return f"{recall[even]:.3f} of {num_fish} at score {score:.2f}, average precision {average:.3f}"
-
-
-def _ious(box: Float[np.ndarray, "4"], others: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N"]:
-    low, high = np.maximum(box[:2], others[:, :2]), np.minimum(box[2:], others[:, 2:])
-    both = (high - low).clip(0).prod(axis=1)
-    areas = (others[:, 2:] - others[:, :2]).prod(axis=1) + (box[2:] - box[:2]).prod()
-    return both / np.maximum(areas - both, 1e-9)

@@ -9,7 +9,12 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from benchmarks.segmentation.clone import Clone
-from benchmarks.segmentation.real_images import first_versions, labelled_boxes, without_padding
+from benchmarks.segmentation.real_images import (
+    first_versions,
+    is_of,
+    labelled_boxes,
+    without_padding,
+)
 from stream_dmr.segmentation.training.annotated_images import read_annotated_images
 from stream_dmr.segmentation.training.image_degradation import add_weather, simulate_camera
 from stream_dmr.segmentation.training.patch_bank import PatchBank
@@ -70,7 +75,7 @@ def read_frames(repositories: Path, source: dict[str, Any], *, every: int) -> li
         image = without_padding(clone.image(path), source.get("sizes_before_padding", []))
         fish = source.get("fish_classes", source["classes"])
         found = labelled_boxes(clone, path, image)
-        boxes = [box for kind, box in found if kind in fish or not fish]
+        boxes = [box for kind, box in found if is_of(kind, fish)]
         frames.append(_kept(image, np.array(boxes).reshape(-1, 4)))
     return frames
 

@@ -9,6 +9,10 @@ from jaxtyping import Bool, Float
 
 from stream_dmr.messages import Frame
 
+# Of how much something looks like a fish, 0 to 1. Nearly all simulated fish have more in most
+# frames, rock, light and plants in none; see docs/research/tracking.md.
+FISH_LIKE = 0.15
+
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Candidate:
@@ -48,3 +52,10 @@ def fraction_inside(box: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) 
     """The fraction of the area of `box` that lies inside `other`, 0 to 1."""
     overlap = np.minimum(box[2:], other[2:]) - np.maximum(box[:2], other[:2])
     return float(np.prod(np.maximum(overlap, 0)) / max(np.prod(box[2:] - box[:2]), 1e-9))
+
+
+def box_iou(one: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> float:
+    """Intersection over union of two boxes."""
+    sides = np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2])
+    both = np.prod(np.maximum(sides, 0))
+    return float(both / (np.prod(one[2:] - one[:2]) + np.prod(other[2:] - other[:2]) - both))

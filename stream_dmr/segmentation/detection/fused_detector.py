@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.messages import Frame
-from stream_dmr.segmentation.detection.detector import Candidate, Detector, fraction_inside
+from stream_dmr.segmentation.detection.detector import Candidate, Detector, box_iou
 from stream_dmr.segmentation.detection.motion_detector import MotionDetector
 
 _MIN_IOU = 0.3  # of what moves with the box that says how much it looks like a fish
@@ -46,16 +46,14 @@ class FusedDetector:
 
 def fuse(moving: Sequence[Candidate], seen: Sequence[Candidate]) -> list[Candidate]:
     """What moves, whose outline is known, and what is seen where nothing moves."""
-    still = [fish for fish in seen if all(_iou(fish, one) < _MIN_IOU for one in moving)]
+    still = [fish for fish in seen if not any(_show_the_same(fish, one) for one in moving)]
     return [*moving, *still]
 
 
 def _looks(one: Candidate, seen: Sequence[Candidate]) -> float:
     """How much a candidate looks like a fish: the best score of the boxes around it."""
-    return max((fish.score for fish in seen if _iou(one, fish) >= _MIN_IOU), default=0.0)
+    return max((fish.score for fish in seen if _show_the_same(one, fish)), default=0.0)
 
 
-def _iou(one: Candidate, other: Candidate) -> float:
-    boxes = one.bbox_xyxy_px, other.bbox_xyxy_px
-    inside, covered = fraction_inside(*boxes), fraction_inside(*boxes[::-1])
-    return 0.0 if inside == 0 else 1 / (1 / inside + 1 / covered - 1)
+def _show_the_same(one: Candidate, other: Candidate) -> bool:
+    return box_iou(one.bbox_xyxy_px, other.bbox_xyxy_px) >= _MIN_IOU

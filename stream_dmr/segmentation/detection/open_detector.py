@@ -5,7 +5,7 @@ from pathlib import Path
 from pydantic import Field
 
 from stream_dmr.errors import ModelError
-from stream_dmr.segmentation.detection.detector import Detector
+from stream_dmr.segmentation.detection.detector import FISH_LIKE, Detector
 from stream_dmr.segmentation.detection.fused_detector import FusedDetector
 from stream_dmr.segmentation.detection.motion_detector import MotionDetector, MotionSettings
 from stream_dmr.segmentation.detection.onnx_detector import OnnxDetector, OnnxSettings
@@ -13,7 +13,6 @@ from stream_dmr.segmentation.detection.unet_detector import UNetDetector
 from stream_dmr.segmentation.network.unet_segmenter import SHIPPED, UNetSegmenter, is_unet_file
 from stream_dmr.settings import Settings
 
-_MIN_LOOKS_SCORE = 0.15  # of the hundreds of boxes below it none is used
 _LOOKS_THREADS = 1  # two take 9.6 ms of the cores instead of 5.2, which other stages need
 _LOOKS = SHIPPED.with_name("fish.onnx")
 
@@ -66,7 +65,7 @@ def open_detector(settings: DetectFishSettings) -> Detector:
 def _open_looks() -> OnnxDetector:
     """The detector that ships, see docs/model-card.md."""
     settings = OnnxSettings(onnx_layout="yolov5")
-    return OnnxDetector(_LOOKS, settings, min_score=_MIN_LOOKS_SCORE, threads=_LOOKS_THREADS)
+    return OnnxDetector(_LOOKS, settings, min_score=FISH_LIKE, threads=_LOOKS_THREADS)
 
 
 def _open_unet(path: Path, settings: UNetDetectorSettings) -> UNetDetector:

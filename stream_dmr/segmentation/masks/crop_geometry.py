@@ -73,13 +73,6 @@ def visible_bbox(
     return np.concatenate([np.minimum(box[:2], extent[:2]), np.maximum(box[2:], extent[2:])])
 
 
-def box_iou(one: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> float:
-    """Intersection over union of two boxes."""
-    sides = np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2])
-    both = np.prod(np.maximum(sides, 0))
-    return float(both / (np.prod(one[2:] - one[:2]) + np.prod(other[2:] - other[:2]) - both))
-
-
 def camera_around(
     bbox_xyxy_px: Float[np.ndarray, "4"], *, frame_camera: Camera, margin: float, size_px: int
 ) -> Camera:

@@ -9,10 +9,10 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from stream_dmr.camera import Camera
 from stream_dmr.messages import FishEnds
+from stream_dmr.segmentation.detection.detector import box_iou
 from stream_dmr.segmentation.masks.crop_geometry import (
     Layer,
     box_in_crop,
-    box_iou,
     camera_around,
     frame_from_crop_map,
     mask_bbox,

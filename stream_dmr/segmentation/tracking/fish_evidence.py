@@ -6,12 +6,9 @@ them looks like a fish. Letters and stones may, but stay where they are.
 
 import numpy as np
 
-from stream_dmr.segmentation.detection.detector import Candidate
+from stream_dmr.segmentation.detection.detector import FISH_LIKE, Candidate
 
-# Of how much it looks like a fish, 0 to 1. Nearly all simulated fish pass the first in most frames,
-# rock, light and plants in none; see docs/research/tracking.md.
-_FISH_LIKE = 0.15
-_SURE = 0.6  # in so many frames it need not move
+_SURE = 0.6  # of how much it looks like a fish: in so many frames it need not move
 _MIN_SURE_FRAMES = 4
 # Sizes from where it was first seen. What went far is looked at in its own box alone, since the
 # network for masks loses a thin fish in a wider one.
@@ -37,7 +34,7 @@ class FishEvidence:
             self._motion = max(self._motion, distance_px / size_px)
         if candidate.looks is not None:
             self._judged_frames += 1
-            self._fish_like_frames += candidate.looks >= _FISH_LIKE
+            self._fish_like_frames += candidate.looks >= FISH_LIKE
             self._sure_frames += candidate.looks >= _SURE
 
     @property

@@ -1,7 +1,6 @@
 """Boxes and pixels between frame and crop."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -9,7 +8,6 @@ from stream_dmr.camera import Camera, frame_from_crop
 from stream_dmr.segmentation.masks.crop_geometry import (
     Layer,
     box_in_crop,
-    box_iou,
     frame_from_crop_map,
     mask_bbox,
     mask_bbox_in_frame,
@@ -75,18 +73,6 @@ def test_a_visible_box_is_clipped_and_encloses_the_mask():
     box = np.array([-10.0, 10, 15, 50])
     assert visible_bbox(box, None, width=40, height=30).tolist() == [0, 10, 15, 30]
     assert visible_bbox(box, mask_bbox(mask), width=40, height=30).tolist() == [0, 2, 38, 30]
-
-
-boxes = st.tuples(*[st.floats(0, 50)] * 2, *[st.floats(1, 50)] * 2).map(
-    lambda b: np.array([b[0], b[1], b[0] + b[2], b[1] + b[3]])
-)
-
-
-@given(boxes, boxes)
-def test_iou_is_symmetric_from_0_to_1_and_1_for_the_same_box(one: np.ndarray, other: np.ndarray):
-    assert 0 <= box_iou(one, other) <= 1
-    assert box_iou(one, other) == pytest.approx(box_iou(other, one))
-    assert box_iou(one, one) == pytest.approx(1)
 
 
 @given(lens_cameras, st.floats(100, 500), st.floats(100, 400), st.floats(20, 500), st.data())
