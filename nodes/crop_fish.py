@@ -1,7 +1,10 @@
 """CropFish: every fish of a frame, cut out through an ideal camera of its own."""
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from stream_dmr.camera import Camera
@@ -36,6 +39,7 @@ class CropFish:
         self._classifier = SpeciesClassifier(Path(species_model)) if species_model else None
         self._settings = settings
         self._camera = camera
+        self._workers = ThreadPoolExecutor(os.cpu_count(), "crop")
 
     def number_after(self, track_id: int) -> None:
         """Number the fish on after those of earlier runs; call it before the first frame."""
@@ -45,16 +49,17 @@ class CropFish:
         """The fish of one frame, by id. Raises AnnotationError for an unusable mask."""
         height, width = frame.image.shape[:2]
         camera = self._camera or Camera.nominal(width=width, height=height)
-        crops = {
-            detection.source_id: crop_fish(
-                frame,
-                detection,
-                frame_camera=camera,
-                settings=self._settings,
-                segmenter=self._segmenter,
-            )
-            for detection in self._finder.detect(frame)
-        }
+        cut = partial(
+            crop_fish,
+            frame,
+            frame_camera=camera,
+            settings=self._settings,
+            segmenter=self._segmenter,
+        )
+        found = self._finder.detect(frame)
+        # A crop's time is the network's and OpenCV's, which run side by side.
+        cuts = self._workers.map(cut, found)
+        crops = {one.source_id: crop for one, crop in zip(found, cuts, strict=True)}
         fish = [
             replace(
                 crops[source_id],

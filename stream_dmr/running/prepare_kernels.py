@@ -28,7 +28,11 @@ from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.parameters import rest_vector
+from stream_dmr.fitting.shape.equations import shape_equations
+from stream_dmr.fitting.shape.space import directions
+from stream_dmr.fitting.size.density import mean_and_std
 from stream_dmr.fitting.target import Target
+from stream_dmr.fitting.uncertainty import covariance, length_std_ratio
 from stream_dmr.fitting.warm_start import recentered
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.detection.motion_detector import MotionDetector, MotionSettings
@@ -132,19 +136,20 @@ def _compile_largest() -> None:
 
 
 def _compile_rest() -> None:
-    """Targets, the loss and detection, and then whole fits, which need the largest as well."""
+    """All others; last those that need the largest, which is done by then."""
     template, settings = load_template(_TEMPLATE), FitMeshSettings()
+    levels = MeshLevels.from_template(template, max_faces=settings.max_faces)
     fitter = Fitter(template, settings)
-    body = MeshLevels.from_template(template, max_faces=settings.max_faces).fine
-    problem = Problem.from_settings(
-        settings, body, fitter.target(drawn_fish()), with_smoothness=True
-    )
-    evaluate(problem, recentered(problem, rest_vector(len(body.joints))), True)
+    target = fitter.target(drawn_fish())
+    problem = Problem.from_settings(settings, levels.fine, target, with_smoothness=True)
+    parameters = recentered(problem, rest_vector(len(levels.fine.joints)))
+    rendering = evaluate(problem, parameters, True).rendering
     _detect()
+    shape_equations(problem, parameters, directions(levels.fine))
+    spread = covariance(problem, settings, parameters, rendering)
+    length_std_ratio(problem, parameters, rendering.points, spread)
+    mean_and_std(np.arange(2.0), np.arange(2.0))
     compile_kernels(fitter)
-    # Shapes are learnt from fits without a scan, whose std is that of their covariance.
-    unscanned = settings.model_copy(update={"scan_iterations": 0})
-    Fitter(template, unscanned, with_covariance=True).fit(drawn_fish(), None)
 
 
 def _detect() -> None:

@@ -67,7 +67,7 @@ def coverage(
     pixels: Float[np.ndarray, "V 2"], rim: Int[np.ndarray, "R 2"], size: int
 ) -> Float[np.ndarray, "{size} {size}"]:
     """Covered share of each pixel: signed areas of the rim edges, summed along rows."""
-    grid = np.zeros((size, size + 1))
+    grid = np.zeros((size, size))
     for r in range(len(rim)):
         x0, y0 = pixels[rim[r, 0], 0] + 0.5, pixels[rim[r, 0], 1] + 0.5
         x1, y1 = pixels[rim[r, 1], 0] + 0.5, pixels[rim[r, 1], 1] + 0.5
@@ -97,12 +97,12 @@ def coverage(
         for k in range(size):
             total += grid[i, k]
             grid[i, k] = min(max(total, 0.0), 1.0)
-    return grid[:, :size]
+    return grid
 
 
 @compiled
 def _add_row(
-    grid: Float[np.ndarray, "rows columns"],
+    grid: Float[np.ndarray, "S S"],
     row: int,
     xa: float,
     xb: float,
@@ -110,7 +110,7 @@ def _add_row(
     sign: float,
 ) -> None:
     """Signed area right of one piece of an edge within one row of pixels."""
-    size = grid.shape[1] - 1
+    size = grid.shape[1]
     if xa > xb:
         xa, xb = xb, xa
     if xa >= size:
@@ -130,7 +130,8 @@ def _add_row(
         share = per_x * (end - left) if xb > xa else height
         own = share * (column + 1.0 - (left + end) / 2)
         grid[row, column] += sign * own
-        grid[row, column + 1] += sign * (share - own)
+        if column + 1 < size:
+            grid[row, column + 1] += sign * (share - own)
         if end >= right:
             break
         left = end

@@ -7,6 +7,7 @@ move, and also marks that look like fish. What either finds is followed; what co
 """
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +26,7 @@ class FusedDetector:
     def __init__(self, motion: MotionDetector, looks: Detector) -> None:
         self._motion = motion
         self._looks = looks
+        self._beside = ThreadPoolExecutor(1, "looks")  # both take as long as each other
 
     @property
     def refused(self) -> Mapping[str, int]:
@@ -33,10 +35,11 @@ class FusedDetector:
 
     def find(self, frame: Frame) -> list[Candidate]:
         """The candidates of one frame."""
-        seen = self._looks.find(frame)
+        looking = self._beside.submit(self._looks.find, frame)
+        moving, seen = self._motion.find(frame), looking.result()
         return [
             replace(one, place_px=self._place(one, frame), looks=_looks(one, seen))
-            for one in fuse(self._motion.find(frame), seen)
+            for one in fuse(moving, seen)
         ]
 
     def _place(self, one: Candidate, frame: Frame) -> Float[np.ndarray, "2"]:
