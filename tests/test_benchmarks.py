@@ -13,7 +13,7 @@ import torch
 
 from benchmarks import batch_speed
 from benchmarks.fit_speed import fit_times, time_to_iou
-from benchmarks.fit_speed.chain_speed import Rate
+from benchmarks.fit_speed.chain_speed import TASKS, Rate
 from benchmarks.fit_speed.deodr_solver import DeodrSilhouette, face_neighbors, make_scene
 from benchmarks.fit_speed.tables import Results, markdown
 from benchmarks.fit_speed.targets import draw_known, draw_pair, species_template
@@ -82,7 +82,7 @@ def test_bench_measures_and_prints_without_nan(monkeypatch):
             },
             losses=[losses],
             first_calls=([1.0, 2.0, 0.1], [1.0, 0.2, 0.1]),
-            chain=dict.fromkeys(("both recordings (default)",), Rate(1.0, 1, 1.0, {"fit": 1.0})),
+            chain=dict.fromkeys(TASKS, Rate(1.0, 1, 1.0, {"fit": 1.0})),
             fit_parts=dict.fromkeys((128, 256), parts[0]),
             iteration_parts=dict.fromkeys((128, 256), parts[1]),
             remarks=[],

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.fit_speed.chain_speed import Rate
+from benchmarks.fit_speed.chain_speed import TASKS, Rate
 from benchmarks.fit_speed.fit_times import ColdFit, Losses, WarmFit
 from benchmarks.fit_speed.time_to_iou import SolverTime
 from benchmarks.fit_speed.timing import Duration, spread
@@ -44,7 +44,8 @@ def markdown(results: Results) -> str:
         "### Cold fit of bodies that the template can match exactly\n\n" + _cold(results.cold),
         "### Final L_rec against adam\n\n" + _losses(results.losses),
         "### First calls\n\n" + _first_calls(*results.first_calls),
-        "### The whole chain, 1280 x 960, three fish in view\n\n" + _chain(results.chain),
+        "### The whole chain, three fish in view, 1280 x 960 but for the last row\n\n"
+        + _chain(results.chain),
         "### Where a warm fit spends its time, CPU ms\n\n" + _parts(results.fit_parts),
         "### Where an iteration spends its time, CPU ms\n\n" + _parts(results.iteration_parts),
     ]
@@ -140,10 +141,13 @@ def _goals(results: Results) -> str:
         gap = spread(values).median
         name = f"final L_rec, contour less adam, median, {which}"
         rows.append((name, "at most 0", f"{gap:+.4f}", gap <= 0))
-    rate = next(iter(results.chain.values()))
-    fps, best = rate.frames_per_second, 1e3 * (os.cpu_count() or 1) / rate.cpu_ms
-    shown = f"{fps:.0f} frames/s ({best:.0f} if both cores were free and always busy)"
-    rows.append(("whole chain, recording on", "30 frames/s", shown, fps >= 30))
+    for name, task in TASKS.items():
+        if task.to_reach is None:
+            continue
+        rate = results.chain[name]
+        fps, best = rate.frames_per_second, 1e3 * (os.cpu_count() or 1) / rate.cpu_ms
+        shown = f"{fps:.0f} frames/s ({best:.0f} if both cores were free and always busy)"
+        rows.append((f"chain, {name}", f"{task.to_reach} frames/s", shown, fps >= task.to_reach))
     body = [f"| {a} | {b} | {c} | {'yes' if met else 'no'} |" for a, b, c, met in rows]
     return "\n".join(["| | to reach | measured | met |", "|---|---|---|---|", *body])
 

@@ -1,8 +1,7 @@
-"""The whole chain on the video alone: fish counted, masks, lengths, and what takes the time.
+"""The whole chain on the video alone: fish counted, masks, lengths.
 
     python -m benchmarks.segmentation.raw_video [SCENE...]        a row a scene; --sheet masks.png
     python -m benchmarks.segmentation.raw_video --simulate 6      scenes of our own, every preset
-    python -m benchmarks.segmentation.raw_video --speed           1280x960, two fish in view
 
 A scene is a folder as `stream-dmr simulate` writes it. Its boxes and masks are used to compare
 with, and by a second run that shows what lengths true masks would give; the first run sees the
@@ -22,7 +21,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from benchmarks.fit_speed.chain_speed import write_clip
 from benchmarks.segmentation.mask_accuracy import iou, write_sheet
 from stream_dmr.calibration.calibration_file import load_calibration
 from stream_dmr.evaluation.length_tables import read_truth
@@ -31,7 +29,7 @@ from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.running.config import load_config
 from stream_dmr.running.measure_source import later_nodes
-from stream_dmr.running.pipeline import StageCounters, run_chain
+from stream_dmr.running.pipeline import run_chain
 from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
 from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map
 from stream_dmr.segmentation.tracking.fish_finder import open_finder
@@ -45,7 +43,6 @@ class ChainResult(NamedTuple):
 
     crops: list[FishCrop]
     lengths: list[LengthEstimate]
-    counters: list[StageCounters]
 
 
 class Row(NamedTuple):
@@ -95,7 +92,7 @@ def chain(scene: Path, path: Path | None, template: str, *, given: bool) -> Chai
     )
     crop_fish = CropFish(config.crop_fish, camera=calibration.camera, finder=finder)
     later = later_nodes(config, template=load_template(template), calibration=calibration)
-    ran = ChainResult([], [], [])
+    ran = ChainResult([], [])
 
     def note(message: Message) -> Message:
         if isinstance(message, FishCrop):
@@ -106,7 +103,7 @@ def chain(scene: Path, path: Path | None, template: str, *, given: bool) -> Chai
 
     reader = ReadFrames(str(scene / "video.mp4"), config.read_frames)
     stop = threading.Event()
-    ran.counters.extend(run_chain(reader, [crop_fish, *later], on_message=note, stop=stop))
+    run_chain(reader, [crop_fish, *later], on_message=note, stop=stop)
     reader.close()
     return ran
 
@@ -161,25 +158,6 @@ def print_rows(rows: Iterable[Row]) -> None:
     )
 
 
-def print_speed(config: Path | None) -> None:
-    """Frames per second of a clip in which every frame shows fish, and each stage's share."""
-    with tempfile.TemporaryDirectory() as folder:
-        clip = Path(folder)
-        write_clip(clip, num_frames=60, num_fish=2)
-        chain(clip, config, str(clip / "species.ply"), given=False)  # compiles
-        ran = chain(clip, config, str(clip / "species.ply"), given=False)
-    num_frames = ran.counters[1].messages_in
-    total = sum(counter.cpu_s for counter in ran.counters)
-    print(f"{num_frames} frames, {len(ran.crops)} crops")
-    for counter in ran.counters:
-        print(
-            f"{counter.stage:13} CPU {counter.cpu_s / num_frames * 1e3:6.1f} ms/frame "
-            f"{counter.cpu_s / total:4.0%}, busy {counter.busy_s / num_frames * 1e3:6.1f} ms/frame"
-        )
-    slowest = max(counter.busy_s for counter in ran.counters)
-    print(f"{num_frames / slowest:.1f} frames/s")
-
-
 def main() -> None:
     """Print what was asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -189,10 +167,7 @@ def main() -> None:
     parser.add_argument("--simulate", type=int, default=0, help="scenes of every preset")
     parser.add_argument("--seed", type=int, default=900, help="of the first simulated scene")
     parser.add_argument("--sheet", type=Path, help="a picture of masks per scene, named after it")
-    parser.add_argument("--speed", action="store_true")
     arguments = parser.parse_args()
-    if arguments.speed:
-        print_speed(arguments.config)
     if arguments.scenes:
         print_rows(measure(scene, arguments) for scene in arguments.scenes)
     if arguments.simulate:

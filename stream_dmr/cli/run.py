@@ -147,8 +147,9 @@ def _print_summary(summary: "RunSummary", out: Path, *, timings: bool) -> None:
     print_fish(summary.fish, may_count_twice=summary.may_count_twice)
     if timings:
         print_timings(summary)
-    rate = summary.num_frames / summary.elapsed_s
+    elapsed_s = summary.shapes_s + summary.elapsed_s
+    rate = summary.num_frames / elapsed_s
     promised = summary.frames_promised
     of = "" if promised is None or summary.num_frames >= promised - 1 else f" of {promised}"
-    print(f"{summary.num_frames}{of} frames in {summary.elapsed_s:.1f} s, {rate:.1f} frames/s")
+    print(f"{summary.num_frames}{of} frames in {elapsed_s:.1f} s, {rate:.1f} frames/s")
     print(f"results in {out}: {', '.join(path.name for path in summary.files)}")

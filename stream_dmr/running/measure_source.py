@@ -47,7 +47,8 @@ class RunSummary:
     may_count_twice: Collection[int]  # the ids of those that were in view at a crash
     num_frames: int  # that went through the whole chain
     frames_promised: int | None  # by the source; None where it doesn't
-    elapsed_s: float
+    shapes_s: float  # of the first pass, in which the shapes of the fish were learnt
+    elapsed_s: float  # of the chain
     counters: Sequence[StageCounters]
     files: Sequence[Path]  # names of segments as a pattern
 
@@ -68,7 +69,9 @@ def measure_source(
     try:
         prepare_kernels(observer.stage, stop=stop)
         crop_fish = _crop_fish(inputs)
+        began = time.perf_counter()
         inputs = with_learnt_shapes(inputs, crop_fish, stop=stop, observer=observer)
+        shapes_s = time.perf_counter() - began
         nodes = [
             inputs.crops or crop_fish,
             *later_nodes(
@@ -97,7 +100,7 @@ def measure_source(
                 )
             _report_start(inputs, outputs, observer)
             observer.begin(inputs.source.num_frames)
-            return _run_chain(inputs, nodes, outputs, observer, stop=stop)
+            return _run_chain(inputs, nodes, outputs, observer, shapes_s=shapes_s, stop=stop)
     finally:
         inputs.reader.close()
         if inputs.positions is not None:
@@ -179,6 +182,7 @@ def _run_chain(
     outputs: Outputs,
     observer: RunObserver,
     *,
+    shapes_s: float,
     stop: threading.Event,
 ) -> RunSummary:
     request, began = inputs.request, time.perf_counter()
@@ -238,6 +242,7 @@ def _run_chain(
         may_count_twice=outputs.store.may_count_twice(),
         num_frames=totals.num_frames,
         frames_promised=inputs.source.num_frames,
+        shapes_s=shapes_s,
         elapsed_s=time.perf_counter() - began,
         counters=counters,
         files=[request.out / name for name in (ENDLESS_RESULTS if inputs.is_endless else RESULTS)],

@@ -2,7 +2,7 @@
 
 Its first convolution already halves the input, so that no layer works at full size; the last one
 gives four values per cell, which are the four pixels of that cell. The widths were chosen for 15 ms
-a crop on one core: 0.65 million weights take 5 ms (docs/research/raw-video-speed.md).
+a crop on one core: 0.65 million weights take 3 ms (docs/research/start-and-memory.md).
 """
 
 import torch
