@@ -89,10 +89,17 @@ def bind_to_midline(
 def _edges(faces: Int[np.ndarray, "F 3"]) -> tuple[np.ndarray, np.ndarray]:
     """Each edge of a closed mesh once, with the faces that run along and against it."""
     directed = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    face_of = {(a, b): i // 3 for i, (a, b) in enumerate(directed.tolist())}
-    edges = [(a, b) for a, b in face_of if a < b]
-    edge_faces = [(face_of[a, b], face_of[b, a]) for a, b in edges]
-    return np.array(edges, np.int64), np.array(edge_faces, np.int64)
+    edges = directed[directed[:, 0] < directed[:, 1]]
+    keys = _keys(directed)
+    order = np.argsort(keys)
+    ways = [_keys(edges), _keys(edges[:, ::-1])]
+    edge_faces = [order[np.searchsorted(keys, way, sorter=order)] // 3 for way in ways]
+    return edges.astype(np.int64), np.stack(edge_faces, axis=1)
+
+
+def _keys(directed: Int[np.ndarray, "N 2"]) -> Int[np.ndarray, "N"]:
+    """One number for each directed edge."""
+    return directed[:, 0] * (1 << 32) + directed[:, 1]
 
 
 def _others(pairs: Int[np.ndarray, "E 2"]) -> Int[np.ndarray, "2*E"]:
