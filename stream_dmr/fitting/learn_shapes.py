@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Iterable
 
+import numpy as np
+
 from stream_dmr.camera import Calibration
 from stream_dmr.catch.species_settings import SpeciesSettings
 from stream_dmr.fitting.fit_settings import FitMeshSettings
@@ -49,9 +51,9 @@ def learn_shapes(
         samples = [Sample(crop, shape.parameters) for crop, shape in fits if shape.iou >= _MIN_IOU]
         if samples:
             candidate = fits[-1][1].candidate or 0  # the last one is decided by all before it
-            fish.append(
-                FishSamples(chosen[0].track_id, candidate, evenly(samples, FRAMES_PER_FISH))
-            )
+            track_id = chosen[0].track_id
+            against = tracks.against(track_id) + np.log(forms.shares)  # masks alone
+            fish.append(FishSamples(track_id, candidate, evenly(samples, FRAMES_PER_FISH), against))
             progress(f"{len(fish)} fish looked at")
     normal = tracks.fitters[0].plane_normal
     return learn_stocks(template, forms, fish, settings, plane_normal=normal, progress=progress)

@@ -103,6 +103,11 @@ class TrackFitter:
                 track.best[fitted.shape.candidate or 0] = best
         return fitted
 
+    def against(self, track_id: int) -> Float[np.ndarray, "K"]:
+        """Nats against each candidate of a track by its masks, its species and their shares."""
+        track = self._tracks[track_id]
+        return track.against + self._of_species(track)
+
     def forget(self, *, before_ns: int) -> None:
         """Forget the tracks that have not been seen since a capture time."""
         for track_id, track in list(self._tracks.items()):

@@ -51,7 +51,7 @@ def forms():
     return candidates(slim=broader(0.0), broad=broader(0.5))
 
 
-def fish_of(shape, *, track_id, candidate=SLIM, num_frames=2):
+def fish_of(shape, *, track_id, candidate=SLIM, num_frames=2, against=(0.0, 0.0)):
     """Frames of one fish of these coefficients, with the poses that they were drawn in."""
     rng, rig = np.random.default_rng(track_id), Rig.from_template(reshaped(TEMPLATE, shape))
     samples = []
@@ -59,4 +59,4 @@ def fish_of(shape, *, track_id, candidate=SLIM, num_frames=2):
         flat = pose(rng, in_plane_rad=rng.uniform(-np.pi, np.pi))
         crop = crop_of(flat, rig, frame_index=frame_index, track_id=track_id)
         samples.append(Sample(crop, flat[0].numpy()))
-    return FishSamples(track_id, candidate, samples)
+    return FishSamples(track_id, candidate, samples, np.array(against))

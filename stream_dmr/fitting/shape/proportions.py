@@ -20,6 +20,7 @@ from scipy.interpolate import RegularGridInterpolator
 _FRAME_STD = float(np.hypot(0.05, 0.06))
 _FRAMES_WORTH = 2.0  # the frames of a fish are much alike
 _OUTLIERS = 1e-4  # density of a breadth that is none: a wrong mask
+_IMPOSSIBLE = 1e-30  # density of proportions that no body form has, for their logarithm
 # Spreads of the roll that are weighed, all alike before; with the last any roll is about as likely.
 _ROLL_STDS_RAD = np.array([0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.6])
 _ROLLS_RAD, _SLANTS_RAD = np.linspace(0.0, np.pi / 2, 31), np.linspace(0.0, 0.9, 13)  # or less
@@ -35,6 +36,7 @@ class Proportions(NamedTuple):
     breadth_std: float
     thickness: float
     thickness_std: float
+    share: float = 1.0  # probability, where it is one of several things that may be so
 
 
 def infer_proportions(
@@ -42,12 +44,12 @@ def infer_proportions(
     *,
     roundness: float,
     slant_std_rad: float,
-    before: Proportions,
+    before: Sequence[Proportions],
 ) -> Proportions:
     """The log factors on a stock's breadth and thickness, from what each fish's frames show.
 
     `roundness` is the thickness of the body over its breadth, both at a factor of 1; `before` is
-    what is known without these fish.
+    what may be so without these fish: one Gaussian for each body form.
     """
     frames = np.concatenate([np.asarray(values) for values in seen.values()])
     worth = np.concatenate([_worth(len(values)) for values in seen.values()])
@@ -58,8 +60,7 @@ def infer_proportions(
         (_ROUNDNESSES, _SEEN), log_density, bounds_error=False, fill_value=np.log(_OUTLIERS)
     )
     log_posterior = np.einsum("f,ktfs->kts", worth, table(points))
-    off = (k - before.breadth) / before.breadth_std, (t - before.thickness) / before.thickness_std
-    log_posterior -= 0.5 * (off[0] ** 2 + off[1] ** 2)
+    log_posterior += np.log(sum(_density(one, k, t) for one in before) + _IMPOSSIBLE)
     posterior = np.exp(log_posterior - log_posterior.max()).sum(axis=2)
     posterior /= posterior.sum()
     return Proportions(
@@ -87,6 +88,16 @@ def _moments(
 ) -> tuple[float, float]:
     mean = float(weights @ values)
     return mean, float(np.sqrt(weights @ (values - mean) ** 2))
+
+
+def _density(
+    known: Proportions, breadth: Float[np.ndarray, "K 1 1"], thickness: Float[np.ndarray, "T 1"]
+) -> Float[np.ndarray, "K T 1"]:
+    """The Gaussian times its share, up to a constant."""
+    off_breadth = (breadth - known.breadth) / known.breadth_std
+    off_thickness = (thickness - known.thickness) / known.thickness_std
+    peak = known.share / (known.breadth_std * known.thickness_std)
+    return peak * np.exp(-0.5 * (off_breadth**2 + off_thickness**2))
 
 
 def _weights(angles: Float[np.ndarray, "A"], std: float) -> Float[np.ndarray, "A"]:

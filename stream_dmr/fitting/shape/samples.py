@@ -34,6 +34,7 @@ class FishSamples:
     track_id: int
     candidate: int  # the shape that it was fitted with
     samples: list[Sample]
+    against: Float[np.ndarray, "N"]  # nats that its masks say against each shape there is
 
 
 @dataclass

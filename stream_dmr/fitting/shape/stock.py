@@ -14,6 +14,7 @@ of them (`proportions.py`).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -78,12 +79,25 @@ class PosedTarget:
         return PosedTarget(self.fish, self.target, unrolled(self.pose, self.target.anchor))
 
 
+class FormOdds(NamedTuple):
+    """The body forms that fish may be of."""
+
+    coefficients: Float[np.ndarray, "K W"]
+    shares: Float[np.ndarray, "K"]  # how probable each is; sum to 1
+
+    @classmethod
+    def certain(cls, form: Float[np.ndarray, "W"]) -> "FormOdds":
+        """One form and no other."""
+        return cls(form[None], np.ones(1))
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Stock:
     """A mean shape with what is not known of it."""
 
     coefficients: Float[np.ndarray, "W"]
     covariance: Float[np.ndarray, "W W"]
+    num_effective: float  # coefficients that its fish determine rather than the prior
     nats: dict[int, float]  # of each fish: mean of its frames, see `evidence.nats_against`
     frames: list[PosedTarget]  # with the poses that go with this shape
 
@@ -105,18 +119,42 @@ class StockFitter:
         frames: Sequence[PosedTarget],
         form: Float[np.ndarray, "W"],
         start: Float[np.ndarray, "W"],
+        odds: FormOdds | None = None,
     ) -> Stock:
-        """The shape of the fish of these frames, a priori near a body form."""
+        """The shape of the fish of these frames, a priori near a body form.
+
+        The outline is that of fish near `form`; how broad and thick they are, which turned fish
+        hide, may be near any of `odds` (default: that form alone).
+        """
+        odds = odds or FormOdds.certain(form)
         shape, _ = self._outline(frames, form, start)
-        _, seen, known = self._read(frames, shape, form)
+        _, seen, known = self._read(frames, shape, odds)
         shape, inverse = self._outline(_broadside(frames, seen - known.breadth), form, shape)
-        square, seen, known = self._read(frames, shape, form)
+        square, seen, known = self._read(frames, shape, odds)
         shape[BREADTH] += known.breadth
         shape[THICKNESS] += known.thickness
-        inverse = with_std_of(inverse, BREADTH, TRUNK, known.breadth_std)
-        inverse = with_std_of(inverse, THICKNESS, MEAN_THICKNESS, known.thickness_std)
+        covariance = _with_proportions(inverse, known.breadth_std, known.thickness_std)
         nats, posed = self._placed(frames, square, seen - known.breadth, shape)
-        return Stock(coefficients=shape, covariance=inverse, nats=nats, frames=posed)
+        return Stock(
+            coefficients=shape,
+            covariance=covariance,
+            num_effective=self._num_effective(inverse, known),
+            nats=nats,
+            frames=posed,
+        )
+
+    def _num_effective(self, covariance: Float[np.ndarray, "W W"], known: Proportions) -> float:
+        """NUM_COEFFICIENTS less what the prior of one form determines of them.
+
+        Proportions that are known less well than by that prior are not determined at all.
+        """
+        usual = np.linalg.inv(self._precision)
+        determined = _with_proportions(
+            covariance,
+            min(known.breadth_std, std_of(TRUNK, usual)),
+            min(known.thickness_std, std_of(MEAN_THICKNESS, usual)),
+        )
+        return NUM_COEFFICIENTS - float(np.trace(determined @ self._precision))
 
     def _outline(
         self,
@@ -152,7 +190,7 @@ class StockFitter:
         self,
         frames: Sequence[PosedTarget],
         shape: Float[np.ndarray, "W"],
-        form: Float[np.ndarray, "W"],
+        odds: FormOdds,
     ) -> tuple[list[PosedTarget], Float[np.ndarray, "F"], Proportions]:
         """Read each frame's breadth off a square fit that may be arched, and what all say.
 
@@ -171,17 +209,22 @@ class StockFitter:
             )
             frame.pose = square_pose(problem, frame.pose, nat=self._nat)
             by_fish.setdefault(frame.fish, []).append(_log_breadth(frame))
-        spread, off = np.linalg.inv(self._precision), form - shape
+        spread = np.linalg.inv(self._precision)
+        breadth_std, thickness_std = std_of(TRUNK, spread), std_of(MEAN_THICKNESS, spread)
         known = infer_proportions(
             by_fish,
             roundness=roundness(template),
             slant_std_rad=self._slant_std_rad,
-            before=Proportions(
-                float(TRUNK @ off),
-                std_of(TRUNK, spread),
-                float(MEAN_THICKNESS @ off),
-                std_of(MEAN_THICKNESS, spread),
-            ),
+            before=[
+                Proportions(
+                    float(TRUNK @ off),
+                    breadth_std,
+                    float(MEAN_THICKNESS @ off),
+                    thickness_std,
+                    float(share),
+                )
+                for off, share in zip(odds.coefficients - shape, odds.shares, strict=True)
+            ],
         )
         return square, np.array([_log_breadth(frame) for frame in square]), known
 
@@ -245,6 +288,13 @@ class StockFitter:
         nothing_held = np.zeros(len(frame.pose), np.bool_)
         frame.pose = descend(problem, frame.pose, nothing_held, _POSE_OPTIONS).parameters
         return nats_against(problem, frame.pose, nat=self._nat)
+
+
+def _with_proportions(
+    covariance: Float[np.ndarray, "W W"], breadth_std: float, thickness_std: float
+) -> Float[np.ndarray, "W W"]:
+    covariance = with_std_of(covariance, BREADTH, TRUNK, breadth_std)
+    return with_std_of(covariance, THICKNESS, MEAN_THICKNESS, thickness_std)
 
 
 def _log_breadth(frame: PosedTarget) -> float:

@@ -6,7 +6,7 @@ criterion). Then every fish is refitted with each stock's shape, and the stocks 
 more from their own.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -17,13 +17,16 @@ from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.shape.candidates import CandidateShape, CandidateShapes
 from stream_dmr.fitting.shape.samples import FishSamples
-from stream_dmr.fitting.shape.space import NUM_COEFFICIENTS, form_precision, reshaped
-from stream_dmr.fitting.shape.stock import PosedTarget, Stock, StockFitter
+from stream_dmr.fitting.shape.space import reshaped
+from stream_dmr.fitting.shape.stock import FormOdds, PosedTarget, Stock, StockFitter
 from stream_dmr.fitting.target import Target
 from stream_dmr.template.template import Template
 
 # The frames of a fish, far apart, determine its shape as two independent ones would.
 _FRAMES_WORTH = 2.0
+# Of the evidence for a form, summed over the frames that decided it: they follow each other, so
+# that three are worth little more than one.
+_EVIDENCE_WORTH = 1 / 3
 # Most evidence of one fish for and against separating two groups, nats: a mask may be wrong. Chosen
 # by trial.
 _MAX_FOR, _MAX_AGAINST = 20.0, -6.0
@@ -40,11 +43,6 @@ class _Group:
         """How many fish."""
         return len(self.stock.nats)
 
-    @property
-    def num_effective(self) -> float:
-        """How many of the shape's coefficients its fish determine rather than the prior."""
-        return NUM_COEFFICIENTS - float(np.trace(self.stock.covariance @ form_precision()))
-
 
 def learn_stocks(
     template: Template,
@@ -58,7 +56,7 @@ def learn_stocks(
     """The stocks that these fish are of, the largest first; None where there are no fish."""
     if not fish:
         return None
-    learner = _StockLearner(template, settings, plane_normal)
+    learner = _StockLearner(template, forms, fish, settings, plane_normal)
     groups = learner.by_form(list(forms), fish)
     progress(f"{len(fish)} fish of {len(groups)} body forms")
     groups = learner.merged(groups)
@@ -83,12 +81,15 @@ class _StockLearner:
     def __init__(
         self,
         template: Template,
+        forms: CandidateShapes,
+        fish: Sequence[FishSamples],
         settings: FitMeshSettings,
         plane_normal: Float[np.ndarray, "3"],
     ) -> None:
         self._template, self._settings = template, settings
         self._plane_normal = np.ascontiguousarray(plane_normal)
         self._fitter = StockFitter(template, settings)
+        self._forms, self._against = forms, {one.track_id: one.against for one in fish}
 
     def by_form(self, forms: Sequence[CandidateShape], fish: Sequence[FishSamples]) -> list[_Group]:
         """One group of each form that any fish was fitted with."""
@@ -142,10 +143,7 @@ class _StockLearner:
             best = int(np.argmin(_FRAMES_WORTH * np.mean(nats, axis=1) - shares))
             frames[best] += options[best]
         return [
-            _Group(
-                group.form,
-                self._fitter.fit(own, group.form.coefficients, group.stock.coefficients),
-            )
+            self._learn(group.form, own, group.stock.coefficients)
             for group, own in zip(groups, frames, strict=True)
             if own
         ]
@@ -156,7 +154,15 @@ class _StockLearner:
         frames: list[PosedTarget],
         start: Float[np.ndarray, "W"],
     ) -> _Group:
-        return _Group(form, self._fitter.fit(frames, form.coefficients, start))
+        odds = self._odds({frame.fish for frame in frames})
+        return _Group(form, self._fitter.fit(frames, form.coefficients, start, odds))
+
+    def _odds(self, fish: Iterable[int]) -> FormOdds:
+        """How probable each body form is by all that decided the forms of these fish."""
+        against = np.sum([self._against[one] for one in sorted(fish)], axis=0)
+        nats = _EVIDENCE_WORTH * against - np.log(self._forms.shares)
+        shares = np.exp(nats.min() - nats)
+        return FormOdds(self._forms.coefficients, shares / shares.sum())
 
     def _search(self, coefficients: Float[np.ndarray, "W"]) -> Callable[[PosedTarget], PosedTarget]:
         """Seeks the pose of a frame from cold, with a template of this shape."""
@@ -176,4 +182,4 @@ def _evidence_for_two(a: _Group, b: _Group, both: _Group) -> float:
     """Nats by which masks prefer two shapes to one, less the parameters of the smaller group."""
     apart = a.stock.nats | b.stock.nats
     gains = [_FRAMES_WORTH * (both.stock.nats[fish] - nats) for fish, nats in apart.items()]
-    return float(np.clip(gains, _MAX_AGAINST, _MAX_FOR).sum()) - b.num_effective
+    return float(np.clip(gains, _MAX_AGAINST, _MAX_FOR).sum()) - b.stock.num_effective

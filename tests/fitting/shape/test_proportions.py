@@ -22,7 +22,7 @@ def seen_of(rng, *, breadth, thickness, roll_std, num_fish=60, num_frames=3):
 
 
 def infer(seen, before=BEFORE):
-    return infer_proportions(seen, roundness=0.4, slant_std_rad=SLANT_STD, before=before)
+    return infer_proportions(seen, roundness=0.4, slant_std_rad=SLANT_STD, before=[before])
 
 
 @pytest.mark.parametrize("breadth", [-0.2, 0.0, 0.25])
@@ -56,13 +56,13 @@ def test_a_factor_on_all_that_is_seen_is_one_on_the_stock(shift):
     factor = 0.02 * shift  # whole steps of the grids
     moved = {fish: [value + factor for value in values] for fish, values in seen.items()}
     as_is = infer_proportions(
-        seen, roundness=0.4, slant_std_rad=SLANT_STD, before=BEFORE._replace(thickness=-factor)
+        seen, roundness=0.4, slant_std_rad=SLANT_STD, before=[BEFORE._replace(thickness=-factor)]
     )
     shifted = infer_proportions(
         moved,
         roundness=0.4 * np.exp(factor),
         slant_std_rad=SLANT_STD,
-        before=BEFORE._replace(breadth=factor, thickness=-factor),
+        before=[BEFORE._replace(breadth=factor, thickness=-factor)],
     )
     assert shifted.breadth - factor == pytest.approx(as_is.breadth, abs=2e-3)
 
@@ -77,3 +77,22 @@ def test_few_fish_leave_more_open():
     seen = seen_of(np.random.default_rng(5), breadth=0.1, thickness=0.0, roll_std=0.5)
     few = {fish: seen[fish] for fish in range(3)}
     assert infer(few).breadth_std > 1.5 * infer(seen).breadth_std
+
+
+def test_of_two_forms_the_one_that_agrees_with_what_is_seen_decides():
+    seen = seen_of(np.random.default_rng(6), breadth=0.6, thickness=0.0, roll_std=0.1)
+    narrow, broad = (Proportions(at, 0.1, 0.0, 0.2, 0.5) for at in (0.0, 0.6))
+    known = infer_proportions(seen, roundness=0.4, slant_std_rad=SLANT_STD, before=[narrow, broad])
+    alone = infer(seen, broad)
+    assert known.breadth == pytest.approx(alone.breadth, abs=1e-3)
+    assert known.breadth_std == pytest.approx(alone.breadth_std, abs=1e-3)
+
+
+def test_a_form_that_is_as_likely_leaves_the_breadth_open():
+    """One fish, a third narrower than the broad form: it may be narrow, or broad and rolled."""
+    seen = {1: [0.0, 0.0]}
+    narrow, broad = (Proportions(at, 0.1, 0.0, 0.2, 0.5) for at in (0.0, 0.4))
+    open_std = infer_proportions(
+        seen, roundness=0.4, slant_std_rad=SLANT_STD, before=[narrow, broad]
+    ).breadth_std
+    assert open_std > 1.25 * infer(seen, narrow).breadth_std

@@ -81,3 +81,23 @@ class TestLearnStocks:
         stocks = learn(fish)
         assert stocks.shares.tolist() == [1.0]
         assert float(stocks.coefficients[0] @ TRUNK) == pytest.approx(0.25, abs=0.1)
+
+    def test_where_masks_leave_the_form_open_the_breadth_is_known_less_well(self):
+        """A fish of the slim form may be one of the broad form that is rolled."""
+        decided, left_open = (
+            learn([fish_of(broader(0.0), track_id=1, against=against)])
+            for against in ((0.0, 60.0), (0.0, 0.0))
+        )
+        std = [float(np.sqrt(TRUNK @ one.covariances[0] @ TRUNK)) for one in (decided, left_open)]
+        assert std[1] > 1.1 * std[0]
+
+    def test_many_fish_decide_the_form_that_one_leaves_open(self):
+        """Each mask says little against the broad form, all of them together enough."""
+        fish = [
+            fish_of(broader(0.0), track_id=n, num_frames=1, against=(0.0, 9.0)) for n in range(6)
+        ]
+        sure = [
+            fish_of(broader(0.0), track_id=n, num_frames=1, against=(0.0, 99.0)) for n in range(6)
+        ]
+        stds = [float(np.sqrt(TRUNK @ learn(one).covariances[0] @ TRUNK)) for one in (fish, sure)]
+        assert stds[0] == pytest.approx(stds[1], rel=0.01)
