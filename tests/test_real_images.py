@@ -28,13 +28,15 @@ def manifest() -> dict:
 
 
 def test_only_pictures_under_open_licences_are_trained_on(manifest):
-    trained = [source for source in manifest["sources"].values() if source["role"] == "train"]
+    listed = [*manifest["sources"].values(), *manifest["frames"].values()]
+    trained = [source for source in listed if source["role"] == "train"]
     assert len(trained) >= 6
     assert {source["licence"] for source in [*trained, manifest["backgrounds"]]} <= OPEN
 
 
 def test_no_repository_is_used_that_is_kept_for_later_checks(manifest):
-    used = {source["repository"] for source in manifest["sources"].values()}
+    listed = [*manifest["sources"].values(), *manifest["frames"].values()]
+    used = {source["repository"] for source in listed}
     assert not used & KEPT_FOR_CHECKS
 
 

@@ -105,7 +105,7 @@ def read_boxes(clone: Clone, source: dict[str, Any]) -> Iterator[Proposal]:
     """
     for stem, path in first_versions(clone.paths(source["files"])).items():
         image = without_padding(clone.image(path), source.get("sizes_before_padding", []))
-        for number, (kind, box) in enumerate(labelled_boxes(clone, path, image)):
+        for number, (kind, box) in enumerate(labelled_boxes(clone, labels_of(path, source), image)):
             if (
                 is_of(kind, source["classes"])
                 and (box[2:] - box[:2]).max() >= source["min_side_px"]
@@ -118,11 +118,17 @@ def is_of(kind: int, classes: list[int]) -> bool:
     return kind in classes if classes else kind != POLYGON
 
 
-def labelled_boxes(clone: Clone, path: str, image: Image) -> list[tuple[int, Box]]:
+def labels_of(path: str, source: dict[str, Any]) -> str:
+    """The file with a picture's labels: beside its folder, or in the one that the source names."""
+    folder, name = path.rsplit("/", 1)
+    folder = source.get("labels", f"{folder}/".replace("/images/", "/labels/")[:-1])
+    return f"{folder}/{name.rsplit('.', 1)[0]}.txt"
+
+
+def labelled_boxes(clone: Clone, labels: str, image: Image) -> list[tuple[int, Box]]:
     """Classes and boxes of a picture's labels; polygons among them have its size."""
-    labels = clone.text(path.replace("/images/", "/labels/").rsplit(".", 1)[0] + ".txt")
     scale, boxes = np.tile(image.shape[1::-1], 2), []
-    for line in labels.splitlines():
+    for line in clone.text(labels).splitlines():
         kind, *values = map(float, line.split())
         if len(values) != 4:
             boxes.append((POLYGON, _whole(image)))
@@ -275,7 +281,7 @@ def write_empty_squares(repositories: Path, manifest: dict[str, Any], folder: Pa
         pictures = list(first_versions(clone.paths(source["files"])).items())
         for stem, path in pictures[:: chosen["every"]]:
             image = without_padding(clone.image(path), source.get("sizes_before_padding", []))
-            boxes = [box for _, box in labelled_boxes(clone, path, image)]
+            boxes = [box for _, box in labelled_boxes(clone, labels_of(path, source), image)]
             square = largest_empty_square(image, boxes)
             if square is not None and stem not in chosen["without"]:
                 cv2.imwrite(str(folder / f"{name}_{stem}.png"), square)

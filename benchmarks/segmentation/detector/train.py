@@ -10,7 +10,6 @@ held back are found, and how many of the boxes found are fish, at the score wher
 
 import argparse
 import math
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,14 +21,11 @@ from torch.optim.swa_utils import AveragedModel, get_ema_avg_fn
 from torch.utils.data import DataLoader, IterableDataset
 
 from benchmarks.segmentation.detector.export import OUTPUTS, export_detector, go_on_from
+from benchmarks.segmentation.detector.frame_sources import read_sources
 from benchmarks.segmentation.detector.loss import detection_loss
 from benchmarks.segmentation.detector.onnx_module import OnnxModule
-from benchmarks.segmentation.detector.scores import equal_error_score
-from benchmarks.segmentation.detector.training_frames import (
-    FrameSource,
-    read_frames,
-    read_singles,
-)
+from benchmarks.segmentation.detector.scores import score
+from benchmarks.segmentation.detector.training_frames import FrameSource, read_singles
 from stream_dmr.segmentation.training.annotated_samples import (
     cutout_patch,
     load_backgrounds,
@@ -37,10 +33,7 @@ from stream_dmr.segmentation.training.annotated_samples import (
 )
 from stream_dmr.segmentation.training.patch_bank import load_or_make_bank
 
-_MANIFEST = Path(__file__).parents[1] / "real_sources.toml"
-_EVERY = {"aquarium": 1, "fish4knowledge": 4, "milkfish": 3}  # frames of one clip are alike
 _SINGLES = ["fish_market", "caltech_bass", "milkfish_weight", "specimens", "fishial"]
-_HELD_BACK = 8  # one in so many frames
 _BATCH, _RATE, _WEIGHT_DECAY = 16, 1e-3, 1e-4
 _DECAY = 0.995  # of the running average that is kept
 _PARTS = 10
@@ -105,15 +98,12 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
-    manifest = tomllib.loads(_MANIFEST.read_text(encoding="utf-8"))["sources"]
-    frames, held_back = [], {}
-    for name, every in _EVERY.items():
-        read = read_frames(arguments.repositories, manifest[name], every=every)
-        held_back[name] = read[::_HELD_BACK]
-        frames += [frame for index, frame in enumerate(read) if index % _HELD_BACK]
+    learnt, held_back = read_sources(arguments.repositories)
+    for name, frames in learnt.items():
+        print(f"{name}: {len(frames)} frames, {len(held_back[name])} held back", flush=True)
     folder = arguments.data / "train"
     source = FrameSource(
-        frames=frames,
+        frames=[frames for frames in learnt.values() if frames],
         singles=read_singles(folder / "images", folder / "masks", sources=_SINGLES),
         bank=load_or_make_bank(
             arguments.out.parent / "cache",
@@ -129,14 +119,14 @@ def main() -> None:
             load_backgrounds(arguments.data / "backgrounds"),
         ),
     )
-    print(f"{len(source.frames)} frames, {len(source.singles)} single fish", flush=True)
+    print(f"{len(source.singles)} single fish", flush=True)
     network = OnnxModule(arguments.yolox, OUTPUTS)
     if arguments.init is not None:
         go_on_from(network, arguments.init)
     for averaged in train(source, network, steps=arguments.steps, seed=arguments.seed):
         export_detector(averaged, arguments.out)
         for name, pictures in held_back.items():
-            print(f"  {name}: {equal_error_score(arguments.out, pictures)}", flush=True)
+            print(f"  {name}: {score(arguments.out, pictures).summary}", flush=True)
 
 
 if __name__ == "__main__":

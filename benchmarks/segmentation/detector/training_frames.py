@@ -13,6 +13,7 @@ from benchmarks.segmentation.real_images import (
     first_versions,
     is_of,
     labelled_boxes,
+    labels_of,
     without_padding,
 )
 from stream_dmr.segmentation.training.annotated_images import read_annotated_images
@@ -21,7 +22,9 @@ from stream_dmr.segmentation.training.patch_bank import PatchBank
 
 SIDE_PX = 352  # of a training frame: between the sides of a detector's input
 _KEPT_PX = 640  # longer side of the photographs that are kept in memory
-_FRAME_SHARE, _SINGLE_SHARE = 0.4, 0.15  # of the examples; the others are put together
+_FRAME_SHARE, _SINGLE_SHARE = 0.55, 0.1  # of the examples; the others are put together
+_MOSAIC_SHARE, _MORE_FISH_SHARE = 0.25, 0.25  # of the examples from frames
+_TURNED_SHARE, _WATER_SHARE = 0.2, 0.3  # of all examples
 _SIZES_PX = (18.0, 560.0)  # of fish put before a background
 _MOST_FISH = 12
 _MIN_VISIBLE = 0.35  # of a fish; with less it has no box
@@ -38,13 +41,14 @@ class AnnotatedFrame:
 
     image: Image
     boxes: Boxes
+    name: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameSource:
     """Draws training frames; a class, since worker processes receive it pickled."""
 
-    frames: list[AnnotatedFrame]
+    frames: list[list[AnnotatedFrame]]  # by source
     singles: list[AnnotatedFrame]
     bank: PatchBank
 
@@ -52,19 +56,35 @@ class FrameSource:
         """A frame of `SIDE_PX` and its boxes."""
         kind = rng.random()
         if kind < _FRAME_SHARE:
-            picture, boxes = _zoomed(rng, self.frames[rng.integers(len(self.frames))])
+            picture, boxes = self._from_frames(rng)
         elif kind < _FRAME_SHARE + _SINGLE_SHARE:
             picture, boxes = _zoomed(rng, self.singles[rng.integers(len(self.singles))])
         else:
             picture, boxes = _composed(rng, self.bank)
-        if rng.random() < 0.5:
-            picture, boxes = picture[:, ::-1].copy(), boxes.copy()
-            boxes[:, [0, 2]] = SIDE_PX - boxes[:, [2, 0]]
+        picture, boxes = _turned(rng, picture, boxes)
+        if rng.random() < _WATER_SHARE:
+            picture = _under_water(rng, picture)
         if rng.random() < 0.4:
             picture = add_weather(rng, picture)
         if rng.random() < 0.7:
             return simulate_camera(rng, picture), boxes
         return np.clip(np.round(picture), 0, 255).astype(np.uint8), boxes
+
+    def _from_frames(self, rng: np.random.Generator) -> tuple[Float32[np.ndarray, "S S 3"], Boxes]:
+        """A photograph, four of them, or one with fish of the bank before it."""
+        kind = rng.random()
+        if kind < _MOSAIC_SHARE:
+            return _mosaic(rng, [self._draw_frame(rng) for _ in range(4)])
+        picture, boxes = _zoomed(rng, self._draw_frame(rng))
+        if kind < _MOSAIC_SHARE + _MORE_FISH_SHARE:
+            return _with_fish(rng, picture, boxes, self.bank, count=int(rng.integers(1, 5)))
+        return picture, boxes
+
+    def _draw_frame(self, rng: np.random.Generator) -> AnnotatedFrame:
+        """Of a source with four times as many frames, twice as often."""
+        shares = np.sqrt([len(frames) for frames in self.frames])
+        frames = self.frames[rng.choice(len(shares), p=shares / shares.sum())]
+        return frames[rng.integers(len(frames))]
 
 
 def read_frames(repositories: Path, source: dict[str, Any], *, every: int) -> list[AnnotatedFrame]:
@@ -74,9 +94,11 @@ def read_frames(repositories: Path, source: dict[str, Any], *, every: int) -> li
     for path in list(first_versions(clone.paths(source["files"])).values())[::every]:
         image = without_padding(clone.image(path), source.get("sizes_before_padding", []))
         fish = source.get("fish_classes", source["classes"])
-        found = labelled_boxes(clone, path, image)
-        boxes = [box for kind, box in found if is_of(kind, fish)]
-        frames.append(_kept(image, np.array(boxes).reshape(-1, 4)))
+        found = labelled_boxes(clone, labels_of(path, source), image)
+        boxes = np.array([box for kind, box in found if is_of(kind, fish)]).reshape(-1, 4)
+        top, bottom, left, right = source.get("area", [0, image.shape[0], 0, image.shape[1]])
+        inside = (boxes - [left, top, left, top]).clip(0, np.tile([right - left, bottom - top], 2))
+        frames.append(_kept(image[top:bottom, left:right], inside, Path(path).stem))
     return frames
 
 
@@ -89,10 +111,10 @@ def read_singles(images: Path, masks: Path, *, sources: list[str]) -> list[Annot
     ]
 
 
-def _kept(image: Image, boxes: Boxes) -> AnnotatedFrame:
+def _kept(image: Image, boxes: Boxes, name: str = "") -> AnnotatedFrame:
     scale = min(1.0, _KEPT_PX / max(image.shape[:2]))
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return AnnotatedFrame(small, boxes * scale)
+    return AnnotatedFrame(small, boxes * scale, name)
 
 
 def _edges(mask: np.ndarray) -> list[int]:
@@ -101,25 +123,25 @@ def _edges(mask: np.ndarray) -> list[int]:
 
 
 def _zoomed(
-    rng: np.random.Generator, frame: AnnotatedFrame
+    rng: np.random.Generator, frame: AnnotatedFrame, *, side: int = SIDE_PX
 ) -> tuple[Float32[np.ndarray, "S S 3"], Boxes]:
     """A part of a photograph, or all of it and what is around it in grey."""
     height, width = frame.image.shape[:2]
-    whole = SIDE_PX / max(height, width)
+    whole = side / max(height, width)
     scale = whole * float(np.exp(rng.uniform(np.log(0.6), np.log(3.0))))
-    room = np.array([SIDE_PX - scale * width, SIDE_PX - scale * height])
+    room = np.array([side - scale * width, side - scale * height])
     shift = np.minimum(room, 0) + rng.random(2) * np.abs(room)
     stretch = np.exp(rng.normal(0.0, 0.08, 2))
     affine = np.column_stack([np.diag(scale * stretch), shift])
     picture = cv2.warpAffine(
         frame.image,
         affine,
-        (SIDE_PX, SIDE_PX),
+        (side, side),
         flags=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR,
         borderValue=(_GREY,) * 3,
     )
     moved = frame.boxes * np.tile(scale * stretch, 2) + np.tile(shift, 2)
-    inside = moved.clip(0, SIDE_PX)
+    inside = moved.clip(0, side)
     visible = _areas(inside) / np.maximum(_areas(moved), 1e-6)
     return picture.astype(np.float32), inside[(visible > _MIN_VISIBLE) & _are_large(inside)]
 
@@ -133,8 +155,33 @@ def _composed(
     row, column = rng.integers(0, len(background) - side + 1, 2)
     part = background[row : row + side, column : column + side]
     picture = cv2.resize(part, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_LINEAR)
-    picture = picture.astype(np.float32)
     count = int(rng.integers(0, _MOST_FISH + 1) if rng.random() < 0.6 else rng.integers(0, 4))
+    return _with_fish(rng, picture.astype(np.float32), np.zeros((0, 4)), bank, count=count)
+
+
+def _mosaic(
+    rng: np.random.Generator, frames: list[AnnotatedFrame]
+) -> tuple[Float32[np.ndarray, "S S 3"], Boxes]:
+    """Four photographs side by side: many and small fish."""
+    half = SIDE_PX // 2
+    picture, boxes = np.zeros((SIDE_PX, SIDE_PX, 3), np.float32), []
+    for index, frame in enumerate(frames):
+        row, column = divmod(index, 2)
+        part, found = _zoomed(rng, frame, side=half)
+        picture[row * half : (row + 1) * half, column * half : (column + 1) * half] = part
+        boxes.append(found + np.tile([column * half, row * half], 2))
+    return picture, np.concatenate(boxes)
+
+
+def _with_fish(
+    rng: np.random.Generator,
+    picture: Float32[np.ndarray, "S S 3"],
+    boxes: Boxes,
+    bank: PatchBank,
+    *,
+    count: int,
+) -> tuple[Float32[np.ndarray, "S S 3"], Boxes]:
+    """Fish of the bank before a picture; those in it that they hide have no box any more."""
     usual = np.exp(rng.uniform(*np.log(_SIZES_PX)))
     owner = np.full((SIDE_PX, SIDE_PX), -1)
     areas = []
@@ -146,13 +193,43 @@ def _composed(
         is_here = cover[..., 0] > 0.5
         owner[is_here] = index
         areas.append(int(is_here.sum()))
-    boxes = [
+    added = [
         _edges(owner == index)
         for index, area in enumerate(areas)
         if area and (owner == index).sum() > _MIN_VISIBLE * area
     ]
-    found = np.array(boxes, np.float64).reshape(-1, 4)
+    kept = [box for box in boxes if _free_share(owner >= 0, box) > 1 - _MIN_VISIBLE]
+    found = np.array(kept + added, np.float64).reshape(-1, 4)
     return picture.clip(0, 255).astype(np.float32), found[_are_large(found)]
+
+
+def _free_share(is_covered: np.ndarray, box: np.ndarray) -> float:
+    x0, y0 = np.floor(box[:2]).astype(int)
+    x1, y1 = np.ceil(box[2:]).astype(int)
+    part = is_covered[y0:y1, x0:x1]
+    return 1 - float(part.mean()) if part.size else 0.0
+
+
+def _turned(
+    rng: np.random.Generator, picture: Float32[np.ndarray, "S S 3"], boxes: Boxes
+) -> tuple[Float32[np.ndarray, "S S 3"], Boxes]:
+    """Mirrored, and some on their side, as fish that hang or are seen from above."""
+    if rng.random() < 0.5:
+        picture, boxes = picture[:, ::-1], boxes.copy()
+        boxes[:, [0, 2]] = SIDE_PX - boxes[:, [2, 0]]
+    if rng.random() < _TURNED_SHARE:
+        picture, boxes = picture.transpose(1, 0, 2), boxes[:, [1, 0, 3, 2]]
+    return np.ascontiguousarray(picture), boxes
+
+
+def _under_water(
+    rng: np.random.Generator, picture: Float32[np.ndarray, "S S 3"]
+) -> Float32[np.ndarray, "S S 3"]:
+    """Water takes light, of one colour more than of another, and contrast."""
+    light = np.exp(rng.normal(-0.25, 0.35, 3)).astype(np.float32)
+    murk = (rng.uniform(20.0, 200.0) * light).astype(np.float32)
+    clear = np.float32(rng.uniform(0.35, 1.0))
+    return (clear * picture * light + (1 - clear) * murk).clip(0, 255).astype(np.float32)
 
 
 def _placed_fish(
