@@ -97,7 +97,6 @@ class Stock:
 
     coefficients: Float[np.ndarray, "W"]
     covariance: Float[np.ndarray, "W W"]
-    num_effective: float  # coefficients that its fish determine rather than the prior
     nats: dict[int, float]  # of each fish: mean of its frames, see `evidence.nats_against`
     frames: list[PosedTarget]  # with the poses that go with this shape
 
@@ -133,28 +132,10 @@ class StockFitter:
         square, seen, known = self._read(frames, shape, odds)
         shape[BREADTH] += known.breadth
         shape[THICKNESS] += known.thickness
-        covariance = _with_proportions(inverse, known.breadth_std, known.thickness_std)
+        inverse = with_std_of(inverse, BREADTH, TRUNK, known.breadth_std)
+        inverse = with_std_of(inverse, THICKNESS, MEAN_THICKNESS, known.thickness_std)
         nats, posed = self._placed(frames, square, seen - known.breadth, shape)
-        return Stock(
-            coefficients=shape,
-            covariance=covariance,
-            num_effective=self._num_effective(inverse, known),
-            nats=nats,
-            frames=posed,
-        )
-
-    def _num_effective(self, covariance: Float[np.ndarray, "W W"], known: Proportions) -> float:
-        """NUM_COEFFICIENTS less what the prior of one form determines of them.
-
-        Proportions that are known less well than by that prior are not determined at all.
-        """
-        usual = np.linalg.inv(self._precision)
-        determined = _with_proportions(
-            covariance,
-            min(known.breadth_std, std_of(TRUNK, usual)),
-            min(known.thickness_std, std_of(MEAN_THICKNESS, usual)),
-        )
-        return NUM_COEFFICIENTS - float(np.trace(determined @ self._precision))
+        return Stock(coefficients=shape, covariance=inverse, nats=nats, frames=posed)
 
     def _outline(
         self,
@@ -288,13 +269,6 @@ class StockFitter:
         nothing_held = np.zeros(len(frame.pose), np.bool_)
         frame.pose = descend(problem, frame.pose, nothing_held, _POSE_OPTIONS).parameters
         return nats_against(problem, frame.pose, nat=self._nat)
-
-
-def _with_proportions(
-    covariance: Float[np.ndarray, "W W"], breadth_std: float, thickness_std: float
-) -> Float[np.ndarray, "W W"]:
-    covariance = with_std_of(covariance, BREADTH, TRUNK, breadth_std)
-    return with_std_of(covariance, THICKNESS, MEAN_THICKNESS, thickness_std)
 
 
 def _log_breadth(frame: PosedTarget) -> float:

@@ -17,7 +17,7 @@ from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.shape.candidates import CandidateShape, CandidateShapes
 from stream_dmr.fitting.shape.samples import FishSamples
-from stream_dmr.fitting.shape.space import reshaped
+from stream_dmr.fitting.shape.space import NUM_COEFFICIENTS, form_precision, reshaped
 from stream_dmr.fitting.shape.stock import FormOdds, PosedTarget, Stock, StockFitter
 from stream_dmr.fitting.target import Target
 from stream_dmr.template.template import Template
@@ -42,6 +42,11 @@ class _Group:
     def num_fish(self) -> int:
         """How many fish."""
         return len(self.stock.nats)
+
+    @property
+    def num_effective(self) -> float:
+        """How many of the shape's coefficients its fish determine rather than the prior."""
+        return NUM_COEFFICIENTS - float(np.trace(self.stock.covariance @ form_precision()))
 
 
 def learn_stocks(
@@ -143,7 +148,12 @@ class _StockLearner:
             best = int(np.argmin(_FRAMES_WORTH * np.mean(nats, axis=1) - shares))
             frames[best] += options[best]
         return [
-            self._learn(group.form, own, group.stock.coefficients)
+            self._learn(
+                group.form,
+                own,
+                group.stock.coefficients,
+                self._odds({frame.fish for frame in own}),
+            )
             for group, own in zip(groups, frames, strict=True)
             if own
         ]
@@ -153,8 +163,8 @@ class _StockLearner:
         form: CandidateShape,
         frames: list[PosedTarget],
         start: Float[np.ndarray, "W"],
+        odds: FormOdds | None = None,
     ) -> _Group:
-        odds = self._odds({frame.fish for frame in frames})
         return _Group(form, self._fitter.fit(frames, form.coefficients, start, odds))
 
     def _odds(self, fish: Iterable[int]) -> FormOdds:
@@ -182,4 +192,4 @@ def _evidence_for_two(a: _Group, b: _Group, both: _Group) -> float:
     """Nats by which masks prefer two shapes to one, less the parameters of the smaller group."""
     apart = a.stock.nats | b.stock.nats
     gains = [_FRAMES_WORTH * (both.stock.nats[fish] - nats) for fish, nats in apart.items()]
-    return float(np.clip(gains, _MAX_AGAINST, _MAX_FOR).sum()) - b.stock.num_effective
+    return float(np.clip(gains, _MAX_AGAINST, _MAX_FOR).sum()) - b.num_effective
