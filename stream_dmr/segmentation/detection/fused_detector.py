@@ -18,6 +18,8 @@ from stream_dmr.segmentation.detection.detector import Candidate, Detector, box_
 from stream_dmr.segmentation.detection.motion_detector import MotionDetector
 
 _MIN_IOU = 0.3  # of what moves with the box that says how much it looks like a fish
+# The part of the frame around a closer look: in sizes of what is looked at, and at least in px.
+_SURROUNDINGS, _MIN_SURROUNDINGS_PX = 4.0, 208
 
 
 class FusedDetector:
@@ -41,6 +43,21 @@ class FusedDetector:
             replace(one, place_px=self._place(one, frame), looks=_looks(one, seen))
             for one in fuse(moving, seen)
         ]
+
+    def look_closer(self, frame: Frame, bbox_xyxy_px: Float[np.ndarray, "4"]) -> float:
+        """How much the content of a box looks like a fish in a picture of its surroundings alone.
+
+        What has less than 20 px in the detector's picture of the whole frame can't be told there.
+        """
+        size_px = float((bbox_xyxy_px[2:] - bbox_xyxy_px[:2]).max())
+        side = max(_SURROUNDINGS * size_px, _MIN_SURROUNDINGS_PX)
+        middle = (bbox_xyxy_px[:2] + bbox_xyxy_px[2:]) / 2
+        limits = np.array(frame.image.shape[1::-1])
+        low = np.round(middle - side / 2).clip(0, np.maximum(limits - side, 0)).astype(int)
+        high = np.minimum(low + round(side), limits)
+        part = np.ascontiguousarray(frame.image[low[1] : high[1], low[0] : high[0]])
+        box = Candidate(bbox_xyxy_px=bbox_xyxy_px - np.tile(low, 2), score=0.0)
+        return _looks(box, self._looks.find(replace(frame, image=part)))
 
     def _place(self, one: Candidate, frame: Frame) -> Float[np.ndarray, "2"]:
         middle = (one.bbox_xyxy_px[:2] + one.bbox_xyxy_px[2:]) / 2

@@ -25,6 +25,7 @@ class FishEvidence:
         self._need_not_move = candidate.place_px is None  # somebody found it
         self._motion = 0.0
         self._judged_frames = self._fish_like_frames = self._sure_frames = 0
+        self.closer_looks = 0  # how many there were
         self.add(candidate, size_px)
 
     def add(self, candidate: Candidate, size_px: float) -> None:
@@ -36,6 +37,11 @@ class FishEvidence:
             self._judged_frames += 1
             self._fish_like_frames += candidate.looks >= FISH_LIKE
             self._sure_frames += candidate.looks >= _SURE
+
+    def add_closer_look(self, looks: float) -> None:
+        """Take into account how much it looks like a fish in a picture of its surroundings."""
+        self.closer_looks += 1
+        self._fish_like_frames += looks >= FISH_LIKE
 
     @property
     def has_moved(self) -> bool:

@@ -3,15 +3,21 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
+from jaxtyping import Float
+
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.annotations.box_detector import BoxDetector
 from stream_dmr.segmentation.detection.detector import Detector
 from stream_dmr.segmentation.detection.fish_detection import Detection
+from stream_dmr.segmentation.detection.fused_detector import FusedDetector
 from stream_dmr.segmentation.tracking.box_correction import BoxCorrector
 from stream_dmr.segmentation.tracking.confirmation import ConfirmationSettings, FishConfirmation
 from stream_dmr.segmentation.tracking.fish_evidence import FishEvidence
 from stream_dmr.segmentation.tracking.no_fish import Sightings, explain_no_fish
 from stream_dmr.segmentation.tracking.tracker import Tracker, TrackerSettings
+
+_MAX_CLOSER_LOOKS = 6  # at a track; each takes as long as one at a frame
 
 
 class TrackFishSettings(TrackerSettings, ConfirmationSettings):
@@ -40,12 +46,27 @@ class TrackedFish:
         boxes = {one.track_number: one.candidate.bbox_xyxy_px for one in tracked}
         visible = {one.track_number: one.visible_fraction for one in tracked}
         self._evidence = {one.track_number: one.evidence for one in tracked}
+        self._look_closer(frame, boxes)
         self._seen.any_moved |= any(one.has_moved for one in self._evidence.values())
         self._seen.any_fish_like |= any(map(self._may_count, self._evidence))
         return [
             replace(one, may_be_no_fish=not self._is_surely_fish(one.source_id))
             for one in self._corrector.correct(boxes, visible, frame)
         ]
+
+    def _look_closer(self, frame: Frame, boxes: Mapping[int, Float[np.ndarray, "4"]]) -> None:
+        """Look at one of those that move and, small as they are, look like no fish from afar."""
+        if not isinstance(self._detector, FusedDetector):
+            return
+        waiting = [
+            track
+            for track, one in self._evidence.items()
+            if one.has_moved and not self._may_count(track) and one.closer_looks < _MAX_CLOSER_LOOKS
+        ]
+        if waiting:
+            track = min(waiting, key=lambda track: self._evidence[track].closer_looks)
+            looks = self._detector.look_closer(frame, boxes[track])
+            self._evidence[track].add_closer_look(looks)
 
     def _is_surely_fish(self, track: int) -> bool:
         """True for a confirmed track, and for one that went far or that need not move."""

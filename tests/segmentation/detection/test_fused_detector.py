@@ -1,7 +1,9 @@
 """Motion and looks find each fish once, and every candidate has its place in the scene."""
 
 from dataclasses import replace
+from typing import ClassVar
 
+import cv2
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -58,6 +60,30 @@ def test_a_shape_that_moves_is_found_once():
     detector = FusedDetector(MotionDetector(MotionSettings()), both)
     found = [detector.find(frame(i)) for i in range(5)][-1]
     assert sorted(is_still(one) for one in found) == [False, True]
+
+
+class LargeAndBright:
+    """Finds what is bright and at least a twentieth of the picture wide, as networks do."""
+
+    refused: ClassVar[dict[str, int]] = {}
+
+    def find(self, frame: Frame) -> list[Candidate]:
+        x, y, width, height = cv2.boundingRect((frame.image[..., 0] > 128).astype(np.uint8))
+        if width < 0.05 * frame.image.shape[1]:
+            return []
+        return [Candidate(bbox_xyxy_px=np.array([x, y, x + width, y + height], float), score=0.8)]
+
+
+@given(st.integers(0, 1240), st.integers(0, 920), st.integers(16, 40))
+def test_small_fish_are_told_from_nearby_wherever_they_are(x: int, y: int, side: int):
+    image = np.zeros((960, 1280, 3), np.uint8)
+    image[y : y + side, x : x + side] = 255
+    detector = FusedDetector(MotionDetector(MotionSettings()), LargeAndBright())
+    box = np.array([x, y, x + side, y + side], np.float64)
+    assert LargeAndBright().find(frame_of(image)) == []
+    assert detector.look_closer(frame_of(image), box) == 0.8
+    beside = box + (100 if x < 640 else -100)
+    assert detector.look_closer(frame_of(image), beside) == 0.0
 
 
 def at(x0: float, y0: float, x1: float, y1: float) -> Candidate:

@@ -57,3 +57,12 @@ def test_what_never_looks_like_a_fish_is_none(looks, min_frames):
     evidence = evidence_of(*(candidate(looks=one) for one in looks))
     assert not evidence.looks_like_a_fish(min_frames)
     assert evidence.looks_like_a_fish(0)
+
+
+def test_closer_looks_count_as_looks_and_are_counted():
+    evidence = evidence_of(*[candidate(looks=0.0)] * 5)
+    for looks in (0.9, 0.0, 0.9):
+        assert not evidence.looks_like_a_fish(2)
+        evidence.add_closer_look(looks)
+    assert evidence.looks_like_a_fish(2)
+    assert evidence.closer_looks == 3

@@ -9,11 +9,14 @@ import pytest
 from stream_dmr.camera import Camera
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.detection.detector import Candidate
+from stream_dmr.segmentation.detection.fused_detector import FusedDetector
+from stream_dmr.segmentation.detection.motion_detector import MotionDetector, MotionSettings
 from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
 from stream_dmr.segmentation.masks.cropping import crop_fish
 from stream_dmr.segmentation.segmenter import SegmentedFish, Segmenter
 from stream_dmr.segmentation.tracking.track_numbering import TrackNumbering
 from stream_dmr.segmentation.tracking.tracked_fish import TrackedFish, TrackFishSettings
+from tests.support.frames import frame_of
 from tests.support.spots import HEIGHT, WIDTH, Spot, climbing, spots_candidates, spots_frame
 
 
@@ -172,3 +175,46 @@ def test_a_shape_may_be_no_fish_until_it_is_confirmed_or_went_far():
     assert doubts_of(8.0) == [True] * 4 + [False] * 4  # confirmed after four clear frames
     assert doubts_of(20.0) == [True] * 2 + [False] * 6  # farther than half its length
     assert doubts_of(1.0, has_place=False) == [False] * 8  # somebody else found it
+
+
+class BlindFromAfar(FusedDetector):
+    """Sees how much what moves looks like a fish, but only from nearby."""
+
+    def __init__(self, looks: float) -> None:
+        super().__init__(MotionDetector(MotionSettings()), NoDetector())
+        self.looks, self.num_looks = looks, 0
+
+    def look_closer(self, frame: Frame, bbox_xyxy_px: np.ndarray) -> float:
+        self.num_looks += 1
+        return self.looks
+
+
+class NoDetector:
+    refused: ClassVar[dict[str, int]] = {}
+
+    def find(self, frame: Frame) -> list[Candidate]:
+        return []
+
+
+@pytest.mark.parametrize(("looks", "counts", "num_looks"), [(0.8, True, 2), (0.0, False, 6)])
+def test_what_moves_is_looked_at_closely_a_few_times(looks: float, counts: bool, num_looks: int):
+    detector = BlindFromAfar(looks)
+    fish = TrackedFish(detector, TrackFishSettings())
+    camera, confirmed = Camera.nominal(width=320, height=240), []
+    for index in range(1, 21):
+        image = np.full((240, 320, 3), 60, np.uint8)
+        image[100:130, 20 + 8 * index : 80 + 8 * index] = 220
+        frame = frame_of(image, index)
+        crops = {
+            one.source_id: crop_fish(
+                frame,
+                one,
+                frame_camera=camera,
+                settings=CropFishSettings(crop_size_px=32),
+                segmenter=WholeBox(1.0),
+            )
+            for one in fish.detect(frame)
+        }
+        confirmed += fish.confirm(crops)
+    assert bool(confirmed) == counts
+    assert detector.num_looks == num_looks
