@@ -39,7 +39,9 @@ class CropFish:
         self._classifier = SpeciesClassifier(Path(species_model)) if species_model else None
         self._settings = settings
         self._camera = camera
-        self._workers = ThreadPoolExecutor(os.cpu_count(), "crop")
+        # Networks run side by side; given masks are cut out mostly by Python, which can't.
+        workers = ThreadPoolExecutor(os.cpu_count(), "crop")
+        self._map = map if self._segmenter is None else workers.map
 
     def number_after(self, track_id: int) -> None:
         """Number the fish on after those of earlier runs; call it before the first frame."""
@@ -57,9 +59,9 @@ class CropFish:
             segmenter=self._segmenter,
         )
         found = self._finder.detect(frame)
-        # A crop's time is the network's and OpenCV's, which run side by side.
-        cuts = self._workers.map(cut, found)
-        crops = {one.source_id: crop for one, crop in zip(found, cuts, strict=True)}
+        crops = {
+            one.source_id: crop for one, crop in zip(found, self._map(cut, found), strict=True)
+        }
         fish = [
             replace(
                 crops[source_id],
