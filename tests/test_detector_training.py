@@ -78,7 +78,8 @@ def test_frames_have_boxes_within_them():
     bank = make_bank(num_fish=4, num_backgrounds=2, seed=3, progress=lambda: None)
     picture = np.full((100, 160, 3), 90, np.uint8)
     frame = AnnotatedFrame(picture, np.array([[20.0, 30.0, 90.0, 60.0]]))
-    source = FrameSource([frame], [frame], bank)
+    empty = AnnotatedFrame(picture, np.zeros((0, 4)))
+    source = FrameSource([[frame, frame, empty, frame], [frame]], [frame], bank)
     num_boxes = 0
     for seed in range(30):
         image, boxes = source(np.random.default_rng(seed))
