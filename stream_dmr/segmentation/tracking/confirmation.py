@@ -14,6 +14,9 @@ from stream_dmr.settings import Settings
 
 # Bounds the memory of a run of weeks; tracks live for seconds, so older ones have ended long ago.
 _MAX_UNCONFIRMED_TRACKS = 1000
+# After so many frames in a row whose masks show as good as nothing, a track is at another thing:
+# the place where its fish was. Of simulated fish at most three frames in a row are unclear.
+_MAX_EMPTY_FRAMES, _NOTHING = 5, 0.2
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
@@ -50,25 +53,26 @@ class ConfirmationSettings(Settings):
 
 
 class FishConfirmation:
-    """Decides which tracks are fish; a confirmed one stays confirmed."""
+    """Decides which tracks are fish; a confirmed one stays confirmed, and counts while seen."""
 
     def __init__(self, settings: ConfirmationSettings) -> None:
         self._settings = settings
         self._confirmed: set[int] = set()  # track numbers
         self._num_clear_frames: Counter[int] = Counter()  # of unconfirmed tracks
+        self._num_empty_frames: Counter[int] = Counter()  # of confirmed ones, in a row
 
     def is_confirmed(self, number: int) -> bool:
         """True for a track that counts as a fish."""
         return number in self._confirmed
 
     def update(self, number: int, crop: FishCrop, *, may_count: bool = True) -> bool:
-        """Take a track's crop of one frame into account; returns True once it is confirmed.
+        """Take a track's crop of one frame into account; True for a confirmed fish that it shows.
 
         `may_count`: False while the other evidence doubts it. A confirmed fish remains one
         outside the zone. A crop without `mask_confidence` (a given mask) counts as clearly seen.
         """
+        confidence = crop.quality.mask_confidence
         if number not in self._confirmed:
-            confidence = crop.quality.mask_confidence
             if confidence is None or confidence >= self._settings.min_mask_confidence:
                 self._num_clear_frames[number] += 1
                 if len(self._num_clear_frames) > _MAX_UNCONFIRMED_TRACKS:
@@ -77,7 +81,11 @@ class FishConfirmation:
                 return False
             self._confirmed.add(number)
             del self._num_clear_frames[number]
-        return True
+        if confidence is None or confidence >= _NOTHING:
+            self._num_empty_frames.pop(number, None)
+        else:
+            self._num_empty_frames[number] += 1
+        return self._num_empty_frames[number] <= _MAX_EMPTY_FRAMES
 
     def _is_confirmed_by(self, number: int, crop: FishCrop) -> bool:
         width, height = crop.frame_camera.width, crop.frame_camera.height

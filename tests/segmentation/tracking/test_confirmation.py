@@ -45,6 +45,12 @@ def test_a_track_is_confirmed_inside_the_zone_and_remains_a_fish_outside():
     assert confirmed(crops, min_track_frames=1, zone=zone) == [False, False, True, True]
 
 
+def test_a_fish_counts_while_it_is_seen():
+    empty, clear = crop_at(50, 50, confidence=0.0), crop_at(50, 50)
+    crops = [clear, *[empty] * 8, clear, *[empty] * 5, clear]
+    assert confirmed(crops, min_track_frames=1) == [True] * 6 + [False] * 3 + [True] * 7
+
+
 def test_tracks_are_counted_apart():
     confirmation = FishConfirmation(ConfirmationSettings(min_track_frames=2))
     crop = crop_at(50, 50)
