@@ -40,7 +40,7 @@ class FusedDetector:
         looking = self._beside.submit(self._looks.find, frame)
         moving, seen = self._motion.find(frame), looking.result()
         return [
-            replace(one, place_px=self._place(one, frame), looks=_looks(one, seen))
+            replace(one, place_px=self._place(one, frame), looks=_looks(one.bbox_xyxy_px, seen))
             for one in fuse(moving, seen)
         ]
 
@@ -56,8 +56,7 @@ class FusedDetector:
         low = np.round(middle - side / 2).clip(0, np.maximum(limits - side, 0)).astype(int)
         high = np.minimum(low + round(side), limits)
         part = np.ascontiguousarray(frame.image[low[1] : high[1], low[0] : high[0]])
-        box = Candidate(bbox_xyxy_px=bbox_xyxy_px - np.tile(low, 2), score=0.0)
-        return _looks(box, self._looks.find(replace(frame, image=part)))
+        return _looks(bbox_xyxy_px - np.tile(low, 2), self._looks.find(replace(frame, image=part)))
 
     def _place(self, one: Candidate, frame: Frame) -> Float[np.ndarray, "2"]:
         middle = (one.bbox_xyxy_px[:2] + one.bbox_xyxy_px[2:]) / 2
@@ -66,14 +65,19 @@ class FusedDetector:
 
 def fuse(moving: Sequence[Candidate], seen: Sequence[Candidate]) -> list[Candidate]:
     """What moves, whose outline is known, and what is seen where nothing moves."""
-    still = [fish for fish in seen if not any(_show_the_same(fish, one) for one in moving)]
+    still = [
+        fish
+        for fish in seen
+        if not any(_show_the_same(fish.bbox_xyxy_px, one.bbox_xyxy_px) for one in moving)
+    ]
     return [*moving, *still]
 
 
-def _looks(one: Candidate, seen: Sequence[Candidate]) -> float:
-    """How much a candidate looks like a fish: the best score of the boxes around it."""
-    return max((fish.score for fish in seen if _show_the_same(one, fish)), default=0.0)
+def _looks(bbox_xyxy_px: Float[np.ndarray, "4"], seen: Sequence[Candidate]) -> float:
+    """How much the content of a box looks like a fish: the best score of the boxes around it."""
+    scores = (fish.score for fish in seen if _show_the_same(bbox_xyxy_px, fish.bbox_xyxy_px))
+    return max(scores, default=0.0)
 
 
-def _show_the_same(one: Candidate, other: Candidate) -> bool:
-    return box_iou(one.bbox_xyxy_px, other.bbox_xyxy_px) >= _MIN_IOU
+def _show_the_same(one: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> bool:
+    return box_iou(one, other) >= _MIN_IOU

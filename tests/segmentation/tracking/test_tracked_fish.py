@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from stream_dmr.camera import Camera
-from stream_dmr.messages import Frame
+from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.detection.detector import Candidate
+from stream_dmr.segmentation.detection.fish_detection import Detection
 from stream_dmr.segmentation.detection.fused_detector import FusedDetector
 from stream_dmr.segmentation.detection.motion_detector import MotionDetector, MotionSettings
 from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
@@ -17,7 +18,7 @@ from stream_dmr.segmentation.segmenter import SegmentedFish, Segmenter
 from stream_dmr.segmentation.tracking.track_numbering import TrackNumbering
 from stream_dmr.segmentation.tracking.tracked_fish import TrackedFish, TrackFishSettings
 from tests.support.frames import frame_of
-from tests.support.spots import HEIGHT, WIDTH, Spot, climbing, spots_candidates, spots_frame
+from tests.support.spots import HEIGHT, Spot, climbing, spots_candidates, spots_frame
 
 
 class Found(NamedTuple):
@@ -54,6 +55,21 @@ class WholeBox:
         return SegmentedFish(probability=probability, ends=None)
 
 
+def cut_out(frame: Frame, found: Sequence[Detection], segmenter: Segmenter) -> dict[int, FishCrop]:
+    """The crops of what was found, by the numbers of their tracks."""
+    height, width = frame.image.shape[:2]
+    return {
+        one.source_id: crop_fish(
+            frame,
+            one,
+            frame_camera=Camera.nominal(width=width, height=height),
+            settings=CropFishSettings(crop_size_px=32),
+            segmenter=segmenter,
+        )
+        for one in found
+    }
+
+
 def follow(
     frames: Sequence[Sequence[Spot]],
     *,
@@ -65,20 +81,10 @@ def follow(
     track_settings = TrackFishSettings.model_validate({"min_track_frames": 1, **settings})
     fish = TrackedFish(ScriptedDetector(frames), track_settings)
     numbering = TrackNumbering(keeps_source_ids=fish.knows_ids)
-    camera = Camera.nominal(width=WIDTH, height=HEIGHT)
     found = {}
     for i, spots in enumerate(frames, start=1):
         frame = spots_frame(spots, i)
-        crops = {
-            detection.source_id: crop_fish(
-                frame,
-                detection,
-                frame_camera=camera,
-                settings=CropFishSettings(crop_size_px=32),
-                segmenter=segmenter or WholeBox(confidence),
-            )
-            for detection in fish.detect(frame)
-        }
+        crops = cut_out(frame, fish.detect(frame), segmenter or WholeBox(confidence))
         found[i] = [
             Found(numbering.track_id(number), crops[number].bbox_xyxy_px)
             for number in fish.confirm(crops)
@@ -159,14 +165,7 @@ def doubts_of(speed: float, *, has_place: bool = True) -> list[bool]:
         frame = spots_frame([], index)
         [detection] = fish.detect(frame)
         doubts.append(detection.may_be_no_fish)
-        crop = crop_fish(
-            frame,
-            detection,
-            frame_camera=Camera.nominal(width=WIDTH, height=HEIGHT),
-            settings=CropFishSettings(crop_size_px=32),
-            segmenter=WholeBox(1.0),
-        )
-        fish.confirm({detection.source_id: crop})
+        fish.confirm(cut_out(frame, [detection], WholeBox(1.0)))
     return doubts
 
 
@@ -200,21 +199,11 @@ class NoDetector:
 def test_what_moves_is_looked_at_closely_a_few_times(looks: float, counts: bool, num_looks: int):
     detector = BlindFromAfar(looks)
     fish = TrackedFish(detector, TrackFishSettings())
-    camera, confirmed = Camera.nominal(width=320, height=240), []
+    confirmed: list[int] = []
     for index in range(1, 21):
         image = np.full((240, 320, 3), 60, np.uint8)
         image[100:130, 20 + 8 * index : 80 + 8 * index] = 220
         frame = frame_of(image, index)
-        crops = {
-            one.source_id: crop_fish(
-                frame,
-                one,
-                frame_camera=camera,
-                settings=CropFishSettings(crop_size_px=32),
-                segmenter=WholeBox(1.0),
-            )
-            for one in fish.detect(frame)
-        }
-        confirmed += fish.confirm(crops)
+        confirmed += fish.confirm(cut_out(frame, fish.detect(frame), WholeBox(1.0)))
     assert bool(confirmed) == counts
     assert detector.num_looks == num_looks
