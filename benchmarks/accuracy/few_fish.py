@@ -22,13 +22,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.accuracy.judged_lengths import HEADER, JudgedLength, figures, judge
 from benchmarks.fit_speed.targets import body_template
 from benchmarks.table1.dmr import through_all
 from benchmarks.table1.filmed_scene import FilmedScene, film_passages
 from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
 from stream_dmr.fitting.shape.space import TRUNK, reshaped, std_of
-from stream_dmr.messages import FishCrop, LearntShapes, LengthEstimate
+from stream_dmr.messages import FishCrop, LearntShapes
 from stream_dmr.running.config import Config
 from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.simulation.presets import PRESETS
@@ -53,9 +54,7 @@ class MeasuredFish(NamedTuple):
     template: str
     learnt_from: int  # fish
     comes_later: bool  # than those
-    error: float  # of the length, relative
-    std: float  # relative
-    is_held: bool  # by its 95 % interval
+    length: JudgedLength
 
 
 class LearntStock(NamedTuple):
@@ -145,21 +144,15 @@ def _measured(
     nodes = later_nodes(
         Config(), template=template, candidates=candidates, calibration=filmed.calibration
     )
-    for one in through_all(crops, nodes):
-        if isinstance(one, LengthEstimate) and one.is_final and one.length_mm is not None:
-            assert one.length_std_mm is not None
-            assert one.ci95_mm is not None
-            truth_mm = filmed.truth_mm[one.track_id]
-            yield MeasuredFish(
-                way=task.way,
-                species=task.species,
-                template=task.templates[0],
-                learnt_from=task.learnt_from,
-                comes_later=one.track_id > task.learnt_from,
-                error=one.length_mm / truth_mm - 1,
-                std=one.length_std_mm / truth_mm,
-                is_held=bool(one.ci95_mm[0] <= truth_mm <= one.ci95_mm[1]),
-            )
+    for length in judge(through_all(crops, nodes), filmed.truth_mm):
+        yield MeasuredFish(
+            way=task.way,
+            species=task.species,
+            template=task.templates[0],
+            learnt_from=task.learnt_from,
+            comes_later=length.track_id > task.learnt_from,
+            length=length,
+        )
 
 
 def _stocks(task: Task, template: Template, learnt: CandidateShapes) -> Iterator[LearntStock]:
@@ -183,7 +176,7 @@ def _trunk_breadth(template: Template) -> float:
 
 def table(fish: Sequence[MeasuredFish], stocks: Sequence[LearntStock]) -> list[str]:
     """Lines of three tables: lengths, by template and species, and learnt breadths."""
-    lines = ["| | fish | mean error | bias | held | width | NEES |", "|---" * 7 + "|"]
+    lines = [f"| | {HEADER} |", "|---" * 7 + "|"]
     for way in WAYS:
         for num in LEARNT_FROM:
             for comes_later in (False, True):
@@ -208,14 +201,7 @@ def table(fish: Sequence[MeasuredFish], stocks: Sequence[LearntStock]) -> list[s
 
 
 def _line(name: str, group: Sequence[MeasuredFish]) -> list[str]:
-    if not group:
-        return []
-    errors, stds = np.array([(one.error, one.std) for one in group]).T
-    held = np.mean([one.is_held for one in group])
-    return [
-        f"| {name} | {len(group)} | {abs(errors).mean():.1%} | {errors.mean():+.1%} | {held:.0%} "
-        f"| {3.92 * stds.mean():.1%} | {np.mean((errors / stds) ** 2):.2f} |"
-    ]
+    return [f"| {name} | {figures([one.length for one in group])} |"] if group else []
 
 
 def main() -> None:

@@ -25,6 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.accuracy.judged_lengths import HEADER, JudgedLength, figures, judge
 from benchmarks.accuracy.oracles import scene_of
 from benchmarks.table1.filmed_scene import (
     FISH_PER_SCENE,
@@ -60,9 +61,7 @@ class MeasuredFish(NamedTuple):
     shape: str  # the candidate's name
     learnt_from: int  # fish; 0 where it was measured by a body form
     known: int  # fish that had been learnt from when it came into view
-    error: float  # of the length, relative
-    std: float  # relative
-    is_held: bool  # by its 95 % interval
+    length: JudgedLength
 
 
 def measure_catch(seed: int) -> list[MeasuredFish]:
@@ -167,9 +166,7 @@ class _Camera:
                 self._finished.append(chosen)
                 if len(self._finished) in LEARNT_AT:
                     self._learn()
-            if one.length_mm is not None and one.length_std_mm is not None:
-                assert one.ci95_mm is not None
-                truth_mm = self._filmed.truth_mm[one.track_id]
+            for length in judge([one], self._filmed.truth_mm):
                 shape = self._chosen[one.track_id]
                 yield MeasuredFish(
                     scene=0,
@@ -177,9 +174,7 @@ class _Camera:
                     shape=self._known.names.split(",")[shape],
                     learnt_from=self._learnt_from[shape],
                     known=self._seen_knowing[one.track_id],
-                    error=one.length_mm / truth_mm - 1,
-                    std=one.length_std_mm / truth_mm,
-                    is_held=bool(one.ci95_mm[0] <= truth_mm <= one.ci95_mm[1]),
+                    length=length,
                 )
 
     def _learn(self) -> None:
@@ -210,20 +205,14 @@ class _Camera:
 
 def table(fish: list[MeasuredFish]) -> list[str]:
     """One line for each number of fish that the shapes were learnt from, and one for all."""
-    lines = ["| learnt from | fish | mean error | bias | held | width | NEES |", "|---" * 7 + "|"]
+    lines = [f"| learnt from | {HEADER} |", "|---" * 7 + "|"]
     groups = [
         (str(known), [one for one in fish if one.known == known]) for known in (0, *LEARNT_AT)
     ]
     own_form = [one for one in fish if one.learnt_from == 0 and one.known > 0]
     for name, group in [*groups, ("(by a body form all the same)", own_form), ("all", fish)]:
-        if not group:
-            continue
-        errors, stds = np.array([(one.error, one.std) for one in group]).T
-        held = np.mean([one.is_held for one in group])
-        lines.append(
-            f"| {name} | {len(group)} | {abs(errors).mean():.1%} | {errors.mean():+.1%} | "
-            f"{held:.0%} | {3.92 * stds.mean():.1%} | {np.mean((errors / stds) ** 2):.2f} |"
-        )
+        if group:
+            lines.append(f"| {name} | {figures([one.length for one in group])} |")
     return lines
 
 
@@ -244,7 +233,7 @@ def main() -> None:
         for catch in pool.imap(measure_catch, seeds):
             fish += catch
             for one in catch:
-                if not one.is_held:
+                if not one.length.is_held:
                     print(f"not held: {one}", flush=True)
     print("\n".join(table(fish)))
 

@@ -15,18 +15,18 @@ import os
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 import multiprocessing
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.accuracy.judged_lengths import JudgedLength, judge
 from benchmarks.table1.dmr import through_all
 from benchmarks.table1.filmed_scene import FilmedScene, film_passages
 from stream_dmr.camera import Calibration, ReferencePlane
 from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
-from stream_dmr.messages import LengthEstimate
 from stream_dmr.running.conditions import lying, stills
 from stream_dmr.running.config import Config
 from stream_dmr.running.measure_source import later_nodes
@@ -47,10 +47,8 @@ class MeasuredFish(NamedTuple):
 
     species: str
     lies: str
-    error: float  # relative
-    ruler_error: float
-    std: float  # relative
-    is_held: bool
+    ruler_error: float  # relative
+    length: JudgedLength
 
 
 def lying_scene(seed: int, species: SimulatedBody, *, num_fish: int) -> tuple[RailScene, list[str]]:
@@ -102,18 +100,15 @@ def measure(task: tuple[str, int, int]) -> list[MeasuredFish]:
     return [
         MeasuredFish(
             species=species,
-            lies=ways[track_id - 1],
-            error=error,
-            ruler_error=rulers[track_id],
-            std=std,
-            is_held=is_held,
+            lies=ways[length.track_id - 1],
+            ruler_error=rulers[length.track_id],
+            length=length,
         )
-        for track_id, error, std, is_held in _measured(film_passages(scene, with_second=False))
+        for length in _measured(film_passages(scene, with_second=False))
     ]
 
 
-def _measured(filmed: FilmedScene) -> Iterator[tuple[int, float, float, bool]]:
-    """Track id, error, std and whether the truth is held, of every fish that is measured."""
+def _measured(filmed: FilmedScene) -> list[JudgedLength]:
     config = stills(lying(Config()), is_calibrated=True)
     crops = [
         replace(sighting.crop, timestamp_ns=round(number * _PICTURES_S * 1e9))
@@ -126,14 +121,7 @@ def _measured(filmed: FilmedScene) -> Iterator[tuple[int, float, float, bool]]:
     nodes = later_nodes(
         config, template=template, candidates=stocks, calibration=filmed.calibration
     )
-    for one in through_all(crops, nodes):
-        if isinstance(one, LengthEstimate) and one.is_final and one.length_mm is not None:
-            assert one.length_std_mm is not None
-            assert one.ci95_mm is not None
-            truth_mm = filmed.truth_mm[one.track_id]
-            is_held = bool(one.ci95_mm[0] <= truth_mm <= one.ci95_mm[1])
-            error, std = one.length_mm / truth_mm - 1, one.length_std_mm / truth_mm
-            yield one.track_id, error, std, is_held
+    return judge(through_all(crops, nodes), filmed.truth_mm)
 
 
 def _ruler_error(visit: Visit, scene: RailScene) -> float:
@@ -158,8 +146,9 @@ def table(fish: Sequence[MeasuredFish]) -> list[str]:
 
 
 def _figures(group: Sequence[MeasuredFish]) -> str:
-    errors, rulers, stds = np.array([(one.error, one.ruler_error, one.std) for one in group]).T
-    held = np.mean([one.is_held for one in group])
+    rulers = np.array([one.ruler_error for one in group])
+    errors, stds = np.array([(one.length.error, one.length.std) for one in group]).T
+    held = np.mean([one.length.is_held for one in group])
     return (
         f"{abs(errors).mean():.1%} | {errors.mean():+.1%} | {held:.0%} | {3.92 * stds.mean():.1%} "
         f"| {abs(rulers).mean():.1%}"

@@ -15,10 +15,10 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 
 import multiprocessing
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.accuracy.judged_lengths import JudgedLength, judge
 from benchmarks.accuracy.oracles import scene_of
 from benchmarks.fit_speed.targets import body_template
 from benchmarks.table1.dmr import through_all
@@ -26,7 +26,7 @@ from benchmarks.table1.filmed_scene import film_passages
 from stream_dmr.camera import Calibration
 from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
-from stream_dmr.messages import FishCrop, LengthEstimate
+from stream_dmr.messages import FishCrop
 from stream_dmr.running.config import Config
 from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.simulation.species import SPECIES, find_species
@@ -38,21 +38,14 @@ CATCHES = (*SPECIES, "haddock,skipjack,halibut", "trout,perch,conger")
 FIRST_SEED = 9000
 
 
-class Measured(NamedTuple):
-    """The fish of one scene by one template: relative errors, and whether intervals hold them."""
-
-    errors: list[float]
-    is_held: list[bool]
-
-
-def measure(task: tuple[str, int, Sequence[str]]) -> dict[str, Measured]:
+def measure(task: tuple[str, int, Sequence[str]]) -> dict[str, list[JudgedLength]]:
     """One scene of a catch by each of the templates."""
     catch, seed, names = task
     species = find_species(catch)
     scene = scene_of(("realistic", seed), species=species)
     filmed = film_passages(scene, with_second=False)
     crops = [sighting.crop for frame in filmed.frames for sighting in frame]
-    found: dict[str, Measured] = {}
+    found: dict[str, list[JudgedLength]] = {}
     for name in names:
         if name != OWN:
             template, shapes = load_shapes(name)
@@ -74,17 +67,9 @@ def _lengths(
     template: Template,
     shapes: CandidateShapes | None,
     calibration: Calibration,
-) -> Measured:
+) -> list[JudgedLength]:
     nodes = later_nodes(Config(), template=template, candidates=shapes, calibration=calibration)
-    errors, is_held = [], []
-    for message in through_all(crops, nodes):
-        if isinstance(message, LengthEstimate) and message.is_final:
-            length_mm, interval_mm = message.length_mm, message.ci95_mm
-            if length_mm is not None and interval_mm is not None:
-                truth = truth_mm[message.track_id]
-                errors.append(length_mm / truth - 1)
-                is_held.append(bool(interval_mm[0] <= truth <= interval_mm[1]))
-    return Measured(errors, is_held)
+    return judge(through_all(crops, nodes), truth_mm)
 
 
 def main() -> None:
@@ -104,10 +89,10 @@ def main() -> None:
             print(f"| {catch} | {' | '.join(_cell(scenes, name) for name in names)} |", flush=True)
 
 
-def _cell(scenes: Sequence[dict[str, Measured]], name: str) -> str:
-    measured = [scene[name] for scene in scenes if name in scene]
-    errors = 100 * np.array([error for one in measured for error in one.errors])
-    held = 100 * np.array([held for one in measured for held in one.is_held])
+def _cell(scenes: Sequence[dict[str, list[JudgedLength]]], name: str) -> str:
+    measured = [length for scene in scenes for length in scene.get(name, [])]
+    errors = 100 * np.array([length.error for length in measured])
+    held = 100 * np.array([length.is_held for length in measured])
     if not len(errors):
         return ""
     return f"{abs(errors).mean():.1f}, {errors.mean():+.1f}, {held.mean():.0f}"
