@@ -14,15 +14,17 @@ and behind one another, and vanish at once. "found": true fish that most of a tr
 
 import argparse
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from benchmarks.segmentation.tracking_metrics import score
+from stream_dmr.camera import Camera
 from stream_dmr.messages import Frame
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.segmentation.detection.detector import box_iou
@@ -34,6 +36,9 @@ from stream_dmr.simulation.pose_sequence import draw_poses
 from stream_dmr.simulation.presets import PRESETS
 from stream_dmr.simulation.rail_scene import RailScene, Visit, make_scene
 
+HEADER = """\
+| scenes | IDF1 | HOTA | fish | found | ids | false | scenes counted exactly |
+|---|---|---|---|---|---|---|---|"""
 _SWING_MM = 700.0  # of each fish to either side
 _PLACES = 77  # key of the random numbers of `random_scene`
 _SHOWN_FRAMES, _PASSAGE_FRAMES = 14, 40  # of each fish: shown, and until it would have passed
@@ -42,6 +47,13 @@ _IN_VIEW = " in view"
 _LONG_FRAMES = 10
 _MIN_IOU = 0.5  # of a box with the fish that it shows
 _MIN_VISIBLE_FRACTION = 0.3  # a fish of which less is to be seen is nobody's to find
+
+
+class Shot(NamedTuple):
+    """A frame and the boxes of the fish in it."""
+
+    image: UInt8[np.ndarray, "H W 3"]
+    boxes: dict[int, Float[np.ndarray, "4"]]  # left, top, right, bottom, px, by fish
 
 
 class Outcome(NamedTuple):
@@ -100,19 +112,28 @@ def _swinging(visit: Visit, *, side: int) -> Visit:
 
 def measure(scene: RailScene) -> Outcome:
     """Film a scene, follow its fish, and compare."""
-    fish = TrackedFish(open_detector(DetectFishSettings()), TrackFishSettings())
-    node = CropFish(CropFishSettings(), camera=scene.calibration.camera, finder=fish)
-    truth, found = [], []
-    for shot in film(scene):
-        index = shot.frame_index
-        frame = Frame(frame_index=index, timestamp_ns=index, image=shot.image, source="")
-        truth.append(
+    filmed = (
+        Shot(
+            shot.image,
             {
                 box.track_id: np.add(box.xywh_px, [0, 0, *box.xywh_px[:2]])
                 for box in shot.boxes
                 if box.visible_fraction >= _MIN_VISIBLE_FRACTION
-            }
+            },
         )
+        for shot in film(scene)
+    )
+    return follow(filmed, camera=scene.calibration.camera)
+
+
+def follow(shots: Iterable[Shot], *, camera: Camera | None) -> Outcome:
+    """Follow the fish of consecutive frames, and compare."""
+    fish = TrackedFish(open_detector(DetectFishSettings()), TrackFishSettings())
+    node = CropFish(CropFishSettings(), camera=camera, finder=fish)
+    truth, found = [], []
+    for index, shot in enumerate(shots, 1):
+        frame = Frame(frame_index=index, timestamp_ns=index, image=shot.image, source="")
+        truth.append(shot.boxes)
         found.append({crop.track_id: crop.bbox_xyxy_px for crop in node.step(frame)})
     scores = score(truth, found)
     shown = shown_fish(truth, found)
@@ -178,6 +199,18 @@ def count_ids(video: Path) -> str:
     )
 
 
+def table_row(name: str, outcomes: Sequence[Outcome]) -> str:
+    """Means of IDF1 and HOTA, sums of the others, below `HEADER`."""
+    exact = sum(outcome.counted == outcome.num_fish for outcome in outcomes)
+    return (
+        f"| {name} | {np.mean([o.idf1 for o in outcomes]):.3f} "
+        f"| {np.mean([o.hota for o in outcomes]):.3f} "
+        f"| {sum(o.num_fish for o in outcomes)} | {sum(o.found for o in outcomes)} "
+        f"| {sum(o.counted for o in outcomes)} | {sum(o.false for o in outcomes)} "
+        f"| {exact}/{len(outcomes)} |"
+    )
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -194,19 +227,10 @@ def main() -> None:
     kinds = [*PRESETS, *meetings]
     if arguments.in_view:
         kinds = [f"{preset}, {n:g}{_IN_VIEW}" for n in arguments.in_view for preset in PRESETS]
-    print("| scenes | IDF1 | HOTA | fish | found | ids | false | scenes counted exactly |")
-    print("|---|---|---|---|---|---|---|---|")
+    print(HEADER)
     for kind in kinds:
-        scores = [measure(s) for s in scenes(kind, arguments.scenes, arguments.seed)]
-        exact = sum(score.counted == score.num_fish for score in scores)
-        print(
-            f"| {kind} | {np.mean([s.idf1 for s in scores]):.3f} "
-            f"| {np.mean([s.hota for s in scores]):.3f} "
-            f"| {sum(s.num_fish for s in scores)} | {sum(s.found for s in scores)} "
-            f"| {sum(s.counted for s in scores)} | {sum(s.false for s in scores)} "
-            f"| {exact}/{len(scores)} |",
-            flush=True,
-        )
+        outcomes = [measure(s) for s in scenes(kind, arguments.scenes, arguments.seed)]
+        print(table_row(kind, outcomes), flush=True)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,8 @@ of one and of three channels), the joint histogram separates fish best; see
 docs/research/tracking.md.
 """
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
@@ -14,6 +16,34 @@ _SMOOTHING_BINS = 0.8  # so that a slight change of light moves no pixel to a bi
 _OFFSETS = np.arange(_BINS) - np.arange(_BINS)[:, None]
 _BLUR = np.exp(-0.5 * (_OFFSETS / _SMOOTHING_BINS) ** 2).astype(np.float32)
 _SIDE_PX = 64  # of a larger picture every n-th pixel is enough
+
+
+class Colours(NamedTuple):
+    """Root histograms of one view of a fish."""
+
+    silhouette: Float32[np.ndarray, "N"] | None  # None: only its box is known
+    middle: Float32[np.ndarray, "N"]  # of an ellipse in the middle of its box
+
+    def are_of_one_kind(self, other: "Colours") -> bool:
+        """True where both views have a silhouette, or neither has."""
+        return (self.silhouette is None) == (other.silhouette is None)
+
+
+def colours_of(
+    region: UInt8[np.ndarray, "h w 3"], silhouette: Bool[np.ndarray, "h w"] | None
+) -> Colours:
+    """Those of the BGR content of a box."""
+    return Colours(
+        silhouette=None if silhouette is None else root_histogram(region, silhouette),
+        middle=root_histogram(region, middle_of(*region.shape[:2])),
+    )
+
+
+def middle_of(height: int, width: int) -> Bool[np.ndarray, "h w"]:
+    """An ellipse in the middle of a box, in whose corners there is background."""
+    inside = np.zeros((height, width), np.uint8)
+    center, axes = (width // 2, height // 2), (width // 3, height // 3)
+    return cv2.ellipse(inside, center, axes, 0, 0, 360, 1, cv2.FILLED) > 0
 
 
 def root_histogram(
@@ -32,6 +62,11 @@ def root_histogram(
     return np.sqrt(counts / max(float(counts.sum()), 1e-6)).ravel()
 
 
-def dissimilarity(a: Float32[np.ndarray, "N"], b: Float32[np.ndarray, "N"]) -> float:
-    """1 less the Bhattacharyya coefficient: 0 for equal colours, 1 for none in common."""
-    return max(0.0, 1.0 - float(a @ b))
+def dissimilarity(a: Colours, b: Colours) -> float:
+    """1 less the Bhattacharyya coefficient: 0 for equal colours, 1 for none in common.
+
+    Like is compared with like: silhouettes where both have one, else the middles of the boxes.
+    """
+    if a.silhouette is not None and b.silhouette is not None:
+        return max(0.0, 1.0 - float(a.silhouette @ b.silhouette))
+    return max(0.0, 1.0 - float(a.middle @ b.middle))

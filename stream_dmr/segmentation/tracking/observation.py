@@ -6,7 +6,9 @@ from jaxtyping import Bool, Float, UInt8
 
 from stream_dmr.segmentation.detection.detector import Candidate, fraction_inside, whole_pixels
 from stream_dmr.segmentation.masks.crop_quality import touches_border
-from stream_dmr.segmentation.tracking.appearance import root_histogram
+from stream_dmr.segmentation.tracking.appearance import colours_of, middle_of
+
+_BOX_STD = 0.02  # of the edges of a box that a network draws, in its longer sides
 
 
 class Observation:
@@ -25,16 +27,15 @@ class Observation:
         self.center = (self.box[:2] + self.box[2:]) / 2
         x0, y0, x1, y1 = whole_pixels(self.box)
         silhouette = candidate.foreground
-        if silhouette is None:  # the corners of a box are background: an ellipse stands in
-            silhouette = np.zeros((y1 - y0, x1 - x0), np.uint8)
-            center, axes = ((x1 - x0) // 2, (y1 - y0) // 2), ((x1 - x0) // 3, (y1 - y0) // 3)
-            cv2.ellipse(silhouette, center, axes, 0, 0, 360, 1, cv2.FILLED)
+        if silhouette is None:
+            silhouette = middle_of(y1 - y0, x1 - x0)
         self.area = float(max(1, np.count_nonzero(silhouette)))
-        self.length = oriented_extent(silhouette > 0)[1]
+        self.length = oriented_extent(silhouette)[1]
         region = image[y0:y1, x0:x1]
-        inside = silhouette[: region.shape[0], : region.shape[1]].astype(np.uint8)
-        self.histogram = root_histogram(region, inside > 0)
-        edges = np.array([x0, y0, x1, y1], np.float64)
+        inside = silhouette[: region.shape[0], : region.shape[1]]
+        self.colours = colours_of(region, None if candidate.foreground is None else inside)
+        reach = _BOX_STD * max(x1 - x0, y1 - y0) if candidate.foreground is None else 0.0
+        edges = np.array([x0 - reach, y0 - reach, x1 + reach, y1 + reach])
         self.touches_border = touches_border(edges, shape=image.shape[:2])
 
     @property

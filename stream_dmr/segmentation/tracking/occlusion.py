@@ -10,10 +10,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
-from stream_dmr.segmentation.tracking.appearance import dissimilarity
+from stream_dmr.segmentation.tracking.appearance import Colours, dissimilarity
 from stream_dmr.segmentation.tracking.observation import Observation
 
 IMPOSSIBLE = 1e6  # cost of an assignment that is ruled out; above any sum of real costs
@@ -38,7 +38,7 @@ class TrackSnapshot:
     covariance: Float[np.ndarray, "4 4"]
     area: float  # px^2
     length: float  # px
-    histogram: Float32[np.ndarray, "N"]  # of colours, from `root_histogram`
+    colours: Colours
     is_covered: bool = False  # predicted inside a visible blob, which hides it
 
     def predict(self, F: Float[np.ndarray, "4 4"], Q: Float[np.ndarray, "4 4"]) -> None:
@@ -67,7 +67,7 @@ class TrackSnapshot:
         cost = offset @ offset / (_POSITION_STD * self.length) ** 2
         cost += (np.log(observation.length / self.length) / _LOG_LENGTH_STD) ** 2
         cost += (np.log(observation.area / self.area) / _LOG_AREA_STD) ** 2
-        cost += dissimilarity(observation.histogram, self.histogram) / _DISSIMILARITY
+        cost += dissimilarity(observation.colours, self.colours) / _DISSIMILARITY
         return float(cost) if cost < _MAX_COST else IMPOSSIBLE
 
     def is_inside(self, box: Float[np.ndarray, "4"]) -> bool:

@@ -22,7 +22,7 @@ _ACCELERATION_STD = 0.06  # per frame squared
 _LOG_AREA_STD = 0.5  # from frame to frame: flatfish turn edge-on within three
 _DISSIMILARITY = 0.003  # of colours, per frame, that costs as much as one standard deviation
 _MAX_DISSIMILAR_FRAMES = 10  # over which colours go on changing: fish turn, and are shaded
-_PART_RATIO = 3.0  # of the colours of a part of a fish, likewise
+_PART_RATIO = 3.0  # of the colours of a part, or of a box beside a silhouette, likewise
 _MAX_COST = 25.0  # of three squares (x, y, area), each about 1, and the colours
 _MAX_DISTANCE = 0.7  # sizes between the predicted and the observed center
 _MAX_FIRST_DISTANCE = 1.2  # the same where the fish was seen once, so that its speed is not known
@@ -53,7 +53,7 @@ class Track:
         self.observation, self.number, self.frame_index = observation, number, frame_index
         # As last seen separately: following pieces, position and size would drift.
         self._whole = observation
-        self.area, self.histogram = observation.area, observation.histogram
+        self.area, self.colours = observation.area, observation.colours
         self.length = observation.length
         self.was_separate = not observation.is_piece  # what is always a piece may be no fish
         self._evidence = FishEvidence(observation.candidate, self.size)
@@ -61,7 +61,7 @@ class Track:
         self.snapshot: TrackSnapshot | None = None  # None while the identity is certain
         self._history: deque[TrackSnapshot] = deque(maxlen=_SNAPSHOT_DELAY)
         self._separate_frames = 1
-        self._histogram_frame = frame_index  # in which `histogram` was seen
+        self._colours_frame = frame_index  # in which `colours` were seen
         self._filter = KalmanFilter(dim_x=4, dim_z=2)  # center x, y; speed per frame
         self._filter.x = np.array([*observation.center, 0.0, 0.0])[:, None]
         self._filter.H = np.eye(2, 4)
@@ -132,7 +132,7 @@ class Track:
         rate = max(_LEARNING_RATE, 1 / self.frames_seen)
         if not observation.touches_border or observation.area > self.area:  # else it is cut off
             self.area *= (observation.area / self.area) ** rate
-        self.histogram, self._histogram_frame = observation.histogram, self.frame_index
+        self.colours, self._colours_frame = observation.colours, self.frame_index
         if self.snapshot is None:
             self._history.append(self._current_snapshot())
 
@@ -142,7 +142,7 @@ class Track:
             covariance=self._filter.P.copy(),
             area=self.area,
             length=self.length,
-            histogram=self.histogram,
+            colours=self.colours,
         )
 
     def make_uncertain(self) -> TrackSnapshot:
@@ -162,7 +162,7 @@ class Track:
         if number != self.number:
             self.number, self.snapshot = number, snapshot
             self.area, self.length = snapshot.area, snapshot.length
-            self.histogram = snapshot.histogram
+            self.colours = snapshot.colours
 
     def resume(self, observation: Observation) -> None:
         """Continue from the snapshot with an observation after a gap."""
@@ -186,12 +186,13 @@ class Track:
         return float(cost) if cost < _MAX_COST else IMPOSSIBLE
 
     def _cost_of_colours(self, observation: Observation) -> float:
-        passed = max(1, self.frame_index - self._histogram_frame)
+        passed = max(1, self.frame_index - self._colours_frame)
         is_part = observation.is_piece or observation.touches_border
-        allowed = (
-            _DISSIMILARITY * min(passed, _MAX_DISSIMILAR_FRAMES) * (_PART_RATIO if is_part else 1.0)
+        is_alike = not is_part and self.colours.are_of_one_kind(observation.colours)
+        allowed = _DISSIMILARITY * min(passed, _MAX_DISSIMILAR_FRAMES)
+        return dissimilarity(observation.colours, self.colours) / (
+            allowed if is_alike else allowed * _PART_RATIO
         )
-        return dissimilarity(observation.histogram, self.histogram) / allowed
 
     def fraction_inside(self, box: Float[np.ndarray, "4"]) -> float:
         """The fraction of this fish's predicted box that lies inside `box`."""

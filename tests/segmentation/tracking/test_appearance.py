@@ -1,17 +1,23 @@
 """Histograms of colours: equal fish are alike, others are not, and pixels outside do not count."""
 
+import cv2
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.segmentation.tracking.appearance import dissimilarity, root_histogram
+from stream_dmr.segmentation.tracking.appearance import (
+    Colours,
+    colours_of,
+    dissimilarity,
+    root_histogram,
+)
 
 levels = st.tuples(*[st.integers(0, 255)] * 3)
 WHOLE = np.ones((20, 20), bool)
 
 
-def plain(colour: tuple[int, ...]) -> np.ndarray:
-    return root_histogram(np.full((20, 20, 3), colour, np.uint8), WHOLE)
+def plain(colour: tuple[int, ...], silhouette: np.ndarray | None = WHOLE) -> Colours:
+    return colours_of(np.full((20, 20, 3), colour, np.uint8), silhouette)
 
 
 @given(levels, levels)
@@ -33,9 +39,30 @@ def test_what_is_outside_the_silhouette_does_not_count():
     silhouette = np.zeros((40, 40), bool)
     silhouette[10:30, 5:35] = True
     region[silhouette] = (30, 60, 90)
-    assert dissimilarity(root_histogram(region, silhouette), plain((30, 60, 90))) < 1e-5
+    assert dissimilarity(colours_of(region, silhouette), plain((30, 60, 90))) < 1e-5
 
 
 def test_an_empty_silhouette_is_like_nothing():
-    empty = root_histogram(np.full((20, 20, 3), 90, np.uint8), ~WHOLE)
+    empty = plain((90, 90, 90), ~WHOLE)
     assert dissimilarity(empty, plain((90, 90, 90))) == 1
+
+
+def test_like_is_compared_with_like():
+    """A thin fish is little of its box: its silhouette's colours are not those of the box."""
+    region = np.full((40, 40, 3), 200, np.uint8)
+    thin = np.zeros((40, 40), bool)
+    thin[18:22] = True
+    region[thin] = (30, 60, 90)
+    outlined, boxed = colours_of(region, thin), colours_of(region, None)
+    assert dissimilarity(outlined, boxed) < 1e-5
+    assert dissimilarity(outlined, plain((30, 60, 90))) < 1e-5
+    assert dissimilarity(boxed, plain((30, 60, 90))) > 0.3
+    assert not outlined.are_of_one_kind(boxed)
+    assert boxed.are_of_one_kind(boxed)
+
+
+def test_of_a_box_alone_the_corners_do_not_count():
+    region = np.full((30, 60, 3), 20, np.uint8)
+    cv2.ellipse(region, (30, 15), (30, 15), 0, 0, 360, (90, 90, 90), cv2.FILLED)
+    alone = root_histogram(np.full((9, 9, 3), 90, np.uint8), np.ones((9, 9), bool))
+    np.testing.assert_allclose(colours_of(region, None).middle, alone, atol=1e-6)

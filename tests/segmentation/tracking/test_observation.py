@@ -1,5 +1,7 @@
 """What the tracker measures of a candidate."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.segmentation.detection.detector import Candidate, fraction_inside
-from stream_dmr.segmentation.tracking.appearance import dissimilarity, root_histogram
+from stream_dmr.segmentation.tracking.appearance import colours_of, dissimilarity
 from stream_dmr.segmentation.tracking.observation import (
     Observation,
     oriented_extent,
@@ -33,19 +35,21 @@ def test_area_length_and_colour_are_those_of_the_silhouette():
     observation = Observation(image, candidate)
     assert observation.area == mask.sum() == pytest.approx(np.pi * 60 * 15, rel=0.05)
     assert observation.length == pytest.approx(120, abs=2)
-    alone = root_histogram(np.full((9, 9, 3), (50, 100, 150), np.uint8), np.ones((9, 9), bool))
-    assert dissimilarity(observation.histogram, alone) == pytest.approx(0, abs=1e-6)
+    alone = colours_of(np.full((9, 9, 3), (50, 100, 150), np.uint8), np.ones((9, 9), bool))
+    assert dissimilarity(observation.colours, alone) == pytest.approx(0, abs=1e-6)
     np.testing.assert_allclose(observation.center, [150, 100], atol=1)
     assert not observation.touches_border
     assert not observation.is_piece
 
 
-def test_of_a_box_alone_the_corners_do_not_count():
-    image = np.full((100, 100, 3), 20, np.uint8)
-    cv2.ellipse(image, (50, 50), (30, 15), 0, 0, 360, (90, 90, 90), cv2.FILLED)
-    box = Candidate(bbox_xyxy_px=np.array([20.0, 35, 80, 65]), score=1.0)
-    alone = root_histogram(np.full((9, 9, 3), 90, np.uint8), np.ones((9, 9), bool))
-    assert dissimilarity(Observation(image, box).histogram, alone) == pytest.approx(0, abs=1e-6)
+@pytest.mark.parametrize(("right", "is_cut"), [(98.0, True), (90.0, False)])
+def test_a_box_that_nearly_reaches_the_edge_reaches_it(right: float, is_cut: bool):
+    """A network draws its boxes to 2 % or so; a silhouette is what it is."""
+    image, box = np.zeros((100, 100, 3), np.uint8), np.array([20.0, 20, right, 80])
+    seen = Candidate(bbox_xyxy_px=box, score=1.0)
+    assert Observation(image, seen).touches_border == is_cut
+    outlined = replace(seen, foreground=np.ones((60, round(right) - 20), bool))
+    assert not Observation(image, outlined).touches_border
 
 
 def test_a_piece_knows_the_box_of_the_whole():

@@ -30,7 +30,7 @@ def snapshot_of(
         covariance=np.eye(4),
         area=observation.area,
         length=observation.length,
-        histogram=observation.histogram,
+        colours=observation.colours,
     )
 
 
