@@ -19,6 +19,7 @@ from stream_dmr.errors import OutputError
 
 MAX_TEXT_BYTES = 1_000_000  # chosen: many times what any settings or calibration take
 MAX_PIXELS = 150_000_000  # chosen: the largest cameras have some 100 megapixels
+PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
 
 class TransactionalFile:

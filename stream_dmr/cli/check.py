@@ -116,8 +116,8 @@ def _pictures(source: str) -> Iterator["np.ndarray"]:
     import cv2
 
     from stream_dmr.calibration.corners import read_grey
+    from stream_dmr.files import PICTURE_SUFFIXES
     from stream_dmr.sources.open_source import open_source
-    from stream_dmr.sources.picture_folder import PICTURE_SUFFIXES
     from stream_dmr.sources.read_settings import ReadFramesSettings
 
     if Path(source).suffix.lower() in PICTURE_SUFFIXES:

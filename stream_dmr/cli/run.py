@@ -44,7 +44,7 @@ def run(
     ] = None,
     masks: Annotated[
         Path | None,
-        typer.Option(help="Folder of %06d.png from 1; a pixel's value is the fish's id."),
+        typer.Option(help="Folder of PNGs of ids: 000001.png ..., or named like the pictures."),
     ] = None,
     template: TemplateOption = "auto",
     config: ConfigOption = None,

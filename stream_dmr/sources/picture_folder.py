@@ -9,13 +9,14 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from stream_dmr.errors import SourceError
-from stream_dmr.files import MAX_PIXELS, natural_order, size_if_huge
+from stream_dmr.files import MAX_PIXELS, PICTURE_SUFFIXES, natural_order, size_if_huge
 from stream_dmr.messages import Frame
 from stream_dmr.sources.source import Source, check_size, nominal_ns
 
-PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 OtherSizes = Literal["refuse", "leave_out", "take"]
 _DEPTHS = {"uint8", "uint16"}
+# What telephones and cameras write and OpenCV does not read.
+_UNREADABLE = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2"}
 
 
 class PictureFolder(Source):
@@ -30,13 +31,13 @@ class PictureFolder(Source):
 
         Raises SourceError where no picture can be decoded.
         """
-        self._paths = _pictures_in(folder)
+        self._paths, unreadable = _pictures_in(folder)
         self._is_closed = False
         self._other_sizes = other_sizes
         self.name = folder.resolve().name
         self.num_frames = len(self._paths)
         self.fps = fps
-        self.warnings: list[str] = []
+        self.warnings = [] if not unreadable else [_not_read(unreadable)]
         first = next((p for p in map(_read_picture, self._paths) if p is not None), None)
         if first is None:
             raise SourceError(
@@ -74,7 +75,8 @@ class PictureFolder(Source):
         self._is_closed = True
 
 
-def _pictures_in(folder: Path) -> list[Path]:
+def _pictures_in(folder: Path) -> tuple[list[Path], list[str]]:
+    """Those that can be read, in natural order, and the names of others. SourceError for none."""
     try:
         files = [p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")]
     except OSError as error:
@@ -82,12 +84,16 @@ def _pictures_in(folder: Path) -> list[Path]:
             f"{folder}: expected a folder of pictures, but it can't be read: {error.strerror}"
         ) from None
     pictures = [p for p in files if p.suffix.lower() in PICTURE_SUFFIXES]
+    unreadable = sorted(p.name for p in files if p.suffix.lower() in _UNREADABLE)
     if pictures:
-        return sorted(pictures, key=natural_order)
+        return sorted(pictures, key=natural_order), unreadable
     suffixes = ", ".join(sorted(PICTURE_SUFFIXES))
-    raise SourceError(
-        f"{folder}: expected a folder of pictures ({suffixes}) or of videos, found none"
-    )
+    found = _not_read(unreadable) if unreadable else "found none"
+    raise SourceError(f"{folder}: expected a folder of pictures ({suffixes}) or of videos, {found}")
+
+
+def _not_read(names: list[str]) -> str:
+    return f"{len(names)} pictures such as {names[0]} can't be read; save them as JPEG or PNG"
 
 
 def _read_picture(path: Path) -> np.ndarray | None:

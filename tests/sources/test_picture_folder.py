@@ -36,6 +36,19 @@ def test_pictures_in_natural_order(tmp_path):
         np.testing.assert_array_equal(frame.image, noise(number))
 
 
+def test_pictures_that_nobody_here_can_read_are_said(tmp_path):
+    for name in ("IMG_1.HEIC", "IMG_3.dng"):
+        (tmp_path / name).touch()
+    with pytest.raises(SourceError, match=r"2 pictures such as IMG_1\.HEIC can't be read; save"):
+        PictureFolder(tmp_path, fps=25.0)
+    cv2.imwrite(str(tmp_path / "IMG_2.webp"), noise(2))
+    opened, frames = read(tmp_path)
+    assert [frame.source for frame in frames] == ["IMG_2.webp"]
+    assert opened.warnings == [
+        "2 pictures such as IMG_1.HEIC can't be read; save them as JPEG or PNG"
+    ]
+
+
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".JPG"])
 def test_grey_pictures_become_three_equal_channels(tmp_path, suffix):
     grey = noise(1, channels=1, size=(33, 21)) // 8 + 100

@@ -8,8 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from stream_dmr.errors import SourceError
-from stream_dmr.files import sha256_of, sha256_of_files
-from stream_dmr.sources.picture_folder import PICTURE_SUFFIXES
+from stream_dmr.files import PICTURE_SUFFIXES, sha256_of, sha256_of_files
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

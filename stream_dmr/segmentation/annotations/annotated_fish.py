@@ -111,7 +111,9 @@ class AnnotatedFish:
         if self._masks is None:
             return None
         height, width = frame.image.shape[:2]
-        labels = self._masks.labels(frame.frame_index, width=width, height=height)
+        labels = self._masks.labels(
+            frame.frame_index, width=width, height=height, picture=frame.source
+        )
         if labels is not None:
             self._masked_ids.update(labels.present)
         elif is_expected:  # a frame without boxes needs no mask

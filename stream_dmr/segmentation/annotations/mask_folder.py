@@ -14,6 +14,7 @@ from jaxtyping import Bool, Integer
 from PIL import Image
 
 from stream_dmr.errors import AnnotationError
+from stream_dmr.files import PICTURE_SUFFIXES
 
 _FILE_NAME = re.compile(r"\d{6,}\.png")
 # What Pillow raises for a PNG that it cannot decode.
@@ -49,10 +50,12 @@ class Labels:
 
 
 class MaskFolder:
-    """A folder of label pictures `000001.png` ...: a pixel's value is a fish's id, 0 is background.
+    """A folder of label pictures: a pixel's value is a fish's id, 0 is background.
 
-    The largest value of the type, 255 or 65535, is "unknown": what a gaff, a line or another fish
-    hides. Pictures are read on demand. Palette pictures give their indices, not their colours.
+    They are named `000001.png` ... by frame, or like the pictures of a folder whose masks they are:
+    `IMG_7.png` for `IMG_7.jpg`. The largest value of the type, 255 or 65535, is "unknown": what a
+    gaff, a line or another fish hides. Pictures are read on demand. Palette pictures give their
+    indices, not their colours.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -60,10 +63,10 @@ class MaskFolder:
         if not folder.is_dir():
             raise AnnotationError(f"{folder}: expected a folder of masks, found none there")
         names = sorted(entry.name for entry in folder.iterdir() if entry.suffix == ".png")
-        if not any(_FILE_NAME.fullmatch(name) for name in names):
-            found = f"{names[0]} and the like" if names else "no PNG"
+        if not names:
             raise AnnotationError(
-                f"{folder}: expected masks named 000001.png, 000002.png ..., found {found}"
+                f"{folder}: expected masks 000001.png, 000002.png ..., or named like the pictures "
+                "of --source, found no PNG"
             )
         if "000000.png" in names:
             raise AnnotationError(
@@ -72,20 +75,23 @@ class MaskFolder:
             )
         self.folder = folder
         self._names = names
+        self._is_numbered = any(_FILE_NAME.fullmatch(name) for name in names)
         self._has_ids = False
 
-    def labels(self, frame_index: int, *, width: int, height: int) -> Labels | None:
-        """The labels of a frame of that size in px; None where the folder has no such picture.
+    def labels(
+        self, frame_index: int, *, width: int, height: int, picture: str = ""
+    ) -> Labels | None:
+        """The labels of a frame of that size in px; None where the folder has none for it.
 
-        Raises AnnotationError for a picture in colour, of another size, or unreadable, and where no
-        picture of the folder has an id.
+        `picture`: the frame's file name, where it is one of a folder. Raises AnnotationError for a
+        label picture in colour, of another size, or unreadable, and where none of them has an id.
         """
-        path = self.folder / f"{frame_index:06d}.png"
+        path = self._path(frame_index, picture)
         try:
-            with Image.open(path) as picture:
-                _check_labels(picture, path, size=(width, height))
+            with Image.open(path) as file:
+                _check_labels(file, path, size=(width, height))
                 # A 1-bit picture is decoded as bool, every other mode as unsigned integers.
-                labels = np.asarray(picture)
+                labels = np.asarray(file)
         except FileNotFoundError:
             return None
         except _DECODING_ERRORS:
@@ -102,9 +108,21 @@ class MaskFolder:
         self._has_ids = True
         return Labels(ids, is_unknown)
 
+    def _path(self, frame_index: int, picture: str) -> Path:
+        if self._is_numbered:
+            return self.folder / f"{frame_index:06d}.png"
+        if Path(picture).suffix.lower() in PICTURE_SUFFIXES:
+            return self.folder / f"{Path(picture).stem}.png"
+        raise AnnotationError(
+            f"{self.folder}: expected masks named 000001.png, 000002.png ..., one a frame, found "
+            f"{self._names[0]} and the like"
+        )
+
     def _check_ids(self, largest: int) -> None:
         """A fish drawn as 255 on 0 is one that nobody would measure. Raises AnnotationError."""
-        names = [name for name in self._names if _FILE_NAME.fullmatch(name)]
+        names = self._names
+        if self._is_numbered:
+            names = [name for name in names if _FILE_NAME.fullmatch(name)]
         for name in names[:: max(1, len(names) // _MAX_LOOKED_AT)]:
             with Image.open(self.folder / name) as picture:
                 values = np.unique(np.asarray(picture))

@@ -70,7 +70,9 @@ class NamedPictures:
         height, width = frame.image.shape[:2]
         mask = unknown = None
         if self._masks is not None:
-            labels = self._masks.labels(frame.frame_index, width=width, height=height)
+            labels = self._masks.labels(
+                frame.frame_index, width=width, height=height, picture=frame.source
+            )
             mask = np.zeros((height, width), bool) if labels is None else labels.ids > 0
             unknown = None if labels is None else labels.unknown
         return [

@@ -11,9 +11,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from stream_dmr.errors import AnnotationError
-from stream_dmr.files import MAX_PIXELS, size_if_huge
-
-_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
+from stream_dmr.files import MAX_PIXELS, PICTURE_SUFFIXES, size_if_huge
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -44,11 +42,11 @@ def list_images(folder: Path) -> dict[str, Path]:
     """The images of a folder by name, in its order. Raises AnnotationError where it has none."""
     if not folder.is_dir():
         raise AnnotationError(f"{folder}: expected a folder of images, found none there")
-    paths = {
-        path.name: path for path in sorted(folder.iterdir()) if path.suffix.lower() in _SUFFIXES
-    }
+    files = sorted(folder.iterdir())
+    paths = {path.name: path for path in files if path.suffix.lower() in PICTURE_SUFFIXES}
     if not paths:
-        raise AnnotationError(f"{folder}: expected images (.png, .jpg, .tif, .bmp), found none")
+        suffixes = ", ".join(sorted(PICTURE_SUFFIXES))
+        raise AnnotationError(f"{folder}: expected images ({suffixes}), found none")
     return paths
 
 

@@ -57,6 +57,25 @@ def test_the_largest_value_is_no_fish_but_unknown(tmp_path, dtype):
     np.testing.assert_array_equal(found.unknown, labels > 1)
 
 
+def test_masks_may_be_named_like_their_pictures(tmp_path):
+    labels = labels_of(id1=(0, 0, 2, 2))
+    cv2.imwrite(str(tmp_path / "IMG_7.png"), labels)
+    masks = MaskFolder(tmp_path)
+    found = masks.labels(1, **LABELS_SIZE, picture="IMG_7.JPG")
+    np.testing.assert_array_equal(found.ids, labels)
+    assert masks.labels(7, **LABELS_SIZE, picture="IMG_8.JPG") is None
+    with pytest.raises(AnnotationError, match=r"one a frame, found IMG_7\.png"):
+        masks.labels(1, **LABELS_SIZE, picture="haul.mp4")
+
+
+def test_numbered_masks_go_by_frame_whatever_pictures_are_called(tmp_path):
+    first, second = labels_of(id1=(0, 0, 2, 2)), labels_of(id3=(4, 1, 7, 5))
+    cv2.imwrite(str(tmp_path / "000001.png"), first)
+    cv2.imwrite(str(tmp_path / "000002.png"), second)
+    found = MaskFolder(tmp_path).labels(1, **LABELS_SIZE, picture="000002.jpg")
+    np.testing.assert_array_equal(found.ids, first)
+
+
 def test_masks_that_show_fish_as_unknown_are_refused(tmp_path):
     """A mask of one fish is often written as 255 on 0."""
     labels = labels_of(id1=(0, 0, 4, 3)) * np.uint8(255)
@@ -89,9 +108,6 @@ def test_folders_without_masks_are_refused(tmp_path):
     with pytest.raises(AnnotationError, match="found none there"):
         MaskFolder(tmp_path / "missing")
     with pytest.raises(AnnotationError, match="found no PNG"):
-        MaskFolder(tmp_path)
-    (tmp_path / "00001.png").touch()
-    with pytest.raises(AnnotationError, match=r"found 00001\.png"):
         MaskFolder(tmp_path)
     (tmp_path / "000000.png").touch()
     with pytest.raises(AnnotationError, match=r"counted from 000001\.png"):
