@@ -22,7 +22,7 @@ from stream_dmr.segmentation.training.patch_bank import PatchBank
 
 SIDE_PX = 352  # of a training frame: between the sides of a detector's input
 _KEPT_PX = 640  # longer side of the photographs that are kept in memory
-_FRAME_SHARE, _SINGLE_SHARE = 0.55, 0.1  # of the examples; the others are put together
+_FRAME_SHARE, _SINGLE_SHARE = 0.45, 0.1  # of the examples; the others are put together
 _MOSAIC_SHARE, _MORE_FISH_SHARE = 0.25, 0.25  # of the examples from frames
 _TURNED_SHARE, _WATER_SHARE = 0.2, 0.3  # of all examples
 _SIZES_PX = (18.0, 560.0)  # of fish put before a background
@@ -128,19 +128,18 @@ def _zoomed(
     """A part of a photograph, or all of it and what is around it in grey."""
     height, width = frame.image.shape[:2]
     whole = side / max(height, width)
-    scale = whole * float(np.exp(rng.uniform(np.log(0.6), np.log(3.0))))
-    room = np.array([side - scale * width, side - scale * height])
-    shift = np.minimum(room, 0) + rng.random(2) * np.abs(room)
-    stretch = np.exp(rng.normal(0.0, 0.08, 2))
-    affine = np.column_stack([np.diag(scale * stretch), shift])
+    zoom = whole * np.exp(rng.uniform(np.log(0.6), np.log(3.0)))
+    scale = zoom * np.exp(rng.normal(0.0, 0.08, 2))
+    size = np.maximum(1, np.round(scale * [width, height])).astype(int)
+    usual = cv2.INTER_AREA if zoom < 1 else cv2.INTER_LINEAR
+    resized = cv2.resize(frame.image, tuple(size.tolist()), interpolation=usual)
+    room = side - size
+    shift = np.round(np.minimum(room, 0) + rng.random(2) * np.abs(room))
+    affine = np.column_stack([np.eye(2), shift])
     picture = cv2.warpAffine(
-        frame.image,
-        affine,
-        (side, side),
-        flags=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR,
-        borderValue=(_GREY,) * 3,
+        resized, affine, (side, side), flags=cv2.INTER_NEAREST, borderValue=(_GREY,) * 3
     )
-    moved = frame.boxes * np.tile(scale * stretch, 2) + np.tile(shift, 2)
+    moved = frame.boxes * np.tile(size / [width, height], 2) + np.tile(shift, 2)
     inside = moved.clip(0, side)
     visible = _areas(inside) / np.maximum(_areas(moved), 1e-6)
     return picture.astype(np.float32), inside[(visible > _MIN_VISIBLE) & _are_large(inside)]
