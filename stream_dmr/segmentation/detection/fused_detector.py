@@ -1,9 +1,9 @@
 """Fish by their motion and by their looks.
 
 Motion finds what a network has never seen, with an outline, and also plants that sway; it misses
-what hangs still, and of a fish that fills the picture it sees parts. Looks find fish that don't
-move, and also marks that look like fish. What either finds is followed; what counts is said by
-`tracking.fish_evidence`.
+what hangs still, of a fish that fills the picture it sees parts, and of one behind a gaff two
+pieces. Looks find fish that don't move, and also marks that look like fish. What either finds is
+followed; what counts is said by `tracking.fish_evidence`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,10 +14,20 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.messages import Frame
-from stream_dmr.segmentation.detection.detector import Candidate, Detector, box_iou
+from stream_dmr.segmentation.detection.detector import (
+    Candidate,
+    Detector,
+    box_iou,
+    fraction_inside,
+    whole_pixels,
+)
 from stream_dmr.segmentation.detection.motion_detector import MotionDetector
 
 _MIN_IOU = 0.3  # of what moves with the box that says how much it looks like a fish
+# A box that has so much surely shows one whole fish, one with so much shows something of its own.
+_SURE, _SEEN = 0.6, 0.3
+_MIN_INSIDE = 0.8  # of a piece of a fish, inside the fish's box
+_MIN_WHOLE_IOU = 0.5  # of all pieces together with that box
 # The part of the frame around a closer look: in sizes of what is looked at, and at least in px.
 _SURROUNDINGS, _MIN_SURROUNDINGS_PX = 4.0, 208
 
@@ -65,12 +75,48 @@ class FusedDetector:
 
 def fuse(moving: Sequence[Candidate], seen: Sequence[Candidate]) -> list[Candidate]:
     """What moves, whose outline is known, and what is seen where nothing moves."""
+    moving = _without_pieces(moving, seen)
     still = [
         fish
         for fish in seen
         if not any(_show_the_same(fish.bbox_xyxy_px, one.bbox_xyxy_px) for one in moving)
     ]
     return [*moving, *still]
+
+
+def _without_pieces(moving: Sequence[Candidate], seen: Sequence[Candidate]) -> list[Candidate]:
+    """What moves, with those that lie in one box of one fish joined to one."""
+    found = list(moving)
+    for fish in sorted(seen, key=lambda one: -one.score):
+        if fish.score < _SURE:
+            break
+        others = [one for one in seen if one is not fish and one.score >= _SEEN]
+        pieces = [one for one in found if _is_piece(one, fish, others)]
+        if len(pieces) > 1:
+            whole = _join(pieces)
+            if box_iou(whole.bbox_xyxy_px, fish.bbox_xyxy_px) >= _MIN_WHOLE_IOU:
+                found = [*(one for one in found if one not in pieces), whole]
+    return found
+
+
+def _is_piece(one: Candidate, fish: Candidate, others: Sequence[Candidate]) -> bool:
+    """True for what lies in a fish's box and doesn't rather look like another fish."""
+    box, whole = one.bbox_xyxy_px, fish.bbox_xyxy_px
+    alike = max(_MIN_IOU, box_iou(box, whole))
+    is_inside = one.foreground is not None and fraction_inside(box, whole) >= _MIN_INSIDE
+    return is_inside and not any(box_iou(box, other.bbox_xyxy_px) > alike for other in others)
+
+
+def _join(pieces: Sequence[Candidate]) -> Candidate:
+    """One candidate with the silhouettes of all pieces."""
+    corners = np.array([whole_pixels(one.bbox_xyxy_px) for one in pieces])
+    left, top = corners[:, :2].min(axis=0)
+    right, bottom = corners[:, 2:].max(axis=0)
+    foreground = np.zeros((bottom - top, right - left), bool)
+    for one, (x0, y0, x1, y1) in zip(pieces, corners, strict=True):
+        foreground[y0 - top : y1 - top, x0 - left : x1 - left] |= one.foreground
+    box = np.array([left, top, right, bottom], np.float64)
+    return replace(pieces[0], bbox_xyxy_px=box, foreground=foreground)
 
 
 def _looks(bbox_xyxy_px: Float[np.ndarray, "4"], seen: Sequence[Candidate]) -> float:

@@ -15,6 +15,8 @@ _BINS = 12  # of each channel of L*a*b*
 _SMOOTHING_BINS = 0.8  # so that a slight change of light moves no pixel to a bin that counts as new
 _OFFSETS = np.arange(_BINS) - np.arange(_BINS)[:, None]
 _BLUR = np.exp(-0.5 * (_OFFSETS / _SMOOTHING_BINS) ** 2).astype(np.float32)
+_MIN_ROOT_SHARE = 0.045  # of a bin that is a colour of the fish: 0.2 % of its pixels
+_MIN_VISIBLE = 0.5  # of a silhouette that something covers
 _SIDE_PX = 64  # of a larger picture every n-th pixel is enough
 
 
@@ -23,10 +25,6 @@ class Colours(NamedTuple):
 
     silhouette: Float32[np.ndarray, "N"] | None  # None: only its box is known
     middle: Float32[np.ndarray, "N"]  # of an ellipse in the middle of its box
-
-    def are_of_one_kind(self, other: "Colours") -> bool:
-        """True where both views have a silhouette, or neither has."""
-        return (self.silhouette is None) == (other.silhouette is None)
 
 
 def colours_of(
@@ -62,11 +60,35 @@ def root_histogram(
     return np.sqrt(counts / max(float(counts.sum()), 1e-6)).ravel()
 
 
-def dissimilarity(a: Colours, b: Colours) -> float:
+def dissimilarity(a: Colours, b: Colours, *, is_cut_off: bool = False) -> float:
     """1 less the Bhattacharyya coefficient: 0 for equal colours, 1 for none in common.
 
-    Like is compared with like: silhouettes where both have one, else the middles of the boxes.
+    A silhouette beside a mere box differs from it by what is behind the fish. In the open that is
+    as it should be: where motion has lost a fish, the next box is mostly another's. A fish that is
+    `is_cut_off` by the picture's edge is lost by motion first, so there middles are compared.
     """
-    if a.silhouette is not None and b.silhouette is not None:
-        return max(0.0, 1.0 - float(a.silhouette @ b.silhouette))
-    return max(0.0, 1.0 - float(a.middle @ b.middle))
+    first, second = (view.middle if view.silhouette is None else view.silhouette for view in (a, b))
+    if is_cut_off and (a.silhouette is None or b.silhouette is None):
+        first, second = a.middle, b.middle
+    return max(0.0, 1.0 - float(first @ second))
+
+
+def dissimilarity_if_covered(a: Colours, b: Colours) -> float:
+    """The same where a gaff or a line covers part of one silhouette: what only one has is left out.
+
+    1 where that is more than half of it, or a view has no silhouette.
+    """
+    if a.silhouette is None or b.silhouette is None:
+        return 1.0
+    return min(
+        _without_cover(a.silhouette, b.silhouette), _without_cover(b.silhouette, a.silhouette)
+    )
+
+
+def _without_cover(bare: Float32[np.ndarray, "N"], covered: Float32[np.ndarray, "N"]) -> float:
+    """The dissimilarity where the second has colours that the fish, in the first, has not."""
+    own = bare > _MIN_ROOT_SHARE
+    fish, seen = bare[own], covered[own]
+    if seen @ seen < _MIN_VISIBLE:
+        return 1.0
+    return max(0.0, 1.0 - float(fish @ seen / np.sqrt((fish @ fish) * (seen @ seen))))

@@ -8,7 +8,7 @@ from stream_dmr.segmentation.detection.detector import Candidate, fraction_insid
 from stream_dmr.segmentation.masks.crop_quality import touches_border
 from stream_dmr.segmentation.tracking.appearance import colours_of, middle_of
 
-_BOX_STD = 0.02  # of the edges of a box that a network draws, in its longer sides
+_BOX_STD = 0.08  # of the edges of a box that a network draws, in its longer sides
 
 
 class Observation:

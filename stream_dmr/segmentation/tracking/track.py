@@ -8,7 +8,7 @@ from filterpy.kalman import KalmanFilter
 from jaxtyping import Float
 
 from stream_dmr.segmentation.detection.detector import Candidate, fraction_inside
-from stream_dmr.segmentation.tracking.appearance import dissimilarity
+from stream_dmr.segmentation.tracking.appearance import dissimilarity, dissimilarity_if_covered
 from stream_dmr.segmentation.tracking.fish_evidence import FishEvidence
 from stream_dmr.segmentation.tracking.observation import Observation
 from stream_dmr.segmentation.tracking.occlusion import IMPOSSIBLE, TrackSnapshot
@@ -22,7 +22,8 @@ _ACCELERATION_STD = 0.06  # per frame squared
 _LOG_AREA_STD = 0.5  # from frame to frame: flatfish turn edge-on within three
 _DISSIMILARITY = 0.003  # of colours, per frame, that costs as much as one standard deviation
 _MAX_DISSIMILAR_FRAMES = 10  # over which colours go on changing: fish turn, and are shaded
-_PART_RATIO = 3.0  # of the colours of a part, or of a box beside a silhouette, likewise
+_PART_RATIO = 3.0  # of the colours of a part of a fish, likewise
+_COVERED_COST = 4.0  # of supposing that something covers part of the fish
 _MAX_COST = 25.0  # of three squares (x, y, area), each about 1, and the colours
 _MAX_DISTANCE = 0.7  # sizes between the predicted and the observed center
 _MAX_FIRST_DISTANCE = 1.2  # the same where the fish was seen once, so that its speed is not known
@@ -187,12 +188,13 @@ class Track:
 
     def _cost_of_colours(self, observation: Observation) -> float:
         passed = max(1, self.frame_index - self._colours_frame)
-        is_part = observation.is_piece or observation.touches_border
-        is_alike = not is_part and self.colours.are_of_one_kind(observation.colours)
+        is_cut_off = observation.touches_border
         allowed = _DISSIMILARITY * min(passed, _MAX_DISSIMILAR_FRAMES)
-        return dissimilarity(observation.colours, self.colours) / (
-            allowed if is_alike else allowed * _PART_RATIO
-        )
+        if observation.is_piece or is_cut_off:
+            allowed *= _PART_RATIO
+        views = self.colours, observation.colours
+        covered = _COVERED_COST + dissimilarity_if_covered(*views) / allowed
+        return min(dissimilarity(*views, is_cut_off=is_cut_off) / allowed, covered)
 
     def fraction_inside(self, box: Float[np.ndarray, "4"]) -> float:
         """The fraction of this fish's predicted box that lies inside `box`."""

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -110,3 +111,34 @@ def test_nothing_is_invented_and_nothing_seen_is_lost(moving, seen):
         inside = (fraction_inside(fish.bbox_xyxy_px, one.bbox_xyxy_px) for one in found)
         assert max(inside, default=0.0) > 0.29
     assert fuse(moves, []) == moves
+
+
+def outlined(x0: int, y0: int, x1: int, y1: int) -> Candidate:
+    return replace(at(x0, y0, x1, y1), foreground=np.ones((y1 - y0, x1 - x0), bool))
+
+
+UPPER, LOWER = outlined(100, 100, 160, 180), outlined(90, 190, 170, 300)
+
+
+def test_pieces_in_the_box_of_one_fish_are_that_fish():
+    elsewhere = outlined(400, 100, 450, 150)
+    kept, whole = fuse([UPPER, elsewhere, LOWER], [at(85, 95, 175, 305)])
+    assert kept is elsewhere
+    np.testing.assert_array_equal(whole.bbox_xyxy_px, [90, 100, 170, 300])
+    rows, columns = np.nonzero(whole.foreground)
+    assert len(rows) == 60 * 80 + 80 * 110
+    assert not whole.foreground[80:90].any()
+    assert set(columns[rows < 80]) == set(range(10, 70))
+
+
+@pytest.mark.parametrize(
+    "seen",
+    [
+        [],
+        [replace(at(85, 95, 175, 305), score=0.5)],  # perhaps a fish
+        [at(0, 0, 400, 600)],  # much larger than both
+        [at(85, 95, 175, 305), at(90, 190, 170, 300)],  # one is a fish of its own
+    ],
+)
+def test_pieces_stay_apart_where_no_box_says_that_they_are_one_fish(seen):
+    assert fuse([UPPER, LOWER], seen)[:2] == [UPPER, LOWER]

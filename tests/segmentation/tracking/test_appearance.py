@@ -9,6 +9,7 @@ from stream_dmr.segmentation.tracking.appearance import (
     Colours,
     colours_of,
     dissimilarity,
+    dissimilarity_if_covered,
     root_histogram,
 )
 
@@ -47,18 +48,41 @@ def test_an_empty_silhouette_is_like_nothing():
     assert dissimilarity(empty, plain((90, 90, 90))) == 1
 
 
-def test_like_is_compared_with_like():
+def test_at_the_edge_like_is_compared_with_like():
     """A thin fish is little of its box: its silhouette's colours are not those of the box."""
     region = np.full((40, 40, 3), 200, np.uint8)
     thin = np.zeros((40, 40), bool)
     thin[18:22] = True
     region[thin] = (30, 60, 90)
     outlined, boxed = colours_of(region, thin), colours_of(region, None)
-    assert dissimilarity(outlined, boxed) < 1e-5
-    assert dissimilarity(outlined, plain((30, 60, 90))) < 1e-5
-    assert dissimilarity(boxed, plain((30, 60, 90))) > 0.3
-    assert not outlined.are_of_one_kind(boxed)
-    assert boxed.are_of_one_kind(boxed)
+    assert dissimilarity(outlined, boxed) > 0.3
+    assert dissimilarity(outlined, boxed, is_cut_off=True) < 1e-5
+    for is_cut_off in (False, True):
+        alone = plain((30, 60, 90))
+        assert dissimilarity(outlined, alone, is_cut_off=is_cut_off) < 1e-5
+
+
+def striped(fish: tuple[int, ...], gaff: tuple[int, ...], rows: int) -> Colours:
+    """A silhouette of 20 rows, so many of which show a gaff before the fish."""
+    region = np.full((20, 20, 3), fish, np.uint8)
+    region[:rows] = gaff
+    return colours_of(region, WHOLE)
+
+
+@given(st.integers(1, 9))
+def test_what_covers_less_than_half_of_a_fish_is_left_out(rows: int):
+    bare, covered = plain((30, 60, 90)), striped((30, 60, 90), (40, 200, 240), rows)
+    for views in ((bare, covered), (covered, bare)):  # it comes, or it goes
+        assert dissimilarity_if_covered(*views) < 1e-3
+    assert dissimilarity(bare, covered) > 0.01 * rows
+
+
+def test_another_fish_is_no_covered_one():
+    seen = plain((30, 60, 90))
+    assert dissimilarity_if_covered(seen, plain((200, 60, 30))) == 1
+    assert dissimilarity_if_covered(seen, striped((30, 60, 90), (200, 60, 30), 12)) > 0.3
+    assert dissimilarity_if_covered(plain((200, 60, 30)), striped((30, 60, 90), (0, 0, 0), 5)) == 1
+    assert dissimilarity_if_covered(seen, plain((30, 60, 90), None)) == 1
 
 
 def test_of_a_box_alone_the_corners_do_not_count():
