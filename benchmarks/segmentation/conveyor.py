@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from benchmarks.segmentation.tracking import HEADER, Shot, follow, table_row
+from benchmarks.segmentation.mask_proposer import box_of
+from benchmarks.segmentation.tracking import HEADER, MIN_VISIBLE_FRACTION, Shot, follow, table_row
 from stream_dmr.segmentation.training.annotated_images import (
     list_images,
     read_annotated_images,
@@ -29,7 +30,6 @@ _WIDTH, _HEIGHT = 1280, 720
 _BELT = slice(150, 570)  # rows
 _LENGTHS_PX, _GAPS_PX = (220.0, 380.0), (350.0, 800.0)
 _SEAMS_PX = 160
-_MIN_VISIBLE_FRACTION = 0.3
 
 Image = UInt8[np.ndarray, "H W 3"]
 
@@ -101,11 +101,9 @@ def _box(fish: Fish, left: int) -> np.ndarray | None:
     start = fish.left - left
     mask = fish.picture[:, max(0, -start) : max(0, _WIDTH - start), 3] > 127
     visible = np.count_nonzero(mask)
-    if visible < max(1.0, _MIN_VISIBLE_FRACTION * np.count_nonzero(fish.picture[..., 3] > 127)):
+    if visible < max(1.0, MIN_VISIBLE_FRACTION * np.count_nonzero(fish.picture[..., 3] > 127)):
         return None
-    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    x, y = x + max(0, start), y + fish.top + _BELT.start
-    return np.array([x, y, x + width, y + height], np.float64)
+    return box_of(mask) + np.tile([max(0, start), fish.top + _BELT.start], 2)
 
 
 def read_cutouts(data: Path) -> list[UInt8[np.ndarray, "h w 4"]]:
@@ -114,9 +112,9 @@ def read_cutouts(data: Path) -> list[UInt8[np.ndarray, "h w 4"]]:
     for annotated in read_annotated_images(data / "images", data / "masks"):
         if annotated.path.stem.startswith(_OUT_OF_WATER):
             for mask in annotated.masks:
-                x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+                left, top, right, bottom = box_of(mask).astype(int)
                 layers = np.dstack([annotated.image, mask * np.uint8(255)])
-                cutouts.append(layers[y : y + height, x : x + width])
+                cutouts.append(layers[top:bottom, left:right])
     return cutouts
 
 

@@ -46,7 +46,7 @@ _LANES_MM, _HEIGHTS_MM = 1000.0, 400.0  # of random places, to either side
 _IN_VIEW = " in view"
 _LONG_FRAMES = 10
 _MIN_IOU = 0.5  # of a box with the fish that it shows
-_MIN_VISIBLE_FRACTION = 0.3  # a fish of which less is to be seen is nobody's to find
+MIN_VISIBLE_FRACTION = 0.3  # a fish of which less is to be seen is nobody's to find
 
 
 class Shot(NamedTuple):
@@ -118,7 +118,7 @@ def measure(scene: RailScene) -> Outcome:
             {
                 box.track_id: np.add(box.xywh_px, [0, 0, *box.xywh_px[:2]])
                 for box in shot.boxes
-                if box.visible_fraction >= _MIN_VISIBLE_FRACTION
+                if box.visible_fraction >= MIN_VISIBLE_FRACTION
             },
         )
         for shot in film(scene)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from benchmarks.segmentation.clone import Clone
+from benchmarks.segmentation.mask_proposer import box_of
 from benchmarks.segmentation.real_images import (
     first_versions,
     is_of,
@@ -105,7 +106,7 @@ def read_frames(repositories: Path, source: dict[str, Any], *, every: int) -> li
 def read_singles(images: Path, masks: Path, *, sources: list[str]) -> list[AnnotatedFrame]:
     """Photographs of single fish with masks, of the sources whose names these are."""
     return [
-        _kept(one.image, np.array([_edges(mask) for mask in one.masks], np.float64))
+        _kept(one.image, np.array([box_of(mask) for mask in one.masks]))
         for one in read_annotated_images(images, masks)
         if one.path.stem.split("-")[0] in sources
     ]
@@ -115,11 +116,6 @@ def _kept(image: Image, boxes: Boxes, name: str = "") -> AnnotatedFrame:
     scale = min(1.0, _KEPT_PX / max(image.shape[:2]))
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return AnnotatedFrame(small, boxes * scale, name)
-
-
-def _edges(mask: np.ndarray) -> list[int]:
-    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    return [x, y, x + width, y + height]
 
 
 def _zoomed(
@@ -193,7 +189,7 @@ def _with_fish(
         owner[is_here] = index
         areas.append(int(is_here.sum()))
     added = [
-        _edges(owner == index)
+        box_of(owner == index)
         for index, area in enumerate(areas)
         if area and (owner == index).sum() > _MIN_VISIBLE * area
     ]

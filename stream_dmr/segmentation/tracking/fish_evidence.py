@@ -66,10 +66,9 @@ class FishEvidence:
 
     def looks_like_a_fish(self, min_frames: int) -> bool:
         """True once it did in so many frames, and for what nothing judged."""
-        seen = self._fish_like_frames
-        if seen < _MIN_FISH_LIKE_SHARE * self._judged_frames:
-            seen = 0
-        return self._judged_frames == 0 or seen + self._fish_like_closer >= min_frames
+        is_rare = self._fish_like_frames < _MIN_FISH_LIKE_SHARE * self._judged_frames
+        seen = self._fish_like_closer + (0 if is_rare else self._fish_like_frames)
+        return self._judged_frames == 0 or seen >= min_frames
 
 
 def _edges_px(candidate: Candidate) -> Float[np.ndarray, "2 2"] | None:

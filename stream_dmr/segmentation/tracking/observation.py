@@ -8,7 +8,7 @@ from stream_dmr.segmentation.detection.detector import Candidate, fraction_insid
 from stream_dmr.segmentation.masks.crop_quality import touches_border
 from stream_dmr.segmentation.tracking.appearance import colours_of, middle_of
 
-_BOX_STD = 0.08  # of the edges of a box that a network draws, in its longer sides
+_CUT_OFF = 0.08  # longer sides: a box of a network that ends so near to the border is cut by it
 
 
 class Observation:
@@ -34,7 +34,7 @@ class Observation:
         region = image[y0:y1, x0:x1]
         inside = silhouette[: region.shape[0], : region.shape[1]]
         self.colours = colours_of(region, None if candidate.foreground is None else inside)
-        reach = _BOX_STD * max(x1 - x0, y1 - y0) if candidate.foreground is None else 0.0
+        reach = _CUT_OFF * max(x1 - x0, y1 - y0) if candidate.foreground is None else 0.0
         edges = np.array([x0 - reach, y0 - reach, x1 + reach, y1 + reach])
         self.touches_border = touches_border(edges, shape=image.shape[:2])
 
