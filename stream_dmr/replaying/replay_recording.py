@@ -254,6 +254,7 @@ def _open_chain(
             masks=files.masks,
             detect=config.detect_fish,
             track=config.track_fish,
+            pictures=None if files.source is None else Path(files.source),
         ),
         species_model=config.species.model,
     )

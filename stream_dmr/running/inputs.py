@@ -113,6 +113,7 @@ def checked_inputs(request: RunRequest) -> Inputs:
         masks=request.masks,
         detect=config.detect_fish,
         track=config.track_fish,
+        pictures=Path(request.source),
     )
     reader = ReadFrames(request.source, config.read_frames)
     inputs = Inputs(

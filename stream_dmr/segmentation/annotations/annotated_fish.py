@@ -16,9 +16,12 @@ from stream_dmr.segmentation.annotations.mask_folder import Labels, MaskFolder
 from stream_dmr.segmentation.detection.fish_detection import Detection
 
 
-def open_annotated_fish(*, boxes: Path | None, masks: Path | None) -> "AnnotatedFish":
+def open_annotated_fish(
+    *, boxes: Path | None, masks: Path | None, pictures: Path | None = None
+) -> "AnnotatedFish":
     """Open a boxes file, a masks folder, or both; the boxes must have ids.
 
+    `pictures`: the source of the frames, see `MaskFolder`.
     Raises AnnotationError where one cannot be read or boxes with masks have no ids, UserError where
     neither is given.
     """
@@ -33,7 +36,8 @@ def open_annotated_fish(*, boxes: Path | None, masks: Path | None) -> "Annotated
                 f"{boxes}: expected the ids of --masks, got boxes without ids; add the ids, or "
                 "leave out --boxes: the masks give boxes as well"
             )
-    return AnnotatedFish(boxes=by_frame, masks=None if masks is None else MaskFolder(masks))
+    folder = None if masks is None else MaskFolder(masks, pictures=pictures)
+    return AnnotatedFish(boxes=by_frame, masks=folder)
 
 
 class AnnotatedFish:

@@ -58,15 +58,20 @@ class MaskFolder:
     indices, not their colours.
     """
 
-    def __init__(self, folder: Path) -> None:
-        """Raises AnnotationError where the folder is missing or holds no such pictures."""
+    def __init__(self, folder: Path, *, pictures: Path | None = None) -> None:
+        """`pictures`: the source of the frames; where it is a folder, masks may be named after it.
+
+        Raises AnnotationError where the folder is missing or holds no masks for these frames.
+        """
         if not folder.is_dir():
             raise AnnotationError(f"{folder}: expected a folder of masks, found none there")
         names = sorted(entry.name for entry in folder.iterdir() if entry.suffix == ".png")
-        if not names:
+        self._is_numbered = any(_FILE_NAME.fullmatch(name) for name in names)
+        if not self._is_numbered and _stems_in(pictures).isdisjoint(Path(n).stem for n in names):
+            found = f"{names[0]} and the like" if names else "no PNG"
             raise AnnotationError(
-                f"{folder}: expected masks 000001.png, 000002.png ..., or named like the pictures "
-                "of --source, found no PNG"
+                f"{folder}: expected masks named 000001.png, 000002.png ..., or like the pictures "
+                f"of the source, found {found}"
             )
         if "000000.png" in names:
             raise AnnotationError(
@@ -75,7 +80,6 @@ class MaskFolder:
             )
         self.folder = folder
         self._names = names
-        self._is_numbered = any(_FILE_NAME.fullmatch(name) for name in names)
         self._has_ids = False
 
     def labels(
@@ -83,10 +87,11 @@ class MaskFolder:
     ) -> Labels | None:
         """The labels of a frame of that size in px; None where the folder has none for it.
 
-        `picture`: the frame's file name, where it is one of a folder. Raises AnnotationError for a
+        `picture`: the frame's file name, by which masks may be named. Raises AnnotationError for a
         label picture in colour, of another size, or unreadable, and where none of them has an id.
         """
-        path = self._path(frame_index, picture)
+        stem = f"{frame_index:06d}" if self._is_numbered else Path(picture).stem
+        path = self.folder / f"{stem}.png"
         try:
             with Image.open(path) as file:
                 _check_labels(file, path, size=(width, height))
@@ -108,16 +113,6 @@ class MaskFolder:
         self._has_ids = True
         return Labels(ids, is_unknown)
 
-    def _path(self, frame_index: int, picture: str) -> Path:
-        if self._is_numbered:
-            return self.folder / f"{frame_index:06d}.png"
-        if Path(picture).suffix.lower() in PICTURE_SUFFIXES:
-            return self.folder / f"{Path(picture).stem}.png"
-        raise AnnotationError(
-            f"{self.folder}: expected masks named 000001.png, 000002.png ..., one a frame, found "
-            f"{self._names[0]} and the like"
-        )
-
     def _check_ids(self, largest: int) -> None:
         """A fish drawn as 255 on 0 is one that nobody would measure. Raises AnnotationError."""
         names = self._names
@@ -132,6 +127,12 @@ class MaskFolder:
             f"{self.folder}: expected fish ids from 1 on, found only 0 and {largest}, which means "
             "unknown; write the mask of a single fish with the value 1"
         )
+
+
+def _stems_in(pictures: Path | None) -> set[str]:
+    if pictures is None or not pictures.is_dir():
+        return set()
+    return {one.stem for one in pictures.iterdir() if one.suffix.lower() in PICTURE_SUFFIXES}
 
 
 def _check_labels(picture: Image.Image, path: Path, *, size: tuple[int, int]) -> None:

@@ -45,18 +45,25 @@ class FishFinder(Protocol):
 
 
 def open_finder(
-    *, boxes: Path | None, masks: Path | None, detect: DetectFishSettings, track: TrackFishSettings
+    *,
+    boxes: Path | None,
+    masks: Path | None,
+    detect: DetectFishSettings,
+    track: TrackFishSettings,
+    pictures: Path | None = None,
 ) -> FishFinder:
     """Fish from annotation files where given; tracked ones otherwise, and for boxes without ids.
 
+    `pictures`: the source of the frames, after which masks may be named.
     Raises AnnotationError or ModelError where a file cannot be read.
     """
     if boxes is None and masks is None:
         return TrackedFish(open_detector(detect), track)
     if boxes is not None and names_pictures(boxes):
-        return NamedPictures(boxes, open_detector(detect) if masks is None else MaskFolder(masks))
+        folder = None if masks is None else MaskFolder(masks, pictures=pictures)
+        return NamedPictures(boxes, folder or open_detector(detect))
     if boxes is None or masks is not None:
-        return open_annotated_fish(boxes=boxes, masks=masks)
+        return open_annotated_fish(boxes=boxes, masks=masks, pictures=pictures)
     frames = load_boxes(boxes)
     if any(box.track_id == UNKNOWN_ID for found in frames.values() for box in found):
         return TrackedFish(BoxDetector(frames), track)

@@ -57,15 +57,20 @@ def test_the_largest_value_is_no_fish_but_unknown(tmp_path, dtype):
     np.testing.assert_array_equal(found.unknown, labels > 1)
 
 
-def test_masks_may_be_named_like_their_pictures(tmp_path):
+def test_masks_may_be_named_like_the_pictures_of_the_source(tmp_path):
+    pictures, folder = tmp_path / "pictures", tmp_path / "masks"
     labels = labels_of(id1=(0, 0, 2, 2))
-    cv2.imwrite(str(tmp_path / "IMG_7.png"), labels)
-    masks = MaskFolder(tmp_path)
+    for one in (pictures, folder):
+        one.mkdir()
+    cv2.imwrite(str(folder / "IMG_7.png"), labels)
+    for unlike in (None, tmp_path / "haul.mp4", pictures):
+        with pytest.raises(AnnotationError, match=r"pictures of the source, found IMG_7\.png"):
+            MaskFolder(folder, pictures=unlike)
+    (pictures / "IMG_7.JPG").touch()
+    masks = MaskFolder(folder, pictures=pictures)
     found = masks.labels(1, **LABELS_SIZE, picture="IMG_7.JPG")
     np.testing.assert_array_equal(found.ids, labels)
     assert masks.labels(7, **LABELS_SIZE, picture="IMG_8.JPG") is None
-    with pytest.raises(AnnotationError, match=r"one a frame, found IMG_7\.png"):
-        masks.labels(1, **LABELS_SIZE, picture="haul.mp4")
 
 
 def test_numbered_masks_go_by_frame_whatever_pictures_are_called(tmp_path):
@@ -108,6 +113,9 @@ def test_folders_without_masks_are_refused(tmp_path):
     with pytest.raises(AnnotationError, match="found none there"):
         MaskFolder(tmp_path / "missing")
     with pytest.raises(AnnotationError, match="found no PNG"):
+        MaskFolder(tmp_path)
+    (tmp_path / "00001.png").touch()
+    with pytest.raises(AnnotationError, match=r"found 00001\.png"):
         MaskFolder(tmp_path)
     (tmp_path / "000000.png").touch()
     with pytest.raises(AnnotationError, match=r"counted from 000001\.png"):
