@@ -128,4 +128,4 @@ class FitMeshSettings(Settings):
         std[JOINT_ROTATION] = self.twist_std_rad, self.arch_std_rad, self.bend_std_rad
         std[JOINT_WEIGHT] = self.weight_std
         weights = self.prior_weight / np.square([self.tilt_std_rad, *std])
-        return Priors(float(weights[0]), weights[1:].copy())
+        return Priors(float(weights[0]), weights[1:].copy(), roll=0.0)

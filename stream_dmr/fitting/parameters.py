@@ -43,6 +43,7 @@ class Priors(NamedTuple):
 
     tilt: float  # of the sine of the body's angle with the plane that fish hang in
     joint: Float[np.ndarray, "13"]  # of each parameter of a joint
+    roll: float  # of the angle by which the broad side is turned away from the camera
 
 
 @compiled

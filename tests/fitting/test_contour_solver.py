@@ -162,7 +162,7 @@ class TestNormalEquations:
             rng.normal(size=(1, NUM_ROOT + NUM_PER_JOINT * num_joints)) * 0.5
         )
         lambdas = rng.uniform(0.1, 2, 6)
-        priors = Priors(rng.uniform(0.1, 2), rng.uniform(0.1, 2, NUM_PER_JOINT))
+        priors = Priors(rng.uniform(0.1, 2), rng.uniform(0.1, 2, NUM_PER_JOINT), 0.3)
         rest = rest_vector(num_joints)
         normal = rng.normal(size=3)
         target = target_of(hooked(0), plane_normal=normal / np.linalg.norm(normal))
@@ -173,10 +173,13 @@ class TestNormalEquations:
             gauge = parts.joint_rotations[0].sum(dim=0) * GAUGE**0.5
             scale = (parts.joint_log_scales[0].exp() - 1) * (2 * lambdas[2]) ** 0.5
             shift = parts.joint_translations[0].flatten() * (2 * lambdas[3]) ** 0.5
-            tilt = torch.as_tensor(target.plane_normal) @ rotation_matrices(p[:3])[:, :1]
+            R = rotation_matrices(p[:3])
+            tilt = torch.as_tensor(target.plane_normal) @ R[:, :1]
+            ray = R.T @ torch.as_tensor(target.anchor)
+            roll = torch.atan(-ray[1:2] / ray[2:3])
             gap = (p - torch.as_tensor(rest))[NUM_ROOT:].view(num_joints, NUM_PER_JOINT)
             gap = gap * torch.as_tensor(priors.joint).sqrt()
-            prior = torch.cat([tilt * priors.tilt**0.5, gap.flatten()])
+            prior = torch.cat([tilt * priors.tilt**0.5, gap.flatten(), roll * priors.roll**0.5])
             return torch.cat([gauge, scale, shift, prior]), prior
 
         J = torch.autograd.functional.jacobian(lambda p: squares(p)[0], flat[0]).numpy()

@@ -5,6 +5,7 @@ from jaxtyping import Float
 
 from stream_dmr.compiled import compiled
 from stream_dmr.fitting.contour.problem import SCALE, TRANSLATION, Problem
+from stream_dmr.fitting.contour.roll_angle import roll_and_slope
 from stream_dmr.fitting.contour.rotation_vector import rotated_slope, rotation_and_jacobian
 from stream_dmr.fitting.parameters import (
     JOINT_LOG_SCALE,
@@ -61,17 +62,25 @@ def regularise(
         g[i] += priors.tilt * tilt * slope[i]
         for k in range(3):
             H[i, k] += priors.tilt * slope[i] * slope[k]
+    if priors.roll > 0:
+        roll, slope = roll_and_slope(parameters, problem.target.anchor)
+        for i in range(3):
+            g[i] += priors.roll * roll * slope[i]
+            for k in range(3):
+                H[i, k] += priors.roll * slope[i] * slope[k]
 
 
 @compiled
 def prior_loss(problem: Problem, parameters: Float[np.ndarray, "P"]) -> float:
-    """What the priors add to L_rec: half the weighted squares of tilt, bends and weights."""
+    """What the priors add to L_rec: half the weighted squares of what they hold."""
     R, _ = rotation_and_jacobian(parameters[ROOT_ROTATION])
     n, priors = problem.target.plane_normal, problem.priors
     loss = 0.5 * priors.tilt * (n[0] * R[0, 0] + n[1] * R[1, 0] + n[2] * R[2, 0]) ** 2
     for p in range(NUM_ROOT, len(parameters)):
         weight = priors.joint[(p - NUM_ROOT) % NUM_PER_JOINT]
         loss += 0.5 * weight * (parameters[p] - problem.rest[p]) ** 2
+    if priors.roll > 0:
+        loss += 0.5 * priors.roll * roll_and_slope(parameters, problem.target.anchor)[0] ** 2
     return loss
 
 

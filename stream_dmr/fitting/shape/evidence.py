@@ -11,8 +11,10 @@ from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
 from stream_dmr.fitting.contour.normal_equations import normal_equations
 from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.contour.regularisers import prior_loss
-from stream_dmr.fitting.shape.roll import ROLL_STD_RAD, roll_rad, roll_slope
 from stream_dmr.fitting.size.scanner import LOG_VOLUME_WEIGHT
+
+# Cameras stand where the broad side of fish is seen. Chosen; of flatfish it is less.
+_ROLL_STD_RAD = 0.7
 
 
 def nats_against(problem: Problem, pose: Float[np.ndarray, "P"], *, nat: float) -> float:
@@ -22,11 +24,10 @@ def nats_against(problem: Problem, pose: Float[np.ndarray, "P"], *, nat: float) 
     (Laplace's method), with the weight that it has in the scan of sizes. `nat` is the loss that
     stands for one.
     """
+    priors = problem.priors._replace(roll=nat / _ROLL_STD_RAD**2)
+    problem = problem._replace(priors=priors)
     here = evaluate(problem, pose, False)
     loss = float(here.terms @ problem.lambdas) + prior_loss(problem, pose)
     H, _ = normal_equations(problem, pose, here.rendering)
-    anchor = problem.target.anchor
-    roll, slope = roll_rad(pose, anchor) / ROLL_STD_RAD, roll_slope(pose, anchor) / ROLL_STD_RAD
-    curvature = H / nat + np.outer(slope, slope) + 1e-9 * np.eye(len(H))
-    log_volume = 0.5 * float(np.linalg.slogdet(curvature)[1])
-    return loss / nat + 0.5 * roll**2 + LOG_VOLUME_WEIGHT * log_volume
+    log_volume = 0.5 * float(np.linalg.slogdet(H / nat + 1e-9 * np.eye(len(H)))[1])
+    return loss / nat + LOG_VOLUME_WEIGHT * log_volume

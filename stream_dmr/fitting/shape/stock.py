@@ -29,7 +29,7 @@ from stream_dmr.fitting.parameters import joints_of
 from stream_dmr.fitting.shape.equations import shape_equations
 from stream_dmr.fitting.shape.evidence import nats_against
 from stream_dmr.fitting.shape.proportions import Proportions, infer_proportions
-from stream_dmr.fitting.shape.roll import add_roll_prior, rolled_as_seen, unrolled
+from stream_dmr.fitting.shape.roll import rolled_as_seen, unrolled
 from stream_dmr.fitting.shape.space import (
     BREADTH,
     LOBES,
@@ -45,7 +45,7 @@ from stream_dmr.fitting.shape.space import (
     std_of,
     with_std_of,
 )
-from stream_dmr.fitting.shape.square_fit import HELD_ROLL_RAD, square_pose, square_problem
+from stream_dmr.fitting.shape.square_fit import square_pose, square_problem
 from stream_dmr.fitting.target import Target
 from stream_dmr.template.template import Template
 
@@ -188,7 +188,7 @@ class StockFitter:
                 scale_std=_READING_SCALE_STD,
                 arch_std_rad=self._settings.arch_std_rad,
             )
-            frame.pose = square_pose(problem, frame.pose, nat=self._nat)
+            frame.pose = square_pose(problem, frame.pose)
             by_fish.setdefault(frame.fish, []).append(_log_breadth(frame))
         spread = np.linalg.inv(self._precision)
         breadth_std, thickness_std = std_of(TRUNK, spread), std_of(MEAN_THICKNESS, spread)
@@ -246,11 +246,8 @@ class StockFitter:
             problem = square_problem(
                 self._settings, body, frame.target, scale_std=_LEARNING_SCALE_STD
             )
-            frame.pose = square_pose(problem, frame.pose, nat=self._nat)
+            frame.pose = square_pose(problem, frame.pose)
             H, g = shape_equations(problem, frame.pose, slopes)
-            add_roll_prior(
-                H, g, frame.pose, frame.target.anchor, weight=self._nat / HELD_ROLL_RAD**2
-            )
             parts = _without_pose(H, g, len(frame.pose))
             fish.setdefault(frame.fish, []).append(parts)
         A, b = np.zeros((NUM_COEFFICIENTS, NUM_COEFFICIENTS)), np.zeros(NUM_COEFFICIENTS)

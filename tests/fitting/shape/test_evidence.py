@@ -7,11 +7,11 @@ from scipy.spatial.transform import Rotation
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.contour.levenberg_marquardt import COLD_DAMPING
 from stream_dmr.fitting.contour.problem import Options, Problem
+from stream_dmr.fitting.contour.roll_angle import roll_and_slope
 from stream_dmr.fitting.contour.scan import descend
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.parameters import ROOT_ROTATION
 from stream_dmr.fitting.shape.evidence import nats_against
-from stream_dmr.fitting.shape.roll import roll_rad
 from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.fitting.target import Target
 from tests.support.stocks import TEMPLATE, TOWARD_CAMERA, broader, fish_of
@@ -36,7 +36,7 @@ def test_a_broad_body_that_rolls_to_fit_has_less_evidence_than_the_true_one(trac
     [sample] = fish_of(broader(0.0), track_id=track_id, num_frames=1).samples
     own, found = fitted(0.0, sample)
     broad, rolled = fitted(0.25, sample, rolled_by=0.6)
-    assert abs(roll_rad(rolled.parameters, broad.target.anchor)) > 0.3
+    assert abs(roll_and_slope(rolled.parameters, broad.target.anchor)[0]) > 0.3
     by_evidence = nats_against(broad, rolled.parameters, nat=SETTINGS.nat) - nats_against(
         own, found.parameters, nat=SETTINGS.nat
     )

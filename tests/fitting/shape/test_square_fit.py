@@ -6,10 +6,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.fitting.body import Body
+from stream_dmr.fitting.contour.roll_angle import roll_and_slope
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.paper.skinning import Rig
 from stream_dmr.fitting.parameters import ROOT_ROTATION, joints_of
-from stream_dmr.fitting.shape.roll import roll_rad, rolled_as_seen, unrolled
+from stream_dmr.fitting.shape.roll import rolled_as_seen, unrolled
 from stream_dmr.fitting.shape.space import reshaped, roundness
 from stream_dmr.fitting.shape.square_fit import square_pose, square_problem
 from stream_dmr.fitting.target import Target
@@ -33,7 +34,7 @@ def square_fit(log_factor, roll):
     crop = crop_of(torch.as_tensor(rolled)[None], Rig.from_template(fish))
     target = Target.from_crop(crop, plane_normal=TOWARD_CAMERA)
     problem = square_problem(SETTINGS, Body.from_template(TEMPLATE), target, scale_std=0.4)
-    found = square_pose(problem, unrolled(rolled, target.anchor), nat=SETTINGS.nat)
+    found = square_pose(problem, unrolled(rolled, target.anchor))
     return found, target, log_factor + narrower
 
 
@@ -46,7 +47,7 @@ def test_reads_the_breadth_that_shows(log_factor, roll):
 
 def test_nothing_is_rolled_slanted_twisted_or_arched():
     found, target, _ = square_fit(0.1, 0.6)
-    assert abs(roll_rad(found, target.anchor)) < 0.03
+    assert abs(roll_and_slope(found, target.anchor)[0]) < 0.03
     assert np.abs(joints_of(found).rotation[:, :2]).max() < 0.05
     along = Rotation.from_rotvec(found[ROOT_ROTATION]).apply([1.0, 0.0, 0.0])
     assert abs(along @ TOWARD_CAMERA) < 0.06
