@@ -4,7 +4,8 @@ A silhouette shows the breadth b as sqrt(b^2 cos^2 r + t^2 sin^2 r) at a roll r,
 t, and the length as its cosine at a slant. Both are second order, so that the equations of a bundle
 adjustment are blind to them, and no single fish tells a narrow body from a rolled one. All fish
 together do: roll only narrows and slant only shortens, so that what is seen is spread to one side
-of what is true. Here rolls and slants are integrated out, with the spread of the rolls learnt.
+of what is true. Here rolls and slants are integrated out, with the spreads of both learnt. A fish
+that is bent out of the picture looks shorter too, and counts as slanted.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,8 +13,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
-from scipy.interpolate import RegularGridInterpolator
+from jaxtyping import Float, Int
 
 # Of one frame's log breadth: 5 % by the individual, as in `space.individual_covariance`, the rest
 # by bends and edges. Chosen.
@@ -23,7 +23,9 @@ _OUTLIERS = 1e-4  # density of a breadth that is none: a wrong mask
 _IMPOSSIBLE = 1e-30  # density of proportions that no body form has, for their logarithm
 # Spreads of the roll that are weighed, all alike before; with the last any roll is about as likely.
 _ROLL_STDS_RAD = np.array([0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.6])
-_ROLLS_RAD, _SLANTS_RAD = np.linspace(0.0, np.pi / 2, 31), np.linspace(0.0, 0.9, 13)  # or less
+# The same of the slant, over the std that is set.
+_SLANT_FACTORS = np.array([0.3, 0.6, 1.0, 1.7, 2.8])
+_ROLLS_RAD, _SLANTS_RAD = np.linspace(0.0, np.pi / 2, 31), np.linspace(0.0, 1.2, 25)  # or less
 # Logs of the factors that are weighed, and of what a density is tabulated at.
 _BREADTHS, _THICKNESSES = np.linspace(-0.8, 0.8, 81), np.linspace(-0.6, 0.6, 13)
 _ROUNDNESSES, _SEEN = np.linspace(-3.5, 1.2, 48), np.linspace(-2.6, 1.4, 101)
@@ -53,13 +55,20 @@ def infer_proportions(
     """
     frames = np.concatenate([np.asarray(values) for values in seen.values()])
     worth = np.concatenate([_worth(len(values)) for values in seen.values()])
-    k, t = _BREADTHS[:, None, None], _THICKNESSES[:, None]
-    points = np.stack(np.broadcast_arrays(np.log(roundness) + t - k, frames - k), axis=-1)
     log_density = np.log(_densities(slant_std_rad) + _OUTLIERS)
-    table = RegularGridInterpolator(
-        (_ROUNDNESSES, _SEEN), log_density, bounds_error=False, fill_value=np.log(_OUTLIERS)
+    log_posterior = np.stack(
+        [
+            np.tensordot(
+                _binned(_SEEN, frames - breadth, worth),
+                _interpolated(
+                    _ROUNDNESSES, log_density, np.log(roundness) + _THICKNESSES - breadth
+                ),
+                (0, 1),
+            )
+            for breadth in _BREADTHS
+        ]
     )
-    log_posterior = np.einsum("f,ktfs->kts", worth, table(points))
+    k, t = _BREADTHS[:, None, None], _THICKNESSES[:, None]
     log_posterior += np.log(sum(_density(one, k, t) for one in before) + _IMPOSSIBLE)
     posterior = np.exp(log_posterior - log_posterior.max()).sum(axis=2)
     posterior /= posterior.sum()
@@ -70,17 +79,46 @@ def infer_proportions(
 
 @lru_cache
 def _densities(slant_std_rad: float) -> Float[np.ndarray, "R X S"]:
-    """Of what is seen of a log breadth of 0, at each roundness, for each spread of the rolls."""
-    slants = _weights(_SLANTS_RAD, slant_std_rad)
+    """Of what is seen of a log breadth of 0, at each roundness, for each pair of spreads."""
+    slant_stds_rad = slant_std_rad * _SLANT_FACTORS
+    slants = np.stack([_weights(_SLANTS_RAD, std) for std in slant_stds_rad], axis=1)
     rolls = np.stack([_weights(_ROLLS_RAD, std) for std in _ROLL_STDS_RAD], axis=1)
     longer = -np.log(np.cos(_SLANTS_RAD))
-    found = np.empty((len(_ROUNDNESSES), len(_SEEN), len(_ROLL_STDS_RAD)))
+    found = np.empty((len(_ROUNDNESSES), len(_SEEN), slants.shape[1] * rolls.shape[1]))
     for n, log_roundness in enumerate(_ROUNDNESSES):
         narrow = np.hypot(np.cos(_ROLLS_RAD), np.exp(log_roundness) * np.sin(_ROLLS_RAD))
         shown = np.log(narrow)[:, None] + longer
         off = (_SEEN[:, None, None] - shown) / _FRAME_STD
-        found[n] = np.exp(-0.5 * off**2) @ slants @ rolls
+        by_slant = np.exp(-0.5 * off**2) @ slants
+        found[n] = (by_slant.transpose(0, 2, 1) @ rolls).reshape(len(_SEEN), -1)
     return found
+
+
+def _interpolated(
+    grid: Float[np.ndarray, "G"], table: Float[np.ndarray, "G *N"], places: Float[np.ndarray, "P"]
+) -> Float[np.ndarray, "P *N"]:
+    """A table over an even grid, linear between its points."""
+    lower, share = _neighbours(grid, places)
+    share = share.reshape(-1, *[1] * (table.ndim - 1))
+    return (1 - share) * table[lower] + share * table[lower + 1]
+
+
+def _binned(
+    grid: Float[np.ndarray, "G"], places: Float[np.ndarray, "P"], weights: Float[np.ndarray, "P"]
+) -> Float[np.ndarray, "G"]:
+    """The weights of a sum of interpolated values, by the points of their grid."""
+    lower, share = _neighbours(grid, places)
+    first, second = (1 - share) * weights, share * weights
+    return np.bincount(lower, first, len(grid)) + np.bincount(lower + 1, second, len(grid))
+
+
+def _neighbours(
+    grid: Float[np.ndarray, "G"], places: Float[np.ndarray, "P"]
+) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
+    """The point of an even grid below each place, and the share of the next one."""
+    index = ((places - grid[0]) / (grid[1] - grid[0])).clip(0, len(grid) - 1)
+    lower = np.minimum(index.astype(int), len(grid) - 2)
+    return lower, index - lower
 
 
 def _moments(

@@ -9,12 +9,12 @@ BEFORE = Proportions(0.0, 0.3, 0.0, 0.2)
 SLANT_STD = 0.25
 
 
-def seen_of(rng, *, breadth, thickness, roll_std, num_fish=60, num_frames=3):
+def seen_of(rng, *, breadth, thickness, roll_std, slant_std=SLANT_STD, num_fish=60, num_frames=3):
     """Log breadths of fish each of which is rolled by one angle and slanted by another."""
     found = {}
     for fish in range(num_fish):
         roll, own = roll_std * rng.standard_normal(), 0.05 * rng.standard_normal()
-        slant = (SLANT_STD * rng.standard_normal(num_frames)).clip(-0.8, 0.8)
+        slant = (slant_std * rng.standard_normal(num_frames)).clip(-1.2, 1.2)
         shown = np.hypot(np.exp(breadth) * np.cos(roll), 0.4 * np.exp(thickness) * np.sin(roll))
         edges = 0.04 * rng.standard_normal(num_frames)
         found[fish] = list(np.log(shown) - np.log(np.cos(slant)) + own + edges)
@@ -33,6 +33,24 @@ def test_a_known_breadth_is_found_however_fish_are_rolled(breadth, roll_std):
     known = infer(seen_of(rng, breadth=breadth, thickness=0.0, roll_std=roll_std))
     assert known.breadth == pytest.approx(breadth, abs=0.05)
     assert abs(known.breadth - breadth) < 3 * known.breadth_std < 0.15
+
+
+@pytest.mark.parametrize("slant_std", [0.05, 0.45])
+def test_a_known_breadth_is_found_however_fish_are_slanted(slant_std):
+    """With the std that is set alone, straight fish are 4 % too narrow, others 5 % too broad."""
+    found = [
+        infer(
+            seen_of(
+                np.random.default_rng(seed),
+                breadth=0.1,
+                thickness=0.0,
+                roll_std=0.3,
+                slant_std=slant_std,
+            )
+        ).breadth
+        for seed in range(6)
+    ]
+    assert np.mean(found) == pytest.approx(0.1, abs=0.025)
 
 
 def test_a_known_thickness_is_found_where_fish_are_rolled():
@@ -70,7 +88,8 @@ def test_a_factor_on_all_that_is_seen_is_one_on_the_stock(shift):
 def test_one_wrong_mask_moves_next_to_nothing():
     seen = seen_of(np.random.default_rng(4), breadth=0.0, thickness=0.0, roll_std=0.5)
     wrong = {**seen, 99: [0.9, 0.9, 0.9]}
-    assert infer(wrong).breadth == pytest.approx(infer(seen).breadth, abs=0.01)
+    known = infer(seen)
+    assert infer(wrong).breadth == pytest.approx(known.breadth, abs=0.5 * known.breadth_std)
 
 
 def test_few_fish_leave_more_open():
