@@ -12,7 +12,7 @@ from benchmarks.segmentation.detector.loss import STRIDES
 from benchmarks.segmentation.detector.onnx_module import OnnxModule, weight_key
 
 OUTPUTS = ["1062", "1063", "1104", "1105", "1146", "1147"]  # YOLOX's boxes and scores, by level
-SIZE_PX = (416, 320)  # width and height of its input
+SIZE_PX = (512, 384)  # width and height of its input
 _OPSET, _IR_VERSION = 17, 8
 
 

@@ -21,7 +21,7 @@ from stream_dmr.segmentation.training.annotated_images import read_annotated_ima
 from stream_dmr.segmentation.training.image_degradation import add_weather, simulate_camera
 from stream_dmr.segmentation.training.patch_bank import PatchBank
 
-SIDE_PX = 352  # of a training frame: between the sides of a detector's input
+SIDE_PX = 448  # of a training frame: between the sides of a detector's input
 _KEPT_PX = 640  # longer side of the photographs that are kept in memory
 _FRAME_SHARE, _SINGLE_SHARE = 0.45, 0.1  # of the examples; the others are put together
 _MOSAIC_SHARE, _MORE_FISH_SHARE = 0.25, 0.25  # of the examples from frames
