@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 # Of one frame's log breadth: 5 % by the individual, as in `space.individual_covariance`, the rest
 # by bends and edges. Chosen.
@@ -56,18 +56,11 @@ def infer_proportions(
     frames = np.concatenate([np.asarray(values) for values in seen.values()])
     worth = np.concatenate([_worth(len(values)) for values in seen.values()])
     log_density = np.log(_densities(slant_std_rad) + _OUTLIERS)
-    log_posterior = np.stack(
-        [
-            np.tensordot(
-                _binned(_SEEN, frames - breadth, worth),
-                _interpolated(
-                    _ROUNDNESSES, log_density, np.log(roundness) + _THICKNESSES - breadth
-                ),
-                (0, 1),
-            )
-            for breadth in _BREADTHS
-        ]
-    )
+    log_posterior = np.empty((len(_BREADTHS), len(_THICKNESSES), log_density.shape[2]))
+    for n, breadth in enumerate(_BREADTHS):
+        by_roundness = np.tensordot(worth @ _hats(_SEEN, frames - breadth), log_density, (0, 1))
+        log_roundnesses = np.log(roundness) + _THICKNESSES - breadth
+        log_posterior[n] = _hats(_ROUNDNESSES, log_roundnesses) @ by_roundness
     k, t = _BREADTHS[:, None, None], _THICKNESSES[:, None]
     log_posterior += np.log(sum(_density(one, k, t) for one in before) + _IMPOSSIBLE)
     posterior = np.exp(log_posterior - log_posterior.max()).sum(axis=2)
@@ -94,31 +87,10 @@ def _densities(slant_std_rad: float) -> Float[np.ndarray, "R X S"]:
     return found
 
 
-def _interpolated(
-    grid: Float[np.ndarray, "G"], table: Float[np.ndarray, "G *N"], places: Float[np.ndarray, "P"]
-) -> Float[np.ndarray, "P *N"]:
-    """A table over an even grid, linear between its points."""
-    lower, share = _neighbours(grid, places)
-    share = share.reshape(-1, *[1] * (table.ndim - 1))
-    return (1 - share) * table[lower] + share * table[lower + 1]
-
-
-def _binned(
-    grid: Float[np.ndarray, "G"], places: Float[np.ndarray, "P"], weights: Float[np.ndarray, "P"]
-) -> Float[np.ndarray, "G"]:
-    """The weights of a sum of interpolated values, by the points of their grid."""
-    lower, share = _neighbours(grid, places)
-    first, second = (1 - share) * weights, share * weights
-    return np.bincount(lower, first, len(grid)) + np.bincount(lower + 1, second, len(grid))
-
-
-def _neighbours(
-    grid: Float[np.ndarray, "G"], places: Float[np.ndarray, "P"]
-) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
-    """The point of an even grid below each place, and the share of the next one."""
-    index = ((places - grid[0]) / (grid[1] - grid[0])).clip(0, len(grid) - 1)
-    lower = np.minimum(index.astype(int), len(grid) - 2)
-    return lower, index - lower
+def _hats(grid: Float[np.ndarray, "G"], places: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P G"]:
+    """By how much each point of an even grid counts where a table over it is read linearly."""
+    steps = (places.clip(grid[0], grid[-1])[:, None] - grid) / (grid[1] - grid[0])
+    return np.maximum(0.0, 1.0 - np.abs(steps))
 
 
 def _moments(
