@@ -12,13 +12,16 @@ from onnx import numpy_helper
 
 
 def mix(first: Path, second: Path, *, share: float) -> onnx.ModelProto:
-    """The first model with `1 - share` of its own weights and `share` of the second's."""
+    """The first model with `1 - share` of its own weights and `share` of the second's.
+
+    They may be for frames of different sizes: what follows from those is the first one's.
+    """
     mixed = onnx.load(first)
     others = {one.name: numpy_helper.to_array(one) for one in onnx.load(second).graph.initializer}
+    learnt = {name for node in mixed.graph.node if node.op_type == "Conv" for name in node.input}
     for one in mixed.graph.initializer:
-        own = numpy_helper.to_array(one)
-        if own.dtype == np.float32:
-            weights = (1 - share) * own + share * others[one.name]
+        if one.name in learnt:
+            weights = (1 - share) * numpy_helper.to_array(one) + share * others[one.name]
             one.CopyFrom(numpy_helper.from_array(weights.astype(np.float32), one.name))
     return mixed
 
