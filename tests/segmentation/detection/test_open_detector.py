@@ -24,7 +24,7 @@ def test_fish_are_seen_where_nothing_moves_and_nothing_else_is():
     shots = list(film(scene))
     whole = [shot for shot in shots if any(box.visible_fraction == 1 for box in shot.boxes)]
     assert len(whole) > 3
-    num_found = 0
+    num_found = num_loose = 0
     for shot in whole:
         x, y, w, h = shot.boxes[0].xywh_px
         truth = np.array([x, y, x + w, y + h], np.float64)
@@ -32,7 +32,9 @@ def test_fish_are_seen_where_nothing_moves_and_nothing_else_is():
         sure = [one.bbox_xyxy_px for one in found if one.score > 0.4]
         num_found += any(fraction_inside(truth, box) > 0.7 for box in sure)
         assert all(box_iou(box, truth) > 0.3 for box in sure)
+        num_loose += sum(fraction_inside(box, truth) <= 0.5 for box in sure)  # and the line above
     assert num_found > 0.8 * len(whole)
+    assert num_loose <= 0.1 * len(whole)
     empty = [shot for shot in shots if not shot.boxes]
     for shot in empty:
         found = detector.find(frame_of(shot.image, shot.frame_index))
