@@ -25,11 +25,15 @@ _MAX_DISSIMILAR_FRAMES = 10  # over which colours go on changing: fish turn, and
 _PART_RATIO = 3.0  # of the colours of a part of a fish, likewise
 _COVERED_COST = 4.0  # of supposing that something covers part of the fish
 _MAX_COST = 25.0  # of three squares (x, y, area), each about 1, and the colours
-_MAX_DISTANCE = 0.7  # sizes between the predicted and the observed center
-_MAX_FIRST_DISTANCE = 1.2  # the same where the fish was seen once, so that its speed is not known
+# Sizes between the predicted and the observed center: so many times the usual distance of this
+# fish, within limits; the upper one where its identity is uncertain, the last where it was seen
+# once, so that its speed is not known.
+_MAX_DEVIATIONS = 3.0
+_MIN_GATE, _MAX_GATE, _FIRST_GATE = 0.3, 0.7, 1.2
 _MAX_SHORTENING = 0.93  # of the length, per frame: a fish that turns seems shorter than it is
 _PIECE_VARIANCE_RATIO = 9.0  # variance of a piece's center over that of a whole candidate's
 _LEARNING_RATE = 0.35  # of the area, per frame
+_MEMORY = 0.8  # of the squared distances from predictions, per frame
 _MIN_HIDEABLE_FRAMES = 3  # frames seen from which on a track is kept while another fish hides it
 _MAX_MERGED_FRAMES = 30  # that fish may stay merged in one candidate
 _SNAPSHOT_DELAY = 3  # frames: silhouettes are wrong some frames before a merge shows
@@ -62,6 +66,7 @@ class Track:
         self.snapshot: TrackSnapshot | None = None  # None while the identity is certain
         self._history: deque[TrackSnapshot] = deque(maxlen=_SNAPSHOT_DELAY)
         self._separate_frames = 1
+        self._mean_square = (_MAX_GATE / _MAX_DEVIATIONS) ** 2  # of its distances, sizes
         self._colours_frame = frame_index  # in which `colours` were seen
         self._filter = KalmanFilter(dim_x=4, dim_z=2)  # center x, y; speed per frame
         self._filter.x = np.array([*observation.center, 0.0, 0.0])[:, None]
@@ -126,6 +131,9 @@ class Track:
                 observation.center[:, None], R=_PIECE_VARIANCE_RATIO * self._filter.R
             )
             return
+        if self.frames_seen > 2:  # before, the speed is not known
+            square = (self._distance_px(observation) / max(self.size, 1.0)) ** 2
+            self._mean_square = _MEMORY * self._mean_square + (1 - _MEMORY) * square
         self._whole = observation
         self.was_separate = not observation.is_piece
         self.length = max(observation.length, _MAX_SHORTENING * self.length)
@@ -173,10 +181,9 @@ class Track:
 
     def cost(self, observation: Observation) -> float:
         """Sum of squared deviations over their variances; `IMPOSSIBLE` beyond the gates."""
-        offset = observation.center - self.center
-        farthest = _MAX_FIRST_DISTANCE if self.frames_seen == 1 else _MAX_DISTANCE
-        if np.hypot(*offset) > farthest * max(self.size, 1.0):
+        if self._distance_px(observation) > self._gate * max(self.size, 1.0):
             return IMPOSSIBLE
+        offset = observation.center - self.center
         S = self._filter.P[:2, :2] + self._filter.R  # S = HPH' + R
         growth = np.log(observation.area / self.area)
         if observation.touches_border:
@@ -185,6 +192,18 @@ class Track:
         cost = offset @ np.linalg.solve(S, offset) + (growth / _LOG_AREA_STD) ** 2 / num_steps
         cost += self._cost_of_colours(observation)
         return float(cost) if cost < _MAX_COST else IMPOSSIBLE
+
+    def _distance_px(self, observation: Observation) -> float:
+        return float(np.hypot(*(observation.center - self.center)))
+
+    @property
+    def _gate(self) -> float:
+        """Sizes beyond which an observation shows another fish."""
+        if self.frames_seen == 1:
+            return _FIRST_GATE
+        if self.snapshot is not None:
+            return _MAX_GATE
+        return float(np.clip(_MAX_DEVIATIONS * np.sqrt(self._mean_square), _MIN_GATE, _MAX_GATE))
 
     def _cost_of_colours(self, observation: Observation) -> float:
         passed = max(1, self.frame_index - self._colours_frame)

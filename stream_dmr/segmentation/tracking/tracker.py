@@ -172,8 +172,9 @@ class Tracker:
 
         Tracks too young to be known count as new observations: they may be an older fish.
         """
+        may_be_behind = self._settings.max_hidden_frames > 0
         for track in self._tracks:
-            is_unclear = track.lost_frames > 0 or track.observation.is_piece
+            is_unclear = (may_be_behind and track.lost_frames > 0) or track.observation.is_piece
             if is_unclear and track.frames_seen >= _MIN_KNOWN_FRAMES:
                 track.make_uncertain()
         uncertain = [t for t in (*self._tracks, *self._hidden) if t.snapshot is not None]

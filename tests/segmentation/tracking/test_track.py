@@ -46,6 +46,17 @@ def test_the_cost_grows_with_distance_up_to_the_gate():
     assert track.cost(observe(300 + 80, 240)) == IMPOSSIBLE  # more than 1.2 sizes
 
 
+@pytest.mark.parametrize(("jitter", "is_possible"), [(0, False), (10, True)])
+def test_what_is_farther_off_than_a_fish_ever_was_is_another_one(jitter: int, is_possible: bool):
+    rng = np.random.default_rng(5)
+    places = np.array([300, 240]) + rng.normal(0, jitter, (20, 2))
+    track = followed([(float(x), float(y)) for x, y in places])
+    track.predict(21)
+    x, y = track.center
+    assert (track.cost(observe(x + 22, y)) < IMPOSSIBLE) is is_possible  # 0.37 sizes
+    assert track.cost(observe(x + 17, y)) < IMPOSSIBLE
+
+
 def test_an_area_cut_by_the_border_is_no_evidence_against_a_fish():
     track = followed([(300, 240)] * 3)
     cut = observe(300, 240, size=30)

@@ -178,6 +178,23 @@ def test_a_fish_of_another_colour_in_the_same_place_is_another_fish():
     assert ids(follow(frames))[-1] == [2]
 
 
+@given(st.floats(0, 2 * np.pi), st.integers(0, 6))
+@settings(max_examples=20, deadline=None)
+def test_a_fish_that_appears_where_another_vanished_in_the_open_is_a_new_one(
+    angle: float, gap: int
+):
+    """Half a length off: a fish that hangs there does not jump so far."""
+    dx, dy = 50 * np.cos(angle), 50 * np.sin(angle)
+    frames = [[climbing(i, speed=0.5)] for i in range(12)] + [[]] * gap
+    frames += [
+        [(x + dx, y + dy, w, h, level)]
+        for x, y, w, h, level in (climbing(i, speed=0.5) for i in range(12 + gap, 16 + gap))
+    ]
+    found = ids(follow(frames))
+    assert found[11] == [1]
+    assert found[-1] == [2]
+
+
 def test_a_fish_that_is_hauled_by_its_own_length_a_frame_is_one_from_the_first():
     frames = [blobs_of((70 + 110 * i, 150)) for i in range(3)]
     assert [[one.track_number for one in found] for found in track(frames)] == [[1]] * 3
