@@ -131,9 +131,10 @@ def simulate_command(
     from stream_dmr.results.own_files import require_writable
     from stream_dmr.simulation import scene_files, simulate
 
-    require_writable(*(out / name for name in scene_files(species)), overwrite=overwrite)
+    names = scene_files(species)
+    require_writable(*(out / name for name in names), overwrite=overwrite)
     simulate(out, num_fish=fish, num_frames=frames, preset=preset, seed=seed, species=species)
-    print(f"scene in {out}: video.mp4, boxes.txt, masks, calibration.yaml, truth.csv, templates")
+    print(f"scene in {out}: {', '.join(names)}")
 
 
 if __name__ == "__main__":

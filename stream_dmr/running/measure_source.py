@@ -30,7 +30,7 @@ from stream_dmr.running.position_feed import PositionFeed
 from stream_dmr.running.prepare_kernels import prepare_kernels
 from stream_dmr.running.result_writer import ResultWriter
 from stream_dmr.running.resume import resume_source
-from stream_dmr.running.run_folder import ENDLESS_RESULTS, LEARNT, RESULTS
+from stream_dmr.running.run_folder import LEARNT, result_names
 from stream_dmr.running.run_observer import RunObserver, RunTotals
 from stream_dmr.running.run_request import RunRequest
 from stream_dmr.running.shape_pass import save_stocks, with_learnt_shapes
@@ -245,7 +245,10 @@ def _run_chain(
         shapes_s=shapes_s,
         elapsed_s=time.perf_counter() - began,
         counters=counters,
-        files=[request.out / name for name in (ENDLESS_RESULTS if inputs.is_endless else RESULTS)],
+        files=[
+            request.out / name
+            for name in result_names(inputs.config.recording, is_endless=inputs.is_endless)
+        ],
     )
 
 

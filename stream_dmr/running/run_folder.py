@@ -5,6 +5,7 @@ import tempfile
 from pathlib import Path
 
 from stream_dmr.errors import OutputError
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.segments.recording_files import STEM
 from stream_dmr.recording.segments.repair import Repair, repair_recordings
 from stream_dmr.results.folder_lock import require_unlocked
@@ -15,8 +16,20 @@ RESULTS = (
     PROVENANCE,
 )
 LEARNT = "template.ply"  # what a run learnt of its fish's shape, with its TOML; -2, ... beside it
-ENDLESS_RESULTS = ("lengths.db", "lengths.csv", "frames.csv", f"{STEM}-*")
+SEGMENTS = f"{STEM}-*"  # the recordings of an endless run
+ENDLESS_RESULTS = ("lengths.db", "lengths.csv", "frames.csv", SEGMENTS)
 _PROBE_BYTES = 1 << 16  # that must fit on the disk at the start: more than the headers of all files
+
+
+def result_names(recording: RecordingSettings, *, is_endless: bool) -> list[str]:
+    """The names of what a run writes in any case; those of segments as a pattern."""
+    is_written = {
+        f"{STEM}.mcap": recording.mcap,
+        f"{STEM}.rrd": recording.rrd,
+        SEGMENTS: recording.mcap or recording.rrd,
+    }
+    names = ENDLESS_RESULTS if is_endless else RESULTS
+    return [name for name in names if is_written.get(name, True)]
 
 
 def prepare_folder(
@@ -53,7 +66,7 @@ def prepare_folder(
 def refuse_earlier(out: Path, *, is_fine: bool) -> list[Path]:
     """The results of an earlier run in a folder; raises OutputError for them unless `is_fine`."""
     earlier = [out / name for name in RESULTS if (out / name).exists()]
-    earlier += sorted(out.glob(f"{STEM}-*"))
+    earlier += sorted(out.glob(SEGMENTS))
     if earlier and not is_fine:
         raise OutputError(
             f"{out}: expected a folder without results, found {earlier[0].name} of an earlier run; "

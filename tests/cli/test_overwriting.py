@@ -87,8 +87,11 @@ def test_exports_are_made_again_but_not_over_files_of_others(out: Path, tmp_path
 @pytest.mark.parametrize("species", ["halibut", "gar,perch"])
 def test_a_scene_knows_its_files(tmp_path: Path, species: str):
     options = {"--out": str(tmp_path), "--fish": "1", "--frames": "1", "--species": species}
-    assert invoke("simulate", options).code == 0
-    assert {path.name for path in tmp_path.iterdir()} == set(scene_files(species))
+    outcome = invoke("simulate", options)
+    assert outcome.code == 0
+    files = {path.name for path in tmp_path.iterdir()}
+    assert files == set(scene_files(species))
+    assert set(outcome.out.strip().removeprefix(f"scene in {tmp_path}: ").split(", ")) == files
     assert invoke("simulate", options).code == 2
     assert invoke("simulate", options | {"--overwrite": None}).code == 0
 

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.results.lengths_database import open_for_reading
 from stream_dmr.results.lengths_table import lengths_row
 from stream_dmr.results.store_rows import read_estimates
 from stream_dmr.running.config import load_config, to_toml
 from stream_dmr.running.measure_source import measure_source
-from stream_dmr.running.run_folder import RESULTS
+from stream_dmr.running.run_folder import RESULTS, SEGMENTS, result_names
 from stream_dmr.running.run_observer import RunObserver
 from tests.support.command import invoke, rows
 from tests.support.fish_run import request
@@ -111,6 +112,29 @@ def test_a_clip_without_fish_gives_empty_tables(tmp_path: Path):
     assert "no fish" in outcome.out
     assert_readable(Path(options["--out"]))
     assert rows(Path(options["--out"]) / "lengths.csv") == []
+
+
+@pytest.mark.parametrize("left_out", [[], ["mcap"], ["rrd"], ["mcap", "rrd"]])
+def test_the_last_line_names_what_was_written(tmp_path: Path, left_out: list[str]):
+    options = write_clip(tmp_path / "clip", fish=[[], []])
+    config = Path(options["--config"])
+    config.write_text(config.read_text() + "[recording]\n")
+    with config.open("a") as file:
+        file.writelines(f"{kind} = false\n" for kind in left_out)
+    outcome = invoke("run", options)
+    assert outcome.code == 0, outcome.err
+    out = Path(options["--out"])
+    said = outcome.out.splitlines()[-1].removeprefix(f"results in {out}: ").split(", ")
+    assert sorted(said) == sorted(path.name for path in out.iterdir())
+
+
+def test_segments_are_named_where_there_are_any():
+    def names(**settings: bool) -> list[str]:
+        return result_names(RecordingSettings(**settings), is_endless=True)
+
+    assert SEGMENTS in names(mcap=False)
+    assert SEGMENTS in names(rrd=False)
+    assert SEGMENTS not in names(mcap=False, rrd=False)
 
 
 def test_too_few_good_frames_give_no_length_and_say_so(tmp_path: Path):
