@@ -66,6 +66,7 @@ def measure_source(
     # The stages run side by side, so that OpenCV's own threads only add a sixth to the work.
     cv2.setNumThreads(1)
     inputs = checked_inputs(request)
+    unused: list[str] = []
     try:
         prepare_kernels(observer.stage, stop=stop)
         crop_fish = _crop_fish(inputs)
@@ -100,12 +101,15 @@ def measure_source(
                 )
             _report_start(inputs, outputs, observer)
             observer.begin(inputs.source.num_frames)
-            return _run_chain(inputs, nodes, outputs, observer, shapes_s=shapes_s, stop=stop)
+            summary = _run_chain(inputs, nodes, outputs, observer, shapes_s=shapes_s, stop=stop)
+        if not stop.is_set():  # only now is it known what the source has no frames for
+            unused = inputs.finder.unused
+        return summary
     finally:
         inputs.reader.close()
         if inputs.positions is not None:
             inputs.positions.close()
-        for line in (*inputs.source.warnings, *inputs.finder.warnings):
+        for line in (*inputs.source.warnings, *inputs.finder.warnings, *unused):
             observer.warn(line)
 
 

@@ -2,6 +2,7 @@
 
 import json
 import sqlite3
+import threading
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -16,12 +17,14 @@ from stream_dmr.errors import SourceError
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.provenance import seal_run
 from stream_dmr.results.verify import verify
+from stream_dmr.running.measure_source import measure_source
+from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.segmentation.annotations.box_files import load_boxes, unused_boxes
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
 from tests.support.command import invoke, rows
 from tests.support.final_estimates import FACTS, fish
-from tests.support.fish_run import measure
+from tests.support.fish_run import measure, request
 from tests.support.tiny_clip import write_clip
 
 FORMULA = '=HYPERLINK("http://x";"fish")'
@@ -91,6 +94,34 @@ def test_a_run_says_that_all_its_boxes_are_past_the_end(tmp_path: Path, track_id
     del options["--masks"]
     outcome = invoke("run", options)
     assert "all are past the end of the source" in outcome.err
+
+
+def test_a_run_that_did_not_see_the_end_says_nothing_of_boxes_past_it(tmp_path: Path):
+    options = write_clip(tmp_path / "clip", fish=[[1]] * 12)
+    assert invoke("run", options).code == 0
+    refused = invoke("run", options)
+    assert refused.code == 2
+    assert "past the end" not in refused.err
+    clip = tmp_path / "clip"
+    observer = StopAt(1)
+    asked = request(clip, tmp_path / "stopped", boxes=clip / "boxes.txt")
+    measure_source(asked, stop=observer.stop, observer=observer)
+    assert not [line for line in observer.warned if "past the end" in line]
+
+
+class StopAt(RunObserver):
+    """Sets the event after so many frames, and keeps the warnings."""
+
+    def __init__(self, num_frames: int) -> None:
+        self.stop, self.warned, self._left = threading.Event(), list[str](), num_frames
+
+    def warn(self, line: str) -> None:
+        self.warned.append(line)
+
+    def frame_done(self) -> None:
+        self._left -= 1
+        if self._left == 0:
+            self.stop.set()
 
 
 CHANGES: dict[str, Callable[[Path], object]] = {

@@ -94,7 +94,7 @@ class AnnotatedFish:
     @property
     def warnings(self) -> list[str]:
         """Mismatches between boxes and masks in the frames so far, one line each."""
-        lines = [] if self._boxes is None else unused_boxes(self._boxes, self._last_frame)
+        lines: list[str] = []
         if missing := self._frames_without_mask:
             lines.append(
                 f"masks: no picture for {len(missing)} frames, the first of them {missing[0]}"
@@ -110,6 +110,11 @@ class AnnotatedFish:
             if unboxed := sorted(self._masked_ids - self._boxed_ids):
                 lines.append(f"masks: ids {joined(unboxed)} have no box, so were left out")
         return lines
+
+    @property
+    def unused(self) -> list[str]:
+        """Whether boxes are beyond the last frame so far, one line."""
+        return [] if self._boxes is None else unused_boxes(self._boxes, self._last_frame)
 
     def _labels(self, frame: Frame, *, is_expected: bool) -> Labels | None:
         if self._masks is None:

@@ -23,7 +23,7 @@ class BoxDetector:
         return {}
 
     @property
-    def warnings(self) -> list[str]:
+    def unused(self) -> list[str]:
         """What of the file was not used so far."""
         return unused_boxes(self._frames, self._last_frame)
 

@@ -51,14 +51,18 @@ class NamedPictures:
 
     @property
     def warnings(self) -> list[str]:
-        """Pictures without a row, and rows without a picture, so far; one line each."""
+        """The pictures without a row so far, in one line."""
+        if not self._unnamed:
+            return []
+        return [f"pictures without a fish in the CSV: {joined(self._unnamed)}; left out"]
+
+    @property
+    def unused(self) -> list[str]:
+        """The rows without a picture so far, in one line."""
         missing = sorted(self._fish.keys() - self._seen)
-        lines = []
-        if self._unnamed:
-            lines.append(f"pictures without a fish in the CSV: {joined(self._unnamed)}; left out")
-        if missing:
-            lines.append(f"pictures of the CSV that the source doesn't have: {joined(missing)}")
-        return lines
+        if not missing:
+            return []
+        return [f"pictures of the CSV that the source doesn't have: {joined(missing)}"]
 
     def detect(self, frame: Frame) -> list[Detection]:
         """The fish of a picture. Raises AnnotationError for an unusable mask."""

@@ -30,6 +30,14 @@ class FishFinder(Protocol):
         """What the user should know of the frames so far, one line each; complete at the end."""
         ...
 
+    @property
+    def unused(self) -> list[str]:
+        """What of the given files no frame so far had, one line each.
+
+        True of the whole source only once it was read to its end.
+        """
+        ...
+
     def detect(self, frame: Frame) -> list[Detection]:
         """What may be fish in one frame. Raises AnnotationError for an unusable mask."""
         ...

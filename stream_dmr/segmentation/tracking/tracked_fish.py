@@ -105,11 +105,9 @@ class TrackedFish:
     @property
     def warnings(self) -> list[str]:
         """Why there are no fish, where there are none; a missed one of several is not noticed."""
-        unused = self._detector.warnings if isinstance(self._detector, BoxDetector) else []
         if self._found_any or self._seen.frames == 0:
-            return unused
+            return []
         return [
-            *unused,
             explain_no_fish(
                 self._seen,
                 self._detector.refused,
@@ -117,3 +115,8 @@ class TrackedFish:
                 min_confidence=self._settings.min_mask_confidence,
             ),
         ]
+
+    @property
+    def unused(self) -> list[str]:
+        """Boxes of a file that are beyond the last frame so far; nothing without such a file."""
+        return self._detector.unused if isinstance(self._detector, BoxDetector) else []

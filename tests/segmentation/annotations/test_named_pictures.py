@@ -69,7 +69,7 @@ def test_pictures_and_rows_that_do_not_match_are_said(tmp_path):
     finder = NamedPictures(ids_file(tmp_path), TwoThings())
     assert finder.detect(frame_of("d.jpg")) == []
     finder.detect(frame_of("a.jpg"))
-    unnamed, missing = finder.warnings
+    [unnamed], [missing] = finder.warnings, finder.unused
     assert "d.jpg" in unnamed
     assert "b.jpg, c.jpg" in missing
 
