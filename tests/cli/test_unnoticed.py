@@ -96,6 +96,25 @@ def test_a_run_says_that_all_its_boxes_are_past_the_end(tmp_path: Path, track_id
     assert "all are past the end of the source" in outcome.err
 
 
+@pytest.mark.parametrize("option", ["--masks", "--boxes"])
+@pytest.mark.parametrize(("first", "which"), [(1, "some"), (4, "all")])
+def test_a_run_says_that_masks_are_of_a_longer_video(
+    tmp_path: Path, option: str, first: int, which: str
+):
+    short, long = (
+        write_clip(tmp_path / name, fish=[[1]] * count) for name, count in (("a", 3), ("b", 8))
+    )
+    for index in range(1, first):
+        (Path(long["--masks"]) / f"{index:06d}.png").unlink()
+    lines = Path(long["--boxes"]).read_text().splitlines(keepends=True)
+    Path(long["--boxes"]).write_text("".join(lines[first - 1 :]))
+    del short["--masks"], short["--boxes"]
+    outcome = invoke("run", short | {option: long[option]})
+    assert outcome.code == 0, outcome.err
+    assert f"{option[2:]}: {which} are past the end of the source, 5 " in outcome.err
+    assert "from 4 on, and it ended at frame 3" in outcome.err
+
+
 def test_a_run_that_did_not_see_the_end_says_nothing_of_boxes_past_it(tmp_path: Path):
     options = write_clip(tmp_path / "clip", fish=[[1]] * 12)
     assert invoke("run", options).code == 0

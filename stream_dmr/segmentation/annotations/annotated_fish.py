@@ -113,8 +113,10 @@ class AnnotatedFish:
 
     @property
     def unused(self) -> list[str]:
-        """Whether boxes are beyond the last frame so far, one line."""
-        return [] if self._boxes is None else unused_boxes(self._boxes, self._last_frame)
+        """Whether boxes and masks are beyond the last frame so far, one line each."""
+        boxes = [] if self._boxes is None else unused_boxes(self._boxes, self._last_frame)
+        masks = [] if self._masks is None else self._masks.unused(self._last_frame)
+        return [*boxes, *masks]
 
     def _labels(self, frame: Frame, *, is_expected: bool) -> Labels | None:
         if self._masks is None:

@@ -113,6 +113,28 @@ class MaskFolder:
         self._has_ids = True
         return Labels(ids, is_unknown)
 
+    def unused(self, last_frame: int) -> list[str]:
+        """A line where pictures are beyond the last frame; those named like pictures don't count.
+
+        The pictures are not opened: one without any id counts as well.
+        """
+        frames = self._frames
+        beyond = [index for index in frames if index > last_frame]
+        if not beyond:
+            return []
+        which = "all" if len(beyond) == len(frames) else "some"
+        return [
+            f"masks: {which} are past the end of the source, {len(beyond)} pictures from "
+            f"{beyond[0]} on, and it ended at frame {last_frame}; are they of another video?"
+        ]
+
+    @property
+    def _frames(self) -> list[int]:
+        """The frames of numbered pictures, ascending; none where they are named otherwise."""
+        if not self._is_numbered:
+            return []
+        return sorted(int(name[:-4]) for name in self._names if _FILE_NAME.fullmatch(name))
+
     def _check_ids(self, largest: int) -> None:
         """A fish drawn as 255 on 0 is one that nobody would measure. Raises AnnotationError."""
         names = self._names

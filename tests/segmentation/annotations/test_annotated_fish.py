@@ -1,13 +1,19 @@
 """Fish by boxes, masks or both, and the mismatches between them."""
 
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from stream_dmr.errors import AnnotationError, UserError
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.annotations.annotated_fish import AnnotatedFish, open_annotated_fish
 from stream_dmr.segmentation.annotations.box_files import load_boxes
+from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
 from tests.support.annotation_files import LABELS_SIZE, boxes_file, labels_of
 
 
@@ -37,6 +43,20 @@ def test_a_frame_without_boxes_needs_no_mask(tmp_path):
     for index in (1, 2, 3, 4):
         annotations.detect(frame_at(index))
     assert annotations.warnings == ["masks: no picture for 1 frames, the first of them 4"]
+
+
+@given(last=st.integers(1, 12), frames=st.sets(st.integers(1, 12), min_size=1))
+def test_masks_are_unused_where_no_frame_is(last: int, frames: set[int]):
+    with TemporaryDirectory() as folder:
+        for index in frames:
+            (Path(folder) / f"{index:06d}.png").touch()
+        said = MaskFolder(Path(folder)).unused(last)
+    beyond = [index for index in frames if index > last]
+    assert bool(said) == bool(beyond)
+    if beyond:
+        which = "all" if len(beyond) == len(frames) else "some"
+        assert f"{which} are past" in said[0]
+        assert f"{len(beyond)} pictures from {min(beyond)} on" in said[0]
 
 
 def test_boxes_select_masks_and_mismatches_are_reported(tmp_path):
