@@ -11,6 +11,7 @@ from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.run_inputs import InputFile, RunInputs
+from stream_dmr.results.signatures import Signer
 from stream_dmr.running.conditions import lying, started_at, stills
 from stream_dmr.running.config import Config, load_config, to_toml
 from stream_dmr.running.kept_crops import KeptCrops
@@ -108,6 +109,8 @@ def checked_inputs(request: RunRequest) -> Inputs:
     notices: list[str] = []
     template, candidates = load_shapes(request.template, on_notice=notices.append)
     calibration = None if request.calibration is None else load_calibration(request.calibration)
+    if request.key is not None:
+        Signer(request.key)  # refused now, not when it is needed
     finder = open_finder(
         boxes=request.boxes,
         masks=request.masks,

@@ -2,6 +2,8 @@
 
 import itertools
 import tempfile
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 
 from stream_dmr.errors import OutputError
@@ -41,10 +43,8 @@ def prepare_folder(
     an earlier run; `overwrite` removes those instead, `resume` keeps them. With `waits_for_room` a
     full disk is no error. Returns the repairs of recordings that a crash left unfinished.
     """
-    earlier = refuse_earlier(out, is_fine=overwrite or resume)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        require_unlocked(out)
+    earlier = _open_folder(out, is_fine=overwrite or resume)
+    with _writing_to(out):
         if overwrite:
             for path in (*earlier, *out.glob(f"{STEM}.*")):
                 for leftover in ("", "-wal", "-shm"):  # of a database after a crash
@@ -56,15 +56,39 @@ def prepare_folder(
         if not waits_for_room:
             with tempfile.TemporaryFile(dir=out) as probe:
                 probe.write(bytes(_PROBE_BYTES))
+    return repairs
+
+
+def require_folder(out: Path, *, overwrite: bool) -> None:
+    """Raise OutputError where `prepare_folder` would, but for a full disk; nothing is removed yet.
+
+    For what takes long before the folder is needed. It is made unless it exists.
+    """
+    _open_folder(out, is_fine=overwrite)
+    with _writing_to(out):
+        tempfile.TemporaryFile(dir=out).close()
+
+
+def _open_folder(out: Path, *, is_fine: bool) -> list[Path]:
+    """Make the folder unless it exists; returns the results of an earlier run in it."""
+    earlier = _earlier_results(out, is_fine=is_fine)
+    with _writing_to(out):
+        out.mkdir(parents=True, exist_ok=True)
+        require_unlocked(out)
+    return earlier
+
+
+@contextmanager
+def _writing_to(out: Path) -> Generator[None]:
+    try:
+        yield
     except OSError as error:
         raise OutputError(
             f"{out}: expected a folder to write to, got: {error.strerror}; choose another --out"
         ) from error
-    return repairs
 
 
-def refuse_earlier(out: Path, *, is_fine: bool) -> list[Path]:
-    """The results of an earlier run in a folder; raises OutputError for them unless `is_fine`."""
+def _earlier_results(out: Path, *, is_fine: bool) -> list[Path]:
     earlier = [out / name for name in RESULTS if (out / name).exists()]
     earlier += sorted(out.glob(SEGMENTS))
     if earlier and not is_fine:

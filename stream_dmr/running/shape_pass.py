@@ -19,7 +19,7 @@ from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.running.inputs import Inputs
 from stream_dmr.running.kept_crops import keep_crops
-from stream_dmr.running.run_folder import refuse_earlier
+from stream_dmr.running.run_folder import require_folder
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.template.template import Template
 from stream_dmr.template.template_file import save_template
@@ -36,7 +36,7 @@ def with_learnt_shapes(
     candidates, learns_shapes = inputs.candidates, inputs.config.fit_mesh.learns_shapes
     if candidates is None or inputs.is_endless or inputs.resumes or not learns_shapes:
         return inputs
-    refuse_earlier(inputs.request.out, is_fine=inputs.request.overwrite)  # before the work
+    require_folder(inputs.request.out, overwrite=inputs.request.overwrite)  # before the work
     observer.stage("finding the fish, for their shapes")
     crops = keep_crops(
         inputs.reader, crop_fish, inputs.config.recording, stop=stop, on_frame=observer.frame_done

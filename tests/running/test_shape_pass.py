@@ -1,14 +1,18 @@
 """`--template auto`: a run learns the shape of its own fish first, writes it and records it."""
 
 import threading
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from stream_dmr.errors import UserError
 from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.replaying.replay_recording import ReplayRequest, replay
+from stream_dmr.results.folder_lock import FolderLock
 from stream_dmr.running.inputs import Inputs, checked_inputs
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_folder import LEARNT
@@ -27,14 +31,14 @@ class Listener(RunObserver):
 
     def __init__(self, *, stop_after: int | None = None) -> None:
         self.stop, self.notices, self._stop_after = threading.Event(), list[str](), stop_after
-        self._num_frames = 0
+        self.num_frames = 0
 
     def notice(self, line: str) -> None:
         self.notices.append(line)
 
     def frame_done(self) -> None:
-        self._num_frames += 1
-        if self._num_frames == self._stop_after:
+        self.num_frames += 1
+        if self.num_frames == self._stop_after:
             self.stop.set()
 
 
@@ -57,6 +61,43 @@ def measured(clip: Path, out: Path, observer: Listener, **other: object) -> RunR
 def learnt(clip: Path) -> tuple[Path, Listener]:
     observer = Listener()
     return measured(clip, clip.parent / "learnt", observer).out, observer
+
+
+def no_key(clip: Path) -> dict[str, object]:
+    (clip / "no.key").write_text("no key")
+    return {"key": clip / "no.key"}
+
+
+def a_file_in_the_way(clip: Path) -> dict[str, object]:
+    return {"out": clip / "video.mp4" / "out"}
+
+
+def a_disk_for_reading(clip: Path) -> dict[str, object]:
+    return {"out": Path("/proc/self")}
+
+
+def a_run_that_goes_on(clip: Path) -> dict[str, object]:
+    out = clip.parent / "locked"
+    out.mkdir(exist_ok=True)
+    return {"out": out}
+
+
+REFUSALS = [no_key, a_file_in_the_way, a_disk_for_reading, a_run_that_goes_on]
+
+
+@pytest.mark.parametrize("given", REFUSALS)
+def test_what_can_be_refused_is_refused_before_the_first_pass(
+    clip: Path, tmp_path: Path, given: Callable[[Path], dict[str, object]]
+):
+    options = {"out": tmp_path / "out"} | given(clip)
+    locked = [options["out"]] if given is a_run_that_goes_on else []
+    observer, asked = Listener(), request(clip, **{"template": "auto"} | options)  # type: ignore[arg-type]
+    with ExitStack() as stack:
+        for folder in locked:
+            stack.callback(FolderLock(Path(str(folder))).release)
+        with pytest.raises(UserError):
+            measure_source(asked, stop=observer.stop, observer=observer)
+    assert observer.num_frames == 0
 
 
 def test_what_was_learnt_is_written_recorded_and_said(learnt: tuple[Path, Listener]):
