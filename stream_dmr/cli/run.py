@@ -67,7 +67,10 @@ def run(
     ] = False,
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="Continue an earlier run in --out; live sources always do."),
+        typer.Option(
+            "--resume",
+            help="Continue in --out, as cameras and folders of clips always do; a video can't.",
+        ),
     ] = False,
     vessel: Annotated[str, typer.Option(help="Name of the vessel, for the exports.")] = "",
     trip: Annotated[str, typer.Option(help="Name of the trip, for the exports.")] = "",

@@ -57,7 +57,7 @@ class Inputs:
     @property
     def resumes(self) -> bool:
         """True where the run continues after the results that are in its folder."""
-        return (self.request.resume or self.is_endless) and not self.request.overwrite
+        return self.is_endless and not self.request.overwrite
 
     def header(self) -> RunHeader:
         """The header of this run's recording."""
@@ -130,6 +130,8 @@ def checked_inputs(request: RunRequest) -> Inputs:
         reader=reader,
     )
     try:
+        if request.resume and not inputs.is_endless:
+            raise UserError(_no_resuming(request))
         if calibration is not None:
             require_size(calibration, width=inputs.source.width, height=inputs.source.height)
         if request.nmea is None:
@@ -141,6 +143,14 @@ def checked_inputs(request: RunRequest) -> Inputs:
         reader.close()
         raise
     return replace(inputs, positions=positions)
+
+
+def _no_resuming(request: RunRequest) -> str:
+    return (
+        "--resume: expected a camera or a folder of clips, which go on where they ended, got "
+        f"{request.source}, which begins at its start: its fish would be counted twice; measure it "
+        "anew with --overwrite, or into another --out"
+    )
 
 
 def _is_since_1970(source: Source) -> bool:

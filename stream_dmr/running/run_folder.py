@@ -94,7 +94,7 @@ def _earlier_results(out: Path, *, is_fine: bool) -> list[Path]:
     if earlier and not is_fine:
         raise OutputError(
             f"{out}: expected a folder without results, found {earlier[0].name} of an earlier run; "
-            "choose another --out, or add --resume or --overwrite"
+            "choose another --out, or add --overwrite to have them replaced"
         )
     return earlier
 

@@ -30,11 +30,10 @@ def with_learnt_shapes(
 ) -> Inputs:
     """The inputs with the stocks of the source's own fish, and its crops.
 
-    As they are where nothing is to be learnt: a mesh was given, the source has no end, or an
-    earlier run is taken up again, whose fish were measured by other shapes.
+    As they are where nothing is to be learnt: a mesh was given, or the source has no end.
     """
     candidates, learns_shapes = inputs.candidates, inputs.config.fit_mesh.learns_shapes
-    if candidates is None or inputs.is_endless or inputs.resumes or not learns_shapes:
+    if candidates is None or inputs.is_endless or not learns_shapes:
         return inputs
     require_folder(inputs.request.out, overwrite=inputs.request.overwrite)  # before the work
     observer.stage("finding the fish, for their shapes")

@@ -61,11 +61,15 @@ def test_pose_and_stills_are_settings(clip: Path):
         assert inputs.config.smooth_length.min_frames == 1
 
 
-@pytest.mark.parametrize(("options", "resumes"), [({}, False), ({"resume": True}, True)])
-def test_a_file_is_measured_from_its_start_unless_asked(clip: Path, options: dict, resumes: bool):
-    for inputs in checked(clip, **options):
+def test_a_file_is_measured_from_its_start(clip: Path):
+    for inputs in checked(clip):
         assert not inputs.is_endless
-        assert inputs.resumes == resumes
+        assert not inputs.resumes
+
+
+def test_a_file_that_is_to_be_resumed_is_refused(clip: Path):
+    with pytest.raises(UserError, match=r"^--resume: expected a camera.*video\.mp4.*--overwrite"):
+        checked_inputs(request(clip, clip.parent / "out", resume=True))
 
 
 def test_a_calibration_of_another_size_is_refused_and_the_source_closed(clip: Path, tmp_path: Path):

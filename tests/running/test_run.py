@@ -1,5 +1,7 @@
 """`stream-dmr run` from end to end on tiny clips: what it writes, and what a stop leaves."""
 
+import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -219,34 +221,76 @@ def test_earlier_results_are_kept_unless_asked_to_replace_them(tmp_path: Path):
     assert (out / "notes.txt").read_text() == "mine"
 
 
-def test_a_resumed_run_numbers_fish_and_recordings_on(tmp_path: Path):
-    options = write_clip(tmp_path / "clip", fish=[[1, 2]] * 3)
+@pytest.mark.parametrize("ended", ["by itself", "by a stop"])
+def test_a_video_is_not_resumed_so_no_fish_counts_twice(tmp_path: Path, ended: str):
+    options = write_clip(tmp_path / "clip", fish=[[1, 2]] * 12)
     out = Path(options["--out"])
-    assert invoke("run", options).code == 0
+    observer = StopAt(4 if ended == "by a stop" else 0)
+    stop = observer.stop if ended == "by a stop" else threading.Event()
+    measure_source(request(tmp_path / "clip", out), stop=stop, observer=observer)
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    refused = invoke("run", options)
+    assert refused.code == 2
+    assert "--resume" not in refused.error
+    again = invoke("run", options | {"--resume": None})
+    assert again.code == 2
+    assert "--overwrite" in again.error
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert invoke("run", options | {"--overwrite": None}).code == 0
+    assert [row["frames_seen"] for row in rows(out / "lengths.csv")] == ["12", "12"]
+    assert_readable(out)
+
+
+def clips_of(folder: Path) -> dict[str, str]:
+    """Options that measure a folder with a clip of three frames, and masks for another one."""
+    options = write_clip(folder, fish=[[1, 2]] * 3)
+    for index in (4, 5, 6):
+        cv2.imwrite(str(folder / "masks" / f"{index:06d}.png"), draw_mask(index - 3, [1, 2]))
+    del options["--boxes"]
+    with Path(options["--config"]).open("a") as config:
+        config.write("\n[read_frames]\nclips_wait_s = 0\n")
+    (folder / "clips").mkdir()
+    add_clip(folder, "1.mp4")
+    return options | {"--source": str(folder / "clips")}
+
+
+def add_clip(folder: Path, name: str) -> None:
+    clip = folder / "clips" / name
+    shutil.copy(folder / "video.mp4", clip)
+    os.utime(clip, (1_700_000_000, 1_700_000_000))  # long ago, so that it is complete
+
+
+@pytest.mark.parametrize("asked", [{}, {"--resume": None}])
+def test_a_resumed_run_numbers_fish_and_recordings_on(tmp_path: Path, asked: dict[str, None]):
+    options = clips_of(tmp_path / "clip")
+    out = Path(options["--out"])
+    assert invoke("run", options | asked).code == 0
     first = {name: (out / name).read_text() for name in ("lengths.csv", "frames.csv")}
-    recording = (out / "recording.mcap").read_bytes()
+    (recording,) = out.glob("recording-*.mcap")
+    recorded = recording.read_bytes()
     (out / "frames.csv").write_text(first["frames.csv"] + "3,7,2,torn by a cra")
 
-    outcome = invoke("run", options | {"--resume": None})
+    add_clip(tmp_path / "clip", "2.mp4")
+    outcome = invoke("run", options | asked)
     assert outcome.code == 0, outcome.err
     assert [row["track_id"] for row in rows(out / "lengths.csv")] == ["1", "2", "3", "4"]
     frames = rows(out / "frames.csv")
     assert [row["track_id"] for row in frames] == ["1", "2"] * 3 + ["3", "4"] * 3
     for name, text in first.items():
         assert (out / name).read_text().startswith(text)
-    assert (out / "recording-1.mcap").read_bytes() == recording
-    resumed = [m for m in read_messages(out / "recording.mcap") if isinstance(m, LocalizedFish)]
+    assert recording.read_bytes() == recorded
+    (later,) = set(out.glob("recording-*.mcap")) - {recording}
+    resumed = [m for m in read_messages(later) if isinstance(m, LocalizedFish)]
     assert {fish.track_id for fish in resumed} == {3, 4}
 
 
 def test_lengths_csv_is_restored_from_the_database(tmp_path: Path):
-    options = write_clip(tmp_path / "clip", fish=[[1, 2]] * 3)
+    options = clips_of(tmp_path / "clip")
     out = Path(options["--out"])
     assert invoke("run", options).code == 0
     text = (out / "lengths.csv").read_text()
     (out / "lengths.csv").write_text(text[: len(text) // 2])  # as a crash may leave it
-    (tmp_path / "clip" / "boxes.txt").write_text("")
-    assert invoke("run", options | {"--resume": None}).code == 0
+    assert invoke("run", options).code == 0
     assert (out / "lengths.csv").read_text() == text
 
 
