@@ -76,7 +76,7 @@ def learn_template(
     others = [out.with_stem(f"{out.stem}-{n}") for n in range(2, len(stocks) + 1)]
     pairs = [file for other in others for file in (other, other.with_suffix(".toml"))]
     require_writable(*pairs, overwrite=overwrite)
-    for path in save_stocks(mesh, stocks, out, source=names):
+    for path in save_stocks(mesh, stocks, out, made_by="stream-dmr learn-template", source=names):
         print(f"{path}: measure with --template {path}")
     for line in describe(forms, stocks):
         print(line)

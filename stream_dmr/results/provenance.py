@@ -13,6 +13,7 @@ from stream_dmr.files import rename_durably, sha256_of, writing_to
 from stream_dmr.results.added_tables import read_added
 from stream_dmr.results.finished_fish import database_of, read_runs, rows_by_run, run_times
 from stream_dmr.results.hauls import HAULS
+from stream_dmr.results.learnt_meshes import learnt_files
 from stream_dmr.results.lengths_database import NAME as DATABASE
 from stream_dmr.results.lengths_database import open_for_reading
 from stream_dmr.results.log_sums import begins_as, log_sum
@@ -23,7 +24,6 @@ from stream_dmr.results.verdicts_table import read_verdicts, verdict_line
 from stream_dmr.version import __version__
 
 NAME = "provenance.json"
-LEARNT = ("template*.ply", "template*.toml")  # what a run learnt of its fish's shapes
 
 
 @contextmanager
@@ -53,8 +53,8 @@ def seal_run(folder: Path, *, with_recordings: bool) -> None:
     """
     database = folder / DATABASE
     kinds = ("*.csv", "*.mcap", "*.rrd") if with_recordings else ("lengths.csv", "frames.csv")
-    kinds = (*kinds, *LEARNT)
     files = [path for kind in kinds for path in folder.glob(kind)]
+    files += learnt_files(folder)
     sums = {
         f"{table}_sha256": {
             run_id: lines_sha256(lines) for run_id, lines in rows_by_run(database, table).items()

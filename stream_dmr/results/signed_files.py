@@ -7,10 +7,10 @@ from threading import Lock
 
 from stream_dmr.files import sha256_of
 from stream_dmr.results.chain_table import ChainWriter
+from stream_dmr.results.learnt_meshes import learnt_files
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.lengths_database import NAME as DATABASE
 from stream_dmr.results.lengths_database import open_for_writing
-from stream_dmr.results.provenance import LEARNT
 from stream_dmr.results.signatures import FILE, FOUND, REMOVED, Signer
 
 RECORDINGS = ("*.mcap", "*.rrd")
@@ -53,7 +53,7 @@ class SignedFiles:
     def finish(self, *, with_recordings: bool) -> None:
         """Sign the files of a run that is about to end; segments were signed before."""
         patterns = (*RECORDINGS, *TABLES) if with_recordings else ("lengths.csv",)
-        for path in _matching(self._folder, (*patterns, *LEARNT)):
+        for path in (*_matching(self._folder, patterns), *learnt_files(self._folder)):
             self.changed(path)
 
     def _sign(self, path: Path, kind: str) -> None:

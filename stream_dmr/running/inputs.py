@@ -11,6 +11,7 @@ from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.run_inputs import InputFile, RunInputs
+from stream_dmr.results.learnt_meshes import learnt_files
 from stream_dmr.results.signatures import Signer
 from stream_dmr.running.conditions import lying, started_at, stills
 from stream_dmr.running.config import Config, load_config, to_toml
@@ -107,6 +108,8 @@ def checked_inputs(request: RunRequest) -> Inputs:
     if request.stills:
         config = stills(config, is_calibrated=request.calibration is not None)
     notices: list[str] = []
+    if request.overwrite:
+        _keep_template(request)
     template, candidates = load_shapes(request.template, on_notice=notices.append)
     calibration = None if request.calibration is None else load_calibration(request.calibration)
     if request.key is not None:
@@ -151,6 +154,16 @@ def _no_resuming(request: RunRequest) -> str:
         f"{request.source}, which begins at its start: its fish would be counted twice; measure it "
         "anew with --overwrite, or into another --out"
     )
+
+
+def _keep_template(request: RunRequest) -> None:
+    """Raise a UserError where the given mesh is of the results that are replaced."""
+    mesh = Path(request.template).resolve()
+    if mesh in {path.resolve() for path in learnt_files(request.out)}:
+        raise UserError(
+            f"--template {request.template}: expected a mesh that stays, got one of the results "
+            "that --overwrite replaces; copy it and its TOML, or choose another --out"
+        )
 
 
 def _is_since_1970(source: Source) -> bool:

@@ -18,11 +18,11 @@ from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.fitting.shape.samples import MAX_FISH, GoodCrops
 from stream_dmr.messages import FishCrop, Frame, LearntShapes, LengthEstimate, Message
 from stream_dmr.nodes.fit_mesh import FitMesh
+from stream_dmr.results.learnt_meshes import LEARNT, MADE_BY_RUN, require_free_names
 from stream_dmr.results.provenance import add_files
 from stream_dmr.running.inputs import Inputs
 from stream_dmr.running.outputs import Outputs
 from stream_dmr.running.pipeline import Node
-from stream_dmr.running.run_folder import LEARNT
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.running.shape_pass import save_stocks, shapes_of
 
@@ -134,7 +134,11 @@ def follow_shapes(
             observer.notice(f"learnt from the fish so far: {line}")
         path = inputs.request.out / LEARNT
         try:
-            meshes = save_stocks(inputs.template, stocks, path, source=inputs.source.name)
+            if not inputs.request.overwrite:
+                require_free_names(path.parent)
+            meshes = save_stocks(
+                inputs.template, stocks, path, made_by=MADE_BY_RUN, source=inputs.source.name
+            )
             add_files(path.parent, [*meshes, *(mesh.with_suffix(".toml") for mesh in meshes)])
         except OutputError as error:
             observer.warn(str(error))

@@ -18,6 +18,7 @@ from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.nodes.localize import Localize
 from stream_dmr.nodes.smooth_length import SmoothLength
+from stream_dmr.results.learnt_meshes import LEARNT, MADE_BY_RUN
 from stream_dmr.results.run_facts import ENDLESS_STOPPED, SOURCE_ENDED, STOPPED
 from stream_dmr.running.config import Config
 from stream_dmr.running.drift_alarms import DriftAlarms
@@ -30,7 +31,7 @@ from stream_dmr.running.position_feed import PositionFeed
 from stream_dmr.running.prepare_kernels import prepare_kernels
 from stream_dmr.running.result_writer import ResultWriter
 from stream_dmr.running.resume import resume_source
-from stream_dmr.running.run_folder import LEARNT, result_names
+from stream_dmr.running.run_folder import result_names
 from stream_dmr.running.run_observer import RunObserver, RunTotals
 from stream_dmr.running.run_request import RunRequest
 from stream_dmr.running.shape_pass import save_stocks, with_learnt_shapes
@@ -97,6 +98,7 @@ def measure_source(
                     inputs.template,
                     inputs.candidates,
                     request.out / LEARNT,
+                    made_by=MADE_BY_RUN,
                     source=inputs.source.name,
                 )
             _report_start(inputs, outputs, observer)

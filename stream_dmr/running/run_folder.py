@@ -11,13 +11,13 @@ from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.segments.recording_files import STEM
 from stream_dmr.recording.segments.repair import Repair, repair_recordings
 from stream_dmr.results.folder_lock import require_unlocked
+from stream_dmr.results.learnt_meshes import learnt_files
 from stream_dmr.results.provenance import NAME as PROVENANCE
 
 RESULTS = (
     *("lengths.db", "lengths.csv", "frames.csv", "recording.mcap", "recording.rrd"),
     PROVENANCE,
 )
-LEARNT = "template.ply"  # what a run learnt of its fish's shape, with its TOML; -2, ... beside it
 SEGMENTS = f"{STEM}-*"  # the recordings of an endless run
 ENDLESS_RESULTS = ("lengths.db", "lengths.csv", "frames.csv", SEGMENTS)
 _PROBE_BYTES = 1 << 16  # that must fit on the disk at the start: more than the headers of all files
@@ -90,7 +90,7 @@ def _writing_to(out: Path) -> Generator[None]:
 
 def _earlier_results(out: Path, *, is_fine: bool) -> list[Path]:
     earlier = [out / name for name in RESULTS if (out / name).exists()]
-    earlier += sorted(out.glob(SEGMENTS))
+    earlier += [*sorted(out.glob(SEGMENTS)), *learnt_files(out)]
     if earlier and not is_fine:
         raise OutputError(
             f"{out}: expected a folder without results, found {earlier[0].name} of an earlier run; "

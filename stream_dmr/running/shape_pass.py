@@ -17,6 +17,7 @@ from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.messages import FishCrop
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
+from stream_dmr.results.learnt_meshes import is_mesh_by, mesh_comment, require_free_names
 from stream_dmr.running.inputs import Inputs
 from stream_dmr.running.kept_crops import keep_crops
 from stream_dmr.running.run_folder import require_folder
@@ -35,7 +36,10 @@ def with_learnt_shapes(
     candidates, learns_shapes = inputs.candidates, inputs.config.fit_mesh.learns_shapes
     if candidates is None or inputs.is_endless or not learns_shapes:
         return inputs
-    require_folder(inputs.request.out, overwrite=inputs.request.overwrite)  # before the work
+    out, overwrite = inputs.request.out, inputs.request.overwrite
+    require_folder(out, overwrite=overwrite)  # before the work
+    if not overwrite:
+        require_free_names(out)
     observer.stage("finding the fish, for their shapes")
     crops = keep_crops(
         inputs.reader, crop_fish, inputs.config.recording, stop=stop, on_frame=observer.frame_done
@@ -74,23 +78,26 @@ def shapes_of(
 
 
 def save_stocks(
-    template: Template, stocks: CandidateShapes, path: Path, *, source: str
+    template: Template, stocks: CandidateShapes, path: Path, *, made_by: str, source: str
 ) -> list[Path]:
     """Write the mesh of each stock, the largest to `path`, others beside it. Raises OutputError.
 
-    Those that were learnt there before are replaced.
+    Those that the command `made_by` wrote there before are replaced or removed.
     """
     for number in itertools.count(len(stocks) + 1):
         mesh = path.with_stem(f"{path.stem}-{number}")
         if not mesh.exists():
             break
-        for leftover in (mesh, mesh.with_suffix(".toml")):
-            leftover.unlink(missing_ok=True)
+        if is_mesh_by(made_by, mesh):
+            for leftover in (mesh, mesh.with_suffix(".toml")):
+                leftover.unlink(missing_ok=True)
     paths = [path, *(path.with_stem(f"{path.stem}-{n}") for n in range(2, len(stocks) + 1))]
     for stock, one in zip(stocks, paths, strict=True):
         save_template(
             replace(reshaped(template, stock.coefficients), name=stock.name),
             one,
-            comment=f"the mean shape of {stock.share:.0%} of the fish of {source}",
+            comment=mesh_comment(
+                made_by, f"the mean shape of {stock.share:.0%} of the fish of {source}"
+            ),
         )
     return paths

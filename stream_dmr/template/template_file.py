@@ -78,8 +78,8 @@ def save_template(template: Template, path: Path, *, comment: str) -> None:
     mesh = trimesh.Trimesh(template.rest_vertices, template.faces, process=False)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        mesh.export(path)
         path.with_suffix(".toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        mesh.export(path)
     except OSError as error:
         raise OutputError(
             f"{path}: can't be written: {error.strerror}; give another --out"

@@ -20,10 +20,12 @@ from stream_dmr.recording.messages.codec import decode, encode
 from stream_dmr.recording.reading.known_shapes import known_shapes, learnt_shapes
 from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
 from stream_dmr.replaying.replay_recording import ReplayRequest, replay
+from stream_dmr.results.learnt_meshes import LEARNT
 from stream_dmr.running.inputs import Inputs
 from stream_dmr.running.live_shapes import LiveShapes
 from stream_dmr.running.measure_source import measure_source
-from stream_dmr.running.run_folder import LEARNT
+from stream_dmr.running.run_observer import RunObserver
+from tests.support.command import rows
 from tests.support.final_estimates import fish as finished
 from tests.support.fish_run import request
 from tests.support.frames import frame_of
@@ -97,6 +99,30 @@ def test_a_restart_knows_what_was_learnt(runs: list[Path]):
     assert last not in runs[0].iterdir()
     [earlier], [later] = (learnt_shapes(open_recordings([one])) for one in (runs[0], last))
     np.testing.assert_array_equal(earlier.coefficients, later.coefficients)
+
+
+class Warned(RunObserver):
+    """Keeps the warnings of a run."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def warn(self, line: str) -> None:
+        self.lines.append(line)
+
+
+def test_a_mesh_of_the_user_stays_and_the_camera_measures_on(
+    runs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / LEARNT).write_text("mine")
+    monkeypatch.setattr(Inputs, "is_endless", property(lambda inputs: True))
+    monkeypatch.setattr("stream_dmr.running.live_shapes.ThreadPoolExecutor", Immediate)
+    observer = Warned()
+    asked = request(runs[0].parent / "clip", tmp_path, template="auto")
+    measure_source(asked, stop=threading.Event(), observer=observer)
+    assert (tmp_path / LEARNT).read_text() == "mine"
+    assert [line for line in observer.lines if f"{LEARNT}: expected a name that is free" in line]
+    assert len(rows(tmp_path / "lengths.csv")) == 4
 
 
 @pytest.mark.parametrize("kind", ["mcap", "rrd"])

@@ -1,5 +1,6 @@
 """`--template auto`: a run learns the shape of its own fish first, writes it and records it."""
 
+import shutil
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -8,14 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stream_dmr.errors import UserError
+from stream_dmr.errors import OutputError, UserError
 from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.replaying.replay_recording import ReplayRequest, replay
 from stream_dmr.results.folder_lock import FolderLock
+from stream_dmr.results.learnt_meshes import LEARNT, learnt_files
+from stream_dmr.results.provenance import NAME as PROVENANCE
+from stream_dmr.results.provenance import known_files
 from stream_dmr.running.inputs import Inputs, checked_inputs
 from stream_dmr.running.measure_source import measure_source
-from stream_dmr.running.run_folder import LEARNT
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.running.run_request import RunRequest
 from stream_dmr.running.shape_pass import with_learnt_shapes
@@ -111,6 +114,48 @@ def test_what_was_learnt_is_written_recorded_and_said(learnt: tuple[Path, Listen
     mean = reshaped(header.template, stock.coefficients)
     np.testing.assert_allclose(written.rest_vertices, mean.rest_vertices, atol=1e-5)
     assert [row["status"] for row in rows(out / "lengths.csv")] == ["measured"]
+
+
+@pytest.mark.parametrize("name", ["template.ply", "template.toml", "template-2.ply"])
+def test_a_mesh_of_the_user_is_not_written_over(clip: Path, tmp_path: Path, name: str):
+    out, observer = tmp_path / "out", Listener()
+    out.mkdir()
+    (out / name).write_text("mine")
+    with pytest.raises(OutputError, match=rf"{name}: expected a name that is free"):
+        measured(clip, out, observer)
+    assert observer.num_frames == 0
+    measured(clip, out, observer, template=str(clip / "tiny.ply"))  # which learns nothing
+    assert (out / name).read_text() == "mine"
+    assert name not in known_files(out)
+    measured(clip, out, observer, template=str(clip / "tiny.ply"), overwrite=True)
+    assert (out / name).read_text() == "mine"
+    measured(clip, out, observer, overwrite=True)
+    assert load_template(str(out / LEARNT))
+    assert {path.name for path in learnt_files(out)} <= set(known_files(out))
+    assert name.startswith("template.") or (out / name).read_text() == "mine"
+
+
+@pytest.mark.parametrize("is_sealed", [True, False])  # not: the earlier run was killed
+def test_overwrite_removes_what_an_earlier_run_learnt(
+    clip: Path, learnt: tuple[Path, Listener], tmp_path: Path, is_sealed: bool
+):
+    out = tmp_path / "out"
+    shutil.copytree(learnt[0], out)
+    (out / "template-of-mine.ply").write_text("mine")
+    if not is_sealed:
+        (out / PROVENANCE).unlink()
+    measured(clip, out, Listener(), template=str(clip / "tiny.ply"), overwrite=True)
+    assert [path.name for path in out.glob("template*")] == ["template-of-mine.ply"]
+    assert not [name for name in known_files(out) if name.startswith("template")]
+
+
+def test_overwrite_does_not_remove_the_mesh_to_measure_with(
+    clip: Path, learnt: tuple[Path, Listener]
+):
+    before = {path.name: path.read_bytes() for path in learnt[0].iterdir()}
+    with pytest.raises(UserError, match=r"--template .*expected a mesh that stays"):
+        measured(clip, learnt[0], Listener(), template=str(learnt[0] / LEARNT), overwrite=True)
+    assert {path.name: path.read_bytes() for path in learnt[0].iterdir()} == before
 
 
 def test_it_replays_to_the_last_bit(learnt: tuple[Path, Listener]):
