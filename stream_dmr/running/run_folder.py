@@ -46,7 +46,7 @@ def prepare_folder(
     earlier = _open_folder(out, is_fine=overwrite or resume)
     with _writing_to(out):
         if overwrite:
-            for path in (*earlier, *out.glob(f"{STEM}.*")):
+            for path in (*earlier, *_recordings(out, f"{STEM}.*")):
                 for leftover in ("", "-wal", "-shm"):  # of a database after a crash
                     path.with_name(path.name + leftover).unlink(missing_ok=True)
         repairs = list(repair_recordings(out))
@@ -90,13 +90,18 @@ def _writing_to(out: Path) -> Generator[None]:
 
 def _earlier_results(out: Path, *, is_fine: bool) -> list[Path]:
     earlier = [out / name for name in RESULTS if (out / name).exists()]
-    earlier += [*sorted(out.glob(SEGMENTS)), *learnt_files(out)]
+    earlier += [*_recordings(out, SEGMENTS), *learnt_files(out)]
     if earlier and not is_fine:
         raise OutputError(
             f"{out}: expected a folder without results, found {earlier[0].name} of an earlier run; "
             "choose another --out, or add --overwrite to have them replaced"
         )
     return earlier
+
+
+def _recordings(out: Path, pattern: str) -> list[Path]:
+    """Recordings, whole or unfinished; a video of the user may be called so as well."""
+    return sorted(path for path in out.glob(pattern) if {".mcap", ".rrd"} & {*path.suffixes})
 
 
 def _rename_earlier(recording: Path) -> None:

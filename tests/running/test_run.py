@@ -207,7 +207,9 @@ def test_earlier_results_are_kept_unless_asked_to_replace_them(tmp_path: Path):
     options = write_clip(tmp_path / "clip", num_frames=3)
     out = Path(options["--out"])
     assert invoke("run", options).code == 0
-    (out / "notes.txt").write_text("mine")
+    mine = ("notes.txt", "recording.mp4", "recording-2.mp4")
+    for name in mine:
+        (out / name).write_text("mine")
     before = {path.name: path.read_bytes() for path in out.iterdir()}
 
     refused = invoke("run", options)
@@ -218,7 +220,7 @@ def test_earlier_results_are_kept_unless_asked_to_replace_them(tmp_path: Path):
     (tmp_path / "clip" / "boxes.txt").write_text("")
     assert invoke("run", options | {"--overwrite": None}).code == 0
     assert rows(out / "lengths.csv") == []
-    assert (out / "notes.txt").read_text() == "mine"
+    assert [(out / name).read_text() for name in mine] == ["mine"] * 3
 
 
 @pytest.mark.parametrize("ended", ["by itself", "by a stop"])
