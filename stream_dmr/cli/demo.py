@@ -11,13 +11,11 @@ import typer
 from stream_dmr.cli.run import run
 from stream_dmr.cli.shared_options import OverwriteOption
 
-_OUT = Path("runs/demo")
-
 
 def demo(
     out: Annotated[
         Path, typer.Option(help="Folder for the results; those of an earlier demo are replaced.")
-    ] = _OUT,
+    ] = Path("runs/demo"),
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure the fish of the embedded scene from its video, and print the true lengths beside.
@@ -35,7 +33,7 @@ def demo(
         calibration=calibration,
         template=str(template),
         out=out,
-        overwrite=overwrite or out == _OUT,
+        overwrite=overwrite or _is_of_demo(out),
     )
     all_measured = print_beside_truth(out / "lengths.csv", DEMO_SCENE / "truth.csv")
     program = os.path.relpath(Path(sys.executable).with_name("stream-dmr"))  # venv not activated
@@ -43,6 +41,20 @@ def demo(
     if not all_measured:
         print("error: a fish of the scene was not measured", file=sys.stderr)
         raise typer.Exit(1)
+
+
+def _is_of_demo(out: Path) -> bool:
+    """True for a folder whose results are those of earlier demos alone."""
+    from stream_dmr.errors import OutputError
+    from stream_dmr.results.finished_fish import database_of, read_runs
+
+    database = database_of(out)
+    try:
+        runs = {} if database is None else read_runs(database)
+    except OutputError:
+        return False
+    commands = [f"{facts.command} " for facts in runs.values()]
+    return bool(commands) and all(one.startswith("stream-dmr demo ") for one in commands)
 
 
 def print_beside_truth(lengths: Path, truth: Path) -> bool:
