@@ -9,6 +9,7 @@ from stream_dmr.cli.shared_options import (
     OverwriteOption,
     TimeOption,
     TrackOption,
+    exit_on_signals,
     parse_selection,
     warn,
 )
@@ -70,26 +71,27 @@ def export(
 
     exported = Export(recording, parse_selection(time, track), overwrite=overwrite)
     exported.claim(out)
-    if meshes:
-        print(f"{out / 'meshes'}: {exported.meshes(out / 'meshes', format=meshes)} meshes")
-    if masks:
-        print(f"{out / 'masks.json'}: {exported.masks(out / 'masks.json')} masks")
-    if tables:
-        for path in exported.tables(out, format=tables):
-            print(path)
-    if fish:
-        settings = (
-            parse_config(exported.config_toml, where=f"{recording}: its config.toml")
-            if config is None
-            else load_config(config)
-        )
-        print(exported.fish(out, settings.fisheries, format=fish))
-    if viame:
-        path = out / "tracks.viame.csv"
-        print(f"{path}: {exported.viame(path)} boxes")
-    if agency:
-        print(exported.agency(out, agency))
-    if hauls:
-        print(exported.hauls(out))
-    print(exported.provenance(out))
+    with exit_on_signals(), exported.kept_if_sealed():
+        if meshes:
+            print(f"{out / 'meshes'}: {exported.meshes(out / 'meshes', format=meshes)} meshes")
+        if masks:
+            print(f"{out / 'masks.json'}: {exported.masks(out / 'masks.json')} masks")
+        if tables:
+            for path in exported.tables(out, format=tables):
+                print(path)
+        if fish:
+            settings = (
+                parse_config(exported.config_toml, where=f"{recording}: its config.toml")
+                if config is None
+                else load_config(config)
+            )
+            print(exported.fish(out, settings.fisheries, format=fish))
+        if viame:
+            path = out / "tracks.viame.csv"
+            print(f"{path}: {exported.viame(path)} boxes")
+        if agency:
+            print(exported.agency(out, agency))
+        if hauls:
+            print(exported.hauls(out))
+        print(exported.provenance(out))
     warn([*run_notes(recording), *exported.warnings])

@@ -105,6 +105,28 @@ def importing() -> Generator[None]:
 
 
 @contextmanager
+def exit_on_signals() -> Generator[None]:
+    """Ctrl-C and SIGTERM end the block by SystemExit, so that it cleans up; repeated ones don't."""
+    number_of_first = 0
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        nonlocal number_of_first
+        if not number_of_first:
+            number_of_first = number
+            raise SystemExit(128 + number)
+
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, on_signal) for number in signals]
+    try:
+        yield
+    finally:
+        for number, handler in zip(signals, before, strict=True):
+            signal.signal(number, handler)
+        if number_of_first:
+            print(f"stopped by {signal.Signals(number_of_first).name}", file=sys.stderr)
+
+
+@contextmanager
 def stop_on_signals() -> Generator[Stop]:
     """Ctrl-C and SIGTERM set the event instead of interrupting; repeated ones change nothing."""
     stop = Stop()

@@ -1,7 +1,8 @@
 """Exports recordings as meshes, COCO masks and tables."""
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,7 @@ class Export:
         self._written: list[Path] = []
         self._overwrite = overwrite
         self._earlier: set[Path] = set()  # exported before from the same recording
+        self._new: list[Path] = []  # files and folders that were not there, and no provenance knows
 
     @property
     def config_toml(self) -> str:
@@ -88,11 +90,11 @@ class Export:
             vertices = None if shape is None else place_fit(shape, fish)[0]
             if vertices is None:
                 continue
-            folder = make_folder(out / f"fish-{fit.track_id}")
+            folder = out / f"fish-{fit.track_id}"
             mesh = trimesh.Trimesh(vertices, template.faces, process=False)
             target = folder / f"{fit.frame_index:06d}.{format}"
             self._require_writable(target)
-            with writing_to(folder):
+            with writing_to(make_folder(folder)):
                 mesh.export(target)
             self._written.append(target)
             count += 1
@@ -239,10 +241,28 @@ class Export:
         """Write provenance.json: the inputs and checksums of all files written into `out`."""
         database = database_of(self._path)
         runs = {"": run_facts(self._recording.header)} if database is None else read_runs(database)
-        return seal_files(out, self._written, runs=runs, origin=str(self._path))
+        sealed = seal_files(out, self._written, runs=runs, origin=str(self._path))
+        self._new.clear()
+        return sealed
+
+    @contextmanager
+    def kept_if_sealed(self) -> Generator[None]:
+        """Remove what the block wrote where it ends before `provenance`: by an error or a signal.
+
+        So the same command can be given again. Files that were replaced stay as they are then.
+        """
+        try:
+            yield
+        except BaseException:
+            for path in reversed(self._new):
+                with suppress(OSError):
+                    path.rmdir() if path.is_dir() else path.unlink()
+            raise
 
     def _require_writable(self, *paths: Path) -> None:
         require_writable(*paths, overwrite=self._overwrite, is_own=self._earlier.__contains__)
+        places = (place for path in paths for place in (*reversed(path.parents), path))
+        self._new += [place for place in places if not place.exists()]
 
     def _messages(self, *kinds: type[Message]) -> Iterator[Message]:
         yield from self._reviewed.of(kinds)

@@ -1,8 +1,11 @@
 """No command writes over a file that it did not make, and never over what a run measured."""
 
+import os
+import signal
 from pathlib import Path
 
 import pytest
+import trimesh
 
 from stream_dmr.results.own_files import is_made_by, is_of_run, require_writable
 from stream_dmr.simulation import scene_files
@@ -82,6 +85,48 @@ def test_exports_are_made_again_but_not_over_files_of_others(out: Path, tmp_path
     (tmp_path / "masks.json").write_text("mine")
     assert invoke("export", options | {"--masks": None}).code == 2
     assert (tmp_path / "masks.json").read_text() == "mine"
+
+
+@pytest.mark.parametrize("ended_by", [signal.SIGINT, signal.SIGTERM, OSError("no room")])
+@pytest.mark.parametrize("is_first", [True, False])
+def test_an_export_that_was_cut_off_can_be_made_again(
+    out: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    ended_by: signal.Signals | OSError,
+    is_first: bool,
+):
+    folder, write = tmp_path / "exports", trimesh.Trimesh.export
+    if not is_first:
+        assert invoke("export", {str(out): None, "--out": str(folder), "--fish": "csv"}).code == 0
+        (folder / "notes.txt").write_text("mine")
+    before = everything(tmp_path)
+
+    def cut_off(mesh: trimesh.Trimesh, target: Path) -> None:
+        write(mesh, target)
+        if len(list(folder.rglob("*.ply"))) < 2:
+            return
+        if isinstance(ended_by, OSError):
+            raise ended_by
+        for _ in range(2):  # the impatient press twice
+            os.kill(os.getpid(), ended_by)
+
+    options = {str(out): None, "--out": str(folder), "--tables": "csv", "--meshes": "ply"}
+    with monkeypatch.context() as patch:
+        patch.setattr(trimesh.Trimesh, "export", cut_off)
+        outcome = invoke("export", options)
+    assert outcome.code == (2 if isinstance(ended_by, OSError) else 128 + ended_by)
+    assert everything(tmp_path) == before
+    assert invoke("export", options).code == 0
+    assert invoke("verify", {str(folder): None}).code == 0
+
+
+def everything(folder: Path) -> dict[str, bytes | None]:
+    """All below a folder; None: a folder."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in folder.rglob("*")
+    }
 
 
 @pytest.mark.parametrize("species", ["halibut", "gar,perch"])
