@@ -11,6 +11,7 @@ from stream_dmr.cli.shared_options import (
     OverwriteOption,
     SquareOption,
 )
+from stream_dmr.errors import OutputError, UserError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -65,9 +66,9 @@ def calibrate(
     from stream_dmr.results.own_files import require_writable
 
     if model not in ("auto", "pinhole", "fisheye"):
-        raise typer.BadParameter(f"--model: expected auto, pinhole or fisheye, got {model}")
+        raise UserError(f"--model: expected auto, pinhole or fisheye, got {model}")
     if (lens is None) == (not images):
-        raise typer.BadParameter(
+        raise UserError(
             "expected photographs of the board to calibrate the lens with, or --lens FILE with a "
             f"lens that is known, got {'neither' if lens is None else 'both'}"
         )
@@ -132,7 +133,6 @@ def _from_photographs(
     from stream_dmr.calibration.board import calibrate as calibrate_camera
     from stream_dmr.calibration.board import draw_views
     from stream_dmr.calibration.calibration_file import save_calibration
-    from stream_dmr.errors import OutputError
 
     if folder.is_dir() and not overwrite and any(folder.iterdir()):
         raise OutputError(

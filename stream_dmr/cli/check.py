@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stream_dmr.cli.shared_options import BoardOption, MarkerOption, SquareOption
+from stream_dmr.errors import OutputError, UserError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -47,7 +48,6 @@ def check(
     """
     from stream_dmr.calibration.calibration_file import load_calibration
     from stream_dmr.calibration.printed_board import PrintedBoard
-    from stream_dmr.errors import OutputError
     from stream_dmr.files import sha256_of
     from stream_dmr.results.finished_fish import database_of
     from stream_dmr.results.scale_checks import ScaleCheck, add_check
@@ -98,7 +98,7 @@ def _measure(
     from stream_dmr.calibration.known_length import scale_of_board, scale_of_points
 
     if (ends is None) != (length_mm is None):
-        raise typer.BadParameter("--ends and --length-mm belong together: give both or neither")
+        raise UserError("--ends and --length-mm belong together: give both or neither")
     pictures = _pictures(source)
     first = next(pictures)
     require_size(calibration, width=first.shape[1], height=first.shape[0])
@@ -107,7 +107,7 @@ def _measure(
     try:
         points = np.array([float(part) for part in ends.split(",")]).reshape(2, 2)
     except ValueError as error:
-        raise typer.BadParameter(f"--ends: expected U,V,U,V in pixels, got {ends}") from error
+        raise UserError(f"--ends: expected U,V,U,V in pixels, got {ends}") from error
     return scale_of_points(points, np.array([[0.0, 0, 0], [length_mm, 0, 0]]), calibration)
 
 

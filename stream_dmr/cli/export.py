@@ -13,6 +13,7 @@ from stream_dmr.cli.shared_options import (
     parse_selection,
     warn,
 )
+from stream_dmr.errors import UserError
 from stream_dmr.results.export_choices import Agency, MeshFormat, TableFormat
 
 
@@ -61,7 +62,7 @@ def export(
     provenance.json beside them says what made them; `stream-dmr verify` checks it.
     """
     if not (meshes or masks or tables or fish or viame or agency or hauls):
-        raise typer.BadParameter(
+        raise UserError(
             "expected a choice of what to export, got none; give some of: "
             "--fish csv, --meshes ply, --masks, --tables csv, --viame, --hauls, --agency wcpfc"
         )

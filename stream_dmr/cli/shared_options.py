@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stream_dmr.errors import UserError
 from stream_dmr.running.run_request import without_password
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ def _parse_time(text: str) -> tuple[float, float]:
     except ValueError:
         first = last = 0.0
     if not first < last:
-        raise typer.BadParameter(f"--time: expected FROM:TO in seconds, such as 60:90, got {text}")
+        raise UserError(f"--time: expected FROM:TO in seconds, such as 60:90, got {text}")
     return first, last
 
 

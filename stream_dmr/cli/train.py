@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from stream_dmr.cli.shared_options import OverwriteOption, command_line, stop_on_signals
+from stream_dmr.errors import UserError
 
 Device = Literal["cpu", "cuda"]
 
@@ -46,9 +47,9 @@ def train(
     use it by [crop_fish] segmenter = "OUT/unet.onnx". Ctrl-C ends it; --resume continues.
     """
     if (images is None) != (masks is None):
-        raise typer.BadParameter("--images and --masks belong together: give both or neither")
+        raise UserError("--images and --masks belong together: give both or neither")
     if backgrounds is not None and images is None:
-        raise typer.BadParameter("--backgrounds needs your own fish: give --images and --masks")
+        raise UserError("--backgrounds needs your own fish: give --images and --masks")
     with stop_on_signals() as stop:
         from stream_dmr.cli.train_display import TrainDisplay
         from stream_dmr.results.own_files import require_writable

@@ -102,8 +102,10 @@ def test_exports_have_the_last_check(files: dict[str, Path], tmp_path: Path):
 
 def test_a_rod_needs_both_and_a_run_its_database(files: dict[str, Path], tmp_path: Path):
     options = {"--calibration": str(files["right"])}
-    assert invoke(f"check {files['picture']}", options | {"--length-mm": "5"}).code == 2
+    outcome = invoke(f"check {files['picture']}", options | {"--length-mm": "5"})
+    assert (outcome.code, "belong together" in outcome.error) == (2, True)
     ends = {"--ends": "1,2,3", "--length-mm": "5"}
-    assert invoke(f"check {files['picture']}", options | ends).code == 2
+    outcome = invoke(f"check {files['picture']}", options | ends)
+    assert (outcome.code, "U,V,U,V" in outcome.error) == (2, True)
     outcome = invoke(f"check {files['picture']}", options | {"--out": str(tmp_path)})
     assert "found no lengths.db" in outcome.error

@@ -48,6 +48,21 @@ def test_usage_errors_exit_with_2_and_no_traceback(command: str):
     assert "Traceback" not in outcome.err
 
 
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        ("export runs/a --out x", "a choice of what to export"),
+        ("replay runs/a --time abc", "FROM:TO"),
+        ("calibrate --plane p.png a.png --model dome", "auto, pinhole or fisheye"),
+        ("calibrate --plane p.png", "photographs of the board"),
+    ],
+)
+def test_options_that_do_not_fit_are_said_in_one_line(command: str, expected: str):
+    outcome = invoke(command)
+    assert outcome.code == 2
+    assert expected in outcome.error
+
+
 def test_our_own_fault_exits_with_1_and_the_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path):
     def broken(*args: object, **kwargs: object) -> None:
         raise ZeroDivisionError("oops")

@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import typer
 
 from stream_dmr.cli.shared_options import command_line, parse_selection, stop_on_signals
 from stream_dmr.cli.terminal import (
@@ -18,6 +17,7 @@ from stream_dmr.cli.terminal import (
     print_timings,
     status_text,
 )
+from stream_dmr.errors import UserError
 from stream_dmr.replaying.comparator import Mismatch
 from stream_dmr.replaying.difference import Difference
 from stream_dmr.replaying.replay_recording import ReplaySummary
@@ -123,7 +123,7 @@ def test_a_time_and_tracks_select_a_part():
 
 @pytest.mark.parametrize("text", ["60", "90:60", "a:b", "1:2:3"])
 def test_an_impossible_time_is_refused(text: str):
-    with pytest.raises(typer.BadParameter, match="FROM:TO"):
+    with pytest.raises(UserError, match="FROM:TO"):
         parse_selection(text, None)
 
 

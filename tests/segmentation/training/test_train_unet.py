@@ -12,6 +12,7 @@ from stream_dmr.errors import ModelError, OutputError
 from stream_dmr.segmentation.network.unet_weights import SHIPPED, load_weights
 from stream_dmr.segmentation.training.train_settings import TrainSettings
 from stream_dmr.segmentation.training.train_unet import TrainObserver, TrainRequest, train_unet
+from tests.support.command import invoke
 
 TINY = TrainSettings(
     epochs=2,
@@ -140,12 +141,12 @@ def test_own_fish_are_trained_on_before_own_backgrounds(vessel):
 
 
 def test_backgrounds_without_own_fish_are_refused():
-    result = CliRunner().invoke(app, ["train", "--backgrounds", "x"])
-    assert result.exit_code == 2
-    assert "--images" in result.output
+    outcome = invoke("train", {"--backgrounds": "x"})
+    assert outcome.code == 2
+    assert "--images" in outcome.error
 
 
 def test_images_without_masks_are_refused():
-    result = CliRunner().invoke(app, ["train", "--images", "x"])
-    assert result.exit_code == 2
-    assert "belong together" in result.output
+    outcome = invoke("train", {"--images": "x"})
+    assert outcome.code == 2
+    assert "belong together" in outcome.error
