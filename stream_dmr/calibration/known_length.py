@@ -43,6 +43,31 @@ def scale_of_points(
     )
 
 
+def scale_of_ends(
+    ends_px: Float[np.ndarray, "2 2"], length_mm: float, calibration: Calibration
+) -> ScaleError:
+    """The scale by a rod's ends in the picture. Raises CalibrationError for ends that it hasn't."""
+    camera = calibration.camera
+    middles = np.array([camera.width - 1, camera.height - 1])  # of the last pixels
+    if not ((ends_px >= -0.5) & (ends_px <= middles + 0.5)).all():
+        raise CalibrationError(
+            f"--ends: expected two points of the picture, {camera.width}x{camera.height} px, got "
+            f"{_pixels(ends_px)}"
+        )
+    if (ends_px[0] == ends_px[1]).all():
+        raise CalibrationError(
+            f"--ends: expected the two ends of the rod, got the same point twice, "
+            f"{_pixels(ends_px[:1])}"
+        )
+    if not 0 < length_mm < np.inf:
+        raise CalibrationError(f"--length-mm: expected the rod's length, got {length_mm:g}")
+    return scale_of_points(ends_px, np.array([[0.0, 0, 0], [length_mm, 0, 0]]), calibration)
+
+
+def _pixels(points_px: Float[np.ndarray, "N 2"]) -> str:
+    return " and ".join(f"({u:g}, {v:g})" for u, v in points_px)
+
+
 def scale_of_board(
     pictures: Iterable[UInt8[np.ndarray, "H W"]], calibration: Calibration, board: PrintedBoard
 ) -> ScaleError:

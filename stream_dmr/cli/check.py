@@ -95,7 +95,7 @@ def _measure(
     import numpy as np
 
     from stream_dmr.calibration.calibration_file import require_size
-    from stream_dmr.calibration.known_length import scale_of_board, scale_of_points
+    from stream_dmr.calibration.known_length import scale_of_board, scale_of_ends
 
     if (ends is None) != (length_mm is None):
         raise UserError("--ends and --length-mm belong together: give both or neither")
@@ -108,7 +108,7 @@ def _measure(
         points = np.array([float(part) for part in ends.split(",")]).reshape(2, 2)
     except ValueError as error:
         raise UserError(f"--ends: expected U,V,U,V in pixels, got {ends}") from error
-    return scale_of_points(points, np.array([[0.0, 0, 0], [length_mm, 0, 0]]), calibration)
+    return scale_of_ends(points, length_mm, calibration)
 
 
 def _pictures(source: str) -> Iterator["np.ndarray"]:

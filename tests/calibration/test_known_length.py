@@ -1,5 +1,6 @@
 """A known length in the reference plane shows a wrong scale, and nothing where it is right."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,6 +54,25 @@ def test_a_rod_is_measured_by_its_ends():
         LENS.project(ends), np.array([[0.0, 0, 0], [200.0, 0, 0]]), farther(0.1)
     )
     assert found.error_mm == pytest.approx(20.0)
+
+
+@pytest.mark.parametrize(
+    ("ends", "length_mm", "expected"),
+    [
+        ("120,300,9800,310", "200", r"two points of the picture, 640x480 px, got .*\(9800, 310\)"),
+        ("120,300,nan,310", "200", "two points of the picture"),
+        ("-1,300,98,310", "200", "two points of the picture"),
+        ("120,300,120,300", "200", r"the same point twice, \(120, 300\)"),
+        ("120,300,220,300", "0", "--length-mm: expected the rod's length, got 0"),
+    ],
+)
+def test_a_rod_that_can_not_be_in_the_picture_is_no_alarm(
+    files: dict[str, Path], ends: str, length_mm: str, expected: str
+):
+    options = {"--calibration": str(files["right"]), "--ends": ends, "--length-mm": length_mm}
+    outcome = invoke(f"check {files['picture']}", options)
+    assert outcome.code == 2
+    assert re.search(expected, outcome.error)
 
 
 def test_a_board_of_another_size_is_named(picture: np.ndarray):
