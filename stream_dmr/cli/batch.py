@@ -49,7 +49,7 @@ def batch(
     workers: Annotated[
         int,
         typer.Option(
-            help="Videos measured at the same time, with local.", show_default="one a core"
+            help="Videos measured at the same time, with local.", show_default="one a core", min=0
         ),
     ] = 0,
     template: TemplateOption = "auto",

@@ -346,6 +346,15 @@ def test_a_killed_worker_or_batch_loses_no_finished_video(season: Path, tmp_path
         assert_same_tables(out / "videos" / name, season / "alone")
 
 
+def test_less_than_no_worker_is_refused(tmp_path: Path):
+    manifest = str(write_manifest(tmp_path / "season.csv", row()))
+    options = {"--out": str(tmp_path / "out"), "--workers": "-2"}
+    outcome = invoke("batch", {manifest: None} | options)
+    assert outcome.code == 2
+    assert "--workers" in outcome.err
+    assert not (tmp_path / "out").exists()
+
+
 def workers(out: Path) -> list[int]:
     """Processes that measure into `out`."""
     found = []
