@@ -68,7 +68,8 @@ def export(
         )
     from stream_dmr.results.export_formats import Export
     from stream_dmr.results.finished_fish import run_notes
-    from stream_dmr.running.config import load_config, parse_config
+    from stream_dmr.running.config import parse_config
+    from stream_dmr.running.species_checks import load_config_for
 
     exported = Export(recording, parse_selection(time, track), overwrite=overwrite)
     exported.claim(out)
@@ -84,7 +85,7 @@ def export(
             settings = (
                 parse_config(exported.config_toml, where=f"{recording}: its config.toml")
                 if config is None
-                else load_config(config)
+                else load_config_for(exported.template, config)
             )
             print(exported.fish(out, settings.fisheries, format=fish))
         if viame:

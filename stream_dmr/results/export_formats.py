@@ -49,6 +49,7 @@ from stream_dmr.results.provenance import known_files, read_origin, seal_files
 from stream_dmr.results.run_facts import run_facts
 from stream_dmr.results.scale_checks import last_checks
 from stream_dmr.results.viame_csv import ViameTracks
+from stream_dmr.template.template import Template
 
 
 class Export:
@@ -73,6 +74,11 @@ class Export:
         return self._recording.header.config_toml
 
     @property
+    def template(self) -> Template:
+        """The template of the run."""
+        return self._recording.header.template
+
+    @property
     def warnings(self) -> Sequence[str]:
         """The parts of the recording that are lost, one line each."""
         return self._recording.warnings
@@ -83,7 +89,7 @@ class Export:
         Vertices are in the camera frame, in mm; without a calibration a fish is one body length
         long.
         """
-        template = self._recording.header.template
+        template = self.template
         restored, count = MeshRebuilder(template, known_shapes(self._recording)), 0
         for fit, fish in _pairs(self._messages(FittedMesh, LocalizedFish)):
             shape = restored.with_vertices(fit).shape
@@ -147,7 +153,7 @@ class Export:
     def fish(self, out: Path, settings: FisheriesSettings, *, format: TableFormat) -> Path:
         """Write fish.csv (or .parquet): lengths as fisheries use them, verdicts, inputs."""
         self._require_writable(out / f"fish.{format}")
-        template = self._recording.header.template
+        template = self.template
         records = [
             fish_record(fish, template, settings)
             for fish in read_fish(self._path, self._recording, self._selection)
@@ -192,7 +198,7 @@ class Export:
         make, columns = (
             (wcpfc_row, WCPFC_COLUMNS) if agency == "wcpfc" else (rdbes_row, RDBES_COLUMNS)
         )
-        template = self._recording.header.template
+        template = self.template
         rows = [make(one, template) for one in self._all_fish() if one.counts]
         self._written.append(write_rows(make_folder(out) / path.name, columns, rows))
         return path

@@ -17,6 +17,7 @@ from stream_dmr.running.conditions import lying, started_at, stills
 from stream_dmr.running.config import Config, load_config, to_toml
 from stream_dmr.running.kept_crops import KeptCrops
 from stream_dmr.running.run_request import RunRequest, without_password
+from stream_dmr.running.species_checks import require_known_species
 from stream_dmr.segmentation.tracking.fish_finder import FishFinder, open_finder
 from stream_dmr.sensors.open_positions import open_positions
 from stream_dmr.sensors.position_source import PositionSource
@@ -111,6 +112,7 @@ def checked_inputs(request: RunRequest) -> Inputs:
     if request.overwrite:
         _keep_template(request)
     template, candidates = load_shapes(request.template, on_notice=notices.append)
+    require_known_species(config, template)
     calibration = None if request.calibration is None else load_calibration(request.calibration)
     if request.key is not None:
         Signer(request.key)  # refused now, not when it is needed

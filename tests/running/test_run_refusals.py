@@ -111,6 +111,18 @@ def config_of_wrong_type(clip: Path) -> None:
     (clip / "quick.toml").write_text("[smooth_length]\nmin_frames = 'three'\n")
 
 
+def unknown_species(clip: Path) -> None:
+    (clip / "quick.toml").write_text("[fisheries]\nspecies = 'halibot'\n")
+
+
+def unknown_form_of_a_species(clip: Path) -> None:
+    (clip / "quick.toml").write_text("[species]\nforms = ['HAP=halibot']\n")
+
+
+def missing_list_of_species(clip: Path) -> None:
+    (clip / "quick.toml").write_text("[species]\nown_list = 'nofile.csv'\n")
+
+
 def file_for_out(clip: Path) -> None:
     (clip / "out").write_text("in the way")
 
@@ -134,6 +146,9 @@ def file_for_out(clip: Path) -> None:
         (template_without_points, "tiny.toml"),
         (unknown_config_key, r"\[fit_mesh\]: unknown key 'solvr'; did you mean 'solver'"),
         (config_of_wrong_type, r"\[smooth_length\].*expected an integer.*received"),
+        (unknown_species, r"\[fisheries\] species.* got 'halibot'; did you mean 'halibut'\?"),
+        (unknown_form_of_a_species, r"\[species\].* HAP .* got 'halibot'; did you mean 'halibut'"),
+        (missing_list_of_species, r"\[species\] own_list: .*nofile.csv: No such file"),
         (file_for_out, "expected a folder"),
     ],
     ids=lambda value: value.__name__ if callable(value) else "",
