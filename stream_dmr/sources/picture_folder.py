@@ -11,7 +11,7 @@ from jaxtyping import UInt8, UInt16
 from stream_dmr.errors import SourceError
 from stream_dmr.files import MAX_PIXELS, PICTURE_SUFFIXES, natural_order, size_if_huge
 from stream_dmr.messages import Frame
-from stream_dmr.sources.source import Source, check_size, nominal_ns
+from stream_dmr.sources.source import Source, nominal_ns
 
 OtherSizes = Literal["refuse", "leave_out", "take"]
 _DEPTHS = {"uint8", "uint16"}
@@ -56,7 +56,7 @@ class PictureFolder(Source):
                 continue
             size = picture.shape[1], picture.shape[0]
             if self._other_sizes == "refuse":
-                check_size(picture, width=self.width, height=self.height, where=str(path))
+                self._require_size(size, path)
             elif self._other_sizes == "leave_out" and size != (self.width, self.height):
                 self.warnings.append(
                     f"{path.name}: {size[0]}x{size[1]} px, the calibration is for {self.width}x"
@@ -68,6 +68,14 @@ class PictureFolder(Source):
                 timestamp_ns=nominal_ns(frame_index, self.fps),
                 image=_to_8_bit(picture, self._full_scale),
                 source=path.name,
+            )
+
+    def _require_size(self, size: tuple[int, int], path: Path) -> None:
+        if size != (self.width, self.height):
+            raise SourceError(
+                f"{path}: expected {self.width}x{self.height} px, as the first picture has, got "
+                f"{size[0]}x{size[1]} px; give --stills where pictures stand for themselves, or "
+                'set [read_frames] other_sizes to "leave_out" or "take"'
             )
 
     def close(self) -> None:

@@ -4,9 +4,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
-from jaxtyping import UInt8, UInt16
-
 from stream_dmr.errors import SourceError
 from stream_dmr.messages import Frame
 
@@ -91,19 +88,6 @@ class Source(ABC):
 def nominal_ns(frame_index: int, fps: float) -> int:
     """The time of a frame where only a constant rate is known, ns since the first frame."""
     return round((frame_index - 1) * _SECOND_NS / fps)
-
-
-def check_size(
-    image: UInt8[np.ndarray, "H W 3"] | UInt16[np.ndarray, "H W 3"],
-    *,
-    width: int,
-    height: int,
-    where: str,
-) -> None:
-    """Raise SourceError, naming both sizes, unless a picture is `width` x `height` px."""
-    if image.shape[:2] != (height, width):
-        size = image.shape[1], image.shape[0]
-        raise size_error(size, expected=(width, height), where=where)
 
 
 def size_error(size: tuple[int, int], *, expected: tuple[int, int], where: str) -> SourceError:

@@ -112,5 +112,5 @@ def test_pictures_of_another_size_are_taken_or_left_out(tmp_path, other_sizes, k
     assert [frame.frame_index for frame in frames] == kept
     assert [len(frame.image) != folder.height for frame in frames] == [n == 2 for n in kept]
     assert len(folder.warnings) == (other_sizes == "leave_out")
-    with pytest.raises(SourceError, match="must have one size"):
+    with pytest.raises(SourceError, match=r"--stills .* \[read_frames\] other_sizes"):
         list(PictureFolder(tmp_path, fps=25.0))
