@@ -21,6 +21,10 @@ MAX_TEXT_BYTES = 1_000_000  # chosen: many times what any settings or calibratio
 MAX_PIXELS = 150_000_000  # chosen: the largest cameras have some 100 megapixels
 PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
+_JPEG_START = b"\xff\xd8"
+_JPEG_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # not a byte of pixels, nor a restart
+_JPEG_END = b"\xd9"
+
 
 class TransactionalFile:
     """An unbuffered file for writing, in which a failed write leaves nothing behind.
@@ -157,6 +161,25 @@ def size_if_huge(path: Path) -> str:
     except (OSError, ValueError, SyntaxError):
         return ""
     return f"{width}x{height} px" if width * height > MAX_PIXELS else ""
+
+
+def is_cut_off(path: Path) -> bool:
+    """True for a JPEG that ends before its end marker, whose rest OpenCV would fill with grey.
+
+    Its segments are walked, since a thumbnail in one has an end marker of its own. Of other kinds
+    of pictures OpenCV refuses what is cut off. Raises OSError.
+    """
+    with path.open("rb") as file:
+        if file.read(2) != _JPEG_START:
+            return False
+        content = file.read()
+    position = 0
+    while found := _JPEG_MARKER.search(content, position):
+        position = found.end()
+        if found[0][-1:] == _JPEG_END:
+            return False
+        position += int.from_bytes(content[position : position + 2])  # the segment's length
+    return True
 
 
 def is_locked(folder: Path) -> bool:

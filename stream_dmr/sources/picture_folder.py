@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from stream_dmr.errors import SourceError
-from stream_dmr.files import MAX_PIXELS, PICTURE_SUFFIXES, natural_order, size_if_huge
+from stream_dmr.files import MAX_PIXELS, PICTURE_SUFFIXES, is_cut_off, natural_order, size_if_huge
 from stream_dmr.messages import Frame
 from stream_dmr.sources.source import Source, nominal_ns
 
@@ -22,8 +22,8 @@ _UNREADABLE = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw"
 class PictureFolder(Source):
     """A folder of pictures in natural order (`2.png` before `10.png`), usually of one size.
 
-    Grey and 16-bit pictures become 8-bit BGR. One that can't be decoded is left out with a warning
-    but keeps its frame index, so that boxes and masks stay with their pictures.
+    Grey and 16-bit pictures become 8-bit BGR. One that can't be decoded, or is cut off, is left out
+    with a warning but keeps its frame index, so that boxes and masks stay with their pictures.
     """
 
     def __init__(self, folder: Path, *, fps: float, other_sizes: OtherSizes = "refuse") -> None:
@@ -52,7 +52,9 @@ class PictureFolder(Source):
                 return
             picture = _read_picture(path)
             if picture is None:
-                self.warnings.append(f"{path.name}: can't be decoded, so was left out")
+                self.warnings.append(
+                    f"{path.name}: can't be decoded, or is cut off, so was left out"
+                )
                 continue
             size = picture.shape[1], picture.shape[0]
             if self._other_sizes == "refuse":
@@ -105,8 +107,9 @@ def _not_read(names: list[str]) -> str:
 
 
 def _read_picture(path: Path) -> np.ndarray | None:
-    """A picture as BGR of its own depth, turned upright if it says so; None if it can't be read.
+    """A picture as BGR of its own depth, turned upright if it says so.
 
+    None if it can't be read, or not to its end.
     Raises SourceError for one that is too large, before it takes the memory.
     """
     if huge := size_if_huge(path):
@@ -114,7 +117,9 @@ def _read_picture(path: Path) -> np.ndarray | None:
             f"{path}: expected a picture of {MAX_PIXELS // 10**6} megapixels or less, got {huge}"
         )
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    return picture if picture is not None and picture.dtype.name in _DEPTHS else None
+    if picture is None or picture.dtype.name not in _DEPTHS or is_cut_off(path):
+        return None
+    return picture
 
 
 def _full_scale_of(paths: list[Path]) -> int:

@@ -291,6 +291,13 @@ def test_sixteen_bit_colour_pictures_are_read(tmp_path):
     assert read_grey(save(tmp_path / "deep.png", deep)).shape == (20, 30)
 
 
+def test_a_picture_that_is_cut_off_is_refused(tmp_path):
+    path = save(tmp_path / "half.jpg", np.random.default_rng(0).integers(0, 255, (20, 30)))
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(CalibrationError, match="a broken one"):
+        read_grey(path)
+
+
 def test_pictures_are_not_turned_by_exif(tmp_path):
     """The lens does not turn with the way up that a picture is shown."""
     _, encoded = cv2.imencode(".jpg", np.zeros((20, 30), np.uint8))

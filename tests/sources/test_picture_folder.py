@@ -83,7 +83,17 @@ def test_a_picture_that_cannot_be_decoded_keeps_its_index(tmp_path):
     (tmp_path / "2.png").touch()
     opened, frames = read(tmp_path)
     assert [f.frame_index for f in frames] == [1, 3]
-    assert opened.warnings == ["2.png: can't be decoded, so was left out"]
+    assert opened.warnings == ["2.png: can't be decoded, or is cut off, so was left out"]
+
+
+def test_a_jpeg_that_is_cut_off_is_left_out(tmp_path):
+    for number in (1, 2, 3):
+        cv2.imwrite(str(tmp_path / f"{number}.jpg"), noise(number))
+    content = (tmp_path / "2.jpg").read_bytes()
+    (tmp_path / "2.jpg").write_bytes(content[: len(content) // 2])
+    opened, frames = read(tmp_path)
+    assert [f.frame_index for f in frames] == [1, 3]
+    assert opened.warnings == ["2.jpg: can't be decoded, or is cut off, so was left out"]
 
 
 def test_pictures_of_two_sizes_are_refused_after_those_before(tmp_path):
