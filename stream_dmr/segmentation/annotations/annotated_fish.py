@@ -1,5 +1,6 @@
 """Fish by the boxes and masks that annotation files give for each frame."""
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -17,11 +18,15 @@ from stream_dmr.segmentation.detection.fish_detection import Detection
 
 
 def open_annotated_fish(
-    *, boxes: Path | None, masks: Path | None, pictures: Path | None = None
+    *,
+    boxes: Path | None,
+    masks: Path | None,
+    pictures: Path | None = None,
+    across_frames: bool = True,
 ) -> "AnnotatedFish":
     """Open a boxes file, a masks folder, or both; the boxes must have ids.
 
-    `pictures`: the source of the frames, see `MaskFolder`.
+    `pictures`: the source of the frames, `across_frames`: False for stills, see `MaskFolder`.
     Raises AnnotationError where one cannot be read or boxes with masks have no ids, UserError where
     neither is given.
     """
@@ -36,8 +41,10 @@ def open_annotated_fish(
                 f"{boxes}: expected the ids of --masks, got boxes without ids; add the ids, or "
                 "leave out --boxes: the masks give boxes as well"
             )
-    folder = None if masks is None else MaskFolder(masks, pictures=pictures)
-    return AnnotatedFish(boxes=by_frame, masks=folder)
+    folder = None
+    if masks is not None:
+        folder = MaskFolder(masks, pictures=pictures, across_frames=across_frames)
+    return AnnotatedFish(boxes=by_frame, masks=folder, across_frames=across_frames)
 
 
 class AnnotatedFish:
@@ -48,8 +55,13 @@ class AnnotatedFish:
     """
 
     def __init__(
-        self, *, boxes: dict[int, list[AnnotatedBox]] | None, masks: MaskFolder | None
+        self,
+        *,
+        boxes: dict[int, list[AnnotatedBox]] | None,
+        masks: MaskFolder | None,
+        across_frames: bool = True,
     ) -> None:
+        """`across_frames`: False for stills, where an id in several pictures is said."""
         self._boxes = boxes
         self._masks = masks
         self._last_frame = 0
@@ -57,6 +69,8 @@ class AnnotatedFish:
         self._boxes_outside: list[tuple[int, int]] = []  # frame, id
         self._boxed_ids: set[int] = set()
         self._masked_ids: set[int] = set()
+        self._across_frames = across_frames
+        self._pictures_of = defaultdict[int, set[int]](set)  # of stills: id -> frames
 
     @property
     def gives_masks(self) -> bool:
@@ -65,6 +79,13 @@ class AnnotatedFish:
 
     def detect(self, frame: Frame) -> list[Detection]:
         """The fish of one frame, ordered by id. Raises AnnotationError for an unusable mask."""
+        detections = self._detect(frame)
+        if not self._across_frames:
+            for detection in detections:
+                self._pictures_of[detection.source_id].add(frame.frame_index)
+        return detections
+
+    def _detect(self, frame: Frame) -> list[Detection]:
         self._last_frame = max(self._last_frame, frame.frame_index)
         if self._boxes is None:
             labels = self._labels(frame, is_expected=True)
@@ -93,8 +114,15 @@ class AnnotatedFish:
 
     @property
     def warnings(self) -> list[str]:
-        """Mismatches between boxes and masks in the frames so far, one line each."""
+        """Mismatches between boxes and masks so far, and ids in several stills; one line each."""
         lines: list[str] = []
+        several = {fish: len(found) for fish, found in self._pictures_of.items() if len(found) > 1}
+        if several:
+            ids = joined([f"id {fish} in {several[fish]} pictures" for fish in sorted(several)])
+            lines.append(
+                f"--stills: equal ids were taken for one fish with one length: {ids}; where "
+                "pictures show different fish, give each of these an id of its own"
+            )
         if missing := self._frames_without_mask:
             lines.append(
                 f"masks: no picture for {len(missing)} frames, the first of them {missing[0]}"

@@ -20,6 +20,15 @@ _FILE_NAME = re.compile(r"\d{6,}\.png")
 # What Pillow raises for a PNG that it cannot decode.
 _DECODING_ERRORS = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 _MAX_LOOKED_AT = 20  # pictures, for ids where the first one has none
+# Commands that make ids of white on black, in place: 1, and 1, 2, 3 ... picture by picture.
+_TO_ONE_FISH = (
+    ".venv/bin/python -c \"import cv2, sys; [cv2.imwrite(p, (cv2.imread(p, 0) > 127).astype('u1')) "
+    'for p in sys.argv[1:]]"'
+)
+_TO_DIFFERENT_FISH = (
+    ".venv/bin/python -c \"import cv2, sys; [cv2.imwrite(p, (cv2.imread(p, 0) > 127).astype('u2') "
+    '* n) for n, p in enumerate(sys.argv[1:], 1)]"'
+)
 _LABEL_MODES = {"1", "L", "P", "I", "I;16", "I;16B"}  # one channel; "P": palette indices
 
 
@@ -58,9 +67,12 @@ class MaskFolder:
     indices, not their colours.
     """
 
-    def __init__(self, folder: Path, *, pictures: Path | None = None) -> None:
+    def __init__(
+        self, folder: Path, *, pictures: Path | None = None, across_frames: bool = True
+    ) -> None:
         """`pictures`: the source of the frames; where it is a folder, masks may be named after it.
 
+        `across_frames`: fish are in several frames; False: each picture stands for itself.
         Raises AnnotationError where the folder is missing or holds no masks for these frames.
         """
         if not folder.is_dir():
@@ -81,6 +93,7 @@ class MaskFolder:
         self.folder = folder
         self._names = names
         self._has_ids = False
+        self._across_frames = across_frames
 
     def labels(
         self, frame_index: int, *, width: int, height: int, picture: str = ""
@@ -147,7 +160,20 @@ class MaskFolder:
                 return
         raise AnnotationError(
             f"{self.folder}: expected fish ids from 1 on, found only 0 and {largest}, which means "
-            "unknown; write the mask of a single fish with the value 1"
+            f"unknown; {self._remedy}"
+        )
+
+    @property
+    def _remedy(self) -> str:
+        """What makes ids of masks that show what is fish, and no more."""
+        if self._across_frames:
+            return (
+                "write the mask of a single fish with the value 1: "
+                f"{_TO_ONE_FISH} {self.folder}/*.png"
+            )
+        return (
+            "write each picture's fish with a value of its own, since equal ids are one fish: "
+            f"{_TO_DIFFERENT_FISH} {self.folder}/*.png"
         )
 
 

@@ -71,8 +71,10 @@ def open_finder(
         folder = None if masks is None else MaskFolder(masks, pictures=pictures)
         return NamedPictures(boxes, folder or open_detector(detect))
     if boxes is None or masks is not None:
-        return open_annotated_fish(boxes=boxes, masks=masks, pictures=pictures)
+        return open_annotated_fish(
+            boxes=boxes, masks=masks, pictures=pictures, across_frames=track.across_frames
+        )
     frames = load_boxes(boxes)
     if any(box.track_id == UNKNOWN_ID for found in frames.values() for box in found):
         return TrackedFish(BoxDetector(frames), track)
-    return AnnotatedFish(boxes=frames, masks=None)
+    return AnnotatedFish(boxes=frames, masks=None, across_frames=track.across_frames)

@@ -36,6 +36,20 @@ def test_masks_alone_give_the_boxes(tmp_path):
     assert annotations.warnings == ["masks: no picture for 2 frames, the first of them 2"]
 
 
+def test_equal_ids_of_stills_are_said_to_be_one_fish(tmp_path):
+    for number in (1, 2):
+        labels = labels_of(id1=(0, 0, 2, 2)) + number * labels_of(id1=(4, 1, 7, 5))
+        cv2.imwrite(str(tmp_path / f"00000{number}.png"), 2 * labels)
+    for across_frames in (True, False):
+        annotations = open_annotated_fish(boxes=None, masks=tmp_path, across_frames=across_frames)
+        for _ in range(2):  # once to learn shapes, once to measure
+            for index in (1, 2):
+                annotations.detect(frame_at(index))
+        said = [line.partition("; ")[0] for line in annotations.warnings]
+        expected = "--stills: equal ids were taken for one fish with one length: id 2 in 2 pictures"
+        assert said == ([] if across_frames else [expected])
+
+
 def test_a_frame_without_boxes_needs_no_mask(tmp_path):
     cv2.imwrite(str(tmp_path / "000001.png"), labels_of(id1=(0, 0, 2, 2)))
     boxes = boxes_file(tmp_path, "1,1,0,0,3,3,1\n4,1,0,0,3,3,1\n")

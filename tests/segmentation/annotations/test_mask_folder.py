@@ -1,5 +1,9 @@
 """Label pictures give ids however they are stored; others are refused."""
 
+import shlex
+import subprocess
+import sys
+
 import cv2
 import numpy as np
 import pytest
@@ -89,6 +93,24 @@ def test_masks_that_show_fish_as_unknown_are_refused(tmp_path):
         MaskFolder(tmp_path).labels(1, **LABELS_SIZE)
     cv2.imwrite(str(tmp_path / "000002.png"), labels // 255)
     assert MaskFolder(tmp_path).labels(1, **LABELS_SIZE).unknown.sum() == 12
+
+
+@pytest.mark.parametrize(("across_frames", "ids"), [(True, [1, 1]), (False, [1, 2])])
+def test_the_command_in_the_refusal_makes_ids(tmp_path, across_frames, ids):
+    """Of video one fish, of stills one fish a picture."""
+    folder, inside = tmp_path / "masks", labels_of(id1=(1, 1, 5, 4))
+    folder.mkdir()
+    for name in ("000001.png", "000002.png"):
+        cv2.imwrite(str(folder / name), inside * np.uint8(255))
+    with pytest.raises(AnnotationError, match="only 0 and 255") as refused:
+        MaskFolder(folder, across_frames=across_frames).labels(1, **LABELS_SIZE)
+    command = str(refused.value).partition(".venv/bin/python")[2]
+    subprocess.run(f"{shlex.quote(sys.executable)}{command}", shell=True, check=True)
+    masks = MaskFolder(folder, across_frames=across_frames)
+    for frame_index, fish in zip((1, 2), ids, strict=True):
+        labels = masks.labels(frame_index, **LABELS_SIZE)
+        np.testing.assert_array_equal(labels.ids, inside.astype(int) * fish)
+        assert labels.unknown is None
 
 
 def test_unusable_masks_are_refused(tmp_path):

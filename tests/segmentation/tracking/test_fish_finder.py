@@ -30,3 +30,15 @@ def test_boxes_with_ids_are_kept_and_others_are_tracked(tmp_path):
         expected = [(1, [10 * f, 20, 10 * f + 50, 50])]
         assert [(d.source_id, list(d.bbox_xyxy_px)) for d in found] == expected
         assert all(d.mask is None for d in found)
+
+
+def test_boxes_of_stills_with_equal_ids_are_said(tmp_path):
+    boxes = tmp_path / "boxes.txt"
+    boxes.write_text("1,7,10,20,50,30,1\n2,7,10,20,50,30,1\n3,8,10,20,50,30,1\n")
+    track = TrackFishSettings(across_frames=False)
+    followed = open_finder(boxes=boxes, masks=None, detect=DetectFishSettings(), track=track)
+    for f in (1, 2, 3):
+        image = np.zeros((100, 200, 3), np.uint8)
+        followed.detect(Frame(frame_index=f, timestamp_ns=f, image=image, source=""))
+    (said,) = followed.warnings
+    assert "id 7 in 2 pictures; where" in said
