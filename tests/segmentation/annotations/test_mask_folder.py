@@ -7,10 +7,12 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 
 from stream_dmr.errors import AnnotationError
-from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
+from stream_dmr.segmentation.annotations.mask_folder import Labels, MaskFolder, are_grey_levels
 from tests.support.annotation_files import LABELS_SIZE, labels_of
 
 
@@ -142,3 +144,38 @@ def test_folders_without_masks_are_refused(tmp_path):
     (tmp_path / "000000.png").touch()
     with pytest.raises(AnnotationError, match=r"counted from 000001\.png"):
         MaskFolder(tmp_path)
+
+
+SIZE = {"width": 320, "height": 240}
+POINT = st.tuples(st.integers(0, SIZE["width"]), st.integers(0, SIZE["height"]))
+FISH = st.tuples(POINT, st.integers(6, 60), st.integers(3, 12), st.integers(0, 180))
+
+
+def draw(fish, dtype=np.uint8):
+    labels = np.zeros((SIZE["height"], SIZE["width"]), dtype)
+    for number, (center, length, depth, angle) in enumerate(fish, start=1):
+        cv2.ellipse(labels, center, (length, depth), angle, 0, 360, number, -1)
+    return labels
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@given(fish=st.lists(FISH, min_size=8, max_size=100))
+def test_dozens_of_fish_are_no_grey_levels(dtype, fish):
+    assert not are_grey_levels(Labels(draw(fish, dtype), None))
+    assert not are_grey_levels(Labels(draw(fish, dtype).astype(np.int32), None))
+
+
+@pytest.mark.parametrize("white", [254, 255])
+@given(length=st.integers(30, 100), angle=st.integers(0, 180), sigma_px=st.floats(0.8, 20))
+def test_a_soft_edge_is_grey_levels(white, length, angle, sigma_px):
+    fish = draw([((160, 120), length, length // 4, angle)]) * np.uint8(white)
+    soft = cv2.GaussianBlur(fish, (0, 0), sigma_px)
+    assert are_grey_levels(Labels(np.where(soft == 255, 0, soft), None))
+
+
+@pytest.mark.parametrize("white", [254, 255])
+def test_masks_with_soft_edges_are_refused(tmp_path, white):
+    fish = draw([((160, 120), 80, 20, 30)]) * np.uint8(white)
+    cv2.imwrite(str(tmp_path / "000001.png"), cv2.GaussianBlur(fish, (0, 0), 2))
+    with pytest.raises(AnnotationError, match=r"000001.png: .* values in thin bands.*the value 1"):
+        MaskFolder(tmp_path).labels(1, **SIZE)
