@@ -145,6 +145,11 @@ class ReferencePlane:
     rotation: Float[np.ndarray, "3 3"]  # camera_from_world
     translation_mm: Float[np.ndarray, "3"]  # camera_from_world
 
+    @property
+    def distance_mm(self) -> float:
+        """From the camera, at a right angle to the plane."""
+        return float(abs(self.rotation[:, 2] @ self.translation_mm))
+
     def homography(self, K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
         """H = K [R1 R2 T] of eq. (9): from (X, Y, 1) mm on the plane to undistorted pixels."""
         return K @ np.column_stack([self.rotation[:, 0], self.rotation[:, 1], self.translation_mm])

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.calibration.calibration_values import CALIBRATE, read_values
+from stream_dmr.calibration.lens_check import require_lens
 from stream_dmr.calibration.lens_file import lens_of, load_lens, read_array, with_common_names
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.errors import CalibrationError, OutputError
@@ -25,6 +27,7 @@ _KEYS = (
 # that tvec is in metres.
 _MIN_SLOPE = np.sin(np.radians(3.0))
 _MIN_DEPTH_MM = 10.0
+_MAX_ANGLE = 2 * np.pi + 1e-6
 
 
 def load_calibration(path: Path | str) -> Calibration:
@@ -48,7 +51,9 @@ def load_calibration(path: Path | str) -> Calibration:
             f"add them, or {CALIBRATE}"
         )
     camera = lens_of(values, path).camera((0, 0))
+    require_lens(camera, path)
     rvec, tvec = (read_array(values, key, shapes=[(3,)], path=path) for key in _PLANE_KEYS)
+    _check_rotation(rvec, path)
     plane = ReferencePlane(rotation=Rotation.from_rotvec(rvec).as_matrix(), translation_mm=tvec)
     _check_plane(camera, plane, path=path)
     return Calibration(camera=camera, plane=plane)
@@ -90,6 +95,15 @@ def require_size(calibration: Calibration, *, width: int, height: int) -> None:
         raise CalibrationError(
             f"expected pictures of {camera.width}x{camera.height} px, the calibration's size, "
             f"got {width}x{height}; calibrate with pictures of {width}x{height} px from this camera"
+        )
+
+
+def _check_rotation(rvec: Float[np.ndarray, "3"], path: Path) -> None:
+    angle = float(np.linalg.norm(rvec))
+    if angle > _MAX_ANGLE:
+        raise CalibrationError(
+            f"{path}: rvec: expected a rotation of at most one turn, {2 * np.pi:.2f} radians, got "
+            f"{angle:.1f}; check that rvec is not in degrees, or {CALIBRATE}"
         )
 
 

@@ -107,11 +107,10 @@ def _with_known_lens(
     save_calibration(out, calibration)
     camera = calibration.camera
     model = "fisheye" if camera.is_fisheye else "pinhole"
-    distance_mm = float(view.plane.rotation[:, 2] @ view.plane.translation_mm)
     for line in (
         f"{model} lens of {lens}, {camera.width}x{camera.height} px; board in {plane.name}: "
         f"{view.rms_px:.3f} px RMS, distances {view.distances.mean_percent:.2f} % off",
-        f"reference plane {distance_mm:.0f} mm from the camera",
+        f"reference plane {view.plane.distance_mm:.0f} mm from the camera",
         f"calibration: {out}",
     ):
         console.print(line, markup=False, soft_wrap=True)
@@ -177,8 +176,7 @@ def _views_table(result: "BoardResult") -> "Table":
 
 def _summary(result: "BoardResult") -> list[str]:
     camera, fit = result.calibration.camera, result.fit
-    plane = result.calibration.plane
-    distance_mm = float(plane.rotation[:, 2] @ plane.translation_mm)
+    distance_mm = result.calibration.plane.distance_mm
     focal = " and ".join(
         f"{camera.K[axis, axis]:.1f} ± {fit.focal_std_px[axis]:.1f} px" for axis in (0, 1)
     )

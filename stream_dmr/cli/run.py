@@ -155,4 +155,7 @@ def _print_summary(summary: "RunSummary", out: Path, *, timings: bool) -> None:
     promised = summary.frames_promised
     of = "" if promised is None or summary.num_frames >= promised - 1 else f" of {promised}"
     print(f"{summary.num_frames}{of} frames in {elapsed_s:.1f} s, {rate:.1f} frames/s")
+    if summary.calibration is not None:
+        distance_m = summary.calibration.plane.distance_mm / 1000
+        print(f"by the calibration the reference plane is {distance_m:.2f} m from the camera")
     print(f"results in {out}: {', '.join(path.name for path in summary.files)}")

@@ -37,6 +37,7 @@ from stream_dmr.running.run_request import RunRequest
 from stream_dmr.running.shape_pass import save_stocks, with_learnt_shapes
 from stream_dmr.template.template import Template
 
+_USUAL_M = (0.5, 20.0)  # chosen: from cameras to the plane of hanging fish
 _MAX_SUMMARY_FISH = 100  # of an endless run, for the table at its end; the store has all fish
 
 
@@ -50,6 +51,7 @@ class RunSummary:
     frames_promised: int | None  # by the source; None where it doesn't
     shapes_s: float  # of the first pass, in which the shapes of the fish were learnt
     elapsed_s: float  # of the chain
+    calibration: Calibration | None
     counters: Sequence[StageCounters]
     files: Sequence[Path]  # names of segments as a pattern
 
@@ -126,6 +128,13 @@ def _report_start(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> No
         observer.warn(note)
     if inputs.calibration is None:
         observer.warn("without --calibration there are relative shapes, no millimetres")
+    elif inputs.request.pose == "hanging":
+        distance_m = inputs.calibration.plane.distance_mm / 1000
+        if not _USUAL_M[0] <= distance_m <= _USUAL_M[1]:
+            observer.warn(
+                f"the calibration's reference plane is {distance_m:.2f} m from the camera; if it "
+                "is not, every length is wrong: tvec must be in mm"
+            )
     if inputs.source.is_live and inputs.config.recording.frames == "reference":
         observer.warn(
             "a live source can't be read again, so its pictures are not kept but for the view and "
@@ -250,6 +259,7 @@ def _run_chain(
         frames_promised=inputs.source.num_frames,
         shapes_s=shapes_s,
         elapsed_s=time.perf_counter() - began,
+        calibration=inputs.calibration,
         counters=counters,
         files=[
             request.out / name

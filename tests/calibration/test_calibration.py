@@ -95,6 +95,9 @@ def test_columns_rows_and_integers_are_all_vectors(tmp_path):
         ({"tvec": np.zeros((3, 1))}, "closer than"),
         ({"tvec": np.array([[0.0], [0.0], [0.9]])}, "in mm"),
         ({"rvec": np.array([[np.pi / 2], [0.0], [0.0]])}, "edge-on"),
+        ({"rvec": np.array([[5.0], [-11.0], [9.0]])}, "15.1; check that rvec is not in degrees"),
+        ({"distortion_coefficients": np.array([[-5.0, 0, 0, 0, 0]])}, "fold"),
+        ({"distortion_coefficients": np.array([[-5.0, 1000.0, 0, 0, 0]])}, "enlarge areas"),
     ],
 )
 def test_wrong_values_are_named(tmp_path, changes, named):

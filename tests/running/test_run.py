@@ -6,12 +6,14 @@ import subprocess
 import sys
 import threading
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from stream_dmr.calibration.calibration_file import save_calibration
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.results.lengths_database import open_for_reading
@@ -24,7 +26,7 @@ from stream_dmr.running.run_observer import RunObserver
 from tests.support.command import invoke, rows
 from tests.support.fish_run import request
 from tests.support.reading import read_header, read_messages
-from tests.support.tiny_clip import draw_mask, draw_picture, write_clip
+from tests.support.tiny_clip import calibration, draw_mask, draw_picture, options, write_clip
 
 COMING_AND_GOING = [[1], [1, 2], [1, 2], [1, 2], [2, 3], [3], [3], []]
 
@@ -326,3 +328,27 @@ def test_a_run_stopped_at_any_frame_leaves_valid_results(tmp_path: Path, num_fra
     if num_frames:
         assert [fish.track_id for fish in summary.fish] == [1, 2]
         assert all(fish.is_final for fish in summary.fish)
+
+
+@pytest.mark.parametrize(
+    ("share", "pose", "is_warned"),
+    [
+        (1.0, "hanging", False),
+        (0.1, "hanging", True),
+        (11.0, "hanging", True),
+        (0.1, "lying", False),
+    ],
+)
+def test_a_run_says_how_far_away_its_plane_is(
+    tmp_path: Path, share: float, pose: str, is_warned: bool
+):
+    """A tvec in cm or in tenths of mm gives wrong lengths that nothing else shows."""
+    clip = tmp_path / "clip"
+    write_clip(clip, num_frames=4)
+    far = calibration()
+    plane = replace(far.plane, translation_mm=far.plane.translation_mm * share)
+    save_calibration(clip / "calibration.yaml", replace(far, plane=plane))
+    outcome = invoke("run", options(clip) | {"--pose": pose})
+    assert outcome.code == 0, outcome.err
+    assert f"reference plane is {2 * share:.2f} m from the camera" in outcome.out
+    assert (f"plane is {2 * share:.2f} m from the camera; if it" in outcome.err) == is_warned
