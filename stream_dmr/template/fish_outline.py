@@ -22,6 +22,9 @@ _BOW_WINDOW = 0.3  # averaged over this part of the length, since fins stand out
 # A tail fin is broader than the peduncle before it: by a factor of 3.7 for the bundled halibut and
 # 2.3 for the pike; towards a snout no outline of theirs becomes broader.
 _MIN_SPREAD = 1.25
+# Between an outline and the one turned by half, of its area: 0.07 for the bundled eel, which has no
+# such fin, 0.3 and more for others and views from above; a drawn ellipse has 0.01 to 0.03.
+_MIN_DIFFERENCE = 0.04
 _TAIL_PART = 0.4  # of the length, in which a peduncle lies
 _TIP_PART = 0.01  # of the length, next to an end, whose middle is the tip
 
@@ -60,7 +63,8 @@ def fish_outline(
 
     Head and tail are distinguished by the tail fin's spread or, without one, by the larger half,
     which is the head's; `head_is_left` says it instead. Raises TemplateError where the mask shows
-    no fish, more than one, one too small or too bent; `name` stands in the message.
+    no fish, more than one, one too small or too bent, or one whose ends are alike; `name` stands in
+    the message.
     """
     blob = _one_blob(mask, name=name)
     left, right = _far_ends(blob)
@@ -78,7 +82,7 @@ def fish_outline(
             "as long as broad; show it from the side"
         )
     if head_is_left is None:
-        head_is_left = _head_is_left(widths)
+        head_is_left = _head_is_left(widths, name=name)
     head, tail = (left, right) if head_is_left else (right, left)
     for _ in range(2):  # first from the farthest pixels, then from what was found with these
         canvas, to_pixels = _straightened(blob, head, tail)
@@ -158,11 +162,20 @@ def _widths(canvas: Bool[np.ndarray, "R C"]) -> Float[np.ndarray, "N"]:
     return gaussian_filter1d(widths[columns[0] : columns[-1] + 1], _SMOOTH_PX, mode="nearest")
 
 
-def _head_is_left(widths: Float[np.ndarray, "N"]) -> bool:
-    """Whether the tail fin spreads on the right; without one, whether the left half is larger."""
+def _head_is_left(widths: Float[np.ndarray, "N"], *, name: str) -> bool:
+    """Whether the tail fin spreads on the right; without one, whether the left half is larger.
+
+    Raises TemplateError for an outline that is the same from both ends, as an ellipse is.
+    """
     right, left = _spread(widths)[1], _spread(widths[::-1])[1]
     if max(left, right) >= _MIN_SPREAD:
         return right > left
+    difference = float(np.abs(widths - widths[::-1]).sum() / widths.sum())
+    if difference < _MIN_DIFFERENCE:
+        raise TemplateError(
+            f"{name}: expected a fish, got an outline without a tail fin whose ends are alike, but "
+            f"for {100 * difference:.0f} % of its area; take the mask of a photograph"
+        )
     middle = len(widths) // 2
     return bool(widths[:middle].sum() >= widths[middle:].sum())
 

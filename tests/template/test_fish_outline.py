@@ -91,6 +91,24 @@ def banana() -> np.ndarray:
     return view > 0
 
 
+def ellipse(breadth: float, *, pointed: float = 0.0, turn_rad: float = 0.0) -> np.ndarray:
+    """`pointed`: by how much its right half is narrower, at half way to the end."""
+    y, x = np.mgrid[-500:500, -500:500] / 400.0
+    along, across = x * np.cos(turn_rad) + y * np.sin(turn_rad), y * np.cos(turn_rad)
+    across -= x * np.sin(turn_rad)
+    share = across / (breadth * (1 - pointed * np.clip(2 * along, 0, 1)))
+    return along**2 + share**2 < 1
+
+
+@given(breadth=st.floats(0.06, 0.7), turn_deg=st.floats(-180.0, 180.0))
+@settings(max_examples=25, deadline=None)
+def test_an_outline_that_is_alike_from_both_ends_is_no_fish(breadth: float, turn_deg: float):
+    with pytest.raises(TemplateError, match="whose ends are alike"):
+        fish_outline(ellipse(breadth, turn_rad=np.radians(turn_deg)), name="x")
+    pointed = ellipse(breadth, pointed=0.3, turn_rad=np.radians(turn_deg))
+    assert fish_outline(pointed, name="x").peduncle == 1
+
+
 @pytest.mark.parametrize(
     ("mask", "message"),
     [
@@ -100,8 +118,9 @@ def banana() -> np.ndarray:
         (side_view("cod")[0][:, 200:], "got one cut off by the picture's rim"),
         (side_view("cod")[0] | np.roll(side_view("cod")[0], 300, axis=0), "got 2 parts"),
         (banana(), "expected a straight fish"),
+        (ellipse(0.22), "an outline without a tail fin whose ends are alike"),
     ],
-    ids=["empty", "square", "small", "cut off", "two", "bent"],
+    ids=["empty", "square", "small", "cut off", "two", "bent", "ellipse"],
 )
 def test_what_is_no_straight_fish_is_refused_in_one_line(mask: np.ndarray, message: str):
     with pytest.raises(TemplateError, match=f"side.png: .*{message}") as refusal:
