@@ -69,12 +69,13 @@ def batch(
         from stream_dmr.cli.terminal import counts_text
         from stream_dmr.fitting.shape.candidates import load_shapes
         from stream_dmr.results.signatures import Signer
-        from stream_dmr.running.species_checks import load_config_for
+        from stream_dmr.running.config import load_config
+        from stream_dmr.running.species_checks import require_known_species
 
         if key is not None:
             Signer(key)  # refuses what is no key before any video
-        mesh, _ = load_shapes(template)  # refuses what it can't read before any video
-        load_config_for(mesh, config)
+        load_shapes(template)  # refuses what it can't read before any video
+        require_known_species(load_config(config).species)
         if (out / VIDEOS).exists():
             read_videos(out)  # refuses a table that is no batch's
         jobs = read_manifest(manifest, config=config, template=template, key=key)

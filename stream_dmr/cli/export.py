@@ -68,11 +68,12 @@ def export(
         )
     from stream_dmr.results.export_formats import Export
     from stream_dmr.results.finished_fish import run_notes
-    from stream_dmr.running.config import parse_config
-    from stream_dmr.running.species_checks import load_config_for
+    from stream_dmr.running.config import load_config, parse_config
+    from stream_dmr.running.species_checks import species_notes
 
     exported = Export(recording, parse_selection(time, track), overwrite=overwrite)
     exported.claim(out)
+    notes: list[str] = []
     with exit_on_signals(), exported.kept_if_sealed():
         if meshes:
             print(f"{out / 'meshes'}: {exported.meshes(out / 'meshes', format=meshes)} meshes")
@@ -85,8 +86,9 @@ def export(
             settings = (
                 parse_config(exported.config_toml, where=f"{recording}: its config.toml")
                 if config is None
-                else load_config_for(exported.template, config)
+                else load_config(config)
             )
+            notes = species_notes(settings, exported.template)
             print(exported.fish(out, settings.fisheries, format=fish))
         if viame:
             path = out / "tracks.viame.csv"
@@ -96,4 +98,4 @@ def export(
         if hauls:
             print(exported.hauls(out))
         print(exported.provenance(out))
-    warn([*run_notes(recording), *exported.warnings])
+    warn([*run_notes(recording), *exported.warnings, *notes])

@@ -13,7 +13,6 @@ from stream_dmr.recording.reading.open_recording import Recording, decoded_messa
 from stream_dmr.replaying.recorded_files import CropFiles, find_crop_files, inputs_with
 from stream_dmr.replaying.replay_request import ReplayRequest
 from stream_dmr.running.config import Config, load_config, parse_config, to_toml
-from stream_dmr.running.species_checks import require_known_species
 from stream_dmr.template.template import Template
 
 
@@ -39,8 +38,6 @@ def read_inputs(request: ReplayRequest, recording: Recording) -> ReplayInputs:
     if request.calibration is not None:
         calibration = load_calibration(request.calibration)
     template, candidates = _shapes(request, recording, config, calibration)
-    if request.config is not None:
-        require_known_species(config, template)
     files = None
     if request.first == "crop":
         files = find_crop_files(

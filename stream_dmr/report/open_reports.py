@@ -28,8 +28,7 @@ from stream_dmr.results.provenance import add_files
 from stream_dmr.results.track_edits import NO_EDITS, edits_of
 from stream_dmr.results.verdicts_table import read_added_frames, read_verdicts
 from stream_dmr.results.vessel_track import VesselTrack
-from stream_dmr.running.config import Config, parse_config
-from stream_dmr.running.species_checks import load_config_for
+from stream_dmr.running.config import Config, load_config, parse_config
 
 
 def open_report(
@@ -60,7 +59,7 @@ def open_report(
         tracks=tracks,
         views=draw_views(tracks, recording, source),
         config=of_run,
-        settings=(of_run if config is None else load_config_for(header.template, config)).fisheries,
+        settings=(of_run if config is None else load_config(config)).fisheries,
         edits=NO_EDITS if reviewed is None else reviewed.edits,
         source=source,
         efforts=[]

@@ -112,7 +112,7 @@ def checked_inputs(request: RunRequest) -> Inputs:
     if request.overwrite:
         _keep_template(request)
     template, candidates = load_shapes(request.template, on_notice=notices.append)
-    require_known_species(config, template)
+    require_known_species(config.species)
     calibration = None if request.calibration is None else load_calibration(request.calibration)
     if request.key is not None:
         Signer(request.key)  # refused now, not when it is needed

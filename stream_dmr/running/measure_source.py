@@ -35,6 +35,7 @@ from stream_dmr.running.run_folder import result_names
 from stream_dmr.running.run_observer import RunObserver, RunTotals
 from stream_dmr.running.run_request import RunRequest
 from stream_dmr.running.shape_pass import save_stocks, with_learnt_shapes
+from stream_dmr.running.species_checks import species_notes
 from stream_dmr.template.template import Template
 
 _USUAL_M = (0.5, 20.0)  # chosen: from cameras to the plane of hanging fish
@@ -125,6 +126,8 @@ def _report_start(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> No
     if observer.address is not None:
         observer.serving(observer.address)
     for note in inputs.notices:
+        observer.warn(note)
+    for note in species_notes(inputs.config, inputs.template):
         observer.warn(note)
     if inputs.calibration is None:
         observer.warn("without --calibration there are relative shapes, no millimetres")

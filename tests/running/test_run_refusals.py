@@ -111,10 +111,6 @@ def config_of_wrong_type(clip: Path) -> None:
     (clip / "quick.toml").write_text("[smooth_length]\nmin_frames = 'three'\n")
 
 
-def unknown_species(clip: Path) -> None:
-    (clip / "quick.toml").write_text("[fisheries]\nspecies = 'halibot'\n")
-
-
 def unknown_form_of_a_species(clip: Path) -> None:
     (clip / "quick.toml").write_text("[species]\nforms = ['HAP=halibot']\n")
 
@@ -146,7 +142,6 @@ def file_for_out(clip: Path) -> None:
         (template_without_points, "tiny.toml"),
         (unknown_config_key, r"\[fit_mesh\]: unknown key 'solvr'; did you mean 'solver'"),
         (config_of_wrong_type, r"\[smooth_length\].*expected an integer.*received"),
-        (unknown_species, r"\[fisheries\] species.* got 'halibot'; did you mean 'halibut'\?"),
         (unknown_form_of_a_species, r"\[species\].* HAP .* got 'halibot'; did you mean 'halibut'"),
         (missing_list_of_species, r"\[species\] own_list: .*nofile.csv: No such file"),
         (file_for_out, "expected a folder"),
