@@ -11,8 +11,9 @@ from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.reading.known_shapes import known_shapes
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
 from stream_dmr.replaying.recorded_files import CropFiles, find_crop_files, inputs_with
+from stream_dmr.replaying.replay_config import replay_config
 from stream_dmr.replaying.replay_request import ReplayRequest
-from stream_dmr.running.config import Config, load_config, parse_config, to_toml
+from stream_dmr.running.config import Config, to_toml
 from stream_dmr.template.template import Template
 
 
@@ -30,10 +31,7 @@ class ReplayInputs:
 def read_inputs(request: ReplayRequest, recording: Recording) -> ReplayInputs:
     """Read the given inputs and take the others from the recording. Raises a UserError."""
     header = recording.header
-    if request.config is not None:
-        config = load_config(request.config)
-    else:
-        config = parse_config(header.config_toml, where="the recording's config.toml")
+    config = replay_config(request.config, header.config_toml, first=request.first)
     calibration = header.calibration
     if request.calibration is not None:
         calibration = load_calibration(request.calibration)

@@ -183,10 +183,7 @@ def _refuse_impossible(request: ReplayRequest, recording: Recording) -> None:
             "--check with --time: each fit starts from the frame before, so a part of a recording "
             "can't equal the whole; leave out one of them"
         )
-    if request.template is not None and request.first not in ("crop", "fit"):
-        raise UserError(
-            f"--template with --from {request.first}: a template matters to the fit; use --from fit"
-        )
+    _refuse_unused(request)
     if request.selection.tracks is not None and request.selection.time_ns is None:
         found = decoded_messages(recording, [LocalizedFish], request.selection)
         missing = request.selection.tracks - {getattr(m, "track_id", 0) for m, _ in found}
@@ -194,6 +191,23 @@ def _refuse_impossible(request: ReplayRequest, recording: Recording) -> None:
             raise UserError(f"--track {min(missing)}: expected a fish of the recording, got none")
     if request.first == "crop" and request.selection.tracks is not None:
         raise UserError("--track with --from crop: crops are made of whole frames; use --from fit")
+
+
+def _refuse_unused(request: ReplayRequest) -> None:
+    """Raise UserError for an input of a stage that is not recomputed."""
+    given = (
+        ("--template", "a template matters to the fit", request.template, "fit"),
+        ("--calibration", "a calibration matters to millimetres", request.calibration, "localize"),
+        ("--source", "pictures matter to crops", request.source, "crop"),
+        ("--boxes", "boxes matter to crops", request.boxes, "crop"),
+        ("--masks", "masks matter to crops", request.masks, "crop"),
+    )
+    for option, meaning, value, last in given:
+        if value is not None and request.first_index > [*STAGES].index(last):
+            raise UserError(
+                f"{option} with --from {request.first}: {meaning}; use --from {last}, or leave it "
+                "out"
+            )
 
 
 def _carried_over(request: ReplayRequest, recorded: RecordedMessages) -> list[LocalizedFish]:

@@ -148,7 +148,7 @@ def _table_lines(config: Config) -> Iterator[str]:
         settings = getattr(config, table)
         yield f"\n# {table_field.description}\n[{table}]\n"
         for key, key_field in type(settings).model_fields.items():
-            yield f"# {_comment(key_field)}\n{key} = {_toml_value(getattr(settings, key))}\n"
+            yield f"# {_comment(key_field)}\n{key} = {toml_value(getattr(settings, key))}\n"
 
 
 def _comment(field: FieldInfo) -> str:
@@ -164,7 +164,7 @@ def _quoted(choices: tuple[str, ...]) -> str:
     return ", ".join(f'"{choice}"' for choice in choices)
 
 
-def _toml_value(value: object) -> str:
+def toml_value(value: object) -> str:
     """A setting as TOML. Raises TypeError for types that no setting has."""
     match value:
         case bool():
@@ -174,7 +174,7 @@ def _toml_value(value: object) -> str:
         case str():
             return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
         case list() | tuple():
-            return "[" + ", ".join(_toml_value(item) for item in value) + "]"
+            return "[" + ", ".join(toml_value(item) for item in value) + "]"
         case _:
             raise TypeError(f"no TOML for {type(value).__name__} {value!r}")
 

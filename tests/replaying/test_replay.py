@@ -20,6 +20,7 @@ from stream_dmr.recording.messages.topics import TOPICS
 from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
 from stream_dmr.replaying.difference import differences
 from stream_dmr.results.folder_lock import FolderLock
+from stream_dmr.running.config import parse_config
 from tests.support.command import invoke, rows
 from tests.support.tiny_clip import write_clip
 
@@ -92,6 +93,44 @@ def test_a_changed_setting_changes_what_follows_it_and_nothing_else(run, tmp_pat
     assert "fields differ, in LengthEstimate" in outcome.out
     assert "length_std_mm: recorded" in outcome.out
     assert "FittedMesh" not in outcome.out
+
+
+@pytest.mark.parametrize(
+    ("first", "setting", "stage"),
+    [
+        ("smooth", "[localize]\nmin_iou = 0.5", "localize"),
+        ("smooth", "[fit_mesh]\nmin_mask_px = 11", "fit"),
+        ("localize", "[fit_mesh]\nmin_mask_px = 11", "fit"),
+        ("fit", '[species]\nmodel = "other.onnx"', "crop"),
+        ("fit", "[crop_fish]\nmargin = 0.2", "crop"),
+    ],
+)
+def test_a_setting_of_an_earlier_stage_is_refused(run, tmp_path, first, setting, stage):
+    config, out = tmp_path / "mine.toml", tmp_path / "out"
+    config.write_text(setting)
+    given = {"--from": first, "--config": str(config), "--out": str(out)}
+    outcome = invoke(f"replay {run[0]}", given)
+    assert outcome.code == 2
+    assert f"use --from {stage}" in outcome.error
+    assert not out.exists()
+
+
+def test_what_a_replay_records_makes_what_it_wrote(run, tmp_path):
+    """Left-out settings of earlier stages are the recorded ones, not the defaults."""
+    config, out = tmp_path / "mine.toml", tmp_path / "out"
+    config.write_text("[smooth_length]\ncommon_std_ratio = 0.05\n")
+    given = {"--from": "smooth", "--config": str(config), "--out": str(out)}
+    assert invoke(f"replay {run[0]}", given).code == 0
+    before, after = (
+        parse_config(open_recordings([folder]).header.config_toml, where="")
+        for folder in (run[0], out)
+    )
+    for table in ("crop_fish", "fit_mesh", "localize"):
+        assert getattr(after, table) == getattr(before, table)
+    assert after.smooth_length.common_std_ratio == 0.05
+    for first in ("fit", "localize", "smooth"):
+        outcome = invoke(f"replay {out}", {"--from": first, "--check": None})
+        assert outcome.code == 0, outcome.out + outcome.err
 
 
 def test_a_new_calibration_needs_no_new_fit(run, tmp_path):
@@ -301,6 +340,11 @@ class TestDifferences:
     ("options", "said"),
     [
         ({"--from": "smooth", "--template": "cod"}, "--from fit"),
+        ({"--from": "localize", "--template": "cod"}, "--from fit"),
+        ({"--from": "smooth", "--calibration": "other.yaml"}, "--from localize"),
+        ({"--source": "video.mp4"}, "--from crop"),
+        ({"--from": "localize", "--boxes": "boxes.txt"}, "--from crop"),
+        ({"--from": "smooth", "--masks": "masks"}, "--from crop"),
         ({"--check": None, "--time": "0:1"}, "--time"),
     ],
 )

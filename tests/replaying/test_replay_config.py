@@ -1,0 +1,60 @@
+"""The settings of a replay: given ones from its first stage on, recorded ones before it."""
+
+from pathlib import Path
+
+import pytest
+
+from stream_dmr.errors import UserError
+from stream_dmr.replaying.replay_config import replay_config
+from stream_dmr.replaying.replay_request import STAGES
+from stream_dmr.running.config import parse_config
+
+RECORDED = """\
+[crop_fish]
+margin = 0.2
+[species]
+model = "mine.onnx"
+forms = ["HAP=halibut"]
+[fit_mesh]
+min_mask_px = 11
+[localize]
+min_iou = 0.5
+[smooth_length]
+min_frames = 4
+"""
+STAGE_OF = {"crop_fish": "crop", "fit_mesh": "fit", "localize": "localize"}
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    path = tmp_path / "mine.toml"
+    path.write_text("[smooth_length]\nmin_frames = 5\n[species]\nmin_share = 0.8\n")
+    return path
+
+
+@pytest.mark.parametrize("first", STAGES)
+def test_what_the_file_leaves_out_is_recorded_before_the_stage_and_default_after(mine, first):
+    recorded, default = parse_config(RECORDED, where=""), parse_config("", where="")
+    config = replay_config(mine, RECORDED, first=first)
+    for table, stage in STAGE_OF.items():
+        is_before = [*STAGES].index(stage) < [*STAGES].index(first)
+        assert getattr(config, table) == getattr(recorded if is_before else default, table)
+    assert config.smooth_length.min_frames == 5
+    assert config.species.min_share == 0.8
+    assert config.species.model == ("" if first == "crop" else "mine.onnx")
+    assert config.species.forms == ([] if first in ("crop", "fit") else ["HAP=halibut"])
+
+
+@pytest.mark.parametrize("first", STAGES)
+def test_the_recorded_settings_may_be_given(tmp_path: Path, first):
+    path = tmp_path / "same.toml"
+    path.write_text(RECORDED)
+    assert replay_config(path, RECORDED, first=first) == parse_config(RECORDED, where="")
+
+
+def test_other_ones_of_earlier_stages_are_refused_with_both_values(tmp_path: Path):
+    path = tmp_path / "other.toml"
+    path.write_text("[localize]\nmin_iou = 0.6\n")
+    with pytest.raises(UserError, match=r"min_iou = 0\.5, got 0\.6.*use --from localize"):
+        replay_config(path, RECORDED, first="smooth")
+    assert replay_config(path, RECORDED, first="localize").localize.min_iou == 0.6
