@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass
 
-from stream_dmr.calibration.calibration_file import load_calibration
+from stream_dmr.calibration.calibration_file import load_calibration, require_size
 from stream_dmr.camera import Calibration
 from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
-from stream_dmr.messages import FishCrop
+from stream_dmr.messages import FishCrop, Frame
+from stream_dmr.recording.messages.codec import stored_picture
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.reading.known_shapes import known_shapes
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
@@ -35,6 +36,7 @@ def read_inputs(request: ReplayRequest, recording: Recording) -> ReplayInputs:
     calibration = header.calibration
     if request.calibration is not None:
         calibration = load_calibration(request.calibration)
+        _require_size_of_frames(calibration, recording)
     template, candidates = _shapes(request, recording, config, calibration)
     files = None
     if request.first == "crop":
@@ -72,6 +74,14 @@ def new_header(request: ReplayRequest, recorded: RunHeader, inputs: ReplayInputs
             calibration=calibration,
         ),
     )
+
+
+def _require_size_of_frames(calibration: Calibration, recording: Recording) -> None:
+    """Raise CalibrationError where a recording's first frame has another size; see `run`."""
+    first = next(recording.payloads([Frame]), None)
+    if first is not None:
+        picture = stored_picture(first[1])
+        require_size(calibration, width=picture.width, height=picture.height)
 
 
 def _shapes(

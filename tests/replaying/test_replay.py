@@ -22,7 +22,7 @@ from stream_dmr.replaying.difference import differences
 from stream_dmr.results.folder_lock import FolderLock
 from stream_dmr.running.config import parse_config
 from tests.support.command import invoke, rows
-from tests.support.tiny_clip import write_clip
+from tests.support.tiny_clip import HEIGHT, WIDTH, calibration, write_clip
 
 COMING_AND_GOING = [[1], [1, 2], [1, 2], [1, 2], [2, 3], [3], [3], []]
 NUM_FISH = 11  # in all frames together
@@ -136,17 +136,28 @@ def test_what_a_replay_records_makes_what_it_wrote(run, tmp_path):
 def test_a_new_calibration_needs_no_new_fit(run, tmp_path):
     """A plane twice as far makes every fish twice as long."""
     folder, options = run
-    calibration = load_calibration(Path(str(options["--calibration"])))
-    plane = calibration.plane
+    recorded = load_calibration(Path(str(options["--calibration"])))
+    plane = recorded.plane
     moved = tmp_path / "calibration.yaml"
     doubled = dataclasses.replace(plane, translation_mm=2 * plane.translation_mm)
-    save_calibration(moved, dataclasses.replace(calibration, plane=doubled))
+    save_calibration(moved, dataclasses.replace(recorded, plane=doubled))
     out = tmp_path / "out"
     given = {"--from": "localize", "--calibration": str(moved), "--out": str(out)}
     assert invoke(f"replay {folder}", given).code == 0
     for old, new in zip(rows(folder / "frames.csv"), rows(out / "frames.csv"), strict=True):
         if old["length_mm"]:
             assert float(new["length_mm"]) == pytest.approx(2 * float(old["length_mm"]), rel=1e-4)
+
+
+@pytest.mark.parametrize("first", ["crop", "fit", "localize"])
+def test_a_calibration_of_other_pictures_is_refused(run, tmp_path, first):
+    other, out = tmp_path / "other.yaml", tmp_path / "out"
+    save_calibration(other, calibration(2 * WIDTH, HEIGHT))
+    given = {"--from": first, "--calibration": str(other), "--out": str(out)}
+    outcome = invoke(f"replay {run[0]}", given)
+    assert outcome.code == 2
+    assert f"got {WIDTH}x{HEIGHT}" in outcome.error
+    assert not out.exists()
 
 
 def test_one_fish_alone_is_as_in_company(run):
