@@ -6,6 +6,7 @@ from stream_dmr.calibration.calibration_file import load_calibration, require_si
 from stream_dmr.camera import Calibration
 from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
+from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.recording.messages.codec import stored_picture
 from stream_dmr.recording.messages.run_header import RunHeader
@@ -15,6 +16,8 @@ from stream_dmr.replaying.recorded_files import CropFiles, find_crop_files, inpu
 from stream_dmr.replaying.replay_config import replay_config
 from stream_dmr.replaying.replay_request import ReplayRequest
 from stream_dmr.running.config import Config, to_toml
+from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.running.shape_pass import NOTHING_LEARNT
 from stream_dmr.template.template import Template
 
 
@@ -29,15 +32,20 @@ class ReplayInputs:
     files: CropFiles | None  # None where no crop is cut again
 
 
-def read_inputs(request: ReplayRequest, recording: Recording) -> ReplayInputs:
-    """Read the given inputs and take the others from the recording. Raises a UserError."""
+def read_inputs(
+    request: ReplayRequest, recording: Recording, observer: RunObserver
+) -> ReplayInputs:
+    """Read the given inputs and take the others from the recording. Raises a UserError.
+
+    `observer` is told what was repaired of a template, or learnt of the fish.
+    """
     header = recording.header
     config = replay_config(request.config, header.config_toml, first=request.first)
     calibration = header.calibration
     if request.calibration is not None:
         calibration = load_calibration(request.calibration)
         _require_size_of_frames(calibration, recording)
-    template, candidates = _shapes(request, recording, config, calibration)
+    template, candidates = _shapes(request, recording, config, calibration, observer)
     files = None
     if request.first == "crop":
         files = find_crop_files(
@@ -85,22 +93,31 @@ def _require_size_of_frames(calibration: Calibration, recording: Recording) -> N
 
 
 def _shapes(
-    request: ReplayRequest, recording: Recording, config: Config, calibration: Calibration | None
+    request: ReplayRequest,
+    recording: Recording,
+    config: Config,
+    calibration: Calibration | None,
+    observer: RunObserver,
 ) -> tuple[Template, CandidateShapes | None]:
     """Mesh and candidate shapes; those of `auto` and of names are learnt from recorded crops."""
     if request.template is None:
         return recording.header.template, known_shapes(recording)
-    template, candidates = load_shapes(request.template)
-    if candidates is not None:
-        messages = (message for message, _ in decoded_messages(recording, [FishCrop]))
-        crops = (message for message in messages if isinstance(message, FishCrop))
-        learnt = learn_shapes(
-            crops,
-            template,
-            candidates,
-            config.fit_mesh,
-            calibration=calibration,
-            species=config.species,
-        )
-        candidates = learnt or candidates
-    return template, candidates
+    template, forms = load_shapes(request.template, on_notice=observer.warn)
+    if forms is None or not config.fit_mesh.learns_shapes:
+        return template, forms
+    messages = (message for message, _ in decoded_messages(recording, [FishCrop]))
+    stocks = learn_shapes(
+        (message for message in messages if isinstance(message, FishCrop)),
+        template,
+        forms,
+        config.fit_mesh,
+        calibration=calibration,
+        species=config.species,
+        progress=lambda step: observer.stage(f"learning their shapes: {step}"),
+    )
+    if stocks is None:
+        observer.warn(NOTHING_LEARNT)
+        return template, forms
+    for line in describe(forms, stocks):
+        observer.notice(line)
+    return template, stocks

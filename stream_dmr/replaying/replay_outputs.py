@@ -13,6 +13,7 @@ from stream_dmr.replaying.replay_inputs import ReplayInputs
 from stream_dmr.replaying.replay_request import ReplayRequest
 from stream_dmr.results.finished_fish import database_of, read_measured_fish, read_runs
 from stream_dmr.results.frames_table import FramesTable
+from stream_dmr.results.learnt_meshes import LEARNT, MADE_BY_RUN, require_free_names
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.lengths_table import LengthsTable
 from stream_dmr.results.provenance import sealed
@@ -22,6 +23,7 @@ from stream_dmr.results.signed_files import SignedFiles
 from stream_dmr.running.result_writer import ResultWriter
 from stream_dmr.running.run_folder import prepare_folder
 from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.running.shape_pass import save_stocks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +77,9 @@ def open_replay_outputs(
     Raises OutputError where the folder can't be written to, or holds an earlier run's results.
     """
     signer = None if request.key is None else Signer(request.key)
+    stocks = None if inputs.candidates is None else inputs.candidates.stocks()
+    if stocks is not None and not request.overwrite:
+        require_free_names(out)
     prepare_folder(out, overwrite=request.overwrite)
     known = recorded.facts
     facts = run_facts(
@@ -92,6 +97,9 @@ def open_replay_outputs(
         stack.callback(partial(files.finish, with_recordings=True))
         store.count_frames(None if known is None else known.frames_promised)
         lengths = stack.enter_context(closing(LengthsTable(out, store)))
+        if stocks is not None:
+            place, source = out / LEARNT, header.source
+            save_stocks(inputs.template, stocks, place, made_by=MADE_BY_RUN, source=source)
         recorder = Recorder(
             out,
             header,

@@ -73,7 +73,7 @@ def replay(
     observer = observer or RunObserver()
     recording = open_recordings(request.recordings)
     _refuse_impossible(request, recording)
-    inputs = read_inputs(request, recording)
+    inputs = read_inputs(request, recording, observer)
     recorded = RecordedMessages(recording, request.selection)
     carried_over = _carried_over(request, recorded)
     with ExitStack() as stack:

@@ -25,6 +25,8 @@ from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.template.template import Template
 from stream_dmr.template.template_file import save_template
 
+NOTHING_LEARNT = "no fish was seen whole: each is measured as the form it is most like"
+
 
 def with_learnt_shapes(
     inputs: Inputs, crop_fish: CropFish, *, stop: Event, observer: RunObserver
@@ -51,7 +53,7 @@ def with_learnt_shapes(
             inputs, crops, progress=lambda step: observer.stage(f"learning their shapes: {step}")
         )
         if stocks is None:
-            observer.warn("no fish was seen whole: each is measured as the form it is most like")
+            observer.warn(NOTHING_LEARNT)
     reader = ReadFrames(inputs.request.source, inputs.config.read_frames)
     inputs = replace(inputs, reader=reader, crops=crops)
     if stocks is None:

@@ -22,6 +22,7 @@ from stream_dmr.replaying.replay_request import ReplayRequest
 from stream_dmr.replaying.replay_writer import ReplayWriter
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.run_facts import run_facts
+from stream_dmr.running.run_observer import RunObserver
 from tests.support.final_estimates import fish
 from tests.support.recorded_run import FRAME_NS, assert_same, calibration, header, run
 
@@ -51,7 +52,7 @@ def of_kinds(recorded: RecordedMessages, kinds: list[type[Message]]) -> Iterator
 
 
 def test_what_is_not_given_is_as_it_was_recorded(recording: Recording, folder: Path):
-    inputs = read_inputs(ReplayRequest(recordings=[folder]), recording)
+    inputs = read_inputs(ReplayRequest(recordings=[folder]), recording, RunObserver())
     assert_same(inputs.template, recording.header.template)
     assert_same(inputs.calibration, recording.header.calibration)
     assert inputs.files is None
@@ -65,13 +66,24 @@ def test_a_given_calibration_replaces_the_recorded_one(
     path = tmp_path / "other.yaml"
     save_calibration(path, given)
     request = ReplayRequest(recordings=[folder], calibration=path, command="stream-dmr replay")
-    inputs = read_inputs(request, recording)
+    inputs = read_inputs(request, recording, RunObserver())
     assert inputs.calibration is not None
     np.testing.assert_array_equal(inputs.calibration.plane.translation_mm, [0, 0, 1200])
     written = new_header(request, recording.header, inputs)
     assert written.calibration_file == path.read_bytes()
     assert written.command == "stream-dmr replay"
     assert written.source == recording.header.source
+
+
+def test_no_shapes_are_learnt_where_the_settings_have_none(
+    recording: Recording, folder: Path, tmp_path: Path
+):
+    config = tmp_path / "paper.toml"
+    config.write_text('[fit_mesh]\ndeformation = "linear-blend"\n')
+    request = ReplayRequest(recordings=[folder], template="auto", config=config)
+    inputs = read_inputs(request, recording, RunObserver())
+    assert inputs.candidates is not None
+    assert not inputs.candidates.are_learnt
 
 
 def test_recorded_messages_pass_as_they_are_and_are_counted(recording: Recording):

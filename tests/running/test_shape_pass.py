@@ -104,7 +104,12 @@ def test_what_can_be_refused_is_refused_before_the_first_pass(
 
 
 def test_what_was_learnt_is_written_recorded_and_said(learnt: tuple[Path, Listener]):
-    out, observer = learnt
+    assert_learnt(*learnt)
+    assert [row["status"] for row in rows(learnt[0] / "lengths.csv")] == ["measured"]
+
+
+def assert_learnt(out: Path, observer: Listener) -> None:
+    """The shape of the fish is in the folder, in the recording, and was said."""
     header = read_header(out / "recording.mcap")
     assert header.candidates is not None
     assert header.candidates.are_learnt
@@ -113,7 +118,7 @@ def test_what_was_learnt_is_written_recorded_and_said(learnt: tuple[Path, Listen
     written, stock = load_template(str(out / LEARNT)), next(iter(header.candidates))
     mean = reshaped(header.template, stock.coefficients)
     np.testing.assert_allclose(written.rest_vertices, mean.rest_vertices, atol=1e-5)
-    assert [row["status"] for row in rows(out / "lengths.csv")] == ["measured"]
+    assert LEARNT in known_files(out)
 
 
 @pytest.mark.parametrize("name", ["template.ply", "template.toml", "template-2.ply"])
@@ -175,14 +180,29 @@ def test_a_live_run_s_recording_learns_its_shapes_ashore(
     assert header.candidates is not None
     assert not header.candidates.are_learnt
     assert not (named / LEARNT).exists()
-    ashore = tmp_path / "ashore"
+    ashore, observer = tmp_path / "ashore", Listener()
     asked = ReplayRequest(
         recordings=[named / "recording.mcap"], first="fit", template="auto", out=ashore
     )
+    replay(asked, stop=threading.Event(), observer=observer)
+    assert_learnt(ashore, observer)
+
+
+def test_a_replay_writes_what_its_run_learnt(learnt: tuple[Path, Listener], tmp_path: Path):
+    asked = ReplayRequest(recordings=[learnt[0]], first="smooth", out=tmp_path / "again")
     replay(asked, stop=threading.Event())
-    again = read_header(ashore / "recording.mcap")
-    assert again.candidates is not None
-    assert again.candidates.are_learnt
+    for name in (LEARNT, Path(LEARNT).with_suffix(".toml").name):
+        assert (tmp_path / "again" / name).read_bytes() == (learnt[0] / name).read_bytes()
+
+
+def test_a_replay_does_not_write_over_a_mesh_of_the_user(
+    learnt: tuple[Path, Listener], tmp_path: Path
+):
+    (tmp_path / LEARNT).write_text("mine")
+    asked = ReplayRequest(recordings=[learnt[0]], first="smooth", out=tmp_path)
+    with pytest.raises(OutputError, match="expected a name that is free"):
+        replay(asked, stop=threading.Event())
+    assert [path.name for path in tmp_path.iterdir()] == [LEARNT]
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
