@@ -81,6 +81,7 @@ def new_header(request: ReplayRequest, recorded: RunHeader, inputs: ReplayInputs
             masks=request.masks if is_cut_anew else None,
             calibration=calibration,
         ),
+        runs=recorded.runs,
     )
 
 

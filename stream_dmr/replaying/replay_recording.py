@@ -5,12 +5,13 @@ import time
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.recording.messages.run_header import REPRODUCIBLE_BY
+from stream_dmr.recording.messages.run_header import REPRODUCIBLE_BY, RunStart
 from stream_dmr.recording.reading.frame_images import open_pictures
 from stream_dmr.recording.reading.open_recording import (
     Recording,
@@ -18,6 +19,8 @@ from stream_dmr.recording.reading.open_recording import (
     open_recordings,
 )
 from stream_dmr.replaying.comparator import MessageComparator, Mismatch
+from stream_dmr.replaying.crop_fish_of_runs import CropFishOfRuns
+from stream_dmr.replaying.recorded_files import CropFiles
 from stream_dmr.replaying.recorded_messages import PlaybackNode, RecordedMessages
 from stream_dmr.replaying.replay_inputs import ReplayInputs, new_header, read_inputs
 from stream_dmr.replaying.replay_outputs import (
@@ -77,7 +80,7 @@ def replay(
     recorded = RecordedMessages(recording, request.selection)
     carried_over = _carried_over(request, recorded)
     with ExitStack() as stack:
-        frames, nodes = _open_chain(request, recorded, inputs, stack)
+        frames, nodes = _open_chain(request, recorded, inputs, recording.header.runs, stack)
         continue_tracks(nodes, carried_over)
         outputs = None
         if request.out is not None:
@@ -238,7 +241,11 @@ def _open_comparator(
 
 
 def _open_chain(
-    request: ReplayRequest, recorded: RecordedMessages, inputs: ReplayInputs, stack: ExitStack
+    request: ReplayRequest,
+    recorded: RecordedMessages,
+    inputs: ReplayInputs,
+    runs: Sequence[RunStart],
+    stack: ExitStack,
 ) -> tuple[Iterable[Frame], list[Node]]:
     """The frames and the nodes; playback nodes that only a new recording needs only with `out`."""
     first, config = request.first_index, inputs.config
@@ -260,7 +267,13 @@ def _open_chain(
     frames = recorded.frames_with_images(
         restorer, exact=request.check, missing_source=files.missing_source
     )
-    crop_fish = CropFish(
+    crop_fish = CropFishOfRuns(partial(_open_crop_fish, inputs, files), runs)
+    return frames, [crop_fish, *computed]
+
+
+def _open_crop_fish(inputs: ReplayInputs, files: CropFiles) -> CropFish:
+    config = inputs.config
+    return CropFish(
         config.crop_fish,
         camera=None if inputs.calibration is None else inputs.calibration.camera,
         finder=open_finder(
@@ -272,4 +285,3 @@ def _open_chain(
         ),
         species_model=config.species.model,
     )
-    return frames, [crop_fish, *computed]

@@ -61,6 +61,12 @@ class Inputs:
         """True where the run continues after the results that are in its folder."""
         return self.is_endless and not self.request.overwrite
 
+    @property
+    def numbers_frames_on(self) -> bool:
+        """True where frames have numbers after those of earlier runs; annotations count anew."""
+        is_annotated = self.request.boxes is not None or self.request.masks is not None
+        return self.is_endless and not is_annotated
+
     def header(self) -> RunHeader:
         """The header of this run's recording."""
         file = self.request.calibration

@@ -297,8 +297,8 @@ def _result_writer(
     """The writer of a run; its source is made to continue after earlier runs."""
     store = outputs.store
     clips = resume_source(inputs.source, store, on_notice=on_notice)
-    if inputs.is_endless and inputs.request.boxes is None and inputs.request.masks is None:
-        inputs.reader.number_after(store.before.frame_index)  # annotations count from the start
+    if inputs.numbers_frames_on:
+        inputs.reader.number_after(store.before.frame_index)
     has_drift_alarms = inputs.is_endless and inputs.calibration is not None
     return ResultWriter(
         store,

@@ -2,11 +2,12 @@
 
 from collections.abc import Generator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LearntShapes, LocalizedFish
+from stream_dmr.recording.messages.run_header import RunStart
 from stream_dmr.recording.messages.sink_states import SinkStates
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.segments.recording_files import open_recording_files
@@ -100,7 +101,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
         )
         recorder = Recorder(
             out,
-            header,
+            replace(header, runs=(_start_of(inputs, store),)),
             config.recording,
             live=request.live,
             sinks=[FramesTable(out, resume=resume, is_endless=is_endless)],
@@ -136,6 +137,14 @@ def _free_space(inputs: Inputs, files: SignedFiles, observer: RunObserver) -> Re
     with suppress(OSError, OutputError):  # it tries again while the run goes on
         retention.free_space()
     return retention
+
+
+def _start_of(inputs: Inputs, store: LengthStore) -> RunStart:
+    """Where this run begins in its folder, for a replay that finds the fish again."""
+    return RunStart(
+        frames_before=store.before.frame_index if inputs.numbers_frames_on else 0,
+        tracks_before=store.before.track_id,
+    )
 
 
 def _frames_lost(inputs: Inputs) -> int:

@@ -399,7 +399,22 @@ def localized(path: Path) -> list[LocalizedFish]:
     return [m for m in read_messages(path, [LocalizedFish]) if isinstance(m, LocalizedFish)]
 
 
-@pytest.mark.parametrize("first", ["fit", "localize", "smooth"])
+def test_the_fish_of_a_folder_that_grew_are_found_again(tmp_path: Path):
+    """Each run begins with nothing seen; also where a replay has made one recording of both."""
+    options = write_clips(tmp_path, num_frames=40)
+    again = {"--from": "crop", "--check": None}
+    assert invoke("run", options).code == 0
+    write_swaying_fish(tmp_path / "clips" / "2.avi", num_frames=40)
+    assert invoke("run", options).code == 0
+    assert {fish.track_id for fish in localized(Path(options["--out"]))} == {1, 2}
+    joined = tmp_path / "joined"
+    outcome = invoke(f"replay {options['--out']}", again | {"--out": str(joined)})
+    assert outcome.code == 0, outcome.out + outcome.err
+    outcome = invoke(f"replay {joined}", again)
+    assert outcome.code == 0, outcome.out + outcome.err
+
+
+@pytest.mark.parametrize("first", ["crop", "fit", "localize", "smooth"])
 def test_consecutive_segments_are_what_was_recorded_over_a_crash(interrupted: Path, first: str):
     outcome = invoke(f"replay {interrupted}", {"--from": first, "--check": None})
     assert outcome.code == 0, outcome.out + outcome.err

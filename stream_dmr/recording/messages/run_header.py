@@ -2,7 +2,7 @@
 
 import platform
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
@@ -22,6 +22,14 @@ _LIBRARIES = ("numpy", "opencv-python-headless", "torch", "scipy", "numba", "mca
 REPRODUCIBLE_BY = ("stream_dmr", "arithmetic", *_LIBRARIES)
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RunStart:
+    """Where a run in a folder began: with nothing seen, after the numbers of earlier runs there."""
+
+    frames_before: int  # frames of earlier runs have at most this number
+    tracks_before: int  # fish of earlier runs have at most this id
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RunHeader:
     """The inputs of a run that are not messages."""
@@ -34,6 +42,7 @@ class RunHeader:
     calibration: Calibration | None = None
     calibration_file: bytes = b""  # the user's file as it was; empty where there is none
     inputs: RunInputs | None = None  # None: recorded before these were
+    runs: tuple[RunStart, ...] = ()  # those that are in it, by their frames; none in old recordings
 
     @property
     def known_inputs(self) -> RunInputs | None:
@@ -52,6 +61,7 @@ class RunHeader:
             "source": self.source,
             "command": self.command,
             **given,
+            **({"runs": _runs_text(self.runs)} if self.runs else {}),
             "codec_version": str(CODEC_VERSION),
             "attachments_crc32": str(self.checksum),
             "stream_dmr": __version__,
@@ -88,11 +98,29 @@ class RunHeader:
             calibration=None if calibration is None else decode(Calibration, calibration),
             calibration_file=attachments.get("calibration.yaml", b""),
             inputs=RunInputs.from_metadata(metadata),
+            runs=_runs_in(metadata.get("runs", "")),
         )
         recorded = metadata.get("attachments_crc32")  # the first recordings have none
         if recorded is not None and recorded != str(_checksum(attachments)):
             raise RecordingError("its config, template or calibration is damaged or missing")
         return header
+
+
+def joined_runs(headers: Iterable[RunHeader]) -> tuple[RunStart, ...]:
+    """The runs of several segments, each once, by their frames."""
+    runs = {run for header in headers for run in header.runs}
+    return tuple(sorted(runs, key=lambda run: run.frames_before))
+
+
+def _runs_text(runs: Sequence[RunStart]) -> str:
+    """Such as: 0 0, 1400 7."""
+    return ", ".join(f"{run.frames_before} {run.tracks_before}" for run in runs)
+
+
+def _runs_in(text: str) -> tuple[RunStart, ...]:
+    """The inverse of `_runs_text`."""
+    pairs = [part.split() for part in text.split(",") if part]
+    return tuple(RunStart(frames_before=int(f), tracks_before=int(t)) for f, t in pairs)
 
 
 def _checksum(attachments: Mapping[str, bytes]) -> int:

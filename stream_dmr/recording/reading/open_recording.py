@@ -1,6 +1,7 @@
 """Opens recordings of any kind: .mcap, torn .mcap, .rrd, or several segments as one recording."""
 
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -10,7 +11,7 @@ from stream_dmr.messages import Message
 from stream_dmr.recording.mcap.mcap_recording import McapRecording
 from stream_dmr.recording.mcap.mcap_sink import PART
 from stream_dmr.recording.messages.codec import decode
-from stream_dmr.recording.messages.run_header import RunHeader
+from stream_dmr.recording.messages.run_header import RunHeader, joined_runs
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.rerun.rrd_recording import RrdRecording
 
@@ -88,7 +89,9 @@ class _Segments:
 
     def __init__(self, files: Sequence[Path], segments: Sequence[Recording]) -> None:
         self._segments = segments
-        self.header, self.metadata = segments[0].header, segments[0].metadata
+        runs = joined_runs(segment.header for segment in segments)
+        self.header = replace(segments[0].header, runs=runs)
+        self.metadata = segments[0].metadata
         self.ends_early = any(segment.ends_early for segment in segments)
         self.is_thinned = any(segment.is_thinned for segment in segments)
         for file, segment in zip(files, segments, strict=True):
