@@ -47,7 +47,9 @@ def view(
     screenshot: Annotated[
         Path | None, typer.Option(help="Save a picture (.png) instead; needs no screen.")
     ] = None,
-    frame: Annotated[int, typer.Option(help="The frame of --screenshot.")] = 1,
+    frame: Annotated[
+        int | None, typer.Option(help="The frame of --screenshot.", show_default="1")
+    ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Look at a recording, or a part of it: frame, 3D scene, lengths, IoU, timings and events."""
@@ -58,14 +60,30 @@ def view(
         require_writable(screenshot, overwrite=overwrite)
     for number in (signal.SIGINT, signal.SIGTERM):  # the viewer's process must end with us
         signal.signal(number, lambda number, _: sys.exit(128 + number))
-    with _as_rrd(recording, source, parse_selection(time, track)) as rrd:
+    selection = parse_selection(time, track)
+    if frame is not None and "://" not in recording:
+        _require_frame(Path(recording), frame, selection)
+    with _as_rrd(recording, source, selection) as rrd:
         if screenshot is not None:
-            viewer.screenshot(rrd, screenshot, frame_index=frame)
+            viewer.screenshot(rrd, screenshot, frame_index=1 if frame is None else frame)
             print(screenshot)
         elif web:
             viewer.serve(rrd, port=port)
         else:
             viewer.show(rrd)
+
+
+def _require_frame(recording: Path, frame_index: int, selection: "Selection") -> None:
+    """Raise UserError where a recording lacks a frame; a view without messages may have it."""
+    from stream_dmr.errors import RecordingError
+    from stream_dmr.recording.reading.open_recording import open_recordings
+    from stream_dmr.recording.reading.required_parts import require_frame
+
+    try:
+        opened = open_recordings([recording])
+    except RecordingError:  # the viewer shows a view without messages
+        return
+    require_frame(opened, frame_index, selection)
 
 
 def convert(

@@ -15,9 +15,9 @@ from stream_dmr.recording.messages.run_header import REPRODUCIBLE_BY, RunStart
 from stream_dmr.recording.reading.frame_images import open_pictures
 from stream_dmr.recording.reading.open_recording import (
     Recording,
-    decoded_messages,
     open_recordings,
 )
+from stream_dmr.recording.reading.required_parts import require_messages, require_selected
 from stream_dmr.replaying.comparator import MessageComparator, Mismatch
 from stream_dmr.replaying.crop_fish_of_runs import CropFishOfRuns
 from stream_dmr.replaying.recorded_files import CropFiles
@@ -187,11 +187,8 @@ def _refuse_impossible(request: ReplayRequest, recording: Recording) -> None:
             "can't equal the whole; leave out one of them"
         )
     _refuse_unused(request)
-    if request.selection.tracks is not None and request.selection.time_ns is None:
-        found = decoded_messages(recording, [LocalizedFish], request.selection)
-        missing = request.selection.tracks - {getattr(m, "track_id", 0) for m, _ in found}
-        if missing:
-            raise UserError(f"--track {min(missing)}: expected a fish of the recording, got none")
+    require_messages(recording)
+    require_selected(recording, request.selection)
     if request.first == "crop" and request.selection.tracks is not None:
         raise UserError("--track with --from crop: crops are made of whole frames; use --from fit")
 

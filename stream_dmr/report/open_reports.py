@@ -10,6 +10,7 @@ from stream_dmr.files import make_folder, writing_to
 from stream_dmr.recording.messages.selection import Selection
 from stream_dmr.recording.reading.frame_lookup import FrameLookup
 from stream_dmr.recording.reading.open_recording import open_recordings
+from stream_dmr.recording.reading.required_parts import require_messages
 from stream_dmr.report.coastline import Line
 from stream_dmr.report.drawn_views import draw_views
 from stream_dmr.report.recorded_tracks import ReviewedTracks, read_tracks
@@ -47,6 +48,8 @@ def open_report(
     of_run = parse_config(header.config_toml, where=f"{path}: its config.toml")
     reviewed = None if as_measured else reviewed_tracks(path, of_run)
     database = database_of(path)
+    if database is None:
+        require_messages(recording)
     if as_measured and database is not None:
         fish = read_measured_fish(database)
     else:

@@ -17,6 +17,11 @@ from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.reading.known_shapes import known_shapes
 from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
+from stream_dmr.recording.reading.required_parts import (
+    require_messages,
+    require_time,
+    require_tracks,
+)
 from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
 from stream_dmr.recording.view.view_geometry import place_fit
 from stream_dmr.results.agency_tables import (
@@ -53,7 +58,7 @@ from stream_dmr.template.template import Template
 
 
 class Export:
-    """A recording, or a part of it, for other programs. Raises RecordingError and OutputError."""
+    """A recording, or a part of it, for other programs. Raises a UserError."""
 
     def __init__(
         self, recording: Path, selection: Selection = EVERYTHING, *, overwrite: bool = False
@@ -67,6 +72,7 @@ class Export:
         self._overwrite = overwrite
         self._earlier: set[Path] = set()  # exported before from the same recording
         self._new: list[Path] = []  # files and folders that were not there, and no provenance knows
+        self._require_selected()
 
     @property
     def config_toml(self) -> str:
@@ -217,6 +223,19 @@ class Export:
         rows = [haul_row(one, utc_zero_ns=zero_ns) for one in efforts]
         self._written.append(write_rows(make_folder(out) / path.name, HAUL_COLUMNS, rows))
         return path
+
+    def _require_selected(self) -> None:
+        """Refuse a recording or a selection of nothing; lengths.db may know more fish than it."""
+        if database_of(self._path) is None:
+            require_messages(self._recording)
+        if self._selection.is_everything:
+            return
+        fish = {one.estimate.track_id for one in self._all_fish()}
+        if not fish:
+            require_time(self._recording, self._selection)
+        if self._selection.tracks is not None:
+            fish |= {getattr(one, "track_id", 0) for one in self._messages(LocalizedFish)}
+            require_tracks(self._selection, fish)
 
     def _fps(self) -> float | None:
         """Frames per second, by the median time between frames; None of fewer than two."""

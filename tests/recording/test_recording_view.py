@@ -199,10 +199,6 @@ def test_a_part_is_shown_and_exported_alone(clip: Path, tmp_path: Path):
     assert [row["frame_index"] for row in rows(tmp_path / "frames.csv")] == ["2"]
     coco = json.loads((tmp_path / "masks.json").read_text())
     assert [image["id"] for image in coco["images"]] == [2]
-    options = {"--out": str(tmp_path / "none"), "--masks": None, "--track": "99"}
-    assert invoke(f"export {clip / 'out'}", options).code == 0
-    coco = json.loads((tmp_path / "none" / "masks.json").read_text())
-    assert not coco["annotations"]
 
 
 def test_what_is_lost_of_a_torn_recording_is_said(clip: Path, tmp_path: Path):

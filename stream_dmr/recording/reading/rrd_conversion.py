@@ -13,6 +13,7 @@ from stream_dmr.recording.messages.topics import TOPICS
 from stream_dmr.recording.reading.frame_images import FrameRestorer, RecordedPictures
 from stream_dmr.recording.reading.known_shapes import known_shapes
 from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
+from stream_dmr.recording.reading.required_parts import require_messages, require_selected
 from stream_dmr.recording.rerun.rrd_sink import RrdSink
 from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
 
@@ -31,10 +32,12 @@ def convert(
 
     Pictures are those of `source`; without it those that the recording holds. Returns
     what is lost of the recording, one line each. Raises RecordingError where the recording can't be
-    read, SourceError where a picture is not the recorded one, OutputError where `rrd` can't be
-    written.
+    read, UserError where it has nothing of the selection, SourceError where a picture is not the
+    recorded one, OutputError where `rrd` can't be written.
     """
     opened = open_recordings([recording])
+    require_messages(opened)
+    require_selected(opened, selection)
     meshes = MeshRebuilder(opened.header.template, known_shapes(opened))
     pictures = source or RecordedPictures(opened, selection)
     unfinished = rrd.with_name(f"{rrd.name}.part")

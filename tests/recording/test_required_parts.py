@@ -1,0 +1,103 @@
+"""What a recording has nothing of is refused, by every command in the same words."""
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from stream_dmr.errors import UserError
+from stream_dmr.recording.mcap.mcap_sink import McapSink
+from stream_dmr.recording.messages.record import make_record
+from stream_dmr.recording.messages.recording_settings import RecordingSettings
+from stream_dmr.recording.messages.selection import EVERYTHING, Selection
+from stream_dmr.recording.reading.open_recording import open_recordings
+from stream_dmr.recording.reading.required_parts import (
+    require_frame,
+    require_messages,
+    require_selected,
+)
+from stream_dmr.recording.rerun.rrd_sink import RrdSink
+from tests.support.command import invoke, rows
+from tests.support.fish_run import measure
+from tests.support.recorded_run import header
+from tests.support.recorded_run import run as made_up_run
+
+COMMANDS = (
+    "replay REC --from smooth --out OUT",
+    "export REC --fish csv --out OUT",
+    "export REC --tables csv --viame --out OUT",
+    "convert REC --out OUT.rrd",
+)
+VIEW = "view REC --screenshot OUT.png"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run of six frames with two fish."""
+    return measure(tmp_path_factory.mktemp("parts"))
+
+
+def said_by(command: str, recording: Path, out: Path) -> str:
+    """The one line in which a command refuses; it writes nothing."""
+    outcome = invoke(command.replace("REC", str(recording)).replace("OUT", str(out)))
+    assert outcome.code == 2, outcome.out + outcome.err
+    assert list(out.parent.glob(f"{out.name}*")) == []
+    return outcome.error
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, VIEW])
+def test_a_fish_or_a_time_that_is_not_in_it_is_refused(folder: Path, tmp_path: Path, command: str):
+    for recording in (folder, folder / "recording.rrd"):
+        said = said_by(f"{command} --track 2 --track 77", recording, tmp_path / "out")
+        assert said == "--track 77: expected a fish of the recording, got none"
+        said = said_by(f"{command} --time 100:200", recording, tmp_path / "out")
+        assert said == "--time 100:200: expected a time of the recording, from 0 to 0.5 s, got none"
+
+
+def test_a_frame_that_is_not_in_it_is_refused(folder: Path, tmp_path: Path):
+    command = f"{VIEW} --frame 999"
+    said = said_by(command, folder, tmp_path / "out")
+    assert said == "--frame 999: expected a frame of the recording, from 1 to 6, got none"
+    require_frame(open_recordings([folder]), 6, EVERYTHING)
+    with pytest.raises(UserError, match="from 1 to 2"):
+        require_frame(open_recordings([folder]), 6, Selection.from_seconds((0.0, 0.15)))
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".rrd"])
+def test_a_recording_without_a_whole_message_is_refused(tmp_path: Path, suffix: str):
+    """Such as is left of a crash, or of a copy that was not finished: a header and no more."""
+    torn, path = tmp_path / f"torn{suffix}", tmp_path / f"begun{suffix}"
+    with closing(
+        McapSink(path, header(), flush_s=0.0)
+        if suffix == ".mcap"
+        else RrdSink(path, header(), RecordingSettings())
+    ):
+        (begun,) = tmp_path.glob("begun*")
+        torn.write_bytes(begun.read_bytes())
+    for command in (*COMMANDS, "report REC --out OUT.html", "replay REC --check"):
+        assert "torn; 0 messages are whole" in said_by(command, torn, tmp_path / "out")
+
+
+def test_one_that_a_run_ended_before_its_first_frame_is_no_torn_one(tmp_path: Path):
+    with closing(McapSink(tmp_path / "recording.mcap", header(), flush_s=0.0)):
+        pass
+    require_messages(open_recordings([tmp_path]))
+
+
+def test_fish_of_a_recording_that_was_deleted_are_still_exported(folder: Path, tmp_path: Path):
+    """lengths.db keeps what recordings make room for."""
+    with closing(McapSink(tmp_path / "recording.mcap", header(), flush_s=0.0)) as sink:
+        for message in made_up_run(2, num_fish=1):
+            sink.write(make_record(message, RecordingSettings()))
+    with (
+        closing(sqlite3.connect(folder / "lengths.db")) as database,
+        closing(sqlite3.connect(tmp_path / "lengths.db")) as copy,
+    ):
+        database.backup(copy)
+    options = {"--fish": "csv", "--track": "2", "--out": str(tmp_path / "out")}
+    assert invoke(f"export {tmp_path}", options).code == 0
+    assert [row["track_id"] for row in rows(tmp_path / "out" / "fish.csv")] == ["2"]
+    recording, second = open_recordings([tmp_path]), Selection(tracks=frozenset({2}))
+    with pytest.raises(UserError, match="--track 2"):
+        require_selected(recording, second)
