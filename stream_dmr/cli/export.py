@@ -43,8 +43,12 @@ def export(
         typer.Option("--viame", help="tracks.viame.csv: boxes, outlines and ends, for DIVE."),
     ] = False,
     agency: Annotated[
-        Agency | None,
-        typer.Option(help="Table in the manner of WCPFC's longline monitoring or ICES' RDBES."),
+        list[Agency] | None,
+        typer.Option(
+            help="Table in the manner of WCPFC's longline monitoring or ICES' RDBES; may be "
+            "repeated.",
+            metavar="<wcpfc|rdbes>",
+        ),
     ] = None,
     hauls: Annotated[
         bool, typer.Option("--hauls", help="hauls.csv: hours watched and fish of each haul.")
@@ -93,8 +97,8 @@ def export(
         if viame:
             path = out / "tracks.viame.csv"
             print(f"{path}: {exported.viame(path)} boxes")
-        if agency:
-            print(exported.agency(out, agency))
+        for one in dict.fromkeys(agency or ()):
+            print(exported.agency(out, one))
         if hauls:
             print(exported.hauls(out))
         print(exported.provenance(out))

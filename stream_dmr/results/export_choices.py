@@ -1,7 +1,14 @@
 """The formats of exports: for the command, which offers them before it imports anything else."""
 
+from enum import StrEnum
 from typing import Literal
 
 MeshFormat = Literal["ply", "glb"]
 TableFormat = Literal["csv", "parquet"]
-Agency = Literal["wcpfc", "rdbes"]
+
+
+class Agency(StrEnum):
+    """An agency's table, by its name; an enumeration, since the option may be repeated."""
+
+    WCPFC = "wcpfc"
+    RDBES = "rdbes"

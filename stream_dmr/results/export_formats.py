@@ -202,7 +202,7 @@ class Export:
         path = out / f"{agency}.csv"
         self._require_writable(path)
         make, columns = (
-            (wcpfc_row, WCPFC_COLUMNS) if agency == "wcpfc" else (rdbes_row, RDBES_COLUMNS)
+            (wcpfc_row, WCPFC_COLUMNS) if agency is Agency.WCPFC else (rdbes_row, RDBES_COLUMNS)
         )
         template = self.template
         rows = [make(one, template) for one in self._all_fish() if one.counts]
