@@ -106,9 +106,12 @@ def convert(
     rrd = out or (
         recording / "recording.rrd" if recording.is_dir() else recording.with_suffix(".rrd")
     )
+    from stream_dmr.errors import UserError
     from stream_dmr.results.own_files import require_writable
 
     require_writable(rrd, overwrite=overwrite)
+    if rrd.suffix != ".rrd":
+        raise UserError(f"--out {rrd}: expected a name for an .rrd, got {rrd.name}; end it in .rrd")
     _convert(recording, rrd, source, parse_selection(time, track), full_size=full_size)
     print(rrd)
 

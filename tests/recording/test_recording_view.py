@@ -201,6 +201,26 @@ def test_a_part_is_shown_and_exported_alone(clip: Path, tmp_path: Path):
     assert [image["id"] for image in coco["images"]] == [2]
 
 
+def test_a_conversion_makes_its_folder(clip: Path, tmp_path: Path):
+    rrd = tmp_path / "new" / "folder" / "a.rrd"
+    assert invoke(f"convert {clip / 'out'}", {"--out": str(rrd)}).code == 0
+    assert [path.name for path in rrd.parent.iterdir()] == [rrd.name]
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "said"),
+    [("a.mcap", "video.mp4", "end it in .rrd"), ("a.rrd", "masks", "give the source")],
+)
+def test_a_refused_conversion_leaves_nothing(
+    clip: Path, tmp_path: Path, name: str, source: str, said: str
+):
+    options = {"--out": str(tmp_path / "new" / name), "--source": str(clip / source)}
+    outcome = invoke(f"convert {clip / 'out'}", options)
+    assert outcome.code == 2
+    assert said in outcome.error
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
 def test_what_is_lost_of_a_torn_recording_is_said(clip: Path, tmp_path: Path):
     data = (clip / "out" / "recording.mcap").read_bytes()
     torn = tmp_path / "recording.mcap.part"

@@ -1,10 +1,10 @@
 """Converts a recording into an .rrd: the view drawn again, with every frame."""
 
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Generator, Sequence
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
-from stream_dmr.files import writing_to
+from stream_dmr.files import make_folder, writing_to
 from stream_dmr.messages import FittedMesh, Frame, Message
 from stream_dmr.recording.messages.record import Record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
@@ -40,8 +40,10 @@ def convert(
     require_selected(opened, selection)
     meshes = MeshRebuilder(opened.header.template, known_shapes(opened))
     pictures = source or RecordedPictures(opened, selection)
-    unfinished = rrd.with_name(f"{rrd.name}.part")
-    with closing(RrdSink(unfinished, opened.header, settings)) as sink:
+    with (
+        _finished_or_removed(make_folder(rrd.parent) / rrd.name) as unfinished,
+        closing(RrdSink(unfinished, opened.header, settings)) as sink,
+    ):
         for message, payload in decoded_messages(opened, list(TOPICS), selection):
             whole: Message = message
             if isinstance(message, Frame):
@@ -49,6 +51,18 @@ def convert(
             elif isinstance(message, FittedMesh):
                 whole = meshes.with_vertices(message)
             sink.write(Record.of_payload(message, payload, whole=whole))
-    with writing_to(rrd):
-        unfinished.replace(rrd)
     return opened.warnings
+
+
+@contextmanager
+def _finished_or_removed(path: Path) -> Generator[Path]:
+    """Where to write what gets the name `path` at the end; an error leaves nothing of it."""
+    unfinished = path.with_name(f"{path.name}.part")
+    try:
+        yield unfinished
+    except BaseException:
+        with suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+        raise
+    with writing_to(path):
+        unfinished.replace(path)
