@@ -373,3 +373,14 @@ def test_other_files_are_refused_by_name(tmp_path):
         assert outcome.code == 2
         assert name in outcome.error
     assert invoke(f"replay {tmp_path / 'none.mcap'}").code == 2
+
+
+@pytest.mark.parametrize("command", ["replay", "export", "report", "convert"])
+def test_what_is_no_recording_is_not_called_a_damaged_one(run, tmp_path, command):
+    options = {} if command == "replay" else {"--out": str(tmp_path / "out.rrd")}
+    options |= {"--tables": "csv"} if command == "export" else {}
+    for path in (run[1]["--source"], run[0] / "lengths.csv", run[0] / "lengths.db"):
+        outcome = invoke(f"{command} {path}", options)
+        assert outcome.code == 2
+        assert outcome.error.startswith(f"{path}: expected a recording")
+        assert "damage" not in outcome.error
