@@ -12,6 +12,7 @@ from typing import Literal, get_args
 from stream_dmr.api.table_rows import FishRow, FrameRow, read_rows
 from stream_dmr.camera import Calibration
 from stream_dmr.csv_file import rotated_files
+from stream_dmr.errors import UserError
 from stream_dmr.messages import Message
 from stream_dmr.recording.messages.selection import Selection
 from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
@@ -25,6 +26,7 @@ from stream_dmr.watch.watch_observer import WatchObserver
 
 Location = str | PathLike[str]
 Stage = Literal["crop", "fit", "localize", "smooth"]
+Pose = Literal["hanging", "lying"]
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ def measure(
     boxes: Location | None = None,
     masks: Location | None = None,
     template: Location = RunRequest.template,
-    pose: Literal["hanging", "lying"] = "hanging",
+    pose: Pose = "hanging",
     stills: bool = False,
     config: Location | None = None,
     overwrite: bool = False,
@@ -113,6 +115,7 @@ def measure(
     Warnings are logged (logger "stream_dmr"), or passed to `observer`. Raises a UserError, in one
     line, where an input is wrong.
     """
+    _require_choice("pose", pose, get_args(Pose))
     request = RunRequest(
         source=str(source),
         out=default_out(str(source)) if out is None else Path(out),
@@ -162,13 +165,14 @@ def replay(
     recorded; `tracks` and `time_s` (from, to, capture time) take a part of it. Raises a UserError
     where an input is wrong.
     """
+    _require_choice("first", first, get_args(Stage))
     request = ReplayRequest(
         recordings=_paths(recordings),
         first=first,
         config=_path(config),
         calibration=_path(calibration),
         template=None if template is None else str(template),
-        selection=Selection.from_seconds(time_s, frozenset(tracks) or None),
+        selection=_selection(time_s, tracks),
         out=Path(out),
         overwrite=overwrite,
         key=_path(key),
@@ -189,14 +193,16 @@ def open(
     """Open a recording (.mcap, .rrd), the folder of a run, or several in order, for iteration.
 
     `kinds`: only these messages, such as [LengthEstimate]; `tracks`, `time_s`: only these fish and
-    this capture time (from, to). RecordingError where it can't be read.
+    this capture time (from, to). RecordingError where it can't be read, another UserError where
+    the time is none.
     """
+    selection = _selection(time_s, tracks)
     paths = _paths(recordings)
     header = open_recordings(paths).header
     return RecordedRun(
         paths=paths,
         kinds=get_args(Message) if kinds is None else kinds,
-        selection=Selection.from_seconds(time_s, frozenset(tracks) or None),
+        selection=selection,
         calibration=header.calibration,
         template=header.template,
         config_toml=header.config_toml,
@@ -220,6 +226,22 @@ class LoggingObserver(RunObserver):
 
     def serving(self, address: str) -> None:  # noqa: D102
         _LOGGER.info("watch it with: %s", address)
+
+
+def _require_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    """Raise UserError for a value that is none of the choices."""
+    if value not in choices:
+        raise UserError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+
+
+def _selection(time_s: tuple[float, float] | None, tracks: Collection[int]) -> Selection:
+    """The selected part; UserError for a time that ends before it begins."""
+    if time_s is not None and not time_s[0] < time_s[1]:
+        raise UserError(
+            f"time_s: expected (from, to) in seconds, such as (60, 90), got {time_s!r}; the first "
+            "must be less"
+        )
+    return Selection.from_seconds(time_s, frozenset(tracks) or None)
 
 
 def _path(location: Location | None) -> Path | None:

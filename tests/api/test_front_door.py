@@ -50,6 +50,30 @@ def test_every_name_is_there_and_no_other():
         sd.weigh  # noqa: B018
 
 
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        ("replay('x', out='o', first='foo')", "first: expected one of crop, fit, localize, smooth"),
+        ("measure('x', out='o', pose='standing')", "pose: expected one of hanging, lying"),
+    ],
+)
+def test_an_unknown_choice_is_a_user_error(call: str, said: str):
+    """In a process where types are not checked, as a user's is."""
+    code = f"import stream_dmr as sd\ntry: sd.{call}\nexcept sd.UserError as error: print(error)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith(said)
+
+
+def test_a_time_that_ends_before_it_begins_is_a_user_error(run: sd.Run, tmp_path: Path):
+    out = tmp_path / "out"
+    for time_s in ((5.0, 1.0), (2.0, 2.0), (float("nan"), 3.0)):
+        with pytest.raises(sd.UserError, match=r"time_s: expected \(from, to\)"):
+            sd.open(run.out, time_s=time_s)
+        with pytest.raises(sd.UserError, match=r"time_s: expected \(from, to\)"):
+            sd.replay(run.out, out=out, time_s=time_s)
+    assert not out.exists()
+
+
 def test_measure_gives_what_the_command_gives(run: sd.Run, tmp_path: Path):
     asked = options(run.out.parent) | {"--out": str(tmp_path / "out")}
     del asked["--boxes"]
