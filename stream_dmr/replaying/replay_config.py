@@ -1,9 +1,8 @@
 """The settings of a replay: those that are given, and the recorded ones of the stages before it."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from stream_dmr.errors import UserError
 from stream_dmr.replaying.replay_request import STAGES
 from stream_dmr.running.config import Config, load_config, parse_config, toml_value
 
@@ -19,11 +18,18 @@ _TABLES = {
 _KEYS = {"species": {"model": "crop", "forms": "fit"}}  # of tables that several stages use
 
 
-def replay_config(given: Path | None, recorded_toml: str, *, first: str) -> Config:
+def replay_config(
+    given: Path | None,
+    recorded_toml: str,
+    *,
+    first: str,
+    on_notice: Callable[[str], None] = lambda line: None,
+) -> Config:
     """The settings of a replay from the stage `first` on.
 
-    Of a given config.toml the recorded settings of the stages before `first` are left out. Raises
-    UserError where it has others, and ConfigError where one of the two can't be read.
+    Of a given config.toml the recorded settings of the stages before `first` are left out;
+    `on_notice` is told of those that it has otherwise. Raises ConfigError where one of the two
+    can't be read.
     """
     if given is not None and first == "crop":
         return load_config(given)
@@ -32,19 +38,22 @@ def replay_config(given: Path | None, recorded_toml: str, *, first: str) -> Conf
         return recorded
     config = load_config(given)
     changes: dict[str, object] = {}
+    unused: list[str] = []
     for table, stages in _stages_before(first, config).items():
         settings, earlier = getattr(config, table), getattr(recorded, table)
-        for key, stage in stages.items():
-            value, before = getattr(settings, key), getattr(earlier, key)
-            is_said = table in config.model_fields_set and key in settings.model_fields_set
-            if is_said and value != before:
-                raise UserError(
-                    f"--config {given} with --from {first}: expected the recorded [{table}] {key} "
-                    f"= {toml_value(before)}, got {toml_value(value)}, which matters to an earlier "
-                    f"stage; use --from {stage}, or leave it out of the file"
-                )
+        said = settings.model_fields_set if table in config.model_fields_set else ()
         kept = {key: getattr(earlier, key) for key in stages}
+        unused += [
+            f"[{table}] {key} = {toml_value(value)}"
+            for key, value in kept.items()
+            if key in said and getattr(settings, key) != value
+        ]
         changes[table] = settings.model_copy(update=kept)
+    if unused:
+        on_notice(
+            f"--config {given}: settings of stages before {first} stay as they were recorded: "
+            + ", ".join(unused)
+        )
     return config.model_copy(update=changes)
 
 

@@ -37,10 +37,13 @@ def read_inputs(
 ) -> ReplayInputs:
     """Read the given inputs and take the others from the recording. Raises a UserError.
 
-    `observer` is told what was repaired of a template, or learnt of the fish.
+    `observer` is told what of the settings is not used, what was repaired of a template, and what
+    was learnt of the fish.
     """
     header = recording.header
-    config = replay_config(request.config, header.config_toml, first=request.first)
+    config = replay_config(
+        request.config, header.config_toml, first=request.first, on_notice=observer.warn
+    )
     calibration = header.calibration
     if request.calibration is not None:
         calibration = load_calibration(request.calibration)

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from stream_dmr.errors import UserError
 from stream_dmr.replaying.replay_config import replay_config
 from stream_dmr.replaying.replay_request import STAGES
 from stream_dmr.running.config import parse_config
@@ -52,9 +51,13 @@ def test_the_recorded_settings_may_be_given(tmp_path: Path, first):
     assert replay_config(path, RECORDED, first=first) == parse_config(RECORDED, where="")
 
 
-def test_other_ones_of_earlier_stages_are_refused_with_both_values(tmp_path: Path):
+def test_other_ones_of_earlier_stages_stay_as_recorded_and_are_named(tmp_path: Path):
     path = tmp_path / "other.toml"
-    path.write_text("[localize]\nmin_iou = 0.6\n")
-    with pytest.raises(UserError, match=r"min_iou = 0\.5, got 0\.6.*use --from localize"):
-        replay_config(path, RECORDED, first="smooth")
+    path.write_text("[localize]\nmin_iou = 0.6\n[smooth_length]\nmin_frames = 7\n")
+    lines: list[str] = []
+    config = replay_config(path, RECORDED, first="smooth", on_notice=lines.append)
+    assert config.localize.min_iou == 0.5
+    assert config.smooth_length.min_frames == 7
+    [line] = lines
+    assert line.endswith(": [localize] min_iou = 0.5")
     assert replay_config(path, RECORDED, first="localize").localize.min_iou == 0.6
