@@ -121,7 +121,7 @@ def assert_learnt(out: Path, observer: Listener) -> None:
     assert LEARNT in known_files(out)
 
 
-@pytest.mark.parametrize("name", ["template.ply", "template.toml", "template-2.ply"])
+@pytest.mark.parametrize("name", ["template.ply", "template-2.ply"])
 def test_a_mesh_of_the_user_is_not_written_over(clip: Path, tmp_path: Path, name: str):
     out, observer = tmp_path / "out", Listener()
     out.mkdir()

@@ -101,7 +101,7 @@ def ellipse(breadth: float, *, pointed: float = 0.0, turn_rad: float = 0.0) -> n
 
 
 @given(breadth=st.floats(0.06, 0.7), turn_deg=st.floats(-180.0, 180.0))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_an_outline_that_is_alike_from_both_ends_is_no_fish(breadth: float, turn_deg: float):
     with pytest.raises(TemplateError, match="whose ends are alike"):
         fish_outline(ellipse(breadth, turn_rad=np.radians(turn_deg)), name="x")
