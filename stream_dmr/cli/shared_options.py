@@ -6,7 +6,7 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -116,13 +116,10 @@ def exit_on_signals() -> Generator[None]:
             number_of_first = number
             raise SystemExit(128 + number)
 
-    signals = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, on_signal) for number in signals]
     try:
-        yield
+        with _handling_signals(on_signal):
+            yield
     finally:
-        for number, handler in zip(signals, before, strict=True):
-            signal.signal(number, handler)
         if number_of_first:
             print(f"stopped by {signal.Signals(number_of_first).name}", file=sys.stderr)
 
@@ -139,10 +136,17 @@ def stop_on_signals() -> Generator[Stop]:
             # waiting for the event, and the lock in it can't be taken twice.
             _thread.start_new_thread(stop.set, ())
 
-    signals = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, on_signal) for number in signals]
-    try:
+    with _handling_signals(on_signal):
         yield stop
+
+
+@contextmanager
+def _handling_signals(handler: Callable[[int, FrameType | None], None]) -> Generator[None]:
+    """Ctrl-C and SIGTERM call the handler within the block."""
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, handler) for number in signals]
+    try:
+        yield
     finally:
-        for number, handler in zip(signals, before, strict=True):
-            signal.signal(number, handler)
+        for number, earlier in zip(signals, before, strict=True):
+            signal.signal(number, earlier)

@@ -4,9 +4,7 @@ from dataclasses import dataclass
 
 from stream_dmr.calibration.calibration_file import load_calibration, require_size
 from stream_dmr.camera import Calibration
-from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
-from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.recording.messages.codec import stored_picture
 from stream_dmr.recording.messages.run_header import RunHeader
@@ -17,7 +15,7 @@ from stream_dmr.replaying.replay_config import replay_config
 from stream_dmr.replaying.replay_request import ReplayRequest
 from stream_dmr.running.config import Config, to_toml
 from stream_dmr.running.run_observer import RunObserver
-from stream_dmr.running.shape_pass import NOTHING_LEARNT
+from stream_dmr.running.shape_pass import learn_aloud
 from stream_dmr.template.template import Template
 
 
@@ -110,18 +108,6 @@ def _shapes(
     if forms is None or not config.fit_mesh.learns_shapes:
         return template, forms
     messages = (message for message, _ in decoded_messages(recording, [FishCrop]))
-    stocks = learn_shapes(
-        (message for message in messages if isinstance(message, FishCrop)),
-        template,
-        forms,
-        config.fit_mesh,
-        calibration=calibration,
-        species=config.species,
-        progress=lambda step: observer.stage(f"learning their shapes: {step}"),
-    )
-    if stocks is None:
-        observer.warn(NOTHING_LEARNT)
-        return template, forms
-    for line in describe(forms, stocks):
-        observer.notice(line)
-    return template, stocks
+    crops = (message for message in messages if isinstance(message, FishCrop))
+    stocks = learn_aloud(crops, template, forms, config, calibration=calibration, observer=observer)
+    return template, forms if stocks is None else stocks

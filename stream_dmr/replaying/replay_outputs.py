@@ -78,8 +78,8 @@ def open_replay_outputs(
     """
     signer = None if request.key is None else Signer(request.key)
     stocks = None if inputs.candidates is None else inputs.candidates.stocks()
-    if stocks is not None and not request.overwrite:
-        require_free_names(out)
+    if stocks is not None:
+        require_free_names(out, overwrite=request.overwrite)
     prepare_folder(out, overwrite=request.overwrite)
     known = recorded.facts
     facts = run_facts(

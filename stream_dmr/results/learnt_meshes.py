@@ -18,10 +18,13 @@ def learnt_files(folder: Path) -> list[Path]:
     return [path for path in _so_named(folder) if is_mesh_by(MADE_BY_RUN, path)]
 
 
-def require_free_names(folder: Path) -> None:
-    """Raise OutputError where somebody else's file has a name that a learnt mesh would get."""
+def require_free_names(folder: Path, *, overwrite: bool) -> None:
+    """Raise OutputError where somebody else's file has a name that a learnt mesh would get.
+
+    With `overwrite` it may be replaced.
+    """
     for path in _so_named(folder):
-        if not is_mesh_by(MADE_BY_RUN, path):
+        if not (overwrite or is_mesh_by(MADE_BY_RUN, path)):
             raise OutputError(
                 f"{path}: expected a name that is free for the learnt shape of the fish, it is "
                 "taken; rename it, or choose another --out"

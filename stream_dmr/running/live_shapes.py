@@ -13,6 +13,7 @@ from contextlib import suppress
 from itertools import chain
 
 from stream_dmr.errors import OutputError
+from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.fitting.shape.samples import MAX_FISH, GoodCrops
@@ -24,7 +25,7 @@ from stream_dmr.running.inputs import Inputs
 from stream_dmr.running.outputs import Outputs
 from stream_dmr.running.pipeline import Node
 from stream_dmr.running.run_observer import RunObserver
-from stream_dmr.running.shape_pass import save_stocks, shapes_of
+from stream_dmr.running.shape_pass import save_stocks
 
 # Finished fish after which shapes are learnt, then after twice as many, and so on. What an earlier
 # run has learnt is known from more fish than the first ones after a restart.
@@ -121,7 +122,16 @@ def follow_shapes(
     fit_mesh.learn(known)
 
     def learn(crops: Sequence[FishCrop], progress: Callable[[str], None]) -> CandidateShapes | None:
-        return shapes_of(inputs, crops, progress=progress)
+        assert inputs.candidates is not None  # there are body forms to begin from
+        return learn_shapes(
+            crops,
+            inputs.template,
+            inputs.candidates,
+            inputs.config.fit_mesh,
+            calibration=inputs.calibration,
+            species=inputs.config.species,
+            progress=progress,
+        )
 
     def on_learnt(learnt: LearntShapes) -> None:
         nonlocal known
@@ -134,8 +144,7 @@ def follow_shapes(
             observer.notice(f"learnt from the fish so far: {line}")
         path = inputs.request.out / LEARNT
         try:
-            if not inputs.request.overwrite:
-                require_free_names(path.parent)
+            require_free_names(path.parent, overwrite=inputs.request.overwrite)
             meshes = save_stocks(
                 inputs.template, stocks, path, made_by=MADE_BY_RUN, source=inputs.source.name
             )

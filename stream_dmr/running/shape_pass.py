@@ -5,11 +5,12 @@ first one is measured.
 """
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
 
+from stream_dmr.camera import Calibration
 from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.shape.describe import describe
@@ -18,14 +19,13 @@ from stream_dmr.messages import FishCrop
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.results.learnt_meshes import is_mesh_by, mesh_comment, require_free_names
+from stream_dmr.running.config import Config
 from stream_dmr.running.inputs import Inputs
 from stream_dmr.running.kept_crops import keep_crops
 from stream_dmr.running.run_folder import require_folder
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.template.template import Template
 from stream_dmr.template.template_file import save_template
-
-NOTHING_LEARNT = "no fish was seen whole: each is measured as the form it is most like"
 
 
 def with_learnt_shapes(
@@ -40,8 +40,7 @@ def with_learnt_shapes(
         return inputs
     out, overwrite = inputs.request.out, inputs.request.overwrite
     require_folder(out, overwrite=overwrite)  # before the work
-    if not overwrite:
-        require_free_names(out)
+    require_free_names(out, overwrite=overwrite)
     observer.stage("finding the fish, for their shapes")
     crops = keep_crops(
         inputs.reader, crop_fish, inputs.config.recording, stop=stop, on_frame=observer.frame_done
@@ -49,34 +48,44 @@ def with_learnt_shapes(
     inputs.reader.close()
     stocks = None
     if not stop.is_set():
-        stocks = shapes_of(
-            inputs, crops, progress=lambda step: observer.stage(f"learning their shapes: {step}")
+        stocks = learn_aloud(
+            crops,
+            inputs.template,
+            candidates,
+            inputs.config,
+            calibration=inputs.calibration,
+            observer=observer,
         )
-        if stocks is None:
-            observer.warn(NOTHING_LEARNT)
     reader = ReadFrames(inputs.request.source, inputs.config.read_frames)
     inputs = replace(inputs, reader=reader, crops=crops)
-    if stocks is None:
-        return inputs
-    for line in describe(candidates, stocks):
-        observer.notice(line)
-    return replace(inputs, candidates=stocks)
+    return inputs if stocks is None else replace(inputs, candidates=stocks)
 
 
-def shapes_of(
-    inputs: Inputs, crops: Iterable[FishCrop], *, progress: Callable[[str], None]
+def learn_aloud(
+    crops: Iterable[FishCrop],
+    template: Template,
+    forms: CandidateShapes,
+    config: Config,
+    *,
+    calibration: Calibration | None,
+    observer: RunObserver,
 ) -> CandidateShapes | None:
-    """The stocks of a run's fish, see `learn_shapes`; the run has body forms to begin from."""
-    assert inputs.candidates is not None
-    return learn_shapes(
+    """The stocks of all fish at once, see `learn_shapes`; the observer is told what they are."""
+    stocks = learn_shapes(
         crops,
-        inputs.template,
-        inputs.candidates,
-        inputs.config.fit_mesh,
-        calibration=inputs.calibration,
-        species=inputs.config.species,
-        progress=progress,
+        template,
+        forms,
+        config.fit_mesh,
+        calibration=calibration,
+        species=config.species,
+        progress=lambda step: observer.stage(f"learning their shapes: {step}"),
     )
+    if stocks is None:
+        observer.warn("no fish was seen whole: each is measured as the form it is most like")
+        return None
+    for line in describe(forms, stocks):
+        observer.notice(line)
+    return stocks
 
 
 def save_stocks(

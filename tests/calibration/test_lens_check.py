@@ -25,19 +25,28 @@ def with_k(*k: float) -> Camera:
     return replace(WIDE, distortion=np.array([k[0], k[1] if len(k) > 1 else 0.0, 0.0, 0.0, 0.0]))
 
 
+def refusal(camera: Camera) -> str:
+    """What is said of a camera that is refused; nothing of one that passes."""
+    try:
+        require_lens(camera, Path("x"))
+    except CalibrationError as error:
+        return str(error)
+    return ""
+
+
 @given(cameras())
 def test_cameras_have_lenses(camera: Camera):
-    require_lens(camera, Path("x"))
+    assert refusal(camera) == ""
 
 
 @pytest.mark.parametrize("k", [(-0.33, 0.11), (-0.3, 0.08), (0.2,), (0.6,)])
 def test_strong_but_true_distortions_pass(k: tuple[float, ...]):
-    require_lens(with_k(*k), Path("x"))
+    assert refusal(with_k(*k)) == ""
 
 
 def test_a_fisheye_is_not_looked_at():
     fisheye = replace(WIDE, distortion=np.array([0.1, -0.5, 0.2, -0.1]), is_fisheye=True)
-    require_lens(fisheye, Path("x"))
+    assert refusal(fisheye) == ""
 
 
 @given(k1=st.floats(-20, -0.01))
@@ -45,10 +54,9 @@ def test_a_radius_that_shrinks_within_the_picture_is_refused(k1: float):
     """r (1 + k1 r^2) grows up to r = 1 / sqrt(-3 k1), where it is two thirds of that."""
     widest_px = WIDE.K[0, 0] * 2 / 3 / np.sqrt(-3 * k1)
     if widest_px > np.hypot(640, 360):
-        require_lens(with_k(k1), Path("x"))
+        assert refusal(with_k(k1)) == ""
     elif widest_px < 360:
-        with pytest.raises(CalibrationError, match="fold"):
-            require_lens(with_k(k1), Path("x"))
+        assert "fold" in refusal(with_k(k1))
 
 
 @given(stretch=st.floats(0, 3))
@@ -58,7 +66,6 @@ def test_areas_are_enlarged_little_or_refused(stretch: float):
     camera = with_k(0.0, stretch / r**4)
     enlargement = (1 + stretch) * (1 + 5 * stretch)
     if enlargement < 5.9:
-        require_lens(camera, Path("x"))
+        assert refusal(camera) == ""
     elif enlargement > 6.1:
-        with pytest.raises(CalibrationError, match="enlarge"):
-            require_lens(camera, Path("x"))
+        assert "enlarge" in refusal(camera)

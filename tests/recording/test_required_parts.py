@@ -11,6 +11,7 @@ from stream_dmr.recording.mcap.mcap_sink import McapSink
 from stream_dmr.recording.messages.record import make_record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
+from stream_dmr.recording.messages.topics import TOPICS
 from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.recording.reading.required_parts import (
     require_frame,
@@ -90,7 +91,10 @@ def test_a_recording_without_a_whole_message_is_refused(tmp_path: Path, suffix: 
 def test_one_that_a_run_ended_before_its_first_frame_is_no_torn_one(tmp_path: Path):
     with closing(McapSink(tmp_path / "recording.mcap", header(), flush_s=0.0)):
         pass
-    require_messages(open_recordings([tmp_path]))
+    recording = open_recordings([tmp_path])
+    require_messages(recording)
+    assert not recording.ends_early
+    assert list(recording.payloads([*TOPICS])) == []
 
 
 def test_fish_of_a_recording_that_was_deleted_are_still_exported(folder: Path, tmp_path: Path):

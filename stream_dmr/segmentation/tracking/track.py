@@ -132,7 +132,7 @@ class Track:
             )
             return
         if self.frames_seen > 2:  # before, the speed is not known
-            square = (self._distance_px(observation) / max(self.size, 1.0)) ** 2
+            square = self._distance(observation) ** 2
             self._mean_square = _MEMORY * self._mean_square + (1 - _MEMORY) * square
         self._whole = observation
         self.was_separate = not observation.is_piece
@@ -181,7 +181,7 @@ class Track:
 
     def cost(self, observation: Observation) -> float:
         """Sum of squared deviations over their variances; `IMPOSSIBLE` beyond the gates."""
-        if self._distance_px(observation) > self._gate * max(self.size, 1.0):
+        if self._distance(observation) > self._gate:
             return IMPOSSIBLE
         offset = observation.center - self.center
         S = self._filter.P[:2, :2] + self._filter.R  # S = HPH' + R
@@ -193,8 +193,9 @@ class Track:
         cost += self._cost_of_colours(observation)
         return float(cost) if cost < _MAX_COST else IMPOSSIBLE
 
-    def _distance_px(self, observation: Observation) -> float:
-        return float(np.hypot(*(observation.center - self.center)))
+    def _distance(self, observation: Observation) -> float:
+        """From where the fish is predicted, sizes."""
+        return float(np.hypot(*(observation.center - self.center)) / max(self.size, 1.0))
 
     @property
     def _gate(self) -> float:
