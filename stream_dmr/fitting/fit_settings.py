@@ -28,6 +28,11 @@ class FitMeshSettings(Settings):
     device: Literal["cpu", "cuda"] = Field(
         default="cpu", description="device of adam; contour always runs on the CPU"
     )
+    learn_shapes: bool = Field(
+        default=True,
+        description="the shapes of the fish are learnt from them, and a given mesh is compared "
+        "with them; a source with an end is gone through once before for it",
+    )
     lambda_scale: float = Field(default=1.0, ge=0, description="weight of L_s, eq. (3)")
     lambda_translation: float = Field(default=10.0, ge=0, description="weight of L_t, eq. (3)")
     lambda_normal: float = Field(default=0.003, ge=0, description="weight of L_normal, eq. (3)")
@@ -93,11 +98,15 @@ class FitMeshSettings(Settings):
 
         Only the spine's size is its length; and the paper's solver is left as the paper has it.
         """
-        return self.learns_shapes and self.scan_iterations > 0 and self.prior_weight > 0
+        return self._is_ours and self.scan_iterations > 0 and self.prior_weight > 0
 
     @property
-    def learns_shapes(self) -> bool:
-        """Whether shapes can be learnt: by the equations of our own solver and deformation."""
+    def are_shapes_learnt(self) -> bool:
+        """Whether shapes are learnt, which takes the equations of our own solver."""
+        return self._is_ours and self.learn_shapes
+
+    @property
+    def _is_ours(self) -> bool:
         return self.deformation == "spine" and self.solver == "contour"
 
     def lambdas(self) -> Float[np.ndarray, "6"]:

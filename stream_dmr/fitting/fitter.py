@@ -89,7 +89,8 @@ class Fitter:
             template = reshaped(template, candidate.coefficients)
             settings = freed(settings, std_of(TRUNK, candidate.covariance) ** 2)
             self._shape_covariance += candidate.covariance
-            self._breadth_std = std_of(TRUNK, self._shape_covariance)
+            if candidate.covariance.any():
+                self._breadth_std = std_of(TRUNK, self._shape_covariance)
         self.plane_normal = np.ascontiguousarray(normal)
         self._template = template
         self._settings = settings

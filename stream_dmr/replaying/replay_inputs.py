@@ -15,7 +15,7 @@ from stream_dmr.replaying.replay_config import replay_config
 from stream_dmr.replaying.replay_request import ReplayRequest
 from stream_dmr.running.config import Config, to_toml
 from stream_dmr.running.run_observer import RunObserver
-from stream_dmr.running.shape_pass import learn_aloud
+from stream_dmr.running.shape_pass import learnt_from
 from stream_dmr.template.template import Template
 
 
@@ -101,13 +101,12 @@ def _shapes(
     calibration: Calibration | None,
     observer: RunObserver,
 ) -> tuple[Template, CandidateShapes | None]:
-    """Mesh and candidate shapes; those of `auto` and of names are learnt from recorded crops."""
+    """Mesh and candidate shapes, by what the recorded crops show where a template is given."""
     if request.template is None:
         return recording.header.template, known_shapes(recording)
     template, forms = load_shapes(request.template, on_notice=observer.warn)
-    if forms is None or not config.fit_mesh.learns_shapes:
+    if not config.fit_mesh.are_shapes_learnt:
         return template, forms
     messages = (message for message, _ in decoded_messages(recording, [FishCrop]))
     crops = (message for message in messages if isinstance(message, FishCrop))
-    stocks = learn_aloud(crops, template, forms, config, calibration=calibration, observer=observer)
-    return template, forms if stocks is None else stocks
+    return learnt_from(crops, template, forms, config, calibration=calibration, observer=observer)

@@ -7,7 +7,7 @@ from pathlib import Path
 from stream_dmr.calibration.calibration_file import load_calibration, require_size
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
-from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
+from stream_dmr.fitting.shape.candidates import CandidateShapes, given_mesh, load_shapes
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.run_inputs import InputFile, RunInputs
@@ -140,6 +140,8 @@ def checked_inputs(request: RunRequest) -> Inputs:
         finder=finder,
         reader=reader,
     )
+    if inputs.is_endless and candidates is None and config.fit_mesh.are_shapes_learnt:
+        inputs = replace(inputs, candidates=given_mesh(template))  # others may join it later
     try:
         if request.resume and not inputs.is_endless:
             raise UserError(_no_resuming(request))

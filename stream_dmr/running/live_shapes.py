@@ -14,8 +14,9 @@ from itertools import chain
 
 from stream_dmr.errors import OutputError
 from stream_dmr.fitting.learn_shapes import learn_shapes
-from stream_dmr.fitting.shape.candidates import CandidateShapes
+from stream_dmr.fitting.shape.candidates import CandidateShapes, mesh_form
 from stream_dmr.fitting.shape.describe import describe
+from stream_dmr.fitting.shape.mesh_agreement import is_like_mesh, not_like_mesh
 from stream_dmr.fitting.shape.samples import MAX_FISH, GoodCrops
 from stream_dmr.messages import FishCrop, Frame, LearntShapes, LengthEstimate, Message
 from stream_dmr.nodes.fit_mesh import FitMesh
@@ -109,39 +110,51 @@ def follow_shapes(
 ) -> LiveShapes | None:
     """Let `fit_mesh` know what earlier runs have learnt, and what this one learns.
 
-    None where there is nothing to learn: a mesh was given, or the source has an end, whose fish
+    None where there is nothing to learn: the settings say so, or the source has an end, whose fish
     were looked at before (`shape_pass.py`).
     """
-    forms = inputs.candidates
-    if forms is None or not inputs.is_endless or not inputs.config.fit_mesh.learns_shapes:
+    given = inputs.candidates
+    if given is None or not inputs.is_endless or not inputs.config.fit_mesh.are_shapes_learnt:
         return None
     assert isinstance(fit_mesh, FitMesh)
-    known = forms
+    known, is_mesh = given, given.is_given_mesh
+    forms = mesh_form(inputs.template) if is_mesh else given
     for learnt in outputs.learnt:
         known = known.extended(learnt)
     fit_mesh.learn(known)
 
     def learn(crops: Sequence[FishCrop], progress: Callable[[str], None]) -> CandidateShapes | None:
-        assert inputs.candidates is not None  # there are body forms to begin from
-        return learn_shapes(
+        stocks = learn_shapes(
             crops,
             inputs.template,
-            inputs.candidates,
+            forms,
             inputs.config.fit_mesh,
             calibration=inputs.calibration,
             species=inputs.config.species,
             progress=progress,
         )
+        if is_mesh and stocks is None:
+            observer.warn(not_like_mesh(forms, None))
+        return stocks
 
     def on_learnt(learnt: LearntShapes) -> None:
         nonlocal known
-        write(learnt)
-        known = known.extended(learnt)
-        fit_mesh.learn(known)
-        stocks = known.stocks()
+        more = known.extended(learnt)
+        stocks = more.stocks()
         assert stocks is not None
-        for line in describe(forms, stocks):
-            observer.notice(f"learnt from the fish so far: {line}")
+        if is_mesh and all(map(is_like_mesh, stocks)):
+            return
+        known = more
+        write(learnt)
+        fit_mesh.learn(known)
+        if is_mesh:
+            observer.warn(
+                f"{not_like_mesh(forms, stocks)}; fish to come may have the shape learnt from "
+                "these; measure those so far anew: stream-dmr replay --from fit --template auto"
+            )
+        else:
+            for line in describe(forms, stocks):
+                observer.notice(f"learnt from the fish so far: {line}")
         path = inputs.request.out / LEARNT
         try:
             require_free_names(path.parent, overwrite=inputs.request.overwrite)

@@ -1,7 +1,7 @@
 """A first pass over a source, for the shapes of its fish, before any of them is measured.
 
-For `--template auto`, and only for sources with an end: the last fish are learnt from before the
-first one is measured.
+Only for sources with an end: the last fish are learnt from before the first one is measured. A mesh
+that was given is compared with what was learnt.
 """
 
 import itertools
@@ -12,8 +12,10 @@ from threading import Event
 
 from stream_dmr.camera import Calibration
 from stream_dmr.fitting.learn_shapes import learn_shapes
-from stream_dmr.fitting.shape.candidates import CandidateShapes
+from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes, mesh_form
 from stream_dmr.fitting.shape.describe import describe
+from stream_dmr.fitting.shape.mesh_agreement import is_like_mesh, not_like_mesh
+from stream_dmr.fitting.shape.samples import good_crops
 from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.messages import FishCrop
 from stream_dmr.nodes.crop_fish import CropFish
@@ -31,61 +33,90 @@ from stream_dmr.template.template_file import save_template
 def with_learnt_shapes(
     inputs: Inputs, crop_fish: CropFish, *, stop: Event, observer: RunObserver
 ) -> Inputs:
-    """The inputs with the stocks of the source's own fish, and its crops.
+    """The inputs with the shapes of the source's own fish, and its crops.
 
-    As they are where nothing is to be learnt: a mesh was given, or the source has no end.
+    As they are where nothing is to be learnt: the settings say so, or the source has no end.
     """
-    candidates, learns_shapes = inputs.candidates, inputs.config.fit_mesh.learns_shapes
-    if candidates is None or inputs.is_endless or not learns_shapes:
+    config, request = inputs.config, inputs.request
+    if inputs.is_endless or not config.fit_mesh.are_shapes_learnt:
         return inputs
-    out, overwrite = inputs.request.out, inputs.request.overwrite
-    require_folder(out, overwrite=overwrite)  # before the work
-    require_free_names(out, overwrite=overwrite)
+    require_folder(request.out, overwrite=request.overwrite)  # before the work
+    if inputs.candidates is not None:
+        require_free_names(request.out, overwrite=request.overwrite)
     observer.stage("finding the fish, for their shapes")
     crops = keep_crops(
-        inputs.reader, crop_fish, inputs.config.recording, stop=stop, on_frame=observer.frame_done
+        inputs.reader, crop_fish, config.recording, stop=stop, on_frame=observer.frame_done
     )
     inputs.reader.close()
-    stocks = None
-    if not stop.is_set():
-        stocks = learn_aloud(
-            crops,
-            inputs.template,
-            candidates,
-            inputs.config,
-            calibration=inputs.calibration,
-            observer=observer,
-        )
-    reader = ReadFrames(inputs.request.source, inputs.config.read_frames)
+    reader = ReadFrames(request.source, config.read_frames)
     inputs = replace(inputs, reader=reader, crops=crops)
-    return inputs if stocks is None else replace(inputs, candidates=stocks)
+    if stop.is_set():
+        return inputs
+    template, candidates = learnt_from(
+        crops,
+        inputs.template,
+        inputs.candidates,
+        config,
+        calibration=inputs.calibration,
+        observer=observer,
+    )
+    if candidates is not None:
+        require_free_names(request.out, overwrite=request.overwrite)
+    return replace(inputs, template=template, candidates=candidates)
 
 
-def learn_aloud(
+def learnt_from(
     crops: Iterable[FishCrop],
     template: Template,
-    forms: CandidateShapes,
+    forms: CandidateShapes | None,
     config: Config,
     *,
     calibration: Calibration | None,
     observer: RunObserver,
-) -> CandidateShapes | None:
-    """The stocks of all fish at once, see `learn_shapes`; the observer is told what they are."""
-    stocks = learn_shapes(
-        crops,
-        template,
-        forms,
-        config.fit_mesh,
-        calibration=calibration,
-        species=config.species,
-        progress=lambda step: observer.stage(f"learning their shapes: {step}"),
-    )
+) -> tuple[Template, CandidateShapes | None]:
+    """The shapes that all these fish together have, and the template of which they are.
+
+    Without `forms` it is the template's own, unless the fish show another: then their shapes are
+    learnt as by `--template auto`. The observer is told what was learnt.
+    """
+    seen_whole = [*itertools.chain.from_iterable(good_crops(crops))]
+
+    def learn(template: Template, forms: CandidateShapes) -> CandidateShapes | None:
+        return learn_shapes(
+            seen_whole,
+            template,
+            forms,
+            config.fit_mesh,
+            calibration=calibration,
+            species=config.species,
+            progress=lambda step: observer.stage(f"learning their shapes: {step}"),
+        )
+
+    if forms is None:
+        if not seen_whole:
+            observer.warn(
+                f"no fish was seen whole: whether they are like {template.name} is not known"
+            )
+            return template, None
+        mesh = mesh_form(template)
+        stocks = learn(template, mesh)
+        if stocks is not None and all(map(is_like_mesh, stocks)):
+            for line in describe(mesh, stocks):
+                observer.notice(line)
+            return template, None
+        observer.warn(
+            f"{not_like_mesh(mesh, stocks)}; they are measured by the shapes learnt from them, as "
+            "with --template auto"
+        )
+        template, forms = load_shapes(AUTO)
+        assert forms is not None
+    stocks = learn(template, forms)
     if stocks is None:
         observer.warn("no fish was seen whole: each is measured as the form it is most like")
-        return None
+        return template, forms
     for line in describe(forms, stocks):
         observer.notice(line)
-    return stocks
+    return template, stocks
 
 
 def save_stocks(

@@ -30,7 +30,7 @@ from tests.support.final_estimates import fish as finished
 from tests.support.fish_run import request
 from tests.support.frames import frame_of
 from tests.support.given_masks import crop_of
-from tests.support.tiny_clip import calibration, draw_mask, write_clip
+from tests.support.tiny_clip import calibration, draw_mask, write_clip, write_template
 
 FORMS = load_shapes("auto")[1]
 CAMERA: Camera = calibration().camera
@@ -59,7 +59,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("live")
     write_clip(folder / "clip", fish=SEEN)
     config = folder / "clip" / "quick.toml"
-    quick = config.read_text().replace("[fit_mesh]", "[fit_mesh]\nmax_faces = 600")
+    quick = config.read_text().replace("learn_shapes = false", "max_faces = 600")
     config.write_text(f"{quick}\n[smooth_length]\ntrack_timeout_s = 0.15\n")
     found = []
     with pytest.MonkeyPatch.context() as patch:
@@ -123,6 +123,32 @@ def test_a_mesh_of_the_user_stays_and_the_camera_measures_on(
     assert (tmp_path / LEARNT).read_text() == "mine"
     assert [line for line in observer.lines if f"{LEARNT}: expected a name that is free" in line]
     assert len(rows(tmp_path / "lengths.csv")) == 4
+
+
+@pytest.mark.parametrize(("half_breadth", "is_believed"), [(17, True), (11, False)])
+def test_a_given_mesh_is_compared_with_the_first_fish(
+    runs: list[Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    half_breadth: float,
+    is_believed: bool,
+):
+    write_template(tmp_path, "mine", half_breadth=half_breadth)
+    monkeypatch.setattr(Inputs, "is_endless", property(lambda inputs: True))
+    monkeypatch.setattr("stream_dmr.running.live_shapes.ThreadPoolExecutor", Immediate)
+    observer, mesh, out = Warned(), str(tmp_path / "mine.ply"), tmp_path / "out"
+    asked = request(runs[0].parent / "clip", out, template=mesh)
+    measure_source(asked, stop=threading.Event(), observer=observer)
+    lines = [line for line in observer.lines if "the fish are not like mine: " in line]
+    assert len(lines) == (0 if is_believed else 1)
+    assert candidates_of(out) == {1: 0, 2: 0, 3: 0, 4: 0 if is_believed else 1}
+    assert (out / LEARNT).exists() != is_believed
+    [recording] = out.glob("recording-*.mcap")
+    again = replay(
+        ReplayRequest(recordings=[recording], first="fit", check=True), stop=threading.Event()
+    )
+    assert again.num_compared > 0
+    assert again.mismatches == []
 
 
 @pytest.mark.parametrize("kind", ["mcap", "rrd"])

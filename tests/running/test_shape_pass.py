@@ -26,18 +26,22 @@ from stream_dmr.template.template_file import load_template
 from tests.support.command import rows
 from tests.support.fish_run import request
 from tests.support.reading import read_header
-from tests.support.tiny_clip import write_clip
+from tests.support.tiny_clip import write_clip, write_template
 
 
 class Listener(RunObserver):
     """Hears what a run says, and asks it to stop after so many frames."""
 
     def __init__(self, *, stop_after: int | None = None) -> None:
-        self.stop, self.notices, self._stop_after = threading.Event(), list[str](), stop_after
+        self.stop, self._stop_after = threading.Event(), stop_after
+        self.notices, self.warnings = list[str](), list[str]()
         self.num_frames = 0
 
     def notice(self, line: str) -> None:
         self.notices.append(line)
+
+    def warn(self, line: str) -> None:
+        self.warnings.append(line)
 
     def frame_done(self) -> None:
         self.num_frames += 1
@@ -50,7 +54,8 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("auto") / "clip"
     write_clip(folder, num_frames=4)
     config = folder / "quick.toml"
-    config.write_text(config.read_text().replace("[fit_mesh]", "[fit_mesh]\nmax_faces = 600"))
+    config.write_text(config.read_text().replace("learn_shapes = false", "max_faces = 600"))
+    write_template(folder, "slim", half_breadth=11)
     return folder
 
 
@@ -223,6 +228,54 @@ def test_a_named_form_is_a_hint_and_its_stock_is_learnt(clip: Path, tmp_path: Pa
     header = read_header(named / "recording.mcap")
     assert header.candidates is not None
     assert header.candidates.are_learnt
+
+
+def test_a_mesh_that_is_like_the_fish_is_believed_as_it_is(clip: Path, tmp_path: Path):
+    observer = Listener()
+    out = measured(clip, tmp_path / "out", observer, template=str(clip / "tiny.ply")).out
+    assert [line for line in observer.notices if "like tiny" in line]
+    assert read_header(out / "recording.mcap").candidates is None
+    assert not (out / LEARNT).exists()
+    config = tmp_path / "unlearnt.toml"
+    config.write_text(
+        (clip / "quick.toml").read_text().replace("max_faces", "learn_shapes = false\nmax_faces")
+    )
+    unlearnt = tmp_path / "unlearnt"
+    measured(clip, unlearnt, Listener(), template=str(clip / "tiny.ply"), config=config)
+    assert (out / "lengths.csv").read_text() == (unlearnt / "lengths.csv").read_text()
+
+
+def test_a_mesh_of_other_fish_is_not_believed(
+    clip: Path, learnt: tuple[Path, Listener], tmp_path: Path
+):
+    observer = Listener()
+    out = measured(clip, tmp_path / "out", observer, template=str(clip / "slim.ply")).out
+    assert [line for line in observer.warnings if "the fish are not like slim: " in line]
+    assert_learnt(out, observer)
+    assert rows(out / "lengths.csv") == rows(learnt[0] / "lengths.csv")  # as with auto
+
+
+def test_a_mesh_that_fits_no_mask_is_not_believed(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("stream_dmr.fitting.learn_shapes._MIN_IOU", 1.1)
+    observer = Listener()
+    out = measured(clip, tmp_path / "out", observer, template=str(clip / "tiny.ply")).out
+    assert [line for line in observer.warnings if "tiny, which fits none of their masks" in line]
+    candidates = read_header(out / "recording.mcap").candidates
+    assert candidates is not None
+    assert len(candidates) > 1
+
+
+def test_a_replay_does_not_believe_it_either(learnt: tuple[Path, Listener], tmp_path: Path):
+    slim = str(learnt[0].parent / "clip" / "slim.ply")
+    asked = ReplayRequest(
+        recordings=[learnt[0]], first="fit", template=slim, out=tmp_path / "again"
+    )
+    observer = Listener()
+    replay(asked, stop=threading.Event(), observer=observer)
+    assert [line for line in observer.warnings if "the fish are not like slim: " in line]
+    assert_learnt(tmp_path / "again", observer)
 
 
 def test_a_stop_while_fish_are_looked_for_leaves_an_empty_valid_result(clip: Path, tmp_path: Path):

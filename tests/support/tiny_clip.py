@@ -20,6 +20,7 @@ segmenter = "grabcut"
 
 [fit_mesh]
 cold_below_iou = 0.0
+learn_shapes = false
 min_mask_px = 10
 
 [localize]
@@ -65,12 +66,12 @@ def options(folder: Path) -> dict[str, str]:
     }
 
 
-def write_template(folder: Path) -> None:
-    """A fish of 42 vertices, 100 long."""
+def write_template(folder: Path, name: str = "tiny", *, half_breadth: float = 18) -> None:
+    """A fish of 42 vertices, 100 long, as broad as those of the clip unless stated otherwise."""
     mesh = trimesh.creation.icosphere(subdivisions=1)
-    mesh.apply_scale([50, 18, 8])
-    mesh.export(folder / "tiny.ply")
-    (folder / "tiny.toml").write_text(
+    mesh.apply_scale([50, half_breadth, 8])
+    mesh.export(folder / f"{name}.ply")
+    (folder / f"{name}.toml").write_text(
         "joints = [[-15, 0, 0], [15, 0, 0]]\n"
         "[keypoints]\nhead = [-50, 0, 0]\ncenter = [0, 0, 0]\ntail = [50, 0, 0]\n"
     )

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from stream_dmr.fitting.shape.space import coefficients_of, form_precision
+from stream_dmr.fitting.shape.space import NUM_COEFFICIENTS, coefficients_of, form_precision
 from stream_dmr.messages import LearntShapes
 from stream_dmr.template.template import Template
 from stream_dmr.template.template_file import bundled_names, load_template
@@ -58,6 +58,11 @@ class CandidateShapes:
     def __len__(self) -> int:
         """Return their number."""
         return len(self.shares)
+
+    @property
+    def is_given_mesh(self) -> bool:
+        """True for a mesh alone that is believed as it is, see `given_mesh`."""
+        return len(self) == 1 and not self.covariances.any()
 
     def choice(self, first_seen_ns: int) -> Choice:
         """What a fish may be that is first seen then: all body forms, and the stocks known last.
@@ -140,8 +145,8 @@ def load_shapes(
     """What `--template` says: the mesh, and the shapes that fish may have.
 
     `auto`: any body form. The name of a body form: that one, unless the masks say otherwise. A
-    mesh: its own shape alone, since it is the user's word; `on_notice` gets what was repaired and
-    found of it. Raises TemplateError.
+    mesh: None, its own shape alone; `on_notice` gets what was repaired and found of it. Raises
+    TemplateError.
     """
     if name != AUTO and name not in bundled_names():
         return load_template(name, on_notice=on_notice), None
@@ -151,8 +156,16 @@ def load_shapes(
 
 def mesh_form(template: Template) -> CandidateShapes:
     """A mesh as the one body form from which a stock is learnt."""
+    return _of_mesh(template, np.linalg.inv(form_precision()))
+
+
+def given_mesh(template: Template) -> CandidateShapes:
+    """A mesh as it is, the user's word: fits by it are those without candidates."""
+    return _of_mesh(template, np.zeros((NUM_COEFFICIENTS, NUM_COEFFICIENTS)))
+
+
+def _of_mesh(template: Template, covariance: Float[np.ndarray, "W W"]) -> CandidateShapes:
     name = template.name.replace(",", " ")
-    covariance = np.linalg.inv(form_precision())
     return CandidateShapes.of(
         [CandidateShape(name, np.zeros(len(covariance)), covariance, 1.0)], are_learnt=False
     )

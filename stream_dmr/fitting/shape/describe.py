@@ -14,18 +14,18 @@ def describe(forms: CandidateShapes, stocks: CandidateShapes) -> Iterator[str]:
     """A line for each stock, such as: 62 % of the fish: like salmon, 18 % broader (+-3 %)."""
     by_name = {form.name: form for form in forms}
     for stock in stocks:
-        yield f"{stock.share:.0%} of the fish: {difference(by_name[stock.name], stock)}"
+        words = changes(by_name[stock.name], stock)
+        yield f"{stock.share:.0%} of the fish: like {stock.name}, {words}"
 
 
-def difference(form: CandidateShape, stock: CandidateShape) -> str:
+def changes(form: CandidateShape, stock: CandidateShape) -> str:
     """How a stock differs from its form."""
     change = stock.coefficients - form.coefficients
     std = std_of(TRUNK, stock.covariance)
-    words = [
-        _factor(float(TRUNK @ change), "broader", "slimmer") + f" (+-{std:.0%})",
-        _factor(float(change[THICKNESS].mean()), "thicker", "thinner"),
-    ]
-    return f"like {stock.name}, {', '.join(words)}"
+    return (
+        f"{_factor(float(TRUNK @ change), 'broader', 'slimmer')} (+-{std:.0%}), "
+        f"{_factor(float(change[THICKNESS].mean()), 'thicker', 'thinner')}"
+    )
 
 
 def _factor(log: float, more: str, less: str) -> str:

@@ -64,7 +64,9 @@ def directions(body: Body) -> Float[np.ndarray, "V 3 W"]:
 
 
 def reshaped(template: Template, coefficients: Float[np.ndarray, "W"]) -> Template:
-    """The template in another shape."""
+    """The template in another shape; zeros: itself, to the last bit."""
+    if not coefficients.any():
+        return template
     place, feet = _feet(template)
     offsets = template.rest_vertices - feet
     breadth = _hats(place, BREADTH_KNOTS)
