@@ -13,7 +13,8 @@ demo: $(STAMP)  ## the main job on the embedded scene, lengths beside the truth
 	$(BIN)/stream-dmr demo
 
 # One worker more than two cores: for a quarter of the time tests wait for others.
-test: $(STAMP)  ## the tests of a few minutes
+test: $(STAMP)  ## the tests of a few minutes; their processes would all compile at once
+	$(BIN)/stream-dmr setup
 	$(BIN)/pytest -n 3 --dist worksteal
 
 test-slow: $(STAMP)  ## the long ones, and those on material outside the repository

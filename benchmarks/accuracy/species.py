@@ -4,8 +4,8 @@
 
 Simulated species whose bodies are not those of the bundled templates, 18 fish a scene, masks as the
 simulator's film has them. `own`: the species' mean mesh; `auto`: shapes learnt from the scene; a
-name: the same, but that body form is taken for likelier than the others; `gar.ply`: the mean mesh of
-the simulated gar, given for any catch. All as a run takes them. Half an hour.
+name: the same, but that body form is taken for likelier than the others; `gar.ply`: the mean mesh
+of the simulated gar, given for any catch. All as a run takes them. Half an hour.
 """
 
 import argparse
