@@ -26,6 +26,7 @@ from stream_dmr.results.verdicts_table import read_verdicts
 from stream_dmr.running.config import parse_config
 
 _PARTITIONS = ("vessel", "trip")
+_TABLE_SUFFIXES = (".parquet", ".part")  # whole, and while it is written
 _INTEGER_COLUMNS = ("frame_index", "timestamp_ns", "track_id")
 _RUN_COLUMNS = ("run_id", "software_version", "config_sha256")
 _VIDEO_COLUMNS = {"video": str, "haul": str}
@@ -83,12 +84,12 @@ def publish(folder: Path, job: Job, out: Path) -> None:
 
 
 def withdraw_others(jobs: Iterable[Job], out: Path) -> None:
-    """Remove all but the files of finished `jobs` from the data set."""
+    """Remove the tables of all but the finished `jobs` from the data set."""
     jobs = list(jobs)
     for kind in TABLE_KINDS:
         known = {_target(out, kind, job) for job in jobs}
-        for path in (out / "dataset" / kind).rglob("*"):
-            if path.is_file() and path not in known:
+        for path in (out / "dataset" / kind).glob("vessel=*/trip=*/*"):
+            if path.suffix in _TABLE_SUFFIXES and path not in known:
                 path.unlink()
 
 

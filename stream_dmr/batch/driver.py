@@ -15,6 +15,7 @@ from stream_dmr.batch.dataset import publish, withdraw_others
 from stream_dmr.batch.engine import Engine
 from stream_dmr.batch.layout import (
     DONE,
+    OUTCOME,
     OUTCOME_COLUMNS,
     VIDEO_COLUMNS,
     VIDEO_FOLDERS,
@@ -30,6 +31,7 @@ from stream_dmr.csv_file import safe_cell
 from stream_dmr.errors import OutputError
 from stream_dmr.files import make_folder, writing_to
 from stream_dmr.results.folder_lock import require_unlocked
+from stream_dmr.results.own_files import has_run_name
 from stream_dmr.results.provenance import seal_files
 
 _LOCK_PATIENCE_S = 10.0  # a killed process may hold its folder while the kernel ends it; generous
@@ -56,11 +58,12 @@ def run_batch(
     """Measure every video that is not done yet; results go below `out`.
 
     Failed videos are tried again by the next call. Setting `stop` ends the batch soon; unfinished
-    videos begin again with the next call. Raises OutputError where `out` can't be written to or
-    another batch is writing there.
+    videos begin again with the next call. Raises OutputError where `out` can't be written to,
+    another batch is writing there, or a folder of its results holds files of the user.
     """
     make_folder(out / VIDEO_FOLDERS)
     _remove_unfinished(out)
+    _require_own_folders(jobs, out)
     began = time.perf_counter()
     results = _BatchResults(jobs, out, log)
     num_before = len(results.outcomes)
@@ -131,12 +134,33 @@ def _result_cells(outcome: Outcome | None) -> tuple[object, ...]:
     return tuple(getattr(outcome, name) for name in OUTCOME_COLUMNS.values())
 
 
+def _require_own_folders(jobs: Sequence[Job], out: Path) -> None:
+    """Raise OutputError where a folder that a batch replaces is not its own.
+
+    It may be the very folder of pictures, or that of a video, that the manifest names.
+    """
+    results = [results_folder(job, out) for job in jobs]
+    strange = [f for f in results if f.exists() and not (f / OUTCOME).exists()]
+    for folder in strange + [unfinished_folder(job, out) for job in jobs]:
+        if folder.is_file() or (folder.exists() and any(folder.iterdir())):
+            raise OutputError(
+                f"{folder}: expected a folder that the batch made, or none, got one with other "
+                "files; choose another --out"
+            )
+
+
+def _is_unfinished(folder: Path) -> bool:
+    """True for what a killed batch left: an empty folder, or one with files of a run."""
+    entries = list(folder.iterdir()) if folder.is_dir() else [folder]
+    return not entries or any(path.name == OUTCOME or has_run_name(path) for path in entries)
+
+
 def _remove_unfinished(out: Path) -> None:
     """Remove the folders that a killed batch left unfinished.
 
     Raises OutputError where another batch is still writing to one.
     """
-    for folder in out.glob(f"{VIDEO_FOLDERS}/*.part"):
+    for folder in filter(_is_unfinished, out.glob(f"{VIDEO_FOLDERS}/*.part")):
         deadline = time.monotonic() + _LOCK_PATIENCE_S
         while True:
             try:

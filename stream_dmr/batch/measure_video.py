@@ -86,12 +86,20 @@ def measure_video(job: Job, out: Path, *, on_progress: OnProgress = lambda share
 
 
 def finish_folder(folder: Path, target: Path, outcome: Outcome) -> None:
-    """Write the outcome and rename the folder to `target`, in place of an earlier one."""
+    """Write the outcome and rename the folder to `target`, in place of an earlier one.
+
+    That one is renamed before it is removed: a process that is killed meanwhile leaves no part of
+    it under the name of results.
+    """
     folder.mkdir(exist_ok=True)
     (folder / OUTCOME).write_text(json.dumps(asdict(outcome)) + "\n", encoding="utf-8")
     add_files(folder, [folder / OUTCOME])
-    shutil.rmtree(target, ignore_errors=True)
+    earlier = target.with_name(f".{target.name}.part")  # no job's name begins with a point
+    shutil.rmtree(earlier, ignore_errors=True)
+    if target.exists():
+        target.rename(earlier)
     rename_durably(folder, target)
+    shutil.rmtree(earlier, ignore_errors=True)
 
 
 def request_of(job: Job, out: Path) -> RunRequest:

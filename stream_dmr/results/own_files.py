@@ -46,6 +46,11 @@ def is_of_run(path: Path) -> bool:
         return False
     if path.suffix == ".rrd" and path.exists():
         return path.name in known_files(folder) or not path.with_suffix(".mcap").exists()
+    return has_run_name(path)
+
+
+def has_run_name(path: Path) -> bool:
+    """True for a name that a run gives to its files, whatever the folder."""
     return bool(_OF_RUN.fullmatch(path.name))
 
 

@@ -26,6 +26,7 @@ from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
 from stream_dmr.batch.measure_video import Outcome, measure_video, read_outcome
 from stream_dmr.batch.progress import BatchProgress
 from stream_dmr.batch.verify_batch import verify_all
+from stream_dmr.errors import OutputError
 from stream_dmr.results.finished_fish import read_stored_fish
 from stream_dmr.results.provenance import seal_verdicts
 from stream_dmr.results.verdicts import Verdict
@@ -308,6 +309,28 @@ def test_a_changed_trip_is_measured_again_and_replaces_the_old_row(season: Path,
     measure([job], tmp_path)
     files = list((tmp_path / "dataset" / "fish").rglob("*.parquet"))
     assert [path.parent.name for path in files] == ["trip=9"]  # the old row is gone
+
+
+@pytest.mark.parametrize("name", ["video", "video.part"])
+def test_a_folder_with_files_of_the_user_is_never_replaced(season: Path, tmp_path: Path, name: str):
+    picture = tmp_path / "videos" / name / "000001.png"
+    picture.parent.mkdir(parents=True)
+    picture.write_bytes(b"mine")
+    with pytest.raises(OutputError, match="a folder that the batch made"):
+        measure(jobs_of(season, tmp_path, row()), tmp_path)
+    assert picture.read_bytes() == b"mine"
+
+
+def test_only_tables_of_the_data_set_are_removed_from_it(season: Path, tmp_path: Path):
+    picture = tmp_path / "dataset" / "frames" / "000001.png"
+    picture.parent.mkdir(parents=True)
+    picture.write_bytes(b"mine")
+    old = tmp_path / "dataset" / "fish" / "vessel=A" / "trip=1" / "old.parquet"
+    old.parent.mkdir(parents=True)
+    old.write_bytes(b"of a video that is no longer in the manifest")
+    measure(jobs_of(season, tmp_path, row("broken")), tmp_path)
+    assert picture.exists()
+    assert not old.exists()
 
 
 def test_a_damaged_outcome_counts_as_none(season: Path, tmp_path: Path):
