@@ -11,6 +11,7 @@ from stream_dmr.errors import OutputError, reason_of
 VIDEOS = "videos.csv"  # the outcome of each video
 VIDEO_FOLDERS = "videos"
 OUTCOME = "outcome.json"  # the outcome of one video, in its folder
+FAILED_OUTCOME = "outcome-failed.json"  # of a later try, beside the results of an earlier one
 TABLE_KINDS = ("fish", "frames")  # tables of the data set
 # Columns of VIDEOS and the fields of an Outcome that they hold.
 OUTCOME_COLUMNS = {

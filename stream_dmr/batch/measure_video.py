@@ -10,7 +10,14 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from stream_dmr.batch.dataset import write_tables
-from stream_dmr.batch.layout import DONE, FAILED, OUTCOME, results_folder, unfinished_folder
+from stream_dmr.batch.layout import (
+    DONE,
+    FAILED,
+    FAILED_OUTCOME,
+    OUTCOME,
+    results_folder,
+    unfinished_folder,
+)
 from stream_dmr.batch.manifest import Job
 from stream_dmr.batch.progress import OnProgress
 from stream_dmr.errors import UserError
@@ -45,12 +52,16 @@ class Outcome:
 
 def read_outcome(job: Job, out: Path) -> Outcome | None:
     """The outcome of a job from an earlier call; None where it has none or its inputs changed."""
+    folder, key = results_folder(job, out), job.key
+    outcomes = (_read_file(folder / name) for name in (OUTCOME, FAILED_OUTCOME))
+    return next((one for one in outcomes if one is not None and one.key == key), None)
+
+
+def _read_file(path: Path) -> Outcome | None:
     try:
-        text = (results_folder(job, out) / OUTCOME).read_text(encoding="utf-8")
-        outcome = Outcome(**json.loads(text))
+        return Outcome(**json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
         return None
-    return outcome if outcome.key == job.key else None
 
 
 def measure_video(job: Job, out: Path, *, on_progress: OnProgress = lambda share: None) -> Outcome:
@@ -89,17 +100,26 @@ def finish_folder(folder: Path, target: Path, outcome: Outcome) -> None:
     """Write the outcome and rename the folder to `target`, in place of an earlier one.
 
     That one is renamed before it is removed: a process that is killed meanwhile leaves no part of
-    it under the name of results.
+    it under the name of results. A failure never replaces results: it is written beside them.
     """
+    before = _read_file(target / OUTCOME)
+    if outcome.status == FAILED and before is not None and before.status == DONE:
+        _write_outcome(target / FAILED_OUTCOME, outcome)
+        shutil.rmtree(folder, ignore_errors=True)
+        return
     folder.mkdir(exist_ok=True)
-    (folder / OUTCOME).write_text(json.dumps(asdict(outcome)) + "\n", encoding="utf-8")
-    add_files(folder, [folder / OUTCOME])
+    _write_outcome(folder / OUTCOME, outcome)
     earlier = target.with_name(f".{target.name}.part")  # no job's name begins with a point
     shutil.rmtree(earlier, ignore_errors=True)
     if target.exists():
         target.rename(earlier)
     rename_durably(folder, target)
     shutil.rmtree(earlier, ignore_errors=True)
+
+
+def _write_outcome(path: Path, outcome: Outcome) -> None:
+    path.write_text(json.dumps(asdict(outcome)) + "\n", encoding="utf-8")
+    add_files(path.parent, [path])
 
 
 def request_of(job: Job, out: Path) -> RunRequest:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 from stream_dmr.batch.layout import (
     DONE,
+    FAILED,
+    FAILED_OUTCOME,
     OUTCOME,
     OUTCOME_COLUMNS,
     TABLE_KINDS,
@@ -46,16 +48,18 @@ def _check_row(out: Path, row: Mapping[str, str]) -> Iterator[Finding]:
     if row["status"] == WAITING:
         return
     folder = out / VIDEO_FOLDERS / row["name"]
+    is_later_try = row["status"] == FAILED and (folder / FAILED_OUTCOME).exists()
+    name_of_outcome = FAILED_OUTCOME if is_later_try else OUTCOME
     try:
-        outcome = json.loads((folder / OUTCOME).read_text(encoding="utf-8"))
+        outcome = json.loads((folder / name_of_outcome).read_text(encoding="utf-8"))
         expected = {column: str(outcome[name]) for column, name in OUTCOME_COLUMNS.items()}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        yield folder / OUTCOME, f"damaged: {error!r}"
+        yield folder / name_of_outcome, f"damaged: {error!r}"
         return
     for column, was in expected.items():
         if row[column] != was:
-            what = f"{row['name']}: {column} is {row[column] or 'blank'}, {OUTCOME} says {was}"
-            yield out / VIDEOS, what
+            is_now = f"{row['name']}: {column} is {row[column] or 'blank'}"
+            yield out / VIDEOS, f"{is_now}, {name_of_outcome} says {was}"
     if row["status"] == DONE:
         for kind, path in zip(TABLE_KINDS, _tables(out, row), strict=True):
             yield from _check_copy(path, folder / f"{kind}.parquet", out)

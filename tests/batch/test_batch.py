@@ -311,6 +311,21 @@ def test_a_changed_trip_is_measured_again_and_replaces_the_old_row(season: Path,
     assert [path.parent.name for path in files] == ["trip=9"]  # the old row is gone
 
 
+def test_a_failure_keeps_the_results_of_an_earlier_call(season: Path, tmp_path: Path):
+    shutil.copytree(season / "other", season / "disk")
+    jobs = jobs_of(season, tmp_path, row("disk"))
+    assert measure(jobs, tmp_path) == {"video": "done"}
+    before = (tmp_path / "videos" / "video" / "lengths.csv").read_bytes()
+    (season / "disk").rename(season / "not-mounted")
+    assert measure(jobs, tmp_path) == {"video": "failed"}
+    assert (tmp_path / "videos" / "video" / "lengths.csv").read_bytes() == before
+    assert list(tmp_path.glob("dataset/**/*.parquet")) == []  # which has finished videos alone
+    assert verify_all(tmp_path)[0] == []
+    (season / "not-mounted").rename(season / "disk")
+    assert run_batch(jobs, tmp_path, ThisProcess(), stop=threading.Event()).num_before == 1
+    assert verify_all(tmp_path)[0] == []
+
+
 @pytest.mark.parametrize("name", ["video", "video.part"])
 def test_a_folder_with_files_of_the_user_is_never_replaced(season: Path, tmp_path: Path, name: str):
     picture = tmp_path / "videos" / name / "000001.png"
