@@ -30,8 +30,8 @@ class FitMeshSettings(Settings):
     )
     learn_shapes: bool = Field(
         default=True,
-        description="the shapes of the fish are learnt from them, and a given mesh is compared "
-        "with them; a source with an end is gone through once before for it",
+        description="the shapes of the fish are learnt from them, before they are measured where "
+        "the source has an end; a given mesh is compared with them",
     )
     lambda_scale: float = Field(default=1.0, ge=0, description="weight of L_s, eq. (3)")
     lambda_translation: float = Field(default=10.0, ge=0, description="weight of L_t, eq. (3)")

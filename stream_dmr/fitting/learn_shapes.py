@@ -31,12 +31,13 @@ def learn_shapes(
     *,
     calibration: Calibration | None,
     species: SpeciesSettings | None = None,
+    refits: bool = True,
     progress: Callable[[str], None] = lambda step: None,
 ) -> CandidateShapes | None:
     """The stocks that these fish are of; None where none of them is seen whole.
 
     `crops` in the order of their capture; of each fish some that are far apart are fitted, with
-    each of the `forms` until one is chosen.
+    each of the `forms` until one is chosen. `refits`: see `learn_stocks`.
     """
     tracks = TrackFitter(
         template,
@@ -56,4 +57,6 @@ def learn_shapes(
             fish.append(FishSamples(track_id, candidate, evenly(samples, FRAMES_PER_FISH), against))
             progress(f"{len(fish)} fish looked at")
     normal = tracks.fitters[0].plane_normal
-    return learn_stocks(template, forms, fish, settings, plane_normal=normal, progress=progress)
+    return learn_stocks(
+        template, forms, fish, settings, plane_normal=normal, refits=refits, progress=progress
+    )

@@ -6,19 +6,17 @@ ashore measures all fish anew by what all of them show.
 
 import os
 import threading
-from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from itertools import chain
 
 from stream_dmr.errors import OutputError
 from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import CandidateShapes, mesh_form
 from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.fitting.shape.mesh_agreement import is_like_mesh, not_like_mesh
-from stream_dmr.fitting.shape.samples import MAX_FISH, GoodCrops
-from stream_dmr.messages import FishCrop, Frame, LearntShapes, LengthEstimate, Message
+from stream_dmr.fitting.shape.samples import MAX_FISH
+from stream_dmr.messages import FishCrop, Frame, LearntShapes
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.results.learnt_meshes import LEARNT, MADE_BY_RUN, require_free_names
 from stream_dmr.results.provenance import add_files
@@ -26,6 +24,7 @@ from stream_dmr.running.inputs import Inputs
 from stream_dmr.running.outputs import Outputs
 from stream_dmr.running.pipeline import Node
 from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.running.seen_fish import SeenFish
 from stream_dmr.running.shape_pass import save_stocks
 
 # Finished fish after which shapes are learnt, then after twice as many, and so on. What an earlier
@@ -38,62 +37,48 @@ Learn = Callable[[Sequence[FishCrop], Callable[[str], None]], CandidateShapes | 
 
 
 class LiveShapes:
-    """Keeps crops of the last fish and learns from them in a thread of its own. Thread-safe."""
+    """Learns from the fish that were seen, in a thread of its own."""
 
     def __init__(
-        self, learn: Learn, on_learnt: Callable[[LearntShapes], object], *, knows_shapes: bool
+        self,
+        seen: SeenFish,
+        learn: Learn,
+        on_learnt: Callable[[LearntShapes], object],
+        *,
+        knows_shapes: bool,
     ) -> None:
         """`on_learnt` gets what fish may be that are first seen in the frame at hand, or later.
 
         `knows_shapes`: an earlier run has learnt some.
         """
-        self._learn, self._on_learnt = learn, on_learnt
-        self._lock, self._stop = threading.Lock(), threading.Event()
-        self._tracks: dict[int, GoodCrops] = {}
-        self._fish: deque[list[FishCrop]] = deque(maxlen=MAX_FISH)
-        self._num_fish, self._next_at = 0, _AFTER_RESTART if knows_shapes else _FIRST
+        self._seen, self._learn, self._on_learnt = seen, learn, on_learnt
+        self._stop = threading.Event()
+        self._next_at = _AFTER_RESTART if knows_shapes else _FIRST
         self._worker = ThreadPoolExecutor(1, "shapes", initializer=_be_nice)
         self._work: Future[tuple[CandidateShapes | None, int]] | None = None
 
-    def take(self, message: Message) -> None:
-        """Take any message of the chain; with a frame, what was learnt is passed on."""
-        match message:
-            case FishCrop(track_id=track_id):
-                with self._lock:
-                    self._tracks.setdefault(track_id, GoodCrops()).add(message)
-            case LengthEstimate(is_final=True, track_id=track_id):
-                self._finish_fish(track_id)
-            case Frame():
-                self._pass_on(message)
-            case _:
-                pass
-
-    def close(self) -> None:
-        """End the work, whose result is lost. Idempotent."""
-        self._stop.set()
-        self._worker.shutdown()
-
-    def _finish_fish(self, track_id: int) -> None:
-        with self._lock:
-            crops = self._tracks.pop(track_id, GoodCrops()).chosen()
-            if crops:
-                self._fish.append(crops)
-                self._num_fish += 1
-
-    def _pass_on(self, frame: Frame) -> None:
+    def take(self, frame: Frame) -> None:
+        """Learn if there are fish enough, and pass on what was learnt by this frame."""
         if self._work is None:
-            with self._lock:
-                if self._num_fish >= self._next_at:
-                    self._next_at = 2 * self._num_fish
-                    self._work = self._worker.submit(self._learn_from, [*self._fish])
+            num_fish = self._seen.num
+            if num_fish >= self._next_at:
+                self._next_at = 2 * num_fish
+                self._work = self._worker.submit(self._learn_from, self._seen.crops(), num_fish)
         elif self._work.done():
             work, self._work = self._work, None
             stocks, num_fish = work.result()
             if stocks is not None:
                 self._on_learnt(_message(stocks, num_fish, frame))
 
-    def _learn_from(self, fish: Sequence[list[FishCrop]]) -> tuple[CandidateShapes | None, int]:
-        return self._learn([*chain.from_iterable(fish)], self._go_on), len(fish)
+    def close(self) -> None:
+        """End the work, whose result is lost. Idempotent."""
+        self._stop.set()
+        self._worker.shutdown()
+
+    def _learn_from(
+        self, crops: Sequence[FishCrop], num_fish: int
+    ) -> tuple[CandidateShapes | None, int]:
+        return self._learn(crops, self._go_on), min(num_fish, MAX_FISH)
 
     def _go_on(self, step: str) -> None:
         if self._stop.is_set():
@@ -104,6 +89,7 @@ def follow_shapes(
     inputs: Inputs,
     outputs: Outputs,
     fit_mesh: Node,
+    seen: SeenFish,
     *,
     write: Callable[[LearntShapes], object],
     observer: RunObserver,
@@ -165,7 +151,7 @@ def follow_shapes(
         except OutputError as error:
             observer.warn(str(error))
 
-    return LiveShapes(learn, on_learnt, knows_shapes=bool(outputs.learnt))
+    return LiveShapes(seen, learn, on_learnt, knows_shapes=bool(outputs.learnt))
 
 
 def _message(stocks: CandidateShapes, num_fish: int, frame: Frame) -> LearntShapes:

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +12,7 @@ from stream_dmr.camera import Calibration
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.fitting.compile_kernels import compile_kernels
 from stream_dmr.fitting.fitter import Fitter
-from stream_dmr.fitting.shape.candidates import CandidateShapes
+from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes
 from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish, Message, Position
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
@@ -34,7 +34,8 @@ from stream_dmr.running.resume import resume_source
 from stream_dmr.running.run_folder import result_names
 from stream_dmr.running.run_observer import RunObserver, RunTotals
 from stream_dmr.running.run_request import RunRequest
-from stream_dmr.running.shape_pass import save_stocks, with_learnt_shapes
+from stream_dmr.running.seen_fish import SeenFish
+from stream_dmr.running.shape_pass import is_mesh_theirs, save_stocks, with_learnt_shapes
 from stream_dmr.running.species_checks import species_notes
 from stream_dmr.template.template import Template
 
@@ -50,7 +51,7 @@ class RunSummary:
     may_count_twice: Collection[int]  # the ids of those that were in view at a crash
     num_frames: int  # that went through the whole chain
     frames_promised: int | None  # by the source; None where it doesn't
-    shapes_s: float  # of the first pass, in which the shapes of the fish were learnt
+    shapes_s: float  # in which the shapes of the fish were learnt, or compared with a mesh
     elapsed_s: float  # of the chain
     calibration: Calibration | None
     counters: Sequence[StageCounters]
@@ -65,10 +66,25 @@ def measure_source(
     All inputs are checked before the first frame; setting `stop` ends the run soon, with valid
     results of the frames so far. Raises a UserError where an input is wrong, also in the middle of
     the source; what was computed before is kept, and a note of the exception says where.
+
+    Where the fish turn out not to be like the mesh that was given, they are measured once more as
+    with `--template auto`, and those results replace the first ones.
     """
     observer = observer or RunObserver()
     # The stages run side by side, so that OpenCV's own threads only add a sixth to the work.
     cv2.setNumThreads(1)
+    summary = _measure(request, stop=stop, observer=observer)
+    if summary is None:
+        auto = replace(request, template=AUTO, overwrite=True)
+        summary = _measure(auto, stop=stop, observer=observer)
+    assert summary is not None
+    return summary
+
+
+def _measure(
+    request: RunRequest, *, stop: threading.Event, observer: RunObserver
+) -> RunSummary | None:
+    """Measure the fish of a source; None where the mesh that was given is not theirs."""
     inputs = checked_inputs(request)
     unused: list[str] = []
     try:
@@ -106,16 +122,35 @@ def measure_source(
                 )
             _report_start(inputs, outputs, observer)
             observer.begin(inputs.source.num_frames)
-            summary = _run_chain(inputs, nodes, outputs, observer, shapes_s=shapes_s, stop=stop)
-        if not stop.is_set():  # only now is it known what the source has no frames for
-            unused = inputs.finder.unused
-        return summary
+            seen = SeenFish()
+            summary = _run_chain(
+                inputs, nodes, outputs, seen, observer, shapes_s=shapes_s, stop=stop
+            )
+        if stop.is_set():
+            return summary
+        unused = inputs.finder.unused  # only now is it known what the source has no frames for
+        began = time.perf_counter()
+        if not _has_the_right_mesh(inputs, seen, observer):
+            return None
+        return replace(summary, shapes_s=shapes_s + time.perf_counter() - began)
     finally:
         inputs.reader.close()
         if inputs.positions is not None:
             inputs.positions.close()
         for line in (*inputs.source.warnings, *inputs.finder.warnings, *unused):
             observer.warn(line)
+
+
+def _has_the_right_mesh(inputs: Inputs, seen: SeenFish, observer: RunObserver) -> bool:
+    """False where a mesh was given that is not that of the fish."""
+    is_given = inputs.candidates is None and inputs.config.fit_mesh.are_shapes_learnt
+    return not is_given or is_mesh_theirs(
+        seen.crops(),
+        inputs.template,
+        inputs.config,
+        calibration=inputs.calibration,
+        observer=observer,
+    )
 
 
 def _report_start(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> None:
@@ -198,6 +233,7 @@ def _run_chain(
     inputs: Inputs,
     nodes: Sequence[Node],
     outputs: Outputs,
+    seen: SeenFish,
     observer: RunObserver,
     *,
     shapes_s: float,
@@ -214,16 +250,17 @@ def _run_chain(
         observer.take(writer.write(position))
 
     positions = PositionFeed(inputs.positions, on_position)
-    shapes = follow_shapes(inputs, outputs, nodes[1], write=writer.write, observer=observer)
+    shapes = follow_shapes(inputs, outputs, nodes[1], seen, write=writer.write, observer=observer)
 
     def on_message(message: Message) -> Message:
         message = writer.write(message)
         totals.take(message)
         observer.take(message)
+        seen.take(message)
         if isinstance(message, Frame):
             positions.take(message)
-        if shapes is not None:
-            shapes.take(message)
+            if shapes is not None:
+                shapes.take(message)
         return message
 
     def on_frame() -> None:

@@ -1,11 +1,11 @@
 """A first pass over a source, for the shapes of its fish, before any of them is measured.
 
-Only for sources with an end: the last fish are learnt from before the first one is measured. A mesh
-that was given is compared with what was learnt.
+For `--template auto`, and only for sources with an end: the last fish are learnt from before the
+first one is measured. A mesh that was given is compared with the fish once they are measured.
 """
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -35,14 +35,14 @@ def with_learnt_shapes(
 ) -> Inputs:
     """The inputs with the shapes of the source's own fish, and its crops.
 
-    As they are where nothing is to be learnt: the settings say so, or the source has no end.
+    As they are where nothing is to be learnt: a mesh was given, the settings say so, or the source
+    has no end.
     """
-    config, request = inputs.config, inputs.request
-    if inputs.is_endless or not config.fit_mesh.are_shapes_learnt:
+    config, request, forms = inputs.config, inputs.request, inputs.candidates
+    if forms is None or inputs.is_endless or not config.fit_mesh.are_shapes_learnt:
         return inputs
     require_folder(request.out, overwrite=request.overwrite)  # before the work
-    if inputs.candidates is not None:
-        require_free_names(request.out, overwrite=request.overwrite)
+    require_free_names(request.out, overwrite=request.overwrite)
     observer.stage("finding the fish, for their shapes")
     crops = keep_crops(
         inputs.reader, crop_fish, config.recording, stop=stop, on_frame=observer.frame_done
@@ -52,17 +52,10 @@ def with_learnt_shapes(
     inputs = replace(inputs, reader=reader, crops=crops)
     if stop.is_set():
         return inputs
-    template, candidates = learnt_from(
-        crops,
-        inputs.template,
-        inputs.candidates,
-        config,
-        calibration=inputs.calibration,
-        observer=observer,
+    candidates = _learn_aloud(
+        crops, inputs.template, forms, config, calibration=inputs.calibration, observer=observer
     )
-    if candidates is not None:
-        require_free_names(request.out, overwrite=request.overwrite)
-    return replace(inputs, template=template, candidates=candidates)
+    return replace(inputs, candidates=candidates)
 
 
 def learnt_from(
@@ -80,43 +73,78 @@ def learnt_from(
     learnt as by `--template auto`. The observer is told what was learnt.
     """
     seen_whole = [*itertools.chain.from_iterable(good_crops(crops))]
-
-    def learn(template: Template, forms: CandidateShapes) -> CandidateShapes | None:
-        return learn_shapes(
-            seen_whole,
-            template,
-            forms,
-            config.fit_mesh,
-            calibration=calibration,
-            species=config.species,
-            progress=lambda step: observer.stage(f"learning their shapes: {step}"),
-        )
-
     if forms is None:
-        if not seen_whole:
-            observer.warn(
-                f"no fish was seen whole: whether they are like {template.name} is not known"
-            )
+        if is_mesh_theirs(seen_whole, template, config, calibration=calibration, observer=observer):
             return template, None
-        mesh = mesh_form(template)
-        stocks = learn(template, mesh)
-        if stocks is not None and all(map(is_like_mesh, stocks)):
-            for line in describe(mesh, stocks):
-                observer.notice(line)
-            return template, None
+        template, forms = load_shapes(AUTO)
+        assert forms is not None
+    return template, _learn_aloud(
+        seen_whole, template, forms, config, calibration=calibration, observer=observer
+    )
+
+
+def is_mesh_theirs(
+    crops: Sequence[FishCrop],
+    template: Template,
+    config: Config,
+    *,
+    calibration: Calibration | None,
+    observer: RunObserver,
+) -> bool:
+    """Whether the fish of these good crops are like a mesh that was given for them.
+
+    True where there are none. The observer is told.
+    """
+    if not crops:
+        observer.warn(f"no fish was seen whole: whether they are like {template.name} is not known")
+        return True
+    mesh = mesh_form(template)
+    observer.stage(f"comparing the fish with {template.name}")
+    stocks = learn_shapes(
+        crops,
+        template,
+        mesh,
+        config.fit_mesh,
+        calibration=calibration,
+        species=config.species,
+        refits=False,
+    )
+    if stocks is None or not all(map(is_like_mesh, stocks)):
         observer.warn(
             f"{not_like_mesh(mesh, stocks)}; they are measured by the shapes learnt from them, as "
             "with --template auto"
         )
-        template, forms = load_shapes(AUTO)
-        assert forms is not None
-    stocks = learn(template, forms)
+        return False
+    for line in describe(mesh, stocks):
+        observer.notice(line)
+    return True
+
+
+def _learn_aloud(
+    crops: Iterable[FishCrop],
+    template: Template,
+    forms: CandidateShapes,
+    config: Config,
+    *,
+    calibration: Calibration | None,
+    observer: RunObserver,
+) -> CandidateShapes:
+    """The stocks of all fish, or the forms where none is seen whole; the observer is told."""
+    stocks = learn_shapes(
+        crops,
+        template,
+        forms,
+        config.fit_mesh,
+        calibration=calibration,
+        species=config.species,
+        progress=lambda step: observer.stage(f"learning their shapes: {step}"),
+    )
     if stocks is None:
         observer.warn("no fish was seen whole: each is measured as the form it is most like")
-        return template, forms
+        return forms
     for line in describe(forms, stocks):
         observer.notice(line)
-    return template, stocks
+    return stocks
 
 
 def save_stocks(

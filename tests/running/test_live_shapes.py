@@ -25,6 +25,7 @@ from stream_dmr.running.inputs import Inputs
 from stream_dmr.running.live_shapes import LiveShapes
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.running.seen_fish import SeenFish
 from tests.support.command import rows
 from tests.support.final_estimates import fish as finished
 from tests.support.fish_run import request
@@ -199,16 +200,16 @@ def crop(track_id: int) -> FishCrop:
     return replace(crop_of(draw_mask(1, [1]) > 0, CAMERA), track_id=track_id)
 
 
-def see(live: LiveShapes, track_id: int) -> None:
-    live.take(crop(track_id))
-    live.take(finished(track_id))
+def see(seen: SeenFish, live: LiveShapes, track_id: int) -> None:
+    seen.take(crop(track_id))
+    seen.take(finished(track_id))
     for _ in range(2):
         live.take(frame_of(np.zeros((4, 4, 3), np.uint8), track_id))
 
 
 def test_shapes_are_learnt_after_three_fish_and_twice_as_many():
     assert FORMS is not None
-    learnt_from, passed_on = list[int](), list[LearntShapes]()
+    seen, learnt_from, passed_on = SeenFish(), list[int](), list[LearntShapes]()
 
     def learn(crops: Sequence[FishCrop], progress: Callable[[str], None]) -> CandidateShapes:
         learnt_from.append(len({crop.track_id for crop in crops}))
@@ -216,9 +217,9 @@ def test_shapes_are_learnt_after_three_fish_and_twice_as_many():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("stream_dmr.running.live_shapes.ThreadPoolExecutor", Immediate)
-        live = LiveShapes(learn, passed_on.append, knows_shapes=False)
+        live = LiveShapes(seen, learn, passed_on.append, knows_shapes=False)
     for track_id in range(1, 14):
-        see(live, track_id)
+        see(seen, live, track_id)
     live.close()
     assert learnt_from == [3, 6, 12]
     assert [one.timestamp_ns for one in passed_on] == [3, 6, 12]
@@ -226,16 +227,16 @@ def test_shapes_are_learnt_after_three_fish_and_twice_as_many():
 
 
 def test_the_end_of_a_run_ends_the_work():
-    began = threading.Event()
+    seen, began = SeenFish(), threading.Event()
 
     def learn(crops: Sequence[FishCrop], progress: Callable[[str], None]) -> None:
         while True:
             progress("another fish")
             began.set()
 
-    live = LiveShapes(learn, lambda learnt: None, knows_shapes=False)
+    live = LiveShapes(seen, learn, lambda learnt: None, knows_shapes=False)
     for track_id in (1, 2, 3):
-        see(live, track_id)
+        see(seen, live, track_id)
     assert began.wait(10)
     live.close()
     assert not any(thread.name.startswith("shapes") for thread in threading.enumerate())

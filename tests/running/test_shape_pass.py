@@ -253,6 +253,8 @@ def test_a_mesh_of_other_fish_is_not_believed(
     assert [line for line in observer.warnings if "the fish are not like slim: " in line]
     assert_learnt(out, observer)
     assert rows(out / "lengths.csv") == rows(learnt[0] / "lengths.csv")  # as with auto
+    assert [path.name for path in out.glob("recording*.mcap")] == ["recording.mcap"]
+    assert set(known_files(out)) == set(known_files(learnt[0]))
 
 
 def test_a_mesh_that_fits_no_mask_is_not_believed(

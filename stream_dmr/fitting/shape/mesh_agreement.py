@@ -10,12 +10,13 @@ from stream_dmr.fitting.shape.space import TRUNK, std_of
 # (root mean square). Chosen between simulated stocks measured by their own mesh and by those of
 # other species: with a mesh that is off by more, intervals hold fewer than nine in ten lengths.
 _MAX_BREADTH, _MAX_OUTLINE = 0.08, 0.15
+_MAX_STD = 0.1  # that of one fish alone; more says that fish differ by more than one stock's do
 
 
 def is_like_mesh(stock: CandidateShape) -> bool:
     """True where the shape learnt from fish, beginning at a mesh, is still about the mesh's."""
     breadth = abs(float(TRUNK @ stock.coefficients))
-    is_as_broad = breadth <= _MAX_BREADTH + std_of(TRUNK, stock.covariance)
+    is_as_broad = breadth <= _MAX_BREADTH + min(std_of(TRUNK, stock.covariance), _MAX_STD)
     return is_as_broad and _outline_off(stock) <= _MAX_OUTLINE
 
 

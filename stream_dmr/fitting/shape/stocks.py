@@ -56,16 +56,21 @@ def learn_stocks(
     settings: FitMeshSettings,
     *,
     plane_normal: Float[np.ndarray, "3"],
+    refits: bool = True,
     progress: Callable[[str], None] = lambda step: None,
 ) -> CandidateShapes | None:
-    """The stocks that these fish are of, the largest first; None where there are no fish."""
+    """The stocks that these fish are of, the largest first; None where there are no fish.
+
+    Without `refits` no fish is sought anew with the stocks' shapes, which takes half the time.
+    """
     if not fish:
         return None
     learner = _StockLearner(template, forms, fish, settings, plane_normal)
     groups = learner.by_form(list(forms), fish)
     progress(f"{len(fish)} fish of {len(groups)} body forms")
     groups = learner.merged(groups)
-    groups = learner.reassigned(groups)
+    if refits:
+        groups = learner.reassigned(groups)
     progress(f"{len(groups)} stocks")
     total = sum(group.num_fish for group in groups)
     return CandidateShapes.of(

@@ -33,6 +33,11 @@ def test_what_is_not_known_of_few_fish_is_allowed_for():
     assert not is_like_mesh(stock(0.12))
 
 
+def test_but_not_what_is_not_known_of_a_mixed_catch():
+    assert not is_like_mesh(stock(0.19, covariance=9 * UNSURE))
+    assert is_like_mesh(stock(0.14, covariance=9 * UNSURE))
+
+
 def test_a_mesh_of_the_same_breadth_and_another_outline_is_not_believed():
     one = stock(0.0)
     one.coefficients[BREADTH] = np.tile(np.linspace(0.6, -0.6, 12), 2)
