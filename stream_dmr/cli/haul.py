@@ -34,7 +34,14 @@ def haul(
     ] = None,
 ) -> None:
     """Begin or end a haul; its fish are those whose middle frame lies in it."""
+    from stream_dmr.errors import UserError
+
     if target.startswith(("http://", "https://")):
+        if at is not None:
+            raise UserError(
+                f"--at: expected with the folder of a run alone, a running box takes a haul as of "
+                f"now, got {at} with {target}; leave it out, or give the box's --out"
+            )
         print(_post(target, what, name, token_file))
     else:
         print(_write(Path(target), what, name, at))

@@ -32,44 +32,49 @@ def read_effort(database: Path, fish: Sequence[FishResult]) -> list[HaulEffort]:
     hauls = hauls_of(read_added(database, HAULS))
     watched = read_added(database, WATCHED)
     if hauls:
-        efforts = [_effort(haul.name, [haul], watched, fish) for haul in _joined(hauls)]
-        inside = sum(one.hours_watched for one in efforts)
-        hours = max(0.0, sum(_hours(row) for row in watched) - inside)
-        outside = replace(_effort("", [], watched, fish), hours_watched=hours)
-        return [*efforts, *([outside] if outside.num_fish or hours > 1e-3 else [])]
+        efforts = [_effort_of_hauls(named, watched, fish) for named in _by_name(hauls)]
+        shares = [1.0 - _overlap(row, hauls) for row in watched]
+        outside = _effort("", watched, shares, fish)
+        is_worth_a_row = outside.num_fish or outside.hours_watched > 1e-3
+        return [*efforts, *([outside] if is_worth_a_row else [])]
     by_run = {run_id: facts.haul for run_id, facts in read_runs(database).items()}
     return [
-        _effort(name, None, [row for row in watched if by_run.get(row["run_id"]) == name], fish)
+        _effort(name, watched, [float(by_run.get(r["run_id"]) == name) for r in watched], fish)
         for name in dict.fromkeys(by_run.values())
     ]
 
 
-def _joined(hauls: Sequence[Haul]) -> list[Haul]:
-    """Each name once: with the first start and the last end."""
-    by_name: dict[str, Haul] = {}
+def _by_name(hauls: Sequence[Haul]) -> list[list[Haul]]:
+    """The hauls of each name: one may be begun, ended, and begun again after others."""
+    named: dict[str, list[Haul]] = {}
     for haul in hauls:
-        first = by_name.get(haul.name, haul)
-        by_name[haul.name] = Haul(name=haul.name, began_ns=first.began_ns, ended_ns=haul.ended_ns)
-    return list(by_name.values())
+        named.setdefault(haul.name, []).append(haul)
+    return list(named.values())
+
+
+def _effort_of_hauls(
+    hauls: Sequence[Haul], watched: Sequence[Mapping[str, Any]], fish: Sequence[FishResult]
+) -> HaulEffort:
+    """Of hauls of one name; from the first start to the last end, without what lies between."""
+    effort = _effort(hauls[0].name, watched, [_overlap(row, hauls) for row in watched], fish)
+    return replace(effort, began_ns=hauls[0].began_ns, ended_ns=hauls[-1].ended_ns)
 
 
 def _effort(
     name: str,
-    hauls: Sequence[Haul] | None,
     watched: Sequence[Mapping[str, Any]],
+    shares: Sequence[float],
     fish: Sequence[FishResult],
 ) -> HaulEffort:
-    """`hauls` None: all that was watched counts."""
-    shares = [(row, 1.0 if hauls is None else _overlap(row, hauls)) for row in watched]
-    frames = sum(row["frames"] * share for row, share in shares)
-    lost = sum(row["frames_lost"] * share for row, share in shares)
+    """`shares` (one a row of `watched`, 0 to 1): what of each watched time belongs to it."""
+    parts = list(zip(watched, shares, strict=True))
+    frames = sum(row["frames"] * share for row, share in parts)
+    lost = sum(row["frames_lost"] * share for row, share in parts)
     of_haul = [one for one in fish if one.haul == name]
     has_fates = any(one.fate is not None for one in fish)
     return HaulEffort(
         haul=name,
-        began_ns=hauls[0].began_ns if hauls else None,
-        ended_ns=hauls[0].ended_ns if hauls else None,
-        hours_watched=sum((_hours(row) * share for row, share in shares), start=0.0),
+        hours_watched=sum((_hours(row) * share for row, share in parts), start=0.0),
         share_measured=frames / (frames + lost) if frames + lost else None,
         num_fish=len(of_haul),
         num_measured=sum(one.length_mm is not None for one in of_haul),

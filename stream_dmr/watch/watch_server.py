@@ -132,7 +132,7 @@ class _WatchHandler(TokenHandler):
             return self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"expected a haul as JSON\n")
         try:
             told = json.loads(self.rfile.read(int(length)))
-            what, name, said_by = (str(told.get(key, "")) for key in ("what", "name", "said_by"))
+            what, name, said_by = (str(told.get(key) or "") for key in ("what", "name", "said_by"))
             name = hauls.tell(what, name, said_by=said_by)
         except (UserError, ValueError, AttributeError) as error:
             return self.answer(HTTPStatus.BAD_REQUEST, "text/plain", f"{error}\n".encode())

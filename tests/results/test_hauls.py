@@ -74,6 +74,23 @@ def test_a_run_that_is_told_of_hauls(tmp_path: Path):
     assert efforts[""].hours_watched == pytest.approx(120 / 3600)
     assert [efforts[name].num_fish for name in ("north", "1", "")] == [2, 1, 1]
     assert efforts["north"].share_measured == 1.0
+    assert efforts[""].share_measured == 1.0
+
+
+def test_a_haul_that_is_begun_again_has_only_its_own_times(tmp_path: Path):
+    store = LengthStore(tmp_path, FACTS)
+    log = HaulLog(store, HaulsSettings())
+    told = {100: ("start", "7"), 200: ("start", "8"), 400: ("start", "7"), 500: ("end", "")}
+    for second in range(0, 601, 5):
+        log.take_frame(second * SECOND)
+        if second in told:
+            log.tell(*told[second], said_by="Ada")
+    log.finish()
+    store.close()
+    efforts = {one.haul: one for one in read_effort(store.path, [])}
+    hours = {name: 3600 * effort.hours_watched for name, effort in efforts.items()}
+    assert hours == pytest.approx({"7": 200, "8": 200, "": 200})
+    assert (efforts["7"].began_ns, efforts["7"].ended_ns) == (100 * SECOND, 500 * SECOND)
 
 
 def test_fish_are_counted_by_fate_with_each_haul(tmp_path: Path):
@@ -178,5 +195,11 @@ def test_hauls_of_a_folder_afterwards(tmp_path: Path):
     write_haul(tmp_path, "start", name="A", at="15", said_by="Ada")
     assert write_haul(tmp_path, "end", name="", at="25.5", said_by="Ada") == "A"
     assert [one.haul for one in read_stored_fish(store.path)] == ["", "A", ""]
-    with pytest.raises(UserError, match="expected a haul that goes on"):
-        write_haul(tmp_path, "end", name="", at="26", said_by="Ada")
+    for nothing_to_end in ("14", "26"):
+        with pytest.raises(UserError, match="expected a haul that goes on"):
+            write_haul(tmp_path, "end", name="", at=nothing_to_end, said_by="Ada")
+    for no_time in ("inf", "1e30", "nan"):
+        with pytest.raises(UserError):
+            write_haul(tmp_path, "start", name="", at=no_time, said_by="Ada")
+    write_haul(tmp_path, "start", name="B", at="40", said_by="Ada")
+    assert write_haul(tmp_path, "end", name="", at="20", said_by="Ada") == "A"

@@ -18,6 +18,7 @@ from stream_dmr.watch.run_state import RunState
 from stream_dmr.watch.watch_server import WatchServer
 from tests.support.browser import Tab
 from tests.support.camera import free_port
+from tests.support.command import invoke
 from tests.support.final_estimates import FACTS
 
 # Until the page says what it must; it asks for news every second or so.
@@ -92,3 +93,11 @@ def test_a_haul_is_begun_and_ended(server: WatchServer, hauls: HaulLog, width: i
         ("1", 3, 10),
         ("2", 10, None),
     ]
+
+
+def test_a_running_box_takes_a_haul_as_of_now_alone(server: WatchServer, hauls: HaulLog):
+    told = invoke("haul", {"start": None, server.address: None, "--at": "5"})
+    assert told.code == 2
+    assert "expected with the folder of a run" in told.error
+    assert hauls.hauls() == []
+    assert invoke("haul", {"start": None, server.address: None}).out == "haul 1: start\n"
