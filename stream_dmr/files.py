@@ -219,7 +219,7 @@ def sync_path(path: Path) -> None:
 
 
 @contextmanager
-def writing_to(path: Path) -> Generator[None, None, None]:
+def writing_to(path: Path) -> Generator[None]:
     """Raise an OSError in the block as an OutputError about `path`."""
     try:
         yield
@@ -227,6 +227,23 @@ def writing_to(path: Path) -> Generator[None, None, None]:
         raise OutputError(
             f"{path}: expected a place to write to, got: {error.strerror}; choose another"
         ) from error
+
+
+@contextmanager
+def replacing(path: Path) -> Generator[Path]:
+    """A draft to write to, which replaces `path` after the block; an error leaves nothing of it.
+
+    At any moment the old or the new file is complete. Raises OutputError where the disk refuses it.
+    """
+    draft = path.with_name(f"{path.name}.part")
+    try:
+        with writing_to(path):
+            yield draft
+            rename_durably(draft, path)
+    except BaseException:
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)
+        raise
 
 
 def make_folder(path: Path) -> Path:

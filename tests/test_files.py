@@ -16,6 +16,7 @@ from stream_dmr.files import (
     make_folder,
     natural_order,
     rename_durably,
+    replacing,
     sha256_of_files,
 )
 from tests.support.small_disk import file_size_limit
@@ -70,6 +71,26 @@ def test_renaming_replaces_the_target(tmp_path: Path):
     (tmp_path / "final").write_text("old")
     rename_durably(tmp_path / "draft", tmp_path / "final")
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("final", "new")]
+
+
+def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path):
+    path = tmp_path / "table.csv"
+    path.write_text("old")
+
+    def write(text: str, error: BaseException | None = None) -> None:
+        with replacing(path) as draft:
+            draft.write_text(text)
+            assert path.read_text() == "old"
+            if error is not None:
+                raise error
+
+    with pytest.raises(OutputError, match=r"table\.csv: .*No space"):
+        write("half of the n", OSError(28, "No space left on device"))
+    with pytest.raises(KeyboardInterrupt):
+        write("half of the n", KeyboardInterrupt())
+    assert [(one.name, one.read_text()) for one in tmp_path.iterdir()] == [("table.csv", "old")]
+    write("new")
+    assert [(one.name, one.read_text()) for one in tmp_path.iterdir()] == [("table.csv", "new")]
 
 
 def test_a_folder_in_the_place_of_a_file_is_refused(tmp_path: Path):

@@ -16,6 +16,7 @@ from pyarrow import Table, parquet
 from stream_dmr.batch.layout import TABLE_KINDS, dataset_file
 from stream_dmr.batch.manifest import Job
 from stream_dmr.errors import OutputError
+from stream_dmr.files import replacing
 from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.results.finished_fish import FishResult, read_fish
 from stream_dmr.results.fish_table import FISH_TABLE, arrow_schema, fish_record
@@ -78,9 +79,8 @@ def publish(folder: Path, job: Job, out: Path) -> None:
         if target.exists() and target.stat().st_mtime_ns >= _written_ns(folder, kind):
             continue
         target.parent.mkdir(parents=True, exist_ok=True)
-        draft = target.with_suffix(".part")
-        shutil.copyfile(folder / f"{kind}.parquet", draft)
-        draft.replace(target)
+        with replacing(target) as draft:
+            shutil.copyfile(folder / f"{kind}.parquet", draft)
 
 
 def withdraw_others(jobs: Iterable[Job], out: Path) -> None:

@@ -29,7 +29,7 @@ from stream_dmr.batch.measure_video import Outcome, finish_folder, read_outcome
 from stream_dmr.batch.progress import BatchProgress
 from stream_dmr.csv_file import safe_cell
 from stream_dmr.errors import OutputError
-from stream_dmr.files import make_folder, writing_to
+from stream_dmr.files import make_folder, replacing
 from stream_dmr.results.folder_lock import require_unlocked
 from stream_dmr.results.own_files import has_run_name
 from stream_dmr.results.provenance import seal_files
@@ -115,16 +115,13 @@ class _BatchResults:
     def _write_table(self) -> None:
         """Write videos.csv: one row a video, in the order of the manifest."""
         target = self._out / VIDEOS
-        draft = target.with_suffix(".csv.part")
-        with writing_to(target):
-            with draft.open("w", newline="", encoding="utf-8") as file:
-                writer = csv.writer(file, lineterminator="\n")
-                writer.writerow(VIDEO_COLUMNS)
-                for job in self._jobs:
-                    origin = (job.name, job.video, job.vessel, job.trip, job.haul)
-                    cells = origin + _result_cells(self.outcomes.get(job.name))
-                    writer.writerow([safe_cell(str(cell)) for cell in cells])
-            draft.replace(target)
+        with replacing(target) as draft, draft.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(VIDEO_COLUMNS)
+            for job in self._jobs:
+                origin = (job.name, job.video, job.vessel, job.trip, job.haul)
+                cells = origin + _result_cells(self.outcomes.get(job.name))
+                writer.writerow([safe_cell(str(cell)) for cell in cells])
         seal_files(self._out, [target], runs={})
 
 

@@ -2,12 +2,12 @@
 
 from collections import deque
 from collections.abc import Callable, Collection, Iterable
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 
 from stream_dmr.csv_file import CsvFile
 from stream_dmr.errors import OutputError
-from stream_dmr.files import rename_durably, writing_to
+from stream_dmr.files import replacing
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.store_rows import MAY_COUNT_TWICE
@@ -86,23 +86,16 @@ class LengthsTable:
 def write_lengths(
     path: Path, estimates: Iterable[LengthEstimate], *, may_count_twice: Collection[int] = ()
 ) -> None:
-    """Replace lengths.csv durably; at any moment the old or the new one is complete.
+    """Replace lengths.csv in one step.
 
     `may_count_twice`: the ids of the fish of which `status` says so. Raises OutputError where the
     disk refuses it.
     """
-    draft = path.with_suffix(".csv.part")
-    try:
-        with closing(CsvFile(draft, LENGTHS_COLUMNS)) as table, writing_to(path):
-            for estimate in estimates:
-                is_doubtful = estimate.track_id in may_count_twice
-                table.add(lengths_row(estimate, may_count_twice=is_doubtful))
-            table.sync()
-            rename_durably(draft, path)
-    except BaseException:
-        with suppress(OSError):
-            draft.unlink(missing_ok=True)
-        raise
+    with replacing(path) as draft, closing(CsvFile(draft, LENGTHS_COLUMNS)) as table:
+        for estimate in estimates:
+            is_doubtful = estimate.track_id in may_count_twice
+            table.add(lengths_row(estimate, may_count_twice=is_doubtful))
+        table.sync()
 
 
 def lengths_row(estimate: LengthEstimate, *, may_count_twice: bool = False) -> list[str]:

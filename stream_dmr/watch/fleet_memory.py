@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from stream_dmr.errors import OutputError
-from stream_dmr.files import read_text, writing_to
+from stream_dmr.files import read_text, replacing
 from stream_dmr.watch.fleet_boxes import Box, BoxReading, BoxState
 
 _MAX_BYTES = 20_000_000
@@ -60,7 +60,5 @@ def write_memory(path: Path, states: Iterable[BoxState]) -> None:
 
 def replace_text(path: Path, text: str) -> None:
     """Write a text in one step: who reads meanwhile gets the old or the new. Raises OutputError."""
-    part = path.with_name(f".{path.name}.part")
-    with writing_to(path):
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
+    with replacing(path) as draft:
+        draft.write_text(text, encoding="utf-8")

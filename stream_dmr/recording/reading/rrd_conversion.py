@@ -1,10 +1,10 @@
 """Converts a recording into an .rrd: the view drawn again, with every frame."""
 
-from collections.abc import Generator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
-from stream_dmr.files import make_folder, writing_to
+from stream_dmr.files import make_folder, replacing
 from stream_dmr.messages import FittedMesh, Frame, Message
 from stream_dmr.recording.messages.record import Record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
@@ -41,8 +41,8 @@ def convert(
     meshes = MeshRebuilder(opened.header.template, known_shapes(opened))
     pictures = source or RecordedPictures(opened, selection)
     with (
-        _finished_or_removed(make_folder(rrd.parent) / rrd.name) as unfinished,
-        closing(RrdSink(unfinished, opened.header, settings)) as sink,
+        replacing(make_folder(rrd.parent) / rrd.name) as draft,
+        closing(RrdSink(draft, opened.header, settings)) as sink,
     ):
         for message, payload in decoded_messages(opened, list(TOPICS), selection):
             whole: Message = message
@@ -52,17 +52,3 @@ def convert(
                 whole = meshes.with_vertices(message)
             sink.write(Record.of_payload(message, payload, whole=whole))
     return opened.warnings
-
-
-@contextmanager
-def _finished_or_removed(path: Path) -> Generator[Path]:
-    """Where to write what gets the name `path` at the end; an error leaves nothing of it."""
-    unfinished = path.with_name(f"{path.name}.part")
-    try:
-        yield unfinished
-    except BaseException:
-        with suppress(OSError):
-            unfinished.unlink(missing_ok=True)
-        raise
-    with writing_to(path):
-        unfinished.replace(path)

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel
 
 from stream_dmr.errors import ModelError, UserError
+from stream_dmr.files import replacing
 from stream_dmr.segmentation.network.unet import UNet, normalise
 from stream_dmr.segmentation.network.unet_export import export_unet
 from stream_dmr.segmentation.network.unet_weights import save_weights
@@ -215,9 +216,8 @@ class UNetTrainer:
             "optimizer": self.optimizer.state_dict(),
             "history": [asdict(scores) for scores in self.history],
         }
-        partial = self.out / "last.pt.part"
-        torch.save(state, partial)
-        partial.replace(self.out / "last.pt")  # atomic: a crash leaves the previous one
+        with replacing(self.out / "last.pt") as draft:  # a crash leaves the previous one
+            torch.save(state, draft)
 
     def _identity(self) -> dict[str, Any]:
         """The settings that a resumed run must share with the one before."""
