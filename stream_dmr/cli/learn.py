@@ -85,9 +85,8 @@ def learn_template(
 def _crops(recordings: "list[Recording]") -> "Iterator[FishCrop]":
     """The crops of all, with ids of their own."""
     from stream_dmr.messages import FishCrop
-    from stream_dmr.recording.reading.open_recording import decoded_messages
+    from stream_dmr.recording.reading.open_recording import messages_of
 
     for number, recording in enumerate(recordings):
-        for message, _ in decoded_messages(recording, [FishCrop]):
-            if isinstance(message, FishCrop):
-                yield replace(message, track_id=message.track_id + number * _IDS)
+        for crop in messages_of(recording, FishCrop):
+            yield replace(crop, track_id=crop.track_id + number * _IDS)

@@ -9,7 +9,7 @@ from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.recording.messages.codec import stored_picture
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.reading.known_shapes import known_shapes
-from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
+from stream_dmr.recording.reading.open_recording import Recording, messages_of
 from stream_dmr.replaying.recorded_files import CropFiles, find_crop_files, inputs_with
 from stream_dmr.replaying.replay_config import replay_config
 from stream_dmr.replaying.replay_request import ReplayRequest
@@ -107,6 +107,5 @@ def _shapes(
     template, forms = load_shapes(request.template, on_notice=observer.warn)
     if not config.fit_mesh.are_shapes_learnt:
         return template, forms
-    messages = (message for message, _ in decoded_messages(recording, [FishCrop]))
-    crops = (message for message in messages if isinstance(message, FishCrop))
+    crops = messages_of(recording, FishCrop)
     return learnt_from(crops, template, forms, config, calibration=calibration, observer=observer)

@@ -12,7 +12,7 @@ from stream_dmr.lengths.track_length import TrackLength
 from stream_dmr.messages import LengthEstimate, LocalizedFish
 from stream_dmr.recording.messages.codec import decode
 from stream_dmr.recording.messages.selection import Selection
-from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
+from stream_dmr.recording.reading.open_recording import Recording, messages_of
 from stream_dmr.results.recorded_settings import recorded_settings
 from stream_dmr.results.store_rows import fish_row
 from stream_dmr.results.track_edits import TrackPart
@@ -36,11 +36,11 @@ def frames_of_tracks(
     """
     wanted = frozenset(track_ids)
     carried = [decode(LocalizedFish, payload) for payload in recording.carried_over()]
-    recorded = decoded_messages(recording, [LocalizedFish], Selection(tracks=wanted))
+    recorded = messages_of(recording, LocalizedFish, Selection(tracks=wanted))
     added = read_added_frames(database)
     frames: dict[int, list[LocalizedFish]] = {track_id: [] for track_id in wanted}
-    for fish in (*carried, *(message for message, _ in recorded)):
-        if isinstance(fish, LocalizedFish) and fish.track_id in wanted:
+    for fish in (*carried, *recorded):
+        if fish.track_id in wanted:
             last = last_frames.get(fish.track_id)
             if last is None or fish.frame_index <= last:
                 frames[fish.track_id].append(fish)

@@ -16,7 +16,11 @@ from stream_dmr.recording.messages.record import make_record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.reading.known_shapes import known_shapes
-from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
+from stream_dmr.recording.reading.open_recording import (
+    decoded_messages,
+    messages_of,
+    open_recordings,
+)
 from stream_dmr.recording.reading.required_parts import (
     require_messages,
     require_time,
@@ -239,8 +243,8 @@ class Export:
 
     def _fps(self) -> float | None:
         """Frames per second, by the median time between frames; None of fewer than two."""
-        frames = decoded_messages(self._recording, [Frame], self._selection)
-        steps = np.diff(np.array([frame.timestamp_ns for frame, _ in frames], np.int64))
+        frames = messages_of(self._recording, Frame, self._selection)
+        steps = np.diff(np.array([frame.timestamp_ns for frame in frames], np.int64))
         return round(1e9 / float(np.median(steps)), 3) if len(steps) else None
 
     def _all_fish(self) -> list[FishResult]:

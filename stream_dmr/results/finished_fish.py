@@ -12,7 +12,7 @@ from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate, Position
 from stream_dmr.recording.messages.run_inputs import RunInputs
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
-from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
+from stream_dmr.recording.reading.open_recording import Recording, messages_of
 from stream_dmr.results.added_tables import added_rows
 from stream_dmr.results.catch_facts import UNKNOWN_CATCH, CatchFacts
 from stream_dmr.results.hauls import HAULS, haul_at, hauls_of
@@ -130,7 +130,6 @@ def read_fish(
             and selection.includes_time(one.estimate.last_timestamp_ns)
         ]
     facts, track = run_facts(recording.header), recorded_track(recording)
-    found = (message for message, _ in decoded_messages(recording, [LengthEstimate], selection))
     return [
         FishResult(
             estimate=estimate,
@@ -139,16 +138,15 @@ def read_fish(
             catch=CatchFacts.of(estimate),
             where=track.at(middle_ns(estimate)),
         )
-        for estimate in found
-        if isinstance(estimate, LengthEstimate) and estimate.is_final
+        for estimate in messages_of(recording, LengthEstimate, selection)
+        if estimate.is_final
     ]
 
 
 def recorded_track(recording: Recording) -> VesselTrack:
     """The vessel's track of a recording, as its run's settings cut it at gaps."""
     settings = recorded_settings(recording, "sensors", SensorsSettings)
-    found = (message for message, _ in decoded_messages(recording, [Position]))
-    positions = (message for message in found if isinstance(message, Position))
+    positions = messages_of(recording, Position)
     return VesselTrack(kept_of(positions, keep_s=settings.keep_s, max_gap_s=settings.max_gap_s))
 
 

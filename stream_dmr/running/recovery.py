@@ -6,8 +6,7 @@ from pathlib import Path
 
 from stream_dmr.errors import OutputError, RecordingError
 from stream_dmr.messages import LengthEstimate
-from stream_dmr.recording.messages.codec import decode
-from stream_dmr.recording.reading.open_recording import open_recordings
+from stream_dmr.recording.reading.open_recording import messages_of, open_recordings
 from stream_dmr.recording.segments.repair import Repair, repair_recordings
 from stream_dmr.results.folder_lock import require_unlocked
 from stream_dmr.results.length_store import LengthStore
@@ -46,11 +45,7 @@ def recover_folder(folder: Path, *, key: Path | None = None) -> Iterator[str]:
 def _add_lengths(path: Path, folder: Path, signer: Signer | None) -> Iterator[str]:
     try:
         recording = open_recordings([path])
-        final = [
-            estimate
-            for _, payload in recording.payloads([LengthEstimate])
-            if (estimate := decode(LengthEstimate, payload)).is_final
-        ]
+        final = [one for one in messages_of(recording, LengthEstimate) if one.is_final]
     except RecordingError as error:
         yield str(error)
         return

@@ -2,16 +2,12 @@
 
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.messages import LearntShapes
-from stream_dmr.recording.messages.codec import decode
-from stream_dmr.recording.reading.open_recording import Recording
+from stream_dmr.recording.reading.open_recording import Recording, messages_of
 
 
 def learnt_shapes(recording: Recording) -> list[LearntShapes]:
     """What the camera of a recording learnt, in its order; each segment holds all before it."""
-    found: dict[int, LearntShapes] = {}
-    for _, payload in recording.payloads([LearntShapes]):
-        learnt = decode(LearntShapes, payload)
-        found[learnt.timestamp_ns] = learnt
+    found = {learnt.timestamp_ns: learnt for learnt in messages_of(recording, LearntShapes)}
     return [found[timestamp_ns] for timestamp_ns in sorted(found)]
 
 

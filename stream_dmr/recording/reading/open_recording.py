@@ -3,7 +3,7 @@
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 from stream_dmr.errors import RecordingError
 from stream_dmr.files import natural_order
@@ -16,6 +16,7 @@ from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.rerun.rrd_recording import RrdRecording
 
 MessageTypes = Collection[type[Message]]
+M = TypeVar("M", bound=Message)
 
 
 @runtime_checkable
@@ -70,6 +71,16 @@ def decoded_messages(
         message = decode(kind, payload)
         if selection.includes(message):
             yield message, payload
+
+
+def messages_of(
+    recording: Recording, kind: type[M], selection: Selection = EVERYTHING
+) -> Iterator[M]:
+    """The selected messages of one kind. Raises RecordingError."""
+    for _, payload in recording.payloads([kind], selection):
+        message = decode(kind, payload)
+        if selection.includes(message):
+            yield message
 
 
 def _files_of(path: Path) -> list[Path]:

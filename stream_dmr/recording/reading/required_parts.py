@@ -6,7 +6,7 @@ from stream_dmr.errors import RecordingError, UserError
 from stream_dmr.messages import Frame, LocalizedFish
 from stream_dmr.recording.messages.selection import Selection
 from stream_dmr.recording.messages.topics import TOPICS
-from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
+from stream_dmr.recording.reading.open_recording import Recording, messages_of
 
 
 def require_messages(recording: Recording) -> None:
@@ -28,8 +28,8 @@ def require_time(recording: Recording, selection: Selection) -> None:
     if selection.time_ns is None:
         return
     selected = Selection(time_ns=selection.time_ns)
-    if next(decoded_messages(recording, [Frame], selected), None) is None:
-        times = [frame.timestamp_ns for frame, _ in decoded_messages(recording, [Frame])]
+    if next(messages_of(recording, Frame, selected), None) is None:
+        times = [frame.timestamp_ns for frame in messages_of(recording, Frame)]
         first, last = (ns / 1e9 for ns in selection.time_ns)
         spans = f", from {min(times) / 1e9:g} to {max(times) / 1e9:g} s" if times else ""
         raise UserError(
@@ -46,8 +46,8 @@ def require_tracks(selection: Selection, known: Collection[int]) -> None:
 
 def require_frame(recording: Recording, frame_index: int, selection: Selection) -> None:
     """Raise UserError where a recording has no frame of this number in the selected time."""
-    found = decoded_messages(recording, [Frame], Selection(time_ns=selection.time_ns))
-    frames = [frame.frame_index for frame, _ in found]
+    found = messages_of(recording, Frame, Selection(time_ns=selection.time_ns))
+    frames = [frame.frame_index for frame in found]
     if frame_index not in frames:
         spans = f", from {min(frames)} to {max(frames)}" if frames else ""
         raise UserError(
@@ -57,5 +57,4 @@ def require_frame(recording: Recording, frame_index: int, selection: Selection) 
 
 def localized_tracks(recording: Recording, selection: Selection) -> set[int]:
     """The ids of the selected fish that a recording has."""
-    found = decoded_messages(recording, [LocalizedFish], selection)
-    return {getattr(message, "track_id", 0) for message, _ in found}
+    return {fish.track_id for fish in messages_of(recording, LocalizedFish, selection)}
