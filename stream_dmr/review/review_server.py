@@ -1,7 +1,6 @@
 """Serves the page of a review on this machine and takes the verdicts."""
 
 import secrets
-import threading
 from collections.abc import Iterator
 from http import HTTPStatus
 from urllib.parse import parse_qs, urlsplit
@@ -30,16 +29,11 @@ class ReviewServer:
         self.address = (
             f"http://{_HOST}:{self._server.server_address[1]}/?token={self._server.token}"
         )
-        self._thread = threading.Thread(
-            target=self._server.serve_forever, name="review", daemon=True
-        )
-        self._thread.start()
+        self._server.start()
 
     def close(self) -> None:
         """Stop serving."""
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
+        self._server.stop()
         self._queue.close()
 
 

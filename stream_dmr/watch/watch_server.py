@@ -41,16 +41,11 @@ class WatchServer:
             ) from error
         host, port = self._server.server_address[:2]
         self.address = f"http://{host}:{port}/"
-        self._thread = threading.Thread(
-            target=self._server.serve_forever, name="watch", daemon=True
-        )
-        self._thread.start()
+        self._server.start()
 
     def close(self) -> None:
         """Stop serving."""
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
+        self._server.stop()
 
 
 def _read_token(settings: WatchSettings) -> str:

@@ -48,6 +48,17 @@ class TokenServer(ThreadingHTTPServer):
         self._connections = threading.BoundedSemaphore(self.max_connections)
         super().__init__(address, handler)
         self.is_local = is_loopback(str(self.server_address[0]))
+        self._thread = threading.Thread(target=self.serve_forever, daemon=True)
+
+    def start(self) -> None:
+        """Serve from a thread of its own, until `stop`."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop serving."""
+        self.shutdown()
+        self.server_close()
+        self._thread.join()
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Handle a connection in a thread of its own; close it where there are too many."""
