@@ -1,9 +1,10 @@
 """The recorded messages, and nodes that return them instead of computing them."""
 
 from collections.abc import Iterator, Sequence
+from typing import TypeVar
 
 from stream_dmr.errors import RecordingError
-from stream_dmr.messages import FishCrop, FittedMesh, Frame, LocalizedFish, Message, Position
+from stream_dmr.messages import FishCrop, FittedMesh, Frame, LocalizedFish, Message
 from stream_dmr.recording.messages.codec import decode
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.reading.frame_images import (
@@ -11,7 +12,9 @@ from stream_dmr.recording.reading.frame_images import (
     RecordedPictures,
     has_original_pixels,
 )
-from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
+from stream_dmr.recording.reading.open_recording import Recording
+
+M = TypeVar("M", bound=Message)
 
 
 class RecordedMessages:
@@ -38,24 +41,17 @@ class RecordedMessages:
         fish = [decode(LocalizedFish, payload) for payload in self._recording.carried_over()]
         return [message for message in fish if self._selection.includes(message)]
 
-    def of_type(self, kind: type[Message], *, keep_payloads: bool = True) -> Iterator[Message]:
-        """The messages of one type; `payload` gives the encoding of each that was kept."""
-        for message, payload in decoded_messages(self._recording, [kind], self._selection):
-            if keep_payloads:
-                self._payloads[id(message)] = payload
-            yield message
+    def of_type(self, kind: type[M], *, keep_payloads: bool = True) -> Iterator[M]:
+        """The messages of one type; `payload` gives the encoding of each that was kept.
 
-    def positions(self) -> Iterator[Position]:
-        """The positions of the vessel."""
-        for message in self.of_type(Position, keep_payloads=False):
-            assert isinstance(message, Position)
-            yield message
-
-    def frames(self) -> Iterator[Frame]:
-        """The frames, without images where they were recorded by reference."""
-        for message in self.of_type(Frame):
-            assert isinstance(message, Frame)
-            yield message
+        Frames have no images where they were recorded by reference.
+        """
+        for _, payload in self._recording.payloads([kind], self._selection):
+            message = decode(kind, payload)
+            if self._selection.includes(message):
+                if keep_payloads:
+                    self._payloads[id(message)] = payload
+                yield message
 
     def frames_with_images(
         self, restorer: FrameRestorer | None, *, exact: bool, missing_source: str
@@ -67,7 +63,7 @@ class RecordedMessages:
         without `exact`, `notes` says so.
         """
         restorer = restorer or RecordedPictures(self._recording, self._selection)
-        for frame in self.frames():
+        for frame in self.of_type(Frame):
             payload = self._payloads.pop(id(frame))
             restored = restorer.restore(frame, payload)
             if restored.image.size == 0:

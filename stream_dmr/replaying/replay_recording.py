@@ -257,7 +257,7 @@ def _open_chain(
         if request.out is None:
             played = played[-1:]
         playback = [PlaybackNode(recorded, kind) for kind in played]
-        return recorded.frames(), [*playback, *computed[first - 1 :]]
+        return recorded.of_type(Frame), [*playback, *computed[first - 1 :]]
     files, restorer = inputs.files, None
     if files.source is not None:
         restorer = stack.enter_context(open_pictures(files.source, config.read_frames))

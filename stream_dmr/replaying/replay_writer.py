@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from stream_dmr.messages import Frame, LengthEstimate, Message
+from stream_dmr.messages import Frame, LengthEstimate, Message, Position
 from stream_dmr.recording.messages.record import Record, as_recorded
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.replaying.comparator import MessageComparator
@@ -26,8 +26,8 @@ class ReplayWriter:
         self._outputs, self._comparator = outputs, comparator
         self._first_ns: int | None = None
         self._last_ns = 0
-        self._positions = recorded.positions() if outputs is not None else iter(())
-        self._next_position = next(self._positions, None)
+        self._positions = recorded.of_type(Position, keep_payloads=False)
+        self._next_position = None if outputs is None else next(self._positions, None)
         self.final: list[LengthEstimate] = []
         self.num_frames = 0
 
