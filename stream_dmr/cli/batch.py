@@ -1,7 +1,6 @@
 """`stream-dmr batch`: a backlog of videos on one machine or many."""
 
 import os
-import signal
 import sys
 from collections import Counter
 from collections.abc import Generator
@@ -97,9 +96,7 @@ def batch(
         total = sum((Counter(getattr(outcome, name)) for outcome in summary.outcomes), Counter())
         if total:
             print(f"{title}: {counts_text(total.elements())}")
-    if stop.signal_number:
-        print(f"stopped by {signal.Signals(stop.signal_number).name}", file=sys.stderr)
-        raise typer.Exit(128 + stop.signal_number)
+    stop.exit()
     if failed:
         raise typer.Exit(2)
 

@@ -83,8 +83,7 @@ def replay(
     with stop_on_signals() as stop, RunDisplay() as display:
         summary = replay_recording(request, stop=stop, observer=display)
     print_replay(summary, out, timings=timings)
-    if stop.signal_number:
-        raise typer.Exit(128 + stop.signal_number)
+    stop.exit()
     if check:
         print_check(summary)
         if not summary.is_as_recorded:

@@ -1,7 +1,5 @@
 """`stream-dmr run`: the main job."""
 
-import signal
-import sys
 from contextlib import nullcontext
 from enum import StrEnum
 from pathlib import Path
@@ -139,9 +137,7 @@ def run(
         with nullcontext(JsonLog()) if log_json else RunDisplay() as observer:
             summary = measure_source(request, stop=stop, observer=WatchObserver(observer))
         _print_summary(summary, request.out, timings=timings)
-    if stop.signal_number:
-        print(f"stopped by {signal.Signals(stop.signal_number).name}", file=sys.stderr)
-        raise typer.Exit(128 + stop.signal_number)
+    stop.exit()
 
 
 def _print_summary(summary: "RunSummary", out: Path, *, timings: bool) -> None:

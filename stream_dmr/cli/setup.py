@@ -2,8 +2,6 @@
 
 import time
 
-import typer
-
 
 def setup() -> None:
     """Compile the numeric loops, so that the first run need not; a run does it by itself else."""
@@ -17,6 +15,5 @@ def setup() -> None:
         if not console.is_terminal:
             console.print("compiling the numeric loops, once on this machine: half a minute")
         prepare_kernels(status.update, stop=stop)
-    if stop.signal_number:
-        raise typer.Exit(128 + stop.signal_number)
+    stop.exit()
     print(f"ready, after {time.monotonic() - began:.0f} s")

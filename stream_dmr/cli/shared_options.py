@@ -90,6 +90,12 @@ class Stop(threading.Event):
 
     signal_number = 0
 
+    def exit(self, hint: str = "") -> None:
+        """End the command with the signal's exit code, where one came; `hint`: what to do next."""
+        if self.signal_number:
+            print(f"stopped by {_name(self.signal_number)}{hint}", file=sys.stderr)
+            raise typer.Exit(128 + self.signal_number)
+
 
 @contextmanager
 def importing() -> Generator[None]:
@@ -121,7 +127,7 @@ def exit_on_signals() -> Generator[None]:
             yield
     finally:
         if number_of_first:
-            print(f"stopped by {signal.Signals(number_of_first).name}", file=sys.stderr)
+            print(f"stopped by {_name(number_of_first)}", file=sys.stderr)
 
 
 @contextmanager
@@ -138,6 +144,10 @@ def stop_on_signals() -> Generator[Stop]:
 
     with _handling_signals(on_signal):
         yield stop
+
+
+def _name(number: int) -> str:
+    return signal.Signals(number).name
 
 
 @contextmanager

@@ -1,7 +1,5 @@
 """`stream-dmr train`: weights of the U-Net that finds masks, also for one's own vessel."""
 
-import signal
-import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -78,9 +76,4 @@ def train(
             best = train_unet(request, stop=stop, observer=display)
     if best is not None:
         print(f"best: epoch {best.epoch}, mean IoU {best.iou:.3f}; {out / 'unet.onnx'}")
-    if stop.signal_number:
-        print(
-            f"stopped by {signal.Signals(stop.signal_number).name}; --resume continues",
-            file=sys.stderr,
-        )
-        raise typer.Exit(128 + stop.signal_number)
+    stop.exit("; --resume continues")
