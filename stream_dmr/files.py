@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import io
+import itertools
 import os
 import re
 import warnings
@@ -201,6 +202,12 @@ def free_bytes(folder: Path) -> int:
     """Free space on the disk of a folder, without the part that is reserved for the superuser."""
     disk = os.statvfs(folder)
     return disk.f_bavail * disk.f_frsize
+
+
+def free_name(path: Path) -> Path:
+    """The path, or the first of `STEM-1`, `STEM-2`, ... that does not exist."""
+    names = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(1))
+    return path if not path.exists() else next(name for name in names if not name.exists())
 
 
 def rename_durably(path: Path, target: Path) -> None:

@@ -1,12 +1,12 @@
 """The folder of a run, checked and made ready before the run."""
 
-import itertools
 import tempfile
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
 from stream_dmr.errors import OutputError
+from stream_dmr.files import free_name
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.segments.recording_files import STEM
 from stream_dmr.recording.segments.repair import Repair, repair_recordings
@@ -52,7 +52,7 @@ def prepare_folder(
         repairs = list(repair_recordings(out))
         for path in (out / f"{STEM}.mcap", out / f"{STEM}.rrd"):
             if path.exists():
-                _rename_earlier(path)
+                path.rename(free_name(path))  # recording-1.mcap, recording-2.mcap, ...
         if not waits_for_room:
             with tempfile.TemporaryFile(dir=out) as probe:
                 probe.write(bytes(_PROBE_BYTES))
@@ -102,9 +102,3 @@ def _earlier_results(out: Path, *, is_fine: bool) -> list[Path]:
 def _recordings(out: Path, pattern: str) -> list[Path]:
     """Recordings, whole or unfinished; a video of the user may be called so as well."""
     return sorted(path for path in out.glob(pattern) if {".mcap", ".rrd"} & {*path.suffixes})
-
-
-def _rename_earlier(recording: Path) -> None:
-    """Rename the recording of an earlier run to recording-1.mcap, recording-2.mcap, ..."""
-    names = (recording.with_stem(f"{recording.stem}-{number}") for number in itertools.count(1))
-    recording.rename(next(name for name in names if not name.exists()))

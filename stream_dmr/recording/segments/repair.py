@@ -4,12 +4,11 @@ import errno
 import os
 from collections.abc import Iterator
 from contextlib import suppress
-from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
 from stream_dmr.errors import RecordingError
-from stream_dmr.files import free_bytes, rename_durably, sync_path
+from stream_dmr.files import free_bytes, free_name, rename_durably, sync_path
 from stream_dmr.recording.mcap.mcap_recording import McapRecording, is_torn
 from stream_dmr.recording.mcap.mcap_sink import PART
 from stream_dmr.recording.mcap.rewrite import REWRITTEN, rewrite
@@ -70,7 +69,7 @@ def _set_aside_damaged(path: Path) -> tuple[Path, str]:
 
 
 def _repair_mcap(part: Path) -> tuple[Path, str]:
-    target = _free_name(part.with_name(part.name.removesuffix(PART)))
+    target = free_name(part.with_name(part.name.removesuffix(PART)))
     if not is_torn(part):  # the crash came between its end and its renaming
         rename_durably(part, target)
         return target, f"it was complete and is {target.name} now"
@@ -95,9 +94,3 @@ def _repair_rrd(rrd: Path) -> tuple[Path, str]:
     sync_path(repaired)
     rename_durably(repaired, rrd)
     return rrd, "what is whole of the view is kept"
-
-
-def _free_name(path: Path) -> Path:
-    """The path, or the first of `STEM-1`, `STEM-2`, ... that does not exist."""
-    names = (path.with_stem(f"{path.stem}-{number}") for number in count(1))
-    return path if not path.exists() else next(name for name in names if not name.exists())
