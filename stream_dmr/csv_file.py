@@ -3,6 +3,7 @@
 import csv
 import io
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from stream_dmr.errors import OutputError
@@ -124,7 +125,14 @@ def original_cell(text: str) -> str:
     return text[1:] if text[:1] == "'" and safe_cell(text[1:]) == text else text
 
 
-def _line(row: list[str]) -> bytes:
+def write_table(path: Path, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+    """Write a whole CSV file at once. Raises OSError."""
+    with path.open("wb") as file:
+        file.write(_line(columns))
+        file.writelines(map(_line, rows))
+
+
+def _line(row: Iterable[object]) -> bytes:
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerow(map(safe_cell, row))
+    csv.writer(text, lineterminator="\n").writerow(safe_cell(str(cell)) for cell in row)
     return text.getvalue().encode("utf-8", "backslashreplace")

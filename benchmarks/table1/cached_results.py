@@ -6,7 +6,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
+from stream_dmr.csv_file import write_table
 from stream_dmr.evaluation.length_tables import LengthRow
+from stream_dmr.files import replacing
 
 CACHE = Path(__file__).parent / "cache"
 _COLUMNS = ("row", "track_id", "truth_mm", "length_mm", "std_mm", "ci95_low_mm", "ci95_high_mm")
@@ -37,17 +39,15 @@ def save(
     """Keep what a method measured of one scene; fish that it says nothing of have no length."""
     path = _path(cache, method, scene)
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    with part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(_COLUMNS)
-        for row, lengths in measured.items():
-            for track_id, truth in truth_mm.items():
-                length = lengths.get(track_id, LengthRow(length_mm=None))
-                interval = length.ci95_mm or (None, None)
-                values = (truth, length.length_mm, length.std_mm, *interval)
-                writer.writerow([row, track_id, *("" if v is None else v for v in values)])
-    part.rename(path)
+    rows = list[list[object]]()
+    for row, lengths in measured.items():
+        for track_id, truth in truth_mm.items():
+            length = lengths.get(track_id, LengthRow(length_mm=None))
+            interval = length.ci95_mm or (None, None)
+            values = (truth, length.length_mm, length.std_mm, *interval)
+            rows.append([row, track_id, *("" if v is None else v for v in values)])
+    with replacing(path) as draft:
+        write_table(draft, _COLUMNS, rows)
 
 
 def is_saved(method: str, scene: int, *, cache: Path) -> bool:

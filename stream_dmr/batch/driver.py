@@ -3,7 +3,6 @@
 Each video gets a folder of its own; videos.csv and the Parquet data set follow from these folders.
 """
 
-import csv
 import shutil
 import threading
 import time
@@ -27,7 +26,7 @@ from stream_dmr.batch.layout import (
 from stream_dmr.batch.manifest import Job
 from stream_dmr.batch.measure_video import Outcome, finish_folder, read_outcome
 from stream_dmr.batch.progress import BatchProgress
-from stream_dmr.csv_file import safe_cell
+from stream_dmr.csv_file import write_table
 from stream_dmr.errors import OutputError
 from stream_dmr.files import make_folder, replacing
 from stream_dmr.results.folder_lock import require_unlocked
@@ -115,20 +114,17 @@ class _BatchResults:
     def _write_table(self) -> None:
         """Write videos.csv: one row a video, in the order of the manifest."""
         target = self._out / VIDEOS
-        with replacing(target) as draft, draft.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(VIDEO_COLUMNS)
-            for job in self._jobs:
-                origin = (job.name, job.video, job.vessel, job.trip, job.haul)
-                cells = origin + _result_cells(self.outcomes.get(job.name))
-                writer.writerow([safe_cell(str(cell)) for cell in cells])
+        rows = (_cells(job, self.outcomes.get(job.name)) for job in self._jobs)
+        with replacing(target) as draft:
+            write_table(draft, VIDEO_COLUMNS, rows)
         seal_files(self._out, [target], runs={})
 
 
-def _result_cells(outcome: Outcome | None) -> tuple[object, ...]:
+def _cells(job: Job, outcome: Outcome | None) -> tuple[object, ...]:
+    of_job = (job.name, job.video, job.vessel, job.trip, job.haul)
     if outcome is None:
-        return (WAITING, *[""] * (len(OUTCOME_COLUMNS) - 1))
-    return tuple(getattr(outcome, name) for name in OUTCOME_COLUMNS.values())
+        return (*of_job, WAITING, *[""] * (len(OUTCOME_COLUMNS) - 1))
+    return (*of_job, *(getattr(outcome, name) for name in OUTCOME_COLUMNS.values()))
 
 
 def _require_own_folders(jobs: Sequence[Job], out: Path) -> None:

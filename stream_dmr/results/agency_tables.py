@@ -5,12 +5,11 @@ What a camera can't know stays empty: nothing is guessed. Sources: draft longlin
 vocabularies TypeMeasured and ValueUnitOrScale.
 """
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
 from stream_dmr.catch.zones import FATE_OF_ZONE
-from stream_dmr.csv_file import safe_cell
+from stream_dmr.csv_file import write_table
 from stream_dmr.files import writing_to
 from stream_dmr.results.effort import HaulEffort
 from stream_dmr.results.finished_fish import FishResult
@@ -111,10 +110,8 @@ def haul_row(effort: HaulEffort, *, utc_zero_ns: int | None) -> Row:
 
 def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> Path:
     """Write a table as CSV; what a row lacks stays empty."""
-    with writing_to(path), path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows([safe_cell(row.get(name, "")) for name in columns] for row in rows)
+    with writing_to(path):
+        write_table(path, columns, ([row.get(name, "") for name in columns] for row in rows))
     return path
 
 

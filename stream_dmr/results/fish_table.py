@@ -1,6 +1,5 @@
 """fish.csv (or .parquet): one row a fish with all that fisheries and auditors need of it."""
 
-import csv
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -8,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from stream_dmr.catch.species_list import CODE, is_called
-from stream_dmr.csv_file import safe_cell
+from stream_dmr.csv_file import write_table
 from stream_dmr.files import writing_to
 from stream_dmr.results.agency_tables import ICES_LENGTHS
 from stream_dmr.results.finished_fish import FishResult
@@ -141,10 +140,9 @@ def _review_columns(review: Review) -> dict[str, Any]:
 def write_csv(path: Path, records: Sequence[dict[str, Any]]) -> Path:
     """Write records of FISH_TABLE as `path`.csv; lengths are rounded as in lengths.csv."""
     target = path.with_suffix(".csv")
-    with writing_to(target), target.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(FISH_TABLE)
-        writer.writerows([_text(record[name]) for name in FISH_TABLE] for record in records)
+    rows = ([_text(record[name]) for name in FISH_TABLE] for record in records)
+    with writing_to(target):
+        write_table(target, FISH_TABLE, rows)
     return target
 
 
@@ -175,4 +173,4 @@ def _text(value: object) -> str:
         case float():
             return f"{value:.6f}"
         case _:
-            return safe_cell(str(value))
+            return str(value)

@@ -1,6 +1,5 @@
 """Writes a simulated scene: the clip, its annotations, its calibration, the truth, a template."""
 
-import csv
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,6 +10,7 @@ import trimesh
 from jaxtyping import UInt16
 
 from stream_dmr.calibration.calibration_file import save_calibration
+from stream_dmr.csv_file import write_table
 from stream_dmr.errors import OutputError, UserError, reason_of
 from stream_dmr.simulation.film import VisibleBox, film
 from stream_dmr.simulation.pose_sequence import FPS
@@ -104,7 +104,7 @@ def _write_all_species(out: Path, names: list[str], *, num_fish: int) -> None:
     for name in names:
         write_species(out / f"{name}.ply", name)
     rows = ((index + 1, names[index % len(names)]) for index in range(num_fish))
-    _write_csv(out / "species.csv", ("track_id", "species"), rows)
+    write_table(out / "species.csv", ("track_id", "species"), rows)
 
 
 def encode_mask(labels: UInt16[np.ndarray, "H W"], *, num_fish: int) -> bytes:
@@ -134,8 +134,8 @@ def _empty_masks(folder: Path) -> None:
 def _write_truth(out: Path, scene: RailScene) -> None:
     fish = [visit.fish for visit in scene.visits]
     lengths = [(one.track_id, f"{one.length_mm:.6f}") for one in fish]
-    _write_csv(out / "truth.csv", ("track_id", "length_mm"), lengths)
-    _write_csv(out / "truth_frames.csv", TRUTH_FRAMES_COLUMNS, _truth_rows(scene))
+    write_table(out / "truth.csv", ("track_id", "length_mm"), lengths)
+    write_table(out / "truth_frames.csv", TRUTH_FRAMES_COLUMNS, _truth_rows(scene))
 
 
 def _truth_rows(scene: RailScene) -> Iterable[tuple[int | str, ...]]:
@@ -153,13 +153,6 @@ def _truth_rows(scene: RailScene) -> Iterable[tuple[int | str, ...]]:
                 f"{posed.bending_ratio:.6f}",
                 f"{bend_deg:.3f}",
             )
-
-
-def _write_csv(path: Path, columns: Iterable[str], rows: Iterable[Iterable[int | str]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(rows)
 
 
 def _write_film(out: Path, scene: RailScene) -> None:
