@@ -138,11 +138,7 @@ def _seal_log(folder: Path, name: str, lines: Sequence[str]) -> None:
 
 
 def _add(folder: Path, more: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
-    try:
-        made = read_provenance(folder)
-    except ValueError:
-        return
-    if made is not None:
+    if (made := _if_readable(folder)) is not None:
         _write(folder, made | more(made))
 
 
@@ -171,20 +167,21 @@ def _write(folder: Path, made: dict[str, Any]) -> Path:
 
 def read_origin(folder: Path) -> Path | None:
     """The source of a folder's files: the folder itself where a run wrote it; None: unknown."""
-    try:
-        made = read_provenance(folder)
-    except ValueError:
-        return None
+    made = _if_readable(folder)
     return None if made is None else Path(made.get("origin") or folder)
 
 
 def known_files(folder: Path) -> Sequence[str]:
     """The names of the files that provenance.json knows; none where it is missing or damaged."""
-    try:
-        made = read_provenance(folder)
-    except ValueError:
-        return []
+    made = _if_readable(folder)
     return [] if made is None else list(made["files"])
+
+
+def _if_readable(folder: Path) -> dict[str, Any] | None:
+    try:
+        return read_provenance(folder)
+    except ValueError:
+        return None
 
 
 def read_provenance(folder: Path) -> dict[str, Any] | None:
