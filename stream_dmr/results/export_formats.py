@@ -69,9 +69,10 @@ class Export:
     ) -> None:
         """With `overwrite`, existing files are replaced, except for those of a run."""
         self._path = recording
+        self._database = database_of(recording)
         self._recording = open_recordings([recording])
         self._selection = selection
-        self._reviewed = ReviewedMessages(self._recording, database_of(recording), selection)
+        self._reviewed = ReviewedMessages(self._recording, self._database, selection)
         self._written: list[Path] = []
         self._overwrite = overwrite
         self._earlier: set[Path] = set()  # exported before from the same recording
@@ -151,8 +152,7 @@ class Export:
             if running is not None:
                 frames.write(make_record(running[message.frame_index], RecordingSettings()))
         frames.close()
-        database = database_of(self._path)
-        fish = [] if database is None else read_stored_fish(database)
+        fish = [] if self._database is None else read_stored_fish(self._database)
         finished += [one.estimate for one in fish if one.estimate.track_id in edited]
         doubtful = {one.estimate.track_id for one in fish if one.may_count_twice}
         write_lengths(out / "lengths.csv", finished, may_count_twice=doubtful)
@@ -163,13 +163,8 @@ class Export:
     def fish(self, out: Path, settings: FisheriesSettings, *, format: TableFormat) -> Path:
         """Write fish.csv (or .parquet): lengths as fisheries use them, verdicts, inputs."""
         self._require_writable(out / f"fish.{format}")
-        template = self.template
-        records = [
-            fish_record(fish, template, settings)
-            for fish in read_fish(self._path, self._recording, self._selection)
-        ]
-        database = database_of(self._path)
-        checks = {} if database is None else last_checks(database)
+        records = [fish_record(fish, self.template, settings) for fish in self._all_fish()]
+        checks = {} if self._database is None else last_checks(self._database)
         for record in records:
             if (check := checks.get(record["calibration_sha256"])) is not None:
                 record["scale_error_percent"] = check.error_percent
@@ -208,14 +203,13 @@ class Export:
         make, columns = (
             (wcpfc_row, WCPFC_COLUMNS) if agency is Agency.WCPFC else (rdbes_row, RDBES_COLUMNS)
         )
-        template = self.template
-        rows = [make(one, template) for one in self._all_fish() if one.counts]
+        rows = [make(one, self.template) for one in self._all_fish() if one.counts]
         self._written.append(write_rows(make_folder(out) / path.name, columns, rows))
         return path
 
     def hauls(self, out: Path) -> Path:
         """Write hauls.csv: each haul with its effort. Raises OutputError without a lengths.db."""
-        path, database = out / "hauls.csv", database_of(self._path)
+        path, database = out / "hauls.csv", self._database
         if database is None:
             raise OutputError(
                 f"{self._path}: expected the folder of a run, which has a lengths.db; give that"
@@ -230,7 +224,7 @@ class Export:
 
     def _require_selected(self) -> None:
         """Refuse a recording or a selection of nothing; lengths.db may know more fish than it."""
-        if database_of(self._path) is None:
+        if self._database is None:
             require_messages(self._recording)
         if self._selection.is_everything:
             return
@@ -268,8 +262,10 @@ class Export:
 
     def provenance(self, out: Path) -> Path:
         """Write provenance.json: the inputs and checksums of all files written into `out`."""
-        database = database_of(self._path)
-        runs = {"": run_facts(self._recording.header)} if database is None else read_runs(database)
+        if self._database is None:
+            runs = {"": run_facts(self._recording.header)}
+        else:
+            runs = read_runs(self._database)
         sealed = seal_files(out, self._written, runs=runs, origin=str(self._path))
         self._new.clear()
         return sealed
