@@ -116,32 +116,26 @@ def open_batch(
     out: Path, *, config: Path | None = None, as_measured: bool = False
 ) -> tuple[list[RunReport], list[str]]:
     """A report of each video that is done, and a line for each that failed. Raises UserError."""
-    rows = read_videos(out)
-    done = [row["name"] for row in rows if row["status"] == DONE]
-    failed = [f"{row['name']}: {row['reason']}" for row in rows if row["status"] == FAILED]
+    done = run_folders([out])
     if not done:
         raise UserError(f"{out / VIDEOS}: expected videos that are done, got none")
-    folders = (out / VIDEO_FOLDERS / name for name in done)
-    reports = [open_report(one, config=config, as_measured=as_measured) for one in folders]
+    reports = [open_report(one, config=config, as_measured=as_measured) for one in done]
     _require_one_template(reports, out)
+    rows = read_videos(out)
+    failed = [f"{row['name']}: {row['reason']}" for row in rows if row["status"] == FAILED]
     return reports, failed
 
 
 def run_folders(folders: Sequence[Path]) -> list[Path]:
     """The folders of runs, those of batches taken apart into their videos that are done."""
-    return [
-        run
-        for folder in folders
-        for run in (
-            [
-                folder / VIDEO_FOLDERS / row["name"]
-                for row in read_videos(folder)
-                if row["status"] == DONE
-            ]
-            if is_batch(folder)
-            else [folder]
-        )
-    ]
+    found = list[Path]()
+    for folder in folders:
+        if is_batch(folder):
+            done = (row["name"] for row in read_videos(folder) if row["status"] == DONE)
+            found += [folder / VIDEO_FOLDERS / name for name in done]
+        else:
+            found.append(folder)
+    return found
 
 
 def open_folders(
