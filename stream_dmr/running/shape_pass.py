@@ -100,24 +100,26 @@ def is_mesh_theirs(
         return True
     mesh = mesh_form(template)
     observer.stage(f"comparing the fish with {template.name}")
-    stocks = learn_shapes(
-        crops,
-        template,
-        mesh,
-        config.fit_mesh,
-        calibration=calibration,
-        species=config.species,
-        refits=False,
-    )
-    if stocks is None or not all(map(is_like_mesh, stocks)):
-        observer.warn(
-            f"{not_like_mesh(mesh, stocks)}; they are measured by the shapes learnt from them, as "
-            "with --template auto"
+    stocks = None
+    for refits in (False, True):  # a mesh is only disbelieved after the longer look
+        stocks = learn_shapes(
+            crops,
+            template,
+            mesh,
+            config.fit_mesh,
+            calibration=calibration,
+            species=config.species,
+            refits=refits,
         )
-        return False
-    for line in describe(mesh, stocks):
-        observer.notice(line)
-    return True
+        if stocks is not None and all(map(is_like_mesh, stocks)):
+            for line in describe(mesh, stocks):
+                observer.notice(line)
+            return True
+    observer.warn(
+        f"{not_like_mesh(mesh, stocks)}; they are measured by the shapes learnt from them, as "
+        "with --template auto"
+    )
+    return False
 
 
 def _learn_aloud(
