@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -81,14 +81,10 @@ def open_replay_outputs(
     if stocks is not None:
         require_free_names(out, overwrite=request.overwrite)
     prepare_folder(out, overwrite=request.overwrite)
-    known = recorded.facts
-    facts = run_facts(
-        header,
-        vessel="" if known is None else known.vessel,
-        trip="" if known is None else known.trip,
-        haul="" if known is None else known.haul,
-        utc_zero_ns=None if known is None else known.utc_zero_ns,
-    )
+    facts, known = run_facts(header), recorded.facts
+    if known is not None:
+        told = {name: getattr(known, name) for name in ("vessel", "trip", "haul", "utc_zero_ns")}
+        facts = replace(facts, **told)
     with ExitStack() as stack:
         stack.enter_context(sealed(out, with_recordings=True, on_notice=observer.warn))
         store = stack.enter_context(closing(LengthStore(out, facts, signer=signer)))

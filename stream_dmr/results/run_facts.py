@@ -62,15 +62,8 @@ def cut_short(facts: RunFacts) -> str:
     return f"{share} of {facts.source} were measured; what ended the run: {facts.ended_by}"
 
 
-def run_facts(
-    header: RunHeader,
-    *,
-    vessel: str = "",
-    trip: str = "",
-    haul: str = "",
-    utc_zero_ns: int | None = None,
-) -> RunFacts:
-    """The facts of the run with this header; each hash is of the bytes that the recording holds."""
+def run_facts(header: RunHeader) -> RunFacts:
+    """The facts that a header has of its run; each hash is of the bytes of the recording."""
     parts = header.attachments()
     hashes = {name: sha256(data).hexdigest() for name, data in parts.items()}
     given = {} if header.inputs is None else header.inputs.metadata()
@@ -82,9 +75,5 @@ def run_facts(
         "config_sha256": hashes["config.toml"],
         "calibration_sha256": hashes.get("calibration.yaml", ""),
         "template_sha256": hashes["template.pb"],
-        "vessel": vessel,
-        "trip": trip,
-        "haul": haul,
-        "utc_zero_ns": utc_zero_ns,
     }
     return RunFacts(**facts)

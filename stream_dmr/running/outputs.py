@@ -1,13 +1,14 @@
 """Opens and closes everything that a run writes to."""
 
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LearntShapes, LocalizedFish
-from stream_dmr.recording.messages.run_header import RunStart
+from stream_dmr.recording.messages.run_header import RunHeader, RunStart
+from stream_dmr.recording.messages.sink import SinkFactory
 from stream_dmr.recording.messages.sink_states import SinkStates
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.segments.recording_files import open_recording_files
@@ -59,8 +60,8 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
         out, overwrite=request.overwrite, resume=resume, waits_for_room=is_endless
     )
     header, states = inputs.header(), SinkStates()
-    facts = run_facts(
-        header,
+    facts = replace(
+        run_facts(header),
         vessel=request.vessel,
         trip=request.trip,
         haul=request.haul,
@@ -99,16 +100,12 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
             on_closed=files.changed,
             states=states,
         )
-        recorder = Recorder(
-            out,
+        recorder = _open_recorder(
+            inputs,
             replace(header, runs=(_start_of(inputs, store),)),
-            config.recording,
-            live=request.live,
-            sinks=[FramesTable(out, resume=resume, is_endless=is_endless)],
             files=segments if is_endless else open_recording_files,
             on_refusal=on_refusal,
             states=states,
-            photographs=config.recording.keeps_photographs(is_live=inputs.source.is_live),
         )
         stack.enter_context(recorder)
         stack.enter_context(closing(retention))
@@ -137,6 +134,29 @@ def _free_space(inputs: Inputs, files: SignedFiles, observer: RunObserver) -> Re
     with suppress(OSError, OutputError):  # it tries again while the run goes on
         retention.free_space()
     return retention
+
+
+def _open_recorder(
+    inputs: Inputs,
+    header: RunHeader,
+    *,
+    files: SinkFactory,
+    on_refusal: Callable[[str], None] | None,
+    states: SinkStates,
+) -> Recorder:
+    request, settings = inputs.request, inputs.config.recording
+    frames = FramesTable(request.out, resume=inputs.resumes, is_endless=inputs.is_endless)
+    return Recorder(
+        request.out,
+        header,
+        settings,
+        live=request.live,
+        sinks=[frames],
+        files=files,
+        on_refusal=on_refusal,
+        states=states,
+        photographs=settings.keeps_photographs(is_live=inputs.source.is_live),
+    )
 
 
 def _start_of(inputs: Inputs, store: LengthStore) -> RunStart:

@@ -36,7 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with closing(McapSink(out / "recording.mcap", header(), flush_s=0.0)) as sink:
         for message in run(NUM_FRAMES):
             sink.write(make_record(message, SETTINGS))
-    with closing(LengthStore(out, run_facts(header(), vessel="Sea Bird"))) as store:
+    with closing(LengthStore(out, replace(run_facts(header()), vessel="Sea Bird"))) as store:
         store.add(fish(1), flags=["the camera seems bumped"])
     return out
 
