@@ -2,7 +2,8 @@
 
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.nodes.localize import Localize
 from stream_dmr.nodes.smooth_length import SmoothLength
 from stream_dmr.results.learnt_meshes import LEARNT, MADE_BY_RUN
+from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.run_facts import ENDLESS_STOPPED, SOURCE_ENDED, STOPPED
 from stream_dmr.running.config import Config
 from stream_dmr.running.drift_alarms import DriftAlarms
@@ -103,23 +105,11 @@ def _measure(
             ),
         ]
         if inputs.is_endless:  # no frame of a camera shall wait for a compiler
-            fitter = Fitter(
-                inputs.template,
-                inputs.config.fit_mesh,
-                with_covariance=_records_covariance(inputs.config),
-            )
-            compile_kernels(fitter)
+            _compile_kernels_for(inputs)
         with open_outputs(inputs, observer) as outputs:
             crop_fish.number_after(outputs.store.before.track_id)
             continue_tracks(nodes, outputs.interrupted)
-            if inputs.candidates is not None and inputs.candidates.are_learnt:
-                save_stocks(
-                    inputs.template,
-                    inputs.candidates,
-                    request.out / LEARNT,
-                    made_by=MADE_BY_RUN,
-                    source=inputs.source.name,
-                )
+            _save_learnt_meshes(inputs)
             _report_start(inputs, outputs, observer)
             observer.begin(inputs.source.num_frames)
             seen = SeenFish()
@@ -151,6 +141,27 @@ def _has_the_right_mesh(inputs: Inputs, seen: SeenFish, observer: RunObserver) -
         calibration=inputs.calibration,
         observer=observer,
     )
+
+
+def _compile_kernels_for(inputs: Inputs) -> None:
+    fitter = Fitter(
+        inputs.template,
+        inputs.config.fit_mesh,
+        with_covariance=_records_covariance(inputs.config),
+    )
+    compile_kernels(fitter)
+
+
+def _save_learnt_meshes(inputs: Inputs) -> None:
+    """Write the meshes of what the first pass learnt, if anything, into the run's folder."""
+    if inputs.candidates is not None and inputs.candidates.are_learnt:
+        save_stocks(
+            inputs.template,
+            inputs.candidates,
+            inputs.request.out / LEARNT,
+            made_by=MADE_BY_RUN,
+            source=inputs.source.name,
+        )
 
 
 def _report_start(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> None:
@@ -239,7 +250,7 @@ def _run_chain(
     shapes_s: float,
     stop: threading.Event,
 ) -> RunSummary:
-    request, began = inputs.request, time.perf_counter()
+    began = time.perf_counter()
     outputs.store.count_frames(inputs.source.num_frames)
     writer = _result_writer(inputs, outputs, on_notice=observer.warn)
     policy = ErrorPolicy(is_endless=inputs.is_endless, on_notice=observer.warn)
@@ -268,24 +279,16 @@ def _run_chain(
             receiver.frame_done()
 
     try:
-        counters = run_chain(
-            inputs.reader,
-            nodes,
-            on_message=on_message,
-            on_frame=on_frame,
-            on_start=observer.attach,
-            on_failure=policy.continues_after,
-            stop=stop,
-        )
-        outputs.store.end(_end_of(inputs, stop), promised=_frames_received(inputs))
-    except UserError as error:
-        outputs.store.end(f"an error: {error}", promised=_frames_received(inputs))
-        if not isinstance(error, OutputError):  # which says so itself
-            error.add_note(f"what was computed before is kept in {request.out}")
-        raise
-    except BaseException as error:
-        outputs.store.end(f"an error: {type(error).__name__}: {error}")
-        raise
+        with _noting_the_end(inputs, outputs.store, stop):
+            counters = run_chain(
+                inputs.reader,
+                nodes,
+                on_message=on_message,
+                on_frame=on_frame,
+                on_start=observer.attach,
+                on_failure=policy.continues_after,
+                stop=stop,
+            )
     finally:
         if shapes is not None:
             shapes.close()
@@ -302,7 +305,7 @@ def _run_chain(
         calibration=inputs.calibration,
         counters=counters,
         files=[
-            request.out / name
+            inputs.request.out / name
             for name in result_names(inputs.config.recording, is_endless=inputs.is_endless)
         ],
     )
@@ -314,6 +317,22 @@ def _begin_positions(inputs: Inputs, outputs: Outputs, observer: RunObserver) ->
         is_live = inputs.source.is_live
         after_ns = outputs.store.resume_after_ns() if is_live else 0
         inputs.positions.begin(after_ns=after_ns)
+
+
+@contextmanager
+def _noting_the_end(inputs: Inputs, store: LengthStore, stop: threading.Event) -> Generator[None]:
+    """Let lengths.db say what ended the block."""
+    try:
+        yield
+    except UserError as error:
+        store.end(f"an error: {error}", promised=_frames_received(inputs))
+        if not isinstance(error, OutputError):  # which says so itself
+            error.add_note(f"what was computed before is kept in {inputs.request.out}")
+        raise
+    except BaseException as error:
+        store.end(f"an error: {type(error).__name__}: {error}")
+        raise
+    store.end(_end_of(inputs, stop), promised=_frames_received(inputs))
 
 
 def _end_of(inputs: Inputs, stop: threading.Event) -> str:
