@@ -6,7 +6,6 @@ import io
 import itertools
 import os
 import re
-import warnings
 import weakref
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager, suppress
@@ -14,17 +13,9 @@ from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
 from stream_dmr.errors import OutputError
 
 MAX_TEXT_BYTES = 1_000_000  # chosen: many times what any settings or calibration take
-MAX_PIXELS = 150_000_000  # chosen: the largest cameras have some 100 megapixels
-PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
-
-_JPEG_START = b"\xff\xd8"
-_JPEG_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # not a byte of pixels, nor a restart
-_JPEG_END = b"\xd9"
 
 
 class TransactionalFile:
@@ -145,42 +136,6 @@ def read_small(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
     if len(data) > max_bytes:
         raise OSError(errno.EFBIG, f"more than {max_bytes // 1000} kB")
     return data
-
-
-def size_if_huge(path: Path) -> str:
-    """Width and height of a picture too large to be decoded, by its header; "" of any other file.
-
-    Its pixels alone would take half a gigabyte and more.
-    """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path) as picture:
-                width, height = picture.size
-    except Image.DecompressionBombError:
-        return f"more than {MAX_PIXELS // 10**6} megapixels"
-    except (OSError, ValueError, SyntaxError):
-        return ""
-    return f"{width}x{height} px" if width * height > MAX_PIXELS else ""
-
-
-def is_cut_off(path: Path) -> bool:
-    """True for a JPEG that ends before its end marker, whose rest OpenCV would fill with grey.
-
-    Its segments are walked, since a thumbnail in one has an end marker of its own. Of other kinds
-    of pictures OpenCV refuses what is cut off. Raises OSError.
-    """
-    with path.open("rb") as file:
-        if file.read(2) != _JPEG_START:
-            return False
-        content = file.read()
-    position = 0
-    while found := _JPEG_MARKER.search(content, position):
-        position = found.end()
-        if found[0][-1:] == _JPEG_END:
-            return False
-        position += int.from_bytes(content[position : position + 2])  # the segment's length
-    return True
 
 
 def is_locked(folder: Path) -> bool:

@@ -87,6 +87,7 @@ ROOMS = [
     "stream_dmr.sources",
     "stream_dmr.csv_file",
     "stream_dmr.files",
+    "stream_dmr.pictures",
     "stream_dmr.compiled",
     "stream_dmr.messages",
     "stream_dmr.reasons",

@@ -3,8 +3,6 @@ import os
 import subprocess
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,7 +10,6 @@ from hypothesis import strategies as st
 from stream_dmr.errors import OutputError
 from stream_dmr.files import (
     TransactionalFile,
-    is_cut_off,
     make_folder,
     natural_order,
     rename_durably,
@@ -119,36 +116,3 @@ def test_the_hash_of_files_is_that_of_sha256sum(tmp_path: Path):
         ["sha256sum", "a", "b"], cwd=tmp_path, capture_output=True, check=True
     ).stdout
     assert sha256_of_files(tmp_path.iterdir()) == hashlib.sha256(printed).hexdigest()
-
-
-JPEGS = {
-    "plain": [],
-    "progressive": [cv2.IMWRITE_JPEG_PROGRESSIVE, 1],
-    "with restarts": [cv2.IMWRITE_JPEG_RST_INTERVAL, 2],
-}
-
-
-def jpeg(kind: str) -> bytes:
-    """A picture whose segments hold a thumbnail, as those of cameras do."""
-    noise = np.random.default_rng(0).integers(0, 255, (64, 48, 3)).astype(np.uint8)
-    content, small = (cv2.imencode(".jpg", n, JPEGS[kind])[1].tobytes() for n in (noise, noise[:9]))
-    segment = b"\xff\xe1" + (len(small) + 2).to_bytes(2) + small
-    return content[:2] + segment + content[2:]
-
-
-@pytest.mark.parametrize("kind", JPEGS)
-@given(share=st.floats(0, 1, exclude_max=True), rest=st.binary(max_size=50))
-def test_a_jpeg_is_cut_off_before_its_end_and_whole_with_more_after_it(
-    tmp_path_factory: pytest.TempPathFactory, kind: str, share: float, rest: bytes
-):
-    path, content = tmp_path_factory.getbasetemp() / "picture.jpg", jpeg(kind)
-    path.write_bytes(content + rest)
-    assert not is_cut_off(path)
-    path.write_bytes(content[: 2 + int(share * (len(content) - 2))])
-    assert is_cut_off(path)
-
-
-def test_other_files_are_not_taken_for_cut_off_jpegs(tmp_path: Path):
-    for content in (b"", b"\xff", b"\x89PNG and so on"):
-        (tmp_path / "other").write_bytes(content)
-        assert not is_cut_off(tmp_path / "other")

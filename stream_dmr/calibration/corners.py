@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from stream_dmr.errors import CalibrationError
-from stream_dmr.files import is_cut_off, size_if_huge
+from stream_dmr.pictures import read_picture, size_if_huge
 
 Board = tuple[int, int]  # inner corners a row, and a column
 
@@ -37,12 +37,10 @@ def read_grey(path: Path) -> UInt8[np.ndarray, "H W"]:
     if huge := size_if_huge(path):
         raise CalibrationError(f"{path}: too large: {huge}")
     try:
-        content = np.frombuffer(path.read_bytes(), np.uint8)
+        picture = read_picture(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     except OSError as error:
         raise CalibrationError(f"{path}: can't be read: {error.strerror}") from error
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    picture = cv2.imdecode(content, flags) if len(content) else None
-    if picture is None or is_cut_off(path):
+    if picture is None:
         raise CalibrationError(f"{path}: no picture, or a broken one")
     return np.asarray(picture, np.uint8)
 

@@ -116,7 +116,7 @@ def _pictures(source: str) -> Iterator["np.ndarray"]:
     import cv2
 
     from stream_dmr.calibration.corners import read_grey
-    from stream_dmr.files import PICTURE_SUFFIXES
+    from stream_dmr.pictures import PICTURE_SUFFIXES
     from stream_dmr.sources.open_source import open_source
     from stream_dmr.sources.read_settings import ReadFramesSettings
 

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from stream_dmr.errors import SourceError
-from stream_dmr.files import MAX_PIXELS, PICTURE_SUFFIXES, is_cut_off, natural_order, size_if_huge
+from stream_dmr.files import natural_order
 from stream_dmr.messages import Frame
+from stream_dmr.pictures import MAX_PIXELS, PICTURE_SUFFIXES, read_picture, size_if_huge
 from stream_dmr.sources.source import Source, nominal_ns
 
 OtherSizes = Literal["refuse", "leave_out", "take"]
@@ -116,10 +117,11 @@ def _read_picture(path: Path) -> np.ndarray | None:
         raise SourceError(
             f"{path}: expected a picture of {MAX_PIXELS // 10**6} megapixels or less, got {huge}"
         )
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    if picture is None or picture.dtype.name not in _DEPTHS or is_cut_off(path):
+    try:
+        picture = read_picture(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    except OSError:
         return None
-    return picture
+    return picture if picture is not None and picture.dtype.name in _DEPTHS else None
 
 
 def _full_scale_of(paths: list[Path]) -> int:

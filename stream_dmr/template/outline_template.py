@@ -9,7 +9,7 @@ import trimesh
 from jaxtyping import Bool, Float
 
 from stream_dmr.errors import TemplateError
-from stream_dmr.files import MAX_PIXELS, size_if_huge
+from stream_dmr.pictures import MAX_PIXELS, size_if_huge
 from stream_dmr.template.body_forms import CENTER, JOINTS, BodyForm, load_body_forms
 from stream_dmr.template.fish_outline import FishOutline, fish_outline
 from stream_dmr.template.ring_mesh import ring_angles, ring_mesh, ring_places

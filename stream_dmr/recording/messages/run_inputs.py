@@ -8,7 +8,8 @@ from itertools import pairwise
 from pathlib import Path
 
 from stream_dmr.errors import SourceError
-from stream_dmr.files import PICTURE_SUFFIXES, sha256_of, sha256_of_files
+from stream_dmr.files import sha256_of, sha256_of_files
+from stream_dmr.pictures import PICTURE_SUFFIXES
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

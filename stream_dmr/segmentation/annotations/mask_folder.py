@@ -14,7 +14,7 @@ from jaxtyping import Bool, Integer
 from PIL import Image
 
 from stream_dmr.errors import AnnotationError
-from stream_dmr.files import PICTURE_SUFFIXES
+from stream_dmr.pictures import PICTURE_SUFFIXES
 
 _FILE_NAME = re.compile(r"\d{6,}\.png")
 # What Pillow raises for a PNG that it cannot decode.

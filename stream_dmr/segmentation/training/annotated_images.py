@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from stream_dmr.errors import AnnotationError
-from stream_dmr.files import MAX_PIXELS, PICTURE_SUFFIXES, size_if_huge
+from stream_dmr.pictures import MAX_PIXELS, PICTURE_SUFFIXES, size_if_huge
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

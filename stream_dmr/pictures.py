@@ -1,0 +1,61 @@
+"""Pictures from files: which files are some, those that are too large, and those cut off."""
+
+import re
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+MAX_PIXELS = 150_000_000  # chosen: the largest cameras have some 100 megapixels
+PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
+
+_JPEG_START = b"\xff\xd8"
+_JPEG_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # not a byte of pixels, nor a restart
+_JPEG_END = b"\xd9"
+
+
+def size_if_huge(path: Path) -> str:
+    """Width and height of a picture too large to be decoded, by its header; "" of any other file.
+
+    Its pixels alone would take half a gigabyte and more.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path) as picture:
+                width, height = picture.size
+    except Image.DecompressionBombError:
+        return f"more than {MAX_PIXELS // 10**6} megapixels"
+    except (OSError, ValueError, SyntaxError):
+        return ""
+    return f"{width}x{height} px" if width * height > MAX_PIXELS else ""
+
+
+def read_picture(path: Path, flags: int) -> np.ndarray | None:
+    """A picture by OpenCV's `flags`; None of a file that can't be decoded, or not to its end.
+
+    Raises OSError.
+    """
+    content = path.read_bytes()
+    if not content or is_cut_off(content):
+        return None
+    return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+
+
+def is_cut_off(content: bytes) -> bool:
+    """True for a JPEG that ends before its end marker, whose rest OpenCV would fill with grey.
+
+    Its segments are walked, since a thumbnail in one has an end marker of its own. Of other kinds
+    of pictures OpenCV refuses what is cut off.
+    """
+    if not content.startswith(_JPEG_START):
+        return False
+    position = len(_JPEG_START)
+    while found := _JPEG_MARKER.search(content, position):
+        position = found.end()
+        if found[0][-1:] == _JPEG_END:
+            return False
+        position += int.from_bytes(content[position : position + 2])  # the segment's length
+    return True
