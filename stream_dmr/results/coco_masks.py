@@ -1,6 +1,7 @@
 """Masks as COCO JSON with run lengths, in the pixels of their frames."""
 
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -9,21 +10,22 @@ from jaxtyping import Bool
 
 from stream_dmr.camera import crop_from_frame, frame_from_crop
 from stream_dmr.messages import FishCrop
+from stream_dmr.pictures import PICTURE_SUFFIXES
 from stream_dmr.recording.messages.picture_codec import EncodedPicture
 
 
 def coco_masks(
-    pictures: Iterable[tuple[int, EncodedPicture]],
+    pictures: Iterable[tuple[int, str, EncodedPicture]],
     crops: Iterable[FishCrop],
     codes: Mapping[int, str],
 ) -> dict[str, Any]:
-    """COCO's object; `pictures` by frame index, `codes` by track id, "" where there is none.
+    """COCO's object; `pictures` with frame index and source, `codes` by track id, "" for none.
 
     Categories are the codes, and "fish" where there is none.
     """
     names = ["fish", *sorted({code for code in codes.values() if code})]
     return {
-        "images": [_image(frame_index, picture) for frame_index, picture in pictures],
+        "images": [_image(*picture) for picture in pictures],
         "annotations": [
             _annotation(
                 crop, number=k, category=1 + names.index(codes.get(crop.track_id) or "fish")
@@ -83,9 +85,11 @@ def _extent(crop: FishCrop) -> tuple[int, int, int, int]:
     return int(x0), int(y0), int(x1), int(y1)
 
 
-def _image(frame_index: int, picture: EncodedPicture) -> dict[str, Any]:
-    name, size = f"{frame_index:06d}.png", {"width": picture.width, "height": picture.height}
-    return {"id": frame_index, "file_name": name, **size}
+def _image(frame_index: int, source: str, picture: EncodedPicture) -> dict[str, Any]:
+    """A picture of a folder has its own name, a frame of a video its number."""
+    is_picture = "://" not in source and Path(source).suffix.lower() in PICTURE_SUFFIXES
+    name = source if is_picture else f"{frame_index:06d}.png"
+    return {"id": frame_index, "file_name": name, "width": picture.width, "height": picture.height}
 
 
 def _annotation(crop: FishCrop, *, number: int, category: int) -> dict[str, Any]:

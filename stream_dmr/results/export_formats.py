@@ -126,7 +126,11 @@ class Export:
         self._require_writable(path)
         frames = decoded_messages(self._recording, [Frame], self._selection)
         coco = coco_masks(
-            ((message.frame_index, stored_picture(payload)) for message, payload in frames),
+            (
+                (frame.frame_index, frame.source, stored_picture(payload))
+                for frame, payload in frames
+                if isinstance(frame, Frame)
+            ),
             (crop for crop in self._messages(FishCrop) if isinstance(crop, FishCrop)),
             {one.estimate.track_id: sure_code(one) for one in self._all_fish()},
         )
