@@ -30,6 +30,7 @@ from stream_dmr.csv_file import write_table
 from stream_dmr.errors import OutputError
 from stream_dmr.files import make_folder, replacing
 from stream_dmr.results.folder_lock import require_unlocked
+from stream_dmr.results.lengths_database import NAME as DATABASE
 from stream_dmr.results.own_files import has_run_name
 from stream_dmr.results.provenance import seal_files
 
@@ -58,8 +59,12 @@ def run_batch(
 
     Failed videos are tried again by the next call. Setting `stop` ends the batch soon; unfinished
     videos begin again with the next call. Raises OutputError where `out` can't be written to,
-    another batch is writing there, or a folder of its results holds files of the user.
+    another batch is writing there, it is a run's, or a folder in it holds files of the user.
     """
+    if (out / DATABASE).exists():  # whose fish reports and reviews would no longer show
+        raise OutputError(
+            f"{out}: expected a folder for a batch, found {DATABASE} of a run; choose another --out"
+        )
     make_folder(out / VIDEO_FOLDERS)
     _remove_unfinished(out)
     _require_own_folders(jobs, out)

@@ -336,6 +336,12 @@ def test_a_folder_with_files_of_the_user_is_never_replaced(season: Path, tmp_pat
     assert picture.read_bytes() == b"mine"
 
 
+def test_the_folder_of_a_run_takes_no_batch(season: Path, tmp_path: Path):
+    with pytest.raises(OutputError, match=r"lengths\.db of a run"):
+        measure(jobs_of(season, tmp_path, row("broken")), season / "alone")
+    assert not (season / "alone" / "videos").exists()
+
+
 def test_only_tables_of_the_data_set_are_removed_from_it(season: Path, tmp_path: Path):
     picture = tmp_path / "dataset" / "frames" / "000001.png"
     picture.parent.mkdir(parents=True)
