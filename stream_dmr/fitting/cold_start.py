@@ -27,7 +27,6 @@ _FLIPS_RAD = (0.0, np.pi)  # which end is the head?
 # Joints turn further than their share of a bend, since their weights never get to 0 and 1. All
 # numbers here were chosen by trial: a start has to be near enough for the fit to find the rest.
 _JOINT_SHARE = 1.25
-NUM_STARTS = len(_BENDS_RAD) * len(_ROLLS_RAD) * len(_FLIPS_RAD)
 
 
 def cold_starts(target: Target, template: Template) -> Float[np.ndarray, "B P"]:

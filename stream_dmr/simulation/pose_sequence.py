@@ -37,21 +37,6 @@ def draw_poses(
     ]
 
 
-def draw_still_pose(
-    rng: np.random.Generator, preset: Preset, *, center_world_mm: Float[np.ndarray, "3"]
-) -> HangingPose:
-    """One pose from the middle of a visit; only its distance from the plane is not moved."""
-    pose = draw_poses(rng, preset, lane_mm=0.0, num_frames=15)[7]
-    center = center_world_mm + np.array([0.0, 0.0, pose.center_world_mm[2]])
-    return HangingPose(
-        bends=pose.bends,
-        yaw_rad=pose.yaw_rad,
-        sway_rad=pose.sway_rad,
-        tilt_rad=pose.tilt_rad,
-        center_world_mm=center,
-    )
-
-
 def _draw_bends(
     rng: np.random.Generator, preset: Preset, seconds: Float[np.ndarray, "T"]
 ) -> Float[np.ndarray, "T 3 K"]:

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float
 
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
-from stream_dmr.simulation.pose_sequence import draw_poses, draw_still_pose
+from stream_dmr.simulation.pose_sequence import draw_poses
 from stream_dmr.simulation.presets import Preset, find_preset
 from stream_dmr.simulation.simulated_body import HALIBUT, SimulatedBody
 from stream_dmr.simulation.simulated_fish import (
@@ -27,7 +26,7 @@ _VISIT_SLOTS = 2.4  # of one fish
 _MARGIN_SLOTS = 0.4  # before the first and after the last fish
 
 # Keys of independent streams of random numbers, so that no part changes another's numbers.
-_CALIBRATION, _FISH, _VIEW = range(3)
+_CALIBRATION, _FISH = range(2)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -121,36 +120,6 @@ def draw_calibration(rng: np.random.Generator) -> Calibration:
     return Calibration(
         camera=Camera(width=WIDTH, height=HEIGHT, K=K, distortion=np.array(lens)),
         plane=ReferencePlane(rotation=rotation.astype(np.float64), translation_mm=middle),
-    )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SimulatedView:
-    """One random bent fish before a random camera: for tests and benchmarks without a video."""
-
-    calibration: Calibration
-    posed: PosedFish
-
-    @property
-    def length_mm(self) -> float:
-        """The fish's true length."""
-        return self.posed.fish.length_mm
-
-    @property
-    def vertices_px(self) -> Float[np.ndarray, "V 2"]:
-        """The body's vertices in the picture, lens distortion included."""
-        return self.calibration.camera.project(self.posed.vertices)
-
-
-def draw_view(*, preset: str, seed: int) -> SimulatedView:
-    """A random fish inside the picture; `render.draw_mask` gives its exact mask."""
-    rng = np.random.default_rng((seed, _VIEW))
-    calibration = draw_calibration(rng)
-    place = np.array([rng.uniform(-900.0, 900.0), rng.uniform(-500.0, 500.0), 0.0])
-    pose = draw_still_pose(rng, find_preset(preset), center_world_mm=place)
-    fish = draw_fish(rng, track_id=1)
-    return SimulatedView(
-        calibration=calibration, posed=pose_fish(fish, pose, calibration=calibration)
     )
 
 

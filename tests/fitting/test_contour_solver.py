@@ -30,7 +30,7 @@ from stream_dmr.fitting.contour.regularisers import GAUGE, prior_loss, regularis
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.mesh_levels import MeshLevels
-from stream_dmr.fitting.paper.skinning import Parameters, Rig, rest_parameters, rotation_matrices
+from stream_dmr.fitting.paper.skinning import Parameters, Rig, rotation_matrices
 from stream_dmr.fitting.parameters import LOG_SIZE, NUM_PER_JOINT, NUM_ROOT, Priors, rest_vector
 from stream_dmr.fitting.target import Target
 from stream_dmr.geometry import arc_length
@@ -42,6 +42,7 @@ from tests.support.shapes import (
     crop_of,
     fish_template,
     picture,
+    rest_parameters,
     seeds,
 )
 

@@ -13,8 +13,8 @@ from stream_dmr.fitting.paper.losses import (
     scale_loss,
     translation_loss,
 )
-from stream_dmr.fitting.paper.skinning import Parameters, deform, rest_parameters, spine
-from tests.support.shapes import fish_rig, random_flat, seeds
+from stream_dmr.fitting.paper.skinning import Parameters, deform, spine
+from tests.support.shapes import fish_rig, random_flat, rest_parameters, seeds
 
 RIG = fish_rig()
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stream_dmr.simulation.center_line import total_bend_rad
-from stream_dmr.simulation.pose_sequence import FPS, draw_poses, draw_still_pose
+from stream_dmr.simulation.pose_sequence import FPS, draw_poses
 from stream_dmr.simulation.presets import PRESETS, find_preset
 from stream_dmr.simulation.skin import draw_skin, noise
 
@@ -31,13 +31,6 @@ def test_a_fish_is_hauled_upwards():
     poses = draw_poses(np.random.default_rng(1), find_preset("clean"), lane_mm=0.0, num_frames=30)
     heights = np.array([pose.center_world_mm[1] for pose in poses])  # Y points down
     assert (np.diff(heights) < 0).all()
-
-
-def test_a_still_pose_hangs_where_it_is_put():
-    place = np.array([120.0, -40.0, 0.0])
-    pose = draw_still_pose(np.random.default_rng(2), find_preset("severe"), center_world_mm=place)
-    np.testing.assert_array_equal(pose.center_world_mm[:2], place[:2])
-    assert abs(pose.center_world_mm[2]) <= 25.0
 
 
 @pytest.mark.parametrize("grain_px", [(1.5, 1.5), (5.0, 14.0), (30.0, 12.0)])

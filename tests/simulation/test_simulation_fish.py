@@ -11,7 +11,7 @@ from stream_dmr.errors import UserError
 from stream_dmr.geometry import arc_length, bending_ratio
 from stream_dmr.simulation.center_line import NUM_STEPS, bend_center_line, total_bend_rad
 from stream_dmr.simulation.presets import PRESETS
-from stream_dmr.simulation.rail_scene import draw_calibration, draw_view, make_scene
+from stream_dmr.simulation.rail_scene import draw_calibration, make_scene
 from stream_dmr.simulation.render import draw_fish_patch, draw_mask, frame_window
 from stream_dmr.simulation.simulated_body import (
     CENTER_ARC,
@@ -22,6 +22,7 @@ from stream_dmr.simulation.simulated_body import (
 )
 from stream_dmr.simulation.simulated_fish import HangingPose, draw_fish, pose_fish
 from stream_dmr.simulation.species import SPECIES, find_species
+from tests.support.simulated_view import draw_view
 
 SEEDS = st.integers(0, 2**32 - 1)
 PRESET_NAMES = st.sampled_from(sorted(PRESETS))

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from stream_dmr.camera import Camera
 from stream_dmr.fitting.paper.silhouette import project, silhouette
-from stream_dmr.fitting.paper.skinning import Deformed, Rig, deform, rest_parameters, spine
+from stream_dmr.fitting.paper.skinning import Deformed, Rig, deform, spine
+from stream_dmr.fitting.parameters import rest_vector
 from stream_dmr.messages import CropQuality, FishCrop
 from stream_dmr.template.template import canonical_template
 
@@ -43,6 +44,11 @@ def fish_template(*, subdivisions=1, points=POINTS):
 
 def fish_rig(*, subdivisions=1, points=POINTS, device="cpu"):
     return Rig.from_template(fish_template(subdivisions=subdivisions, points=points), device=device)
+
+
+def rest_parameters(num_joints, *, batch=1):
+    """A batch of parameters of the template at rest, one body length at depth 1."""
+    return torch.as_tensor(rest_vector(num_joints)).repeat(batch, 1)
 
 
 def random_flat(rng, *, batch=1, num_joints=2, size=1.0):

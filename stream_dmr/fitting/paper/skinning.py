@@ -27,7 +27,6 @@ from stream_dmr.fitting.parameters import (
     NUM_ROOT,
     ROOT_ROTATION,
     ROOT_TRANSLATION,
-    rest_vector,
 )
 from stream_dmr.template.template import Template
 
@@ -56,27 +55,6 @@ class Parameters(NamedTuple):
             joint_log_scales=joints[..., JOINT_LOG_SCALE],
             joint_precisions=joints[..., JOINT_WEIGHT],
         )
-
-    def vector(self) -> Float[Tensor, "B P"]:
-        """The inverse of `from_vector`."""
-        root = torch.cat(
-            [self.root_rotation, self.root_translation, self.root_log_scale[:, None]], dim=1
-        )
-        joints = torch.cat(
-            [
-                self.joint_rotations,
-                self.joint_translations,
-                self.joint_log_scales[..., None],
-                self.joint_precisions,
-            ],
-            dim=2,
-        )
-        return torch.cat([root, joints.flatten(1)], dim=1)
-
-
-def rest_parameters(num_joints: int, *, batch: int = 1) -> Float[Tensor, "B P"]:
-    """A batch of parameters of the template at rest, one body length at depth 1."""
-    return torch.as_tensor(rest_vector(num_joints)).repeat(batch, 1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
