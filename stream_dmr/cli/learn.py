@@ -41,7 +41,7 @@ def learn_template(
     from stream_dmr.recording.reading.open_recording import open_recordings
     from stream_dmr.results.own_files import require_writable
     from stream_dmr.running.config import load_config, parse_config
-    from stream_dmr.running.shape_pass import save_stocks
+    from stream_dmr.running.shape_pass import save_stocks, stock_paths
 
     if out.suffix != ".ply":
         raise OutputError(f"--out {out}: expected a name that ends in .ply")
@@ -73,9 +73,8 @@ def learn_template(
             "recordings"
         )
     names = ", ".join(path.name for path in recordings)
-    others = [out.with_stem(f"{out.stem}-{n}") for n in range(2, len(stocks) + 1)]
-    pairs = [file for other in others for file in (other, other.with_suffix(".toml"))]
-    require_writable(*pairs, overwrite=overwrite)
+    for other in stock_paths(out, len(stocks))[1:]:
+        require_writable(other, other.with_suffix(".toml"), overwrite=overwrite)
     for path in save_stocks(mesh, stocks, out, made_by="stream-dmr learn-template", source=names):
         print(f"{path}: measure with --template {path}")
     for line in describe(forms, stocks):

@@ -163,7 +163,7 @@ def save_stocks(
         if is_mesh_by(made_by, mesh):
             for leftover in (mesh, mesh.with_suffix(".toml")):
                 leftover.unlink(missing_ok=True)
-    paths = [path, *(path.with_stem(f"{path.stem}-{n}") for n in range(2, len(stocks) + 1))]
+    paths = stock_paths(path, len(stocks))
     for stock, one in zip(stocks, paths, strict=True):
         save_template(
             replace(reshaped(template, stock.coefficients), name=stock.name),
@@ -173,3 +173,8 @@ def save_stocks(
             ),
         )
     return paths
+
+
+def stock_paths(path: Path, num_stocks: int) -> list[Path]:
+    """The names of the meshes of so many stocks: `path`, then PATH-2, PATH-3, ..."""
+    return [path, *(path.with_stem(f"{path.stem}-{n}") for n in range(2, num_stocks + 1))]

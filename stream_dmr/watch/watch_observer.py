@@ -1,5 +1,7 @@
 """Shows a run while it measures: its state, the server of the status page, the watchdog."""
 
+from contextlib import ExitStack, closing
+
 from stream_dmr.messages import Message
 from stream_dmr.results.scale_checks import ScaleAlarm
 from stream_dmr.running.pipeline import Chain
@@ -16,9 +18,7 @@ class WatchObserver(RunObserver):
     def __init__(self, observer: RunObserver) -> None:
         self._observer = observer
         self._state: RunState | None = None  # from `open` on
-        self._server: WatchServer | None = None
-        self._watchdog: SystemdWatchdog | None = None
-        self._alerts: AlertSender | None = None
+        self._opened = ExitStack()
 
     def open(self, run: OpenRun) -> None:
         """Serve as `[watch]` says; ConfigError or OutputError where it can't listen as asked."""
@@ -36,15 +36,17 @@ class WatchObserver(RunObserver):
             scale_alarm=ScaleAlarm(run.store.path, run.store.calibration_sha256).line,
         )
         state.continue_after(run.store)
-        self._server = WatchServer(state, settings) if settings.port else None
+        if settings.port:
+            server = self._opened.enter_context(closing(WatchServer(state, settings)))
+            self.address = server.address
         alerts = run.config.alerts
         if alerts.webhook or alerts.mail_to:
-            self._alerts = AlertSender(
+            sender = AlertSender(
                 alerts, run=run.out.resolve().name, problems=state.problems, on_notice=self.warn
             )
-        self._watchdog = SystemdWatchdog(lambda: not state.is_stuck())
+            self._opened.enter_context(closing(sender))
+        self._opened.enter_context(closing(SystemdWatchdog(lambda: not state.is_stuck())))
         self._state = state
-        self.address = None if self._server is None else self._server.address
 
     def attach(self, chain: Chain) -> None:
         """Show this chain's counters."""
@@ -54,15 +56,8 @@ class WatchObserver(RunObserver):
 
     def close(self) -> None:
         """Stop serving. Idempotent."""
-        if self._alerts is not None:
-            self._alerts.close()
-            self._alerts = None
-        if self._watchdog is not None:
-            self._watchdog.close()
-            self._watchdog = None
-        if self._server is not None:
-            self._server.close()
-            self._server = self.address = None
+        self._opened.close()
+        self.address = None
         self._observer.close()
 
     def take(self, message: Message) -> None:  # noqa: D102
