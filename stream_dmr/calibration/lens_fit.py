@@ -103,6 +103,11 @@ def _undetermined(got: str) -> CalibrationError:
     )
 
 
+def _require_finite(*parts: np.ndarray) -> None:
+    if not all(np.isfinite(part).all() for part in parts):
+        raise _undetermined("no finite solution")
+
+
 def _fit_pinhole(
     boards: list[BoardCorners], size: tuple[int, int]
 ) -> tuple[Camera, Float[np.ndarray, "2"]]:
@@ -128,8 +133,7 @@ def _calibrate_pinhole(
         )
     except cv2.error as error:
         raise _undetermined("no finite solution") from error
-    if not (np.isfinite(K).all() and np.isfinite(distortion).all() and np.isfinite(stds).all()):
-        raise _undetermined("no finite solution")
+    _require_finite(K, distortion, stds)
     return Camera(width=size[0], height=size[1], K=K, distortion=distortion.ravel()), stds.ravel()
 
 
@@ -150,8 +154,7 @@ def _fit_fisheye(
         stds = _fisheye_stds(boards, K, distortion, list(zip(rvecs, tvecs, strict=True)))
     except (cv2.error, np.linalg.LinAlgError) as error:
         raise _undetermined("no finite solution") from error
-    if not (np.isfinite(K).all() and np.isfinite(distortion).all() and np.isfinite(stds).all()):
-        raise _undetermined("no finite solution")
+    _require_finite(K, distortion, stds)
     camera = Camera(width=size[0], height=size[1], K=K, distortion=distortion, is_fisheye=True)
     return camera, stds[:2]
 

@@ -77,10 +77,10 @@ class _Changes:
 
 
 def _figures(state: "BoxState") -> str:
-    from stream_dmr.watch.fleet_page import disk_text, utc_text
+    from stream_dmr.watch.fleet_page import disk_text, minute_text
 
     if state.contact_ns is None or state.reading is None:
         return "never answered"
     if state.error:
-        return f"last contact {utc_text(state.contact_ns)}"
+        return f"last contact {minute_text(state.contact_ns)}"
     return f"{state.reading.fish_per_hour:.0f} fish an hour, {disk_text(state.reading)} free"

@@ -76,8 +76,7 @@ class VerdictRecorder:
             said = read_verdicts(self._database)
             self._follow(said)
             verdict = self._verdict(submitted)
-            if submitted.kind == "undo":
-                verdict = self._undo(verdict, said)
+            if verdict.kind == "undo":
                 edit = TrackEdit(verdict=self._undo(verdict, said))
             else:
                 edit = self._checked(verdict, submitted, said)

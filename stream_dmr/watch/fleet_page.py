@@ -22,7 +22,7 @@ def fleet_page(states: Sequence[BoxState], *, title: str, every_s: float, now_ns
     return template.substitute(
         refresh=refresh,
         title=escape(title),
-        summary=escape(f"{fleet_summary(states)}; written {utc_text(now_ns)}"),
+        summary=escape(f"{fleet_summary(states)}; written {minute_text(now_ns)}"),
         rows="\n".join(_row(state) for state in ordered),
         every=f"{every_s:g}",
         written=_iso(now_ns),
@@ -57,8 +57,8 @@ def disk_text(reading: BoxReading) -> str:
     return f"{reading.disk_free_bytes / 1e9:.1f} GB"
 
 
-def utc_text(time_ns: int) -> str:
-    """A time for people, UTC."""
+def minute_text(time_ns: int) -> str:
+    """A time for people, to the minute, UTC."""
     return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):%Y-%m-%d %H:%M} UTC"
 
 
@@ -72,7 +72,7 @@ def _row(state: BoxState) -> str:
     contact = "never"
     if state.contact_ns is not None:
         contact = (
-            f'<span>{utc_text(state.contact_ns)}<small data-time="{_iso(state.contact_ns)}">'
+            f'<span>{minute_text(state.contact_ns)}<small data-time="{_iso(state.contact_ns)}">'
             "</small></span>"
         )
     numbers = ["", "", "", ""]

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from stream_dmr.errors import AnnotationError, UserError
+from stream_dmr.errors import AnnotationError
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.annotations.annotated_box import UNKNOWN_ID, AnnotatedBox
 from stream_dmr.segmentation.annotations.box_files import load_boxes, unused_boxes
@@ -27,13 +27,8 @@ def open_annotated_fish(
     """Open a boxes file, a masks folder, or both; the boxes must have ids.
 
     `pictures`: the source of the frames, `across_frames`: False for stills, see `MaskFolder`.
-    Raises AnnotationError where one cannot be read or boxes with masks have no ids, UserError where
-    neither is given.
+    Raises AnnotationError where one cannot be read or boxes have no ids.
     """
-    if boxes is None and masks is None:
-        raise UserError(
-            "expected boxes or masks of the fish, got neither; give --boxes, --masks or both"
-        )
     by_frame = None if boxes is None else load_boxes(boxes)
     for box in (box for found in (by_frame or {}).values() for box in found):
         if box.track_id == UNKNOWN_ID:

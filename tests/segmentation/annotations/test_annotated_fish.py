@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.errors import AnnotationError, UserError
+from stream_dmr.errors import AnnotationError
 from stream_dmr.messages import Frame
 from stream_dmr.segmentation.annotations.annotated_fish import AnnotatedFish, open_annotated_fish
 from stream_dmr.segmentation.annotations.box_files import load_boxes
@@ -97,11 +97,6 @@ def test_boxes_without_ids_beside_masks_are_refused(tmp_path):
     boxes = boxes_file(tmp_path, "1,-1,0,0,3,3,1\n")
     with pytest.raises(AnnotationError, match="expected the ids of --masks"):
         open_annotated_fish(boxes=boxes, masks=tmp_path)
-
-
-def test_neither_boxes_nor_masks_is_refused():
-    with pytest.raises(UserError, match="--boxes, --masks or both"):
-        open_annotated_fish(boxes=None, masks=None)
 
 
 def test_boxes_alone_leave_the_mask_to_a_segmenter(tmp_path):
