@@ -46,7 +46,6 @@ from stream_dmr.results.finished_fish import (
     database_of,
     read_fish,
     read_runs,
-    read_stored_fish,
 )
 from stream_dmr.results.fish_species import sure_code
 from stream_dmr.results.fish_table import fish_record, write_csv, write_parquet
@@ -140,7 +139,8 @@ class Export:
     def tables(self, out: Path, *, format: TableFormat) -> list[Path]:
         """Write lengths and frames (keypoints, one row a fish and frame) into `out`, as `run`.
 
-        Fish that reviewers added, split or merged have the frames that they have since.
+        Fish that reviewers added, split or merged have the frames that they have since. Lengths
+        are those of lengths.db, where there is one: of a camera, old segments may be deleted.
         """
         paths = [out / "lengths.csv", out / "frames.csv"]
         self._require_writable(*paths, *(path.with_suffix(".parquet") for path in paths))
@@ -156,8 +156,12 @@ class Export:
             if running is not None:
                 frames.write(make_record(running[message.frame_index], RecordingSettings()))
         frames.close()
-        fish = [] if self._database is None else read_stored_fish(self._database)
-        finished += [one.estimate for one in fish if one.estimate.track_id in edited]
+        fish = [] if self._database is None else self._all_fish()
+        kept = {one.estimate.track_id: one.estimate for one in fish}
+        finished = [
+            *(estimate for track_id, estimate in kept.items() if track_id not in edits.merged),
+            *(one for one in finished if one.track_id not in kept),
+        ]
         doubtful = {one.estimate.track_id for one in fish if one.may_count_twice}
         write_lengths(out / "lengths.csv", finished, may_count_twice=doubtful)
         paths = paths if format == "csv" else [_as_parquet(path) for path in paths]

@@ -1,7 +1,10 @@
 """What is drawn, and what is made from a recording for others to read."""
 
 import json
+import shutil
+import sqlite3
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -241,6 +244,20 @@ def test_parquet_has_the_same_numbers(clip: Path, tmp_path: Path):
     table = parquet.read_table(tmp_path / "lengths.parquet").to_pylist()
     expected = [float(row["length_mm"]) for row in rows(clip / "out" / "lengths.csv")]
     assert [row["length_mm"] for row in table] == expected
+
+
+def test_fish_of_deleted_segments_stay_in_the_exported_lengths(clip: Path, tmp_path: Path):
+    out = Path(shutil.copytree(clip / "out", tmp_path / "out"))
+    with closing(sqlite3.connect(out / "lengths.db")) as database:
+        database.execute("CREATE TEMP TABLE old AS SELECT * FROM fish LIMIT 1")
+        database.execute("UPDATE old SET number = 99, track_id = 99")
+        database.execute("INSERT INTO fish SELECT * FROM old")  # no recording has it
+        database.commit()
+    outcome = invoke(f"export {out}", {"--out": str(tmp_path), "--tables": "csv"})
+    assert outcome.code == 0, outcome.err
+    *before, old = rows(tmp_path / "lengths.csv")
+    assert before == rows(clip / "out" / "lengths.csv")
+    assert old == {**before[0], "track_id": "99"}
 
 
 def test_a_mask_comes_back_into_its_frame(clip: Path):
