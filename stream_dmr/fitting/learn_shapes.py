@@ -15,6 +15,7 @@ from stream_dmr.fitting.shape.samples import (
     evenly,
     good_crops,
 )
+from stream_dmr.fitting.shape.side_by_side import side_by_side
 from stream_dmr.fitting.shape.stocks import learn_stocks
 from stream_dmr.fitting.tracks import TrackFitter
 from stream_dmr.messages import FishCrop
@@ -46,15 +47,21 @@ def learn_shapes(
         candidates=forms,
         species=species,
     )
-    fish: list[FishSamples] = []
-    for chosen in good_crops(crops):
+
+    def fitted(chosen: list[FishCrop]) -> FishSamples | None:
         fits = [(crop, shape) for crop in chosen if (shape := tracks.fit(crop).shape) is not None]
         samples = [Sample(crop, shape.parameters) for crop, shape in fits if shape.iou >= _MIN_IOU]
-        if samples:
-            candidate = fits[-1][1].candidate or 0  # the last one is decided by all before it
-            track_id = chosen[0].track_id
-            against = tracks.against(track_id) + np.log(forms.shares)  # masks alone
-            fish.append(FishSamples(track_id, candidate, evenly(samples, FRAMES_PER_FISH), against))
+        if not samples:
+            return None
+        candidate = fits[-1][1].candidate or 0  # the last one is decided by all before it
+        track_id = chosen[0].track_id
+        against = tracks.against(track_id) + np.log(forms.shares)  # masks alone
+        return FishSamples(track_id, candidate, evenly(samples, FRAMES_PER_FISH), against)
+
+    fish: list[FishSamples] = []
+    for one in side_by_side(fitted, good_crops(crops)):
+        if one is not None:
+            fish.append(one)
             progress(f"{len(fish)} fish looked at")
     normal = tracks.fitters[0].plane_normal
     return learn_stocks(

@@ -17,6 +17,7 @@ from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.shape.candidates import CandidateShape, CandidateShapes
 from stream_dmr.fitting.shape.samples import FishSamples
+from stream_dmr.fitting.shape.side_by_side import side_by_side
 from stream_dmr.fitting.shape.space import NUM_COEFFICIENTS, form_precision, reshaped
 from stream_dmr.fitting.shape.stock import FormOdds, PosedTarget, Stock, StockFitter
 from stream_dmr.fitting.target import Target
@@ -124,11 +125,8 @@ class _StockLearner:
         while len(groups) > 1:
             groups = sorted(groups, key=lambda group: -group.num_fish)
             pairs = [(a, b) for n, a in enumerate(groups) for b in groups[n + 1 :]]
-            for a, b in pairs:
-                if (a, b) not in joined:
-                    joined[a, b] = self._learn(
-                        a.form, a.stock.frames + b.stock.frames, a.stock.coefficients
-                    )
+            new = [pair for pair in pairs if pair not in joined]
+            joined.update(zip(new, side_by_side(self._join, new), strict=True))
             a, b = min(pairs, key=lambda pair: _evidence_for_two(*pair, joined[pair]))
             if _evidence_for_two(a, b, joined[a, b]) > 0:
                 break
@@ -144,8 +142,11 @@ class _StockLearner:
         by_fish: dict[int, list[PosedTarget]] = {}
         for frame in (frame for group in groups for frame in group.stock.frames):
             by_fish.setdefault(frame.fish, []).append(frame)
-        for found in by_fish.values():
-            options = [[search(frame) for frame in found] for search in searches]
+
+        def posed(found: list[PosedTarget]) -> list[list[PosedTarget]]:
+            return [[search(frame) for frame in found] for search in searches]
+
+        for options in side_by_side(posed, by_fish.values()):
             nats = [
                 list(self._fitter.nats([one.copy() for one in option], shape).values())
                 for option, shape in zip(options, shapes, strict=True)
@@ -162,6 +163,10 @@ class _StockLearner:
             for group, own in zip(groups, frames, strict=True)
             if own
         ]
+
+    def _join(self, pair: tuple[_Group, _Group]) -> _Group:
+        a, b = pair
+        return self._learn(a.form, a.stock.frames + b.stock.frames, a.stock.coefficients)
 
     def _learn(
         self,

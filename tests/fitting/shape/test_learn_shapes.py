@@ -43,3 +43,8 @@ def test_broad_fish_give_a_broad_stock_and_say_how_far_they_are():
     assert TRUNK @ stocks.coefficients[0] == pytest.approx(0.4, abs=0.12)
     assert np.isclose(stocks.shares.sum(), 1.0)
     assert any("2 fish" in step for step in steps)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.cpu_count", lambda: 1)
+        on_one_core = learnt(crops)
+    assert on_one_core is not None
+    np.testing.assert_array_equal(on_one_core.coefficients, stocks.coefficients)
