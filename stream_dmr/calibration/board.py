@@ -22,9 +22,8 @@ from stream_dmr.camera import Calibration
 from stream_dmr.errors import CalibrationError, OutputError
 
 _SAME_VIEW = 0.01  # of the picture's diagonal, chosen: closer boards add no information
-_GOOD_PLANE_RMS = (
-    1 / 1000
-)  # of the picture's longer side; chosen: a lens that is another's is worse
+# Of the picture's longer side; chosen: a lens that is another's is worse.
+_GOOD_PLANE_RMS = 1 / 1000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -6,11 +6,6 @@ from stream_dmr.errors import OutputError, reason_of
 from stream_dmr.evaluation.compare import Distributions
 
 
-def _made_by(path: Path) -> dict[str, str] | None:
-    """By what `evaluate` knows its own pictures; formats have names of their own for it."""
-    return {"Software": "stream-dmr evaluate"} if path.suffix in ("", ".png") else None
-
-
 def plot_histograms(path: Path, distributions: Distributions) -> None:
     """Draw both histograms into a picture; the suffix of `path` is its format, PNG without one.
 
@@ -36,3 +31,8 @@ def plot_histograms(path: Path, distributions: Distributions) -> None:
         raise OutputError(
             f"{path}: expected to write a picture there, got: {reason_of(error)}"
         ) from error
+
+
+def _made_by(path: Path) -> dict[str, str] | None:
+    """By what `evaluate` knows its own pictures; formats have names of their own for it."""
+    return {"Software": "stream-dmr evaluate"} if path.suffix in ("", ".png") else None

@@ -221,8 +221,8 @@ class StockFitter:
         They follow the shape from where the frame was found, and from the square pose, rolled by
         as much as the breadth that is seen says.
         """
-        body = Body.from_template(reshaped(self._template, shape))
-        thin = roundness(reshaped(self._template, shape))
+        template = reshaped(self._template, shape)
+        body, thin = Body.from_template(template), roundness(template)
         against: dict[int, list[float]] = {}
         placed: list[PosedTarget] = []
         for frame, flat, log_breadth in zip(frames, square, seen, strict=True):

@@ -52,17 +52,18 @@ class FishEvidence:
     @property
     def has_moved(self) -> bool:
         """True once it left its place, and for what need not move."""
-        return self._need_not_move or self._is_sure or self._motion > _MIN_MOTION
+        return self._is_sure or self._motion > _MIN_MOTION
 
     @property
     def went_far(self) -> bool:
         """True once it is far from its first place, and for what need not move."""
-        return self._need_not_move or self._is_sure or self._motion > _FAR
+        return self._is_sure or self._motion > _FAR
 
     @property
     def _is_sure(self) -> bool:
+        """True for what somebody found, and for what looked like a fish often enough."""
         needed = max(_MIN_SURE_FRAMES, _MIN_SURE_SHARE * self._judged_frames)
-        return self._sure_frames >= needed
+        return self._need_not_move or self._sure_frames >= needed
 
     def looks_like_a_fish(self, min_frames: int) -> bool:
         """True once it did in so many frames, and for what nothing judged."""
