@@ -141,17 +141,22 @@ def follow_shapes(
         else:
             for line in describe(forms, stocks):
                 observer.notice(f"learnt from the fish so far: {line}")
-        path = inputs.request.out / LEARNT
         try:
-            require_free_names(path.parent, overwrite=inputs.request.overwrite)
-            meshes = save_stocks(
-                inputs.template, stocks, path, made_by=MADE_BY_RUN, source=inputs.source.name
-            )
-            add_files(path.parent, [*meshes, *(mesh.with_suffix(".toml") for mesh in meshes)])
+            _save_meshes(inputs, stocks)
         except OutputError as error:
             observer.warn(str(error))
 
     return LiveShapes(seen, learn, on_learnt, knows_shapes=bool(outputs.learnt))
+
+
+def _save_meshes(inputs: Inputs, stocks: CandidateShapes) -> None:
+    """Write the mesh of each stock into the run's folder. Raises OutputError."""
+    path = inputs.request.out / LEARNT
+    require_free_names(path.parent, overwrite=inputs.request.overwrite)
+    meshes = save_stocks(
+        inputs.template, stocks, path, made_by=MADE_BY_RUN, source=inputs.source.name
+    )
+    add_files(path.parent, [*meshes, *(mesh.with_suffix(".toml") for mesh in meshes)])
 
 
 def _message(stocks: CandidateShapes, num_fish: int, frame: Frame) -> LearntShapes:
