@@ -19,10 +19,11 @@ from stream_dmr.errors import OutputError
 from stream_dmr.files import replacing
 from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.results.finished_fish import FishResult, read_fish
-from stream_dmr.results.fish_table import FISH_TABLE, arrow_schema, fish_record
+from stream_dmr.results.fish_table import FISH_TABLE, arrow_schema, fish_records
 from stream_dmr.results.frames_table import FRAMES_COLUMNS
 from stream_dmr.results.lengths_database import NAME as DATABASE
 from stream_dmr.results.provenance import add_files
+from stream_dmr.results.scale_checks import last_checks
 from stream_dmr.results.verdicts_table import read_verdicts
 from stream_dmr.running.config import parse_config
 
@@ -49,8 +50,8 @@ def write_tables(folder: Path, job: Job) -> None:
     settings = parse_config(header.config_toml, where=f"{folder}: its config.toml").fisheries
     fish = read_fish(folder, recording)
     of_video = {"video": job.name, "haul": job.haul}
-    records = [fish_record(one, header.template, settings) | of_video for one in fish]
-    _write(folder / "fish.parquet", records, _FISH_SCHEMA)
+    records = fish_records(fish, header.template, settings, database=folder / DATABASE)
+    _write(folder / "fish.parquet", [one | of_video for one in records], _FISH_SCHEMA)
     _write(folder / "frames.parquet", _frame_records(folder, fish, of_video), _FRAMES_SCHEMA)
     add_files(folder, [folder / f"{kind}.parquet" for kind in TABLE_KINDS])
 
@@ -70,9 +71,9 @@ def _frame_records(
 def publish(folder: Path, job: Job, out: Path) -> None:
     """Copy the tables of a finished video into the data set. Idempotent.
 
-    They are written again where a reviewer has added verdicts since.
+    They are written again where a reviewer has added verdicts since, or the scale was checked.
     """
-    if _last_verdict_ns(folder) > _written_ns(folder, "fish"):
+    if _last_addition_ns(folder) > _written_ns(folder, "fish"):
         write_tables(folder, job)
     for kind in TABLE_KINDS:
         target = _target(out, kind, job)
@@ -101,13 +102,15 @@ def _written_ns(folder: Path, kind: str) -> int:
     return (folder / f"{kind}.parquet").stat().st_mtime_ns
 
 
-def _last_verdict_ns(folder: Path) -> int:
-    """When a reviewer gave the last verdict, ns since 1970; 0 without any."""
+def _last_addition_ns(folder: Path) -> int:
+    """When the last verdict or check of the scale came, ns since 1970; 0 without any."""
     try:
         verdicts = read_verdicts(folder / DATABASE)
+        checks = last_checks(folder / DATABASE).values()
     except OutputError:  # which `verify` reports
         return 0
-    return verdicts[-1].written_ns if verdicts else 0
+    times = [one.written_ns for one in verdicts] + [one.time_ns for one in checks]
+    return max(times, default=0)
 
 
 def _write(path: Path, records: list[dict[str, Any]], schema: dict[str, type]) -> None:

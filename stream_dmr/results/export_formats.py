@@ -48,14 +48,13 @@ from stream_dmr.results.finished_fish import (
     read_runs,
 )
 from stream_dmr.results.fish_species import sure_code
-from stream_dmr.results.fish_table import fish_record, write_csv, write_parquet
+from stream_dmr.results.fish_table import fish_records, write_csv, write_parquet
 from stream_dmr.results.fisheries import FisheriesSettings
 from stream_dmr.results.frames_table import FramesTable
 from stream_dmr.results.lengths_table import write_lengths
 from stream_dmr.results.own_files import require_writable
 from stream_dmr.results.provenance import known_files, read_origin, seal_files
 from stream_dmr.results.run_facts import run_facts
-from stream_dmr.results.scale_checks import last_checks
 from stream_dmr.results.viame_csv import ViameTracks
 from stream_dmr.template.template import Template
 
@@ -171,12 +170,8 @@ class Export:
     def fish(self, out: Path, settings: FisheriesSettings, *, format: TableFormat) -> Path:
         """Write fish.csv (or .parquet): lengths as fisheries use them, verdicts, inputs."""
         self._require_writable(out / f"fish.{format}")
-        records = [fish_record(fish, self.template, settings) for fish in self._all_fish()]
-        checks = {} if self._database is None else last_checks(self._database)
-        for record in records:
-            if (check := checks.get(record["calibration_sha256"])) is not None:
-                record["scale_error_percent"] = check.error_percent
-                record["scale_checked_ns"] = check.time_ns
+        fish = self._all_fish()
+        records = fish_records(fish, self.template, settings, database=self._database)
         write = write_csv if format == "csv" else write_parquet
         path = write(make_folder(out) / "fish", records)
         self._written.append(path)

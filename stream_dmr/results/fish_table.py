@@ -13,6 +13,7 @@ from stream_dmr.results.agency_tables import ICES_LENGTHS
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.fish_species import code_of, species_of
 from stream_dmr.results.fisheries import FisheriesSettings, derive
+from stream_dmr.results.scale_checks import last_checks
 from stream_dmr.results.table_cells import seconds, utc_text
 from stream_dmr.results.verdicts import Review
 from stream_dmr.template.template import Template
@@ -83,6 +84,23 @@ def fish_record(
         "length_type": ICES_LENGTHS.get(template.tail_gives or ""),
         "origin": fish.origin,
     }
+
+
+def fish_records(
+    fish: Sequence[FishResult],
+    template: Template,
+    settings: FisheriesSettings,
+    *,
+    database: Path | None,
+) -> list[dict[str, Any]]:
+    """`fish_record` of all, with the last check of the scale that their lengths.db knows."""
+    records = [fish_record(one, template, settings) for one in fish]
+    checks = {} if database is None else last_checks(database)
+    for record in records:
+        if (check := checks.get(record["calibration_sha256"])) is not None:
+            record["scale_error_percent"] = check.error_percent
+            record["scale_checked_ns"] = check.time_ns
+    return records
 
 
 def _species_columns(fish: FishResult) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from stream_dmr.batch.verify_batch import verify_all
 from stream_dmr.errors import OutputError
 from stream_dmr.results.finished_fish import read_stored_fish
 from stream_dmr.results.provenance import seal_verdicts
+from stream_dmr.results.scale_checks import ScaleCheck, add_check
 from stream_dmr.results.verdicts import Verdict
 from stream_dmr.results.verdicts_table import add_verdict
 from stream_dmr.running.measure_source import measure_source
@@ -289,6 +290,23 @@ def test_the_next_call_takes_verdicts_into_the_data_set(season: Path, tmp_path: 
     measure([job], tmp_path)
     fish = dataset.dataset(tmp_path / "dataset" / "fish").to_table().to_pylist()
     assert [one["verdict"] for one in fish] == [None, "reject"]
+    assert verify_all(tmp_path)[0] == []
+
+
+def test_the_next_call_takes_checks_of_the_scale_into_the_data_set(season: Path, tmp_path: Path):
+    (job,) = jobs_of(season, tmp_path, row())
+    measure([job], tmp_path)
+    database = results_folder(job, tmp_path) / "lengths.db"
+    check = ScaleCheck(
+        source="board.png",
+        calibration_sha256=read_stored_fish(database)[0].facts.calibration_sha256,
+        **{"known_mm": 200.0, "error_mm": 8.0, "error_percent": 4.0},
+        **{"worst_percent": 5.0, "limit_percent": 1.0},
+    )
+    add_check(database, check)
+    measure([job], tmp_path)
+    fish = dataset.dataset(tmp_path / "dataset" / "fish").to_table().to_pylist()
+    assert [one["scale_error_percent"] for one in fish] == [4.0, 4.0]
     assert verify_all(tmp_path)[0] == []
 
 
