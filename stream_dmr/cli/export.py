@@ -11,6 +11,7 @@ from stream_dmr.cli.shared_options import (
     TrackOption,
     exit_on_signals,
     parse_selection,
+    settings_of,
     warn,
 )
 from stream_dmr.errors import UserError
@@ -72,7 +73,6 @@ def export(
         )
     from stream_dmr.results.export_formats import Export
     from stream_dmr.results.finished_fish import run_notes
-    from stream_dmr.running.config import load_config, parse_config
     from stream_dmr.running.species_checks import species_notes
 
     exported = Export(recording, parse_selection(time, track), overwrite=overwrite)
@@ -87,11 +87,7 @@ def export(
             for path in exported.tables(out, format=tables):
                 print(path)
         if fish:
-            settings = (
-                parse_config(exported.config_toml, where=f"{recording}: its config.toml")
-                if config is None
-                else load_config(config)
-            )
+            settings = settings_of(config, exported.config_toml, recording)
             notes = species_notes(settings, exported.template)
             print(exported.fish(out, settings.fisheries, format=fish))
         if viame:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stream_dmr.cli.shared_options import ConfigOption, OverwriteOption, warn
+from stream_dmr.cli.shared_options import ConfigOption, OverwriteOption, settings_of, warn
 
 if TYPE_CHECKING:
     from stream_dmr.messages import FishCrop
@@ -40,7 +40,6 @@ def learn_template(
     from stream_dmr.fitting.shape.describe import describe
     from stream_dmr.recording.reading.open_recording import open_recordings
     from stream_dmr.results.own_files import require_writable
-    from stream_dmr.running.config import load_config, parse_config
     from stream_dmr.running.shape_pass import save_stocks, stock_paths
 
     if out.suffix != ".ply":
@@ -50,11 +49,7 @@ def learn_template(
     header = opened[0].header
     mesh, forms = load_shapes(template, on_notice=lambda line: warn([line]))
     forms = forms or mesh_form(mesh)
-    settings = (
-        parse_config(header.config_toml, where=f"{recordings[0]}: its config.toml")
-        if config is None
-        else load_config(config)
-    )
+    settings = settings_of(config, header.config_toml, recordings[0])
     with Progress(transient=True) as progress:
         task = progress.add_task("looking for fish that are completely visible", total=None)
         stocks = learn_shapes(

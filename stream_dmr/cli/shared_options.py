@@ -19,6 +19,7 @@ from stream_dmr.running.run_request import without_password
 
 if TYPE_CHECKING:
     from stream_dmr.recording.messages.selection import Selection
+    from stream_dmr.running.config import Config
 
 TemplateOption = Annotated[
     str,
@@ -73,6 +74,15 @@ def parse_selection(time: str | None, track: list[int] | None) -> "Selection":
 
     time_s = None if time is None else _parse_time(time)
     return Selection.from_seconds(time_s, frozenset(track) if track else None)
+
+
+def settings_of(config: Path | None, recorded_toml: str, recording: Path) -> "Config":
+    """The settings that --config gives, else those that a recording holds."""
+    from stream_dmr.running.config import load_config, parse_config
+
+    if config is not None:
+        return load_config(config)
+    return parse_config(recorded_toml, where=f"{recording}: its config.toml")
 
 
 def _parse_time(text: str) -> tuple[float, float]:
