@@ -72,6 +72,11 @@ def calibrate(
             "expected photographs of the board to calibrate the lens with, or --lens FILE with a "
             f"lens that is known, got {'neither' if lens is None else 'both'}"
         )
+    if lens is not None and model != "auto":
+        raise UserError(
+            f"--model: expected with photographs alone, got {model} with --lens, whose file says "
+            "which lens it is; leave it out"
+        )
     require_writable(out, overwrite=overwrite)
     printed = PrintedBoard.parse(board, square_mm=square_mm, marker_mm=marker_mm)
     console = Console()

@@ -241,6 +241,12 @@ def test_the_lens_of_an_own_calibration_gets_a_new_plane(tmp_path):
     assert load_lens(tmp_path / "old.yaml").size == (640, 480)
 
 
+def test_a_model_is_not_chosen_for_a_lens_that_is_known():
+    outcome = invoke("calibrate --lens a.yaml --plane p.png --model fisheye")
+    assert outcome.code == 2
+    assert "--model: expected with photographs alone" in outcome.error
+
+
 @pytest.mark.parametrize("arguments", ["--lens a.yaml --plane p.png b.png", "--plane p.png"])
 def test_photographs_or_a_lens_are_asked_for(arguments, tmp_path):
     assert invoke(f"calibrate {arguments} --out {tmp_path / 'c.yaml'}").code == 2
