@@ -63,9 +63,9 @@ class MaskFolder:
     """A folder of label pictures: a pixel's value is a fish's id, 0 is background.
 
     They are named `000001.png` ... by frame, or like the pictures of a folder whose masks they are:
-    `IMG_7.png` for `IMG_7.jpg`. The largest value of the type, 255 or 65535, is "unknown": what a
-    gaff, a line or another fish hides. Pictures are read on demand. Palette pictures give their
-    indices, not their colours.
+    `IMG_7.png` for `IMG_7.jpg`; where every picture has a mask of its own name, it has that one.
+    The largest value of the type, 255 or 65535, is "unknown": what a gaff, a line or another fish
+    hides. Pictures are read on demand. Palette pictures give their indices, not their colours.
     """
 
     def __init__(
@@ -79,14 +79,17 @@ class MaskFolder:
         if not folder.is_dir():
             raise AnnotationError(f"{folder}: expected a folder of masks, found none there")
         names = sorted(entry.name for entry in folder.iterdir() if entry.suffix == ".png")
-        self._is_numbered = any(_FILE_NAME.fullmatch(name) for name in names)
-        if not self._is_numbered and _stems_in(pictures).isdisjoint(Path(n).stem for n in names):
+        stems, own = _stems_in(pictures), {Path(name).stem for name in names}
+        # Pictures may have numbers for names that are not those of their frames.
+        is_named = bool(stems) and stems <= own
+        self._is_numbered = not is_named and any(_FILE_NAME.fullmatch(name) for name in names)
+        if not self._is_numbered and stems.isdisjoint(own):
             found = f"{names[0]} and the like" if names else "no PNG"
             raise AnnotationError(
                 f"{folder}: expected masks named 000001.png, 000002.png ..., or like the pictures "
                 f"of the source, found {found}"
             )
-        if "000000.png" in names:
+        if self._is_numbered and "000000.png" in names:
             raise AnnotationError(
                 f"{folder}: expected masks counted from 000001.png, found 000000.png; "
                 "rename them by one"

@@ -87,6 +87,23 @@ def test_numbered_masks_go_by_frame_whatever_pictures_are_called(tmp_path):
     np.testing.assert_array_equal(found.ids, first)
 
 
+@pytest.mark.parametrize("first", [0, 8])
+def test_numbered_pictures_with_masks_of_their_own_names_have_those(tmp_path, first: int):
+    pictures, folder = tmp_path / "pictures", tmp_path / "masks"
+    pictures.mkdir()
+    folder.mkdir()
+    for number in (first, first + 1):
+        (pictures / f"{number:06d}.jpg").touch()
+        labels = np.full((LABELS_SIZE["height"], LABELS_SIZE["width"]), number + 1, np.uint8)
+        cv2.imwrite(str(folder / f"{number:06d}.png"), labels)
+    masks = MaskFolder(folder, pictures=pictures)
+    for frame_index, number in enumerate((first, first + 1), start=1):
+        found = masks.labels(frame_index, **LABELS_SIZE, picture=f"{number:06d}.jpg")
+        assert found is not None
+        assert found.present == [number + 1]
+    assert masks.unused(1) == []
+
+
 def test_masks_that_show_fish_as_unknown_are_refused(tmp_path):
     """A mask of one fish is often written as 255 on 0."""
     labels = labels_of(id1=(0, 0, 4, 3)) * np.uint8(255)
