@@ -17,7 +17,8 @@ def unrolled(
     pose: Float[np.ndarray, "P"], anchor: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "P"]:
     """The pose turned about the body's axis until the broad side faces the camera."""
-    return _turned(pose, roll_and_slope(pose, anchor)[0])
+    # A copy: for the read-only arrays of messages numba would compile it once more.
+    return _turned(pose, roll_and_slope(pose.copy(), anchor)[0])
 
 
 def rolled_as_seen(
