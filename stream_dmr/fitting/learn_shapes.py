@@ -32,13 +32,13 @@ def learn_shapes(
     *,
     calibration: Calibration | None,
     species: SpeciesSettings | None = None,
-    refits: bool = True,
+    suffices: Callable[[CandidateShapes], bool] = lambda stocks: False,
     progress: Callable[[str], None] = lambda step: None,
 ) -> CandidateShapes | None:
     """The stocks that these fish are of; None where none of them is seen whole.
 
     `crops` in the order of their capture; of each fish some that are far apart are fitted, with
-    each of the `forms` until one is chosen. `refits`: see `learn_stocks`.
+    each of the `forms` until one is chosen. `suffices`: see `learn_stocks`.
     """
     tracks = TrackFitter(
         template,
@@ -65,5 +65,5 @@ def learn_shapes(
             progress(f"{len(fish)} fish looked at")
     normal = tracks.fitters[0].plane_normal
     return learn_stocks(
-        template, forms, fish, settings, plane_normal=normal, refits=refits, progress=progress
+        template, forms, fish, settings, plane_normal=normal, suffices=suffices, progress=progress
     )

@@ -14,7 +14,7 @@ from stream_dmr.errors import OutputError
 from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import CandidateShapes, mesh_form
 from stream_dmr.fitting.shape.describe import describe
-from stream_dmr.fitting.shape.mesh_agreement import is_like_mesh, not_like_mesh
+from stream_dmr.fitting.shape.mesh_agreement import are_like_mesh, not_like_mesh
 from stream_dmr.fitting.shape.samples import MAX_FISH
 from stream_dmr.messages import FishCrop, Frame, LearntShapes
 from stream_dmr.nodes.fit_mesh import FitMesh
@@ -128,7 +128,7 @@ def follow_shapes(
         more = known.extended(learnt)
         stocks = more.stocks()
         assert stocks is not None
-        if is_mesh and all(map(is_like_mesh, stocks)):
+        if is_mesh and are_like_mesh(stocks):
             return
         known = more
         write(learnt)

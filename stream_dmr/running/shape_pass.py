@@ -14,7 +14,7 @@ from stream_dmr.camera import Calibration
 from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes, mesh_form
 from stream_dmr.fitting.shape.describe import describe
-from stream_dmr.fitting.shape.mesh_agreement import is_like_mesh, not_like_mesh
+from stream_dmr.fitting.shape.mesh_agreement import are_like_mesh, not_like_mesh
 from stream_dmr.fitting.shape.samples import good_crops
 from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.messages import FishCrop
@@ -100,21 +100,19 @@ def is_mesh_theirs(
         return True
     mesh = mesh_form(template)
     observer.stage(f"comparing the fish with {template.name}")
-    stocks = None
-    for refits in (False, True):  # a mesh is only disbelieved after the longer look
-        stocks = learn_shapes(
-            crops,
-            template,
-            mesh,
-            config.fit_mesh,
-            calibration=calibration,
-            species=config.species,
-            refits=refits,
-        )
-        if stocks is not None and all(map(is_like_mesh, stocks)):
-            for line in describe(mesh, stocks):
-                observer.notice(line)
-            return True
+    stocks = learn_shapes(
+        crops,
+        template,
+        mesh,
+        config.fit_mesh,
+        calibration=calibration,
+        species=config.species,
+        suffices=are_like_mesh,  # only what would be disbelieved is looked at longer
+    )
+    if stocks is not None and are_like_mesh(stocks):
+        for line in describe(mesh, stocks):
+            observer.notice(line)
+        return True
     observer.warn(
         f"{not_like_mesh(mesh, stocks)}; they are measured by the shapes learnt from them, as "
         "with --template auto"

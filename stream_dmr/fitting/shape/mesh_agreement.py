@@ -13,8 +13,13 @@ _MAX_BREADTH, _MAX_OUTLINE = 0.08, 0.15
 _MAX_STD = 0.1  # that of one fish alone; more says that fish differ by more than one stock's do
 
 
+def are_like_mesh(stocks: CandidateShapes) -> bool:
+    """True where the shapes learnt from fish, beginning at a mesh, are still about the mesh's."""
+    return all(map(is_like_mesh, stocks))
+
+
 def is_like_mesh(stock: CandidateShape) -> bool:
-    """True where the shape learnt from fish, beginning at a mesh, is still about the mesh's."""
+    """The same of one stock."""
     breadth = abs(float(TRUNK @ stock.coefficients))
     is_as_broad = breadth <= _MAX_BREADTH + min(std_of(TRUNK, stock.covariance), _MAX_STD)
     return is_as_broad and _outline_off(stock) <= _MAX_OUTLINE

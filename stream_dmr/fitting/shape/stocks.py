@@ -57,12 +57,13 @@ def learn_stocks(
     settings: FitMeshSettings,
     *,
     plane_normal: Float[np.ndarray, "3"],
-    refits: bool = True,
+    suffices: Callable[[CandidateShapes], bool] = lambda stocks: False,
     progress: Callable[[str], None] = lambda step: None,
 ) -> CandidateShapes | None:
     """The stocks that these fish are of, the largest first; None where there are no fish.
 
-    Without `refits` no fish is sought anew with the stocks' shapes, which takes half the time.
+    Where the stocks found first are said to suffice, the fish are not refitted with their shapes,
+    which is half of the work.
     """
     if not fish:
         return None
@@ -70,9 +71,16 @@ def learn_stocks(
     groups = learner.by_form(list(forms), fish)
     progress(f"{len(fish)} fish of {len(groups)} body forms")
     groups = learner.merged(groups)
-    if refits:
-        groups = learner.reassigned(groups)
+    stocks = _shapes_of(groups)
+    if suffices(stocks):
+        return stocks
+    groups = learner.reassigned(groups)
     progress(f"{len(groups)} stocks")
+    return _shapes_of(groups)
+
+
+def _shapes_of(groups: Sequence[_Group]) -> CandidateShapes:
+    """The largest group first."""
     total = sum(group.num_fish for group in groups)
     return CandidateShapes.of(
         [
