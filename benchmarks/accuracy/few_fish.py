@@ -30,8 +30,8 @@ from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
 from stream_dmr.fitting.shape.space import TRUNK, reshaped, std_of
 from stream_dmr.messages import FishCrop, LearntShapes
+from stream_dmr.running.chain_nodes import later_nodes
 from stream_dmr.running.config import Config
-from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.simulation.presets import PRESETS
 from stream_dmr.simulation.rail_scene import make_scene
 from stream_dmr.simulation.species import SPECIES

@@ -41,8 +41,8 @@ from stream_dmr.messages import FishCrop, FittedMesh, LearntShapes, LengthEstima
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.nodes.read_frames import ReadFrames
+from stream_dmr.running.chain_nodes import later_nodes
 from stream_dmr.running.config import Config
-from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.segmentation.tracking.fish_finder import open_finder
 from stream_dmr.simulation.pose_sequence import FPS
 from stream_dmr.simulation.species import SPECIES

@@ -27,9 +27,9 @@ from benchmarks.table1.filmed_scene import FilmedScene, film_passages
 from stream_dmr.camera import Calibration, ReferencePlane
 from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
+from stream_dmr.running.chain_nodes import later_nodes
 from stream_dmr.running.conditions import lying, stills
 from stream_dmr.running.config import Config
-from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.simulation.presets import PRESETS
 from stream_dmr.simulation.rail_scene import RailScene, Visit, draw_calibration
 from stream_dmr.simulation.simulated_body import SimulatedBody

@@ -27,8 +27,8 @@ from benchmarks.table1.filmed_scene import film_passages
 from stream_dmr.camera import Calibration
 from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
 from stream_dmr.messages import FishCrop
+from stream_dmr.running.chain_nodes import later_nodes
 from stream_dmr.running.config import Config
-from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.running.shape_pass import learnt_from
 from stream_dmr.simulation.species import SPECIES, find_species

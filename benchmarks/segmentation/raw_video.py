@@ -27,8 +27,8 @@ from stream_dmr.evaluation.length_tables import read_truth
 from stream_dmr.messages import FishCrop, LengthEstimate, Message
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
+from stream_dmr.running.chain_nodes import later_nodes
 from stream_dmr.running.config import load_config
-from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.running.pipeline import run_chain
 from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
 from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map

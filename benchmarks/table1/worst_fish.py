@@ -17,8 +17,8 @@ from benchmarks.table1.filmed_scene import chain_crops, table_scene
 from benchmarks.table1.tables import worst_fish
 from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
 from stream_dmr.report.view_pictures import crop_outlines, draw_outlines
+from stream_dmr.running.chain_nodes import later_nodes
 from stream_dmr.running.config import Config
-from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.simulation.film import film
 
 _NUM_FISH, _NUM_FRAMES, _TILE_PX = 5, 6, 170

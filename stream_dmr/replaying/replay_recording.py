@@ -31,7 +31,7 @@ from stream_dmr.replaying.replay_outputs import (
 )
 from stream_dmr.replaying.replay_request import STAGES, ReplayRequest
 from stream_dmr.replaying.replay_writer import ReplayWriter
-from stream_dmr.running.measure_source import continue_tracks, later_nodes
+from stream_dmr.running.chain_nodes import continue_tracks, later_nodes
 from stream_dmr.running.pipeline import Node, StageCounters, run_chain
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.segmentation.tracking.fish_finder import open_finder

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Collection, Generator, Iterable, Sequence
+from collections.abc import Callable, Collection, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,16 +13,13 @@ from stream_dmr.camera import Calibration
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.fitting.compile_kernels import compile_kernels
 from stream_dmr.fitting.fitter import Fitter
-from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes
-from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish, Message, Position
+from stream_dmr.fitting.shape.candidates import AUTO
+from stream_dmr.messages import Frame, LengthEstimate, Message, Position
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.nodes.fit_mesh import FitMesh
-from stream_dmr.nodes.localize import Localize
-from stream_dmr.nodes.smooth_length import SmoothLength
 from stream_dmr.results.learnt_meshes import LEARNT, MADE_BY_RUN
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.run_facts import ENDLESS_STOPPED, SOURCE_ENDED, STOPPED
-from stream_dmr.running.config import Config
+from stream_dmr.running.chain_nodes import continue_tracks, later_nodes, records_covariance
 from stream_dmr.running.drift_alarms import DriftAlarms
 from stream_dmr.running.error_policy import ErrorPolicy
 from stream_dmr.running.inputs import Inputs, checked_inputs
@@ -39,7 +36,6 @@ from stream_dmr.running.run_request import RunRequest
 from stream_dmr.running.seen_fish import SeenFish
 from stream_dmr.running.shape_pass import is_mesh_theirs, save_stocks, with_learnt_shapes
 from stream_dmr.running.species_checks import species_notes
-from stream_dmr.template.template import Template
 
 _USUAL_M = (0.5, 20.0)  # chosen: from cameras to the plane of hanging fish
 _MAX_SUMMARY_FISH = 100  # of an endless run, for the table at its end; the store has all fish
@@ -147,7 +143,7 @@ def _compile_kernels_for(inputs: Inputs) -> None:
     fitter = Fitter(
         inputs.template,
         inputs.config.fit_mesh,
-        with_covariance=_records_covariance(inputs.config),
+        with_covariance=records_covariance(inputs.config),
     )
     compile_kernels(fitter)
 
@@ -199,45 +195,6 @@ def _crop_fish(inputs: Inputs) -> CropFish:
         finder=inputs.finder,
         species_model=inputs.config.species.model,
     )
-
-
-def later_nodes(
-    config: Config,
-    *,
-    template: Template,
-    calibration: Calibration | None,
-    candidates: CandidateShapes | None = None,
-) -> list[Node]:
-    """The nodes after CropFish: fit, localization, length."""
-    camera = None if calibration is None else calibration.camera
-    frame_size = None if camera is None else (camera.width, camera.height)
-    return [
-        FitMesh(
-            config.fit_mesh,
-            template=template,
-            candidates=candidates,
-            calibration=calibration,
-            with_covariance=_records_covariance(config),
-            species=config.species,
-        ),
-        Localize(config.localize, calibration=calibration),
-        SmoothLength(
-            config.smooth_length,
-            zones=config.zones,
-            species=config.species,
-            frame_size=frame_size,
-        ),
-    ]
-
-
-def _records_covariance(config: Config) -> bool:
-    return config.recording.meshes == "vertices"
-
-
-def continue_tracks(nodes: Sequence[Node], interrupted: Iterable[LocalizedFish]) -> None:
-    """Give a chain's last node the frames of fish that an earlier recording has."""
-    for fish in interrupted:
-        nodes[-1].step(fish)
 
 
 def _run_chain(

@@ -14,8 +14,8 @@ from stream_dmr.recording.messages.record import as_recorded
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.reading.frame_lookup import FoundFrame
 from stream_dmr.results.verdicts_table import AddedFrame
+from stream_dmr.running.chain_nodes import later_nodes
 from stream_dmr.running.config import Config
-from stream_dmr.running.measure_source import later_nodes
 from stream_dmr.segmentation.annotations.annotated_box import AnnotatedBox
 from stream_dmr.segmentation.annotations.annotated_fish import AnnotatedFish
 
