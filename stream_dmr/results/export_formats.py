@@ -48,7 +48,7 @@ from stream_dmr.results.finished_fish import (
     read_runs,
 )
 from stream_dmr.results.fish_species import sure_code
-from stream_dmr.results.fish_table import fish_records, write_csv, write_parquet
+from stream_dmr.results.fish_table import fish_records, unweighed_note, write_csv, write_parquet
 from stream_dmr.results.fisheries import FisheriesSettings
 from stream_dmr.results.frames_table import FramesTable
 from stream_dmr.results.lengths_table import write_lengths
@@ -75,6 +75,7 @@ class Export:
         self._overwrite = overwrite
         self._earlier: set[Path] = set()  # exported before from the same recording
         self._new: list[Path] = []  # files and folders that were not there, and no provenance knows
+        self._notes: list[str] = []  # of what was exported
         self._require_selected()
 
     @property
@@ -89,8 +90,8 @@ class Export:
 
     @property
     def warnings(self) -> Sequence[str]:
-        """The parts of the recording that are lost, one line each."""
-        return self._recording.warnings
+        """What is lost of the recording or missing in the exports so far, one line each."""
+        return [*self._recording.warnings, *self._notes]
 
     def meshes(self, out: Path, *, format: MeshFormat) -> int:
         """Write `fish-ID/FRAME.ply` (or .glb) into `out`; returns their number.
@@ -172,6 +173,7 @@ class Export:
         self._require_writable(out / f"fish.{format}")
         fish = self._all_fish()
         records = fish_records(fish, self.template, settings, database=self._database)
+        self._notes += unweighed_note(records, settings)
         write = write_csv if format == "csv" else write_parquet
         path = write(make_folder(out) / "fish", records)
         self._written.append(path)

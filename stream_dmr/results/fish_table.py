@@ -6,12 +6,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from stream_dmr.catch.species_list import CODE, is_called
+from stream_dmr.catch.species_list import CODE
 from stream_dmr.csv_file import write_table
 from stream_dmr.files import writing_to
 from stream_dmr.results.agency_tables import ICES_LENGTHS
 from stream_dmr.results.finished_fish import FishResult
-from stream_dmr.results.fish_species import code_of, species_of
+from stream_dmr.results.fish_species import code_of, is_same_species, species_of
 from stream_dmr.results.fisheries import FisheriesSettings, derive
 from stream_dmr.results.scale_checks import last_checks
 from stream_dmr.results.table_cells import seconds, utc_text
@@ -64,8 +64,7 @@ def fish_record(
     found = species_of(fish)
     named = "" if CODE.fullmatch(fish.review.species) else fish.review.species
     species = named or (found.english_name if found else None) or fish.review.species
-    weighed = settings.species if found and is_called(found, settings.species) else species
-    derived = derive(fish.length_mm, template, settings, species=weighed)
+    derived = derive(fish.length_mm, template, settings, species=species)
     values: dict[str, Any] = {name: getattr(fish.facts, name, None) for name in FISH_TABLE}
     values |= {n: getattr(fish.estimate, n) for n in FISH_TABLE if hasattr(fish.estimate, n)}
     values |= asdict(fish.catch)
@@ -101,6 +100,19 @@ def fish_records(
             record["scale_error_percent"] = check.error_percent
             record["scale_checked_ns"] = check.time_ns
     return records
+
+
+def unweighed_note(records: Sequence[dict[str, Any]], settings: FisheriesSettings) -> list[str]:
+    """A line where weight or legal size are asked for, and no fish is of their species."""
+    species = sorted({record["species"] for record in records if record["length_mm"] is not None})
+    is_asked = settings.weight_a > 0 or settings.legal_cm > 0
+    if not is_asked or not species or any(is_same_species(s, settings.species) for s in species):
+        return []
+    return [
+        f"[fisheries] species: no fish is '{settings.species}' (column species: "
+        f"{', '.join(species)}), so none has a weight or a legal size; set [fisheries] to the "
+        "species that they are, or name it with `stream-dmr review`"
+    ]
 
 
 def _species_columns(fish: FishResult) -> dict[str, Any]:

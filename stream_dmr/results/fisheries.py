@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from stream_dmr.results.fish_species import is_same_species
 from stream_dmr.settings import Settings
 from stream_dmr.template.template import Template
 
@@ -15,8 +16,8 @@ class FisheriesSettings(Settings):
 
     species: str = Field(
         default="halibut",
-        description="template, or code or name of the species, to which weight and legal size "
-        "apply; others get neither",
+        description="code or name of the species to which weight and legal size apply, or its "
+        "template; others get neither",
     )
     rounding: Literal["down", "nearest"] = Field(
         default="down",
@@ -76,7 +77,7 @@ def derive(
     if length_mm is None:
         return Derived()
     lengths = _both_lengths(length_mm, template)
-    is_species = (species or template.name) == settings.species
+    is_species = is_same_species(species or template.name, settings.species)
     weighed, legal = lengths[settings.weight_length], lengths[settings.legal_length]
     has_weight = is_species and settings.weight_a > 0 and weighed is not None
     has_legal = is_species and settings.legal_cm > 0 and legal is not None

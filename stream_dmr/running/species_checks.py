@@ -32,7 +32,7 @@ def species_notes(config: Config, template: Template) -> list[str]:
     wanted, bundled = config.fisheries.species, load_species()
     known = [template.name, *bundled_names()]
     known += [one.code for one in load_species(config.species.own_list)]
-    if wanted in known or find_species(wanted, bundled):
+    if wanted.casefold() in map(str.casefold, known) or find_species(wanted, bundled):
         return []
     names = [name for one in bundled for name in (one.english_name, one.scientific_name)]
     return [

@@ -7,7 +7,7 @@ import pytest
 from stream_dmr.results.catch_facts import CatchFacts
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.fish_species import species_of
-from stream_dmr.results.fish_table import fish_record
+from stream_dmr.results.fish_table import fish_record, unweighed_note
 from stream_dmr.results.fisheries import FisheriesSettings
 from stream_dmr.results.verdicts import Review
 from stream_dmr.template.template_file import load_template
@@ -45,8 +45,33 @@ def test_the_reviewers_species_comes_first(
 
 def test_weight_follows_the_species_however_it_is_named():
     assert species_of(result(SURE)) == species_of(result(CatchFacts(), named="pacific halibut"))
-    for name in ("HAP", "Pacific halibut", "hippoglossus stenolepis"):
+    for name in ("HAP", "Pacific halibut", "hippoglossus stenolepis", "halibut"):
         settings = FisheriesSettings(species=name)
         assert fish_record(result(SURE), load_template("cod"), settings)["weight_kg"] > 0
+        unnamed = fish_record(result(CatchFacts()), load_template("halibut"), settings)
+        assert unnamed["weight_kg"] > 0
         other = fish_record(result(SURE, named="COD"), load_template("cod"), settings)
         assert other["weight_kg"] is None
+
+
+def test_a_relative_that_is_measured_by_the_same_template_is_another_species():
+    other = fish_record(result(SURE, named="Atlantic halibut"), load_template("halibut"), HALIBUT)
+    assert other["weight_kg"] is None
+
+
+@pytest.mark.parametrize(
+    ("named", "settings", "is_said"),
+    [
+        ("Pacific cod", HALIBUT, True),
+        ("Pacific halibut", HALIBUT, False),
+        ("", HALIBUT, True),
+        ("Pacific cod", FisheriesSettings(weight_a=0, legal_cm=0), False),
+    ],
+)
+def test_fish_without_weight_for_their_species_are_said(
+    named: str, settings: FisheriesSettings, is_said: bool
+):
+    records = [fish_record(result(CatchFacts(), named=named), load_template("cod"), settings)]
+    note = unweighed_note(records, settings)
+    assert bool(note) is is_said
+    assert not note or (named or "cod") in note[0]
