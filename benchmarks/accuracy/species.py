@@ -24,15 +24,14 @@ from benchmarks.accuracy.oracles import scene_of
 from benchmarks.fit_speed.targets import body_template
 from benchmarks.table1.dmr import through_all
 from benchmarks.table1.filmed_scene import film_passages
-from stream_dmr.camera import Calibration
-from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
+from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
 from stream_dmr.messages import FishCrop
 from stream_dmr.running.chain_nodes import later_nodes
 from stream_dmr.running.config import Config
+from stream_dmr.running.measuring_setup import MeasuringSetup
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.running.shape_pass import learnt_from
 from stream_dmr.simulation.species import SPECIES, find_species
-from stream_dmr.template.template import Template
 from stream_dmr.template.template_file import bundled_names
 
 OWN = "own"
@@ -58,26 +57,25 @@ def measure(task: tuple[str, int, Sequence[str]]) -> dict[str, list[JudgedLength
             template, shapes = body_template(find_species(name.removesuffix(_MESH))[0]), None
         else:
             template, shapes = load_shapes(name)
-        template, shapes = learnt_from(
-            crops,
-            template,
-            shapes,
-            Config(),
-            calibration=filmed.calibration,
-            observer=RunObserver(),
+        setup = MeasuringSetup(
+            config=Config(), template=template, candidates=shapes, calibration=filmed.calibration
         )
-        found[name] = _lengths(crops, filmed.truth_mm, template, shapes, filmed.calibration)
+        setup = learnt_from(crops, setup, RunObserver())
+        found[name] = _lengths(crops, filmed.truth_mm, setup)
     return found
 
 
 def _lengths(
     crops: Sequence[FishCrop],
     truth_mm: dict[int, float],
-    template: Template,
-    shapes: CandidateShapes | None,
-    calibration: Calibration,
+    setup: MeasuringSetup,
 ) -> list[JudgedLength]:
-    nodes = later_nodes(Config(), template=template, candidates=shapes, calibration=calibration)
+    nodes = later_nodes(
+        setup.config,
+        template=setup.template,
+        candidates=setup.candidates,
+        calibration=setup.calibration,
+    )
     return judge(through_all(crops, nodes), truth_mm)
 
 

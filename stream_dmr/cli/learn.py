@@ -35,11 +35,11 @@ def learn_template(
     from rich.progress import Progress
 
     from stream_dmr.errors import OutputError, TemplateError
-    from stream_dmr.fitting.learn_shapes import learn_shapes
     from stream_dmr.fitting.shape.candidates import load_shapes, mesh_form
     from stream_dmr.fitting.shape.describe import describe
     from stream_dmr.recording.reading.open_recording import open_recordings
     from stream_dmr.results.own_files import require_writable
+    from stream_dmr.running.measuring_setup import MeasuringSetup
     from stream_dmr.running.shape_pass import save_stocks, stock_paths
 
     if out.suffix != ".ply":
@@ -49,16 +49,17 @@ def learn_template(
     header = opened[0].header
     mesh, forms = load_shapes(template, on_notice=lambda line: warn([line]))
     forms = forms or mesh_form(mesh)
-    settings = settings_of(config, header.config_toml, recordings[0])
+    setup = MeasuringSetup(
+        config=settings_of(config, header.config_toml, recordings[0]),
+        template=mesh,
+        candidates=forms,
+        calibration=header.calibration,
+    )
     with Progress(transient=True) as progress:
         task = progress.add_task("looking for fish that are completely visible", total=None)
-        stocks = learn_shapes(
+        stocks = setup.learn(
             _crops(opened),
-            mesh,
             forms,
-            settings.fit_mesh,
-            calibration=header.calibration,
-            species=settings.species,
             progress=lambda step: progress.update(task, description=step),
         )
     warn([line for one in opened for line in one.warnings])

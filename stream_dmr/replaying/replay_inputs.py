@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from stream_dmr.calibration.calibration_file import load_calibration, require_size
 from stream_dmr.camera import Calibration
-from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
+from stream_dmr.fitting.shape.candidates import load_shapes
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.recording.messages.codec import stored_picture
 from stream_dmr.recording.messages.run_header import RunHeader
@@ -14,19 +14,15 @@ from stream_dmr.replaying.recorded_files import CropFiles, find_crop_files, inpu
 from stream_dmr.replaying.replay_config import replay_config
 from stream_dmr.replaying.replay_request import ReplayRequest
 from stream_dmr.running.config import Config, to_toml
+from stream_dmr.running.measuring_setup import MeasuringSetup
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.running.shape_pass import learnt_from
-from stream_dmr.template.template import Template
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayInputs:
+class ReplayInputs(MeasuringSetup):
     """What the nodes of a replay are made of."""
 
-    config: Config
-    template: Template
-    candidates: CandidateShapes | None  # the shapes that the fish may have; None: the template's
-    calibration: Calibration | None
     files: CropFiles | None  # None where no crop is cut again
 
 
@@ -46,7 +42,7 @@ def read_inputs(
     if request.calibration is not None:
         calibration = load_calibration(request.calibration)
         _require_size_of_frames(calibration, recording)
-    template, candidates = _shapes(request, recording, config, calibration, observer)
+    setup = _with_shapes(request, recording, config, calibration, observer)
     files = None
     if request.first == "crop":
         files = find_crop_files(
@@ -54,8 +50,8 @@ def read_inputs(
         )
     return ReplayInputs(
         config=config,
-        template=template,
-        candidates=candidates,
+        template=setup.template,
+        candidates=setup.candidates,
         calibration=calibration,
         files=files,
     )
@@ -94,18 +90,21 @@ def _require_size_of_frames(calibration: Calibration, recording: Recording) -> N
         require_size(calibration, width=picture.width, height=picture.height)
 
 
-def _shapes(
+def _with_shapes(
     request: ReplayRequest,
     recording: Recording,
     config: Config,
     calibration: Calibration | None,
     observer: RunObserver,
-) -> tuple[Template, CandidateShapes | None]:
-    """Mesh and candidate shapes, by what the recorded crops show where a template is given."""
+) -> MeasuringSetup:
+    """With mesh and candidate shapes, by what the crops show where a template is given."""
     if request.template is None:
-        return recording.header.template, known_shapes(recording)
-    template, forms = load_shapes(request.template, on_notice=observer.warn)
-    if not config.fit_mesh.are_shapes_learnt:
-        return template, forms
-    crops = messages_of(recording, FishCrop)
-    return learnt_from(crops, template, forms, config, calibration=calibration, observer=observer)
+        template, candidates = recording.header.template, known_shapes(recording)
+    else:
+        template, candidates = load_shapes(request.template, on_notice=observer.warn)
+    setup = MeasuringSetup(
+        config=config, template=template, candidates=candidates, calibration=calibration
+    )
+    if request.template is None or not config.fit_mesh.are_shapes_learnt:
+        return setup
+    return learnt_from(messages_of(recording, FishCrop), setup, observer)

@@ -5,36 +5,31 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from stream_dmr.calibration.calibration_file import load_calibration, require_size
-from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
-from stream_dmr.fitting.shape.candidates import CandidateShapes, given_mesh, load_shapes
+from stream_dmr.fitting.shape.candidates import given_mesh, load_shapes
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.run_inputs import InputFile, RunInputs
 from stream_dmr.results.learnt_meshes import learnt_files
 from stream_dmr.results.signatures import Signer
 from stream_dmr.running.conditions import lying, started_at, stills
-from stream_dmr.running.config import Config, load_config, to_toml
+from stream_dmr.running.config import load_config, to_toml
 from stream_dmr.running.kept_crops import KeptCrops
+from stream_dmr.running.measuring_setup import MeasuringSetup
 from stream_dmr.running.run_request import RunRequest, without_password
 from stream_dmr.running.species_checks import require_known_species
 from stream_dmr.segmentation.tracking.fish_finder import FishFinder, open_finder
 from stream_dmr.sensors.open_positions import open_positions
 from stream_dmr.sensors.position_source import PositionSource
 from stream_dmr.sources.source import Source
-from stream_dmr.template.template import Template
 
 
 @dataclass(frozen=True, kw_only=True)
-class Inputs:
+class Inputs(MeasuringSetup):
     """A request with its files read and checked, and the open source."""
 
     request: RunRequest
-    config: Config
-    template: Template
     notices: Sequence[str]  # what was repaired or found when the template was read
-    candidates: CandidateShapes | None  # None: the template's own shape
-    calibration: Calibration | None
     finder: FishFinder
     reader: ReadFrames
     positions: PositionSource | None = None  # None: none were asked for

@@ -11,7 +11,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 
 from stream_dmr.errors import OutputError
-from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import CandidateShapes, mesh_form
 from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.fitting.shape.mesh_agreement import are_like_mesh, not_like_mesh
@@ -110,15 +109,7 @@ def follow_shapes(
     fit_mesh.learn(known)
 
     def learn(crops: Sequence[FishCrop], progress: Callable[[str], None]) -> CandidateShapes | None:
-        stocks = learn_shapes(
-            crops,
-            inputs.template,
-            forms,
-            inputs.config.fit_mesh,
-            calibration=inputs.calibration,
-            species=inputs.config.species,
-            progress=progress,
-        )
+        stocks = inputs.learn(crops, forms, progress=progress)
         if is_mesh and stocks is None:
             observer.warn(not_like_mesh(forms, None))
         return stocks

@@ -130,13 +130,7 @@ def _measure(
 def _has_the_right_mesh(inputs: Inputs, seen: SeenFish, observer: RunObserver) -> bool:
     """False where a mesh was given that is not that of the fish."""
     is_given = inputs.candidates is None and inputs.config.fit_mesh.are_shapes_learnt
-    return not is_given or is_mesh_theirs(
-        seen.crops(),
-        inputs.template,
-        inputs.config,
-        calibration=inputs.calibration,
-        observer=observer,
-    )
+    return not is_given or is_mesh_theirs(seen.crops(), inputs, observer)
 
 
 def _compile_kernels_for(inputs: Inputs) -> None:

@@ -10,8 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from threading import Event
 
-from stream_dmr.camera import Calibration
-from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes, mesh_form
 from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.fitting.shape.mesh_agreement import are_like_mesh, not_like_mesh
@@ -21,9 +19,9 @@ from stream_dmr.messages import FishCrop
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.results.learnt_meshes import is_mesh_by, mesh_comment, require_free_names
-from stream_dmr.running.config import Config
 from stream_dmr.running.inputs import Inputs
 from stream_dmr.running.kept_crops import keep_crops
+from stream_dmr.running.measuring_setup import MeasuringSetup
 from stream_dmr.running.run_folder import require_folder
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.template.template import Template
@@ -52,63 +50,41 @@ def with_learnt_shapes(
     inputs = replace(inputs, reader=reader, crops=crops)
     if stop.is_set():
         return inputs
-    candidates = _learn_aloud(
-        crops, inputs.template, forms, config, calibration=inputs.calibration, observer=observer
-    )
-    return replace(inputs, candidates=candidates)
+    return replace(inputs, candidates=_learn_aloud(crops, inputs, forms, observer))
 
 
 def learnt_from(
-    crops: Iterable[FishCrop],
-    template: Template,
-    forms: CandidateShapes | None,
-    config: Config,
-    *,
-    calibration: Calibration | None,
-    observer: RunObserver,
-) -> tuple[Template, CandidateShapes | None]:
-    """The shapes that all these fish together have, and the template of which they are.
+    crops: Iterable[FishCrop], setup: MeasuringSetup, observer: RunObserver
+) -> MeasuringSetup:
+    """The setup with the shapes that all these fish together have, told to the observer.
 
-    Without `forms` it is the template's own, unless the fish show another: then their shapes are
-    learnt as by `--template auto`. The observer is told what was learnt.
+    Without candidates these are the template's own, unless the fish show another: then their shapes
+    are learnt as by `--template auto`.
     """
     seen_whole = [*itertools.chain.from_iterable(good_crops(crops))]
+    forms = setup.candidates
     if forms is None:
-        if is_mesh_theirs(seen_whole, template, config, calibration=calibration, observer=observer):
-            return template, None
+        if is_mesh_theirs(seen_whole, setup, observer):
+            return setup
         template, forms = load_shapes(AUTO)
         assert forms is not None
-    return template, _learn_aloud(
-        seen_whole, template, forms, config, calibration=calibration, observer=observer
-    )
+        setup = replace(setup, template=template)
+    return replace(setup, candidates=_learn_aloud(seen_whole, setup, forms, observer))
 
 
-def is_mesh_theirs(
-    crops: Sequence[FishCrop],
-    template: Template,
-    config: Config,
-    *,
-    calibration: Calibration | None,
-    observer: RunObserver,
-) -> bool:
+def is_mesh_theirs(crops: Sequence[FishCrop], setup: MeasuringSetup, observer: RunObserver) -> bool:
     """Whether the fish of these good crops are like a mesh that was given for them.
 
     True where there are none. The observer is told.
     """
+    template = setup.template
     if not crops:
         observer.warn(f"no fish was seen whole: whether they are like {template.name} is not known")
         return True
     mesh = mesh_form(template)
     observer.stage(f"comparing the fish with {template.name}")
-    stocks = learn_shapes(
-        crops,
-        template,
-        mesh,
-        config.fit_mesh,
-        calibration=calibration,
-        species=config.species,
-        suffices=are_like_mesh,  # only what would be disbelieved is looked at longer
-    )
+    # Only what would be disbelieved is looked at longer.
+    stocks = setup.learn(crops, mesh, suffices=are_like_mesh)
     if stocks is not None and are_like_mesh(stocks):
         for line in describe(mesh, stocks):
             observer.notice(line)
@@ -122,22 +98,13 @@ def is_mesh_theirs(
 
 def _learn_aloud(
     crops: Iterable[FishCrop],
-    template: Template,
+    setup: MeasuringSetup,
     forms: CandidateShapes,
-    config: Config,
-    *,
-    calibration: Calibration | None,
     observer: RunObserver,
 ) -> CandidateShapes:
     """The stocks of all fish, or the forms where none is seen whole; the observer is told."""
-    stocks = learn_shapes(
-        crops,
-        template,
-        forms,
-        config.fit_mesh,
-        calibration=calibration,
-        species=config.species,
-        progress=lambda step: observer.stage(f"learning their shapes: {step}"),
+    stocks = setup.learn(
+        crops, forms, progress=lambda step: observer.stage(f"learning their shapes: {step}")
     )
     if stocks is None:
         observer.warn("no fish was seen whole: each is measured as the form it is most like")
