@@ -180,16 +180,21 @@ class Export:
         return path
 
     def viame(self, path: Path) -> int:
-        """Write boxes, outlines, ends and lengths as VIAME CSV, for DIVE; returns their number."""
+        """Write boxes, outlines, ends and lengths as VIAME CSV, for DIVE; returns their number.
+
+        Rejected fish and doubles are left out.
+        """
         self._require_writable(path)
-        tracks = ViameTracks(self._all_fish(), fps=self._fps())
+        fish = self._all_fish()
+        left_out = {one.estimate.track_id for one in fish if not one.counts}
+        tracks = ViameTracks(fish, fps=self._fps())
         crops: dict[tuple[int, int], FishCrop] = {}
         for message in self._messages(FishCrop, LocalizedFish):
             if isinstance(message, FishCrop):
                 crops[message.track_id, message.frame_index] = message
             elif isinstance(message, LocalizedFish):
                 crop = crops.pop((message.track_id, message.frame_index), None)
-                if crop is not None:
+                if crop is not None and message.track_id not in left_out:
                     tracks.add(
                         track_id=message.track_id,
                         frame_index=message.frame_index,

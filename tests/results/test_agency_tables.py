@@ -18,7 +18,8 @@ from stream_dmr.results.agency_tables import (
 from stream_dmr.results.catch_facts import CatchFacts
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.fish_species import sure_code
-from stream_dmr.results.verdicts import Review
+from stream_dmr.results.verdicts import Review, Verdict
+from stream_dmr.results.verdicts_table import add_verdict
 from stream_dmr.results.vessel_track import Whereabouts
 from stream_dmr.results.viame_csv import ViameTracks
 from stream_dmr.template.template_file import load_template
@@ -121,3 +122,14 @@ def test_every_export_of_a_run(tmp_path: Path):
     assert len(rows) == 2 + 10  # a fish in two frames, two in four
     assert invoke("verify", {str(tmp_path / "exp"): None}).code == 0
     shutil.rmtree(tmp_path / "exp")
+
+
+@pytest.mark.parametrize("kind", ["reject", "duplicate"])
+def test_tracks_are_of_the_fish_that_count(tmp_path: Path, kind: str):
+    out = measure(tmp_path)
+    verdict = Verdict(track_id=1, kind=kind, reason="a glove", duplicate_of=2, reviewer="Ada")
+    add_verdict(out / "lengths.db", verdict)
+    done = invoke(f"export {out} --viame", {"--out": str(tmp_path / "exp")})
+    assert done.code == 0, done.err
+    lines = (tmp_path / "exp" / "tracks.viame.csv").read_text().splitlines()
+    assert {line.split(",")[0] for line in lines if not line.startswith("#")} == {"2"}
