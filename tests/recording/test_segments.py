@@ -18,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
+from stream_dmr.errors import OutputError
 from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.recording.messages.codec import decode
 from stream_dmr.recording.messages.record import Record
@@ -26,8 +27,11 @@ from stream_dmr.recording.messages.sink_states import SinkStates
 from stream_dmr.recording.messages.topics import TOPICS
 from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
 from stream_dmr.recording.recorder import Recorder
+from stream_dmr.recording.segments.recording_files import open_recording_files
 from stream_dmr.recording.segments.repair import repair_recordings
 from stream_dmr.recording.segments.rotating_sink import open_segments
+from stream_dmr.recording.segments.segment_files import last_segment_number
+from stream_dmr.recording.segments.unfinished_files import UnfinishedFiles
 from stream_dmr.report.view_pictures import frame_images, recorded_source
 from stream_dmr.results.folder_lock import FolderLock
 from stream_dmr.results.frames_table import FramesTable
@@ -43,6 +47,7 @@ from tests.support.tiny_clip import HEIGHT, QUICK, WIDTH, write_clip
 
 NUM_FRAMES, SLOWER = 24, 20  # 2 fish in 24 frames, 2/3 s from one to the next
 SEGMENT_S = 3.0  # 5 frames
+SEGMENT_FILES = "stream_dmr.recording.segments.segment_files"
 SETTINGS = RecordingSettings(rrd=False, flush_s=1e-9, segment_s=SEGMENT_S)
 
 
@@ -148,6 +153,47 @@ def test_recording_goes_on_when_the_folder_was_away(tmp_path: Path, messages: li
     assert all(name.endswith(".mcap") for name in names(out))
     recorded = {m.frame_index for m in read_messages(out, [Frame])}
     assert recorded == set(range(1, NUM_FRAMES + 1))  # into the file that was open
+
+
+def test_a_segment_that_was_refused_twice_is_written_to_its_end(
+    tmp_path: Path, messages: list[Message]
+):
+    refused = 0
+
+    def refuse_twice(out_dir: Path, *args, **kwargs):
+        nonlocal refused
+        if kwargs["segment_number"] == 2 and refused < 2:
+            refused += 1
+            raise OutputError(f"{out_dir}: no room")
+        return open_recording_files(out_dir, *args, **kwargs)
+
+    notices: list[str] = []
+    files = partial(open_segments, on_notice=notices.append)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(f"{SEGMENT_FILES}.open_recording_files", refuse_twice)
+        with Recorder(tmp_path, header(), SETTINGS, files=files, in_one_thread=True) as segments:
+            for message in messages:
+                segments.write(message)
+    assert refused == 2
+    assert [line for line in notices if "tried again" not in line] == []
+    recorded = {m.frame_index for m in read_messages(tmp_path, [Frame])}
+    assert recorded == set(range(1, NUM_FRAMES + 1))
+
+
+def test_what_no_segment_holds_is_said_at_the_end(tmp_path: Path, messages: list[Message]):
+    notices: list[str] = []
+    files = partial(open_segments, on_notice=notices.append)
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        Recorder(tmp_path, header(), SETTINGS, files=files, in_one_thread=True) as segments,
+    ):
+        for message in messages:
+            if message.frame_index == NUM_FRAMES - 3:
+                patch.setattr(f"{SEGMENT_FILES}.free_bytes", lambda folder: 0)
+            segments.write(message)
+    recorded = {m.frame_index for m in read_messages(tmp_path, [Frame])}
+    assert recorded == set(range(1, NUM_FRAMES - 3))
+    assert notices[-1].startswith("at least 4 frames are in no recording")
 
 
 def test_a_recording_is_read_as_it_is_while_a_run_writes_and_renames_it(
@@ -271,6 +317,20 @@ def test_a_recording_that_was_only_begun_is_set_aside(torn: Path, tmp_path: Path
     part.write_bytes((torn / part.name).read_bytes()[:size])
     list(repair_recordings(tmp_path))
     assert names(tmp_path) == ["recording-000001.mcap.part.damaged"]
+
+
+def test_what_was_not_there_when_a_disk_refused_it_is_not_repaired(torn: Path, tmp_path: Path):
+    folder = Path(shutil.copytree(torn, tmp_path / "out"))
+    assert last_segment_number(folder) == 2
+    notices, closed = list[str](), list[Path]()
+    unfinished = UnfinishedFiles(on_notice=notices.append, on_closed=closed.append)
+    for number in (2, 3):
+        unfinished.add(folder / f"recording-00000{number}.mcap")
+    shutil.copy(folder / "recording-000002.mcap.part", folder / "recording-000003.mcap.part")
+    unfinished.finish()
+    assert closed == [folder / "recording-000002.mcap"]
+    assert names(folder)[-1] == "recording-000003.mcap.part"
+    assert len(notices) == 1
 
 
 def test_a_repair_replaces_no_recording(torn: Path, tmp_path: Path):
