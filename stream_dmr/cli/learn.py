@@ -45,6 +45,7 @@ def learn_template(
     if out.suffix != ".ply":
         raise OutputError(f"--out {out}: expected a name that ends in .ply")
     require_writable(out, out.with_suffix(".toml"), overwrite=overwrite)
+    _require_different(recordings)
     opened = [open_recordings([path]) for path in recordings]
     header = opened[0].header
     mesh, forms = load_shapes(template, on_notice=lambda line: warn([line]))
@@ -75,6 +76,22 @@ def learn_template(
         print(f"{path}: measure with --template {path}")
     for line in describe(forms, stocks):
         print(line)
+
+
+def _require_different(recordings: list[Path]) -> None:
+    """Raise UserError where two paths lead to one recording: its fish would count twice."""
+    from stream_dmr.errors import UserError
+    from stream_dmr.recording.reading.open_recording import files_of
+
+    known = dict[Path, Path]()
+    for path in recordings:
+        stems = {file.resolve().with_suffix("") for file in files_of(path)}  # .mcap, or its .rrd
+        for stem in stems & known.keys():
+            raise UserError(
+                f"{path}: expected each recording once, got one that {known[stem]} has too; leave "
+                "one out, else its fish count twice"
+            )
+        known |= dict.fromkeys(stems, path)
 
 
 def _crops(recordings: "list[Recording]") -> "Iterator[FishCrop]":

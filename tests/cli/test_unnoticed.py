@@ -217,3 +217,17 @@ def test_no_message_has_the_number_of_an_error(command: str, options: dict[str, 
     outcome = invoke(command, options)
     assert outcome.code == 2
     assert "Errno" not in outcome.err
+
+
+@pytest.mark.parametrize(
+    "again", ["clip/../out", "link", "out/recording.mcap", "out/recording.rrd"]
+)
+def test_fish_of_a_recording_that_is_given_twice_are_not_counted_twice(
+    out: Path, tmp_path: Path, again: str
+):
+    link = out.with_name("link")
+    link.unlink(missing_ok=True)
+    link.symlink_to(out)
+    outcome = invoke(f"learn-template {out} {out.parent / again} --out {tmp_path / 'x.ply'}")
+    assert outcome.code == 2
+    assert outcome.error.startswith(f"{out.parent / again}: expected each recording once")

@@ -58,7 +58,7 @@ def open_recordings(paths: Sequence[Path]) -> Recording:
 
     Raises RecordingError where one can't be read, or where they are not of the same run.
     """
-    files = [file for path in paths for file in _files_of(path)]
+    files = [file for path in paths for file in files_of(path)]
     segments = [RrdRecording(f) if f.suffix == ".rrd" else McapRecording(f) for f in files]
     return segments[0] if len(segments) == 1 else _Segments(files, segments)
 
@@ -83,7 +83,7 @@ def messages_of(
             yield message
 
 
-def _files_of(path: Path) -> list[Path]:
+def files_of(path: Path) -> list[Path]:
     """A file itself; of a folder its .mcap files, whole or torn, or else its .rrd files."""
     if not path.is_dir():
         return [path]
