@@ -12,8 +12,15 @@ def setup() -> None:
 
     began, console = time.monotonic(), Console(stderr=True, highlight=False)
     with stop_on_signals() as stop, console.status("") as status:
-        if not console.is_terminal:
-            console.print("compiling the numeric loops, once on this machine: half a minute")
-        prepare_kernels(status.update, stop=stop)
+        said = list[str]()
+
+        def say(line: str) -> None:
+            """Draw it on a terminal; elsewhere print the first line alone."""
+            if not console.is_terminal and not said:
+                console.print(line, markup=False)
+            said.append(line)
+            status.update(line)
+
+        prepare_kernels(say, stop=stop)
     stop.exit()
     print(f"ready, after {time.monotonic() - began:.0f} s")

@@ -231,3 +231,17 @@ def test_fish_of_a_recording_that_is_given_twice_are_not_counted_twice(
     outcome = invoke(f"learn-template {out} {out.parent / again} --out {tmp_path / 'x.ply'}")
     assert outcome.code == 2
     assert outcome.error.startswith(f"{out.parent / again}: expected each recording once")
+
+
+@pytest.mark.parametrize("lines", [[], ["7 of about 85, 0 s", "9 of about 85, 1 s"]])
+def test_setup_speaks_of_compiling_where_it_compiles(
+    lines: list[str], monkeypatch: pytest.MonkeyPatch
+):
+    def prepare(on_progress: Callable[[str], None], *, stop: threading.Event) -> None:
+        for line in lines:
+            on_progress(line)
+
+    monkeypatch.setattr("stream_dmr.running.prepare_kernels.prepare_kernels", prepare)
+    outcome = invoke("setup")
+    assert (outcome.code, outcome.out) == (0, "ready, after 0 s\n")
+    assert outcome.err.splitlines() == lines[:1]
