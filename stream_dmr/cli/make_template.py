@@ -20,8 +20,8 @@ def make_template(
     thickness: Annotated[
         float | None,
         typer.Option(
-            help="Largest thickness over largest breadth.",
-            show_default="as seen from above, or of the bundled body form nearest in outline",
+            help="Largest thickness over largest breadth, where there is no --top.",
+            show_default="that of the bundled body form nearest in outline",
         ),
     ] = None,
     overwrite: OverwriteOption = False,

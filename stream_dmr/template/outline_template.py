@@ -38,9 +38,14 @@ def template_from_masks(
     Without `top`, the thickness along the body is that of the bundled body form whose outline is
     nearest; `thickness` scales it to this largest thickness, as a share of the breadth.
 
-    Raises TemplateError where a mask can't be read or shows no whole straight fish, or `thickness`
-    is out of range.
+    Raises TemplateError where a mask can't be read or shows no whole straight fish, `thickness` is
+    out of range, or both `top` and `thickness` are given.
     """
+    if top is not None and thickness is not None:
+        raise TemplateError(
+            f"--thickness {thickness:g}: expected either it or --top {top}, which shows the "
+            "thickness, got both; leave one out"
+        )
     if thickness is not None and not 0 < thickness <= 2:
         raise TemplateError(
             f"--thickness: expected thickness over breadth, above 0 to 2, got {thickness:g}"

@@ -68,11 +68,14 @@ def test_without_a_view_from_above_the_nearest_form_gives_the_thickness(tmp_path
 
 def test_thickness_is_a_share_of_the_breadth(tmp_path: Path):
     side, top = write_views(tmp_path, "cod")
-    for view in (top, None):
-        made = template_from_masks(side, top=view, thickness=0.5, name="cod")
-        _, breadth, thickness = body_of(made.template).extents
-        assert made.thickness == pytest.approx(0.5)
-        assert thickness == pytest.approx(0.5 * breadth, rel=0.02)
+    made = template_from_masks(side, thickness=0.5, name="cod")
+    _, breadth, thickness = body_of(made.template).extents
+    assert made.thickness == pytest.approx(0.5)
+    assert thickness == pytest.approx(0.5 * breadth, rel=0.02)
+    both = {"--side": str(side), "--top": str(top), "--thickness": "0.5"}
+    refused = invoke("make-template", {**both, "--out": str(tmp_path / "both.ply")})
+    assert (refused.code, "got both" in refused.error) == (2, True)
+    assert not (tmp_path / "both.ply").exists()
 
 
 def test_upper_and_lower_edge_may_differ(tmp_path: Path):
