@@ -43,6 +43,11 @@ def haul(
                 f"now, got {at} with {target}; leave it out, or give the box's --out"
             )
         print(_post(target, what, name, token_file))
+    elif "://" in target:
+        raise UserError(
+            f"{target}: expected http:// or https:// of a run's status page, or the --out of a "
+            "run, got another kind of address"
+        )
     else:
         print(_write(Path(target), what, name, at))
 
