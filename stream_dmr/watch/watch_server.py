@@ -3,6 +3,7 @@
 import json
 import threading
 import time
+from contextlib import suppress
 from datetime import UTC, datetime
 from http import HTTPStatus
 from importlib.resources import files
@@ -126,16 +127,25 @@ class _WatchHandler(TokenHandler):
         if path != "/haul" or hauls is None or not is_json or not is_short:
             return self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"expected a haul as JSON\n")
         try:
-            told = json.loads(self.rfile.read(int(length)))
+            told = _parse_haul(self.rfile.read(int(length)))
             what, name, said_by = (str(told.get(key) or "") for key in ("what", "name", "said_by"))
             name = hauls.tell(what, name, said_by=said_by)
-        except (UserError, ValueError, AttributeError) as error:
+        except UserError as error:
             return self.answer(HTTPStatus.BAD_REQUEST, "text/plain", f"{error}\n".encode())
         self.answer_json(HTTPStatus.OK, {"name": name})
 
     def _answer_page(self, name: str) -> None:
         page = files("stream_dmr.watch").joinpath(name).read_bytes()
         self.answer(HTTPStatus.OK, "text/html; charset=utf-8", page)
+
+
+def _parse_haul(content: bytes) -> dict[str, Any]:
+    """The JSON object of a haul. Raises UserError where it is none."""
+    with suppress(ValueError):
+        if isinstance(told := json.loads(content), dict):
+            return told
+    got = content.decode(errors="replace")
+    raise UserError(f"expected a haul as a JSON object with what, name, said_by, got {got!r}")
 
 
 def zones_json(state: RunState) -> dict[str, Any]:

@@ -1,5 +1,7 @@
 """Hauls begun and ended on the status page, in a browser, by mouse on two widths."""
 
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -101,3 +103,24 @@ def test_a_running_box_takes_a_haul_as_of_now_alone(server: WatchServer, hauls: 
     assert "expected with the folder of a run" in told.error
     assert hauls.hauls() == []
     assert invoke("haul", {"start": None, server.address: None}).out == "haul 1: start\n"
+
+
+@pytest.mark.parametrize("told", ['["start"]', '"start"', "3", "null", "true", "[1", "\xff"])
+def test_what_is_no_haul_is_refused_in_one_line(server: WatchServer, hauls: HaulLog, told: str):
+    headers = {"Content-Type": "application/json"}
+    request = urllib.request.Request(f"{server.address}haul", told.encode("latin-1"), headers)
+    with pytest.raises(urllib.error.HTTPError) as refused:
+        urllib.request.urlopen(request)
+    with refused.value as answer:
+        text = answer.read().decode()
+    assert refused.value.code == 400
+    assert text.startswith("expected a haul as a JSON object")
+    assert text.count("\n") == 1
+    assert hauls.hauls() == []
+
+
+@pytest.mark.parametrize("address", ["ftp://x", "rtsp://camera/1", "htp://localhost:8000"])
+def test_an_address_of_another_kind_is_no_folder(address: str):
+    told = invoke("haul", {"start": None, address: None})
+    assert told.code == 2
+    assert told.error.startswith(f"{address}: expected http://")
