@@ -8,7 +8,7 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -55,7 +55,7 @@ def main() -> None:
     """The entry point of `stream-dmr`."""
     sys.meta_path.insert(0, _WithoutPandas())
     with exit_codes():
-        app(prog_name="stream-dmr")
+        sys.exit(app(prog_name=app.info.name, standalone_mode=False))
 
 
 class _WithoutPandas(MetaPathFinder, Loader):
@@ -76,11 +76,18 @@ class _WithoutPandas(MetaPathFinder, Loader):
 
 @contextmanager
 def exit_codes() -> Generator[None]:
-    """Turns a UserError into one line and exit code 2, other errors into a traceback and 1."""
+    """Turns a UserError into one line and exit code 2, other errors into a traceback and 1.
+
+    So it does with what Typer says of a wrong command line.
+    """
     try:
         yield
     except UserError as error:
         print(f"error: {one_line(error)}", file=sys.stderr)
+        sys.exit(2)
+    except typer.TyperException as error:
+        is_help = len(sys.argv) == 1
+        print(error.format_message() if is_help else _usage_line(error), file=sys.stderr)
         sys.exit(2)
     except Exception as error:
         traceback.print_exc()
@@ -96,6 +103,17 @@ def one_line(error: UserError) -> str:
     """The message of an error and its notes on one line."""
     parts = [str(error), *getattr(error, "__notes__", [])]
     return "; ".join(" ".join(part.splitlines()) for part in parts)
+
+
+def _usage_line(error: typer.TyperException) -> str:
+    """What is wrong with a command line, and where to read how it must be."""
+    context: Any = getattr(error, "ctx", None)
+    command = app.info.name if context is None else context.command_path
+    said = " ".join(error.format_message().replace("Value error, ", "").split()).rstrip(".")
+    cause: Any = error.__cause__  # Pydantic's, which does not always say what came
+    got = [repr(one["input"]) for one in cause.errors()] if hasattr(cause, "errors") else []
+    came = "".join(f", got {one}" for one in got if one not in said)
+    return f"error: {said[:1].lower()}{said[1:]}{came}; see {command} --help"
 
 
 def _print_version(is_asked: bool) -> bool:

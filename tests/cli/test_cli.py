@@ -41,11 +41,28 @@ def test_every_command_has_help(command: str):
     assert invoke(command, {"--help": None}).code == 0
 
 
-@pytest.mark.parametrize("command", ["fly", "run --speed 3", "simulate --fish many --out x"])
-def test_usage_errors_exit_with_2_and_no_traceback(command: str):
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        ("fly", "no such command 'fly'; see stream-dmr --help"),
+        ("--speed 3", "no such option: --speed; see stream-dmr --help"),
+        ("run --speed 3", "; see stream-dmr run --help"),
+        ("run", "missing option '--source'; see stream-dmr run --help"),
+        ("run --source", "option '--source' requires an argument; see stream-dmr --help"),
+        ("simulate --fish many --out x", ", got 'many'; see stream-dmr simulate --help"),
+        ("haul go x", "'go' is not one of 'start', 'end'; see stream-dmr haul --help"),
+        ("haul", "missing argument 'what'. Choose from: start, end; see stream-dmr haul --help"),
+    ],
+)
+def test_a_usage_error_is_one_line_with_what_to_read(command: str, expected: str):
     outcome = invoke(command)
     assert outcome.code == 2
-    assert "Traceback" not in outcome.err
+    assert outcome.error.endswith(expected)
+
+
+def test_without_a_command_there_is_help():
+    outcome = invoke("")
+    assert (outcome.code, outcome.err.splitlines()[0].split(":")[0]) == (2, "Usage")
 
 
 @pytest.mark.parametrize(
