@@ -9,7 +9,6 @@ from stream_dmr.errors import UserError
 from stream_dmr.files import make_folder, writing_to
 from stream_dmr.recording.messages.selection import Selection
 from stream_dmr.recording.reading.frame_lookup import FrameLookup
-from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.recording.reading.required_parts import require_messages
 from stream_dmr.report.coastline import Line
 from stream_dmr.report.drawn_views import draw_views
@@ -25,6 +24,7 @@ from stream_dmr.results.finished_fish import (
     run_notes,
 )
 from stream_dmr.results.kept_positions import read_positions
+from stream_dmr.results.lost_recording import LostRecording, open_results, require_recording
 from stream_dmr.results.provenance import add_files
 from stream_dmr.results.track_edits import NO_EDITS, edits_of
 from stream_dmr.results.verdicts_table import read_added_frames, read_verdicts
@@ -43,7 +43,7 @@ def open_report(
 
     Raises a UserError where they can't be read, or where `source` is not the recorded one.
     """
-    recording = open_recordings([path])
+    recording = open_results(path)
     header = recording.header
     of_run = parse_config(header.config_toml, where=f"{path}: its config.toml")
     reviewed = None if as_measured else reviewed_tracks(path, of_run)
@@ -54,13 +54,14 @@ def open_report(
         fish = read_measured_fish(database)
     else:
         fish = read_fish(path, recording)
-    tracks = read_tracks(recording, reviewed=reviewed)
+    is_lost = isinstance(recording, LostRecording)
+    tracks = {} if is_lost else read_tracks(recording, reviewed=reviewed)
     return RunReport(
         path=path,
         recording=recording,
         fish=fish,
         tracks=tracks,
-        views=draw_views(tracks, recording, source),
+        views={} if is_lost else draw_views(tracks, recording, source),
         config=of_run,
         settings=(of_run if config is None else load_config(config)).fisheries,
         edits=NO_EDITS if reviewed is None else reviewed.edits,
@@ -157,6 +158,8 @@ def open_folders(
         else:
             opened = [open_report(folder, source=source, config=config, as_measured=as_measured)]
         reports += opened
+    for report in reports:
+        require_recording(report.recording, where=report.path, what="a review")
     if source is not None and len(reports) > 1:
         raise UserError("--source: expected one run, got several, which have their own")
     _require_one_template(reports, folders[0])

@@ -153,7 +153,7 @@ def summary_row(fish: FishResult, report: RunReport) -> dict[str, Any]:
         "id": fish.estimate.track_id,  # in the page
         "run": 0,
         "video": "",
-        "unit": "body lengths" if report.recording.header.calibration is None else "mm",
+        "unit": "mm" if fish.facts.calibration_sha256 else "body lengths",
         "vessel": fish.facts.vessel,
         "trip": fish.facts.trip,
         "haul": fish.haul,

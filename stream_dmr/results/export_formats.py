@@ -19,7 +19,6 @@ from stream_dmr.recording.reading.known_shapes import known_shapes
 from stream_dmr.recording.reading.open_recording import (
     decoded_messages,
     messages_of,
-    open_recordings,
 )
 from stream_dmr.recording.reading.required_parts import (
     require_messages,
@@ -52,6 +51,7 @@ from stream_dmr.results.fish_table import fish_records, unweighed_note, write_cs
 from stream_dmr.results.fisheries import FisheriesSettings
 from stream_dmr.results.frames_table import FramesTable
 from stream_dmr.results.lengths_table import write_lengths
+from stream_dmr.results.lost_recording import open_results, require_recording
 from stream_dmr.results.own_files import require_writable
 from stream_dmr.results.provenance import known_files, read_origin, seal_files
 from stream_dmr.results.run_facts import run_facts
@@ -68,7 +68,7 @@ class Export:
         """With `overwrite`, existing files are replaced, except for those of a run."""
         self._path = recording
         self._database = database_of(recording)
-        self._recording = open_recordings([recording])
+        self._recording = open_results(recording)
         self._selection = selection
         self._reviewed = ReviewedMessages(self._recording, self._database, selection)
         self._written: list[Path] = []
@@ -99,6 +99,7 @@ class Export:
         Vertices are in the camera frame, in mm; without a calibration a fish is one body length
         long.
         """
+        self._require_recording("--meshes")
         template = self.template
         restored, count = MeshRebuilder(template, known_shapes(self._recording)), 0
         for fit, fish in _pairs(self._messages(FittedMesh, LocalizedFish)):
@@ -122,6 +123,7 @@ class Export:
         They are in the pixels of the frame, lens distortion included. Frames without fish are
         listed too. Categories are the FAO codes of the fish, and "fish" where there is none.
         """
+        self._require_recording("--masks")
         self._require_writable(path)
         frames = decoded_messages(self._recording, [Frame], self._selection)
         coco = coco_masks(
@@ -184,6 +186,7 @@ class Export:
 
         Rejected fish and doubles are left out.
         """
+        self._require_recording("--viame")
         self._require_writable(path)
         fish = self._all_fish()
         left_out = {one.estimate.track_id for one in fish if not one.counts}
@@ -231,6 +234,9 @@ class Export:
         rows = [haul_row(one, utc_zero_ns=zero_ns) for one in efforts]
         self._written.append(write_rows(make_folder(out) / path.name, HAUL_COLUMNS, rows))
         return path
+
+    def _require_recording(self, what: str) -> None:
+        require_recording(self._recording, where=self._path, what=what)
 
     def _require_selected(self) -> None:
         """Refuse a recording or a selection of nothing; lengths.db may know more fish than it."""

@@ -1,0 +1,110 @@
+"""Opens the results of a run whose recording is gone: lengths.db still has every fish."""
+
+from collections.abc import Iterator
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+
+from stream_dmr.errors import RecordingError
+from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
+from stream_dmr.messages import Message
+from stream_dmr.recording.messages.codec import encode
+from stream_dmr.recording.messages.run_header import RunHeader
+from stream_dmr.recording.messages.selection import EVERYTHING, Selection
+from stream_dmr.recording.reading.open_recording import (
+    MessageTypes,
+    Recording,
+    files_of,
+    open_recordings,
+)
+from stream_dmr.results.finished_fish import database_of, read_runs
+from stream_dmr.template.template import Template
+from stream_dmr.template.template_file import bundled_names
+
+_UNKNOWN = "unknown"
+
+
+def open_results(path: Path) -> Recording:
+    """The recording of a run's folder or a recording itself; a `LostRecording` where it is gone.
+
+    Raises RecordingError where there is neither a recording nor a lengths.db.
+    """
+    database = database_of(path)
+    if database is None or _has_recording(path):
+        return open_recordings([path])
+    return LostRecording(database)
+
+
+def _has_recording(path: Path) -> bool:
+    try:
+        return bool(files_of(path))
+    except RecordingError:
+        return False
+
+
+class LostRecording:
+    """A recording without messages; its header has what lengths.db knows of the last run."""
+
+    def __init__(self, database: Path) -> None:
+        """Raises OutputError where the database can't be read."""
+        facts = [*read_runs(database).values()][-1:]
+        self.header = RunHeader(
+            source=facts[0].source if facts else _UNKNOWN,
+            command=facts[0].command if facts else _UNKNOWN,
+            config_toml="",
+            template=_template_by(facts[0].template_sha256 if facts else ""),
+        )
+        self.metadata: dict[str, str] = {}
+        self.is_thinned = True
+        self.ends_early = False
+        self.warnings = [
+            f"{database.parent}: no recording (.mcap, .rrd) is left, so this is what "
+            f"{database.name} has: no frames, pictures or meshes, and [fisheries] of --config or "
+            "the defaults"
+        ]
+
+    def payloads(
+        self, kinds: MessageTypes, selection: Selection = EVERYTHING
+    ) -> Iterator[tuple[type[Message], bytes]]:
+        """None."""
+        return iter(())
+
+    def carried_over(self) -> Iterator[bytes]:
+        """None."""
+        return iter(())
+
+    def video(self, selection: Selection = EVERYTHING) -> Iterator[bytes]:
+        """None."""
+        return iter(())
+
+
+def require_recording(recording: Recording, *, where: object, what: str) -> None:
+    """Raise RecordingError where a recording is gone that is needed for `what`."""
+    if isinstance(recording, LostRecording):
+        raise RecordingError(
+            f"{where}: expected a recording for {what}, found no .mcap and no .rrd; lengths.db "
+            "has the lengths, which `export --fish`, `--tables` and `report` give"
+        )
+
+
+@cache
+def _template_by(hash_hex: str) -> Template:
+    """The bundled template with this SHA-256; of another one nothing is known, not even its tail.
+
+    A mesh of the user's own stood in the recording alone.
+    """
+    for name in (AUTO, *bundled_names()):
+        template, _ = load_shapes(name)
+        if sha256(encode(template)).hexdigest() == hash_hex:
+            return template
+    midline = np.linspace([-0.5, 0.0, 0.0], [0.5, 0.0, 0.0], 3)
+    return Template(
+        name=_UNKNOWN,
+        rest_vertices=np.zeros((0, 3)),
+        faces=np.zeros((0, 3), np.int64),
+        keypoints=midline,
+        joints=midline[1:2].repeat(2, axis=0),
+        midline=midline,
+    )
