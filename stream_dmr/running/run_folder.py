@@ -13,6 +13,7 @@ from stream_dmr.recording.segments.repair import Repair, repair_recordings
 from stream_dmr.results.folder_lock import require_unlocked
 from stream_dmr.results.learnt_meshes import learnt_files
 from stream_dmr.results.provenance import NAME as PROVENANCE
+from stream_dmr.results.provenance import known_files, read_origin
 
 RESULTS = (
     *("lengths.db", "lengths.csv", "frames.csv", "recording.mcap", "recording.rrd"),
@@ -39,8 +40,9 @@ def prepare_folder(
 ) -> list[Repair]:
     """Make sure that results can be written to `out`, and that no earlier ones are lost.
 
-    Raises OutputError where it is no folder, can't be written to, has no room, or holds results of
-    an earlier run; `overwrite` removes those instead, `resume` keeps them. With `waits_for_room` a
+    Raises OutputError where it is no folder, can't be written to, has no room, is that of a batch
+    or of exports, or holds results of an earlier run; `overwrite` removes those instead, `resume`
+    keeps them. With `waits_for_room` a
     full disk is no error. Returns the repairs of recordings that a crash left unfinished.
     """
     earlier = _open_folder(out, is_fine=overwrite or resume)
@@ -71,11 +73,23 @@ def require_folder(out: Path, *, overwrite: bool) -> None:
 
 def _open_folder(out: Path, *, is_fine: bool) -> list[Path]:
     """Make the folder unless it exists; returns the results of an earlier run in it."""
+    _require_no_others(out)
     earlier = _earlier_results(out, is_fine=is_fine)
     with _writing_to(out):
         out.mkdir(parents=True, exist_ok=True)
         require_unlocked(out)
     return earlier
+
+
+def _require_no_others(out: Path) -> None:
+    """Raise OutputError where the provenance in a folder is that of a batch or of exports."""
+    known, origin = known_files(out), read_origin(out)
+    is_exported = origin is not None and origin.resolve() != out.resolve()
+    if is_exported or (known and not {*known} & {*RESULTS}):
+        raise OutputError(
+            f"{out}: expected a folder for a run, found {PROVENANCE} of "
+            f"{'exports' if is_exported else 'a batch'}, which stays; choose another --out"
+        )
 
 
 @contextmanager

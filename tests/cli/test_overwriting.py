@@ -8,6 +8,7 @@ import pytest
 import trimesh
 
 from stream_dmr.results.own_files import is_made_by, is_of_run, require_writable
+from stream_dmr.results.provenance import seal_files
 from stream_dmr.simulation import scene_files
 from tests.support.command import Outcome, invoke
 from tests.support.fish_run import measure
@@ -152,3 +153,24 @@ def test_shapes_that_a_run_learnt_are_its_results(out: Path, tmp_path: Path):
         assert is_of_run(out / name)
         assert not is_of_run(tmp_path / name)
     assert not is_of_run(out / "template-of-mine.ply")
+
+
+@pytest.mark.parametrize("command", ["run", "run --overwrite", "replay --from smooth --overwrite"])
+@pytest.mark.parametrize("kind", ["batch", "exports"])
+def test_a_run_writes_nothing_into_a_batch_or_exports(
+    out: Path, tmp_path: Path, kind: str, command: str
+):
+    target = tmp_path / kind
+    if kind == "batch":
+        target.mkdir()
+        (target / "videos.csv").write_text("name\n")
+        seal_files(target, [target / "videos.csv"], runs={})
+    else:
+        assert invoke(f"export {out} --fish csv --tables csv --out {target}").code == 0
+    before = contents(target)
+    clip = out.parent / "clip"
+    given = f"{out}" if command.startswith("replay") else f"--source {clip / 'video.mp4'}"
+    outcome = invoke(f"{command} {given} --out {target}")
+    assert outcome.code == 2
+    assert f"provenance.json of {'a batch' if kind == 'batch' else 'exports'}" in outcome.error
+    assert contents(target) == before
