@@ -9,8 +9,8 @@ from stream_dmr.messages import LengthEstimate
 class CatchFacts:
     """What a run found out about a fish; None where it did not.
 
-    The fields are columns of `fish` that the first databases lack. A value of None stands in no
-    checksum, so that a database that got the columns later stays as it was sealed.
+    Each field is a column of `fish`, which older databases get when they are next written to. A
+    value of None stands in no checksum, so that these stay as they were sealed.
     """
 
     species_code: str | None = None  # FAO 3-alpha, or "unsure"

@@ -1,10 +1,10 @@
 """fish.csv (or .parquet): one row a fish with all that fisheries and auditors need of it."""
 
 import json
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from stream_dmr.catch.species_list import CODE
 from stream_dmr.csv_file import write_table
@@ -12,77 +12,117 @@ from stream_dmr.files import writing_to
 from stream_dmr.results.agency_tables import ICES_LENGTHS
 from stream_dmr.results.finished_fish import FishResult
 from stream_dmr.results.fish_species import code_of, is_same_species, species_of
-from stream_dmr.results.fisheries import FisheriesSettings, derive
-from stream_dmr.results.scale_checks import last_checks
+from stream_dmr.results.fisheries import Derived, FisheriesSettings, derive
+from stream_dmr.results.scale_checks import ScaleCheck, last_checks
 from stream_dmr.results.table_cells import seconds, utc_text
-from stream_dmr.results.verdicts import Review
 from stream_dmr.template.template import Template
 
-# Name -> type of its values, as in Parquet; every value may be missing.
-FISH_TABLE: dict[str, type] = {
-    **dict.fromkeys(("vessel", "trip", "haul"), str),
-    "track_id": int,
-    "origin": str,  # "run", or what a reviewer did to its frames: "add", "split" or "merge"
-    **dict.fromkeys(("template", "species", "species_code", "fate", "status"), str),
-    **dict.fromkeys(("species_share", "fate_share"), float),
-    "condition": str,
-    **dict.fromkeys(("length_mm", "length_std_mm", "ci95_low_mm", "ci95_high_mm"), float),
-    "length_from": str,  # "measurement" or "review": what the five columns after it follow from
-    **dict.fromkeys(("fork_length_mm", "total_length_mm"), float),
-    "length_cm": int,
-    "weight_kg": float,
-    "is_legal_size": bool,
-    **dict.fromkeys(("frames_seen", "frames_used", "first_frame", "last_frame"), int),
-    **dict.fromkeys(("first_time", "last_time"), str),
-    "time_utc": str,  # at the middle of its frames
-    "time_utc_ns": int,  # the same, since 1970
-    **dict.fromkeys(("latitude", "longitude", "speed_knots", "position_gap_s"), float),
-    "refused": str,  # JSON: reason -> number of frames
-    "iou": float,
-    "flags": str,  # JSON
-    **dict.fromkeys(("verdict", "verdict_reason"), str),
-    "duplicate_of": int,
-    **dict.fromkeys(("corrected_length_mm", "corrected_length_std_mm"), float),
-    "reviewer": str,
-    "reviewed_utc": str,
-    "reviewed_ns": int,  # wall clock, since 1970
-    **dict.fromkeys(("weight_source", "legal_source", "source", "run_id"), str),
-    **dict.fromkeys(("software_version", "config_sha256", "calibration_sha256"), str),
-    "template_sha256": str,
-    "ended_by": str,  # of the run
-    **dict.fromkeys(("frames_done", "frames_promised"), int),
-    "scale_error_percent": float,  # of the last `check` with the run's calibration
-    "scale_checked_ns": int,  # wall clock, since 1970
-    "length_type": str,  # which length `length_mm` is, by the ICES vocabulary; None: not known
+
+class _Row(NamedTuple):
+    """What the columns of one fish are made of."""
+
+    fish: FishResult
+    template: Template
+    settings: FisheriesSettings
+    species: str  # "": neither a reviewer nor a classifier said it
+    derived: Derived
+    check: ScaleCheck | None  # the last one with the calibration of its run
+
+
+_Column = tuple[type, Callable[[_Row], Any]]
+"""Type, as in Parquet, and value, which may be None."""
+
+
+def _same(kind: type, part: str, *names: str) -> dict[str, _Column]:
+    """Columns that are attributes of these names of a part of the row."""
+    return {name: (kind, attrgetter(f"{part}.{name}")) for name in names}
+
+
+_COLUMNS: dict[str, _Column] = {
+    **_same(str, "fish.facts", "vessel", "trip"),
+    **_same(str, "fish", "haul"),
+    **_same(int, "fish.estimate", "track_id"),
+    **_same(str, "fish", "origin"),
+    "template": (str, lambda row: row.template.name),
+    "species": (str, lambda row: row.species or row.template.name),
+    "species_code": (str, lambda row: code_of(row.fish)),
+    **_same(str, "fish", "fate"),
+    **_same(str, "fish.estimate", "status"),
+    # What a reviewer says has no share.
+    "species_share": (
+        float,
+        lambda row: None if row.fish.review.species else row.fish.catch.species_share,
+    ),
+    "fate_share": (
+        float,
+        lambda row: row.fish.catch.fate_share if row.fish.review.fate is None else None,
+    ),
+    **_same(str, "fish.review", "condition"),
+    **_same(float, "fish.estimate", "length_mm", "length_std_mm"),
+    "ci95_low_mm": (float, lambda row: _ci95_mm(row, 0)),
+    "ci95_high_mm": (float, lambda row: _ci95_mm(row, 1)),
+    "length_from": (str, lambda row: _length_from(row.fish)),  # as are the five after it
+    **_same(float, "derived", "fork_length_mm", "total_length_mm"),
+    **_same(int, "derived", "length_cm"),
+    **_same(float, "derived", "weight_kg"),
+    **_same(bool, "derived", "is_legal_size"),
+    **_same(int, "fish.estimate", "frames_seen", "frames_used", "first_frame", "last_frame"),
+    "first_time": (str, lambda row: seconds(row.fish.estimate.first_timestamp_ns)),
+    "last_time": (str, lambda row: seconds(row.fish.estimate.last_timestamp_ns)),
+    "time_utc": (str, lambda row: utc_text(row.fish.utc_ns)),  # at the middle of its frames
+    "time_utc_ns": (int, lambda row: row.fish.utc_ns),  # the same, since 1970
+    **_same(float, "fish.where", "latitude", "longitude", "speed_knots"),
+    "position_gap_s": (float, lambda row: row.fish.where.gap_s),
+    # JSON: reason -> number of frames
+    "refused": (str, lambda row: json.dumps(dict(row.fish.estimate.refused))),
+    **_same(float, "fish", "iou"),
+    "flags": (str, lambda row: json.dumps(list(row.fish.flags))),
+    "verdict": (str, lambda row: row.fish.review.decision or None),
+    "verdict_reason": (str, lambda row: row.fish.review.reason or None),
+    **_same(int, "fish.review", "duplicate_of"),
+    "corrected_length_mm": (float, lambda row: row.fish.review.length_mm),
+    "corrected_length_std_mm": (float, lambda row: row.fish.review.length_std_mm),
+    "reviewer": (str, lambda row: row.fish.review.reviewer or None),
+    "reviewed_utc": (str, lambda row: utc_text(row.fish.review.written_ns or None)),
+    "reviewed_ns": (int, lambda row: row.fish.review.written_ns or None),  # since 1970
+    "weight_source": (
+        str,
+        lambda row: None if row.derived.weight_kg is None else row.settings.weight_source,
+    ),
+    "legal_source": (
+        str,
+        lambda row: None if row.derived.is_legal_size is None else row.settings.legal_source,
+    ),
+    **_same(str, "fish.facts", "source"),
+    **_same(str, "fish", "run_id"),
+    **_same(str, "fish.facts", "software_version", "config_sha256", "calibration_sha256"),
+    **_same(str, "fish.facts", "template_sha256", "ended_by"),
+    **_same(int, "fish.facts", "frames_done", "frames_promised"),
+    "scale_error_percent": (float, lambda row: row.check and row.check.error_percent),
+    "scale_checked_ns": (int, lambda row: row.check and row.check.time_ns),  # since 1970
+    # Which length `length_mm` is, by the ICES vocabulary.
+    "length_type": (str, lambda row: ICES_LENGTHS.get(row.template.tail_gives or "")),
 }
+FISH_TABLE: dict[str, type] = {name: kind for name, (kind, _) in _COLUMNS.items()}
 
 
 def fish_record(
-    fish: FishResult, template: Template, settings: FisheriesSettings
+    fish: FishResult,
+    template: Template,
+    settings: FisheriesSettings,
+    *,
+    check: ScaleCheck | None = None,
 ) -> dict[str, Any]:
-    """The values of FISH_TABLE; None where there is none."""
+    """The values of FISH_TABLE; None where there is none.
+
+    `check`: the last one with the calibration of the fish's run.
+    """
     found = species_of(fish)
     named = "" if CODE.fullmatch(fish.review.species) else fish.review.species
-    species = named or (found.english_name if found else None) or fish.review.species
+    species = named or (found.english_name if found else "") or fish.review.species
     derived = derive(fish.length_mm, template, settings, species=species)
-    values: dict[str, Any] = {name: getattr(fish.facts, name, None) for name in FISH_TABLE}
-    values |= {n: getattr(fish.estimate, n) for n in FISH_TABLE if hasattr(fish.estimate, n)}
-    values |= asdict(fish.catch)
-    values |= {n: getattr(derived, n) for n in FISH_TABLE if hasattr(derived, n)}
-    return values | {
-        **_measured(fish),
-        **_review_columns(fish.review),
-        **_place_columns(fish),
-        "template": template.name,
-        "species": species or template.name,
-        **_species_columns(fish),
-        **_fate_columns(fish.review),
-        "weight_source": None if derived.weight_kg is None else settings.weight_source,
-        "legal_source": None if derived.is_legal_size is None else settings.legal_source,
-        "run_id": fish.run_id,
-        "length_type": ICES_LENGTHS.get(template.tail_gives or ""),
-        "origin": fish.origin,
-    }
+    row = _Row(fish, template, settings, species, derived, check)
+    return {name: value(row) for name, (_, value) in _COLUMNS.items()}
 
 
 def fish_records(
@@ -93,13 +133,11 @@ def fish_records(
     database: Path | None,
 ) -> list[dict[str, Any]]:
     """`fish_record` of all, with the last check of the scale that their lengths.db knows."""
-    records = [fish_record(one, template, settings) for one in fish]
     checks = {} if database is None else last_checks(database)
-    for record in records:
-        if (check := checks.get(record["calibration_sha256"])) is not None:
-            record["scale_error_percent"] = check.error_percent
-            record["scale_checked_ns"] = check.time_ns
-    return records
+    return [
+        fish_record(one, template, settings, check=checks.get(one.facts.calibration_sha256))
+        for one in fish
+    ]
 
 
 def unweighed_note(records: Sequence[dict[str, Any]], settings: FisheriesSettings) -> list[str]:
@@ -115,56 +153,15 @@ def unweighed_note(records: Sequence[dict[str, Any]], settings: FisheriesSetting
     ]
 
 
-def _species_columns(fish: FishResult) -> dict[str, Any]:
-    """The code; a reviewer says no share."""
-    share = None if fish.review.species else fish.catch.species_share
-    return {"species_code": code_of(fish), "species_share": share}
+def _ci95_mm(row: _Row, end: int) -> float | None:
+    ci95_mm = row.fish.estimate.ci95_mm
+    return None if ci95_mm is None else float(ci95_mm[end])
 
 
-def _fate_columns(review: Review) -> dict[str, Any]:
-    """The reviewer's condition; the reviewer's fate, which has no share, where there is one."""
-    fate = {} if review.fate is None else {"fate": review.fate, "fate_share": None}
-    return fate | {"condition": review.condition}
-
-
-def _measured(fish: FishResult) -> dict[str, Any]:
-    estimate, corrected = fish.estimate, fish.review.length_mm is not None
-    low, high = (None, None) if estimate.ci95_mm is None else estimate.ci95_mm.tolist()
-    return {
-        "ci95_low_mm": low,
-        "ci95_high_mm": high,
-        "length_from": None if fish.length_mm is None else "review" if corrected else "measurement",
-        "first_time": seconds(estimate.first_timestamp_ns),
-        "last_time": seconds(estimate.last_timestamp_ns),
-        "refused": json.dumps(dict(estimate.refused)),
-        "iou": fish.iou,
-        "flags": json.dumps(list(fish.flags)),
-    }
-
-
-def _place_columns(fish: FishResult) -> dict[str, Any]:
-    return {
-        "haul": fish.haul,
-        "time_utc": utc_text(fish.utc_ns),
-        "time_utc_ns": fish.utc_ns,
-        "latitude": fish.where.latitude,
-        "longitude": fish.where.longitude,
-        "speed_knots": fish.where.speed_knots,
-        "position_gap_s": fish.where.gap_s,
-    }
-
-
-def _review_columns(review: Review) -> dict[str, Any]:
-    return {
-        "verdict": review.decision or None,
-        "verdict_reason": review.reason or None,
-        "duplicate_of": review.duplicate_of,
-        "corrected_length_mm": review.length_mm,
-        "corrected_length_std_mm": review.length_std_mm,
-        "reviewer": review.reviewer or None,
-        "reviewed_utc": utc_text(review.written_ns or None),
-        "reviewed_ns": review.written_ns or None,
-    }
+def _length_from(fish: FishResult) -> str | None:
+    if fish.length_mm is None:
+        return None
+    return "measurement" if fish.review.length_mm is None else "review"
 
 
 def write_csv(path: Path, records: Sequence[dict[str, Any]]) -> Path:

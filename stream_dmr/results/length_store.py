@@ -41,10 +41,7 @@ from stream_dmr.results.waiting_rows import MARK, WRITTEN, WaitingRows
 _MARK_EVERY_NS = 5_000_000_000  # capture times that a crash may leave unmarked; chosen
 _FRAMES_AHEAD = 1000  # frame numbers that are marked as used at a time; a crash skips the rest
 _COUNTS = "UPDATE runs SET frames_done = ?, frames_promised = ? WHERE run_id = ?"
-_END = (
-    "UPDATE runs SET ended_ns = ?, ended_by = ?, frames_done = ?, frames_promised = ? "
-    "WHERE run_id = ?"
-)
+_END = f"UPDATE runs SET {' = ?, '.join(END_COLUMNS)} = ? WHERE run_id = ?"
 _CLIP = "INSERT OR REPLACE INTO clips VALUES (?, ?, ?)"
 
 

@@ -12,7 +12,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from stream_dmr.errors import OutputError
-from stream_dmr.results.sql import add_columns, has_table
+from stream_dmr.results.catch_facts import CatchFacts
+from stream_dmr.results.run_facts import RunFacts
+from stream_dmr.results.sql import add_columns, declaration, has_table, optional_columns
 
 NAME = "lengths.db"
 VERSION = 1  # PRAGMA user_version
@@ -27,22 +29,10 @@ FISH_COLUMNS = [
     *("track_id", "length_mm", "length_std_mm", "frames_seen", "frames_used", "first_frame"),
     *("last_frame", "first_timestamp_ns", "last_timestamp_ns", "status"),
 ]
-# Columns that the first databases lack. Older versions read and write tables that have them, so
-# they need no new VERSION.
-_ADDED_COLUMNS: dict[str, dict[str, str]] = {
-    "runs": {
-        **dict.fromkeys(("source_path", "source_sha256", "boxes_path", "boxes_sha256"), "TEXT"),
-        **dict.fromkeys(("masks_path", "masks_sha256", "calibration_path", "ended_by"), "TEXT"),
-        **dict.fromkeys(("frames_done", "frames_promised", "utc_zero_ns"), "INTEGER"),
-        **dict.fromkeys(("nmea_path", "nmea_sha256"), "TEXT"),
-        **dict.fromkeys(("species_model_path", "species_model_sha256"), "TEXT"),
-    },
-    "fish": {  # `CatchFacts`
-        **{"species_code": "TEXT", "species_share": "REAL"},
-        **{"fate": "TEXT", "fate_share": "REAL"},
-    },
-}
-_TABLES = """
+# Older databases get those that they lack, NULL in the rows that are there. Older versions read and
+# write tables that have them, so they need no new VERSION.
+_OPTIONAL_COLUMNS = {"runs": optional_columns(RunFacts), "fish": optional_columns(CatchFacts)}
+_TABLES = f"""
 CREATE TABLE runs (
     run_id TEXT PRIMARY KEY,
     started_ns INTEGER NOT NULL, -- wall clock, ns since 1970
@@ -53,16 +43,7 @@ CREATE TABLE runs (
     config_sha256 TEXT NOT NULL,
     calibration_sha256 TEXT NOT NULL, -- '': no calibration
     template_sha256 TEXT NOT NULL,
-    vessel TEXT, trip TEXT, haul TEXT,
-    -- the files that the run was given; NULL: by an older stream-dmr, '': it was given none
-    source_path TEXT, source_sha256 TEXT, boxes_path TEXT, boxes_sha256 TEXT,
-    masks_path TEXT, masks_sha256 TEXT, calibration_path TEXT,
-    ended_by TEXT, -- why, for people; NULL: by an older stream-dmr
-    frames_done INTEGER, -- that went through the whole chain
-    frames_promised INTEGER, -- by the source; of a camera: that came; NULL: unknown
-    utc_zero_ns INTEGER, -- added to capture times gives UTC, ns since 1970; NULL: unknown
-    nmea_path TEXT, nmea_sha256 TEXT, -- as the files above
-    species_model_path TEXT, species_model_sha256 TEXT
+    {declaration(_OPTIONAL_COLUMNS["runs"])}
 ) STRICT;
 CREATE TABLE fish (
     number INTEGER PRIMARY KEY, -- in the order in which the tracks ended
@@ -76,8 +57,8 @@ CREATE TABLE fish (
     refused TEXT NOT NULL, -- JSON: reason -> number of frames
     iou REAL, -- median of the frames that were accepted: mesh and mask
     flags TEXT NOT NULL, -- JSON: what a reader of this length must know, such as a moved camera
-    -- wall clock; FAO 3-alpha, and what became of it, each with the share that says so, or NULL
-    written_ns INTEGER NOT NULL, species_code TEXT, species_share REAL, fate TEXT, fate_share REAL
+    written_ns INTEGER NOT NULL, -- wall clock
+    {declaration(_OPTIONAL_COLUMNS["fish"])}
 ) STRICT;
 CREATE TABLE marks (name TEXT PRIMARY KEY, value INTEGER NOT NULL) STRICT;
 CREATE TABLE clips (
@@ -240,5 +221,5 @@ def _prepare(database: sqlite3.Connection) -> None:
             f"BEGIN; {_TABLES} PRAGMA application_id = {APPLICATION_ID}; "
             f"PRAGMA user_version = {VERSION}; COMMIT;"
         )
-    for table, columns in _ADDED_COLUMNS.items():
+    for table, columns in _OPTIONAL_COLUMNS.items():
         add_columns(database, table, columns)

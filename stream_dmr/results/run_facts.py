@@ -18,7 +18,10 @@ END_COLUMNS = ("ended_ns", "ended_by", "frames_done", "frames_promised")
 
 @dataclass(frozen=True, kw_only=True)
 class RunFacts:
-    """The facts of one run; hashes are SHA-256 in hex; "" where there is none."""
+    """The facts of one run; hashes are SHA-256 in hex; "" where there is none.
+
+    Each field is a column of `runs`, which older databases get when they are next written to.
+    """
 
     source: str
     command: str

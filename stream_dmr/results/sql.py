@@ -3,7 +3,10 @@
 import sqlite3
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from typing import Any
+from dataclasses import MISSING, fields
+from typing import Any, get_args, get_type_hints
+
+_KINDS: dict[Any, str] = {str: "TEXT", int: "INTEGER", float: "REAL"}
 
 Statement = tuple[str, tuple[object, ...]]
 """SQL, and the values of its marks."""
@@ -45,8 +48,22 @@ def has_table(database: sqlite3.Connection, name: str) -> bool:
 
 def add_columns(database: sqlite3.Connection, table: str, columns: Mapping[str, str]) -> None:
     """Add the columns (name -> type) that a table of an earlier version lacks."""
-    for name in columns.keys() - columns_of(database, table):
-        database.execute(f"ALTER TABLE {table} ADD COLUMN {name} {columns[name]}")
+    present = columns_of(database, table)
+    for name, kind in columns.items():
+        if name not in present:
+            database.execute(f"ALTER TABLE {table} ADD COLUMN {name} {kind}")
+
+
+def optional_columns(facts: type) -> dict[str, str]:
+    """The columns (name -> type) for the fields with a default: of str, int, float, or None."""
+    hints = get_type_hints(facts)
+    names = [field.name for field in fields(facts) if field.default is not MISSING]
+    return {name: _KINDS[(get_args(hints[name]) or (hints[name],))[0]] for name in names}
+
+
+def declaration(columns: Mapping[str, str]) -> str:
+    """The columns as CREATE TABLE takes them."""
+    return ", ".join(f"{name} {kind}" for name, kind in columns.items())
 
 
 def columns_of(database: sqlite3.Connection, table: str) -> set[str]:
