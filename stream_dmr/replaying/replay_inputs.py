@@ -48,6 +48,12 @@ def read_inputs(
         files = find_crop_files(
             header, source=request.source, boxes=request.boxes, masks=request.masks
         )
+        if len({run.frames_before for run in header.runs}) < len(header.runs):
+            observer.warn(
+                "--from crop: runs with given boxes or masks do not record at which frame each of "
+                "them began, so fish of all but the first have other numbers than recorded; "
+                "--from fit keeps them"
+            )
     return ReplayInputs(
         config=config,
         template=setup.template,

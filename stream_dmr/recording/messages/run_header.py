@@ -109,7 +109,7 @@ class RunHeader:
 def joined_runs(headers: Iterable[RunHeader]) -> tuple[RunStart, ...]:
     """The runs of several segments, each once, by their frames."""
     runs = {run for header in headers for run in header.runs}
-    return tuple(sorted(runs, key=lambda run: run.frames_before))
+    return tuple(sorted(runs, key=lambda run: (run.frames_before, run.tracks_before)))
 
 
 def _runs_text(runs: Sequence[RunStart]) -> str:
