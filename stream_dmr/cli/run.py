@@ -49,7 +49,8 @@ def run(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for the results; one with results of an earlier run is refused.",
+            help="Folder for the results. With those of an earlier run in it a video is refused, "
+            "a camera or a folder of clips goes on.",
             show_default="runs/<name of the source>",
         ),
     ] = None,
@@ -62,13 +63,6 @@ def run(
     ] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the results of an earlier run in --out.")
-    ] = False,
-    resume: Annotated[
-        bool,
-        typer.Option(
-            "--resume",
-            help="Continue in --out, as cameras and folders of clips always do; a video can't.",
-        ),
     ] = False,
     vessel: Annotated[str, typer.Option(help="Name of the vessel, for the exports.")] = "",
     trip: Annotated[str, typer.Option(help="Name of the trip, for the exports.")] = "",
@@ -124,7 +118,6 @@ def run(
             stills=stills,
             config=config,
             overwrite=overwrite,
-            resume=resume,
             live=live,
             command=command_line(),
             vessel=vessel,

@@ -138,8 +138,6 @@ def checked_inputs(request: RunRequest) -> Inputs:
     if inputs.is_endless and candidates is None and config.fit_mesh.are_shapes_learnt:
         inputs = replace(inputs, candidates=given_mesh(template))  # others may join it later
     try:
-        if request.resume and not inputs.is_endless:
-            raise UserError(_no_resuming(request))
         if calibration is not None:
             require_size(calibration, width=inputs.source.width, height=inputs.source.height)
         if request.nmea is None:
@@ -151,14 +149,6 @@ def checked_inputs(request: RunRequest) -> Inputs:
         reader.close()
         raise
     return replace(inputs, positions=positions)
-
-
-def _no_resuming(request: RunRequest) -> str:
-    return (
-        "--resume: expected a camera or a folder of clips, which go on where they ended, got "
-        f"{request.source}, which begins at its start: its fish would be counted twice; measure it "
-        "anew with --overwrite, or into another --out"
-    )
 
 
 def _keep_template(request: RunRequest) -> None:

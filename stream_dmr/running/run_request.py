@@ -21,7 +21,6 @@ class RunRequest:
     stills: bool = False  # pictures are independent of each other
     config: Path | None = None
     overwrite: bool = False  # replace the results of an earlier run in `out`
-    resume: bool = False  # continue after them: cameras and folders of clips always do
     live: bool = False  # serve the view while measuring
     command: str = ""  # as typed, for the recording
     vessel: str = ""  # vessel, trip and haul, for the exports

@@ -88,8 +88,8 @@ def test_measure_takes_all_that_a_run_can_be_asked():
 
 
 def test_a_request_is_recorded_as_the_command_that_does_the_same():
-    request = RunRequest(source="rtsp://me:secret@rail/1", out=Path("a b"), resume=True)
-    command = "stream-dmr run --source rtsp://rail/1 --out 'a b' --resume"
+    request = RunRequest(source="rtsp://me:secret@rail/1", out=Path("a b"), stills=True)
+    command = "stream-dmr run --source rtsp://rail/1 --out 'a b' --stills"
     assert command_of(request).command == command
 
 

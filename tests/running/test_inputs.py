@@ -67,11 +67,6 @@ def test_a_file_is_measured_from_its_start(clip: Path):
         assert not inputs.resumes
 
 
-def test_a_file_that_is_to_be_resumed_is_refused(clip: Path):
-    with pytest.raises(UserError, match=r"^--resume: expected a camera.*video\.mp4.*--overwrite"):
-        checked_inputs(request(clip, clip.parent / "out", resume=True))
-
-
 def test_a_calibration_of_another_size_is_refused_and_the_source_closed(clip: Path, tmp_path: Path):
     cv2.imwrite(str(tmp_path / "1.png"), np.zeros((50, 70, 3), np.uint8))
     with pytest.raises(CalibrationError, match="calibrate with pictures of 70x50 px"):
