@@ -50,36 +50,33 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
     Raises OutputError where the folder can't be written to, or holds an earlier run's results. An
     endless run warns of what the disk refuses, and tries again.
     """
-    request, config, out = inputs.request, inputs.config, inputs.request.out
-    is_endless, resume = inputs.is_endless, inputs.resumes
+    out, is_endless = inputs.request.out, inputs.is_endless
     on_refusal = observer.warn if is_endless else None
-    signer = None if request.key is None else Signer(request.key)
-    files = SignedFiles(out)
+    files, states = SignedFiles(out), SinkStates()
     retention = _free_space(inputs, files, observer)
     repairs = prepare_folder(
-        out, overwrite=request.overwrite, resume=resume, waits_for_room=is_endless
+        out,
+        overwrite=inputs.request.overwrite,
+        resume=inputs.resumes,
+        waits_for_room=is_endless,
     )
-    header, states = inputs.header(), SinkStates()
-    facts = replace(
-        run_facts(header),
-        vessel=request.vessel,
-        trip=request.trip,
-        haul=request.haul,
-        utc_zero_ns=inputs.utc_zero_ns,
-    )
+    header = inputs.header()
     with ExitStack() as stack:
+        # At the end lengths.csv is complete before it is signed, it is signed while the store is
+        # open, and the provenance is made of all that there is then.
         stack.enter_context(sealed(out, with_recordings=not is_endless, on_notice=observer.warn))
-        store = LengthStore(out, facts, waits_for_disk=is_endless, signer=signer)
-        stack.enter_context(closing(store))
+        store = stack.enter_context(closing(_open_store(inputs, header)))
         files.attach(store, repaired=[repair.path for repair in repairs])
         stack.callback(partial(files.finish, with_recordings=not is_endless))
-        lengths = LengthsTable(out, store, resume=resume, on_refusal=on_refusal)
+        lengths = LengthsTable(out, store, resume=inputs.resumes, on_refusal=on_refusal)
         stack.enter_context(closing(lengths))
+        # The observer may refuse the run, so it is asked before anything is recorded, and it sees
+        # the recording's end.
         stack.enter_context(closing(observer))
-        hauls = HaulLog(store, config.hauls, frames_lost=partial(_frames_lost, inputs))
+        hauls = HaulLog(store, inputs.config.hauls, frames_lost=partial(_frames_lost, inputs))
         observer.open(
             OpenRun(
-                config=config,
+                config=inputs.config,
                 source=inputs.source,
                 positions=inputs.positions,
                 store=store,
@@ -88,6 +85,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
                 sinks=states,
             )
         )
+        # What earlier runs recorded is read before a new segment stands beside it.
         interrupted = interrupted_tracks(
             repairs if is_endless else [], store, on_notice=observer.warn
         )
@@ -100,14 +98,15 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
             on_closed=files.changed,
             states=states,
         )
-        recorder = _open_recorder(
-            inputs,
-            replace(header, runs=(_start_of(inputs, store),)),
-            files=segments if is_endless else open_recording_files,
-            on_refusal=on_refusal,
-            states=states,
+        recorder = stack.enter_context(
+            _open_recorder(
+                inputs,
+                replace(header, runs=(_start_of(inputs, store),)),
+                files=segments if is_endless else open_recording_files,
+                on_refusal=on_refusal,
+                states=states,
+            )
         )
-        stack.enter_context(recorder)
         stack.enter_context(closing(retention))
         retention.start()
         yield Outputs(
@@ -134,6 +133,19 @@ def _free_space(inputs: Inputs, files: SignedFiles, observer: RunObserver) -> Re
     with suppress(OSError, OutputError):  # it tries again while the run goes on
         retention.free_space()
     return retention
+
+
+def _open_store(inputs: Inputs, header: RunHeader) -> LengthStore:
+    request = inputs.request
+    facts = replace(
+        run_facts(header),
+        vessel=request.vessel,
+        trip=request.trip,
+        haul=request.haul,
+        utc_zero_ns=inputs.utc_zero_ns,
+    )
+    signer = None if request.key is None else Signer(request.key)
+    return LengthStore(request.out, facts, waits_for_disk=inputs.is_endless, signer=signer)
 
 
 def _open_recorder(
