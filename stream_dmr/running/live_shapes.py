@@ -11,15 +11,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 
 from stream_dmr.errors import OutputError
-from stream_dmr.fitting.shape.candidates import CandidateShapes, mesh_form
+from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.shape.describe import describe
-from stream_dmr.fitting.shape.mesh_agreement import are_like_mesh, not_like_mesh
 from stream_dmr.fitting.shape.samples import MAX_FISH
 from stream_dmr.messages import FishCrop, Frame, LearntShapes
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.results.learnt_meshes import LEARNT, MADE_BY_RUN, require_free_names
 from stream_dmr.results.provenance import add_files
 from stream_dmr.running.inputs import Inputs
+from stream_dmr.running.mesh_comparison import compare_with_mesh
 from stream_dmr.running.outputs import Outputs
 from stream_dmr.running.pipeline import Node
 from stream_dmr.running.run_observer import RunObserver
@@ -102,35 +102,35 @@ def follow_shapes(
     if given is None or not inputs.is_endless or not inputs.config.fit_mesh.are_shapes_learnt:
         return None
     assert isinstance(fit_mesh, FitMesh)
-    known, is_mesh = given, given.is_given_mesh
-    forms = mesh_form(inputs.template) if is_mesh else given
+    known, compared = given, None
     for learnt in outputs.learnt:
         known = known.extended(learnt)
     fit_mesh.learn(known)
 
     def learn(crops: Sequence[FishCrop], progress: Callable[[str], None]) -> CandidateShapes | None:
-        stocks = inputs.learn(crops, forms, progress=progress)
-        if is_mesh and stocks is None:
-            observer.warn(not_like_mesh(forms, None))
-        return stocks
+        nonlocal compared
+        if not given.is_given_mesh:
+            return inputs.learn(crops, given, progress=progress)
+        compared = compare_with_mesh(crops, inputs, progress=progress)
+        if compared.stocks is None:
+            observer.warn(compared.not_like_mesh)
+        return None if compared.is_like_mesh else compared.stocks
 
     def on_learnt(learnt: LearntShapes) -> None:
         nonlocal known
         more = known.extended(learnt)
         stocks = more.stocks()
         assert stocks is not None
-        if is_mesh and are_like_mesh(stocks):
-            return
         known = more
         write(learnt)
         fit_mesh.learn(known)
-        if is_mesh:
+        if compared is not None:
             observer.warn(
-                f"{not_like_mesh(forms, stocks)}; fish to come may have the shape learnt from "
+                f"{compared.not_like_mesh}; fish to come may have the shape learnt from "
                 "these; measure those so far anew: stream-dmr replay --from fit --template auto"
             )
         else:
-            for line in describe(forms, stocks):
+            for line in describe(given, stocks):
                 observer.notice(f"learnt from the fish so far: {line}")
         try:
             _save_meshes(inputs, stocks)

@@ -10,9 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from threading import Event
 
-from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes, mesh_form
+from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
 from stream_dmr.fitting.shape.describe import describe
-from stream_dmr.fitting.shape.mesh_agreement import are_like_mesh, not_like_mesh
 from stream_dmr.fitting.shape.samples import good_crops
 from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.messages import FishCrop
@@ -22,6 +21,7 @@ from stream_dmr.results.learnt_meshes import is_mesh_by, mesh_comment, require_f
 from stream_dmr.running.inputs import Inputs
 from stream_dmr.running.kept_crops import keep_crops
 from stream_dmr.running.measuring_setup import MeasuringSetup
+from stream_dmr.running.mesh_comparison import compare_with_mesh
 from stream_dmr.running.run_folder import require_folder
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.template.template import Template
@@ -77,21 +77,19 @@ def is_mesh_theirs(crops: Sequence[FishCrop], setup: MeasuringSetup, observer: R
 
     True where there are none. The observer is told.
     """
-    template = setup.template
+    name = setup.template.name
     if not crops:
-        observer.warn(f"no fish was seen whole: whether they are like {template.name} is not known")
+        observer.warn(f"no fish was seen whole: whether they are like {name} is not known")
         return True
-    mesh = mesh_form(template)
-    observer.stage(f"comparing the fish with {template.name}")
-    # Only what would be disbelieved is looked at longer.
-    stocks = setup.learn(crops, mesh, suffices=are_like_mesh)
-    if stocks is not None and are_like_mesh(stocks):
-        for line in describe(mesh, stocks):
+    observer.stage(f"comparing the fish with {name}")
+    found = compare_with_mesh(crops, setup)
+    if found.is_like_mesh and found.stocks is not None:
+        for line in describe(found.mesh, found.stocks):
             observer.notice(line)
         return True
     observer.warn(
-        f"{not_like_mesh(mesh, stocks)}; they are measured by the shapes learnt from them, as "
-        "with --template auto"
+        f"{found.not_like_mesh}; they are measured by the shapes learnt from them, as with "
+        "--template auto"
     )
     return False
 

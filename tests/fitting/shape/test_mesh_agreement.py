@@ -4,8 +4,12 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.fitting.shape.candidates import CandidateShape
-from stream_dmr.fitting.shape.mesh_agreement import is_like_mesh
+from stream_dmr.fitting.shape.candidates import CandidateShape, CandidateShapes
+from stream_dmr.fitting.shape.mesh_agreement import (
+    LengthShift,
+    is_like_mesh,
+    not_like_mesh,
+)
 from stream_dmr.fitting.shape.space import BREADTH, NUM_COEFFICIENTS, THICKNESS, form_precision
 
 SURE = np.zeros((NUM_COEFFICIENTS, NUM_COEFFICIENTS))
@@ -43,3 +47,20 @@ def test_a_mesh_of_the_same_breadth_and_another_outline_is_not_believed():
     one.coefficients[BREADTH] = np.tile(np.linspace(0.6, -0.6, 12), 2)
     assert abs(one.coefficients[BREADTH].mean()) < 1e-12
     assert not is_like_mesh(one)
+
+
+@given(log_ratio=st.floats(-0.039, 0.039), num_fish=st.integers(1, 60))
+def test_lengths_may_move_by_some_percent(log_ratio: float, num_fish: int):
+    assert LengthShift(log_ratio, 0.0, num_fish).off < 1
+
+
+def test_and_as_far_as_they_are_uncertain_which_is_less_far_for_many_fish():
+    assert LengthShift(-0.09, 0.1, 1).off < 1 < LengthShift(-0.09, 0.1, 12).off
+    assert LengthShift(-0.07, 0.1, 1000).off < 1 < LengthShift(-0.11, 0.1, 1).off
+
+
+def test_it_is_said_what_the_mesh_does_to_lengths():
+    shapes = CandidateShapes.of([stock(0.0)], are_learnt=True)
+    assert not_like_mesh(shapes, shapes, LengthShift(-0.1)).endswith("; by it they are 11% longer")
+    assert not_like_mesh(shapes, shapes, LengthShift(0.1)).endswith("; by it they are 10% shorter")
+    assert "by it" not in not_like_mesh(shapes, shapes)
