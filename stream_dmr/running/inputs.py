@@ -13,7 +13,7 @@ from stream_dmr.recording.messages.run_inputs import InputFile, RunInputs
 from stream_dmr.results.learnt_meshes import learnt_files
 from stream_dmr.results.signatures import Signer
 from stream_dmr.running.conditions import lying, started_at, stills
-from stream_dmr.running.config import load_config, to_toml
+from stream_dmr.running.config import Config, load_config, to_toml
 from stream_dmr.running.kept_crops import KeptCrops
 from stream_dmr.running.measuring_setup import MeasuringSetup
 from stream_dmr.running.run_request import RunRequest, without_password
@@ -102,13 +102,7 @@ def checked_inputs(request: RunRequest) -> Inputs:
 
     Raises a UserError where one of them is wrong.
     """
-    config = load_config(request.config)
-    if request.pose == "lying":
-        config = lying(config)
-    if request.start_utc:
-        config = started_at(config, request.start_utc)
-    if request.stills:
-        config = stills(config, is_calibrated=request.calibration is not None)
+    config = _config(request)
     notices: list[str] = []
     if request.overwrite:
         _keep_template(request)
@@ -125,6 +119,17 @@ def checked_inputs(request: RunRequest) -> Inputs:
         pictures=Path(request.source),
     )
     reader = ReadFrames(request.source, config.read_frames)
+    source = reader.source
+    try:
+        if calibration is not None:
+            require_size(calibration, width=source.width, height=source.height)
+        positions = None
+        if request.nmea is not None:
+            is_since_1970 = _is_since_1970(source)
+            positions = open_positions(request.nmea, config.sensors, is_since_1970=is_since_1970)
+    except UserError:
+        reader.close()
+        raise
     inputs = Inputs(
         request=request,
         config=config,
@@ -134,21 +139,23 @@ def checked_inputs(request: RunRequest) -> Inputs:
         calibration=calibration,
         finder=finder,
         reader=reader,
+        positions=positions,
     )
     if inputs.is_endless and candidates is None and config.fit_mesh.are_shapes_learnt:
-        inputs = replace(inputs, candidates=given_mesh(template))  # others may join it later
-    try:
-        if calibration is not None:
-            require_size(calibration, width=inputs.source.width, height=inputs.source.height)
-        if request.nmea is None:
-            return inputs
-        positions = open_positions(
-            request.nmea, config.sensors, is_since_1970=_is_since_1970(inputs.source)
-        )
-    except UserError:
-        reader.close()
-        raise
-    return replace(inputs, positions=positions)
+        return replace(inputs, candidates=given_mesh(template))  # others may join it later
+    return inputs
+
+
+def _config(request: RunRequest) -> Config:
+    """The settings, with what the request's options change of them."""
+    config = load_config(request.config)
+    if request.pose == "lying":
+        config = lying(config)
+    if request.start_utc:
+        config = started_at(config, request.start_utc)
+    if request.stills:
+        config = stills(config, is_calibrated=request.calibration is not None)
+    return config
 
 
 def _keep_template(request: RunRequest) -> None:

@@ -42,8 +42,8 @@ def prepare_folder(
 
     Raises OutputError where it is no folder, can't be written to, has no room, is that of a batch
     or of exports, or holds results of an earlier run; `overwrite` removes those instead, `resume`
-    keeps them. With `waits_for_room` a
-    full disk is no error. Returns the repairs of recordings that a crash left unfinished.
+    keeps them. With `waits_for_room` a full disk is no error. Returns the repairs of recordings
+    that a crash left unfinished.
     """
     earlier = _open_folder(out, is_fine=overwrite or resume)
     with _writing_to(out):
