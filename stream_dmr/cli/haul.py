@@ -4,6 +4,7 @@ import json
 import urllib.error
 import urllib.request
 from getpass import getuser
+from http.client import HTTPException
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -55,24 +56,32 @@ def haul(
 def _post(address: str, what: str, name: str, token_file: Path | None) -> str:
     from stream_dmr.errors import UserError
 
-    request = urllib.request.Request(
-        f"{address.rstrip('/')}/haul",
-        data=json.dumps({"what": what, "name": name, "said_by": getuser()}).encode(),
-        headers={"Content-Type": "application/json"},
-    )
+    headers = {"Content-Type": "application/json"}
+    if token_file is not None:
+        headers["Authorization"] = f"Bearer {_read_token(token_file)}"
+    content = json.dumps({"what": what, "name": name, "said_by": getuser()}).encode()
     try:
-        if token_file is not None:
-            token = token_file.read_text(encoding="utf-8").strip()
-            request.add_header("Authorization", f"Bearer {token}")
+        request = urllib.request.Request(f"{address.rstrip('/')}/haul", content, headers)
         with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
             return f"haul {json.loads(answer.read())['name']}: {what}"
     except urllib.error.HTTPError as error:
         with error:
             said = error.read(500).decode(errors="replace").strip()
         raise UserError(f"{address}: expected it to take the haul, got: {said or error}") from error
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError, HTTPException) as error:
         raise UserError(
             f"{address}: expected the status page of a run ([watch] port), got: {error}"
+        ) from error
+
+
+def _read_token(path: Path) -> str:
+    from stream_dmr.errors import UserError, reason_of
+
+    try:
+        return path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(
+            f"--token-file {path}: expected a file with the access token, got: {reason_of(error)}"
         ) from error
 
 

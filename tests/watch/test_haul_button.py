@@ -119,6 +119,20 @@ def test_what_is_no_haul_is_refused_in_one_line(server: WatchServer, hauls: Haul
     assert hauls.hauls() == []
 
 
+@pytest.mark.parametrize("address", ["http://[::1", "http://h:x/", "http://", "http://a%20b/"])
+def test_an_address_that_is_none_is_said(address: str):
+    told = invoke("haul", {"start": None, address: None})
+    assert told.code == 2
+    assert told.error.startswith(f"{address}: expected the status page of a run")
+
+
+def test_a_token_file_that_is_not_there_is_said(server: WatchServer, tmp_path: Path):
+    missing = str(tmp_path / "nofile")
+    told = invoke("haul", {"start": None, server.address: None, "--token-file": missing})
+    assert told.code == 2
+    assert told.error.startswith(f"--token-file {missing}: expected a file with the access token")
+
+
 @pytest.mark.parametrize("address", ["ftp://x", "rtsp://camera/1", "htp://localhost:8000"])
 def test_an_address_of_another_kind_is_no_folder(address: str):
     told = invoke("haul", {"start": None, address: None})
