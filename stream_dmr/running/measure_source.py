@@ -35,9 +35,8 @@ from stream_dmr.running.run_observer import RunObserver, RunTotals
 from stream_dmr.running.run_request import RunRequest
 from stream_dmr.running.seen_fish import SeenFish
 from stream_dmr.running.shape_pass import is_mesh_theirs, save_stocks, with_learnt_shapes
-from stream_dmr.running.species_checks import species_notes
+from stream_dmr.running.start_notices import start_notices
 
-_USUAL_M = (0.5, 20.0)  # chosen: from cameras to the plane of hanging fish
 _MAX_SUMMARY_FISH = 100  # of an endless run, for the table at its end; the store has all fish
 
 
@@ -161,24 +160,8 @@ def _report_start(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> No
         observer.serving(f"stream-dmr view {outputs.recorder.live_address}")
     if observer.address is not None:
         observer.serving(observer.address)
-    for note in inputs.notices:
-        observer.warn(note)
-    for note in species_notes(inputs.config, inputs.template):
-        observer.warn(note)
-    if inputs.calibration is None:
-        observer.warn("without --calibration there are relative shapes, no millimetres")
-    elif inputs.request.pose == "hanging":
-        distance_m = inputs.calibration.plane.distance_mm / 1000
-        if not _USUAL_M[0] <= distance_m <= _USUAL_M[1]:
-            observer.warn(
-                f"the calibration's reference plane is {distance_m:.2f} m from the camera; if it "
-                "is not, every length is wrong: tvec must be in mm"
-            )
-    if inputs.source.is_live and inputs.config.recording.frames == "reference":
-        observer.warn(
-            "a live source can't be read again, so its pictures are not kept but for the view and "
-            'a few of each fish; record them with [recording] frames = "jpeg" or "h264"'
-        )
+    for line in start_notices(inputs):
+        observer.warn(line)
 
 
 def _crop_fish(inputs: Inputs) -> CropFish:
