@@ -66,7 +66,8 @@ def _post(address: str, what: str, name: str, token_file: Path | None) -> str:
             return f"haul {json.loads(answer.read())['name']}: {what}"
     except urllib.error.HTTPError as error:
         with error:
-            said = error.read(500).decode(errors="replace").strip()
+            is_ours = error.headers.get_content_type() == "text/plain"
+            said = error.read(500).decode(errors="replace").strip() if is_ours else ""
         raise UserError(f"{address}: expected it to take the haul, got: {said or error}") from error
     except (OSError, ValueError, KeyError, TypeError, HTTPException) as error:
         raise UserError(

@@ -1,8 +1,10 @@
 """Hauls begun and ended on the status page, in a browser, by mouse on two widths."""
 
+import threading
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import cv2
@@ -124,6 +126,23 @@ def test_an_address_that_is_none_is_said(address: str):
     told = invoke("haul", {"start": None, address: None})
     assert told.code == 2
     assert told.error.startswith(f"{address}: expected the status page of a run")
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    """Logs no requests."""
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+def test_the_page_of_another_server_is_not_printed():
+    with ThreadingHTTPServer(("127.0.0.1", 0), Quiet) as other:
+        threading.Thread(target=other.serve_forever, daemon=True).start()
+        told = invoke("haul", {"start": None, f"http://127.0.0.1:{other.server_port}/": None})
+        other.shutdown()
+    assert told.code == 2
+    assert "HTTP Error 501" in told.error
+    assert "<" not in told.error
 
 
 def test_a_token_file_that_is_not_there_is_said(server: WatchServer, tmp_path: Path):
