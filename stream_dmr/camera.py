@@ -107,6 +107,14 @@ class Camera:
         )
         return Camera(width=size, height=size, K=K, distortion=np.zeros(5))
 
+    def resized(self, size: int) -> "Camera":
+        """The square crop of this camera in `size` x `size` pixels, whose edges stay in place."""
+        scale = size / self.width
+        K = self.K.copy()
+        K[:2, :2] *= scale
+        K[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5  # pixel centers are integers, edges at halves
+        return Camera(width=size, height=size, K=K, distortion=self.distortion)
+
     def middle_ray(self) -> Float[np.ndarray, "3"]:
         """The ray (X, Y, 1) through the middle of the picture."""
         return self.back_project(np.array([[(self.width - 1) / 2, (self.height - 1) / 2]]))[0]

@@ -1,12 +1,13 @@
 """The interface of a segmenter: an image and a box in, a mask out.
 
-A segmenter sees the crop, not the frame. A crop is free of lens distortion, and its pixel map to
-the frame is in one place (`masks.crop_geometry`), so that a segmenter needs no camera.
+A segmenter sees a picture of the crop, not the frame. A crop is free of lens distortion, and its
+pixel map to the frame is in one place (`masks.crop_geometry`), so that a segmenter needs no camera.
 """
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
@@ -19,6 +20,30 @@ class SegmentedFish:
 
     probability: Float32[np.ndarray, "S S"]  # of each crop pixel to be fish, 0 to 1
     ends: FishEnds | None  # None from a segmenter that does not locate them
+
+    def resized(self, size_px: int) -> "SegmentedFish":
+        """The same fish in a crop of another size; pixel edges stay where they are."""
+        scale = size_px / len(self.probability)
+        return SegmentedFish(
+            probability=np.clip(resize(self.probability, size_px), 0, 1),
+            ends=None if self.ends is None else _scaled(self.ends, scale),
+        )
+
+
+def resize(picture: np.ndarray, size_px: int) -> np.ndarray:
+    """A square picture in another size; pixel edges stay where they are, not pixel centers."""
+    if len(picture) == size_px:
+        return picture
+    interpolation = cv2.INTER_AREA if len(picture) > size_px else cv2.INTER_LINEAR
+    return cv2.resize(picture, (size_px, size_px), interpolation=interpolation)
+
+
+def _scaled(ends: FishEnds, scale: float) -> FishEnds:
+    return FishEnds(
+        head_px=(ends.head_px + 0.5) * scale - 0.5,
+        tail_px=(ends.tail_px + 0.5) * scale - 0.5,
+        confidence=ends.confidence,
+    )
 
 
 @runtime_checkable

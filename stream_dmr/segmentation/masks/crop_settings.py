@@ -1,8 +1,13 @@
 """`[crop_fish]`: how fish are cut out of the frame."""
 
+from typing import Annotated
+
 from pydantic import Field
 
+from stream_dmr.segmentation.network.unet_interface import SIZE_MULTIPLE_PX
 from stream_dmr.settings import Settings
+
+_PictureSize = Annotated[int, Field(ge=64, le=1024, multiple_of=SIZE_MULTIPLE_PX)]
 
 
 class CropFishSettings(Settings):
@@ -19,6 +24,12 @@ class CropFishSettings(Settings):
     )
     min_mask_area_px: int = Field(
         default=64, ge=1, description="smaller masks are ignored, frame px"
+    )
+    segmenter_sizes_px: list[_PictureSize] = Field(
+        default=[128],
+        min_length=1,
+        description="widths of the pictures of a crop that the segmenter sees, multiples of 32 px, "
+        "those that the frame has; the mean counts. Stills: [128, 192, 256]",
     )
     segmenter: str = Field(
         default="unet",

@@ -1,6 +1,7 @@
 """The crop of a fish with its mask, by a given mask or by a segmenter."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -21,7 +22,7 @@ from stream_dmr.segmentation.masks.crop_geometry import (
 )
 from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
 from stream_dmr.segmentation.masks.mask_cleaning import clean_mask
-from stream_dmr.segmentation.segmenter import Segmenter
+from stream_dmr.segmentation.segmenter import SegmentedFish, Segmenter, resize
 
 # Chosen on simulated scenes: a fish whose tail the detector had missed was read 20 % long without
 # a second crop; see docs/method.md.
@@ -152,26 +153,51 @@ def _segment(
 ) -> MaskedCrop:
     """The crop around a box, with the mask that a segmenter finds in it at once."""
     crop_camera = view.camera_around(bbox_xyxy_px)
-    cameras = {"crop_camera": crop_camera, "frame_camera": view.camera}
-    [image] = resample([Layer(view.image)], **cameras)
-    found = segmenter.segment(image, box_in_crop(bbox_xyxy_px, **cameras))
+    pictures, looks = _looks(view, bbox_xyxy_px, crop_camera, segmenter)
     x, y = frame_from_crop_map(crop_camera, frame_camera=view.camera)
     height, width = view.shape
     is_in_frame = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
-    probability = found.probability * is_in_frame
+    probability = np.mean([look.probability for look in looks], axis=0) * is_in_frame
     areas = _pixel_areas(x, y)
     min_area_px = math.ceil(view.settings.min_mask_area_px / float(areas.mean()))
     mask = clean_mask(probability > 0.5, min_area_px=min_area_px)
     return MaskedCrop(
-        image=image,
+        image=resize(pictures[-1], crop_camera.width),
         crop_camera=crop_camera,
         mask=mask,
         area_px=float(areas[mask].sum()),
         extent=_extent(x[mask], y[mask]),
         is_cut=bool(mask[[0, -1]].any() or mask[:, [0, -1]].any()),
         confidence=mask_confidence(probability, mask),
-        ends=found.ends,
+        ends=looks[-1].ends,
     )
+
+
+def _looks(
+    view: FrameView,
+    bbox_xyxy_px: Float[np.ndarray, "4"],
+    crop_camera: Camera,
+    segmenter: Segmenter,
+) -> tuple[list[UInt8[np.ndarray, "_ _ 3"]], list[SegmentedFish]]:
+    """The pictures of a crop that the segmenter sees, and what it finds, in the crop's pixels."""
+    side_px = crop_camera.width * float(view.camera.K[0, 0] / crop_camera.K[0, 0])
+    pictures, found = [], []
+    for size_px in picture_sizes(side_px, view.settings.segmenter_sizes_px):
+        cameras = {"crop_camera": crop_camera.resized(size_px), "frame_camera": view.camera}
+        pictures += resample([Layer(view.image)], **cameras)
+        box = box_in_crop(bbox_xyxy_px, **cameras)
+        found.append(segmenter.segment(pictures[-1], box).resized(crop_camera.width))
+    return pictures, found
+
+
+def picture_sizes(side_px: float, sizes_px: Sequence[int]) -> list[int]:
+    """Those sizes of pictures, ascending, that a crop of `side_px` in the frame has pixels for.
+
+    Enlarged pictures of small fish are cut out worse than small ones
+    (docs/research/real-pictures.md); the smallest size is always among them.
+    """
+    smallest, *larger = sorted(sizes_px)
+    return [smallest, *(size for size in larger if size <= side_px)]
 
 
 def _pixel_areas(

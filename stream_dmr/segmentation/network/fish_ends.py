@@ -15,11 +15,11 @@ _PEAK_RADIUS = 2  # cells around a peak whose mean locates it between the cells
 _MAX_LOG_ODDS = 50.0  # keeps the exponential finite; the confidence is 1 long before
 
 
-def find_ends(maps: Float32[np.ndarray, "2 s s"], *, scale: float) -> FishEnds:
+def find_ends(maps: Float32[np.ndarray, "2 s s"]) -> FishEnds:
     """The most probable pair of head and tail, in crop pixels.
 
-    `maps` are log probabilities of head and tail per cell; `scale` is network pixels per crop
-    pixel. The odds against the two being swapped are p_h(H) p_t(T) / (p_h(T) p_t(H)).
+    `maps` are log probabilities of head and tail per cell. The odds against the two being swapped
+    are p_h(H) p_t(T) / (p_h(T) p_t(H)).
     """
     cells = [cell for one in maps for cell in _peaks(one)]
     value, head, tail = max(
@@ -29,7 +29,7 @@ def find_ends(maps: Float32[np.ndarray, "2 s s"], *, scale: float) -> FishEnds:
     )
     log_odds = min(value - float(maps[0][tail] + maps[1][head]), _MAX_LOG_ODDS)
     cells_xy = np.array([_refine(maps[0], head), _refine(maps[1], tail)])
-    head_px, tail_px = ((cells_xy + 0.5) * ENDS_STRIDE) / scale - 0.5
+    head_px, tail_px = (cells_xy + 0.5) * ENDS_STRIDE - 0.5
     confidence = 1 / (1 + math.exp(-log_odds))
     return FishEnds(head_px=head_px, tail_px=tail_px, confidence=confidence)
 

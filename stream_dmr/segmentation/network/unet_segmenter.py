@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
@@ -16,7 +15,6 @@ from stream_dmr.segmentation.network.unet_interface import (
     IMAGES_INPUT,
     MASK_OUTPUT,
     MODEL_FORMAT,
-    SIZE_PX,
     box_coverage,
 )
 from stream_dmr.segmentation.segmenter import SegmentedFish
@@ -52,15 +50,13 @@ class UNetSegmenter:
     def segment(
         self, image: UInt8[np.ndarray, "S S 3"], bbox_xyxy_px: Float[np.ndarray, "4"]
     ) -> SegmentedFish:
-        """The fish in a box, half-open in pixels of the crop `image` (BGR) of any size."""
-        size = len(image)
-        scale = SIZE_PX / size
-        in_box = box_coverage(bbox_xyxy_px * scale, size=SIZE_PX)
-        probability, ends = self.segment_batch(_resize(image, SIZE_PX)[None], in_box[None])
-        return SegmentedFish(
-            probability=np.clip(_resize(probability[0], size), 0, 1),
-            ends=find_ends(ends[0], scale=scale),
-        )
+        """The fish in a box, half-open in pixels of the crop `image` (BGR).
+
+        S is a multiple of SIZE_MULTIPLE_PX.
+        """
+        in_box = box_coverage(bbox_xyxy_px, size=len(image))
+        probability, ends = self.segment_batch(image[None], in_box[None])
+        return SegmentedFish(probability=probability[0], ends=find_ends(ends[0]))
 
     def segment_all(self, image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
         """Probability of each pixel to be any fish; H and W are multiples of SIZE_MULTIPLE_PX."""
@@ -93,11 +89,3 @@ def _convert(path: Path) -> bytes:
     from stream_dmr.segmentation.network.unet_weights import load_weights
 
     return unet_as_onnx(load_weights(path))
-
-
-def _resize(picture: np.ndarray, size: int) -> np.ndarray:
-    """A square picture in another size; pixel edges stay where they are, not pixel centers."""
-    if len(picture) == size:
-        return picture
-    interpolation = cv2.INTER_AREA if len(picture) > size else cv2.INTER_LINEAR
-    return cv2.resize(picture, (size, size), interpolation=interpolation)

@@ -108,6 +108,21 @@ def test_a_fish_that_extends_beyond_its_box_is_found_whole(share, axis, from_its
     assert crop.quality.mask_area_px == pytest.approx(60 * 300, rel=0.08)
 
 
+@pytest.mark.parametrize(("side_px", "seen_px"), [(60, 128), (160, 192), (400, 256)])
+def test_a_segmenter_sees_no_more_pixels_than_the_frame_has(side_px, seen_px):
+    camera = Camera.nominal(width=640, height=640)
+    picture = np.zeros((640, 640), np.uint8)
+    picture[100 : 100 + side_px // 4, 80 : 80 + side_px] = 255
+    box = [80, 100, 80 + side_px, 100 + side_px // 4]
+    crop, seen = segmented(picture, box, camera, segmenter_sizes_px=[256, 128, 192])
+    coarse, _ = segmented(picture, box, camera)
+    assert seen[2] - seen[0] == pytest.approx(seen_px / 1.3, rel=0.02)
+    assert crop.image.shape == coarse.image.shape == (128, 128, 3)
+    assert crop.quality.mask_area_px == pytest.approx(side_px * (side_px // 4), rel=0.06)
+    both, either = crop.mask & coarse.mask, crop.mask | coarse.mask
+    assert both.sum() > 0.95 * either.sum()
+
+
 def test_a_fish_that_no_crop_shows_whole_touches_the_border():
     picture = np.zeros((420, 420), np.uint8)
     picture[20:400, 200:220] = 255

@@ -12,15 +12,15 @@ from tests.support.random_unet import log_blob
 places = st.tuples(st.floats(3, 28), st.floats(3, 28))
 
 
-@given(places, places, st.sampled_from([0.5, 1.0, 2.0]))
-def test_ends_are_found_between_the_cells(head, tail, scale):
+@given(places, places)
+def test_ends_are_found_between_the_cells(head, tail):
     maps = np.stack([log_blob(32, *head), log_blob(32, *tail)])
-    ends = find_ends(maps, scale=scale)
-    expected = ((np.array([head, tail]) + 0.5) * ENDS_STRIDE) / scale - 0.5
+    ends = find_ends(maps)
+    expected = (np.array([head, tail]) + 0.5) * ENDS_STRIDE - 0.5
     apart = np.linalg.norm(np.subtract(head, tail))
     if apart > 5:
         assert ends.confidence > 0.9
-        np.testing.assert_allclose([ends.head_px, ends.tail_px], expected, atol=1.6 / scale)
+        np.testing.assert_allclose([ends.head_px, ends.tail_px], expected, atol=1.6)
     assert 0.5 <= ends.confidence <= 1
 
 
@@ -28,7 +28,7 @@ def test_ends_are_found_between_the_cells(head, tail, scale):
 def test_the_more_probable_direction_is_chosen_by_its_odds(head_here, tail_here):
     here, there = log_blob(32, 5, 16), log_blob(32, 26, 16)
     maps = [np.logaddexp(here + np.log(p), there + np.log(1 - p)) for p in (head_here, tail_here)]
-    ends = find_ends(np.stack(maps).astype(np.float32), scale=1.0)
+    ends = find_ends(np.stack(maps).astype(np.float32))
     odds = head_here * (1 - tail_here) / (tail_here * (1 - head_here))
     assert ends.confidence == pytest.approx(
         max(odds, 1 / odds) / (1 + max(odds, 1 / odds)), abs=0.01

@@ -63,7 +63,7 @@ def cut_out(frame: Frame, found: Sequence[Detection], segmenter: Segmenter) -> d
             frame,
             one,
             frame_camera=Camera.nominal(width=width, height=height),
-            settings=CropFishSettings(crop_size_px=32),
+            settings=CropFishSettings(crop_size_px=64, segmenter_sizes_px=[64]),
             segmenter=segmenter,
         )
         for one in found
