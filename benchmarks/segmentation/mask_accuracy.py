@@ -1,6 +1,7 @@
 """How well a segmenter finds masks in given boxes, and how fast.
 
-    python -m benchmarks.segmentation.mask_accuracy SCENE... [--segmenter unet] [--sheet masks.png]
+    python -m benchmarks.segmentation.mask_accuracy SCENE... [--segmenter unet]
+        [--sizes 128] [--sheet masks.png]
 
 A scene is a folder with `masks/`, `boxes.txt`, perhaps `calibration.yaml`, and either `video.mp4`
 or `frames/`. The IoU is that of crops, 128 px wide, with the given masks seen by the same cameras.
@@ -25,7 +26,7 @@ from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
 from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map
 from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
 from stream_dmr.segmentation.network.onnx_session import open_session
-from stream_dmr.segmentation.network.unet_interface import SIZE_PX
+from stream_dmr.segmentation.network.unet_interface import SIZES_PX
 from stream_dmr.segmentation.network.unet_segmenter import SHIPPED, UNetSegmenter
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.read_settings import ReadFramesSettings
@@ -34,12 +35,14 @@ _MIN_MASK_PX = 64  # of a true mask in its crop
 _SHOWN, _PER_ROW = 36, 12  # crops on the sheet: the worst third, the others at random
 
 
-def crops_of(scene: Path, segmenter: str) -> Iterator[tuple[FishCrop, Bool[np.ndarray, "S S"]]]:
+def crops_of(
+    scene: Path, settings: CropFishSettings
+) -> Iterator[tuple[FishCrop, Bool[np.ndarray, "S S"]]]:
     """Every crop with a fish in it, and its true mask."""
     file = scene / "calibration.yaml"
     camera = load_calibration(file).camera if file.exists() else None
     detections = open_annotated_fish(boxes=scene / "boxes.txt", masks=None)
-    node = CropFish(CropFishSettings(segmenter=segmenter), camera=camera, finder=detections)
+    node = CropFish(settings, camera=camera, finder=detections)
     masks = MaskFolder(scene / "masks")
     video = scene / "video.mp4"
     source = open_source(str(video if video.exists() else scene / "frames"), ReadFramesSettings())
@@ -86,8 +89,8 @@ def write_sheet(
     cv2.imwrite(str(path), np.vstack(rows))
 
 
-def report(scene: Path, *, segmenter: str, sheet: Path | None) -> None:
-    crops = list(crops_of(scene, segmenter))
+def report(scene: Path, settings: CropFishSettings, *, sheet: Path | None) -> None:
+    crops = list(crops_of(scene, settings))
     ious = np.array([iou(crop.mask, truth) for crop, truth in crops])
     visible = np.array([crop.quality.visible_fraction for crop, _ in crops])
     whole = np.array([not crop.quality.touches_border for crop, _ in crops]) & (visible > 0.95)
@@ -105,11 +108,13 @@ def report(scene: Path, *, segmenter: str, sheet: Path | None) -> None:
 def measure_speed() -> None:
     """Milliseconds per crop: one by one as in a run, and in batches on every device."""
     rng = np.random.default_rng(0)
-    images = rng.integers(0, 256, (64, SIZE_PX, SIZE_PX, 3), np.uint8)
-    boxes = np.ones((64, SIZE_PX, SIZE_PX), np.float32)
     box = np.array([20.0, 40.0, 110.0, 90.0])
     segmenter = UNetSegmenter.load(SHIPPED)
-    show("one crop, one thread", lambda: segmenter.segment(images[0], box), crops=1)
+    for size in SIZES_PX:
+        image = rng.integers(0, 256, (size, size, 3), np.uint8)
+        show(f"one crop of {size} px, one thread", partial(segmenter.segment, image, box), crops=1)
+    images = rng.integers(0, 256, (64, SIZES_PX[0], SIZES_PX[0], 3), np.uint8)
+    boxes = np.ones((64, SIZES_PX[0], SIZES_PX[0]), np.float32)
     for threads in sorted({1, os.cpu_count() or 1}):
         run = UNetSegmenter(open_session(SHIPPED, threads=threads)).segment_batch
         show(f"batch of 64, {threads} threads", partial(run, images, boxes), crops=64)
@@ -131,10 +136,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenes", nargs="*", type=Path)
     parser.add_argument("--segmenter", default="unet")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[128], help="128 192 256: stills")
     parser.add_argument("--sheet", type=Path, help="a picture of masks per scene, named after it")
     arguments = parser.parse_args()
+    settings = CropFishSettings(segmenter=arguments.segmenter, segmenter_sizes_px=arguments.sizes)
     for scene in arguments.scenes:
-        report(scene, segmenter=arguments.segmenter, sheet=arguments.sheet)
+        report(scene, settings, sheet=arguments.sheet)
     measure_speed()
 
 

@@ -2,7 +2,8 @@
 
 Its first convolution already halves the input, so that no layer works at full size; the last one
 gives four values per cell, which are the four pixels of that cell. The widths were chosen for 15 ms
-a crop on one core: 0.65 million weights take 3 ms (docs/research/start-and-memory.md).
+a crop on one core: 1.53 million weights, more than half of them in the coarsest level, which takes
+little time, need 3.3 ms (docs/research/start-and-memory.md).
 """
 
 import torch
@@ -10,8 +11,8 @@ from jaxtyping import Float, Float32
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pixel_shuffle
 
-_WIDTHS = (24, 40, 64, 96)  # channels at 1/2, 1/4, 1/8 and 1/16 of the size
-_DEPTHS = (0, 1, 1, 2)  # residual blocks on the way down
+_WIDTHS = (24, 40, 64, 96, 128)  # channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the size
+_DEPTHS = (0, 1, 1, 2, 2)  # residual blocks on the way down
 MIN_SPREAD = 4.0  # grey levels: noise of a uniform image is not amplified
 
 

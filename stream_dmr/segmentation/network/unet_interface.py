@@ -3,14 +3,14 @@
 import numpy as np
 from jaxtyping import Float, Float32
 
-SIZE_PX = 128  # width and height of the crops that it is trained on
-SIZE_MULTIPLE_PX = 16  # of its input's width and height: it halves the input four times
+SIZES_PX = (128, 192, 256)  # width and height of the crops that it is trained on
+SIZE_MULTIPLE_PX = 32  # of its input's width and height: it halves the input five times
 ENDS_STRIDE = 4  # input pixels per cell of the maps of head and tail
 
 # Of its ONNX file.
 IMAGES_INPUT, BOXES_INPUT = "images", "in_boxes"
 MASK_OUTPUT, ENDS_OUTPUT = "probability", "log_ends"
-MODEL_FORMAT = "stream-dmr unet 1"  # a new number where the network's layers change
+MODEL_FORMAT = "stream-dmr unet 2"  # a new number where the network's layers change
 
 
 def box_coverage(bbox_xyxy_px: Float[np.ndarray, "4"], *, size: int) -> Float32[np.ndarray, "S S"]:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from stream_dmr.errors import AnnotationError
-from stream_dmr.segmentation.network.unet_interface import SIZE_PX, box_coverage
+from stream_dmr.segmentation.network.unet_interface import box_coverage
 from stream_dmr.segmentation.training.annotated_images import (
     list_images,
     read_annotated_images,
@@ -19,7 +19,7 @@ from stream_dmr.segmentation.training.image_degradation import add_weather, simu
 from stream_dmr.segmentation.training.random_backgrounds import BACKGROUND_PX
 from stream_dmr.segmentation.training.training_sample import TrainingSample
 
-_CUTOUT_PX = 320  # width and height of a cutout-out: the fish is longer than in a crop
+_CUTOUT_PX = 448  # width and height of a cutout-out: the fish is longer than in a crop
 _MARGIN = 0.6  # on each side, of the fish's longer side: room to rotate it
 _MIN_AREA_PX = 64  # of a fish's mask, as `[crop_fish] min_mask_area_px`
 _PART_SHARE = 0.055  # of the crops, whose box is around a part of the fish
@@ -54,7 +54,9 @@ def load_fish_cutouts(images: Path, masks: Path) -> tuple[list[Cutout], list[Cut
     return training, validation
 
 
-def draw_annotated_sample(rng: np.random.Generator, cutout: Cutout) -> TrainingSample:
+def draw_annotated_sample(
+    rng: np.random.Generator, cutout: Cutout, *, size_px: int
+) -> TrainingSample:
     """One crop of a fish, rotated, perhaps mirrored, around a box with random errors."""
     center = (_CUTOUT_PX - 1) / 2
     angle_deg = 90.0 * rng.integers(4) + rng.normal(0.0, 12.0)
@@ -68,9 +70,9 @@ def draw_annotated_sample(rng: np.random.Generator, cutout: Cutout) -> TrainingS
         box = draw_part_box(rng, box, points)
     everywhere = np.array([-np.inf, -np.inf, np.inf, np.inf])
     box = jitter_box(rng, box, limits=everywhere)
-    crop_from_rotated = crop_affine(box, margin=rng.uniform(0.08, 0.22), size=SIZE_PX)
+    crop_from_rotated = crop_affine(box, margin=rng.uniform(0.08, 0.22), size=size_px)
     crop_from_cutout = crop_from_rotated @ np.vstack([rotation, [0.0, 0.0, 1.0]])
-    crop = cv2.warpAffine(cutout, crop_from_cutout, (SIZE_PX, SIZE_PX), flags=cv2.INTER_LINEAR)
+    crop = cv2.warpAffine(cutout, crop_from_cutout, (size_px, size_px), flags=cv2.INTER_LINEAR)
     picture = crop[..., :3].astype(np.float32)
     image = crop[..., :3]
     if rng.random() < 0.7:
@@ -79,7 +81,7 @@ def draw_annotated_sample(rng: np.random.Generator, cutout: Cutout) -> TrainingS
     return TrainingSample(
         image=np.ascontiguousarray(image),
         mask=crop[..., 3].astype(np.float32) / 255,
-        in_box=box_coverage(edges.ravel(), size=SIZE_PX),
+        in_box=box_coverage(edges.ravel(), size=size_px),
         ends_px=None,
     )
 

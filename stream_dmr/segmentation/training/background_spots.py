@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from stream_dmr.segmentation.network.unet_interface import SIZE_PX, box_coverage
+from stream_dmr.segmentation.network.unet_interface import box_coverage
 from stream_dmr.segmentation.training.box_crops import crop_affine, jitter_box
 from stream_dmr.segmentation.training.image_degradation import add_weather, simulate_camera
 from stream_dmr.segmentation.training.patch_bank import PatchBank
@@ -14,7 +14,9 @@ _FINE_PX, _COARSE_PX = 2.0, 24.0  # blurs whose difference stands out at the siz
 _SIDES_PX = (16, 160)  # shortest and longest box; a background has 256 px
 
 
-def draw_spot_sample(rng: np.random.Generator, bank: PatchBank) -> TrainingSample | None:
+def draw_spot_sample(
+    rng: np.random.Generator, bank: PatchBank, *, size_px: int
+) -> TrainingSample | None:
     """A crop around a spot of a background, with an empty mask; None where nothing stands out."""
     background = bank.draw_background(rng)
     spot = find_spot(rng, background)
@@ -22,8 +24,8 @@ def draw_spot_sample(rng: np.random.Generator, bank: PatchBank) -> TrainingSampl
         return None
     edges = np.array([0, 0, background.shape[1], background.shape[0]]) - 0.5
     box = jitter_box(rng, spot, limits=edges)
-    affine = crop_affine(box, margin=rng.uniform(0.08, 0.22), size=SIZE_PX)
-    size = (SIZE_PX, SIZE_PX)
+    affine = crop_affine(box, margin=rng.uniform(0.08, 0.22), size=size_px)
+    size = (size_px, size_px)
     crop = cv2.warpAffine(
         background, affine, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
     )
@@ -32,7 +34,7 @@ def draw_spot_sample(rng: np.random.Generator, bank: PatchBank) -> TrainingSampl
     return TrainingSample(
         image=np.ascontiguousarray(image),
         mask=np.zeros(size, np.float32),
-        in_box=box_coverage(np.concatenate([low, high]) + 0.5, size=SIZE_PX),
+        in_box=box_coverage(np.concatenate([low, high]) + 0.5, size=size_px),
         ends_px=None,
     )
 

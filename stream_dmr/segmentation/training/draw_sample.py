@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-from stream_dmr.segmentation.network.unet_interface import SIZE_PX, box_coverage
+from stream_dmr.segmentation.network.unet_interface import box_coverage
 from stream_dmr.segmentation.training.background_spots import draw_spot_sample
 from stream_dmr.segmentation.training.box_crops import crop_affine, draw_part_box, jitter_box
 from stream_dmr.segmentation.training.occluders import draw_into
@@ -30,12 +30,16 @@ _PART_SHARE = 0.055  # of the examples: the box is around a part of the fish
 _MIN_VISIBLE = 0.2  # of the target fish; with less visible the scene is drawn again
 
 
-def draw_sample(rng: np.random.Generator, bank: PatchBank) -> TrainingSample:
-    """One crop with its true mask and ends."""
+def draw_sample(rng: np.random.Generator, bank: PatchBank, *, size_px: int) -> TrainingSample:
+    """One crop, `size_px` wide and high, with its true mask and ends."""
     kind = rng.random()
     is_boxed, is_empty = kind >= _NO_BOX_SHARE, kind >= 1 - _NO_FISH_SHARE
     is_part = not is_empty and kind >= 1 - _NO_FISH_SHARE - _PART_SHARE
-    if is_empty and rng.random() < _SPOT_SHARE and (spot := draw_spot_sample(rng, bank)):
+    if (
+        is_empty
+        and rng.random() < _SPOT_SHARE
+        and (spot := draw_spot_sample(rng, bank, size_px=size_px))
+    ):
         return spot
     while True:
         scene = draw_scene(rng, bank)
@@ -45,15 +49,17 @@ def draw_sample(rng: np.random.Generator, bank: PatchBank) -> TrainingSample:
     box = jitter_box(rng, box, limits=scene.frame)
     targets = [] if is_empty else [scene.target]
     if is_boxed:
-        crop_from_scene = crop_affine(box, margin=rng.uniform(0.08, 0.22), size=SIZE_PX)
+        crop_from_scene = crop_affine(box, margin=rng.uniform(0.08, 0.22), size=size_px)
     else:
         center, side = rng.normal(0.0, 0.35, 2), rng.uniform(0.9, 3.2)
         anywhere = np.concatenate([center - side / 2, center + side / 2])
-        crop_from_scene = crop_affine(anywhere, margin=0.0, size=SIZE_PX)
+        crop_from_scene = crop_affine(anywhere, margin=0.0, size=size_px)
         targets = scene.fish
-    picture, mask = render_scene(rng, bank, scene, crop_from_scene, targets=targets)
+    picture, mask = render_scene(
+        rng, bank, scene, crop_from_scene, targets=targets, size_px=size_px
+    )
     low, high = box.reshape(2, 2) @ crop_from_scene[:, :2].T + crop_from_scene[:, 2]
-    in_box = box_coverage(np.concatenate([low, high]) + 0.5, size=SIZE_PX)
+    in_box = box_coverage(np.concatenate([low, high]) + 0.5, size=size_px)
     has_ends = is_boxed and not is_empty
     return TrainingSample(
         image=picture,

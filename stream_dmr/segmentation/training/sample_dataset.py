@@ -8,9 +8,10 @@ from jaxtyping import Float32, UInt8
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from stream_dmr.segmentation.network.unet_interface import SIZES_PX
 from stream_dmr.segmentation.training.training_sample import TrainingSample
 
-Draw = Callable[[np.random.Generator], TrainingSample]
+Draw = Callable[[np.random.Generator, int], TrainingSample]  # of so many pixels a side
 Batch = tuple[
     UInt8[Tensor, "B S S 3"],  # images, BGR
     Float32[Tensor, "B S S"],  # masks
@@ -19,26 +20,34 @@ Batch = tuple[
 ]
 
 
-class SampleDataset(Dataset[TrainingSample]):
-    """`size` random examples, drawn on demand: equal seeds give equal ones, so a run can resume."""
+_SMALL_PX, *_LARGER_PX = SIZES_PX
+# Every other batch is of the size that videos are cut out at.
+_TURNS_PX = tuple(px for larger in _LARGER_PX for px in (_SMALL_PX, larger))
 
-    def __init__(self, draw: Draw, *, size: int, seed: tuple[int, ...]) -> None:
+
+class SampleDataset(Dataset[TrainingSample]):
+    """`size` random examples, drawn on demand: equal seeds give equal ones, so a run can resume.
+
+    The pictures of a batch are of one size, in turn those of `_TURNS_PX`.
+    """
+
+    def __init__(self, draw: Draw, *, size: int, batch_size: int, seed: tuple[int, ...]) -> None:
         self._draw, self._size, self._seed = draw, size, seed
+        self.batch_size = min(batch_size, size)
 
     def __len__(self) -> int:
         return self._size
 
     def __getitem__(self, index: int) -> TrainingSample:
-        return self._draw(np.random.default_rng((*self._seed, index)))
+        size_px = _TURNS_PX[index // self.batch_size % len(_TURNS_PX)]
+        return self._draw(np.random.default_rng((*self._seed, index)), size_px)
 
 
-def load_batches(
-    samples: SampleDataset, *, batch_size: int, workers: int
-) -> DataLoader[TrainingSample]:
+def load_batches(samples: SampleDataset, *, workers: int) -> DataLoader[TrainingSample]:
     """Batches in order; an incomplete last one is dropped, unless it is the only one."""
     return DataLoader(
         samples,
-        batch_size=min(batch_size, len(samples)),
+        batch_size=samples.batch_size,
         num_workers=workers,
         collate_fn=collate_samples,
         drop_last=True,

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from stream_dmr.segmentation.network.unet_interface import SIZE_PX, box_coverage
+from stream_dmr.segmentation.network.unet_interface import box_coverage
 from stream_dmr.segmentation.training.image_degradation import (
     add_weather,
     motion_kernel,
@@ -32,18 +32,19 @@ def render_scene(
     crop_from_scene: Float[np.ndarray, "2 3"],
     *,
     targets: list[SceneFish],
+    size_px: int,
 ) -> tuple[UInt8[np.ndarray, "S S 3"], Float32[np.ndarray, "S S"]]:
     """The crop (BGR), and the visible fraction of `targets` in each pixel, 0 to 1."""
-    picture = _draw_backdrop(rng, bank)
+    picture = _draw_backdrop(rng, bank, size_px)
     if rng.random() < _ALIKE_SHARE:
-        target = warp_fish(bank, scene.target, crop_from_scene, size=SIZE_PX)
+        target = warp_fish(bank, scene.target, crop_from_scene, size=size_px)
         picture = recolour_backdrop(rng, picture, target)
-    mask = np.zeros((SIZE_PX, SIZE_PX), np.float32)
+    mask = np.zeros((size_px, size_px), np.float32)
     motion = motion_kernel(rng, rng.uniform(1.0, 5.0)) if rng.random() < 0.2 else None
     blur_px = rng.uniform(0.3, 1.2) if rng.random() < 0.5 else 0.0
     shadow = _draw_shadow_kind(rng, crop_from_scene) if rng.random() < _SHADOW_SHARE else None
     for fish in scene.fish:
-        layer = warp_fish(bank, fish, crop_from_scene, size=SIZE_PX)
+        layer = warp_fish(bank, fish, crop_from_scene, size=size_px)
         if shadow is not None:
             picture = picture * (1 - cast_shadow(shadow, layer[..., 3])[..., None])
         mask *= 1 - layer[..., 3]
@@ -53,12 +54,12 @@ def render_scene(
         layer = layer if motion is None else cv2.filter2D(layer, -1, motion)
         picture = picture * (1 - layer[..., 3:]) + layer[..., :3]
     for occluder in scene.occluders:
-        covered, tones = draw_into(occluder, crop_from_scene, size=SIZE_PX)
+        covered, tones = draw_into(occluder, crop_from_scene, size=size_px)
         if occluder.hides:
             mask *= 1 - covered
-        tone = tones[..., None] * _draw_texture(rng, bank)
+        tone = tones[..., None] * _draw_texture(rng, bank, size_px)
         picture += covered[..., None] * (tone * occluder.colour.astype(np.float32) - picture)
-    inside = frame_coverage(scene.frame, crop_from_scene, size=SIZE_PX)
+    inside = frame_coverage(scene.frame, crop_from_scene, size=size_px)
     pixels = simulate_camera(rng, add_weather(rng, picture))
     return (pixels * (inside[..., None] > 0.5)).astype(np.uint8), mask * inside
 
@@ -121,14 +122,16 @@ def frame_coverage(
     return box_coverage(frame * scale + np.tile(shift, 2) + 0.5, size=size)
 
 
-def _draw_backdrop(rng: np.random.Generator, bank: PatchBank) -> Float32[np.ndarray, "S S 3"]:
+def _draw_backdrop(
+    rng: np.random.Generator, bank: PatchBank, size_px: int
+) -> Float32[np.ndarray, "S S 3"]:
     """A piece of a background, rotated, mirrored at its edges, enlarged or shrunken."""
     background = bank.draw_background(rng)
     half = background.shape[0] / 2
     angle_deg = rng.choice([0.0, 90.0, 180.0, 270.0]) + rng.normal(0.0, 8.0)
     affine = cv2.getRotationMatrix2D((half, half), angle_deg, np.exp(rng.normal(-0.15, 0.45)))
-    affine[:, 2] += SIZE_PX / 2 - half + rng.uniform(-60.0, 60.0, 2)
-    size = (SIZE_PX, SIZE_PX)
+    affine[:, 2] += size_px / 2 - half + rng.uniform(-60.0, 60.0, 2)
+    size = (size_px, size_px)
     piece = cv2.warpAffine(
         background, affine, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
     )
@@ -153,7 +156,9 @@ def recolour_backdrop(
     return np.clip(backdrop * factor ** np.float32(rng.uniform(0.6, 1.0)), 0, 255)
 
 
-def _draw_texture(rng: np.random.Generator, bank: PatchBank) -> Float32[np.ndarray, "S S 1"]:
+def _draw_texture(
+    rng: np.random.Generator, bank: PatchBank, size_px: int
+) -> Float32[np.ndarray, "S S 1"]:
     """Factors around 1, from the grey levels of a background."""
-    grey = _draw_backdrop(rng, bank).mean(axis=2, keepdims=True)
+    grey = _draw_backdrop(rng, bank, size_px).mean(axis=2, keepdims=True)
     return 1 + np.float32(rng.uniform(0.0, 0.4)) * (grey / max(float(grey.mean()), 1.0) - 1)

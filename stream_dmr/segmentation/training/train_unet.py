@@ -76,7 +76,10 @@ def train_unet(
     training = _prepare(request)
     draw, draw_validation = _sources(request, observer)
     validation = SampleDataset(
-        draw_validation, size=request.settings.validation_crops, seed=(request.settings.seed, 0)
+        draw_validation,
+        size=request.settings.validation_crops,
+        batch_size=request.settings.batch_size,
+        seed=(request.settings.seed, 0),
     )
     began = time.monotonic()
     if training.is_fine_tuning and not training.history:
@@ -168,16 +171,17 @@ class _SimulatedSource:
 
     bank: PatchBank
 
-    def __call__(self, rng: np.random.Generator) -> TrainingSample:
-        return draw_sample(rng, self.bank)
+    def __call__(self, rng: np.random.Generator, size_px: int) -> TrainingSample:
+        return draw_sample(rng, self.bank, size_px=size_px)
 
 
 @dataclass(frozen=True)
 class _AnnotatedSource:
     cutouts: Sequence[Cutout]
 
-    def __call__(self, rng: np.random.Generator) -> TrainingSample:
-        return draw_annotated_sample(rng, self.cutouts[int(rng.integers(len(self.cutouts)))])
+    def __call__(self, rng: np.random.Generator, size_px: int) -> TrainingSample:
+        cutout = self.cutouts[int(rng.integers(len(self.cutouts)))]
+        return draw_annotated_sample(rng, cutout, size_px=size_px)
 
 
 @dataclass(frozen=True)
@@ -186,9 +190,10 @@ class _MixedSource:
     cutouts: Sequence[Cutout]
     own_share: float
 
-    def __call__(self, rng: np.random.Generator) -> TrainingSample:
+    def __call__(self, rng: np.random.Generator, size_px: int) -> TrainingSample:
         is_own = rng.random() < self.own_share
-        return _AnnotatedSource(self.cutouts)(rng) if is_own else self.simulated(rng)
+        source = _AnnotatedSource(self.cutouts) if is_own else self.simulated
+        return source(rng, size_px)
 
 
 def _write_report(

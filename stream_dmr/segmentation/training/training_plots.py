@@ -8,12 +8,14 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from stream_dmr.segmentation.segmenter import resize
 from stream_dmr.segmentation.training.sample_dataset import SampleDataset
 from stream_dmr.segmentation.training.training_sample import TrainingSample
 from stream_dmr.segmentation.training.unet_trainer import EpochScores, UNetTrainer
 
 _NUM_WORST = 32
 _PER_ROW = 8
+TILE_PX = 192
 _WIDTH, _HEIGHT, _EDGE = 720, 400, 48  # px of the curve
 _TRUE_BGR, _FOUND_BGR = (80, 220, 80), (60, 60, 255)
 _TEXT, _GRID = (60, 60, 60), (225, 225, 225)
@@ -50,11 +52,10 @@ def draw_worst_masks(training: UNetTrainer, validation: SampleDataset, path: Pat
     """Write the validation pictures of least IoU; green: true outline, red: found one."""
     ious = training.ious
     worst = np.argsort(ious.numpy())[:_NUM_WORST].tolist()
-    samples = [validation[index] for index in worst]
-    found = training.predict(samples)
+    samples = {index: validation[index] for index in worst}
     tiles = [
-        _tile(sample, mask, float(ious[index]))
-        for sample, mask, index in zip(samples, found, worst, strict=True)
+        _tile(sample, training.predict(sample), float(ious[index]))
+        for index, sample in samples.items()
     ]
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % _PER_ROW)
     rows = [np.hstack(tiles[k : k + _PER_ROW]) for k in range(0, len(tiles), _PER_ROW)]
@@ -63,14 +64,15 @@ def draw_worst_masks(training: UNetTrainer, validation: SampleDataset, path: Pat
 
 def _tile(
     sample: TrainingSample, found: Bool[np.ndarray, "S S"], iou: float
-) -> UInt8[np.ndarray, "T S 3"]:
+) -> UInt8[np.ndarray, "T W 3"]:
     """The picture, and below it the same with both outlines."""
     drawn = sample.image.copy()
     for mask, colour in ((sample.mask > 0.5, _TRUE_BGR), (found, _FOUND_BGR)):
         outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(drawn, outlines, -1, colour, 1)
+    drawn = resize(drawn, TILE_PX)
     _write(drawn, f"{iou:.2f}", (3, 12), (255, 255, 255))
-    return np.vstack([sample.image, drawn])
+    return np.vstack([resize(sample.image, TILE_PX), drawn])
 
 
 def _place(along: float, value: float) -> tuple[int, int]:

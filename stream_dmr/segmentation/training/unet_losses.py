@@ -7,7 +7,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, log_softmax, m
 
 from stream_dmr.segmentation.network.unet_interface import ENDS_STRIDE
 
-_THIN_PX = 5  # wider than a tail seen edge-on
+_THIN_SHARE = 0.036  # of the picture's side: wider than a tail seen edge-on
 # Added to the weight 1 of every pixel. Without it IoU on the foreign `realistic` scene was 0.918
 # instead of 0.930 (docs/research/network-weights.md).
 _THIN_WEIGHT = 4.0
@@ -30,9 +30,10 @@ def mask_loss(logits: Float[Tensor, "B S S"], masks: Float[Tensor, "B S S"]) -> 
 
 
 def _thin(masks: Float[Tensor, "B S S"]) -> Float[Tensor, "B S S"]:
-    """The parts of the masks narrower than `_THIN_PX`: mask minus its morphological opening."""
-    shrunk = -max_pool2d(-masks, _THIN_PX, stride=1, padding=_THIN_PX // 2)
-    return masks - max_pool2d(shrunk, _THIN_PX, stride=1, padding=_THIN_PX // 2)
+    """The parts of the masks narrower than `_THIN_SHARE`: mask minus its morphological opening."""
+    half = round(_THIN_SHARE * masks.shape[-1] / 2)
+    shrunk = -max_pool2d(-masks, 2 * half + 1, stride=1, padding=half)
+    return masks - max_pool2d(shrunk, 2 * half + 1, stride=1, padding=half)
 
 
 def ends_loss(

@@ -126,9 +126,14 @@ class UNetTrainer:
         `progress` is called with the number of crops after each step.
         """
         settings, epoch = self.settings, self._epoch + 1
-        pictures = SampleDataset(draw, size=settings.crops_per_epoch, seed=(settings.seed, epoch))
+        pictures = SampleDataset(
+            draw,
+            size=settings.crops_per_epoch,
+            batch_size=settings.batch_size,
+            seed=(settings.seed, epoch),
+        )
         losses = []
-        batches = load_batches(pictures, batch_size=settings.batch_size, workers=settings.workers)
+        batches = load_batches(pictures, workers=settings.workers)
         for step, batch in enumerate(batches):
             if stop.is_set():
                 return None
@@ -156,7 +161,7 @@ class UNetTrainer:
         """IoU of each validation picture, and the fraction of heads found at the head."""
         self.averaged.eval()
         ious, num_right, num_known = [], 0, 0
-        for batch in load_batches(validation, batch_size=self.settings.batch_size, workers=0):
+        for batch in load_batches(validation, workers=0):
             mask_logits, ends_logits, masks, ends_px = self._forward(self.averaged, batch)
             ious.append(mask_iou(mask_logits, masks).cpu())
             is_right, is_known = ends_are_right(ends_logits, ends_px)
@@ -165,11 +170,11 @@ class UNetTrainer:
         return torch.cat(ious), num_right / num_known if num_known else None
 
     @torch.no_grad()
-    def predict(self, samples: list[TrainingSample]) -> Bool[np.ndarray, "B S S"]:
-        """The masks that the averaged weights find in some examples."""
+    def predict(self, sample: TrainingSample) -> Bool[np.ndarray, "S S"]:
+        """The mask that the averaged weights find in an example."""
         self.averaged.eval()
-        mask_logits, *_ = self._forward(self.averaged, collate_samples(samples))
-        return (mask_logits > 0).cpu().numpy()
+        mask_logits, *_ = self._forward(self.averaged, collate_samples([sample]))
+        return (mask_logits[0] > 0).cpu().numpy()
 
     def _forward(self, network: torch.nn.Module, batch: Batch) -> Iterator[Tensor]:
         images, masks, in_box, ends_px = (part.to(self.device) for part in batch)

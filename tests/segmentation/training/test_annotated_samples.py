@@ -28,7 +28,7 @@ def test_a_rotated_crop_rotates_the_mask(vessel):
     _, [cut] = load_fish_cutouts(vessel / "images", vessel / "masks")
     shares = []
     for seed in range(20):
-        sample = draw_annotated_sample(np.random.default_rng(seed), cut)
+        sample = draw_annotated_sample(np.random.default_rng(seed), cut, size_px=128)
         bright = cv2.GaussianBlur(sample.image, (0, 0), 2).mean(axis=2)
         inside = sample.mask > 0.5
         assert bright[inside].mean() > bright[~inside].mean() + 20

@@ -22,7 +22,9 @@ def test_nothing_stands_out_of_a_plain_background():
 
 def test_a_spot_has_a_box_and_no_fish():
     bank = make_bank(num_fish=1, num_backgrounds=8, seed=3, progress=lambda: None)
-    samples = [draw_spot_sample(np.random.default_rng(seed), bank) for seed in range(20)]
+    samples = [
+        draw_spot_sample(np.random.default_rng(seed), bank, size_px=128) for seed in range(20)
+    ]
     found = [sample for sample in samples if sample is not None]
     assert len(found) > 5
     for sample in found:

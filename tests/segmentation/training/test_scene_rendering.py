@@ -35,7 +35,7 @@ def scene_of(bank: PatchBank, seed: int) -> TrainingScene:
 
 def render(bank: PatchBank, scene: TrainingScene) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)
-    return render_scene(rng, bank, scene, CROP, targets=[scene.target])
+    return render_scene(rng, bank, scene, CROP, targets=[scene.target], size_px=128)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -9,9 +9,14 @@ import pytest
 import torch
 
 from stream_dmr.errors import ModelError
+from stream_dmr.segmentation.segmenter import resize
 from stream_dmr.segmentation.training.sample_dataset import SampleDataset
 from stream_dmr.segmentation.training.train_settings import TrainSettings
-from stream_dmr.segmentation.training.training_plots import draw_training_curve, draw_worst_masks
+from stream_dmr.segmentation.training.training_plots import (
+    TILE_PX,
+    draw_training_curve,
+    draw_worst_masks,
+)
 from stream_dmr.segmentation.training.training_sample import TrainingSample
 from stream_dmr.segmentation.training.unet_trainer import EpochScores, UNetTrainer
 from tests.support.frames import ellipse_mask
@@ -20,7 +25,7 @@ SETTINGS = TrainSettings(epochs=2, crops_per_epoch=32, validation_crops=16, batc
 SIZE = 64
 
 
-def draw_sample(rng: np.random.Generator) -> TrainingSample:
+def draw_sample(rng: np.random.Generator, _size_px: int) -> TrainingSample:
     """A light ellipse on a dark ground."""
     mask = ellipse_mask(size=(SIZE, SIZE), center=(32, 32), axes=(24, 8), angle=rng.uniform(0, 180))
     image = rng.integers(0, 40, (SIZE, SIZE, 3)).astype(np.uint8)
@@ -41,7 +46,7 @@ def trainer(out: Path, **changes: object) -> UNetTrainer:
 
 
 def samples(seed: int = 0) -> SampleDataset:
-    return SampleDataset(draw_sample, size=4, seed=(seed,))
+    return SampleDataset(draw_sample, size=4, batch_size=8, seed=(seed,))
 
 
 def scores(epoch: int, iou: float, *, loss: float | None = 1.0) -> EpochScores:
@@ -56,10 +61,9 @@ def checked(tmp_path_factory: pytest.TempPathFactory) -> UNetTrainer:
 
 
 def test_scores_are_those_of_the_masks_that_it_finds(checked: UNetTrainer):
-    chosen = [samples()[index] for index in range(4)]
-    found = checked.predict(chosen)
-    for sample, mask, iou in zip(chosen, found, checked.ious.tolist(), strict=True):
-        truth = sample.mask > 0.5
+    for index, iou in enumerate(checked.ious.tolist()):
+        sample = samples()[index]
+        mask, truth = checked.predict(sample), sample.mask > 0.5
         assert iou == pytest.approx((mask & truth).sum() / (mask | truth).sum(), abs=1e-3)
     assert checked.history[0].iou == pytest.approx(float(checked.ious.mean()), abs=1e-6)
 
@@ -95,10 +99,11 @@ def test_training_ends_where_nothing_improves(tmp_path: Path):
 def test_the_worst_masks_come_first(checked: UNetTrainer, tmp_path: Path):
     draw_worst_masks(checked, samples(), tmp_path / "worst.png")
     picture = cv2.imread(str(tmp_path / "worst.png"))
-    assert picture.shape == (2 * SIZE, 8 * SIZE, 3)
+    assert picture.shape == (2 * TILE_PX, 8 * TILE_PX, 3)
     worst = int(np.argmin(checked.ious.numpy()))
-    np.testing.assert_array_equal(picture[:SIZE, :SIZE], samples()[worst].image)
-    assert not picture[:, 4 * SIZE :].any()  # four samples, eight to a row
+    image = resize(samples()[worst].image, TILE_PX)
+    np.testing.assert_array_equal(picture[:TILE_PX, :TILE_PX], image)
+    assert not picture[:, 4 * TILE_PX :].any()  # four samples, eight to a row
 
 
 def test_a_better_score_is_drawn_higher(tmp_path: Path):
