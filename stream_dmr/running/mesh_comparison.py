@@ -7,6 +7,7 @@ them longer or shorter.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import chain
 
 import numpy as np
@@ -59,15 +60,17 @@ def compare_with_mesh(
     mesh = mesh_form(setup.template)
     measured = evenly(good_crops(crops), _MAX_FISH)
     frames = [frame for fish in measured for frame in evenly(fish, FRAMES_PER_FISH)]
-    by_mesh: Lengths = {}
 
+    @cache
+    def by_mesh() -> Lengths:
+        return _lengths(frames, setup, None)
+
+    @cache  # stocks that suffice are asked for twice
     def shift_of(stocks: CandidateShapes) -> LengthShift | None:
         if not are_like_mesh(stocks):
             return None
         progress("measuring some of them by both shapes")
-        if not by_mesh:
-            by_mesh.update(_lengths(frames, setup, None))
-        return _shift(by_mesh, _lengths(frames, setup, stocks))
+        return _shift(by_mesh(), _lengths(frames, setup, stocks))
 
     def suffices(stocks: CandidateShapes) -> bool:
         shift = shift_of(stocks)

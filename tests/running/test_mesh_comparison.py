@@ -51,11 +51,14 @@ def compare(monkeypatch: pytest.MonkeyPatch) -> Callable[..., MeshComparison]:
 
     def compared(*stages: tuple[float, float]) -> MeshComparison:
         shapes = learnt_shape(stages[0][0]), learnt_shape(stages[-1][0])
+        measured_by = list[CandidateShapes | None]()
         longer = {id(shapes[0]): stages[0][1], id(shapes[1]): stages[-1][1]}
 
         def lengths(
             crops: list[FishCrop], setup: MeasuringSetup, candidates: CandidateShapes | None
         ) -> Lengths:
+            assert candidates not in measured_by  # no shape is measured by twice
+            measured_by.append(candidates)
             shift = 0.0 if candidates is None else longer[id(candidates)]
             return {fish: (6.0 + fish + shift, STD) for fish in range(3)}
 
