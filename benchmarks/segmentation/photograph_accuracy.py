@@ -90,7 +90,7 @@ def tile(crop: Crop, found: Bool[np.ndarray, "S S"], iou: float) -> UInt8[np.nda
     for mask, colour in ((crop[1], (80, 220, 80)), (found, (60, 60, 255))):
         outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(drawn, outlines, -1, colour, 1)
-    drawn = cv2.resize(drawn, (_TILE_PX, _TILE_PX), interpolation=cv2.INTER_AREA)
+    drawn = resize(drawn, _TILE_PX)
     cv2.putText(drawn, f"{iou:.2f}", (3, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1)
     return drawn
 

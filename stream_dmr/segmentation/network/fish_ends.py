@@ -16,7 +16,7 @@ _MAX_LOG_ODDS = 50.0  # keeps the exponential finite; the confidence is 1 long b
 
 
 def find_ends(maps: Float32[np.ndarray, "2 s s"]) -> FishEnds:
-    """The most probable pair of head and tail, in crop pixels.
+    """The most probable pair of head and tail, in pixels of the picture that the network saw.
 
     `maps` are log probabilities of head and tail per cell. The odds against the two being swapped
     are p_h(H) p_t(T) / (p_h(T) p_t(H)).

@@ -19,7 +19,7 @@ from stream_dmr.segmentation.training.image_degradation import add_weather, simu
 from stream_dmr.segmentation.training.random_backgrounds import BACKGROUND_PX
 from stream_dmr.segmentation.training.training_sample import TrainingSample
 
-_CUTOUT_PX = 448  # width and height of a cutout-out: the fish is longer than in a crop
+_CUTOUT_PX = 448  # width and height of a cutout: the fish is longer than in a crop
 _MARGIN = 0.6  # on each side, of the fish's longer side: room to rotate it
 _MIN_AREA_PX = 64  # of a fish's mask, as `[crop_fish] min_mask_area_px`
 _PART_SHARE = 0.055  # of the crops, whose box is around a part of the fish

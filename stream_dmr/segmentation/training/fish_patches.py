@@ -16,7 +16,7 @@ from stream_dmr.segmentation.training.random_skins import ALONG_END, draw_skin_p
 from stream_dmr.simulation.render import rasterize, vertex_normals
 from stream_dmr.simulation.skin import noise
 
-PATCH_PX = 160  # somewhat larger than a crop, 128 px
+PATCH_PX = 160  # a fish of 152 px, as in a crop of 192 px; larger crops enlarge it
 _OVERSAMPLING = 2  # samples per pixel and axis while drawing
 RIM_PX = 4  # transparent margin for the interpolation at the edges
 

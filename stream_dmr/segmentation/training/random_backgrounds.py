@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 
 from stream_dmr.simulation.skin import noise
 
-BACKGROUND_PX = 256  # width and height; twice a crop, so that each crop is another piece
+BACKGROUND_PX = 256  # width and height; so that each crop of 128 px is another piece
 
 Picture = Float[np.ndarray, "B B 3"]
 Layer = Float[np.ndarray, "B B"]
