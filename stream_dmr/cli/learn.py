@@ -45,7 +45,6 @@ def learn_template(
     if out.suffix != ".ply":
         raise OutputError(f"--out {out}: expected a name that ends in .ply")
     require_writable(out, out.with_suffix(".toml"), overwrite=overwrite)
-    _require_different(recordings)
     opened = [open_recordings([path]) for path in recordings]
     header = opened[0].header
     mesh, forms = load_shapes(template, on_notice=lambda line: warn([line]))
@@ -59,7 +58,7 @@ def learn_template(
     with Progress(transient=True) as progress:
         task = progress.add_task("looking for fish that are completely visible", total=None)
         stocks = setup.learn(
-            _crops(opened),
+            crops_of(recordings, opened),
             forms,
             progress=lambda step: progress.update(task, description=step),
         )
@@ -78,27 +77,36 @@ def learn_template(
         print(line)
 
 
-def _require_different(recordings: list[Path]) -> None:
-    """Raise UserError where two paths lead to one recording: its fish would count twice."""
+def crops_of(paths: "list[Path]", recordings: "list[Recording]") -> "Iterator[FishCrop]":
+    """The crops of all as reviewed, with ids of their own, without rejected fish and doubles.
+
+    Raises UserError where two have a frame of the same source: its fish would count twice.
+    """
     from stream_dmr.errors import UserError
-    from stream_dmr.recording.reading.open_recording import files_of
-
-    known = dict[Path, Path]()
-    for path in recordings:
-        stems = {file.resolve().with_suffix("") for file in files_of(path)}  # .mcap, or its .rrd
-        for stem in stems & known.keys():
-            raise UserError(
-                f"{path}: expected each recording once, got one that {known[stem]} has too; leave "
-                "one out, else its fish count twice"
-            )
-        known |= dict.fromkeys(stems, path)
-
-
-def _crops(recordings: "list[Recording]") -> "Iterator[FishCrop]":
-    """The crops of all, with ids of their own."""
     from stream_dmr.messages import FishCrop
-    from stream_dmr.recording.reading.open_recording import messages_of
+    from stream_dmr.recording.messages.selection import EVERYTHING
+    from stream_dmr.results.edited_messages import ReviewedMessages
+    from stream_dmr.results.finished_fish import database_of, read_stored_fish
 
-    for number, recording in enumerate(recordings):
-        for crop in messages_of(recording, FishCrop):
-            yield replace(crop, track_id=crop.track_id + number * _IDS)
+    first_with = dict[tuple[str, int], int]()
+    for number, (path, recording) in enumerate(zip(paths, recordings, strict=True)):
+        source, database = _identity(recording), database_of(path)
+        fish = () if database is None else read_stored_fish(database)
+        left_out = {one.estimate.track_id for one in fish if not one.counts}
+        for crop in ReviewedMessages(recording, database, EVERYTHING).of([FishCrop]):
+            first = first_with.setdefault((source, crop.timestamp_ns), number)
+            if first != number:
+                raise UserError(
+                    f"{path}: expected recordings of different frames, got some of the same source "
+                    f"and time as in {paths[first]}; leave one out, else their fish count twice"
+                )
+            if isinstance(crop, FishCrop) and crop.track_id not in left_out:
+                yield replace(crop, track_id=crop.track_id + number * _IDS)
+
+
+def _identity(recording: "Recording") -> str:
+    """What was filmed: the content of the source; of a camera, or where unknown, its name."""
+    inputs = recording.header.known_inputs
+    if inputs is None:
+        return recording.header.source
+    return inputs.source.sha256 or inputs.source.path

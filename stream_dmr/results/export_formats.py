@@ -118,13 +118,15 @@ class Export:
         return count
 
     def masks(self, path: Path) -> int:
-        """Write every mask as COCO JSON with run lengths; returns their number.
+        """Write the masks as COCO JSON with run lengths; returns their number.
 
         They are in the pixels of the frame, lens distortion included. Frames without fish are
         listed too. Categories are the FAO codes of the fish, and "fish" where there is none.
+        Rejected fish and doubles are left out: `train` would learn from them.
         """
         self._require_recording("--masks")
         self._require_writable(path)
+        left_out = self._left_out()
         frames = decoded_messages(self._recording, [Frame], self._selection)
         coco = coco_masks(
             (
@@ -132,8 +134,12 @@ class Export:
                 for frame, payload in frames
                 if isinstance(frame, Frame)
             ),
-            (crop for crop in self._messages(FishCrop) if isinstance(crop, FishCrop)),
-            {one.estimate.track_id: sure_code(one) for one in self._all_fish()},
+            (
+                crop
+                for crop in self._messages(FishCrop)
+                if isinstance(crop, FishCrop) and crop.track_id not in left_out
+            ),
+            {one.estimate.track_id: sure_code(one) for one in self._all_fish() if one.counts},
         )
         self._write_text(path, json.dumps(coco))
         return len(coco["annotations"])
@@ -188,9 +194,8 @@ class Export:
         """
         self._require_recording("--viame")
         self._require_writable(path)
-        fish = self._all_fish()
-        left_out = {one.estimate.track_id for one in fish if not one.counts}
-        tracks = ViameTracks(fish, fps=self._fps())
+        left_out = self._left_out()
+        tracks = ViameTracks(self._all_fish(), fps=self._fps())
         crops: dict[tuple[int, int], FishCrop] = {}
         for message in self._messages(FishCrop, LocalizedFish):
             if isinstance(message, FishCrop):
@@ -259,6 +264,10 @@ class Export:
 
     def _all_fish(self) -> list[FishResult]:
         return read_fish(self._path, self._recording, self._selection)
+
+    def _left_out(self) -> set[int]:
+        """Track ids of rejected fish and of doubles."""
+        return {one.estimate.track_id for one in self._all_fish() if not one.counts}
 
     def _write_text(self, path: Path, text: str) -> None:
         make_folder(path.parent)

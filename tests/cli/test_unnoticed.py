@@ -6,14 +6,17 @@ import threading
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.batch.manifest import read_manifest, repeated_videos
+from stream_dmr.cli.learn import crops_of
 from stream_dmr.csv_file import original_cell, safe_cell
 from stream_dmr.errors import SourceError
+from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.provenance import seal_run
 from stream_dmr.results.verify import verify
@@ -230,7 +233,28 @@ def test_fish_of_a_recording_that_is_given_twice_are_not_counted_twice(
     link.symlink_to(out)
     outcome = invoke(f"learn-template {out} {out.parent / again} --out {tmp_path / 'x.ply'}")
     assert outcome.code == 2
-    assert outcome.error.startswith(f"{out.parent / again}: expected each recording once")
+    assert outcome.error.startswith(
+        f"{out.parent / again}: expected recordings of different frames"
+    )
+
+
+def test_fish_of_two_runs_of_one_video_are_not_counted_twice(out: Path, tmp_path: Path):
+    video = tmp_path / "copy.mp4"
+    video.write_bytes((out.parent / "clip" / "video.mp4").read_bytes())
+    again = tmp_path / "again"
+    measure_source(request(out.parent / "clip", again, source=str(video)), stop=threading.Event())
+    outcome = invoke(f"learn-template {out} {again} --out {tmp_path / 'x.ply'}")
+    assert outcome.code == 2
+    assert f"same source and time as in {out}" in outcome.error
+
+
+def test_no_shape_is_learnt_from_rejected_fish(out: Path, monkeypatch: pytest.MonkeyPatch):
+    rejected = SimpleNamespace(estimate=SimpleNamespace(track_id=1), counts=False)
+    monkeypatch.setattr(
+        "stream_dmr.results.finished_fish.read_stored_fish", lambda database: [rejected]
+    )
+    crops = list(crops_of([out], [open_recordings([out])]))
+    assert {crop.track_id for crop in crops} == {2}
 
 
 @pytest.mark.parametrize("lines", [[], ["7 of about 85, 0 s", "9 of about 85, 1 s"]])

@@ -90,6 +90,20 @@ def test_masks_meshes_and_tracks_are_of_the_reviewed_fish(out: Path, exported: P
     assert tracks == {fish: len(frames) for fish, frames in FRAMES.items()}
 
 
+def test_masks_and_tracks_are_without_rejected_fish_and_doubles(out: Path, tmp_path: Path):
+    reviewed = Path(shutil.copytree(out, tmp_path / "out"))
+    queue = ReviewQueue([open_report(reviewed)], reviewer="Ada")
+    submit(queue, "reject", 2, reason="a glove")
+    submit(queue, "duplicate", 5, duplicate_of=1)
+    queue.close()
+    options = {"--out": str(tmp_path / "exports"), "--masks": None, "--viame": None}
+    assert invoke(f"export {reviewed}", options).code == 0
+    coco = json.loads((tmp_path / "exports" / "masks.json").read_text())
+    assert {one["track_id"] for one in coco["annotations"]} == {1, 3, 4}
+    text = (tmp_path / "exports" / "tracks.viame.csv").read_text().splitlines()
+    assert {line.split(",")[0] for line in text[2:]} == {"1", "3", "4"}
+
+
 def test_tables_are_of_the_reviewed_fish(out: Path, exported: Path):
     stored = {one.estimate.track_id: one.estimate for one in read_stored_fish(out / "lengths.db")}
     lengths = {int(row["track_id"]): row for row in rows(exported / "lengths.csv")}
