@@ -7,10 +7,11 @@ from urllib.parse import quote
 from stream_dmr.batch.manifest import Job
 from stream_dmr.csv_file import original_cell
 from stream_dmr.errors import OutputError, reason_of
+from stream_dmr.running.run_folder import BATCH_OUTCOME
 
 VIDEOS = "videos.csv"  # the outcome of each video
 VIDEO_FOLDERS = "videos"
-OUTCOME = "outcome.json"  # the outcome of one video, in its folder
+OUTCOME = BATCH_OUTCOME  # the outcome of one video, in its folder
 FAILED_OUTCOME = "outcome-failed.json"  # of a later try, beside the results of an earlier one
 TABLE_KINDS = ("fish", "frames")  # tables of the data set
 # Columns of VIDEOS and the fields of an Outcome that they hold.

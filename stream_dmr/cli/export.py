@@ -98,4 +98,4 @@ def export(
         if hauls:
             print(exported.hauls(out))
         print(exported.provenance(out))
-    warn([*run_notes(recording), *exported.warnings, *notes])
+    warn([*run_notes(recording), *exported.warnings, *(notes or exported.notes)])

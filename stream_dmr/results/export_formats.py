@@ -75,7 +75,7 @@ class Export:
         self._overwrite = overwrite
         self._earlier: set[Path] = set()  # exported before from the same recording
         self._new: list[Path] = []  # files and folders that were not there, and no provenance knows
-        self._notes: list[str] = []  # of what was exported
+        self.notes: list[str] = []  # what is missing in the exports so far, one line each
         self._require_selected()
 
     @property
@@ -90,8 +90,8 @@ class Export:
 
     @property
     def warnings(self) -> Sequence[str]:
-        """What is lost of the recording or missing in the exports so far, one line each."""
-        return [*self._recording.warnings, *self._notes]
+        """What is lost of the recording, one line each."""
+        return self._recording.warnings
 
     def meshes(self, out: Path, *, format: MeshFormat) -> int:
         """Write `fish-ID/FRAME.ply` (or .glb) into `out`; returns their number.
@@ -181,7 +181,7 @@ class Export:
         self._require_writable(out / f"fish.{format}")
         fish = self._all_fish()
         records = fish_records(fish, self.template, settings, database=self._database)
-        self._notes += unweighed_note(records, settings)
+        self.notes += unweighed_note(records, settings)
         write = write_csv if format == "csv" else write_parquet
         path = write(make_folder(out) / "fish", records)
         self._written.append(path)

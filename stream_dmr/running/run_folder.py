@@ -19,6 +19,7 @@ RESULTS = (
     *("lengths.db", "lengths.csv", "frames.csv", "recording.mcap", "recording.rrd"),
     PROVENANCE,
 )
+BATCH_OUTCOME = "outcome.json"  # in the folder of a video that a batch measured, or tried to
 SEGMENTS = f"{STEM}-*"  # the recordings of an endless run
 ENDLESS_RESULTS = ("lengths.db", "lengths.csv", "frames.csv", SEGMENTS)
 _PROBE_BYTES = 1 << 16  # that must fit on the disk at the start: more than the headers of all files
@@ -82,7 +83,12 @@ def _open_folder(out: Path, *, is_fine: bool) -> list[Path]:
 
 
 def _require_no_others(out: Path) -> None:
-    """Raise OutputError where the provenance in a folder is that of a batch or of exports."""
+    """Raise OutputError where a folder is that of a batch, of a video of one, or of exports."""
+    if (out / BATCH_OUTCOME).exists():
+        raise OutputError(
+            f"{out}: expected a folder for a run, found {BATCH_OUTCOME} of a batch, which replaces "
+            "what is there; choose another --out, or let `stream-dmr batch` measure it"
+        )
     known, origin = known_files(out), read_origin(out)
     is_exported = origin is not None and origin.resolve() != out.resolve()
     if is_exported or (known and not {*known} & {*RESULTS}):

@@ -38,8 +38,8 @@ def load_template(
     mesh_path = BUNDLED / f"{path}.ply" if str(path) in bundled_names() else Path(path)
     if not mesh_path.is_file():
         raise TemplateError(
-            f"template {path}: expected a mesh file or one of {', '.join(bundled_names())}; "
-            "found neither; check the path"
+            f"template {path}: expected a mesh file, auto or one of {', '.join(bundled_names())}; "
+            "found none of them; check the path"
         )
     repaired = repair_mesh(_read_mesh(mesh_path), name=str(path))
     if repaired.changes:

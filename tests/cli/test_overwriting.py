@@ -1,6 +1,7 @@
 """No command writes over a file that it did not make, and never over what a run measured."""
 
 import os
+import shutil
 import signal
 from pathlib import Path
 
@@ -156,7 +157,7 @@ def test_shapes_that_a_run_learnt_are_its_results(out: Path, tmp_path: Path):
 
 
 @pytest.mark.parametrize("command", ["run", "run --overwrite", "replay --from smooth --overwrite"])
-@pytest.mark.parametrize("kind", ["batch", "exports"])
+@pytest.mark.parametrize("kind", ["batch", "exports", "video"])
 def test_a_run_writes_nothing_into_a_batch_or_exports(
     out: Path, tmp_path: Path, kind: str, command: str
 ):
@@ -165,6 +166,9 @@ def test_a_run_writes_nothing_into_a_batch_or_exports(
         target.mkdir()
         (target / "videos.csv").write_text("name\n")
         seal_files(target, [target / "videos.csv"], runs={})
+    elif kind == "video":
+        shutil.copytree(out, target)
+        (target / "outcome.json").write_text("{}")
     else:
         assert invoke(f"export {out} --fish csv --tables csv --out {target}").code == 0
     before = contents(target)
@@ -172,5 +176,5 @@ def test_a_run_writes_nothing_into_a_batch_or_exports(
     given = f"{out}" if command.startswith("replay") else f"--source {clip / 'video.mp4'}"
     outcome = invoke(f"{command} {given} --out {target}")
     assert outcome.code == 2
-    assert f"provenance.json of {'a batch' if kind == 'batch' else 'exports'}" in outcome.error
+    assert f"of {'exports' if kind == 'exports' else 'a batch'}, which" in outcome.error
     assert contents(target) == before

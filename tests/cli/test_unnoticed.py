@@ -53,6 +53,20 @@ def test_a_vessel_that_is_a_formula_is_text_in_a_table(out: Path, tmp_path: Path
     }
 
 
+def test_a_misspelt_species_is_said_once(out: Path, tmp_path: Path):
+    config = tmp_path / "config.toml"
+    config.write_text('[fisheries]\nspecies = "halibu"\nweight_a = 1e-5\n')
+    options = {"--fish": "csv", "--config": str(config), "--out": str(tmp_path / "exports")}
+    said = invoke(f"export {out}", options).err
+    assert said.count("[fisheries] species") == 1
+    assert "did you mean 'halibut'?" in said
+
+
+def test_a_template_that_is_none_is_told_all_choices(tmp_path: Path):
+    options = {"--source": "x.mp4", "--template": "hallibut", "--out": str(tmp_path)}
+    assert "auto or one of bream, cod" in invoke("run", options).error
+
+
 def test_a_track_that_is_not_there_is_refused(out: Path, tmp_path: Path):
     outcome = invoke(f"replay {out}", {"--track": "999", "--out": str(tmp_path / "again")})
     assert (outcome.code, "--track 999" in outcome.error) == (2, True)
