@@ -8,7 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Integer, UInt8
 
 from stream_dmr.errors import AnnotationError
 from stream_dmr.pictures import MAX_PIXELS, PICTURE_SUFFIXES, size_if_huge
@@ -27,9 +27,14 @@ def read_annotated_images(images: Path, masks: Path) -> Iterator[AnnotatedImage]
     """The annotated images, ordered by name.
 
     `masks` is a folder with STEM.png for each image, whose pixel values are fish ids and 0 is
-    background, or a COCO file. Raises AnnotationError where images and masks do not match.
+    background, or a COCO file. Beside ids the largest value of the type is unknown, as in a run.
+    Raises AnnotationError where images and masks do not match.
     """
     paths = list_images(images)
+    if masks.is_dir() and masks.samefile(images):
+        raise AnnotationError(
+            f"{masks}: expected masks in a folder of their own, got that of the images; move them"
+        )
     if masks.is_dir():
         yield from _read_folder(paths, masks)
     elif masks.suffix.lower() == ".json":
@@ -57,22 +62,36 @@ def _read_folder(paths: dict[str, Path], masks: Path) -> Iterator[AnnotatedImage
             f"{masks}: expected a mask for each of {len(paths)} images, found none for "
             f"{len(missing)}, the first of them {missing[0]}; a mask is named like its image, .png"
         )
-    for path in paths.values():
-        image, mask = read_image(path), masks / f"{path.stem}.png"
-        _refuse_huge(mask)
-        labels = cv2.imread(str(mask), cv2.IMREAD_UNCHANGED)
-        if labels is None or labels.ndim != 2:
-            raise AnnotationError(f"{mask}: expected a PNG of one channel, the ids of fish")
+    files = {path: masks / f"{path.stem}.png" for path in paths.values()}
+    # Fish that are drawn as 255 alone are fish; beside ids that is what hides them.
+    have_ids = any(_ids(labels).any() for labels in map(_read_labels, files.values()))
+    for path, mask in files.items():
+        image, labels = read_image(path), _read_labels(mask)
         _check_size(mask, labels.shape, image)
+        labels = _ids(labels) if have_ids else labels
         ids = np.unique(labels[labels > 0]).tolist()
         yield AnnotatedImage(path=path, image=image, masks=[labels == one for one in ids])
+
+
+def _read_labels(mask: Path) -> Integer[np.ndarray, "H W"]:
+    _refuse_huge(mask)
+    labels = cv2.imread(str(mask), cv2.IMREAD_UNCHANGED)
+    if labels is None or labels.ndim != 2:
+        raise AnnotationError(f"{mask}: expected a PNG of one channel, the ids of fish")
+    return labels
+
+
+def _ids(labels: Integer[np.ndarray, "H W"]) -> Integer[np.ndarray, "H W"]:
+    """Without what is unknown."""
+    return np.where(labels == np.iinfo(labels.dtype).max, 0, labels)
 
 
 def _read_coco(paths: dict[str, Path], file: Path) -> Iterator[AnnotatedImage]:
     pictures, annotations = _parse_coco(file)
     for picture in pictures:
         name = Path(str(picture["file_name"])).name
-        found = [one for one in annotations if one.get("image_id") == picture["id"]]
+        of_it = [one for one in annotations if one.get("image_id") == picture["id"]]
+        found = [one for one in of_it if not one.get("iscrowd")]  # several fish as one
         if not found:
             continue
         if name not in paths:

@@ -62,6 +62,27 @@ def test_coco_masks_are_the_ones_written(vessel, kind):
         np.testing.assert_array_equal(annotated.masks[0], mask > 0)
 
 
+def test_a_crowd_is_no_fish(vessel):
+    square = [[0, 0, 9, 0, 9, 9, 0, 9]]
+    file = coco(vessel, [square] * 6)
+    content = json.loads(file.read_text())
+    content["annotations"][2]["iscrowd"] = 1
+    file.write_text(json.dumps(content))
+    names = [one.path.name for one in read_annotated_images(vessel / "images", file)]
+    assert names == [f"haul-{i}.png" for i in (0, 1, 3, 4, 5)]
+
+
+@pytest.mark.parametrize("has_ids", [True, False])
+def test_what_is_unknown_beside_ids_is_no_fish(vessel, has_ids):
+    for path in (vessel / "masks").iterdir():
+        mask = ellipse_mask()
+        labels = np.where(mask > 0, 1 if has_ids and path.stem != "haul-0" else 255, 0)
+        labels[:5, :5] = 255
+        cv2.imwrite(str(path), labels.astype(np.uint8))
+    found = [len(one.masks) for one in read_annotated_images(vessel / "images", vessel / "masks")]
+    assert found == ([0, 1, 1, 1, 1, 1] if has_ids else [1] * 6)
+
+
 def refusal(images, masks):
     with pytest.raises(AnnotationError) as caught:
         load_fish_cutouts(images, masks)
@@ -74,6 +95,7 @@ def test_images_and_masks_that_do_not_match_are_refused(vessel):
     assert "found none there" in refusal(vessel / "nowhere", masks)
     (vessel / "empty").mkdir()
     assert "expected images" in refusal(vessel / "empty", masks)
+    assert "a folder of their own" in refusal(images, images)
     assert "a folder of PNG masks or a COCO .json" in refusal(images, vessel / "masks.txt")
     cv2.imwrite(str(masks / "haul-3.png"), np.zeros((10, 20), np.uint8))
     assert "160x120 px, got 20x10 px" in refusal(images, masks)
