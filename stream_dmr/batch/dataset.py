@@ -17,15 +17,15 @@ from stream_dmr.batch.layout import TABLE_KINDS, dataset_file
 from stream_dmr.batch.manifest import Job
 from stream_dmr.errors import OutputError
 from stream_dmr.files import replacing
-from stream_dmr.recording.reading.open_recording import open_recordings
 from stream_dmr.results.finished_fish import FishResult, read_fish
 from stream_dmr.results.fish_table import FISH_TABLE, arrow_schema, fish_records
 from stream_dmr.results.frames_table import FRAMES_COLUMNS
 from stream_dmr.results.lengths_database import NAME as DATABASE
+from stream_dmr.results.lost_recording import open_results
 from stream_dmr.results.provenance import add_files
 from stream_dmr.results.scale_checks import last_checks
 from stream_dmr.results.verdicts_table import read_verdicts
-from stream_dmr.running.config import parse_config
+from stream_dmr.running.config import load_config
 
 _PARTITIONS = ("vessel", "trip")
 _TABLE_SUFFIXES = (".parquet", ".part")  # whole, and while it is written
@@ -44,13 +44,15 @@ _FRAMES_SCHEMA: dict[str, type] = {
 
 
 def write_tables(folder: Path, job: Job) -> None:
-    """Write fish.parquet and frames.parquet of a finished run beside its other results."""
-    recording = open_recordings([folder])
-    header = recording.header
-    settings = parse_config(header.config_toml, where=f"{folder}: its config.toml").fisheries
+    """Write fish.parquet and frames.parquet of a finished run beside its other results.
+
+    Its recording may be gone: lengths.db, frames.csv and the job have all that is needed.
+    """
+    recording = open_results(folder, template=job.template)
+    settings = load_config(job.config or None).fisheries
     fish = read_fish(folder, recording)
     of_video = {"video": job.name, "haul": job.haul}
-    records = fish_records(fish, header.template, settings, database=folder / DATABASE)
+    records = fish_records(fish, recording.header.template, settings, database=folder / DATABASE)
     _write(folder / "fish.parquet", [one | of_video for one in records], _FISH_SCHEMA)
     _write(folder / "frames.parquet", _frame_records(folder, fish, of_video), _FRAMES_SCHEMA)
     add_files(folder, [folder / f"{kind}.parquet" for kind in TABLE_KINDS])
@@ -71,9 +73,11 @@ def _frame_records(
 def publish(folder: Path, job: Job, out: Path) -> None:
     """Copy the tables of a finished video into the data set. Idempotent.
 
-    They are written again where a reviewer has added verdicts since, or the scale was checked.
+    They are written again where a reviewer has added verdicts since, or the scale was checked, or
+    where one is gone.
     """
-    if _last_addition_ns(folder) > _written_ns(folder, "fish"):
+    written_ns = min(_written_ns(folder, kind) for kind in TABLE_KINDS)
+    if not written_ns or _last_addition_ns(folder) > written_ns:
         write_tables(folder, job)
     for kind in TABLE_KINDS:
         target = _target(out, kind, job)
@@ -99,7 +103,9 @@ def _target(out: Path, kind: str, job: Job) -> Path:
 
 
 def _written_ns(folder: Path, kind: str) -> int:
-    return (folder / f"{kind}.parquet").stat().st_mtime_ns
+    """When a table was written, ns since 1970; 0 where it is not there."""
+    table = folder / f"{kind}.parquet"
+    return table.stat().st_mtime_ns if table.exists() else 0
 
 
 def _last_addition_ns(folder: Path) -> int:

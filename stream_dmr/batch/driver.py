@@ -27,7 +27,7 @@ from stream_dmr.batch.manifest import Job
 from stream_dmr.batch.measure_video import Outcome, finish_folder, read_outcome
 from stream_dmr.batch.progress import BatchProgress
 from stream_dmr.csv_file import write_table
-from stream_dmr.errors import OutputError
+from stream_dmr.errors import OutputError, UserError, reason_of
 from stream_dmr.files import make_folder, replacing
 from stream_dmr.results.folder_lock import require_unlocked
 from stream_dmr.results.lengths_database import NAME as DATABASE
@@ -94,7 +94,10 @@ class _BatchResults:
         known = {job.name: read_outcome(job, out) for job in jobs}
         self.outcomes = {name: one for name, one in known.items() if one and one.status == DONE}
         for job in self._done():
-            publish(results_folder(job, out), job, out)
+            try:
+                publish(results_folder(job, out), job, out)
+            except (UserError, OSError) as error:  # a file of its results is damaged or gone
+                log(f"{job.name}: its tables stay as they were: {reason_of(error)}")
         self._write_table()
 
     def add(self, job: Job, outcome: Outcome) -> None:

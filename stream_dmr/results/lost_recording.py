@@ -26,15 +26,16 @@ from stream_dmr.template.template_file import bundled_names
 _UNKNOWN = "unknown"
 
 
-def open_results(path: Path) -> Recording:
+def open_results(path: Path, *, template: str = AUTO) -> Recording:
     """The recording of a run's folder or a recording itself; a `LostRecording` where it is gone.
 
-    Raises RecordingError where there is neither a recording nor a lengths.db.
+    `template`: the run's, as far as is known. Raises RecordingError where there is neither a
+    recording nor a lengths.db.
     """
     database = database_of(path)
     if database is None or _has_recording(path):
         return open_recordings([path])
-    return LostRecording(database)
+    return LostRecording(database, template)
 
 
 def _has_recording(path: Path) -> bool:
@@ -47,14 +48,14 @@ def _has_recording(path: Path) -> bool:
 class LostRecording:
     """A recording without messages; its header has what lengths.db knows of the last run."""
 
-    def __init__(self, database: Path) -> None:
+    def __init__(self, database: Path, template: str = AUTO) -> None:
         """Raises OutputError where the database can't be read."""
         facts = [*read_runs(database).values()][-1:]
         self.header = RunHeader(
             source=facts[0].source if facts else _UNKNOWN,
             command=facts[0].command if facts else _UNKNOWN,
             config_toml="",
-            template=_template_by(facts[0].template_sha256 if facts else ""),
+            template=_template_by(facts[0].template_sha256 if facts else "", template),
         )
         self.metadata: dict[str, str] = {}
         self.is_thinned = True
@@ -90,12 +91,12 @@ def require_recording(recording: Recording, *, where: object, what: str) -> None
 
 
 @cache
-def _template_by(hash_hex: str) -> Template:
-    """The bundled template with this SHA-256; of another one nothing is known, not even its tail.
+def _template_by(hash_hex: str, likely: str) -> Template:
+    """The likely or the bundled template with this SHA-256.
 
-    A mesh of the user's own stood in the recording alone.
+    Of another one nothing is known, not even its tail: it stood in the recording alone.
     """
-    for name in (AUTO, *bundled_names()):
+    for name in (likely, AUTO, *bundled_names()):
         template, _ = load_shapes(name)
         if sha256(encode(template)).hexdigest() == hash_hex:
             return template

@@ -293,6 +293,20 @@ def test_the_next_call_takes_verdicts_into_the_data_set(season: Path, tmp_path: 
     assert verify_all(tmp_path)[0] == []
 
 
+def test_a_video_whose_tables_can_not_be_written_again_is_named(season: Path, tmp_path: Path):
+    jobs = jobs_of(season, tmp_path, row(), row("other"))
+    measure(jobs, tmp_path)
+    folder = results_folder(jobs[0], tmp_path)
+    add_verdict(folder / "lengths.db", Verdict(track_id=2, kind="accept", reviewer="Ada"))
+    (folder / "frames.csv").unlink()
+    lines: list[str] = []
+    summary = run_batch(jobs, tmp_path, ThisProcess(), stop=threading.Event(), log=lines.append)
+    assert (summary.num_before, len(summary.outcomes)) == (2, 2)
+    assert [line.partition(": ")[0] for line in lines] == [jobs[0].name]
+    tables = dataset.dataset(tmp_path / "dataset" / "fish").to_table().to_pylist()
+    assert {one["video"] for one in tables} == {job.name for job in jobs}
+
+
 def test_the_next_call_takes_checks_of_the_scale_into_the_data_set(season: Path, tmp_path: Path):
     (job,) = jobs_of(season, tmp_path, row())
     measure([job], tmp_path)

@@ -1,5 +1,7 @@
 """The data set of a batch: a file for each finished video, in its partition, and no others."""
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,6 +10,8 @@ from pyarrow import parquet
 from stream_dmr.batch.dataset import publish, withdraw_others, write_tables
 from stream_dmr.batch.layout import TABLE_KINDS
 from stream_dmr.batch.manifest import Job
+from stream_dmr.results.verdicts import Verdict
+from stream_dmr.results.verdicts_table import add_verdict
 from tests.support.command import rows
 from tests.support.fish_run import measure
 
@@ -48,6 +52,24 @@ def test_publishing_again_changes_no_file(folder: Path, tmp_path: Path):
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.parquet")}
     publish(folder, JOB, tmp_path)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.parquet")} == before
+
+
+def test_without_its_recording_a_video_still_takes_verdicts(folder: Path, tmp_path: Path):
+    left = Path(shutil.copytree(folder, tmp_path / "left"))
+    before = parquet.read_table(left / "fish.parquet").to_pylist()
+    for path in (*left.glob("recording.*"), left / "fish.parquet"):
+        path.unlink()
+    verdict = Verdict(track_id=2, kind="reject", reason="a glove", reviewer="Ada")
+    add_verdict(left / "lengths.db", verdict)
+    mesh = str(folder.parent / "clip" / "tiny.ply")
+    publish(left, replace(JOB, template=mesh), tmp_path)
+    after = parquet.read_table(left / "fish.parquet").to_pylist()
+    assert [one["verdict"] for one in after] == [None, "reject"]
+    of_review = ("verdict", "verdict_reason", "reviewer", "reviewed_utc", "reviewed_ns")
+    for one in before + after:
+        for name in of_review:
+            one.pop(name)
+    assert after == before
 
 
 def test_files_of_videos_that_are_not_finished_go(folder: Path, tmp_path: Path):
