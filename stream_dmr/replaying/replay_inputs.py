@@ -13,7 +13,7 @@ from stream_dmr.recording.reading.open_recording import Recording, messages_of
 from stream_dmr.replaying.recorded_files import CropFiles, find_crop_files, inputs_with
 from stream_dmr.replaying.replay_config import replay_config
 from stream_dmr.replaying.replay_request import ReplayRequest
-from stream_dmr.running.config import Config, to_toml
+from stream_dmr.running.config import to_toml
 from stream_dmr.running.measuring_setup import MeasuringSetup
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.running.shape_pass import learnt_from
@@ -42,7 +42,6 @@ def read_inputs(
     if request.calibration is not None:
         calibration = load_calibration(request.calibration)
         _require_size_of_frames(calibration, recording)
-    setup = _with_shapes(request, recording, config, calibration, observer)
     files = None
     if request.first == "crop":
         files = find_crop_files(
@@ -54,13 +53,20 @@ def read_inputs(
                 "them began, so fish of all but the first have other numbers than recorded; "
                 "--from fit keeps them"
             )
-    return ReplayInputs(
+    if request.template is None:
+        template, candidates = header.template, known_shapes(recording)
+    else:
+        template, candidates = load_shapes(request.template, on_notice=observer.warn)
+    inputs = ReplayInputs(
         config=config,
-        template=setup.template,
-        candidates=setup.candidates,
+        template=template,
+        candidates=candidates,
         calibration=calibration,
         files=files,
     )
+    if request.template is None or not config.fit_mesh.are_shapes_learnt:
+        return inputs
+    return learnt_from(messages_of(recording, FishCrop), inputs, observer)
 
 
 def new_header(request: ReplayRequest, recorded: RunHeader, inputs: ReplayInputs) -> RunHeader:
@@ -94,23 +100,3 @@ def _require_size_of_frames(calibration: Calibration, recording: Recording) -> N
     if first is not None:
         picture = stored_picture(first[1])
         require_size(calibration, width=picture.width, height=picture.height)
-
-
-def _with_shapes(
-    request: ReplayRequest,
-    recording: Recording,
-    config: Config,
-    calibration: Calibration | None,
-    observer: RunObserver,
-) -> MeasuringSetup:
-    """With mesh and candidate shapes, by what the crops show where a template is given."""
-    if request.template is None:
-        template, candidates = recording.header.template, known_shapes(recording)
-    else:
-        template, candidates = load_shapes(request.template, on_notice=observer.warn)
-    setup = MeasuringSetup(
-        config=config, template=template, candidates=candidates, calibration=calibration
-    )
-    if request.template is None or not config.fit_mesh.are_shapes_learnt:
-        return setup
-    return learnt_from(messages_of(recording, FishCrop), setup, observer)

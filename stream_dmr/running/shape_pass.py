@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
+from typing import TypeVar
 
 from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
 from stream_dmr.fitting.shape.describe import describe
@@ -26,6 +27,8 @@ from stream_dmr.running.run_folder import require_folder
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.template.template import Template
 from stream_dmr.template.template_file import save_template
+
+S = TypeVar("S", bound=MeasuringSetup)
 
 
 def with_learnt_shapes(
@@ -53,9 +56,7 @@ def with_learnt_shapes(
     return replace(inputs, candidates=_learn_aloud(crops, inputs, forms, observer))
 
 
-def learnt_from(
-    crops: Iterable[FishCrop], setup: MeasuringSetup, observer: RunObserver
-) -> MeasuringSetup:
+def learnt_from(crops: Iterable[FishCrop], setup: S, observer: RunObserver) -> S:
     """The setup with the shapes that all these fish together have, told to the observer.
 
     Without candidates these are the template's own, unless the fish show another: then their shapes
