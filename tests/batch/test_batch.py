@@ -11,7 +11,6 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import duckdb
@@ -23,7 +22,7 @@ from stream_dmr.batch.driver import run_batch
 from stream_dmr.batch.layout import results_folder
 from stream_dmr.batch.local_engine import LocalEngine
 from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
-from stream_dmr.batch.measure_video import Outcome, measure_video, read_outcome
+from stream_dmr.batch.measure_video import measure_video, read_outcome
 from stream_dmr.batch.progress import BatchProgress
 from stream_dmr.batch.verify_batch import verify_all
 from stream_dmr.errors import OutputError
@@ -33,6 +32,7 @@ from stream_dmr.results.scale_checks import ScaleCheck, add_check
 from stream_dmr.results.verdicts import Verdict
 from stream_dmr.results.verdicts_table import add_verdict
 from stream_dmr.running.measure_source import measure_source
+from tests.support.batch_engine import ThisProcess
 from tests.support.command import invoke, rows
 from tests.support.fish_run import FISH, request
 from tests.support.nmea import START_NS, straight_way
@@ -80,16 +80,6 @@ def jobs_of(season: Path, tmp_path: Path, *lines: dict[str, str]) -> list[Job]:
     return read_manifest(manifest, config=clip / "quick.toml", template=str(clip / "tiny.ply"))
 
 
-class ThisProcess:
-    """An engine without processes, which take seconds to start."""
-
-    def outcomes(
-        self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, progress: BatchProgress
-    ) -> Iterator[Outcome]:
-        for job in jobs:
-            yield measure_video(job, out, on_progress=progress.of(job))
-
-
 def measure(jobs: list[Job], out: Path) -> dict[str, str]:
     summary = run_batch(jobs, out, ThisProcess(), stop=threading.Event())
     return {one.name: one.status for one in summary.outcomes}
@@ -113,7 +103,8 @@ def test_a_batch_measures_a_video_as_run_does(season: Path, tmp_path: Path):
     assert read_outcome(job, tmp_path) == outcome
 
 
-def test_a_video_of_a_batch_has_positions_and_its_fish_have_fates(season: Path, tmp_path: Path):
+def test_a_worker_s_video_has_positions_and_its_fish_have_fates(season: Path, tmp_path: Path):
+    """The other video is not there, which the command's exit code says."""
     (season / "way.nmea").write_text(straight_way(10), newline="")
     zones = season / "zones.toml"
     whole = "[[0, 0], [160, 0], [160, 120], [0, 120]]"
@@ -123,13 +114,16 @@ def test_a_video_of_a_batch_has_positions_and_its_fish_have_fates(season: Path, 
     manifest = season / "positions.csv"
     header = ",".join([*COLUMNS, "nmea", "start_utc"])
     cells = [*(row().get(name, "") for name in COLUMNS), "way.nmea", "2026-11-22T06:00:02Z"]
-    manifest.write_text(f"{header}\n{','.join(cells)}\n")
+    missing = ["missing.mp4", *("" for _ in cells[1:])]
+    manifest.write_text("\n".join([header, ",".join(cells), ",".join(missing), ""]))
     outcome = invoke(
         "batch",
         {str(manifest): None, "--out": str(tmp_path), "--config": str(zones), "--workers": "1"}
         | {"--template": str(season / "clip" / "tiny.ply")},
     )
-    assert outcome.code == 0, outcome.err
+    assert outcome.code == 2
+    assert "1 of 2 videos are done, 0 of them before, 1 failed" in outcome.out
+    assert "missing: failed: " in outcome.err
     folder = tmp_path / "videos" / "video"
     fish = read_stored_fish(folder / "lengths.db")
     for one in fish:
@@ -395,6 +389,7 @@ def test_a_damaged_outcome_counts_as_none(season: Path, tmp_path: Path):
         assert read_outcome(job, tmp_path) is None
 
 
+@pytest.mark.slow  # four starts
 def test_a_killed_worker_or_batch_loses_no_finished_video(season: Path, tmp_path: Path):
     """First its worker is killed, which one video is charged with, then the batch itself."""
     clip, out = season / "clip", tmp_path / "out"
@@ -451,19 +446,7 @@ def wait_for(condition, seconds: float = 300.0) -> None:  # type: ignore[no-unty
         time.sleep(0.01)
 
 
-def test_the_command_exits_with_2_where_a_video_failed(season: Path, tmp_path: Path):
-    manifest = write_manifest(season / f"{tmp_path.name}.csv", row(), row(video="missing.mp4"))
-    clip = season / "clip"
-    outcome = invoke(
-        "batch",
-        {str(manifest): None, "--out": str(tmp_path), "--config": str(clip / "quick.toml")}
-        | {"--template": str(clip / "tiny.ply"), "--workers": "1"},
-    )
-    assert outcome.code == 2
-    assert "1 of 2 videos are done, 0 of them before, 1 failed" in outcome.out
-    assert "missing: failed: " in outcome.err
-
-
+@pytest.mark.slow  # two starts
 def test_a_process_measures_so_many_videos(season: Path, tmp_path: Path):
     """What a process keeps of its videos must not add up over a season."""
     names = ("one.mp4", "two.mp4", "three.mp4")  # none is there, which takes no time to say

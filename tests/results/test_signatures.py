@@ -31,6 +31,7 @@ from stream_dmr.results.signatures import (
 from stream_dmr.results.signed_files import SignedFiles
 from stream_dmr.results.verify_signatures import check_signatures
 from stream_dmr.running.measure_source import measure_source
+from tests.support.batch_engine import without_workers
 from tests.support.command import invoke
 from tests.support.final_estimates import FACTS, fish
 from tests.support.fish_run import FISH, request
@@ -375,7 +376,7 @@ def test_a_check_after_the_last_run_is_said_and_is_no_change(
 
 
 def test_a_replay_a_repair_and_a_batch_are_signed_as_well(
-    measured: Path, key: Path, tmp_path: Path
+    measured: Path, key: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     again = tmp_path / "again"
     options = {"--from": "localize", "--out": str(again), "--key": str(key)}
@@ -390,6 +391,7 @@ def test_a_replay_a_repair_and_a_batch_are_signed_as_well(
     )
     options = {"--out": str(tmp_path / "season"), "--key": str(key), "--workers": "1"}
     options |= {"--template": str(clip / "tiny.ply"), "--config": str(clip / "quick.toml")}
+    without_workers(monkeypatch)
     assert invoke("batch", {str(manifest): None} | options).code == 0
     assert changes(tmp_path / "season" / "videos" / "video", key) == []
     with closing(sqlite3.connect(again / "lengths.db")) as database, database:

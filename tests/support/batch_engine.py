@@ -1,0 +1,27 @@
+"""An engine of batches without processes, each of which takes seconds to start."""
+
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from stream_dmr.batch import local_engine
+from stream_dmr.batch.manifest import Job
+from stream_dmr.batch.measure_video import Outcome, measure_video
+from stream_dmr.batch.progress import BatchProgress
+
+
+class ThisProcess:
+    """Measures one video after the other, where it is called."""
+
+    def outcomes(
+        self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, progress: BatchProgress
+    ) -> Iterator[Outcome]:
+        for job in jobs:
+            yield measure_video(job, out, on_progress=progress.of(job))
+
+
+def without_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `stream-dmr batch` measure in this process."""
+    monkeypatch.setattr(local_engine, "LocalEngine", lambda workers: ThisProcess())
