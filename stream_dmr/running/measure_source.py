@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Collection, Generator, Sequence
+from collections.abc import Collection, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,30 +14,23 @@ from stream_dmr.errors import OutputError, UserError
 from stream_dmr.fitting.compile_kernels import compile_kernels
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.shape.candidates import AUTO
-from stream_dmr.messages import Frame, LengthEstimate, Message, Position
+from stream_dmr.messages import LengthEstimate
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.results.learnt_meshes import LEARNT, MADE_BY_RUN
 from stream_dmr.results.length_store import LengthStore
 from stream_dmr.results.run_facts import ENDLESS_STOPPED, SOURCE_ENDED, STOPPED
 from stream_dmr.running.chain_nodes import continue_tracks, later_nodes, records_covariance
-from stream_dmr.running.drift_alarms import DriftAlarms
-from stream_dmr.running.error_policy import ErrorPolicy
 from stream_dmr.running.inputs import Inputs, checked_inputs
-from stream_dmr.running.live_shapes import follow_shapes
+from stream_dmr.running.message_flow import MessageFlow
 from stream_dmr.running.outputs import Outputs, open_outputs
 from stream_dmr.running.pipeline import Node, StageCounters, run_chain
-from stream_dmr.running.position_feed import PositionFeed
 from stream_dmr.running.prepare_kernels import prepare_kernels
-from stream_dmr.running.result_writer import ResultWriter
-from stream_dmr.running.resume import resume_source
 from stream_dmr.running.run_folder import result_names
-from stream_dmr.running.run_observer import RunObserver, RunTotals
+from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.running.run_request import RunRequest
 from stream_dmr.running.seen_fish import SeenFish
 from stream_dmr.running.shape_pass import is_mesh_theirs, save_stocks, with_learnt_shapes
 from stream_dmr.running.start_notices import start_notices
-
-_MAX_SUMMARY_FISH = 100  # of an endless run, for the table at its end; the store has all fish
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,71 +179,32 @@ def _run_chain(
 ) -> RunSummary:
     began = time.perf_counter()
     outputs.store.count_frames(inputs.source.num_frames)
-    writer = _result_writer(inputs, outputs, on_notice=observer.warn)
-    policy = ErrorPolicy(is_endless=inputs.is_endless, on_notice=observer.warn)
-    _begin_positions(inputs, outputs, observer)
-    totals = RunTotals(max_fish=_MAX_SUMMARY_FISH if inputs.is_endless else None)
-
-    def on_position(position: Position) -> None:
-        observer.take(writer.write(position))
-
-    positions = PositionFeed(inputs.positions, on_position)
-    shapes = follow_shapes(inputs, outputs, nodes[1], seen, write=writer.write, observer=observer)
-
-    def on_message(message: Message) -> Message:
-        message = writer.write(message)
-        totals.take(message)
-        observer.take(message)
-        seen.take(message)
-        if isinstance(message, Frame):
-            positions.take(message)
-            if shapes is not None:
-                shapes.take(message)
-        return message
-
-    def on_frame() -> None:
-        for receiver in (policy, writer, totals, observer):
-            receiver.frame_done()
-
+    flow = MessageFlow(inputs, nodes, outputs, seen, observer)
     try:
         with _noting_the_end(inputs, outputs.store, stop):
             counters = run_chain(
                 inputs.reader,
                 nodes,
-                on_message=on_message,
-                on_frame=on_frame,
+                on_message=flow.take,
+                on_frame=flow.frame_done,
                 on_start=observer.attach,
-                on_failure=policy.continues_after,
+                on_failure=flow.policy.continues_after,
                 stop=stop,
             )
     finally:
-        if shapes is not None:
-            shapes.close()
-        if line := positions.finish():
-            observer.warn(line)
-        writer.finish()
+        flow.finish()
+    names = result_names(inputs.config.recording, is_endless=inputs.is_endless)
     return RunSummary(
-        fish=totals.fish(),
+        fish=flow.totals.fish(),
         may_count_twice=outputs.store.may_count_twice(),
-        num_frames=totals.num_frames,
+        num_frames=flow.totals.num_frames,
         frames_promised=inputs.source.num_frames,
         shapes_s=shapes_s,
         elapsed_s=time.perf_counter() - began,
         calibration=inputs.calibration,
         counters=counters,
-        files=[
-            inputs.request.out / name
-            for name in result_names(inputs.config.recording, is_endless=inputs.is_endless)
-        ],
+        files=[inputs.request.out / name for name in names],
     )
-
-
-def _begin_positions(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> None:
-    if inputs.positions is not None:
-        inputs.positions.listen(observer.warn)
-        is_live = inputs.source.is_live
-        after_ns = outputs.store.resume_after_ns() if is_live else 0
-        inputs.positions.begin(after_ns=after_ns)
 
 
 @contextmanager
@@ -279,27 +233,3 @@ def _end_of(inputs: Inputs, stop: threading.Event) -> str:
 def _frames_received(inputs: Inputs) -> int | None:
     """The frames that came from a camera; None for another source."""
     return None if inputs.source.counts is None else inputs.source.counts.received
-
-
-def _result_writer(
-    inputs: Inputs, outputs: Outputs, *, on_notice: Callable[[str], None]
-) -> ResultWriter:
-    """The writer of a run; its source is made to continue after earlier runs."""
-    store = outputs.store
-    clips = resume_source(inputs.source, store, on_notice=on_notice)
-    if inputs.numbers_frames_on:
-        inputs.reader.number_after(store.before.frame_index)
-    has_drift_alarms = inputs.is_endless and inputs.calibration is not None
-    return ResultWriter(
-        store,
-        outputs.lengths,
-        outputs.recorder,
-        clips=clips,
-        interrupted=outputs.interrupted,
-        drift=DriftAlarms(store, inputs.config.drift, on_notice=on_notice)
-        if has_drift_alarms
-        else None,
-        sensors=inputs.config.sensors,
-        hauls=outputs.hauls,
-        on_notice=on_notice,
-    )

@@ -54,12 +54,8 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
     on_refusal = observer.warn if is_endless else None
     files, states = SignedFiles(out), SinkStates()
     retention = _free_space(inputs, files, observer)
-    repairs = prepare_folder(
-        out,
-        overwrite=inputs.request.overwrite,
-        resume=inputs.resumes,
-        waits_for_room=is_endless,
-    )
+    overwrite, resume = inputs.request.overwrite, inputs.resumes
+    repairs = prepare_folder(out, overwrite=overwrite, resume=resume, waits_for_room=is_endless)
     header = inputs.header()
     with ExitStack() as stack:
         # At the end lengths.csv is complete before it is signed, it is signed while the store is
@@ -68,45 +64,31 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
         store = stack.enter_context(closing(_open_store(inputs, header)))
         files.attach(store, repaired=[repair.path for repair in repairs])
         stack.callback(partial(files.finish, with_recordings=not is_endless))
-        lengths = LengthsTable(out, store, resume=inputs.resumes, on_refusal=on_refusal)
+        lengths = LengthsTable(out, store, resume=resume, on_refusal=on_refusal)
         stack.enter_context(closing(lengths))
         # The observer may refuse the run, so it is asked before anything is recorded, and it sees
         # the recording's end.
         stack.enter_context(closing(observer))
         hauls = HaulLog(store, inputs.config.hauls, frames_lost=partial(_frames_lost, inputs))
-        observer.open(
-            OpenRun(
-                config=inputs.config,
-                source=inputs.source,
-                positions=inputs.positions,
-                store=store,
-                hauls=hauls,
-                out=out,
-                sinks=states,
-            )
-        )
+        observer.open(_open_run(inputs, store, hauls, states))
         # What earlier runs recorded is read before a new segment stands beside it.
         interrupted = interrupted_tracks(
             repairs if is_endless else [], store, on_notice=observer.warn
         )
         learnt = learnt_before(out, header) if is_endless else []
-        segments = partial(
-            open_segments,
-            interrupted=interrupted,
-            learnt=learnt,
-            on_notice=observer.warn,
-            on_closed=files.changed,
-            states=states,
-        )
-        recorder = stack.enter_context(
-            _open_recorder(
-                inputs,
-                replace(header, runs=(_start_of(inputs, store),)),
-                files=segments if is_endless else open_recording_files,
-                on_refusal=on_refusal,
+        recording = open_recording_files
+        if is_endless:
+            recording = partial(
+                open_segments,
+                interrupted=interrupted,
+                learnt=learnt,
+                on_notice=observer.warn,
+                on_closed=files.changed,
                 states=states,
             )
-        )
+        header = replace(header, runs=(_start_of(inputs, store),))
+        recorder = _open_recorder(inputs, header, recording, on_refusal=on_refusal, states=states)
+        stack.enter_context(recorder)
         stack.enter_context(closing(retention))
         retention.start()
         yield Outputs(
@@ -118,6 +100,18 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
             interrupted=interrupted,
             learnt=learnt,
         )
+
+
+def _open_run(inputs: Inputs, store: LengthStore, hauls: HaulLog, states: SinkStates) -> OpenRun:
+    return OpenRun(
+        config=inputs.config,
+        source=inputs.source,
+        positions=inputs.positions,
+        store=store,
+        hauls=hauls,
+        out=inputs.request.out,
+        sinks=states,
+    )
 
 
 def _free_space(inputs: Inputs, files: SignedFiles, observer: RunObserver) -> Retention:
@@ -151,8 +145,8 @@ def _open_store(inputs: Inputs, header: RunHeader) -> LengthStore:
 def _open_recorder(
     inputs: Inputs,
     header: RunHeader,
-    *,
     files: SinkFactory,
+    *,
     on_refusal: Callable[[str], None] | None,
     states: SinkStates,
 ) -> Recorder:
