@@ -11,6 +11,7 @@ from PIL import Image
 MAX_PIXELS = 150_000_000  # chosen: the largest cameras have some 100 megapixels
 PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
+_ORIENTATION = 0x0112  # the tag of EXIF; 1: as it should be shown
 _JPEG_START = b"\xff\xd8"
 _JPEG_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # not a byte of pixels, nor a restart
 _JPEG_END = b"\xd9"
@@ -31,6 +32,18 @@ def size_if_huge(path: Path) -> str:
     except (OSError, ValueError, SyntaxError):
         return ""
     return f"{width}x{height} px" if width * height > MAX_PIXELS else ""
+
+
+def is_turned(path: Path) -> bool:
+    """True for a picture that by its EXIF is not as it should be shown, and can be read so.
+
+    OpenCV turns a TIFF in any case.
+    """
+    try:
+        with Image.open(path) as picture:
+            return picture.format != "TIFF" and picture.getexif().get(_ORIENTATION, 1) != 1
+    except (OSError, ValueError, SyntaxError):
+        return False
 
 
 def read_picture(path: Path, flags: int) -> np.ndarray | None:

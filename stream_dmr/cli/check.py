@@ -123,6 +123,6 @@ def _pictures(source: str) -> Iterator["np.ndarray"]:
     if Path(source).suffix.lower() in PICTURE_SUFFIXES:
         yield read_grey(Path(source))
         return
-    with closing(open_source(source, ReadFramesSettings())) as frames:
+    with closing(open_source(source, ReadFramesSettings(orientation="sensor"))) as frames:
         for frame in islice(frames, _MAX_PICTURES):
             yield cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)

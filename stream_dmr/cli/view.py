@@ -126,6 +126,8 @@ def _convert(
 ) -> None:
     from stream_dmr.errors import RecordingError
     from stream_dmr.recording.reading.frame_images import open_pictures
+    from stream_dmr.recording.reading.open_recording import open_recordings
+    from stream_dmr.recording.reading.recorded_settings import recorded_settings
     from stream_dmr.recording.reading.rrd_conversion import EVERY_FRAME
     from stream_dmr.recording.reading.rrd_conversion import convert as convert_recording
     from stream_dmr.sources.read_settings import ReadFramesSettings
@@ -136,7 +138,10 @@ def _convert(
     with ExitStack() as stack:
         pictures = None
         if source is not None:
-            pictures = stack.enter_context(open_pictures(source, ReadFramesSettings()))
+            of_run = recorded_settings(
+                open_recordings([recording]), "read_frames", ReadFramesSettings
+            )
+            pictures = stack.enter_context(open_pictures(source, of_run))
         lost = convert_recording(
             recording, rrd, source=pictures, settings=settings, selection=selection
         )

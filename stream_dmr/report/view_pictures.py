@@ -18,6 +18,7 @@ from stream_dmr.recording.reading.frame_images import (
     open_pictures,
 )
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
+from stream_dmr.recording.reading.recorded_settings import recorded_settings
 from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map
 from stream_dmr.sources.read_settings import ReadFramesSettings
 
@@ -112,7 +113,8 @@ def _open_pictures(recording: Recording, source: str | None) -> Generator[FrameR
     if source is None:
         yield RecordedPictures(recording, EVERYTHING)
     else:
-        with open_pictures(source, ReadFramesSettings()) as pictures:
+        settings = recorded_settings(recording, "read_frames", ReadFramesSettings)
+        with open_pictures(source, settings) as pictures:
             yield pictures
 
 

@@ -13,7 +13,7 @@ from stream_dmr.messages import LengthEstimate, LocalizedFish
 from stream_dmr.recording.messages.codec import decode
 from stream_dmr.recording.messages.selection import Selection
 from stream_dmr.recording.reading.open_recording import Recording, messages_of
-from stream_dmr.results.recorded_settings import recorded_settings
+from stream_dmr.recording.reading.recorded_settings import recorded_settings
 from stream_dmr.results.store_rows import fish_row
 from stream_dmr.results.track_edits import TrackPart
 from stream_dmr.results.verdicts_table import AddedFrame, read_added_frames

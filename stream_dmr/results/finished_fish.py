@@ -13,12 +13,12 @@ from stream_dmr.messages import LengthEstimate, Position
 from stream_dmr.recording.messages.run_inputs import RunInputs
 from stream_dmr.recording.messages.selection import EVERYTHING, Selection
 from stream_dmr.recording.reading.open_recording import Recording, messages_of
+from stream_dmr.recording.reading.recorded_settings import recorded_settings
 from stream_dmr.results.added_tables import added_rows
 from stream_dmr.results.catch_facts import UNKNOWN_CATCH, CatchFacts
 from stream_dmr.results.hauls import HAULS, haul_at, hauls_of
 from stream_dmr.results.kept_positions import POSITIONS, kept_of, positions_of
 from stream_dmr.results.lengths_database import NAME, open_for_reading
-from stream_dmr.results.recorded_settings import recorded_settings
 from stream_dmr.results.run_facts import RunFacts, cut_short, run_facts
 from stream_dmr.results.scale_checks import last_checks
 from stream_dmr.results.sql import has_table, rows_of

@@ -35,6 +35,11 @@ _STILLS: dict[str, dict[str, Any]] = {
 }
 
 
+def as_calibrated(config: Config) -> Config:
+    """The settings with a calibration, which is of pictures as the sensor sees them."""
+    return _with(config, {"read_frames": {"orientation": "sensor"}})
+
+
 def lying(config: Config) -> Config:
     """The settings for fish that lie on the reference plane."""
     return _with(config, _LYING)

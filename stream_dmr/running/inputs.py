@@ -12,7 +12,7 @@ from stream_dmr.recording.messages.run_header import RunHeader
 from stream_dmr.recording.messages.run_inputs import InputFile, RunInputs
 from stream_dmr.results.learnt_meshes import learnt_files
 from stream_dmr.results.signatures import Signer
-from stream_dmr.running.conditions import lying, started_at, stills
+from stream_dmr.running.conditions import as_calibrated, lying, started_at, stills
 from stream_dmr.running.config import Config, load_config, to_toml
 from stream_dmr.running.kept_crops import KeptCrops
 from stream_dmr.running.measuring_setup import MeasuringSetup
@@ -149,6 +149,8 @@ def checked_inputs(request: RunRequest) -> Inputs:
 def _config(request: RunRequest) -> Config:
     """The settings, with what the request's options change of them."""
     config = load_config(request.config)
+    if request.calibration is not None:
+        config = as_calibrated(config)
     if request.pose == "lying":
         config = lying(config)
     if request.start_utc:

@@ -24,7 +24,12 @@ def open_source(source: str, settings: ReadFramesSettings) -> Source:
     if path.is_dir():
         if clips_in(path):
             return ClipFolder(path, settings)
-        return PictureFolder(path, fps=settings.images_fps, other_sizes=settings.other_sizes)
+        return PictureFolder(
+            path,
+            fps=settings.images_fps,
+            other_sizes=settings.other_sizes,
+            as_sensor=settings.orientation == "sensor",
+        )
     if path.is_file():
         return VideoFile(path, settings)
     if source.isdecimal() or "://" in source:

@@ -11,7 +11,13 @@ from jaxtyping import UInt8, UInt16
 from stream_dmr.errors import SourceError
 from stream_dmr.files import natural_order
 from stream_dmr.messages import Frame
-from stream_dmr.pictures import MAX_PIXELS, PICTURE_SUFFIXES, read_picture, size_if_huge
+from stream_dmr.pictures import (
+    MAX_PIXELS,
+    PICTURE_SUFFIXES,
+    is_turned,
+    read_picture,
+    size_if_huge,
+)
 from stream_dmr.sources.source import Source, nominal_ns
 
 OtherSizes = Literal["refuse", "leave_out", "take"]
@@ -27,10 +33,18 @@ class PictureFolder(Source):
     with a warning but keeps its frame index, so that boxes and masks stay with their pictures.
     """
 
-    def __init__(self, folder: Path, *, fps: float, other_sizes: OtherSizes = "refuse") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        fps: float,
+        other_sizes: OtherSizes = "refuse",
+        as_sensor: bool = False,
+    ) -> None:
         """`other_sizes`: what becomes of pictures whose size is not the first one's.
 
-        Raises SourceError where no picture can be decoded.
+        `as_sensor`: pictures are not turned upright, see `[read_frames] orientation`. Raises
+        SourceError where no picture can be decoded.
         """
         self._paths, unreadable = _pictures_in(folder)
         self._is_closed = False
@@ -39,24 +53,26 @@ class PictureFolder(Source):
         self.num_frames = len(self._paths)
         self.fps = fps
         self.warnings = [] if not unreadable else [_not_read(unreadable)]
-        first = next((p for p in map(_read_picture, self._paths) if p is not None), None)
+        self._as_sensor, self._is_warned = as_sensor, False
+        first = next((p for p in map(self._read, self._paths) if p is not None), None)
         if first is None:
             raise SourceError(
                 f"{folder}: expected pictures, but none of its {len(self._paths)} can be decoded"
             )
         self.height, self.width = first.shape[:2]
-        self._full_scale = _full_scale_of(self._paths) if first.dtype == np.uint16 else 2**16 - 1
+        self._white = self._full_scale() if first.dtype == np.uint16 else 2**16 - 1
 
     def __iter__(self) -> Iterator[Frame]:
         for frame_index, path in enumerate(self._paths, start=1):
             if self._is_closed:
                 return
-            picture = _read_picture(path)
+            picture = self._read(path)
             if picture is None:
                 self.warnings.append(
                     f"{path.name}: can't be decoded, or is cut off, so was left out"
                 )
                 continue
+            self._warn_if_turned(path)
             size = picture.shape[1], picture.shape[0]
             if self._other_sizes == "refuse":
                 self._require_size(size, path)
@@ -69,8 +85,46 @@ class PictureFolder(Source):
             yield Frame(
                 frame_index=frame_index,
                 timestamp_ns=nominal_ns(frame_index, self.fps),
-                image=_to_8_bit(picture, self._full_scale),
+                image=_to_8_bit(picture, self._white),
                 source=path.name,
+            )
+
+    def _read(self, path: Path) -> np.ndarray | None:
+        """As BGR of its own depth; None if it can't be read, or not to its end.
+
+        Raises SourceError for one that is too large, before it takes the memory.
+        """
+        if huge := size_if_huge(path):
+            raise SourceError(
+                f"{path}: expected a picture of {MAX_PIXELS // 10**6} megapixels or less, got "
+                f"{huge}"
+            )
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+        try:
+            picture = read_picture(
+                path, flags | cv2.IMREAD_IGNORE_ORIENTATION if self._as_sensor else flags
+            )
+        except OSError:
+            return None
+        return picture if picture is not None and picture.dtype.name in _DEPTHS else None
+
+    def _full_scale(self) -> int:
+        """The value of white in a folder of 16-bit pictures: 4095 or 65535.
+
+        Sensors of 12 bits often write their values unscaled into 16 bits, where they come out all
+        but black. A folder is taken for 12 bits where about five pictures, evenly spaced, stay
+        below 4096.
+        """
+        sample = map(self._read, self._paths[:: max(1, len(self._paths) // 4)])
+        brightest = max((int(p.max()) for p in sample if p is not None), default=2**16 - 1)
+        return 2**12 - 1 if brightest < 2**12 else 2**16 - 1
+
+    def _warn_if_turned(self, path: Path) -> None:
+        if self._as_sensor and not self._is_warned and is_turned(path):
+            self._is_warned = True
+            self.warnings.append(
+                f"pictures such as {path.name} are to be turned by their EXIF; with a calibration "
+                "they are measured as the sensor saw them, and masks and boxes must be so"
             )
 
     def _require_size(self, size: tuple[int, int], path: Path) -> None:
@@ -105,34 +159,6 @@ def _pictures_in(folder: Path) -> tuple[list[Path], list[str]]:
 
 def _not_read(names: list[str]) -> str:
     return f"{len(names)} pictures such as {names[0]} can't be read; save them as JPEG or PNG"
-
-
-def _read_picture(path: Path) -> np.ndarray | None:
-    """A picture as BGR of its own depth, turned upright if it says so.
-
-    None if it can't be read, or not to its end.
-    Raises SourceError for one that is too large, before it takes the memory.
-    """
-    if huge := size_if_huge(path):
-        raise SourceError(
-            f"{path}: expected a picture of {MAX_PIXELS // 10**6} megapixels or less, got {huge}"
-        )
-    try:
-        picture = read_picture(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    except OSError:
-        return None
-    return picture if picture is not None and picture.dtype.name in _DEPTHS else None
-
-
-def _full_scale_of(paths: list[Path]) -> int:
-    """The value of white in a folder of 16-bit pictures: 4095 or 65535.
-
-    Sensors of 12 bits often write their values unscaled into 16 bits, where they come out all but
-    black. A folder is taken for 12 bits where about five pictures, evenly spaced, stay below 4096.
-    """
-    sample = map(_read_picture, paths[:: max(1, len(paths) // 4)])
-    brightest = max((int(p.max()) for p in sample if p is not None), default=2**16 - 1)
-    return 2**12 - 1 if brightest < 2**12 else 2**16 - 1
 
 
 def _to_8_bit(

@@ -21,6 +21,11 @@ class ReadFramesSettings(Settings):
         description="pictures of a folder whose size is not the first one's; --stills takes them "
         "without a calibration, and leaves them out with one",
     )
+    orientation: Literal["auto", "upright", "sensor"] = Field(
+        default="auto",
+        description="pictures of a folder that by their EXIF are to be turned: upright as it says, "
+        "or as the sensor saw them; auto: the sensor with a calibration, which is the sensor's",
+    )
     silence_s: float = Field(
         default=20.0,
         ge=0.1,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.recording.reading.open_recording import open_recordings
-from stream_dmr.results.recorded_settings import recorded_settings
+from stream_dmr.recording.reading.recorded_settings import recorded_settings
 from stream_dmr.running.config import parse_config
 
 GOLDEN = Path(__file__).parents[2] / "recordings" / "golden"

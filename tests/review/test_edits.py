@@ -3,10 +3,12 @@
 import json
 import shutil
 import sqlite3
+import threading
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -28,8 +30,10 @@ from stream_dmr.results.verify_edits import changed_edits
 from stream_dmr.review.review_queue import ReviewQueue
 from stream_dmr.review.submitted_verdict import parse_verdict
 from stream_dmr.review.track_editor import ADDED
+from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.measured_boxes import boxes_between
 from tests.support.fish_run import measure, request
+from tests.support.tiny_clip import draw_mask, draw_picture, write_clip
 
 BOXES = {1: (8, 18, 52, 104), 5: (12, 18, 52, 100)}  # around fish 1, roughly
 
@@ -249,6 +253,22 @@ def test_the_pictures_of_a_recording_are_found_without_its_source(tmp_path: Path
         found = list(FrameLookup(open_report(folder).recording, None).frames((10**8, 3 * 10**8)))
         assert [one.frame.frame_index for one in found] == [2, 3]
         assert {(one.frame.image.size > 0, one.is_original) for one in found} == {(is_there,) * 2}
+
+
+def test_pictures_of_several_sizes_are_found_as_the_run_read_them(tmp_path: Path):
+    clip, pictures, masks = (tmp_path / name for name in ("clip", "pictures", "masks"))
+    write_clip(clip)
+    pictures.mkdir()
+    masks.mkdir()
+    for number, width in ((1, 160), (2, 140)):
+        mask = draw_mask(number, [number])[:, :width]
+        cv2.imwrite(str(pictures / f"{number}.png"), draw_picture(mask))
+        cv2.imwrite(str(masks / f"{number}.png"), mask)
+    given = {"source": str(pictures), "masks": masks, "calibration": None, "stills": True}
+    measure_source(request(clip, tmp_path / "out", **given), stop=threading.Event())
+    lookup = FrameLookup(open_report(tmp_path / "out").recording, str(pictures))
+    found = list(lookup.frames((0, 10**12)))
+    assert [one.is_original for one in found] == [True, True]
 
 
 @given(

@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 
-from stream_dmr.running.conditions import lying
+from stream_dmr.running.conditions import as_calibrated, lying
 from stream_dmr.running.conditions import stills as stills_of
 from stream_dmr.running.config import Config, parse_config
 
@@ -44,6 +44,12 @@ def test_the_users_own_settings_stay():
 
 def test_both_conditions_hold_together_in_either_order():
     assert lying(stills(Config())) == stills(lying(Config()))
+
+
+def test_with_a_calibration_pictures_are_as_the_sensor_saw_them():
+    assert as_calibrated(Config()).read_frames.orientation == "sensor"
+    own = parse_config('[read_frames]\norientation = "upright"', where="own")
+    assert as_calibrated(own).read_frames.orientation == "upright"
 
 
 def test_a_calibration_holds_for_pictures_of_one_size():

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from stream_dmr.errors import SourceError
 from stream_dmr.sources.open_source import open_source
@@ -75,6 +76,21 @@ def test_12_bits_in_16_are_not_read_as_night(tmp_path):
     cv2.imwrite(str(tmp_path / "3.png"), np.full((20, 30), 2048, np.uint16))
     _, frames = read(tmp_path)
     assert [int(f.image.max()) for f in frames] == [0, 255, 128]
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+@pytest.mark.parametrize("turn", [3, 6])
+def test_a_picture_is_turned_upright_or_as_the_sensor_saw_it(tmp_path, suffix, turn):
+    exif = Image.Exif()
+    exif[0x0112] = turn
+    seen = np.repeat(np.arange(0, 240, 10, dtype=np.uint8)[:, None], 32, axis=1)  # light below
+    Image.fromarray(seen).save(tmp_path / f"1{suffix}", exif=exif)
+    (upright,) = PictureFolder(tmp_path, fps=25.0)
+    assert upright.image.shape[:2] == ((24, 32) if turn == 3 else (32, 24))
+    folder = PictureFolder(tmp_path, fps=25.0, as_sensor=True)
+    (frame,) = folder
+    assert np.abs(frame.image[..., 0].astype(int) - seen).max() < 10
+    assert len(folder.warnings) == 1
 
 
 def test_a_picture_that_cannot_be_decoded_keeps_its_index(tmp_path):

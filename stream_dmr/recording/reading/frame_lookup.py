@@ -13,6 +13,7 @@ from stream_dmr.recording.reading.frame_images import (
     open_pictures,
 )
 from stream_dmr.recording.reading.open_recording import Recording, decoded_messages
+from stream_dmr.recording.reading.recorded_settings import recorded_settings
 from stream_dmr.sources.read_settings import ReadFramesSettings
 from stream_dmr.sources.seekable_video import SeekableVideo
 
@@ -76,7 +77,8 @@ class FrameLookup:
         """Frames that no search finds: the source is read up to them."""
         if not missing or self._source is None:
             return
-        with open_pictures(self._source, ReadFramesSettings()) as pictures:
+        settings = recorded_settings(self._recording, "read_frames", ReadFramesSettings)
+        with open_pictures(self._source, settings) as pictures:
             for frame, payload in missing:
                 try:
                     found = pictures.restore(frame, payload)
