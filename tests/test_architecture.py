@@ -238,7 +238,6 @@ UNNAMED = {
     "stream_dmr.cli": "commands are tested as they are typed",
     "stream_dmr.results.export_choices": "names of choices",
     "stream_dmr.results.sql": "small parts of what the tests of every table test",
-    "stream_dmr.running.outputs": "opens what other tests test, in the order in which it closes",
     "stream_dmr.settings": "a base class without code of its own",
     "stream_dmr.version": "a number",
 }
