@@ -1,5 +1,6 @@
 """A folder of pictures as a source of frames."""
 
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
@@ -43,7 +44,7 @@ class PictureFolder(Source):
     ) -> None:
         """`other_sizes`: what becomes of pictures whose size is not the first one's.
 
-        `as_sensor`: pictures are not turned upright, see `[read_frames] orientation`. Raises
+        Those that are left out are not of the size that most have. `as_sensor`: pictures are not turned upright, see `[read_frames] orientation`. Raises
         SourceError where no picture can be decoded.
         """
         self._paths, unreadable = _pictures_in(folder)
@@ -60,6 +61,9 @@ class PictureFolder(Source):
                 f"{folder}: expected pictures, but none of its {len(self._paths)} can be decoded"
             )
         self.height, self.width = first.shape[:2]
+        if other_sizes == "leave_out":  # one picture of another telephone may be the first
+            sizes = Counter(p.shape[:2] for p in self._sample()) or {first.shape[:2]: 1}
+            self.height, self.width = max(sizes, key=lambda size: sizes[size])
         self._white = self._full_scale() if first.dtype == np.uint16 else 2**16 - 1
 
     def __iter__(self) -> Iterator[Frame]:
@@ -112,12 +116,15 @@ class PictureFolder(Source):
         """The value of white in a folder of 16-bit pictures: 4095 or 65535.
 
         Sensors of 12 bits often write their values unscaled into 16 bits, where they come out all
-        but black. A folder is taken for 12 bits where about five pictures, evenly spaced, stay
-        below 4096.
+        but black. A folder is taken for 12 bits where a sample stays below 4096.
         """
-        sample = map(self._read, self._paths[:: max(1, len(self._paths) // 4)])
-        brightest = max((int(p.max()) for p in sample if p is not None), default=2**16 - 1)
+        brightest = max((int(p.max()) for p in self._sample()), default=2**16 - 1)
         return 2**12 - 1 if brightest < 2**12 else 2**16 - 1
+
+    def _sample(self) -> Iterator[np.ndarray]:
+        """About five pictures, evenly spaced; those that can be read."""
+        sample = map(self._read, self._paths[:: max(1, len(self._paths) // 4)])
+        return (picture for picture in sample if picture is not None)
 
     def _warn_if_turned(self, path: Path) -> None:
         if self._as_sensor and not self._is_warned and is_turned(path):

@@ -129,6 +129,14 @@ def test_refuses_folders_without_pictures(tmp_path):
     assert "1.mp4: expected a video" in refusal(tmp_path)
 
 
+def test_the_size_of_most_pictures_counts_where_others_are_left_out(tmp_path):
+    for number, size in enumerate([(20, 30), (30, 20), (30, 20)]):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), noise(number, size=size))
+    folder = PictureFolder(tmp_path, fps=25.0, other_sizes="leave_out")
+    assert (folder.width, folder.height) == (30, 20)
+    assert [frame.source for frame in folder] == ["1.png", "2.png"]
+
+
 @pytest.mark.parametrize(("other_sizes", "kept"), [("take", [1, 2, 3]), ("leave_out", [1, 3])])
 def test_pictures_of_another_size_are_taken_or_left_out(tmp_path, other_sizes, kept):
     for number, size in ((1, (30, 20)), (2, (20, 30)), (3, (30, 20))):
