@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from stream_dmr.files import natural_order
+
 MAX_PIXELS = 150_000_000  # chosen: the largest cameras have some 100 megapixels
 PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
@@ -15,6 +17,12 @@ _ORIENTATION = 0x0112  # the tag of EXIF; 1: as it should be shown
 _JPEG_START = b"\xff\xd8"
 _JPEG_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # not a byte of pixels, nor a restart
 _JPEG_END = b"\xd9"
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """The pictures of a folder as a source has them: frame 1 is the first. Raises OSError."""
+    files = (path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES)
+    return sorted((p for p in files if p.is_file() and p.name[0] != "."), key=natural_order)
 
 
 def size_if_huge(path: Path) -> str:

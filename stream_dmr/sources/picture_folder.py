@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from stream_dmr.errors import SourceError
-from stream_dmr.files import natural_order
 from stream_dmr.messages import Frame
 from stream_dmr.pictures import (
     MAX_PIXELS,
     PICTURE_SUFFIXES,
     is_turned,
+    pictures_in,
     read_picture,
     size_if_huge,
 )
@@ -44,8 +44,9 @@ class PictureFolder(Source):
     ) -> None:
         """`other_sizes`: what becomes of pictures whose size is not the first one's.
 
-        Those that are left out are not of the size that most have. `as_sensor`: pictures are not turned upright, see `[read_frames] orientation`. Raises
-        SourceError where no picture can be decoded.
+        Those that are left out are not of the size that most have. `as_sensor`: pictures are not
+        turned upright, see `[read_frames] orientation`. Raises SourceError where no picture can be
+        decoded.
         """
         self._paths, unreadable = _pictures_in(folder)
         self._is_closed = False
@@ -150,15 +151,15 @@ class PictureFolder(Source):
 def _pictures_in(folder: Path) -> tuple[list[Path], list[str]]:
     """Those that can be read, in natural order, and the names of others. SourceError for none."""
     try:
+        pictures = pictures_in(folder)
         files = [p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")]
     except OSError as error:
         raise SourceError(
             f"{folder}: expected a folder of pictures, but it can't be read: {error.strerror}"
         ) from None
-    pictures = [p for p in files if p.suffix.lower() in PICTURE_SUFFIXES]
     unreadable = sorted(p.name for p in files if p.suffix.lower() in _UNREADABLE)
     if pictures:
-        return sorted(pictures, key=natural_order), unreadable
+        return pictures, unreadable
     suffixes = ", ".join(sorted(PICTURE_SUFFIXES))
     found = _not_read(unreadable) if unreadable else "found none"
     raise SourceError(f"{folder}: expected a folder of pictures ({suffixes}) or of videos, {found}")

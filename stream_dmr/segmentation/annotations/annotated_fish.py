@@ -29,7 +29,7 @@ def open_annotated_fish(
     `pictures`: the source of the frames, `across_frames`: False for stills, see `MaskFolder`.
     Raises AnnotationError where one cannot be read or boxes have no ids.
     """
-    by_frame = None if boxes is None else load_boxes(boxes)
+    by_frame = None if boxes is None else load_boxes(boxes, pictures=pictures)
     for box in (box for found in (by_frame or {}).values() for box in found):
         if box.track_id == UNKNOWN_ID:
             raise AnnotationError(

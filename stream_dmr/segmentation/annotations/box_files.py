@@ -5,6 +5,7 @@ from pathlib import Path
 
 from stream_dmr.errors import AnnotationError
 from stream_dmr.files import read_text
+from stream_dmr.pictures import pictures_in
 from stream_dmr.segmentation.annotations.annotated_box import AnnotatedBox
 from stream_dmr.segmentation.annotations.coco import parse_coco
 from stream_dmr.segmentation.annotations.cvat import parse_cvat
@@ -14,14 +15,18 @@ _MAX_BYTES = 1 << 29  # chosen: some ten million boxes
 _PARSERS = {".json": parse_coco, ".xml": parse_cvat}
 
 
-def load_boxes(path: Path) -> dict[int, list[AnnotatedBox]]:
+def load_boxes(path: Path, *, pictures: Path | None = None) -> dict[int, list[AnnotatedBox]]:
     """Boxes by frame (from 1), within a frame by id; none from an empty text file.
 
-    `.json` is read as COCO, `.xml` as CVAT, everything else as MOT Challenge text. Raises
+    `.json` is read as COCO, `.xml` as CVAT, everything else as MOT Challenge text. `pictures`: the
+    source of the frames; where it is a folder, COCO and CVAT name its pictures. Raises
     AnnotationError with the place in the file and what was expected there.
     """
-    parse = _PARSERS.get(path.suffix.lower(), parse_mot)
-    return parse(_read_text(path), path)
+    text, suffix = _read_text(path), path.suffix.lower()
+    if suffix not in _PARSERS:
+        return parse_mot(text, path)
+    named = pictures_in(pictures) if pictures is not None and pictures.is_dir() else []
+    return _PARSERS[suffix](text, path, named)
 
 
 def unused_boxes(frames: Mapping[int, Sequence[AnnotatedBox]], last_frame: int) -> list[str]:

@@ -1,12 +1,15 @@
 """Boxes from COCO's JSON (cocodataset.org, "Data format"), as annotation tools export it.
 
-Frames are counted from 1 in the natural order of the pictures' file names. The track id is
+Pictures of a folder are known by their names. Frames of a video are those that names of six and
+more digits say, as `export --masks` writes them, else counted from 1 in the natural order of the
+pictures' file names. The track id is
 `track_id` or `instance_id`, of the annotation itself or among its `attributes`; boxes without
 either get `UNKNOWN_ID`.
 """
 
 import json
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +21,20 @@ from stream_dmr.segmentation.annotations.annotated_box import (
     box_from_xywh,
     group_by_frame,
 )
+from stream_dmr.segmentation.annotations.picture_names import frames_by_name
 
+_NUMBER = re.compile(r"[0-9]{6,}")  # of a frame, as masks are named
 _ID_NAMES = ("track_id", "instance_id")
 _TOO_LARGE = (OverflowError, RecursionError)  # an infinite number; deeply nested brackets
 
 
-def parse_coco(text: str, path: Path) -> dict[int, list[AnnotatedBox]]:
+def parse_coco(
+    text: str, path: Path, pictures: Sequence[Path] = ()
+) -> dict[int, list[AnnotatedBox]]:
     """Boxes by frame, from a file's text; `path` is for messages.
 
-    Raises AnnotationError with what was expected, and where.
+    `pictures` of the source, in its order; empty of a video. Raises AnnotationError with what was
+    expected, and where.
     """
     try:
         table = json.loads(text)
@@ -37,9 +45,24 @@ def parse_coco(text: str, path: Path) -> dict[int, list[AnnotatedBox]]:
             f'{path}: expected COCO\'s JSON with "images" (id, file_name) and "annotations", '
             f"got: {type(error).__name__} {error}"
         ) from None
+    return group_by_frame(_boxes(annotations, _frames_of(names, pictures, path), path))
+
+
+def _frames_of(names: dict[int, str], pictures: Sequence[Path], path: Path) -> dict[int, int]:
+    """The frame of each image by its id."""
+    if known := frames_by_name(names, pictures, where=path):
+        return known
     order = sorted(names, key=lambda image_id: natural_order(Path(names[image_id])))
-    frames = {image_id: number for number, image_id in enumerate(order, start=1)}
-    return group_by_frame(_boxes(annotations, frames, path))
+    if pictures and len(pictures) != len(names):
+        raise AnnotationError(
+            f"{path}: expected images named like the {len(pictures)} pictures of the source, got "
+            f"{len(names)} of other names, such as {names[order[0]] if order else 'none'}; correct "
+            "the names"
+        )
+    stems = {image_id: Path(name).stem for image_id, name in names.items()}
+    if all(_NUMBER.fullmatch(stem) and int(stem) for stem in stems.values()):
+        return {image_id: int(stem) for image_id, stem in stems.items()}
+    return {image_id: number for number, image_id in enumerate(order, start=1)}
 
 
 def _boxes(

@@ -1,11 +1,12 @@
 """Boxes from CVAT's XML, version 1.1 (docs.cvat.ai, "CVAT"), for videos and for pictures.
 
-CVAT counts frames, pictures and tracks from 0, this package from 1. A box inside a video's track
+CVAT counts frames, pictures and tracks from 0, this package from 1. Pictures of a folder are known
+by their names, since CVAT may have another order. A box inside a video's track
 gets the track's id; a box of a single picture gets `UNKNOWN_ID`.
 """
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from stream_dmr.errors import AnnotationError
@@ -15,12 +16,16 @@ from stream_dmr.segmentation.annotations.annotated_box import (
     box_from_xywh,
     group_by_frame,
 )
+from stream_dmr.segmentation.annotations.picture_names import frames_by_name
 
 
-def parse_cvat(text: str, path: Path) -> dict[int, list[AnnotatedBox]]:
+def parse_cvat(
+    text: str, path: Path, pictures: Sequence[Path] = ()
+) -> dict[int, list[AnnotatedBox]]:
     """Boxes by frame, from a file's text; `path` is for messages.
 
-    Raises AnnotationError with what was expected, and where.
+    `pictures` of the source, in its order; empty of a video. Raises AnnotationError with what was
+    expected, and where.
     """
     try:
         root = ET.fromstring(text)
@@ -28,19 +33,25 @@ def parse_cvat(text: str, path: Path) -> dict[int, list[AnnotatedBox]]:
         raise AnnotationError(f"{path}: expected CVAT's XML, got: {error}") from None
     if root.tag != "annotations":
         raise AnnotationError(f"{path}: expected CVAT's <annotations>, got <{root.tag}>")
-    return group_by_frame(_boxes(root, path))
+    return group_by_frame(_boxes(root, path, pictures))
 
 
-def _boxes(root: ET.Element, path: Path) -> Iterator[tuple[str, int, AnnotatedBox]]:
+def _boxes(
+    root: ET.Element, path: Path, pictures: Sequence[Path]
+) -> Iterator[tuple[str, int, AnnotatedBox]]:
     for track in root.iter("track"):
         for box in track.iter("box"):
             where = f"{path}, track {track.get('id')}, frame {box.get('frame')}"
             if box.get("outside") != "1":
                 yield _box(box, box.get("frame"), track.get("id"), where)
-    for image in root.iter("image"):
+    images = [*root.iter("image")]
+    names = {number: image.get("name", "") for number, image in enumerate(images)}
+    frames = frames_by_name(names, pictures, where=path)
+    for number, image in enumerate(images):
         where = f"{path}, image {image.get('id')}"
+        frame = str(frames[number] - 1) if frames else image.get("id")
         for box in image.iter("box"):
-            yield _box(box, image.get("id"), None, where)
+            yield _box(box, frame, None, where)
 
 
 def _box(

@@ -62,7 +62,7 @@ def open_finder(
 ) -> FishFinder:
     """Fish from annotation files where given; tracked ones otherwise, and for boxes without ids.
 
-    `pictures`: the source of the frames, after which masks may be named.
+    `pictures`: the source of the frames, after which masks and boxes may be named.
     Raises AnnotationError or ModelError where a file cannot be read.
     """
     if boxes is None and masks is None:
@@ -74,7 +74,7 @@ def open_finder(
         return open_annotated_fish(
             boxes=boxes, masks=masks, pictures=pictures, across_frames=track.across_frames
         )
-    frames = load_boxes(boxes)
+    frames = load_boxes(boxes, pictures=pictures)
     if any(box.track_id == UNKNOWN_ID for found in frames.values() for box in found):
         return TrackedFish(BoxDetector(frames), track)
     return AnnotatedFish(boxes=frames, masks=None, across_frames=track.across_frames)
