@@ -19,6 +19,8 @@ from stream_dmr.sources.source import Source, nominal_ns, size_error
 _MAX_MS = 1e12  # 31 years
 _MIN_FPS, _MAX_FPS = 1e-3, 1e6
 _MAX_FRAMES = 1e12
+_NEAR_END = 3  # frames; at a variable rate the last one may stand for longer
+_MATROSKA = b"\x1a\x45\xdf\xa3"  # and WebM
 _TEXT_BYTES = bytes(range(32, 127)) + b"\t\r\n"
 
 
@@ -32,6 +34,7 @@ class VideoFile(Source):
         self._timeout_s = settings.silence_s
         self._is_closed = False
         start = _first_bytes(path)
+        self._is_matroska = start.startswith(_MATROSKA)
         self._decoder = open_decoder(path)
         try:
             self._first = self._decoder.read(timeout_s=self._timeout_s)
@@ -63,7 +66,7 @@ class VideoFile(Source):
                 source=self.name,
             )
             pending = self._read(after=frame_index)
-        self._warn_if_cut_off(frame_index)
+        self._warn_if_cut_off(frame_index, last_ns=timestamp_ns)
         self.close()
 
     def close(self) -> None:
@@ -89,9 +92,16 @@ class VideoFile(Source):
                 )
             return None
 
-    def _warn_if_cut_off(self, num_read: int) -> None:
-        # Containers without a frame count promise duration x rate, which may be one too many.
-        if not self._is_closed and self.num_frames and num_read < self.num_frames - 1:
+    def _warn_if_cut_off(self, num_read: int, *, last_ns: int) -> None:
+        """Containers without a frame count promise duration x rate, which may be one too many.
+
+        Matroska has no count; at a variable rate any number of frames may be all of a duration.
+        """
+        if self._is_closed or not self.num_frames:
+            return
+        if self._is_matroska and last_ns >= nominal_ns(self.num_frames - _NEAR_END, self.fps):
+            self.num_frames = num_read
+        if num_read < self.num_frames - 1:
             self.warnings.append(
                 f"{self.name}: the file promises {self.num_frames} frames, only {num_read} could "
                 "be read; it seems cut off or damaged"

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.nodes.read_frames import ReadFrames
+from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.source import nominal_ns
 from stream_dmr.sources.video_file import container_ns
 from tests.support.sources import SETTINGS, noise, read, refusal
@@ -90,6 +91,14 @@ def test_what_decodes_of_a_cut_video_is_read_and_the_rest_reported(tmp_path, nam
     ]
     for frame, original in zip(frames[:-1], whole, strict=False):
         np.testing.assert_array_equal(frame.image, original.image)
+
+
+def test_a_matroska_of_variable_rate_is_whole_where_its_time_is(tmp_path):
+    """OpenCV promises duration x mean rate: here 0.48 s x 31 frames/s."""
+    write_video(tmp_path / "a.mkv")
+    opened = open_source(str(tmp_path / "a.mkv"), SETTINGS)
+    opened.num_frames, opened.fps = 15, 31.25
+    assert (len(list(opened)), opened.warnings, opened.num_frames) == (12, [], 12)
 
 
 def test_stopping_early_is_no_damage(tmp_path):
