@@ -11,6 +11,7 @@ from stream_dmr.calibration.charuco import CharucoFinder
 from stream_dmr.calibration.corners import Board, board_points_mm, find_corners, seen_board
 from stream_dmr.errors import CalibrationError
 
+_SQUARES_MM = (1.0, 1000.0)  # chosen: what is outside of them is in m, or a slip
 _CHARUCO = "charuco:"
 
 
@@ -38,10 +39,10 @@ class PrintedBoard:
 
     def __post_init__(self) -> None:
         """Raise CalibrationError for a board that can't be."""
-        if not (np.isfinite(self.square_mm) and self.square_mm > 0):
+        if not _SQUARES_MM[0] <= self.square_mm <= _SQUARES_MM[1]:
             raise CalibrationError(
-                f"--square-mm: expected the side of one square in mm, above 0, "
-                f"got {self.square_mm:g}"
+                "--square-mm: expected the side of one square in mm, from "
+                f"{_SQUARES_MM[0]:g} to {_SQUARES_MM[1]:g}, got {self.square_mm:g}"
             )
         if self.marker_mm is not None and not 0 < self.marker_mm < self.square_mm:
             raise CalibrationError(

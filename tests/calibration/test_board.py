@@ -234,7 +234,7 @@ def test_the_planes_picture_must_be_usable(folder, views, tmp_path):
         calibrate(views, plane_image=folder / "plane.png", board=PrintedBoard(inner=(8, 5)))
 
 
-@pytest.mark.parametrize("square_mm", [0.0, -25.0, float("nan")])
+@pytest.mark.parametrize("square_mm", [0.0, -25.0, 0.025, 1e6, float("nan")])
 def test_impossible_squares_are_refused(square_mm):
     with pytest.raises(CalibrationError, match="--square-mm"):
         PrintedBoard(square_mm=square_mm)
