@@ -56,8 +56,8 @@ def canonical_template(
     """The template of a closed mesh in any unit, place and orientation.
 
     `points` holds `keypoints` (head, center, tail) and `joints` (J, 3; J >= 2, in any order) in the
-    mesh's coordinates. Raises TemplateError where a point lies off the mesh or head and tail
-    coincide.
+    mesh's coordinates. Raises TemplateError where a point lies off the mesh, or head and
+    tail, or joints, coincide.
     """
     keypoints, joints = points["keypoints"], points["joints"]
     head, _, tail = keypoints
@@ -65,6 +65,8 @@ def canonical_template(
     if np.linalg.norm(axis) < 1e-6 * mesh.scale:
         raise TemplateError(f"template {name}: head and tail coincide; give two distinct points")
     joints = joints[np.argsort(joints @ axis)]
+    if np.linalg.norm(np.diff(joints, axis=0), axis=1).min() < 1e-6 * mesh.scale:
+        raise TemplateError(f"template {name}: two joints coincide; give distinct points")
     spine = np.vstack([head, joints, tail])
     body_length = arc_lengths(spine)[-1]
     _require_on_mesh(mesh, keypoints, joints, body_length, name)

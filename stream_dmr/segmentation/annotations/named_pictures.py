@@ -1,6 +1,7 @@
 """Pictures of one fish each, by a CSV that says which fish a picture shows."""
 
 import csv
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -18,11 +19,11 @@ PICTURE, FISH = "picture", "fish"
 
 
 def names_pictures(path: Path) -> bool:
-    """True for a CSV whose header has the columns `picture` and `fish`, and no box."""
+    """True for a CSV whose header speaks of `picture` and `fish`, whatever stands between them."""
     if path.suffix.lower() != ".csv" or not path.is_file():
         return False
     header = path.read_text(encoding="utf-8-sig", errors="replace").partition("\n")[0]
-    return {PICTURE, FISH} <= set(_cells(header))
+    return {PICTURE, FISH} <= set(re.findall(r"\w+", header.lower()))
 
 
 class NamedPictures:
@@ -106,23 +107,32 @@ def _area(bbox_xyxy_px: Float[np.ndarray, "4"]) -> float:
 
 
 def _read(path: Path) -> dict[str, int]:
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        rows = csv.DictReader(file)
-        found: dict[str, int] = {}
-        for line, row in enumerate(rows, start=2):
-            name, fish = (row.get(PICTURE) or "").strip(), (row.get(FISH) or "").strip()
-            if not name or not fish.isdecimal() or int(fish) < 1:
-                raise AnnotationError(
-                    f"{path}:{line}: expected a picture's file name and a fish's number from 1 on, "
-                    f"got {name!r} and {fish!r}"
-                )
-            if found.setdefault(name, int(fish)) != int(fish):
-                raise AnnotationError(
-                    f"{path}:{line}: expected one fish a picture, got another one for {name!r}; "
-                    "pictures of several fish need --boxes or --masks with ids"
-                )
+    try:
+        header, *rows = csv.reader(path.read_text(encoding="utf-8-sig").splitlines())
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise AnnotationError(
+            f"{path}: expected a CSV in UTF-8, got: {error}; save it as CSV UTF-8"
+        ) from error
+    columns = [cell.strip() for cell in header]
+    if not {PICTURE, FISH} <= {*columns}:
+        raise AnnotationError(
+            f"{path}: expected the columns {PICTURE} and {FISH}, separated by a comma, got "
+            f"{','.join(header)}"
+        )
+    found: dict[str, int] = {}
+    for line, cells in enumerate(rows, start=2):
+        if not cells:
+            continue  # an empty line
+        row = dict(zip(columns, cells, strict=False))
+        name, fish = row.get(PICTURE, "").strip(), row.get(FISH, "").strip()
+        if not name or not fish.isdecimal() or int(fish) < 1:
+            raise AnnotationError(
+                f"{path}:{line}: expected a picture's file name and a fish's number from 1 on, "
+                f"got {name!r} and {fish!r}"
+            )
+        if found.setdefault(name, int(fish)) != int(fish):
+            raise AnnotationError(
+                f"{path}:{line}: expected one fish a picture, got another one for {name!r}; "
+                "pictures of several fish need --boxes or --masks with ids"
+            )
     return found
-
-
-def _cells(line: str) -> list[str]:
-    return [cell.strip() for cell in next(csv.reader([line]), [])]

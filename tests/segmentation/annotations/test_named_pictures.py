@@ -14,7 +14,7 @@ from stream_dmr.segmentation.tracking.fish_finder import open_finder
 from stream_dmr.segmentation.tracking.tracked_fish import TrackFishSettings
 
 
-def ids_file(folder, text="picture,fish\na.jpg,7\nb.jpg,7\nc.jpg,2\n"):
+def ids_file(folder, text="picture,fish\na.jpg,7\nb.jpg,7\n\nc.jpg,2\n"):
     path = folder / "fish.csv"
     path.write_text(text)
     return path
@@ -40,6 +40,21 @@ def test_a_csv_of_pictures_is_known_by_its_header(tmp_path):
         boxes=ids_file(tmp_path), masks=None, detect=DetectFishSettings(), track=TrackFishSettings()
     )
     assert isinstance(finder, NamedPictures)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("picture;fish\na.jpg;7\n", "separated by a comma, got picture;fish"),
+        ("Picture,Fish\na.jpg,7\n", "the columns picture and fish"),
+        ("picture,fish\nB\xe4r.jpg,7\n", "a CSV in UTF-8"),
+    ],
+)
+def test_tables_of_a_spreadsheet_are_refused_clearly(tmp_path, text, expected):
+    path = tmp_path / "fish.csv"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(AnnotationError, match=expected):
+        open_finder(boxes=path, masks=None, detect=DetectFishSettings(), track=TrackFishSettings())
 
 
 def test_pictures_of_one_fish_have_its_id_and_the_largest_thing_is_the_fish(tmp_path):
