@@ -4,11 +4,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from stream_dmr.replaying.replay_request import STAGES
+from stream_dmr.running.conditions import lying, stills
 from stream_dmr.running.config import Config, load_config, parse_config, toml_value
 
+_READ = "read"  # comes before all stages of a replay, whose frames are those of the recording
 # The settings that a replay from a later stage on leaves as they were, by their stage.
 _TABLES = {
-    "read_frames": "crop",
+    "read_frames": _READ,
     "detect_fish": "crop",
     "track_fish": "crop",
     "crop_fish": "crop",
@@ -31,17 +33,16 @@ def replay_config(
     `on_notice` is told of those that it has otherwise. Raises ConfigError where one of the two
     can't be read.
     """
-    if given is not None and first == "crop":
-        return load_config(given)
     recorded = parse_config(recorded_toml, where="the recording's config.toml")
     if given is None:
         return recorded
-    config = load_config(given)
+    mine = load_config(given)
+    config = _in_conditions_of(recorded, mine)
     changes: dict[str, object] = {}
     unused: list[str] = []
     for table, stages in _stages_before(first, config).items():
         settings, earlier = getattr(config, table), getattr(recorded, table)
-        said = settings.model_fields_set if table in config.model_fields_set else ()
+        said = getattr(mine, table).model_fields_set if table in mine.model_fields_set else ()
         kept = {key: getattr(earlier, key) for key in stages}
         unused += [
             f"[{table}] {key} = {toml_value(value)}"
@@ -57,13 +58,24 @@ def replay_config(
     return config.model_copy(update=changes)
 
 
+def _in_conditions_of(recorded: Config, given: Config) -> Config:
+    """The given settings with those of --pose lying and --stills, where the run had these."""
+    config = given
+    if recorded.localize.rests_on_plane and "rests_on_plane" not in given.localize.model_fields_set:
+        config = lying(config)
+    is_stills = not recorded.track_fish.across_frames
+    if is_stills and "across_frames" not in given.track_fish.model_fields_set:
+        config = stills(config, is_calibrated=True)  # the size of pictures stays as recorded
+    return config
+
+
 def _stages_before(first: str, config: Config) -> Mapping[str, Mapping[str, str]]:
     """Table -> key -> stage, of the settings that belong to a stage before `first`."""
     keys = {
         table: dict.fromkeys(type(getattr(config, table)).model_fields, stage)
         for table, stage in _TABLES.items()
     }
-    earlier = [*STAGES][: [*STAGES].index(first)]
+    earlier = {_READ, *[*STAGES][: [*STAGES].index(first)]}
     return {
         table: {key: stage for key, stage in stages.items() if stage in earlier}
         for table, stages in (keys | _KEYS).items()

@@ -6,9 +6,12 @@ import pytest
 
 from stream_dmr.replaying.replay_config import replay_config
 from stream_dmr.replaying.replay_request import STAGES
-from stream_dmr.running.config import parse_config
+from stream_dmr.running.conditions import lying, stills
+from stream_dmr.running.config import Config, parse_config, to_toml
 
 RECORDED = """\
+[read_frames]
+orientation = "sensor"
 [crop_fish]
 margin = 0.2
 [species]
@@ -38,10 +41,24 @@ def test_what_the_file_leaves_out_is_recorded_before_the_stage_and_default_after
     for table, stage in STAGE_OF.items():
         is_before = [*STAGES].index(stage) < [*STAGES].index(first)
         assert getattr(config, table) == getattr(recorded if is_before else default, table)
+    assert config.read_frames.orientation == "sensor"  # frames are always those of the recording
     assert config.smooth_length.min_frames == 5
     assert config.species.min_share == 0.8
     assert config.species.model == ("" if first == "crop" else "mine.onnx")
     assert config.species.forms == ([] if first in ("crop", "fit") else ["HAP=halibut"])
+
+
+@pytest.mark.parametrize("first", STAGES)
+def test_a_file_keeps_the_conditions_of_the_run(mine: Path, tmp_path: Path, first):
+    run = lying(stills(Config(), is_calibrated=True))
+    config = replay_config(mine, to_toml(run), first=first)
+    kept = config.model_copy(update={"species": run.species})
+    smooth = run.smooth_length.model_copy(update={"min_frames": 5})  # what the file says
+    assert kept == run.model_copy(update={"smooth_length": smooth})
+    path = tmp_path / "hanging.toml"
+    path.write_text("[localize]\nrests_on_plane = false\n")
+    hangs = replay_config(path, to_toml(run), first="crop")
+    assert hangs.localize == Config().localize
 
 
 @pytest.mark.parametrize("first", STAGES)
