@@ -10,7 +10,7 @@ import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.errors import RecordingError
+from stream_dmr.errors import OutputError, RecordingError
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.recording.messages.record import make_record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
@@ -137,3 +137,11 @@ def test_a_plane_behind_the_camera_has_its_origin_for_a_middle():
     behind = replace(calibration().plane, translation_mm=np.array([0.0, 100.0, -1500.0]))
     one = replace(calibration(), plane=behind)
     np.testing.assert_array_equal(middle_mm(one), behind.translation_mm)
+
+
+def test_an_rrd_is_not_begun_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Rerun would wait for ever, and the run with it."""
+    monkeypatch.setattr("stream_dmr.recording.rerun.rrd_sink.free_bytes", lambda folder: 1000)
+    with pytest.raises(OutputError, match="room to write to, got: No space left"):
+        RrdSink(tmp_path / "a.rrd", header(), SETTINGS)
+    assert not (tmp_path / "a.rrd").exists()

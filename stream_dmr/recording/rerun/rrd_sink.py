@@ -1,13 +1,17 @@
 """Writes an .rrd: the view of a run and, with `rrd_messages`, its messages."""
 
+import errno
 import json
+import os
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import rerun as rr
 
 from stream_dmr.errors import OutputError
+from stream_dmr.files import free_bytes
 from stream_dmr.recording.messages.record import Record
 from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.messages.run_header import RunHeader
@@ -21,6 +25,7 @@ _HEADER = ["messages", "header"]
 # One for so many of the .mcap, which is the record of truth: what is flushed together is sent in a
 # third of the time, and Rerun keeps some kilobytes of each piece until the file is closed.
 _MCAP_FLUSHES = 4
+_BEGIN_BYTES = 1 << 18  # chosen: several times what Rerun writes before it is first flushed
 _FLUSH_TIMEOUT_S = 30.0  # chosen: a slow disk is waited for, a hanging one is not
 
 
@@ -37,6 +42,7 @@ class RrdSink:
         self._closed = False
         self._counts: dict[str, int] = {}  # rows of the header, by entity
         try:
+            _require_room(path)
             self._rec = new_stream(rr.FileSink(str(path)), header)
         except RuntimeError as error:
             raise self._output_error(error) from error
@@ -105,6 +111,13 @@ class RrdSink:
             f"{self.path}: expected a file with room to write to, got: {error}; "
             "make room or choose another --out"
         )
+
+
+def _require_room(path: Path) -> None:
+    """Raise RuntimeError where a file can't be begun: Rerun would wait for ever for its layout."""
+    with suppress(OSError):  # which Rerun reports
+        if free_bytes(path.parent) < _BEGIN_BYTES:
+            raise RuntimeError(os.strerror(errno.ENOSPC))
 
 
 def log_run(rec: rr.RecordingStream, header: RunHeader) -> None:
