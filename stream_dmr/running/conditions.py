@@ -28,7 +28,8 @@ _LYING: dict[str, dict[str, Any]] = {
 # Independent pictures: none follows another, and one good one gives a length. Ten
 # seconds between them are more than anything in `[smooth_length]` remembers, but for the track.
 _STILLS: dict[str, dict[str, Any]] = {
-    "crop_fish": {"segmenter_sizes_px": [128, 192, 256]},  # nobody waits for the next frame
+    # Nobody waits for the next frame.
+    "crop_fish": {"segmenter_sizes_px": [128, 192, 256], "second_look": True},
     "detect_fish": {"detector": "looks"},  # nothing moves
     "track_fish": {"min_track_frames": 1, "across_frames": False},
     "smooth_length": {"min_frames": 1, "track_timeout_s": 1e9},

@@ -5,16 +5,22 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 _OVEREXPOSED_LEVEL = 250  # grey level of every channel; brighter than any skin in our scenes
-_BORDER_PX = 1  # a mask this near to the frame's edge touches it
 
 
-def touches_border(extent: Float[np.ndarray, "4"] | None, *, shape: tuple[int, ...]) -> bool:
-    """True where a half-open box in px reaches the edge of a frame of shape (H, W); None: False."""
+def touches_border(
+    extent: Float[np.ndarray, "4"] | None, *, shape: tuple[int, ...], pixel_px: float = 1.0
+) -> bool:
+    """True where a mask is within a pixel of the edge of a frame of shape (H, W); None: False.
+
+    `extent`: the half-open box of the frame pixels with the centers of the mask's pixels, which are
+    `pixel_px` frame pixels wide: the mask goes half of one further. In a picture of 12 megapixels a
+    crop's pixel has 40.
+    """
     if extent is None:
         return False
     height, width = shape
     x0, y0, x1, y1 = extent
-    return bool(min(x0, y0, width - x1, height - y1) <= _BORDER_PX)
+    return bool(min(x0, y0, width - x1, height - y1) <= 1.5 * max(pixel_px, 1.0) - 0.5)
 
 
 def glare(image: UInt8[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]) -> float:

@@ -31,6 +31,11 @@ class CropFishSettings(Settings):
         description="widths of the pictures of a crop that the segmenter sees, multiples of 32 px, "
         "those that the frame has; the mean counts. Stills: [128, 192, 256]",
     )
+    second_look: bool = Field(
+        default=False,
+        description="true: what was found is cut out again as a wider view shows it, and the surer "
+        "mask counts: a detector's box may lack the tail. Stills: true",
+    )
     segmenter: str = Field(
         default="unet",
         min_length=1,

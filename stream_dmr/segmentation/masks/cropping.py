@@ -11,9 +11,10 @@ from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
 from stream_dmr.segmentation.masks.masked_crop import (
     FrameView,
     MaskedCrop,
-    agreement_in_wider_view,
+    agreement,
     crop_given_mask,
     crop_segmented,
+    crop_wider,
 )
 from stream_dmr.segmentation.segmenter import Segmenter
 
@@ -58,7 +59,8 @@ def crop_fish(
         crop_camera=crop.crop_camera,
         frame_camera=frame_camera,
         quality=CropQuality(
-            touches_border=crop.is_cut or touches_border(crop.extent, shape=view.shape),
+            touches_border=crop.is_cut
+            or touches_border(crop.extent, shape=view.shape, pixel_px=crop.pixel_px),
             visible_fraction=detection.visible_fraction,
             sharpness=sharpness(crop.image, crop.mask),
             mask_area_px=crop.area_px,
@@ -70,8 +72,21 @@ def crop_fish(
 
 
 def _doubted(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> MaskedCrop:
-    """A crop of what may be no fish: of little confidence where a wider view shows another mask."""
+    """A crop of what may be no fish: of little confidence where a wider view shows another mask.
+
+    An eye, a fin, a leaf or a letter looks like a fish while its surroundings are cut off. Seen
+    with them it is nothing, or a part of something larger.
+    """
     if (crop.confidence or 0.0) < _MIN_AGREEMENT:
         return crop  # doubted already, and the wider view costs as much as a crop
-    agreement = agreement_in_wider_view(view, crop, segmenter)
-    return crop if agreement >= _MIN_AGREEMENT else replace(crop, confidence=agreement)
+    wider = crop_wider(view, crop, segmenter)
+    agreed = agreement(crop, wider)
+    if agreed < _MIN_AGREEMENT:
+        return replace(crop, confidence=agreed)
+    if not view.settings.second_look or wider.extent is None:
+        return crop
+    second = crop_segmented(view, wider.extent, segmenter)
+    if (second.confidence or 0.0) <= (crop.confidence or 0.0):
+        return crop
+    # Whether it is a fish says the first look: the better of two would find more that are none.
+    return replace(second, confidence=crop.confidence)

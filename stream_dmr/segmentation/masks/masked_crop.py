@@ -70,6 +70,7 @@ class MaskedCrop:
     confidence: float | None  # see `mask_confidence`; None for a given mask
     ends: FishEnds | None
     unknown: Bool[np.ndarray, "S S"] | None = None  # hidden by something in front
+    pixel_px: float = 1.0  # frame pixels along a pixel of the mask that `extent` is of
 
 
 def crop_given_mask(
@@ -128,18 +129,21 @@ def crop_segmented(
     return max(crops, key=lambda crop: (not crop.is_cut, crop.confidence or 0.0))
 
 
-def agreement_in_wider_view(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> float:
-    """IoU of a crop's mask with the one that a segmenter finds in a wider box around it.
+def crop_wider(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> MaskedCrop:
+    """The crop of a wider box around a crop's mask, with what a segmenter finds in it.
 
-    An eye, a fin, a leaf or a letter looks like a fish while its surroundings are cut off. Seen
-    with them it is nothing, or a part of something larger. The box grows by half its shorter side
-    on each side: by more, a thin fish gets too small to be recognised. 0 for an empty mask.
+    The box grows by half its shorter side on each side: by more, a thin fish gets too small to be
+    recognised. An empty mask's crop is returned as it is.
     """
     if crop.extent is None:
-        return 0.0
+        return crop
     low, high = crop.extent[:2], crop.extent[2:]
     rim = (high - low).min() / 2
-    wider = _segment(view, np.concatenate([low - rim, high + rim]), segmenter)
+    return _segment(view, np.concatenate([low - rim, high + rim]), segmenter)
+
+
+def agreement(crop: MaskedCrop, wider: MaskedCrop) -> float:
+    """IoU of a crop's mask with the one of a wider crop; 0 for an empty mask."""
     wider_from_crop = wider.crop_camera.K @ np.linalg.inv(crop.crop_camera.K)
     mask = cv2.warpAffine(
         crop.mask.view(np.uint8) * np.uint8(255), wider_from_crop[:2], wider.mask.shape[::-1]
@@ -170,6 +174,7 @@ def _segment(
         is_cut=bool(mask[[0, -1]].any() or mask[:, [0, -1]].any()),
         confidence=mask_confidence(probability, mask),
         ends=looks[-1].ends,
+        pixel_px=math.sqrt(float(areas.mean())),
     )
 
 

@@ -15,6 +15,7 @@ from stream_dmr.segmentation.tracking.box_correction import BoxCorrector
 from stream_dmr.segmentation.tracking.confirmation import ConfirmationSettings, FishConfirmation
 from stream_dmr.segmentation.tracking.fish_evidence import FishEvidence
 from stream_dmr.segmentation.tracking.no_fish import Sightings, explain_no_fish
+from stream_dmr.segmentation.tracking.repeated_fish import without_repeats
 from stream_dmr.segmentation.tracking.tracker import Tracker, TrackerSettings
 
 _MAX_CLOSER_LOOKS = 6  # at a track; each takes as long as one at a frame
@@ -34,7 +35,10 @@ class TrackedFish:
         self._corrector = BoxCorrector()
         self._settings = settings
         self._seen = Sightings()
+        # Single pictures in which a detector's boxes are all that speaks for a fish.
+        self._are_stills = not settings.across_frames and not isinstance(detector, BoxDetector)
         self._evidence: dict[int, FishEvidence] = {}  # of the frame's tracks
+        self._scores: dict[int, float] = {}  # of the detector, likewise
         self._found_any = False
 
     def detect(self, frame: Frame) -> list[Detection]:
@@ -46,6 +50,7 @@ class TrackedFish:
         boxes = {one.track_number: one.candidate.bbox_xyxy_px for one in tracked}
         visible = {one.track_number: one.visible_fraction for one in tracked}
         self._evidence = {one.track_number: one.evidence for one in tracked}
+        self._scores = {one.track_number: one.candidate.score for one in tracked}
         self._look_closer(frame, boxes)
         self._seen.any_moved |= any(one.has_moved for one in self._evidence.values())
         self._seen.any_fish_like |= any(map(self._may_count, self._evidence))
@@ -70,6 +75,8 @@ class TrackedFish:
 
     def _is_surely_fish(self, track: int) -> bool:
         """True for a confirmed track, and for one that went far or that need not move."""
+        if self._are_stills:
+            return False
         return self._evidence[track].went_far or self._confirmation.is_confirmed(track)
 
     def _may_count(self, track: int) -> bool:
@@ -90,6 +97,8 @@ class TrackedFish:
             for track, crop in crops.items()
             if self._confirmation.update(track, crop, may_count=self._may_count(track))
         ]
+        if self._are_stills:
+            fish = without_repeats({track: crops[track] for track in fish}, self._scores)
         self._found_any = self._found_any or bool(fish)
         self._seen.tracks = max(self._seen.tracks, *crops) if crops else self._seen.tracks
         for crop in crops.values():

@@ -148,7 +148,7 @@ def test_a_box_is_corrected_by_the_last_confident_mask_by_a_tenth_at_most(
         np.testing.assert_allclose(found[i][0].bbox_xyxy_px, edges, atol=0.5)
 
 
-def doubts_of(speed: float, *, has_place: bool = True) -> list[bool]:
+def doubts_of(speed: float, *, has_place: bool = True, across_frames: bool = True) -> list[bool]:
     """For each of eight frames, whether a shape of 60 px at this speed may be no fish."""
 
     class OneShape:
@@ -159,7 +159,8 @@ def doubts_of(speed: float, *, has_place: bool = True) -> list[bool]:
             box, place = np.array([x - 30, 140.0, x + 30, 160.0]), np.array([x, 150.0])
             return [Candidate(bbox_xyxy_px=box, score=1.0, place_px=place if has_place else None)]
 
-    fish = TrackedFish(OneShape(), TrackFishSettings(min_track_frames=4))
+    settings = TrackFishSettings(min_track_frames=4, across_frames=across_frames)
+    fish = TrackedFish(OneShape(), settings)
     doubts = []
     for index in range(1, 9):
         frame = spots_frame([], index)
@@ -174,6 +175,24 @@ def test_a_shape_may_be_no_fish_until_it_is_confirmed_or_went_far():
     assert doubts_of(8.0) == [True] * 4 + [False] * 4  # confirmed after four clear frames
     assert doubts_of(20.0) == [True] * 2 + [False] * 6  # farther than half its length
     assert doubts_of(1.0, has_place=False) == [False] * 8  # somebody else found it
+    assert doubts_of(1.0, has_place=False, across_frames=False) == [True] * 8  # one picture alone
+
+
+@pytest.mark.parametrize(("across_frames", "num_fish"), [(False, 2), (True, 3)])
+def test_a_still_shows_no_fish_inside_of_another(across_frames: bool, num_fish: int):
+    class Boxes:
+        refused: ClassVar[dict[str, int]] = {}
+
+        def find(self, frame: Frame) -> list[Candidate]:
+            boxes = {0.4: [60, 60, 110, 90], 0.8: [50, 50, 200, 100], 0.6: [205, 50, 300, 100]}
+            return [
+                Candidate(bbox_xyxy_px=np.array(box, np.float64), score=score)
+                for score, box in boxes.items()
+            ]
+
+    settings = TrackFishSettings(min_track_frames=1, across_frames=across_frames)
+    fish, frame = TrackedFish(Boxes(), settings), spots_frame([], 1)
+    assert len(fish.confirm(cut_out(frame, fish.detect(frame), WholeBox(1.0)))) == num_fish
 
 
 class BlindFromAfar(FusedDetector):
