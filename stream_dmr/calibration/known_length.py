@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.distance import pdist
 
 from stream_dmr.calibration.printed_board import PrintedBoard
-from stream_dmr.camera import Calibration
+from stream_dmr.camera import Calibration, Camera
 from stream_dmr.errors import CalibrationError
 
 
@@ -47,7 +47,12 @@ def scale_of_ends(
     ends_px: Float[np.ndarray, "2 2"], length_mm: float, calibration: Calibration
 ) -> ScaleError:
     """The scale by a rod's ends in the picture. Raises CalibrationError for ends that it hasn't."""
-    camera = calibration.camera
+    require_ends(ends_px, length_mm, calibration.camera)
+    return scale_of_points(ends_px, np.array([[0.0, 0, 0], [length_mm, 0, 0]]), calibration)
+
+
+def require_ends(ends_px: Float[np.ndarray, "2 2"], length_mm: float, camera: Camera) -> None:
+    """Raise CalibrationError unless these are two points of a camera's picture, and a length."""
     middles = np.array([camera.width - 1, camera.height - 1])  # of the last pixels
     if not ((ends_px >= -0.5) & (ends_px <= middles + 0.5)).all():
         raise CalibrationError(
@@ -61,7 +66,6 @@ def scale_of_ends(
         )
     if not 0 < length_mm < np.inf:
         raise CalibrationError(f"--length-mm: expected the rod's length, got {length_mm:g}")
-    return scale_of_points(ends_px, np.array([[0.0, 0, 0], [length_mm, 0, 0]]), calibration)
 
 
 def _pixels(points_px: Float[np.ndarray, "N 2"]) -> str:

@@ -10,10 +10,12 @@ from stream_dmr.cli.shared_options import (
     MarkerOption,
     OverwriteOption,
     SquareOption,
+    parse_ends,
 )
 from stream_dmr.errors import OutputError, UserError
 
 if TYPE_CHECKING:
+    import numpy as np
     from rich.console import Console
     from rich.table import Table
 
@@ -24,7 +26,8 @@ if TYPE_CHECKING:
 
 def calibrate(
     plane: Annotated[
-        Path, typer.Option(help="Photograph of the board lying in the reference plane.")
+        Path,
+        typer.Option(help="Photograph of the board lying in the reference plane, or of --ends."),
     ],
     images: Annotated[
         list[Path] | None,
@@ -50,6 +53,21 @@ def calibrate(
     camera: Annotated[
         str | None, typer.Option(help="Which camera of --lens: left, right, cam0, ...")
     ] = None,
+    ends: Annotated[
+        str | None,
+        typer.Option(
+            help="Without a board: ends of a ruler in --plane, px, which was taken squarely.",
+            metavar="U,V,U,V",
+        ),
+    ] = None,
+    length_mm: Annotated[float | None, typer.Option(help="Distance of the --ends in mm.")] = None,
+    focal_35mm: Annotated[
+        float | None,
+        typer.Option(
+            help="With --ends and no --lens: the focal length as on 35 mm film; phones have 24 to "
+            "28 mm."
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Calibration file to write.")] = Path(
         "calibration.yaml"
     ),
@@ -67,6 +85,15 @@ def calibrate(
 
     if model not in ("auto", "pinhole", "fisheye"):
         raise UserError(f"--model: expected auto, pinhole or fisheye, got {model}")
+    if ends is not None or length_mm is not None or focal_35mm is not None:
+        if ends is None or length_mm is None or images or (lens is None) == (focal_35mm is None):
+            raise UserError(
+                "--ends: expected --length-mm and one of --focal-35mm and --lens with it, and no "
+                "photographs of a board"
+            )
+        require_writable(out, overwrite=overwrite)
+        _squarely(plane, parse_ends(ends), length_mm, lens, camera, focal_35mm, out)
+        return
     if (lens is None) == (not images):
         raise UserError(
             "expected photographs of the board to calibrate the lens with, or --lens FILE with a "
@@ -93,6 +120,37 @@ def calibrate(
         overwrite=overwrite,
         console=console,
     )
+
+
+def _squarely(
+    picture: Path,
+    ends_px: "np.ndarray",
+    length_mm: float,
+    lens: Path | None,
+    name: str | None,
+    focal_35mm: float | None,
+    out: Path,
+) -> None:
+    from stream_dmr.calibration.calibration_file import require_size, save_calibration
+    from stream_dmr.calibration.corners import read_grey
+    from stream_dmr.calibration.lens_file import load_lens
+    from stream_dmr.calibration.square_view import calibrate_squarely, camera_of_focal_35mm
+
+    height, width = read_grey(picture).shape
+    if lens is not None:
+        camera = load_lens(lens, name=name).camera((width, height))
+    else:
+        camera = camera_of_focal_35mm(focal_35mm or 0.0, width=width, height=height)
+    calibration = calibrate_squarely(ends_px, length_mm, camera)
+    require_size(calibration, width=width, height=height)
+    save_calibration(out, calibration)
+    distance_mm = calibration.plane.distance_mm
+    print(f"lens: {camera.K[0, 0]:.0f} px of focal length, {width}x{height} px")
+    print(
+        f"reference plane {distance_mm:.0f} mm from the camera, taken to be seen squarely: "
+        f"{distance_mm / camera.K[0, 0]:.4f} mm a pixel"
+    )
+    print(f"calibration: {out}")
 
 
 def _with_known_lens(

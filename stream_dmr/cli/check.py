@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stream_dmr.cli.shared_options import BoardOption, MarkerOption, SquareOption
+from stream_dmr.cli.shared_options import BoardOption, MarkerOption, SquareOption, parse_ends
 from stream_dmr.errors import OutputError, UserError
 
 if TYPE_CHECKING:
@@ -92,8 +92,6 @@ def _measure(
     ends: str | None,
     length_mm: float | None,
 ) -> "ScaleError":
-    import numpy as np
-
     from stream_dmr.calibration.calibration_file import require_size
     from stream_dmr.calibration.known_length import scale_of_board, scale_of_ends
 
@@ -104,11 +102,7 @@ def _measure(
     require_size(calibration, width=first.shape[1], height=first.shape[0])
     if ends is None or length_mm is None:
         return scale_of_board(chain([first], pictures), calibration, board)
-    try:
-        points = np.array([float(part) for part in ends.split(",")]).reshape(2, 2)
-    except ValueError as error:
-        raise UserError(f"--ends: expected U,V,U,V in pixels, got {ends}") from error
-    return scale_of_ends(points, length_mm, calibration)
+    return scale_of_ends(parse_ends(ends), length_mm, calibration)
 
 
 def _pictures(source: str) -> Iterator["np.ndarray"]:

@@ -18,6 +18,8 @@ from stream_dmr.errors import UserError
 from stream_dmr.running.run_request import without_password
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from stream_dmr.recording.messages.selection import Selection
     from stream_dmr.running.config import Config
 
@@ -55,6 +57,16 @@ KeyOption = Annotated[
     Path | None, typer.Option(help="Device key of `keygen`; signs all that is written.")
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
+
+
+def parse_ends(ends: str) -> "np.ndarray":
+    """Two points of a picture, px (2, 2), from U,V,U,V. Raises UserError for anything else."""
+    import numpy as np
+
+    try:
+        return np.array([float(part) for part in ends.split(",")]).reshape(2, 2)
+    except ValueError as error:
+        raise UserError(f"--ends: expected U,V,U,V in pixels, got {ends}") from error
 
 
 def command_line() -> str:
