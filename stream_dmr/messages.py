@@ -175,11 +175,13 @@ class LocalizedFish(FishMessage):
     midline_mm: Float[np.ndarray, "M 3"] | None
     bending_ratio: float | None  # arc over chord, eq. (13)
     length_mm: float | None
-    length_std_mm: float | None
+    length_std_mm: float | None  # without the part below
     iou: float | None
     accepted: bool  # may this frame count towards the fish's length?
     reason: str  # "" when accepted, else a Reason
-    shape_std_ratio: float | None = None  # FittedShape's
+    # Std over length of an error that all frames of a fish share: since its shape isn't known
+    # exactly, and how far it hangs from the plane. None: an older recording.
+    shared_std_ratio: float | None = None
     species: Mapping[str, float] = field(default_factory=dict[str, float])  # FishCrop's
 
 

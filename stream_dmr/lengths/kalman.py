@@ -55,7 +55,7 @@ class SmoothLengthSettings(Settings):
     common_std_ratio: float = Field(
         default=0.01,
         ge=0,
-        description="error that all frames of a fish share (proportions, plane), std over length",
+        description="error that all frames of a fish share beside shape and plane, std over length",
     )
 
 
@@ -67,7 +67,7 @@ class Measurement:
     timestamp_ns: int
     length_mm: float
     std_ratio: float  # std over length
-    shape_std_ratio: float = 0.0  # of an error that all frames of the fish share
+    shared_std_ratio: float = 0.0  # of an error that all frames of the fish share
 
 
 @dataclass(frozen=True, kw_only=True)

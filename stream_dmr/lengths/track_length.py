@@ -36,7 +36,7 @@ def measurement_of(fish: LocalizedFish, settings: SmoothLengthSettings) -> Measu
         timestamp_ns=fish.timestamp_ns,
         length_mm=length_mm,
         std_ratio=max(std_mm / length_mm, settings.min_frame_std_ratio),
-        shape_std_ratio=fish.shape_std_ratio or 0.0,
+        shared_std_ratio=fish.shared_std_ratio or 0.0,
     )
 
 
@@ -146,12 +146,12 @@ class TrackLength:
         """Std from the filter's variance and from what frames of one fish have in common."""
         assert self._filter is not None
         shared = (self._settings.common_std_ratio * length_mm) ** 2
-        shared += (self._shape_std_ratio() * length_mm) ** 2
+        shared += (self._shared_std_ratio() * length_mm) ** 2
         return np.sqrt(variance * self._filter.design_effect + shared)
 
-    def _shape_std_ratio(self) -> float:
-        """Of the log length, since the fish's own shape isn't known: the frames' mean."""
-        return float(np.mean([measurement.shape_std_ratio for measurement in self._measurements]))
+    def _shared_std_ratio(self) -> float:
+        """Of the log length, by the fish's own shape and distance from the plane: the mean."""
+        return float(np.mean([one.shared_std_ratio for one in self._measurements]))
 
     def _status(self, num_used: int, *, is_measured: bool, is_final: bool) -> str:
         if Reason.NO_CALIBRATION in self._refused:

@@ -94,7 +94,9 @@ class Location:
     keypoints_mm: Float[np.ndarray, "3 3"]  # H', C', T'
     midline_mm: Float[np.ndarray, "M 3"]
     length_mm: float
-    length_std_mm: float | None  # None where the fit can't tell
+    length_std_mm: float | None  # without the part below; None where the fit can't tell
+    # Of an error that all frames of the fish share: its own shape, and its distance from the plane.
+    shared_std_ratio: float
     slant_rad: float  # of the chord from the plane across the line of sight: 0 is broadside
     bow_ratio: float  # of the midline from its chord along the line of sight, over its length
     bending_ratio: float  # arc over chord
@@ -189,7 +191,6 @@ def locate(shape: FittedShape, calibration: Calibration, settings: LocalizeSetti
     slant_rad = slant(keypoints_mm)
     parts = [
         shape.length_std_ratio,
-        plane_std_ratio(calibration.plane, settings),
         # Two joints can't follow every bend, and the outline doesn't say so.
         settings.bending_std * (1.0 - chord_mm / length_mm),
         # The length is the one seen over cos(slant), of which d log / d slant is tan(slant).
@@ -198,11 +199,13 @@ def locate(shape: FittedShape, calibration: Calibration, settings: LocalizeSetti
         settings.misfit_std * ((1.0 - shape.iou) / 0.1) ** 3,
     ]
     std_mm = length_mm * float(np.linalg.norm(parts))
+    plane_std = plane_std_ratio(calibration.plane, settings)
     return Location(
         keypoints_mm=keypoints_mm,
         midline_mm=place_midline(shape.midline, shape.keypoints[1], keypoints_mm),
         length_mm=length_mm,
         length_std_mm=std_mm if np.isfinite(std_mm) else None,
+        shared_std_ratio=float(np.hypot(shape.shape_std_ratio or 0.0, plane_std)),
         slant_rad=slant_rad,
         bow_ratio=bow_ratio(shape.midline, keypoints_mm[1]),
         bending_ratio=ratio,
@@ -240,8 +243,10 @@ def bend(shape: FittedShape) -> float | None:
 def plane_std_ratio(plane: ReferencePlane, settings: LocalizeSettings) -> float:
     """Std of a length as a fraction of it, since centers lie off the plane.
 
-    A center off the plane by d scales the whole fish by d over the camera's distance from the
-    plane, along its normal: |R_3 . T|, which is the depth where the camera looks at it squarely.
+    A fish hangs as far off the plane in its last frame as in its first, so this does not average
+    out over its frames. A center off the plane by d scales the whole fish by d over the camera's
+    distance from the plane, along its normal: |R_3 . T|, which is the depth where the camera looks
+    at it squarely.
     """
     distance_mm = abs(float(plane.rotation[:, 2] @ plane.translation_mm))
     return settings.plane_std_mm / distance_mm
@@ -311,6 +316,6 @@ def _message(
         iou=None if shape is None else shape.iou,
         accepted=not reason,
         reason=reason or "",
-        shape_std_ratio=None if shape is None else shape.shape_std_ratio,
+        shared_std_ratio=None if location is None else location.shared_std_ratio,
         species=mesh.species,
     )

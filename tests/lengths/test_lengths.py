@@ -332,7 +332,7 @@ def test_what_is_not_known_of_the_shape_widens_the_interval_however_many_frames(
     """An error that all frames share: it is added to the variance and does not average out."""
     frames = [frame(index, 700.0) for index in range(1, count + 1)]
     known = run(frames)[-1]
-    unknown = run([replace(fish, shape_std_ratio=0.03) for fish in frames])[-1]
+    unknown = run([replace(fish, shared_std_ratio=0.03) for fish in frames])[-1]
     assert unknown.length_mm == known.length_mm
     added = unknown.length_std_mm**2 - known.length_std_mm**2
     assert added == pytest.approx((0.03 * 700.0) ** 2, rel=1e-9)
@@ -340,5 +340,5 @@ def test_what_is_not_known_of_the_shape_widens_the_interval_however_many_frames(
 
 def test_frames_of_before_say_nothing_of_the_shape():
     frames = [frame(index, 700.0) for index in range(1, 6)]
-    zero = run([replace(fish, shape_std_ratio=0.0) for fish in frames])[-1]
+    zero = run([replace(fish, shared_std_ratio=0.0) for fish in frames])[-1]
     assert run(frames)[-1].length_std_mm == zero.length_std_mm

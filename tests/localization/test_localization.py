@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -270,7 +272,10 @@ def test_border_gate_can_be_switched_off():
 
 @pytest.mark.parametrize("tilt_rad", [0.0, 0.6, -0.9])
 def test_std_of_the_plane_is_what_moving_the_plane_does(tilt_rad):
-    """Move the true plane along its normal by d: the length changes by the ratio the std states."""
+    """Move the true plane along its normal by d: the length changes by the ratio the std states.
+
+    It is the same in all frames of a fish, so it is no part of a frame's own std.
+    """
     calibration, d = make_calibration(tilt_rad=tilt_rad), 1e-3
     normal = calibration.plane.rotation[:, 2]
     moved = ReferencePlane(
@@ -280,19 +285,16 @@ def test_std_of_the_plane_is_what_moving_the_plane_does(tilt_rad):
     mesh = straight_fish(calibration, std_ratio=0.0)
     fish = localized(mesh, calibration, plane_std_mm=d, slant_std_rad=0.0, misfit_std=0.0)
     change = localized(mesh, Calibration(camera=calibration.camera, plane=moved)).length_mm - 700.0
-    assert fish.length_std_mm == pytest.approx(abs(change), rel=1e-4)
+    assert 700.0 * fish.shared_std_ratio == pytest.approx(abs(change), rel=1e-4)
+    assert fish.length_std_mm == pytest.approx(0.0, abs=1e-6)
 
 
-def test_std_combines_fit_and_plane_as_independent():
+def test_shape_and_plane_are_shared_by_all_frames_and_independent():
     calibration = make_calibration(depth_mm=2000.0)
-    fish = localized(
-        straight_fish(calibration, std_ratio=0.03),
-        calibration,
-        plane_std_mm=80.0,
-        slant_std_rad=0.0,
-        misfit_std=0.0,
-    )
-    assert fish.length_std_mm == pytest.approx(700.0 * 0.05)
+    mesh = straight_fish(calibration)
+    unknown = replace(mesh, shape=replace(mesh.shape, shape_std_ratio=0.03))
+    shared = [localized(fit, calibration, plane_std_mm=80.0) for fit in (mesh, unknown)]
+    assert [fish.shared_std_ratio for fish in shared] == pytest.approx([0.04, 0.05])
 
 
 @pytest.mark.parametrize("slant_rad", [0.0, 0.3, -0.6, 1.1])
