@@ -13,6 +13,7 @@ from contextlib import suppress
 from stream_dmr.errors import OutputError
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.shape.describe import describe
+from stream_dmr.fitting.shape.plausible import why_implausible
 from stream_dmr.fitting.shape.samples import MAX_FISH
 from stream_dmr.messages import FishCrop, Frame, LearntShapes
 from stream_dmr.nodes.fit_mesh import FitMesh
@@ -110,7 +111,12 @@ def follow_shapes(
     def learn(crops: Sequence[FishCrop], progress: Callable[[str], None]) -> CandidateShapes | None:
         nonlocal compared
         if not given.is_given_mesh:
-            return inputs.learn(crops, given, progress=progress)
+            stocks = inputs.learn(crops, given, progress=progress)
+            reason = None if stocks is None else why_implausible(given, stocks)
+            if reason is None:
+                return stocks
+            observer.warn(reason)
+            return None
         compared = compare_with_mesh(crops, inputs, progress=progress)
         if compared.stocks is None:
             observer.warn(compared.not_like_mesh)

@@ -13,6 +13,7 @@ from typing import TypeVar
 
 from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
 from stream_dmr.fitting.shape.describe import describe
+from stream_dmr.fitting.shape.plausible import why_implausible
 from stream_dmr.fitting.shape.samples import good_crops
 from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.messages import FishCrop
@@ -101,12 +102,18 @@ def _learn_aloud(
     forms: CandidateShapes,
     observer: RunObserver,
 ) -> CandidateShapes:
-    """The stocks of all fish, or the forms where none is seen whole; the observer is told."""
+    """The stocks of all fish; the forms where none is seen whole, or a stock can't be of fish.
+
+    The observer is told.
+    """
     stocks = setup.learn(
         crops, forms, progress=lambda step: observer.stage(f"learning their shapes: {step}")
     )
     if stocks is None:
         observer.warn("no fish was seen whole: each is measured as the form it is most like")
+        return forms
+    if (reason := why_implausible(forms, stocks)) is not None:
+        observer.warn(reason)
         return forms
     for line in describe(forms, stocks):
         observer.notice(line)

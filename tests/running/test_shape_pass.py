@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from stream_dmr.errors import OutputError, UserError
+from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
 from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.replaying.replay_recording import ReplayRequest, replay
@@ -17,11 +18,13 @@ from stream_dmr.results.folder_lock import FolderLock
 from stream_dmr.results.learnt_meshes import LEARNT, learnt_files
 from stream_dmr.results.provenance import NAME as PROVENANCE
 from stream_dmr.results.provenance import known_files
+from stream_dmr.running.config import Config
 from stream_dmr.running.inputs import Inputs, checked_inputs
 from stream_dmr.running.measure_source import measure_source
+from stream_dmr.running.measuring_setup import MeasuringSetup
 from stream_dmr.running.run_observer import RunObserver
 from stream_dmr.running.run_request import RunRequest
-from stream_dmr.running.shape_pass import with_learnt_shapes
+from stream_dmr.running.shape_pass import learnt_from, with_learnt_shapes
 from stream_dmr.template.template_file import load_template
 from tests.support.command import rows
 from tests.support.fish_run import request
@@ -287,3 +290,17 @@ def test_a_stop_while_fish_are_looked_for_leaves_an_empty_valid_result(clip: Pat
     assert header.candidates is not None
     assert not header.candidates.are_learnt
     assert not (out / LEARNT).exists()
+
+
+def test_a_shape_that_no_fish_has_is_not_believed(monkeypatch: pytest.MonkeyPatch):
+    template, forms = load_shapes(AUTO)
+    assert forms is not None
+    setup = MeasuringSetup(config=Config(), template=template, candidates=forms, calibration=None)
+    needle = next(iter(forms))
+    far = needle._replace(coefficients=needle.coefficients - 5.0, share=1.0)
+    stocks = CandidateShapes.of([far], are_learnt=True)
+    monkeypatch.setattr(MeasuringSetup, "learn", lambda *_, **__: stocks)
+    observer = Listener()
+    assert learnt_from([], setup, observer).candidates is forms
+    assert len(observer.warnings) == 1
+    assert "look whether the masks hold more than the fish" in observer.warnings[0]
