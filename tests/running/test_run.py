@@ -19,6 +19,7 @@ from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.results.lengths_database import open_for_reading
 from stream_dmr.results.lengths_table import lengths_row
 from stream_dmr.results.store_rows import read_estimates
+from stream_dmr.running.conditions import as_calibrated
 from stream_dmr.running.config import load_config, to_toml
 from stream_dmr.running.measure_source import measure_source
 from stream_dmr.running.run_folder import RESULTS, SEGMENTS, result_names
@@ -78,7 +79,7 @@ def test_several_fish_come_and_go_and_every_stage_is_recorded(tmp_path: Path):
     assert str(out) in outcome.out
 
     header = read_header(out / "recording.mcap")
-    assert header.config_toml == to_toml(load_config(options["--config"]))
+    assert header.config_toml == to_toml(as_calibrated(load_config(options["--config"])))
     assert header.calibration_file == Path(options["--calibration"]).read_bytes()
     assert header.command.startswith("stream-dmr run --source")
     assert header.template.name == "tiny"
