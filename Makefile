@@ -48,7 +48,7 @@ golden: $(STAMP)  ## recordings/golden anew, after saying what moved
 	$(BIN)/python recordings/make_golden.py
 
 config: $(STAMP)  ## config.toml anew from the settings classes
-	$(BIN)/python -m stream_dmr.running.config > config.toml.new
+	$(BIN)/python -m stream_dmr.pipeline.config > config.toml.new
 	mv config.toml.new config.toml
 
 docs: $(STAMP)  ## the plan of the imports, the tables of settings, reasons and files, anew from the code

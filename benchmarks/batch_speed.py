@@ -25,9 +25,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from stream_dmr.batch.driver import run_batch
-from stream_dmr.batch.engine import Engine
-from stream_dmr.batch.local_engine import LocalEngine
+from stream_dmr.batch.driver import Engine, run_batch
+from stream_dmr.batch.engines import LocalEngine
 from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
 from stream_dmr.simulation import DEMO_SCENE
 
@@ -48,7 +47,7 @@ def engine_of(name: str, workers: int) -> Iterator[Engine]:
     os.environ.setdefault("RAY_worker_niceness", "0")  # else Ray's workers wait for all others
     from ray.cluster_utils import Cluster
 
-    from stream_dmr.batch.ray_engine import RayEngine
+    from stream_dmr.batch.engines import RayEngine
 
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     for _ in range(workers - 1):

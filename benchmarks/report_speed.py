@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 from statistics import median
 
-from stream_dmr.report.open_reports import open_report, write_report
+from stream_dmr.web.open_reports import open_report, write_report
 from tests.support.browser import Tab
 
 _REPEATS = 5

@@ -14,11 +14,10 @@ import tempfile
 import time
 from pathlib import Path
 
-from stream_dmr.report.open_reports import open_folders
-from stream_dmr.results.finished_fish import read_stored_fish
-from stream_dmr.results.verify import verify
-from stream_dmr.review.review_queue import ReviewQueue
-from stream_dmr.review.review_server import ReviewServer
+from stream_dmr.evidence.verify_folder import verify
+from stream_dmr.store.fish import read_stored_fish
+from stream_dmr.web.open_reports import open_folders
+from stream_dmr.web.review_queue import ReviewQueue, ReviewServer
 from tests.support.browser import Tab
 
 _SCRIPT = """

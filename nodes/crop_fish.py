@@ -9,12 +9,11 @@ from pathlib import Path
 
 from stream_dmr.camera import Camera
 from stream_dmr.messages import FishCrop, Frame
-from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
-from stream_dmr.segmentation.masks.cropping import crop_fish
-from stream_dmr.segmentation.masks.open_segmenter import open_segmenter
-from stream_dmr.segmentation.network.species_classifier import SpeciesClassifier
-from stream_dmr.segmentation.tracking.fish_finder import FishFinder
-from stream_dmr.segmentation.tracking.track_numbering import TrackNumbering
+from stream_dmr.segmentation.crop import CropFishSettings, crop_fish
+from stream_dmr.segmentation.open_segmenter import open_segmenter
+from stream_dmr.segmentation.species_classifier import SpeciesClassifier
+from stream_dmr.tracking.finder import FishFinder
+from stream_dmr.tracking.tracker import TrackNumbering
 
 
 class CropFish:

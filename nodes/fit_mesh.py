@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 
 from stream_dmr.camera import Calibration
-from stream_dmr.catch.species_settings import SpeciesSettings
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.tracks import TrackFitter
 from stream_dmr.messages import FishCrop, FittedMesh
+from stream_dmr.species import SpeciesSettings
 from stream_dmr.template.template import Template
 
 # Of capture time: a pose that old says nothing of the next one, and runs of weeks see many fish.

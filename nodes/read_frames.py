@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from stream_dmr.messages import Frame
 from stream_dmr.sources.open_source import open_source
-from stream_dmr.sources.read_settings import ReadFramesSettings
+from stream_dmr.sources.source import ReadFramesSettings
 
 
 class ReadFrames:

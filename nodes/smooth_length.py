@@ -7,13 +7,11 @@ and a final one when its track ends.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from stream_dmr.catch.fate import FateTracker
-from stream_dmr.catch.species_evidence import UNSURE, SpeciesEvidence
-from stream_dmr.catch.species_settings import SpeciesSettings
-from stream_dmr.catch.zones import ZonesSettings
+from stream_dmr.lengths.fate import FateTracker, ZonesSettings
 from stream_dmr.lengths.kalman import SmoothLengthSettings
-from stream_dmr.lengths.track_length import TrackLength, late_estimate
+from stream_dmr.lengths.track_record import TrackLength, late_estimate
 from stream_dmr.messages import LengthEstimate, LocalizedFish
+from stream_dmr.species import UNSURE, SpeciesEvidence, SpeciesSettings
 
 
 @dataclass(frozen=True)

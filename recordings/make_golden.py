@@ -11,10 +11,9 @@ import tempfile
 import threading
 from pathlib import Path
 
-from stream_dmr.replaying.replay_recording import replay
-from stream_dmr.replaying.replay_request import ReplayRequest
-from stream_dmr.running.measure_source import measure_source
-from stream_dmr.running.run_request import RunRequest
+from stream_dmr.pipeline.measure_source import measure_source
+from stream_dmr.pipeline.replay_recording import replay
+from stream_dmr.pipeline.run_options import ReplayRequest, RunRequest
 from stream_dmr.simulation import DEMO_SCENE
 
 GOLDEN = Path(__file__).parent / "golden"

@@ -40,8 +40,7 @@ from typing import TYPE_CHECKING
 from stream_dmr.version import __version__
 
 if TYPE_CHECKING:
-    from stream_dmr.api.functions import RecordedRun, Run, measure, open, replay
-    from stream_dmr.api.table_rows import FishRow, FrameRow
+    from stream_dmr.api import FishRow, FrameRow, RecordedRun, Run, measure, open, replay
     from stream_dmr.errors import UserError
     from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish
     from stream_dmr.simulation import DEMO_SCENE
@@ -65,8 +64,8 @@ __all__ = [
 ]
 
 _MODULES = {
-    **dict.fromkeys(("RecordedRun", "Run", "measure", "open", "replay"), "api.functions"),
-    **dict.fromkeys(("FishRow", "FrameRow"), "api.table_rows"),
+    **dict.fromkeys(("RecordedRun", "Run", "measure", "open", "replay"), "api"),
+    **dict.fromkeys(("FishRow", "FrameRow"), "api"),
     **dict.fromkeys(
         ("FishCrop", "FittedMesh", "Frame", "LengthEstimate", "LocalizedFish"), "messages"
     ),

@@ -1,4 +1,4 @@
-"""Files: writes undone when they fail, durable renames, hashes, natural order of names."""
+"""Durable writes, hashes, locks and reserved space."""
 
 import errno
 import fcntl
@@ -231,3 +231,61 @@ def natural_order(path: Path) -> tuple[list[str | int], str]:
     """Sorting key that orders numbers in names by value: `2.png` before `10.png`."""
     parts = re.split(r"([0-9]+)", path.name)
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
+
+
+class FolderLock:
+    """Holds a folder for this process until `release`; a crash releases it as well."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises OutputError where another process holds the folder."""
+        self._descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self.release()
+            raise OutputError(
+                f"{folder}: expected a folder of its own for each run, found one that another run "
+                "is writing to; wait for that one or choose another --out"
+            ) from None
+
+    @property
+    def is_held(self) -> bool:
+        """False after `release`."""
+        return self._descriptor >= 0
+
+    def release(self) -> None:
+        """Unlock the folder. Idempotent."""
+        if self.is_held:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+
+def require_unlocked(folder: Path) -> None:
+    """Raise OutputError where another run is writing to the folder."""
+    FolderLock(folder).release()
+
+
+_NAME = "lengths.reserve"
+_MAX_BYTES = 1 << 20  # some thousand fish
+_MAX_SHARE = 0.01  # of the free space: a disk with hardly any is left alone
+
+
+class ReservedSpace:
+    """A file that takes up to a megabyte until it is released."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / _NAME
+
+    def reserve(self) -> None:
+        """Reserve the space; where the disk refuses it, none is reserved."""
+        with suppress(OSError):
+            disk = os.statvfs(self._path.parent)
+            size = min(_MAX_BYTES, int(_MAX_SHARE * disk.f_bavail * disk.f_frsize))
+            if size > 0:
+                with self._path.open("wb") as file:
+                    os.posix_fallocate(file.fileno(), 0, size)
+
+    def release(self) -> None:
+        """Release the space. Idempotent."""
+        with suppress(OSError):
+            self._path.unlink(missing_ok=True)

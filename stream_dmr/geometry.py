@@ -1,7 +1,8 @@
-"""Geometry of polylines in numpy, shared by several rooms."""
+"""Polylines, boxes and connected components."""
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int32, UInt8
 
 
 def arc_lengths(points: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "M"]:
@@ -24,3 +25,36 @@ def bending_ratio(midline: Float[np.ndarray, "M 3"]) -> float:
     if chord == 0.0:
         raise ValueError("expected a midline with two distinct ends, got a closed one")
     return arc_length(midline) / chord
+
+
+def components(
+    mask: UInt8[np.ndarray, "H W"],
+) -> tuple[int, Int32[np.ndarray, "H W"], Int32[np.ndarray, "N 5"]]:
+    """How many there are with the background, 0; labels; x, y, width, height and area of each, px.
+
+    The labels are those of `cv2.connectedComponentsWithStats`, which takes another algorithm by
+    default, made for several threads and slow on one.
+    """
+    count, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
+        mask, 8, cv2.CV_32S, cv2.CCL_BBDT
+    )
+    return count, np.asarray(labels, np.int32), np.asarray(stats, np.int32)
+
+
+def whole_pixels(bbox_xyxy_px: Float[np.ndarray, "4"]) -> tuple[int, int, int, int]:
+    """x0, y0, x1, y1 of a box rounded to pixel edges, at least one pixel wide and high."""
+    x0, y0, x1, y1 = np.round(bbox_xyxy_px).astype(int).tolist()
+    return x0, y0, max(x1, x0 + 1), max(y1, y0 + 1)
+
+
+def fraction_inside(box: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> float:
+    """The fraction of the area of `box` that lies inside `other`, 0 to 1."""
+    overlap = np.minimum(box[2:], other[2:]) - np.maximum(box[:2], other[:2])
+    return float(np.prod(np.maximum(overlap, 0)) / max(np.prod(box[2:] - box[:2]), 1e-9))
+
+
+def box_iou(one: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> float:
+    """Intersection over union of two boxes."""
+    sides = np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2])
+    both = np.prod(np.maximum(sides, 0))
+    return float(both / (np.prod(one[2:] - one[:2]) + np.prod(other[2:] - other[:2]) - both))

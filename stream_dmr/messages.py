@@ -133,7 +133,7 @@ class FittedShape(_ReadOnly):
     their common scale is arbitrary.
     """
 
-    parameters: Float[np.ndarray, "P"]  # layout: stream_dmr.fitting.parameters
+    parameters: Float[np.ndarray, "P"]  # layout: stream_dmr.fitting.body
     vertices: Float[np.ndarray, "V 3"] | None  # None: not recorded, `parameters` give them
     keypoints: Float[np.ndarray, "3 3"]  # head, center, tail
     keypoints_px: Float[np.ndarray, "3 2"]  # the same in frame pixels

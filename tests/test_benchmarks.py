@@ -18,11 +18,10 @@ from benchmarks.fit_speed.deodr_solver import DeodrSilhouette, face_neighbors, m
 from benchmarks.fit_speed.tables import Results, markdown
 from benchmarks.fit_speed.targets import draw_known, draw_pair, species_template
 from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
-from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.fit_settings import FitMeshSettings
-from stream_dmr.fitting.paper.silhouette import project, silhouette
-from stream_dmr.fitting.paper.skinning import Rig, deform, spine
+from stream_dmr.fitting.paper.torch_body import Rig, deform, project, silhouette, spine
+from stream_dmr.fitting.solver.descent import evaluate
+from stream_dmr.fitting.solver.problem import Problem
 from stream_dmr.fitting.target import Target
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.csv_file import CsvFile, original_cell, rotated_files
 from stream_dmr.errors import OutputError
+from stream_dmr.tables import CsvFile, original_cell, rotated_files
 from tests.support.small_disk import file_size_limit
 
 COLUMNS = ["a", "b"]

@@ -17,7 +17,7 @@ from benchmarks.segmentation.detector.training_frames import (
     FrameSource,
 )
 from benchmarks.segmentation.empty_squares import largest_empty_square
-from stream_dmr.segmentation.training.patch_bank import make_bank
+from stream_dmr.training.image_degradation import make_bank
 
 boxes_of_any_place = st.lists(
     st.tuples(st.integers(-20, 120), st.integers(-20, 90), st.integers(3, 60), st.integers(3, 60)),

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from stream_dmr.results.fish_table import FISH_TABLE
-from stream_dmr.results.frames_table import FRAMES_COLUMNS
-from stream_dmr.results.lengths_database import open_for_writing
-from stream_dmr.results.lengths_table import LENGTHS_COLUMNS
-from stream_dmr.results.verdicts import Verdict
+from stream_dmr.export.fish_table import FISH_TABLE
+from stream_dmr.store.run_tables import FRAMES_COLUMNS, LENGTHS_COLUMNS
+from stream_dmr.store.schema import open_for_writing
+from stream_dmr.store.verdicts import Verdict
 from tests.support.pages import pages
 from tests.support.plan import Plan, direct
 

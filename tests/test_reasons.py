@@ -6,8 +6,8 @@ import pytest
 
 from stream_dmr.messages import FittedMesh, LengthEstimate, LocalizedFish
 from stream_dmr.reasons import MEASURED, MEASURING, Reason, with_counts, without_counts
-from stream_dmr.recording.messages.codec import decode
-from stream_dmr.recording.reading.open_recording import open_recordings
+from stream_dmr.recording.codec import decode
+from stream_dmr.recording.reading import open_recordings
 
 ROOT = Path(__file__).parents[1]
 SOURCES = [*(ROOT / "stream_dmr").rglob("*.py"), *(ROOT / "nodes").rglob("*.py")]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from stream_dmr.sources.read_settings import ReadFramesSettings
+from stream_dmr.sources.source import ReadFramesSettings
 from tests.support.camera import require_server
 
 ROOT = Path(__file__).resolve().parents[1]

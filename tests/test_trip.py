@@ -12,18 +12,17 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from stream_dmr.report.open_reports import open_folders
-from stream_dmr.results.finished_fish import read_runs
-from stream_dmr.results.verdicts_table import read_verdicts
-from stream_dmr.results.verify import verify
-from stream_dmr.review.review_queue import ReviewQueue
-from stream_dmr.review.review_server import ReviewServer
+from stream_dmr.evidence.verify_folder import verify
 from stream_dmr.simulation.write_scene import write_scene
-from tests.review.test_keyboard import WAIT
+from stream_dmr.store.fish import read_runs
+from stream_dmr.store.verdicts import read_verdicts
+from stream_dmr.web.open_reports import open_folders
+from stream_dmr.web.review_queue import ReviewQueue, ReviewServer
 from tests.support.browser import Tab
 from tests.support.command import invoke, rows
 from tests.support.small_classifier import crops_of, train_classifier
 from tests.support.trip import CODES, NAMES, START_UTC, Trip, make_trip, small_scene
+from tests.web.test_keyboard import WAIT
 
 _CONFIG = f"""
 [zones]

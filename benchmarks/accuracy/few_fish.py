@@ -26,15 +26,14 @@ from benchmarks.accuracy.judged_lengths import HEADER, JudgedLength, figures, ju
 from benchmarks.fit_speed.targets import body_template
 from benchmarks.table1.dmr import through_all
 from benchmarks.table1.filmed_scene import FilmedScene, film_passages
-from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
 from stream_dmr.fitting.shape.space import TRUNK, reshaped, std_of
+from stream_dmr.fitting.shape.stocks import learn_shapes
 from stream_dmr.messages import FishCrop, LearntShapes
-from stream_dmr.running.chain_nodes import later_nodes
-from stream_dmr.running.config import Config
-from stream_dmr.simulation.presets import PRESETS
-from stream_dmr.simulation.rail_scene import make_scene
-from stream_dmr.simulation.species import SPECIES
+from stream_dmr.pipeline.config import Config
+from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.simulation.rail_scene import PRESETS, make_scene
+from stream_dmr.simulation.simulated_fish import SPECIES
 from stream_dmr.template.template import Template
 from stream_dmr.template.template_file import bundled_names
 

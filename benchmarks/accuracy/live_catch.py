@@ -34,18 +34,17 @@ from benchmarks.table1.filmed_scene import (
     film_passages,
 )
 from stream_dmr.calibration.calibration_file import load_calibration
-from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
-from stream_dmr.fitting.shape.samples import GoodCrops
+from stream_dmr.fitting.shape.stocks import GoodCrops, learn_shapes
 from stream_dmr.messages import FishCrop, FittedMesh, LearntShapes, LengthEstimate
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.nodes.read_frames import ReadFrames
-from stream_dmr.running.chain_nodes import later_nodes
-from stream_dmr.running.config import Config
-from stream_dmr.segmentation.tracking.fish_finder import open_finder
-from stream_dmr.simulation.pose_sequence import FPS
-from stream_dmr.simulation.species import SPECIES
+from stream_dmr.pipeline.config import Config
+from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.simulation.rail_scene import FPS
+from stream_dmr.simulation.simulated_fish import SPECIES
+from stream_dmr.tracking.finder import open_finder
 
 FIRST_SEED = 9400
 SPECIES_PER_CATCH = 3

@@ -25,16 +25,19 @@ from benchmarks.accuracy.judged_lengths import JudgedLength, judge
 from benchmarks.table1.dmr import through_all
 from benchmarks.table1.filmed_scene import FilmedScene, film_passages
 from stream_dmr.camera import Calibration, ReferencePlane
-from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
-from stream_dmr.running.chain_nodes import later_nodes
-from stream_dmr.running.conditions import lying, stills
-from stream_dmr.running.config import Config
-from stream_dmr.simulation.presets import PRESETS
-from stream_dmr.simulation.rail_scene import RailScene, Visit, draw_calibration
-from stream_dmr.simulation.simulated_body import SimulatedBody
-from stream_dmr.simulation.simulated_fish import HangingPose, SimulatedFish, draw_fish, pose_fish
-from stream_dmr.simulation.species import SPECIES
+from stream_dmr.fitting.shape.stocks import learn_shapes
+from stream_dmr.pipeline.config import Config, lying, stills
+from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.simulation.rail_scene import PRESETS, RailScene, Visit, draw_calibration
+from stream_dmr.simulation.simulated_fish import (
+    SPECIES,
+    HangingPose,
+    SimulatedBody,
+    SimulatedFish,
+    draw_fish,
+    pose_fish,
+)
 
 FIRST_SEED = 9600
 FLAT, TURNED, BENT = "flat", "turned", "bent out of the plane"

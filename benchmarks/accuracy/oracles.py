@@ -28,12 +28,10 @@ from benchmarks.table1.filmed_scene import (
 )
 from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish
 from stream_dmr.nodes.smooth_length import SmoothLength
-from stream_dmr.running.chain_nodes import later_nodes
-from stream_dmr.running.config import Config
-from stream_dmr.simulation.presets import PRESETS
-from stream_dmr.simulation.rail_scene import RailScene, make_scene
-from stream_dmr.simulation.simulated_body import HALIBUT, SimulatedBody
-from stream_dmr.simulation.simulated_fish import pose_fish
+from stream_dmr.pipeline.config import Config
+from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.simulation.rail_scene import PRESETS, RailScene, make_scene
+from stream_dmr.simulation.simulated_fish import HALIBUT, SimulatedBody, pose_fish
 from stream_dmr.template.template import Template
 
 T = TypeVar("T")

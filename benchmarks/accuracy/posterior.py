@@ -22,18 +22,15 @@ from benchmarks.accuracy.oracles import final_estimate, map_scenes, scene_of, tr
 from benchmarks.fit_speed.targets import species_template
 from benchmarks.table1.filmed_scene import film_passages
 from stream_dmr.camera import Calibration
-from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
-from stream_dmr.fitting.contour.normal_equations import normal_equations
-from stream_dmr.fitting.contour.problem import Problem
-from stream_dmr.fitting.contour.regularisers import prior_loss
-from stream_dmr.fitting.mesh_levels import MeshLevels
-from stream_dmr.fitting.parameters import LOG_SIZE
-from stream_dmr.fitting.size.scanner import STD_SCALE
+from stream_dmr.fitting.body import LOG_SIZE, MeshLevels
+from stream_dmr.fitting.size import STD_SCALE
+from stream_dmr.fitting.solver.descent import evaluate, normal_equations
+from stream_dmr.fitting.solver.problem import Problem, prior_loss
 from stream_dmr.fitting.tracks import TrackFitter
 from stream_dmr.localization.localize_fish import localize
 from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
-from stream_dmr.running.config import Config
-from stream_dmr.simulation.presets import PRESETS
+from stream_dmr.pipeline.config import Config
+from stream_dmr.simulation.rail_scene import PRESETS
 
 _FRAMES_PER_FISH = 5
 _STEPS, _THIN, _BURN_IN = 24_000, 10, 0.2

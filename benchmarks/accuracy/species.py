@@ -26,12 +26,11 @@ from benchmarks.table1.dmr import through_all
 from benchmarks.table1.filmed_scene import film_passages
 from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
 from stream_dmr.messages import FishCrop
-from stream_dmr.running.chain_nodes import later_nodes
-from stream_dmr.running.config import Config
-from stream_dmr.running.measuring_setup import MeasuringSetup
-from stream_dmr.running.run_observer import RunObserver
-from stream_dmr.running.shape_pass import learnt_from
-from stream_dmr.simulation.species import SPECIES, find_species
+from stream_dmr.pipeline.config import Config
+from stream_dmr.pipeline.learn_shapes import learnt_from
+from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.pipeline.session import MeasuringSetup, later_nodes
+from stream_dmr.simulation.simulated_fish import SPECIES, find_species
 from stream_dmr.template.template_file import bundled_names
 
 OWN = "own"

@@ -12,10 +12,9 @@ from benchmarks.fit_speed.targets import species_template
 from benchmarks.table1.dmr import through_all
 from benchmarks.table1.filmed_scene import film_passages
 from stream_dmr.messages import LocalizedFish
-from stream_dmr.running.chain_nodes import later_nodes
-from stream_dmr.running.config import Config
-from stream_dmr.simulation.pose_sequence import FPS
-from stream_dmr.simulation.presets import PRESETS
+from stream_dmr.pipeline.config import Config
+from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.simulation.rail_scene import FPS, PRESETS
 
 _NUM_FRAMES = 600  # of a scene: some 48 of each fish
 CONFIG = Config()

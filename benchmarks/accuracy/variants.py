@@ -13,9 +13,9 @@ import threading
 from pathlib import Path
 
 from stream_dmr.evaluation.compare import Evaluation, evaluate
-from stream_dmr.running.config import Config, to_toml
-from stream_dmr.running.measure_source import measure_source
-from stream_dmr.running.run_request import RunRequest
+from stream_dmr.pipeline.config import Config, to_toml
+from stream_dmr.pipeline.measure_source import measure_source
+from stream_dmr.pipeline.run_options import RunRequest
 
 _QUIET = {"mcap": False, "rrd": False}
 _PAPER = {"deformation": "linear-blend", "solver": "adam"}

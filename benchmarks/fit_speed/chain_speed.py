@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 
 from stream_dmr.calibration.calibration_file import load_calibration, save_calibration
-from stream_dmr.running.config import Config, to_toml
-from stream_dmr.running.measure_source import measure_source
-from stream_dmr.running.run_request import RunRequest
+from stream_dmr.pipeline.config import Config, to_toml
+from stream_dmr.pipeline.measure_source import measure_source
+from stream_dmr.pipeline.run_options import RunRequest
 from stream_dmr.simulation.film import FilmedFrame, film
 from stream_dmr.simulation.rail_scene import HEIGHT, WIDTH, make_scene
 from stream_dmr.simulation.write_scene import encode_mask, write_species

@@ -15,11 +15,10 @@ from deodr.differentiable_renderer import Scene2D
 from jaxtyping import Float
 from torch import Tensor
 
+from stream_dmr.fitting.body import NUM_PER_JOINT, NUM_ROOT
 from stream_dmr.fitting.fit_settings import FitMeshSettings
-from stream_dmr.fitting.paper import adam, losses
-from stream_dmr.fitting.paper.silhouette import project
-from stream_dmr.fitting.paper.skinning import Parameters, Rig, deform, spine
-from stream_dmr.fitting.parameters import NUM_PER_JOINT, NUM_ROOT
+from stream_dmr.fitting.paper import adam
+from stream_dmr.fitting.paper.torch_body import Parameters, Rig, deform, project, spine
 from stream_dmr.fitting.target import Target
 from stream_dmr.template.template import Template
 
@@ -60,10 +59,10 @@ class DeodrSolver:
             watch(_hard_iou(covered, mask))
             parameters = Parameters.from_vector(vector)
             terms = (
-                losses.iou_loss(covered, mask),
-                losses.boundary_loss(covered, distance),
-                losses.scale_loss(parameters.joint_log_scales),
-                losses.translation_loss(parameters.joint_translations),
+                adam.iou_loss(covered, mask),
+                adam.boundary_loss(covered, distance),
+                adam.scale_loss(parameters.joint_log_scales),
+                adam.translation_loss(parameters.joint_translations),
             )
             optimizer.zero_grad()
             (torch.cat(terms) @ self._lambdas).backward()

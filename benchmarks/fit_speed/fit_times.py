@@ -15,24 +15,19 @@ from jaxtyping import Float
 
 from benchmarks.fit_speed.targets import FramePair, KnownTarget
 from benchmarks.fit_speed.timing import Duration, median_duration, time_call
-from stream_dmr.fitting.contour import deformation, levenberg_marquardt, mesh_terms, outline
-from stream_dmr.fitting.contour.contour_residuals import Residuals
-from stream_dmr.fitting.contour.contour_solver import ContourSolver
-from stream_dmr.fitting.contour.deformation import KINDS, deform
-from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
-from stream_dmr.fitting.contour.normal_equations import normal_equations, weighted_squares
-from stream_dmr.fitting.contour.outline import project
-from stream_dmr.fitting.contour.problem import Problem
-from stream_dmr.fitting.contour.visible_rim import visible_rim
-from stream_dmr.fitting.distance_map import signed_distance
+from stream_dmr.fitting.body import LOG_SIZE, MeshLevels
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fitter
-from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.paper.adam import AdamSolver
-from stream_dmr.fitting.parameters import LOG_SIZE
-from stream_dmr.fitting.target import Target, mask_contour
+from stream_dmr.fitting.solver import descent, mesh_terms, outline, spine
+from stream_dmr.fitting.solver.contour_solver import ContourSolver
+from stream_dmr.fitting.solver.descent import evaluate, normal_equations, weighted_squares
+from stream_dmr.fitting.solver.outline import Residuals, project, visible_rim
+from stream_dmr.fitting.solver.problem import Problem
+from stream_dmr.fitting.solver.spine import KINDS, deform
+from stream_dmr.fitting.starts import recentered
+from stream_dmr.fitting.target import Target, mask_contour, signed_distance
 from stream_dmr.fitting.uncertainty import covariance
-from stream_dmr.fitting.warm_start import recentered
 from stream_dmr.template.template import Template
 
 SPINE = KINDS["spine"]
@@ -176,7 +171,7 @@ def fit_parts(setup: Setup, pair: FramePair) -> dict[str, Callable[[], object]]:
 
 def iteration_parts(setup: Setup, pair: FramePair) -> dict[str, Callable[[], object]]:
     """What one iteration of the solver does."""
-    body, lm, out = setup.body, levenberg_marquardt, outline
+    body, lm, out = setup.body, descent, outline
     target, start = setup.start(pair)
     problem, size = setup.problem(target), np.exp(start[LOG_SIZE])
     rendering = evaluate(problem, start, True).rendering
@@ -196,7 +191,7 @@ def iteration_parts(setup: Setup, pair: FramePair) -> dict[str, Callable[[], obj
         "- smoothness": lambda: mesh_terms.smoothness(body, normals, offsets, size),
         "normal equations": lambda: normal_equations(problem, start, rendering),
         "- visible rim": lambda: visible_rim(rendering),
-        "- jacobian": lambda: deformation.jacobian(body, SPINE, start, chosen),
+        "- jacobian": lambda: spine.jacobian(body, SPINE, start, chosen),
         "- sums of squares": lambda: weighted_squares(residuals),
         "solve": lambda: lm.solve(H, g, 1e-2, np.zeros(len(g), np.bool_)),
     }
@@ -214,8 +209,8 @@ import time
 began = time.perf_counter()
 from benchmarks.fit_speed.targets import species_template
 from stream_dmr.fitting.fitter import Fitter
-from stream_dmr.fitting.compile_kernels import compile_kernels
-from stream_dmr.fitting.parameters import LOG_SIZE
+from stream_dmr.pipeline.prepare_kernels import compile_kernels
+from stream_dmr.fitting.body import LOG_SIZE
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 fitter = Fitter(species_template(), FitMeshSettings())
 ready = time.perf_counter()

@@ -9,25 +9,23 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import Camera
-from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.deformation import KINDS, deform
-from stream_dmr.fitting.parameters import (
+from stream_dmr.fitting.body import (
     JOINT_ROTATION,
     LOG_SIZE,
     NUM_PER_JOINT,
     NUM_ROOT,
     ROOT_ROTATION,
     ROOT_TRANSLATION,
+    Body,
     rest_vector,
 )
+from stream_dmr.fitting.solver.spine import KINDS, deform
 from stream_dmr.messages import CropQuality, FishCrop, Frame
-from stream_dmr.segmentation.detection.fish_detection import Detection
-from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
-from stream_dmr.segmentation.masks.cropping import crop_fish
-from stream_dmr.segmentation.masks.grabcut_segmenter import GrabCutSegmenter
+from stream_dmr.segmentation.crop import CropFishSettings, Detection, crop_fish
+from stream_dmr.segmentation.open_segmenter import GrabCutSegmenter
 from stream_dmr.simulation.rail_scene import RailScene, Visit, make_scene
 from stream_dmr.simulation.render import draw_mask
-from stream_dmr.simulation.simulated_body import (
+from stream_dmr.simulation.simulated_fish import (
     HALIBUT,
     JOINT_ARCS,
     SimulatedBody,

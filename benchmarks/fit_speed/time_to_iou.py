@@ -17,20 +17,16 @@ from jaxtyping import Float
 
 from benchmarks.fit_speed.targets import FramePair
 from benchmarks.fit_speed.timing import Duration, median_duration, time_call
-from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.cold_start import cold_starts
-from stream_dmr.fitting.contour import contour_solver
-from stream_dmr.fitting.contour.contour_solver import ContourSolver
-from stream_dmr.fitting.contour.levenberg_marquardt import Minimum
-from stream_dmr.fitting.contour.problem import Problem
-from stream_dmr.fitting.contour.scan import descend
+from stream_dmr.fitting.body import Body, MeshLevels
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fitter
-from stream_dmr.fitting.mesh_levels import MeshLevels
-from stream_dmr.fitting.paper.adam import FAR, NEAR, AdamSolver
-from stream_dmr.fitting.paper.objective import Objective, Terms
+from stream_dmr.fitting.paper.adam import FAR, NEAR, AdamSolver, Objective, Terms
+from stream_dmr.fitting.solver import contour_solver
+from stream_dmr.fitting.solver.contour_solver import ContourSolver
+from stream_dmr.fitting.solver.descent import Minimum, descend
+from stream_dmr.fitting.solver.problem import Problem
+from stream_dmr.fitting.starts import cold_starts, recentered
 from stream_dmr.fitting.target import Target
-from stream_dmr.fitting.warm_start import recentered
 from stream_dmr.template.template import Template
 
 GOAL = 0.97

@@ -19,9 +19,9 @@ import numpy as np
 
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.messages import FishCrop, Frame, Message
-from stream_dmr.recording.messages.recording_settings import RecordingSettings
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.results.frames_table import FramesTable
+from stream_dmr.recording.topics import RecordingSettings
+from stream_dmr.store.run_tables import FramesTable
 from tests.support.recorded_run import HEIGHT, WIDTH, header, run
 
 NUM_FRAMES, RATE_HZ = 90, 30

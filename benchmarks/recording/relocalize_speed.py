@@ -22,11 +22,11 @@ import numpy as np
 
 from stream_dmr.calibration.calibration_file import save_calibration
 from stream_dmr.messages import Frame, LengthEstimate, Message
+from stream_dmr.recording.codec import encode, stored_picture
 from stream_dmr.recording.mcap.mcap_sink import McapSink
-from stream_dmr.recording.messages.codec import encode, stored_picture
-from stream_dmr.recording.messages.record import Record
-from stream_dmr.recording.messages.topics import TOPICS
-from stream_dmr.recording.reading.open_recording import Recording, decoded_messages, open_recordings
+from stream_dmr.recording.reading import Recording, decoded_messages, open_recordings
+from stream_dmr.recording.record import Record
+from stream_dmr.recording.topics import TOPICS
 
 
 def main() -> None:

@@ -14,7 +14,7 @@ from benchmarks.reliability.small_scene import write_crossing_fish
 from stream_dmr.errors import SourceError
 from stream_dmr.messages import Frame
 from stream_dmr.sources.live_stream import LiveStream
-from stream_dmr.sources.read_settings import ReadFramesSettings
+from stream_dmr.sources.source import ReadFramesSettings
 from tests.support.camera import Camera
 
 KINDS = ("refused", "reset", "silent", "frozen", "resized")

@@ -15,10 +15,10 @@ from benchmarks.reliability.kills import messages, unreadable_ones
 from benchmarks.reliability.small_scene import write_crossing_fish, write_small_scene
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import Frame
-from stream_dmr.recording.segments.repair import repair_recordings
-from stream_dmr.running.measure_source import measure_source
-from stream_dmr.running.run_observer import RunObserver
-from stream_dmr.running.run_request import RunRequest
+from stream_dmr.pipeline.measure_source import measure_source
+from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.pipeline.run_options import RunRequest
+from stream_dmr.recording.repair import repair_recordings
 
 _FPS = 5  # of capture time: a new segment is tried again 5 s after one that failed
 _CONFIG = QUICK.replace("[watch]\nport = {port}\n", "").replace(

@@ -18,9 +18,9 @@ from benchmarks.reliability.camera_run import QUICK, Measurement
 from benchmarks.reliability.small_scene import write_small_scene
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import FishCrop, Frame, LengthEstimate, LocalizedFish
-from stream_dmr.recording.messages.codec import decode
-from stream_dmr.recording.reading.open_recording import open_recordings
-from stream_dmr.recording.segments.repair import repair_recordings
+from stream_dmr.recording.codec import decode
+from stream_dmr.recording.reading import open_recordings
+from stream_dmr.recording.repair import repair_recordings
 
 M = TypeVar("M", Frame, FishCrop, LocalizedFish, LengthEstimate)
 _STARTING, _RUNNING, _CUTTING = "while it starts", "while it measures", "while a segment ends"

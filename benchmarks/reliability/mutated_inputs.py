@@ -26,17 +26,17 @@ from benchmarks.reliability.mutations import (
     of_header,
 )
 from stream_dmr.calibration.calibration_file import load_calibration
+from stream_dmr.detection.given_fish import open_annotated_fish
 from stream_dmr.errors import UserError
+from stream_dmr.export.exporter import Export
 from stream_dmr.messages import Frame, Message
-from stream_dmr.recording.messages.codec import decode
-from stream_dmr.recording.reading.open_recording import open_recordings
-from stream_dmr.recording.reading.rrd_conversion import convert
-from stream_dmr.results.export_formats import Export
-from stream_dmr.running.config import load_config
-from stream_dmr.segmentation.annotations.annotated_fish import open_annotated_fish
+from stream_dmr.pipeline.config import load_config
+from stream_dmr.recording.codec import decode
+from stream_dmr.recording.reading import open_recordings
+from stream_dmr.recording.rerun.viewer import convert
 from stream_dmr.simulation import DEMO_SCENE
 from stream_dmr.sources.open_source import open_source
-from stream_dmr.sources.read_settings import ReadFramesSettings
+from stream_dmr.sources.source import ReadFramesSettings
 from stream_dmr.template.template_file import load_template
 
 _SLOW_S = 10.0

@@ -10,10 +10,10 @@ from benchmarks.reliability.camera_run import QUICK, write_pictures
 from benchmarks.reliability.small_scene import write_small_scene
 from benchmarks.reliability.soak import metrics_of
 from stream_dmr.messages import LocalizedFish, Message
-from stream_dmr.running.measure_source import RunSummary, measure_source
-from stream_dmr.running.run_observer import RunObserver
-from stream_dmr.running.run_request import RunRequest
-from stream_dmr.watch.watch_observer import WatchObserver
+from stream_dmr.pipeline.measure_source import RunSummary, measure_source
+from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.pipeline.run_options import RunRequest
+from stream_dmr.web.watch_observer import WatchObserver
 from tests.support.camera import Camera, free_port
 
 _TIMES = 3

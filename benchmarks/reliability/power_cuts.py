@@ -14,12 +14,11 @@ from benchmarks.reliability.kills import unreadable_ones
 from stream_dmr.files import TransactionalFile
 from stream_dmr.recording.mcap.mcap_recording import whole_records
 from stream_dmr.recording.mcap.mcap_sink import McapSink
-from stream_dmr.recording.messages.record import make_record
-from stream_dmr.recording.messages.recording_settings import RecordingSettings
-from stream_dmr.recording.messages.topics import TOPICS
-from stream_dmr.recording.reading.open_recording import open_recordings
-from stream_dmr.recording.segments.repair import repair_recordings
-from stream_dmr.results.length_store import LengthStore
+from stream_dmr.recording.reading import open_recordings
+from stream_dmr.recording.record import make_record
+from stream_dmr.recording.repair import repair_recordings
+from stream_dmr.recording.topics import TOPICS, RecordingSettings
+from stream_dmr.store.length_store import LengthStore
 from tests.support.final_estimates import FACTS, fish
 from tests.support.recorded_run import header, run
 

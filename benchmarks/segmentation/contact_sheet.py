@@ -19,12 +19,12 @@ import numpy as np
 from stream_dmr.messages import FishCrop, FittedMesh, Message
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
-from stream_dmr.report.view_pictures import crop_outlines, draw_outlines
-from stream_dmr.running.chain_nodes import later_nodes
-from stream_dmr.running.config import load_config
-from stream_dmr.running.pipeline import run_chain
-from stream_dmr.segmentation.tracking.fish_finder import open_finder
+from stream_dmr.pipeline.chain import run_chain
+from stream_dmr.pipeline.config import load_config
+from stream_dmr.pipeline.session import later_nodes
 from stream_dmr.template.template_file import load_template
+from stream_dmr.tracking.finder import open_finder
+from stream_dmr.web.views import crop_outlines, draw_outlines
 
 _SHOWN, _PER_ROW = 30, 10
 _TILE_PX = 160

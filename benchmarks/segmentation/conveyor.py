@@ -18,11 +18,7 @@ from jaxtyping import UInt8
 
 from benchmarks.segmentation.mask_proposer import box_of
 from benchmarks.segmentation.tracking import HEADER, MIN_VISIBLE_FRACTION, Shot, follow, table_row
-from stream_dmr.segmentation.training.annotated_images import (
-    list_images,
-    read_annotated_images,
-    read_image,
-)
+from stream_dmr.training.annotated_images import list_images, read_annotated_images, read_image
 
 _OUT_OF_WATER = ("anglers", "catfish", "counter")
 _NUM_FISH = 10

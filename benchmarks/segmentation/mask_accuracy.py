@@ -19,17 +19,17 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from stream_dmr.calibration.calibration_file import load_calibration
+from stream_dmr.detection.given_fish import open_annotated_fish
+from stream_dmr.detection.mask_folder import MaskFolder
 from stream_dmr.messages import FishCrop
+from stream_dmr.networks.onnx_session import open_session
+from stream_dmr.networks.unet_interface import SIZES_PX
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.segmentation.annotations.annotated_fish import open_annotated_fish
-from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
-from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map
-from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
-from stream_dmr.segmentation.network.onnx_session import open_session
-from stream_dmr.segmentation.network.unet_interface import SIZES_PX
-from stream_dmr.segmentation.network.unet_segmenter import SHIPPED, UNetSegmenter
+from stream_dmr.segmentation.crop import CropFishSettings
+from stream_dmr.segmentation.crop_geometry import frame_from_crop_map
+from stream_dmr.segmentation.unet_segmenter import SHIPPED, UNetSegmenter
 from stream_dmr.sources.open_source import open_source
-from stream_dmr.sources.read_settings import ReadFramesSettings
+from stream_dmr.sources.source import ReadFramesSettings
 
 _MIN_MASK_PX = 64  # of a true mask in its crop
 _SHOWN, _PER_ROW = 36, 12  # crops on the sheet: the worst third, the others at random

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from stream_dmr.segmentation.network.onnx_session import open_session
+from stream_dmr.networks.onnx_session import open_session
 
 _SIDE_PX = 320  # the network's input
 _MARGINS = (0.18, 0.4)  # around the box, of its longer side; one view each

@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from stream_dmr.segmentation.masks.masked_crop import mask_confidence, picture_sizes
-from stream_dmr.segmentation.network.unet_segmenter import SHIPPED, UNetSegmenter
+from stream_dmr.segmentation.crop import mask_confidence, picture_sizes
 from stream_dmr.segmentation.segmenter import resize
-from stream_dmr.segmentation.training.annotated_images import read_annotated_images
-from stream_dmr.segmentation.training.box_crops import crop_affine
+from stream_dmr.segmentation.unet_segmenter import SHIPPED, UNetSegmenter
+from stream_dmr.training.annotated_images import read_annotated_images
+from stream_dmr.training.samples import crop_affine
 
 _BOXES = 3  # per fish
 _MARGIN = 0.15  # as `[crop_fish] margin`

@@ -23,19 +23,19 @@ from jaxtyping import Bool
 
 from benchmarks.segmentation.mask_accuracy import iou, write_sheet
 from stream_dmr.calibration.calibration_file import load_calibration
+from stream_dmr.detection.mask_folder import MaskFolder
 from stream_dmr.evaluation.length_tables import read_truth
 from stream_dmr.messages import FishCrop, LengthEstimate, Message
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
-from stream_dmr.running.chain_nodes import later_nodes
-from stream_dmr.running.config import load_config
-from stream_dmr.running.pipeline import run_chain
-from stream_dmr.segmentation.annotations.mask_folder import MaskFolder
-from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map
-from stream_dmr.segmentation.tracking.fish_finder import open_finder
-from stream_dmr.simulation.presets import PRESETS
+from stream_dmr.pipeline.chain import run_chain
+from stream_dmr.pipeline.config import load_config
+from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.segmentation.crop_geometry import frame_from_crop_map
+from stream_dmr.simulation.rail_scene import PRESETS
 from stream_dmr.simulation.write_scene import simulate
 from stream_dmr.template.template_file import load_template
+from stream_dmr.tracking.finder import open_finder
 
 
 class ChainResult(NamedTuple):

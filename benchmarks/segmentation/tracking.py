@@ -25,16 +25,14 @@ from jaxtyping import Float, UInt8
 
 from benchmarks.segmentation.tracking_metrics import score
 from stream_dmr.camera import Camera
+from stream_dmr.detection.open_detector import DetectFishSettings, open_detector
+from stream_dmr.geometry import box_iou
 from stream_dmr.messages import Frame
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.segmentation.detection.detector import box_iou
-from stream_dmr.segmentation.detection.open_detector import DetectFishSettings, open_detector
-from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
-from stream_dmr.segmentation.tracking.tracked_fish import TrackedFish, TrackFishSettings
+from stream_dmr.segmentation.crop import CropFishSettings
 from stream_dmr.simulation.film import film
-from stream_dmr.simulation.pose_sequence import draw_poses
-from stream_dmr.simulation.presets import PRESETS
-from stream_dmr.simulation.rail_scene import RailScene, Visit, make_scene
+from stream_dmr.simulation.rail_scene import PRESETS, RailScene, Visit, draw_poses, make_scene
+from stream_dmr.tracking.finder import TrackedFish, TrackFishSettings
 
 HEADER = """\
 | scenes | IDF1 | HOTA | fish | found | ids | false | scenes counted exactly |

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from stream_dmr.csv_file import write_table
 from stream_dmr.evaluation.length_tables import LengthRow
 from stream_dmr.files import replacing
+from stream_dmr.tables import write_table
 
 CACHE = Path(__file__).parent / "cache"
 _COLUMNS = ("row", "track_id", "truth_mm", "length_mm", "std_mm", "ci95_low_mm", "ci95_high_mm")

@@ -8,9 +8,9 @@ from benchmarks.table1.filmed_scene import FilmedScene
 from stream_dmr.evaluation.length_tables import LengthRow
 from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish, Message
-from stream_dmr.running.chain_nodes import later_nodes
-from stream_dmr.running.config import Config
-from stream_dmr.running.pipeline import Node
+from stream_dmr.pipeline.chain import Node
+from stream_dmr.pipeline.config import Config
+from stream_dmr.pipeline.session import later_nodes
 from stream_dmr.template.template import Template
 
 ROWS = ("dmr", "dmr-flat")

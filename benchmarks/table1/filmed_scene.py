@@ -15,13 +15,10 @@ from jaxtyping import Float
 
 from stream_dmr.camera import Calibration, ReferencePlane
 from stream_dmr.messages import FishCrop, Frame
-from stream_dmr.segmentation.detection.fish_detection import Detection
-from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
-from stream_dmr.segmentation.masks.cropping import crop_fish
-from stream_dmr.segmentation.masks.grabcut_segmenter import GrabCutSegmenter
+from stream_dmr.segmentation.crop import CropFishSettings, Detection, crop_fish
+from stream_dmr.segmentation.open_segmenter import GrabCutSegmenter
 from stream_dmr.simulation.film import FilmedFrame, film
-from stream_dmr.simulation.pose_sequence import FPS
-from stream_dmr.simulation.rail_scene import RailScene, make_scene
+from stream_dmr.simulation.rail_scene import FPS, RailScene, make_scene
 
 FISH_PER_SCENE = 18  # 41 scenes, each with a camera and a plane of its own, are 738 fish
 FRAMES_PER_SCENE = 151  # 12 of them for each fish

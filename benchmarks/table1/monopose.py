@@ -16,8 +16,7 @@ from benchmarks.table1.filmed_scene import FilmedScene
 from benchmarks.table1.frame_lengths import fitted_mesh, measure_frames, unfitted
 from benchmarks.table1.plate import Plate, draw, pose
 from stream_dmr.evaluation.length_tables import LengthRow
-from stream_dmr.fitting.distance_map import signed_distance
-from stream_dmr.fitting.target import mask_contour
+from stream_dmr.fitting.target import mask_contour, signed_distance
 from stream_dmr.messages import FishCrop, FittedMesh
 
 ROWS = ("monopose", "monopose-flat")

@@ -16,10 +16,10 @@ from benchmarks.table1 import cached_results
 from benchmarks.table1.filmed_scene import chain_crops, table_scene
 from benchmarks.table1.tables import worst_fish
 from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
-from stream_dmr.report.view_pictures import crop_outlines, draw_outlines
-from stream_dmr.running.chain_nodes import later_nodes
-from stream_dmr.running.config import Config
+from stream_dmr.pipeline.config import Config
+from stream_dmr.pipeline.session import later_nodes
 from stream_dmr.simulation.film import film
+from stream_dmr.web.views import crop_outlines, draw_outlines
 
 _NUM_FISH, _NUM_FRAMES, _TILE_PX = 5, 6, 170
 OUT = Path(__file__).parents[2] / "docs" / "images" / "table1_worst.jpg"

@@ -1,1 +1,1 @@
-"""Many videos from a manifest, on all cores or on a Ray cluster, as one data set."""
+"""Measure many videos, in local processes or on a Ray cluster."""

@@ -13,19 +13,19 @@ from typing import Any
 
 from pyarrow import Table, parquet
 
-from stream_dmr.batch.layout import TABLE_KINDS, dataset_file
 from stream_dmr.batch.manifest import Job
 from stream_dmr.errors import OutputError
+from stream_dmr.evidence.seal import add_files
+from stream_dmr.export.fish_table import FISH_TABLE, arrow_schema, fish_records
 from stream_dmr.files import replacing
-from stream_dmr.results.finished_fish import FishResult, read_fish
-from stream_dmr.results.fish_table import FISH_TABLE, arrow_schema, fish_records
-from stream_dmr.results.frames_table import FRAMES_COLUMNS
-from stream_dmr.results.lengths_database import NAME as DATABASE
-from stream_dmr.results.lost_recording import open_results
-from stream_dmr.results.provenance import add_files
-from stream_dmr.results.scale_checks import last_checks
-from stream_dmr.results.verdicts_table import read_verdicts
-from stream_dmr.running.config import load_config
+from stream_dmr.pipeline.config import load_config
+from stream_dmr.store.batch_folder import TABLE_KINDS, dataset_file
+from stream_dmr.store.fish import FishResult, read_fish
+from stream_dmr.store.open_results import open_results
+from stream_dmr.store.run_tables import FRAMES_COLUMNS
+from stream_dmr.store.scale_checks import last_checks
+from stream_dmr.store.schema import NAME as DATABASE
+from stream_dmr.store.verdicts import read_verdicts
 
 _PARTITIONS = ("vessel", "trip")
 _TABLE_SUFFIXES = (".parquet", ".part")  # whole, and while it is written

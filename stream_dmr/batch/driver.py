@@ -6,13 +6,19 @@ Each video gets a folder of its own; videos.csv and the Parquet data set follow 
 import shutil
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 from stream_dmr.batch.dataset import publish, withdraw_others
-from stream_dmr.batch.engine import Engine
-from stream_dmr.batch.layout import (
+from stream_dmr.batch.manifest import Job
+from stream_dmr.batch.measure_video import BatchProgress, Outcome, finish_folder, read_outcome
+from stream_dmr.errors import OutputError, UserError, reason_of
+from stream_dmr.evidence.own_files import has_run_name
+from stream_dmr.evidence.seal import seal_files
+from stream_dmr.files import make_folder, replacing, require_unlocked
+from stream_dmr.store.batch_folder import (
     DONE,
     OUTCOME,
     OUTCOME_COLUMNS,
@@ -23,16 +29,20 @@ from stream_dmr.batch.layout import (
     results_folder,
     unfinished_folder,
 )
-from stream_dmr.batch.manifest import Job
-from stream_dmr.batch.measure_video import Outcome, finish_folder, read_outcome
-from stream_dmr.batch.progress import BatchProgress
-from stream_dmr.csv_file import write_table
-from stream_dmr.errors import OutputError, UserError, reason_of
-from stream_dmr.files import make_folder, replacing
-from stream_dmr.results.folder_lock import require_unlocked
-from stream_dmr.results.lengths_database import NAME as DATABASE
-from stream_dmr.results.own_files import has_run_name
-from stream_dmr.results.provenance import seal_files
+from stream_dmr.store.schema import NAME as DATABASE
+from stream_dmr.tables import write_table
+
+
+@runtime_checkable
+class Engine(Protocol):
+    """Measures the videos of several jobs, each by `measure_video`."""
+
+    def outcomes(
+        self, jobs: Sequence[Job], out: Path, *, stop: threading.Event, progress: BatchProgress
+    ) -> Iterator[Outcome]:
+        """Yield the outcome of each job when it ends; setting `stop` ends those that run."""
+        ...
+
 
 _LOCK_PATIENCE_S = 10.0  # a killed process may hold its folder while the kernel ends it; generous
 _LOCK_POLL_S = 0.1
@@ -95,7 +105,7 @@ class _BatchResults:
         self.outcomes = {name: one for name, one in known.items() if one and one.status == DONE}
         for job in self._done():
             try:
-                publish(results_folder(job, out), job, out)
+                publish(results_folder(job.name, out), job, out)
             except (UserError, OSError) as error:  # a file of its results is damaged or gone
                 log(f"{job.name}: its tables stay as they were: {reason_of(error)}")
         self._write_table()
@@ -104,7 +114,7 @@ class _BatchResults:
         """Record what became of a video."""
         self.outcomes[job.name] = outcome
         if outcome.status == DONE:
-            publish(results_folder(job, self._out), job, self._out)
+            publish(results_folder(job.name, self._out), job, self._out)
         else:
             _record_failure(job, self._out, outcome)
             self._log(f"{outcome.name}: failed: {outcome.reason}")
@@ -140,9 +150,9 @@ def _require_own_folders(jobs: Sequence[Job], out: Path) -> None:
 
     It may be the very folder of pictures, or that of a video, that the manifest names.
     """
-    results = [results_folder(job, out) for job in jobs]
+    results = [results_folder(job.name, out) for job in jobs]
     strange = [f for f in results if f.exists() and not (f / OUTCOME).exists()]
-    for folder in strange + [unfinished_folder(job, out) for job in jobs]:
+    for folder in strange + [unfinished_folder(job.name, out) for job in jobs]:
         if folder.is_file() or (folder.exists() and any(folder.iterdir())):
             raise OutputError(
                 f"{folder}: expected a folder that the batch made, or none, got one with other "
@@ -177,6 +187,6 @@ def _remove_unfinished(out: Path) -> None:
 def _record_failure(job: Job, out: Path, outcome: Outcome) -> None:
     """Write the outcome of a video whose process died before it could."""
     if read_outcome(job, out) is None:
-        folder = unfinished_folder(job, out)
+        folder = unfinished_folder(job.name, out)
         shutil.rmtree(folder, ignore_errors=True)
-        finish_folder(folder, results_folder(job, out), outcome)
+        finish_folder(folder, results_folder(job.name, out), outcome)

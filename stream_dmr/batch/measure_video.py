@@ -1,16 +1,24 @@
-"""Measures one video of a batch: its folder appears complete, or not at all."""
+"""Measure one video of a batch into its folder."""
 
 import json
+import math
 import shutil
 import threading
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from stream_dmr.batch.dataset import write_tables
-from stream_dmr.batch.layout import (
+from stream_dmr.batch.manifest import Job
+from stream_dmr.errors import UserError
+from stream_dmr.evidence.seal import add_files
+from stream_dmr.files import rename_durably
+from stream_dmr.pipeline.measure_source import measure_source
+from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.pipeline.run_options import RunRequest, command_of
+from stream_dmr.store.batch_folder import (
     DONE,
     FAILED,
     FAILED_OUTCOME,
@@ -18,16 +26,59 @@ from stream_dmr.batch.layout import (
     results_folder,
     unfinished_folder,
 )
-from stream_dmr.batch.manifest import Job
-from stream_dmr.batch.progress import OnProgress
-from stream_dmr.errors import UserError
-from stream_dmr.files import rename_durably
-from stream_dmr.results.finished_fish import run_notes
-from stream_dmr.results.provenance import add_files
-from stream_dmr.running.measure_source import measure_source
-from stream_dmr.running.run_observer import RunObserver
-from stream_dmr.running.run_request import RunRequest, command_of
-from stream_dmr.watch.watch_observer import WatchObserver
+from stream_dmr.store.fish import run_notes
+from stream_dmr.web.watch_observer import WatchObserver
+
+_LOG_EVERY_S = 5.0  # between two lines of progress
+_MIN_SHARE = 0.01  # of the work, before a pace is estimated: the first frames also load and compile
+OnProgress = Callable[[float], None]  # takes the share of one video that is done, 0 to 1
+
+
+class BatchProgress:
+    """Progress over all videos by their bytes; logs a line now and then."""
+
+    def __init__(self, jobs: Sequence[Job], log: Callable[[str], None]) -> None:
+        self._bytes = {job.name: max(1, job.num_bytes) for job in jobs}
+        self._shares = dict.fromkeys(self._bytes, 0.0)
+        self._finished = set[str]()
+        self._log = log
+        self._began = self._logged = time.monotonic()
+
+    def of(self, job: Job) -> OnProgress:
+        """The function that takes the share done of one video, from any thread."""
+
+        def take(share: float) -> None:
+            self._shares[job.name] = share
+
+        return take
+
+    def finish(self, name: str) -> None:
+        """Count a video as over, measured or failed."""
+        self._finished.add(name)
+        self._shares[name] = 1.0
+        self._logged = -math.inf  # so that the next `update` says so
+
+    def update(self) -> None:
+        """Log a line if one is due."""
+        now = time.monotonic()
+        if now - self._logged >= _LOG_EVERY_S:
+            self._logged = now
+            self._log(self.line(now - self._began))
+
+    def line(self, elapsed_s: float) -> str:
+        """The videos over, the share of all bytes, and the time left at the pace so far."""
+        total = max(1, sum(self._bytes.values()))
+        share = sum(self._bytes[name] * done for name, done in self._shares.items()) / total
+        left = duration(elapsed_s * (1 - share) / share) if share >= _MIN_SHARE else "unknown"
+        over = len(self._finished)
+        return f"{over} of {len(self._bytes)} videos, {100 * share:.0f} %, time left: {left}"
+
+
+def duration(seconds: float) -> str:
+    """Seconds as text in s, min or h; two units would say more than an estimate knows."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +103,7 @@ class Outcome:
 
 def read_outcome(job: Job, out: Path) -> Outcome | None:
     """The outcome of a job from an earlier call; None where it has none or its inputs changed."""
-    folder, key = results_folder(job, out), job.key
+    folder, key = results_folder(job.name, out), job.key
     outcomes = (_read_file(folder / name) for name in (OUTCOME, FAILED_OUTCOME))
     return next((one for one in outcomes if one is not None and one.key == key), None)
 
@@ -70,7 +121,7 @@ def measure_video(job: Job, out: Path, *, on_progress: OnProgress = lambda share
     The run writes to a folder of another name, which is renamed at the end: a killed process leaves
     nothing that looks finished.
     """
-    target, folder = results_folder(job, out), unfinished_folder(job, out)
+    target, folder = results_folder(job.name, out), unfinished_folder(job.name, out)
     began, key = time.perf_counter(), job.key
     folder.parent.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(folder, ignore_errors=True)
@@ -126,7 +177,7 @@ def request_of(job: Job, out: Path) -> RunRequest:
     """The run that measures a video of the batch in `out`, with its command as a user types it."""
     request = RunRequest(
         source=job.video,
-        out=results_folder(job, out),
+        out=results_folder(job.name, out),
         calibration=_path(job.calibration),
         boxes=_path(job.boxes),
         masks=_path(job.masks),
@@ -139,7 +190,7 @@ def request_of(job: Job, out: Path) -> RunRequest:
         nmea=job.nmea or None,
         start_utc=job.start_utc,
     )
-    return replace(command_of(request), out=unfinished_folder(job, out))
+    return replace(command_of(request), out=unfinished_folder(job.name, out))
 
 
 def _path(text: str) -> Path | None:

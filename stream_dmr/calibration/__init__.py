@@ -1,1 +1,1 @@
-"""The camera's lens and the reference plane, from pictures of a chessboard."""
+"""The lens of a camera and the reference plane."""

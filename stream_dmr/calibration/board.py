@@ -1,24 +1,26 @@
-"""Calibrates a camera and its reference plane from photographs of a board."""
+"""Calibrate a camera from pictures of a board."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
-from stream_dmr.calibration.corners import draw_corners, read_grey
-from stream_dmr.calibration.lens_choice import (
+from stream_dmr.calibration.corners import BoardCorners, PrintedBoard, draw_corners, read_grey
+from stream_dmr.calibration.known_length import require_ends
+from stream_dmr.calibration.lens import (
+    BoardView,
     LeftOut,
+    LensFit,
     LensModel,
     choose_fit,
     quality_warnings,
+    require_determined,
     require_views,
 )
 from stream_dmr.calibration.lens_file import LensFile
-from stream_dmr.calibration.lens_fit import BoardView, LensFit, require_determined
-from stream_dmr.calibration.printed_board import BoardCorners, PrintedBoard
-from stream_dmr.camera import Calibration
+from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.errors import CalibrationError, OutputError
 
 _SAME_VIEW = 0.01  # of the picture's diagonal, chosen: closer boards add no information
@@ -175,3 +177,36 @@ def _refuse_same_view(
         here, there = found.shared_with(other)
         if len(here) and np.linalg.norm(here - there, axis=1).max() < _SAME_VIEW * diagonal_px:
             raise CalibrationError(f"almost the same view as {path.name}")
+
+
+_FILM_DIAGONAL_MM = 43.27  # of a picture on 35 mm film, 36 x 24 mm
+_LEAST_FOCAL_MM, _LARGEST_FOCAL_MM = 8, 1000  # wider lenses are no pinholes
+
+
+def camera_of_focal_35mm(focal_mm: float, *, width: int, height: int) -> Camera:
+    """The pinhole of a focal length as on 35 mm film, by the picture's diagonal.
+
+    Raises CalibrationError where no pinhole has it.
+    """
+    if not _LEAST_FOCAL_MM <= focal_mm <= _LARGEST_FOCAL_MM:
+        raise CalibrationError(
+            f"--focal-35mm: expected {_LEAST_FOCAL_MM} to {_LARGEST_FOCAL_MM} mm, got {focal_mm:g}"
+        )
+    focal_px = focal_mm / _FILM_DIAGONAL_MM * float(np.hypot(width, height))
+    K = np.diag([focal_px, focal_px, 1.0])
+    K[:2, 2] = (width - 1) / 2, (height - 1) / 2
+    return Camera(width=width, height=height, K=K, distortion=np.zeros(5))
+
+
+def calibrate_squarely(
+    ends_px: Float[np.ndarray, "2 2"], length_mm: float, camera: Camera
+) -> Calibration:
+    """A plane at a right angle to the camera's axis on which two pixels are so far apart.
+
+    Raises CalibrationError for ends that are no two points of the picture, or no length.
+    """
+    require_ends(ends_px, length_mm, camera)
+    rays = camera.back_project(ends_px)  # at depth 1
+    depth_mm = length_mm / float(np.linalg.norm(rays[1] - rays[0]))
+    plane = ReferencePlane(rotation=np.eye(3), translation_mm=np.array([0.0, 0.0, depth_mm]))
+    return Calibration(camera=camera, plane=plane)

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.calibration.calibration_values import CALIBRATE, read_values
-from stream_dmr.calibration.lens_check import require_lens
+from stream_dmr.calibration.calibration_values import CALIBRATE, read_values, require_lens
 from stream_dmr.calibration.lens_file import lens_of, load_lens, read_array, with_common_names
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.errors import CalibrationError, OutputError

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial.distance import pdist
 
-from stream_dmr.calibration.printed_board import PrintedBoard
+from stream_dmr.calibration.corners import PrintedBoard
 from stream_dmr.camera import Calibration, Camera
 from stream_dmr.errors import CalibrationError
 

@@ -1,1 +1,1 @@
-"""The commands of `stream-dmr`: one file per command, shared options, terminal display."""
+"""The commands of `stream-dmr`, one file per group."""

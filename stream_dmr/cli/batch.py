@@ -19,7 +19,7 @@ from stream_dmr.cli.shared_options import (
 )
 
 if TYPE_CHECKING:
-    from stream_dmr.batch.engine import Engine
+    from stream_dmr.batch.driver import Engine
 
 Engines = Literal["local", "ray"]
 
@@ -62,14 +62,14 @@ def batch(
     """
     with stop_on_signals() as stop:
         from stream_dmr.batch.driver import run_batch
-        from stream_dmr.batch.layout import VIDEOS, read_videos
         from stream_dmr.batch.manifest import read_manifest, repeated_videos
-        from stream_dmr.batch.progress import duration
+        from stream_dmr.batch.measure_video import duration
         from stream_dmr.cli.terminal import counts_text
         from stream_dmr.fitting.shape.candidates import load_shapes
-        from stream_dmr.results.signatures import Signer
-        from stream_dmr.running.config import load_config
-        from stream_dmr.running.species_checks import require_known_species
+        from stream_dmr.pipeline.config import load_config
+        from stream_dmr.pipeline.run_inputs import require_known_species
+        from stream_dmr.store.batch_folder import VIDEOS, read_videos
+        from stream_dmr.store.ledger import Signer
 
         if key is not None:
             Signer(key)  # refuses what is no key before any video
@@ -104,11 +104,11 @@ def batch(
 @contextmanager
 def _engine(name: str, workers: int, address: str | None, gpus: float) -> Generator["Engine"]:
     if name == "local":
-        from stream_dmr.batch.local_engine import LocalEngine
+        from stream_dmr.batch.engines import LocalEngine
 
         yield LocalEngine(workers or os.cpu_count() or 1)
         return
-    from stream_dmr.batch.ray_engine import RayEngine
+    from stream_dmr.batch.engines import RayEngine
 
     with closing(RayEngine(address=address, gpus=gpus)) as engine:
         yield engine

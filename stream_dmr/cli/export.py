@@ -15,7 +15,7 @@ from stream_dmr.cli.shared_options import (
     warn,
 )
 from stream_dmr.errors import UserError
-from stream_dmr.results.export_choices import Agency, MeshFormat, TableFormat
+from stream_dmr.export.export_choices import Agency, MeshFormat, TableFormat
 
 
 def export(
@@ -71,9 +71,9 @@ def export(
             "expected a choice of what to export, got none; give some of: "
             "--fish csv, --meshes ply, --masks, --tables csv, --viame, --hauls, --agency wcpfc"
         )
-    from stream_dmr.results.export_formats import Export
-    from stream_dmr.results.finished_fish import run_notes
-    from stream_dmr.running.species_checks import species_notes
+    from stream_dmr.export.exporter import Export
+    from stream_dmr.pipeline.run_inputs import species_notes
+    from stream_dmr.store.fish import run_notes
 
     exported = Export(recording, parse_selection(time, track), overwrite=overwrite)
     exported.claim(out)

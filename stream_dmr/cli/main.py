@@ -13,24 +13,16 @@ from typing import Annotated, Any
 import typer
 
 from stream_dmr.cli.batch import batch
-from stream_dmr.cli.calibrate import calibrate
-from stream_dmr.cli.check import check
-from stream_dmr.cli.demo import demo
-from stream_dmr.cli.evaluate import evaluate
+from stream_dmr.cli.calibrate import calibrate, check
 from stream_dmr.cli.export import export
-from stream_dmr.cli.fleet import fleet
-from stream_dmr.cli.haul import haul
-from stream_dmr.cli.keygen import keygen
-from stream_dmr.cli.learn import learn_template
-from stream_dmr.cli.make_template import make_template
-from stream_dmr.cli.recover import recover
 from stream_dmr.cli.replay import replay
-from stream_dmr.cli.report import report, verify
 from stream_dmr.cli.review import agreement, review
-from stream_dmr.cli.run import run
-from stream_dmr.cli.setup import setup
+from stream_dmr.cli.run import demo, recover, run, setup
 from stream_dmr.cli.shared_options import OverwriteOption
-from stream_dmr.cli.train import train
+from stream_dmr.cli.templates import learn_template, make_template
+from stream_dmr.cli.train import evaluate, train
+from stream_dmr.cli.verify import keygen, report, verify
+from stream_dmr.cli.vessel import fleet, haul
 from stream_dmr.cli.view import convert, view
 from stream_dmr.errors import UserError
 from stream_dmr.version import __version__
@@ -146,7 +138,7 @@ def simulate_command(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make a scene of hooked fish with known lengths: video, boxes, masks, calibration, truth."""
-    from stream_dmr.results.own_files import require_writable
+    from stream_dmr.evidence.own_files import require_writable
     from stream_dmr.simulation import scene_files, simulate
 
     names = scene_files(species)

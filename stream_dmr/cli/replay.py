@@ -61,8 +61,8 @@ def replay(
 ) -> None:
     """Recompute a recording from one stage on, with its own inputs or with others."""
     from stream_dmr.cli.terminal import RunDisplay, print_check, print_replay
-    from stream_dmr.replaying.replay_recording import replay as replay_recording
-    from stream_dmr.replaying.replay_request import ReplayRequest
+    from stream_dmr.pipeline.replay_recording import replay as replay_recording
+    from stream_dmr.pipeline.run_options import ReplayRequest
 
     request = ReplayRequest(
         recordings=recordings,

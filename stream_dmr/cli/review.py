@@ -51,9 +51,8 @@ def review(
         from getpass import getuser
 
         from stream_dmr.errors import UserError
-        from stream_dmr.report.open_reports import open_folders
-        from stream_dmr.review.review_queue import AuditSample, ReviewQueue
-        from stream_dmr.review.review_server import ReviewServer
+        from stream_dmr.web.open_reports import open_folders
+        from stream_dmr.web.review_queue import AuditSample, ReviewQueue, ReviewServer
 
         reports, notes = open_folders(folders, source=source, config=config, as_measured=blind)
         for line in notes:
@@ -76,8 +75,8 @@ def review(
 
 def agreement(folders: _Folders) -> None:
     """Say how well the review and blind readings agree: decisions, species, lengths."""
-    from stream_dmr.report.open_reports import run_folders
-    from stream_dmr.review.agreement import MEASUREMENT, agreements
+    from stream_dmr.web.agreement import MEASUREMENT, agreements
+    from stream_dmr.web.open_reports import run_folders
 
     for pair in agreements(run_folders(folders)):
         print(f"{pair.first} and {pair.second}:")

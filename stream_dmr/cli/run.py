@@ -1,5 +1,9 @@
-"""`stream-dmr run`: the main job."""
+"""The commands that measure: `run`, `demo`, `setup`, `recover`."""
 
+import os
+import shlex
+import sys
+import time
 from contextlib import nullcontext
 from enum import StrEnum
 from pathlib import Path
@@ -10,15 +14,16 @@ import typer
 from stream_dmr.cli.shared_options import (
     ConfigOption,
     KeyOption,
+    OverwriteOption,
     TemplateOption,
     command_line,
     importing,
     stop_on_signals,
 )
-from stream_dmr.running.run_request import RunRequest, default_out
+from stream_dmr.pipeline.run_options import RunRequest, default_out
 
 if TYPE_CHECKING:
-    from stream_dmr.running.measure_source import RunSummary
+    from stream_dmr.pipeline.measure_source import RunSummary
 
 
 class Pose(StrEnum):
@@ -103,9 +108,8 @@ def run(
     with stop_on_signals() as stop, decoding_ahead(Path(source)) if is_file else nullcontext():
         with importing():  # a second and a half
             from stream_dmr.cli.terminal import RunDisplay
-            from stream_dmr.running.measure_source import measure_source
-            from stream_dmr.watch.json_log import JsonLog
-            from stream_dmr.watch.watch_observer import WatchObserver
+            from stream_dmr.pipeline.measure_source import measure_source
+            from stream_dmr.web.watch_observer import JsonLog, WatchObserver
 
         request = RunRequest(
             source=source,
@@ -148,3 +152,104 @@ def _print_summary(summary: "RunSummary", out: Path, *, timings: bool) -> None:
         distance_m = summary.calibration.plane.distance_mm / 1000
         print(f"by the calibration the reference plane is {distance_m:.2f} m from the camera")
     print(f"results in {out}: {', '.join(path.name for path in summary.files)}")
+
+
+def demo(
+    out: Annotated[
+        Path, typer.Option(help="Folder for the results; those of an earlier demo are replaced.")
+    ] = Path("runs/demo"),
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Measure the fish of the embedded scene from its video, and print the true lengths beside.
+
+    Exits with 1 where a fish was not measured.
+    """
+    from stream_dmr.simulation import DEMO_SCENE
+
+    source, calibration = DEMO_SCENE / "video.mp4", DEMO_SCENE / "calibration.yaml"
+    template = DEMO_SCENE / "species.ply"
+    arguments = ["--source", source, "--calibration", calibration, "--template", template]
+    print(shlex.join(["stream-dmr", "run", *map(str, arguments), "--out", str(out)]), flush=True)
+    run(
+        source=str(source),
+        calibration=calibration,
+        template=str(template),
+        out=out,
+        overwrite=overwrite or _is_of_demo(out),
+    )
+    all_measured = print_beside_truth(out / "lengths.csv", DEMO_SCENE / "truth.csv")
+    program = os.path.relpath(Path(sys.executable).with_name("stream-dmr"))  # venv not activated
+    print(f"\nlook at it: {program} view {out}")
+    if not all_measured:
+        print("error: a fish of the scene was not measured", file=sys.stderr)
+        raise typer.Exit(1)
+
+
+def _is_of_demo(out: Path) -> bool:
+    """True for a folder whose results are those of earlier demos alone."""
+    from stream_dmr.errors import OutputError
+    from stream_dmr.store.fish import database_of, read_runs
+
+    database = database_of(out)
+    try:
+        runs = {} if database is None else read_runs(database)
+    except OutputError:
+        return False
+    commands = [f"{facts.command} " for facts in runs.values()]
+    return bool(commands) and all(one.startswith("stream-dmr demo ") for one in commands)
+
+
+def print_beside_truth(lengths: Path, truth: Path) -> bool:
+    """Print measured lengths beside the true ones; True if every fish was measured.
+
+    Fish are compared by track_id: here both count them in the order in which they come into view.
+    """
+    from stream_dmr.cli.terminal import print_evaluation
+    from stream_dmr.evaluation.compare import evaluate
+
+    evaluation = evaluate(lengths, truth)
+    print("\nbeside the truth:\n")
+    print_evaluation(evaluation)
+    return evaluation.fraction_measured == 1.0
+
+
+def setup() -> None:
+    """Compile the numeric loops, so that the first run need not; a run does it by itself else."""
+    from rich.console import Console
+
+    from stream_dmr.cli.shared_options import stop_on_signals
+    from stream_dmr.pipeline.prepare_kernels import prepare_kernels
+
+    began, console = time.monotonic(), Console(stderr=True, highlight=False)
+    with stop_on_signals() as stop, console.status("") as status:
+        said = list[str]()
+
+        def say(line: str) -> None:
+            """Draw it on a terminal; elsewhere print the first line alone."""
+            if not console.is_terminal and not said:
+                console.print(line, markup=False)
+            said.append(line)
+            status.update(line)
+
+        prepare_kernels(say, stop=stop)
+    stop.exit()
+    print(f"ready, after {time.monotonic() - began:.0f} s")
+
+
+def recover(
+    folder: Annotated[Path, typer.Argument(help="The folder of a run.", metavar="DIR")],
+    key: KeyOption = None,
+) -> None:
+    """Repair recordings that a crash or a power cut left unfinished.
+
+    `run` does it by itself when it starts. Lengths that a full disk kept out of lengths.db are
+    taken over from the recordings. With --key what was repaired is signed as found after a crash.
+    """
+    from stream_dmr.pipeline.run_folder import recover_folder
+
+    count = 0
+    for line in recover_folder(folder, key=key):
+        print(line)
+        count += 1
+    if not count:
+        print(f"{folder}: nothing to repair")

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stream_dmr.errors import UserError
-from stream_dmr.running.run_request import without_password
+from stream_dmr.pipeline.run_options import without_password
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from stream_dmr.recording.messages.selection import Selection
-    from stream_dmr.running.config import Config
+    from stream_dmr.pipeline.config import Config
+    from stream_dmr.recording.selection import Selection
 
 TemplateOption = Annotated[
     str,
@@ -82,7 +82,7 @@ def warn(lines: Iterable[str]) -> None:
 
 def parse_selection(time: str | None, track: list[int] | None) -> "Selection":
     """The part of a recording that --time and --track ask for."""
-    from stream_dmr.recording.messages.selection import Selection
+    from stream_dmr.recording.selection import Selection
 
     time_s = None if time is None else _parse_time(time)
     return Selection.from_seconds(time_s, frozenset(track) if track else None)
@@ -90,7 +90,7 @@ def parse_selection(time: str | None, track: list[int] | None) -> "Selection":
 
 def settings_of(config: Path | None, recorded_toml: str, recording: Path) -> "Config":
     """The settings that --config gives, else those that a recording holds."""
-    from stream_dmr.running.config import load_config, parse_config
+    from stream_dmr.pipeline.config import load_config, parse_config
 
     if config is not None:
         return load_config(config)

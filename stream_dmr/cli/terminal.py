@@ -13,10 +13,10 @@ from rich.table import Table
 
 from stream_dmr.evaluation.compare import Distributions, Evaluation, distribution_rows, summary_rows
 from stream_dmr.messages import LengthEstimate, Message
-from stream_dmr.replaying.replay_recording import LENGTH_TOLERANCE, ReplaySummary
-from stream_dmr.results.store_rows import MAY_COUNT_TWICE
-from stream_dmr.running.measure_source import RunSummary
-from stream_dmr.running.run_observer import RunObserver
+from stream_dmr.pipeline.measure_source import RunSummary
+from stream_dmr.pipeline.replay_recording import LENGTH_TOLERANCE, ReplaySummary
+from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.store.schema import MAY_COUNT_TWICE
 
 _LINE_EVERY_S = 10.0  # where there is no terminal to draw a bar on
 _PLAIN_WIDTH = 120

@@ -1,11 +1,12 @@
-"""`stream-dmr train`: weights of the U-Net that finds masks, also for one's own vessel."""
+"""The commands `train` and `evaluate`."""
 
+import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from stream_dmr.cli.shared_options import OverwriteOption, command_line, stop_on_signals
+from stream_dmr.cli.shared_options import OverwriteOption, command_line, stop_on_signals, warn
 from stream_dmr.errors import UserError
 
 Device = Literal["cpu", "cuda"]
@@ -50,13 +51,9 @@ def train(
         raise UserError("--backgrounds needs your own fish: give --images and --masks")
     with stop_on_signals() as stop:
         from stream_dmr.cli.train_display import TrainDisplay
-        from stream_dmr.results.own_files import require_writable
-        from stream_dmr.running.config import load_config
-        from stream_dmr.segmentation.training.train_unet import (
-            TRAINING_FILES,
-            TrainRequest,
-            train_unet,
-        )
+        from stream_dmr.evidence.own_files import require_writable
+        from stream_dmr.pipeline.config import load_config
+        from stream_dmr.training.train_unet import TRAINING_FILES, TrainRequest, train_unet
 
         if not resume and not (out / "last.pt").exists():  # else it refuses the earlier training
             require_writable(*(out / name for name in TRAINING_FILES), overwrite=overwrite)
@@ -77,3 +74,65 @@ def train(
     if best is not None:
         print(f"best: epoch {best.epoch}, mean IoU {best.iou:.3f}; {out / 'unet.onnx'}")
     stop.exit("; --resume continues")
+
+
+_NOT_THE_SAME_IDS = (
+    "the run numbered its fish in the order in which it found them; where the truth numbers them "
+    "differently, different fish are compared: run with the truth's --boxes or --masks, or compare "
+    "the distributions only"
+)
+
+
+def evaluate(
+    lengths: Annotated[Path, typer.Option(help="lengths.csv of a run.")],
+    truth: Annotated[
+        Path,
+        typer.Option(
+            help="truth.csv with track_id,length_mm; or a histogram with bin_low_mm,bin_high_mm "
+            "and count or share."
+        ),
+    ],
+    config: Annotated[
+        Path | None, typer.Option(help="A config.toml; its [evaluate] has the bins.")
+    ] = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(
+            help="Where to draw both histograms.",
+            show_default="lengths_histogram.png beside lengths",
+        ),
+    ] = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Compare measured lengths with known ones: fish by fish, as intervals, as distributions."""
+    from stream_dmr.cli.terminal import print_distributions, print_evaluation
+    from stream_dmr.errors import OutputError
+    from stream_dmr.evaluation.compare import evaluate, evaluate_histogram, plot_histograms
+    from stream_dmr.evaluation.length_tables import is_histogram
+    from stream_dmr.evidence.own_files import is_made_by, require_writable
+    from stream_dmr.pipeline.config import load_config
+    from stream_dmr.store.fish import numbers_its_own
+
+    settings = load_config(config).evaluate
+    if not is_histogram(truth) and numbers_its_own(lengths.parent):
+        warn([_NOT_THE_SAME_IDS])
+    if is_histogram(truth):
+        distributions = evaluate_histogram(lengths, truth, settings=settings)
+        print_distributions(distributions)
+    else:
+        evaluation = evaluate(lengths, truth, settings=settings)
+        print_evaluation(evaluation)
+        distributions = evaluation.distributions
+    if distributions is None:
+        print("no histograms: no measured or no true length within the bins of [evaluate]")
+        return
+    picture = plot or lengths.with_name(f"{lengths.stem}_histogram.png")
+    try:
+        require_writable(picture, overwrite=overwrite, is_own=is_made_by("evaluate"))
+        plot_histograms(picture, distributions)
+    except OutputError as error:
+        if plot is not None:
+            raise
+        print(f"not drawn: {error}; choose another place with --plot", file=sys.stderr)
+    else:
+        print(f"both histograms: {picture}")

@@ -3,9 +3,9 @@
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from stream_dmr.segmentation.training.train_settings import TrainSettings
-from stream_dmr.segmentation.training.train_unet import TrainObserver
-from stream_dmr.segmentation.training.unet_trainer import EpochScores
+from stream_dmr.training.train_settings import TrainSettings
+from stream_dmr.training.train_unet import TrainObserver
+from stream_dmr.training.unet_trainer import EpochScores
 
 
 class TrainDisplay(TrainObserver):

@@ -19,7 +19,7 @@ from stream_dmr.cli.shared_options import (
 )
 
 if TYPE_CHECKING:
-    from stream_dmr.recording.messages.selection import Selection
+    from stream_dmr.recording.selection import Selection
 
 _Source = Annotated[
     str | None,
@@ -53,8 +53,8 @@ def view(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Look at a recording, or a part of it: frame, 3D scene, lengths, IoU, timings and events."""
+    from stream_dmr.evidence.own_files import require_writable
     from stream_dmr.recording.rerun import viewer
-    from stream_dmr.results.own_files import require_writable
 
     if screenshot is not None:
         require_writable(screenshot, overwrite=overwrite)
@@ -76,8 +76,7 @@ def view(
 def _require_frame(recording: Path, frame_index: int, selection: "Selection") -> None:
     """Raise UserError where a recording lacks a frame; a view without messages may have it."""
     from stream_dmr.errors import RecordingError
-    from stream_dmr.recording.reading.open_recording import open_recordings
-    from stream_dmr.recording.reading.required_parts import require_frame
+    from stream_dmr.recording.reading import open_recordings, require_frame
 
     try:
         opened = open_recordings([recording])
@@ -107,7 +106,7 @@ def convert(
         recording / "recording.rrd" if recording.is_dir() else recording.with_suffix(".rrd")
     )
     from stream_dmr.errors import UserError
-    from stream_dmr.results.own_files import require_writable
+    from stream_dmr.evidence.own_files import require_writable
 
     require_writable(rrd, overwrite=overwrite)
     if rrd.suffix != ".rrd":
@@ -125,12 +124,11 @@ def _convert(
     full_size: bool = False,
 ) -> None:
     from stream_dmr.errors import RecordingError
-    from stream_dmr.recording.reading.frame_images import open_pictures
-    from stream_dmr.recording.reading.open_recording import open_recordings
-    from stream_dmr.recording.reading.recorded_settings import recorded_settings
-    from stream_dmr.recording.reading.rrd_conversion import EVERY_FRAME
-    from stream_dmr.recording.reading.rrd_conversion import convert as convert_recording
-    from stream_dmr.sources.read_settings import ReadFramesSettings
+    from stream_dmr.recording.frame_images import open_pictures
+    from stream_dmr.recording.reading import open_recordings, recorded_settings
+    from stream_dmr.recording.rerun.viewer import EVERY_FRAME
+    from stream_dmr.recording.rerun.viewer import convert as convert_recording
+    from stream_dmr.sources.source import ReadFramesSettings
 
     if recording.resolve() == rrd.resolve():
         raise RecordingError(f"{rrd}: expected another file to write to; choose one with --out")

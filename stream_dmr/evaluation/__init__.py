@@ -1,1 +1,1 @@
-"""Measured lengths compared with known ones: metrics, tables, plots."""
+"""Compare measured lengths with known ones."""

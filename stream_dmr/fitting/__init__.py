@@ -1,1 +1,1 @@
-"""The deformable mesh: its parameters, its solvers and its fit to a mask."""
+"""Fit a mesh to a crop: solver/ is compiled, shape/ learns, paper/ is the reference in torch."""

@@ -6,12 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
-from stream_dmr.fitting.parameters import (
-    JOINT_ROTATION,
-    JOINT_WEIGHT,
-    NUM_PER_JOINT,
-    Priors,
-)
+from stream_dmr.fitting.body import JOINT_ROTATION, JOINT_WEIGHT, NUM_PER_JOINT, Priors
 from stream_dmr.settings import Settings
 
 

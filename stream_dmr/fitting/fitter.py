@@ -8,19 +8,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import frame_from_crop
-from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.cold_start import cold_starts
-from stream_dmr.fitting.contour.contour_solver import ContourSolver
-from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
-from stream_dmr.fitting.contour.outline import project
-from stream_dmr.fitting.contour.problem import Problem
+from stream_dmr.fitting.body import LOG_SIZE, ROOT_ROTATION, Body, MeshLevels
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.heading import is_reversed
-from stream_dmr.fitting.mesh_levels import MeshLevels
-from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_ROTATION
 from stream_dmr.fitting.shape.candidates import CandidateShape
-from stream_dmr.fitting.shape.evidence import nats_against
-from stream_dmr.fitting.shape.length_std import freed, shape_std_ratio, slant_std_ratio
 from stream_dmr.fitting.shape.space import (
     TRUNK,
     directions,
@@ -29,11 +20,20 @@ from stream_dmr.fitting.shape.space import (
     reshaped,
     std_of,
 )
-from stream_dmr.fitting.size.scanner import SizeScanner
-from stream_dmr.fitting.solver import Solution, Solver
-from stream_dmr.fitting.target import Target
-from stream_dmr.fitting.uncertainty import covariance, length_std_ratio
-from stream_dmr.fitting.warm_start import recentered
+from stream_dmr.fitting.size import SizeScanner, nats_against
+from stream_dmr.fitting.solver.contour_solver import ContourSolver
+from stream_dmr.fitting.solver.descent import evaluate
+from stream_dmr.fitting.solver.outline import project
+from stream_dmr.fitting.solver.problem import Problem
+from stream_dmr.fitting.starts import cold_starts, recentered
+from stream_dmr.fitting.target import Solution, Solver, Target
+from stream_dmr.fitting.uncertainty import (
+    covariance,
+    freed,
+    length_std_ratio,
+    shape_std_ratio,
+    slant_std_ratio,
+)
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms, SolverReport
 from stream_dmr.reasons import Reason
 from stream_dmr.template.template import Template

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import Camera
-from stream_dmr.fitting.parameters import ROOT_ROTATION
+from stream_dmr.fitting.body import ROOT_ROTATION
 from stream_dmr.messages import FishEnds
 
 # Added to the L_rec of a fit whose head is at the wrong end, when fits are compared. Chosen far

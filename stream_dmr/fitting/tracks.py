@@ -12,14 +12,13 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.camera import Calibration
-from stream_dmr.catch.species_evidence import SpeciesEvidence, forms_of_species
-from stream_dmr.catch.species_settings import SpeciesSettings
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fit, Fitter, Solved
 from stream_dmr.fitting.heading import HeadTracker
 from stream_dmr.fitting.shape.candidates import CandidateShapes, Choice
-from stream_dmr.fitting.shape.length_std import form_std_ratio
+from stream_dmr.fitting.uncertainty import form_std_ratio
 from stream_dmr.messages import FishCrop, FittedMesh
+from stream_dmr.species import SpeciesEvidence, SpeciesSettings, forms_of_species
 from stream_dmr.template.template import Template
 
 _DECIDING_FRAMES = 3  # good ones: each takes a fit of every candidate

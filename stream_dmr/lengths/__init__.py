@@ -1,1 +1,1 @@
-"""From the lengths of single frames to one length per fish with its interval."""
+"""From frames to one length, species and fate per fish."""

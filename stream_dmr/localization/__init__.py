@@ -1,1 +1,1 @@
-"""From a fitted mesh to millimetres on the reference plane, with uncertainty."""
+"""From a fitted mesh to millimetres."""

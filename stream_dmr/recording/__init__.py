@@ -1,1 +1,1 @@
-"""Recordings in MCAP and Rerun files: written, read, converted, repaired."""
+"""The record of truth (.mcap) and the view (.rrd)."""

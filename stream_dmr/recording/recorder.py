@@ -1,24 +1,87 @@
-"""Records a run: writes every message of every stage to every sink."""
+"""Write every message to every sink, and return it as a replay reads it."""
 
 import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from queue import Empty, Queue
 from threading import Lock, Thread
 
-from stream_dmr.errors import OutputError
+from stream_dmr.errors import ConfigError, OutputError
 from stream_dmr.files import make_folder
 from stream_dmr.messages import FishCrop, Message
-from stream_dmr.recording.messages.photographs import PhotographChooser
-from stream_dmr.recording.messages.record import Record, make_record
-from stream_dmr.recording.messages.recording_settings import RecordingSettings
-from stream_dmr.recording.messages.run_header import RunHeader
-from stream_dmr.recording.messages.sink import BufferedSink, Sink, SinkFactory
-from stream_dmr.recording.messages.sink_states import SinkStates
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.mcap.mcap_sink import ExtraTopics, McapSink
+from stream_dmr.recording.record import (
+    BufferedSink,
+    FileSink,
+    PhotographChooser,
+    Record,
+    Sink,
+    SinkFactory,
+    SinkStates,
+    make_record,
+)
 from stream_dmr.recording.rerun.live_view import LiveView
-from stream_dmr.recording.segments.recording_files import open_recording_files
+from stream_dmr.recording.rerun.rrd_file import RrdSink
+from stream_dmr.recording.topics import RecordingSettings
+
+STEM = "recording"
+
+
+def open_recording_files(
+    out_dir: Path,
+    header: RunHeader,
+    settings: RecordingSettings,
+    *,
+    stem: str = STEM,
+    segment_number: int | None = None,
+) -> list[FileSink]:
+    """The file sinks that the settings ask for, the .mcap first.
+
+    Raises OutputError where the disk refuses one, ConfigError where a package is missing.
+    """
+    files: list[FileSink] = []
+    with ExitStack() as undo:
+        if settings.mcap:
+            mcap = McapSink(
+                out_dir / f"{stem}.mcap",
+                header,
+                flush_s=settings.flush_s,
+                extras=list(_extra_topics(header, settings)),
+                segment_number=segment_number,
+            )
+            undo.callback(mcap.close)
+            files.append(mcap)
+        if settings.rrd:
+            files.append(RrdSink(out_dir / f"{stem}.rrd", header, settings))
+        undo.pop_all()
+    return files
+
+
+def _extra_topics(header: RunHeader, settings: RecordingSettings) -> Iterator[ExtraTopics]:
+    if settings.foxglove:
+        with _requires_extra("foxglove", "foxglove = true"):
+            from stream_dmr.recording.mcap.foxglove_topics import FoxgloveTopics
+        yield FoxgloveTopics(header, settings)
+    if settings.frames == "h264":
+        with _requires_extra("h264", 'frames = "h264"'):
+            from stream_dmr.recording.mcap.h264_topic import H264Topic
+        yield H264Topic(crf=settings.h264_crf)
+
+
+@contextmanager
+def _requires_extra(extra: str, setting: str) -> Generator[None]:
+    """Turn a missing package into a ConfigError that names how to install it."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"[recording] {setting}: expected the package {error.name}, found none; install it "
+            f"with: pip install 'stream-dmr[{extra}]'"
+        ) from error
+
 
 _MAX_QUEUED = 64  # messages, some six frames; where the disk can't keep up, the run waits
 _MIN_PAUSE_S = 0.05  # between two looks for what is due, whatever `flush_s` says

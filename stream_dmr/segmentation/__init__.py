@@ -1,1 +1,1 @@
-"""Where fish are in a frame: detection, tracking, masks, the network, its training."""
+"""Crops and masks of fish that were found."""

@@ -10,8 +10,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numba import njit
 
 from stream_dmr.camera import Camera
-from stream_dmr.simulation.simulated_fish import PosedFish
-from stream_dmr.simulation.skin import draw_skin
+from stream_dmr.simulation.simulated_fish import PosedFish, draw_skin
 
 _TOWARDS_LIGHT = np.array([-0.35, -0.75, -0.56])  # camera frame: from above, behind the camera
 _AMBIENT = 0.5  # of the light; this and the direction are chosen

@@ -1,22 +1,251 @@
-"""One simulated fish: the individual, its pose in one frame, and its posed body."""
+"""Simulated fish: body, center line, skin and pose.
 
-from dataclasses import dataclass
+The body of a simulated fish: outline, thickness and tail fin as formulas, and a straight mesh.
 
+Body coordinates, in body lengths: s along the body from the snout (0) to the fork of the tail fin
+(1), y across the broad side, z through the thickness. The lobes of the tail fin reach beyond s = 1.
+
+The centre line of a bent fish: continuous curvature, integrated so that its length is exact.
+
+There are no joints and no blended transforms here, on purpose: a fit that is tested on these fish
+must not be tested against its own deformation model.
+
+Mean bodies of species that scenes can be drawn with.
+
+Drawn by formulas of their own, not from the tables of the bundled templates, so that measuring them
+with those is no test against itself. Proportions as anglers' and FAO's guides draw these fish; good
+to some 10 %.
+
+The skin of a simulated halibut: a mottled eyed side and a pale blind side.
+
+Colours and marks were chosen by eye.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import Calibration, ReferencePlane
+from stream_dmr.errors import UserError
 from stream_dmr.geometry import arc_length, bending_ratio
-from stream_dmr.simulation.center_line import CenterLine, bend_center_line, total_bend_rad
-from stream_dmr.simulation.simulated_body import (
-    HALIBUT,
-    SimulatedBody,
-    StraightBody,
-    draw_body,
-    keypoints,
-    straight_body,
-)
+
+CENTER_ARC = 0.51  # position of the center keypoint along the body
+JOINT_ARCS = (0.33, 0.66)  # joints of the template that is made from this body
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatedBody:
+    """Proportions of one fish, as fractions of its length.
+
+    The default is a mean halibut: a rhombic outline including its long fins, 0.38 broad and 0.10
+    thick (sources: `template/body_forms.toml`), with a narrow peduncle and an
+    emarginate tail fin.
+    """
+
+    half_width: float = 0.19
+    widest_at: float = 0.44
+    half_thickness: float = 0.05
+    thickest_at: float = 0.32
+    peduncle_half_width: float = 0.036
+    tail_from: float = 0.885
+    tail_half_width: float = 0.095
+    fork_depth: float = 0.022
+    fin_half_thickness: float = 0.004
+
+    def half_width_at(self, s: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
+        """Half the breadth of the outline at s including fins; `half_width` at `widest_at`."""
+        flesh = self.half_width * _bump(s, peak=self.widest_at, end=0.92, power=0.8)
+        flare = np.clip((s - self.tail_from) / (1.0 - self.tail_from), 0.0, 1.0) ** 1.2
+        peduncle = self.peduncle_half_width * _smooth_step((s - 0.6) / 0.2)
+        tail = peduncle + (self.tail_half_width - self.peduncle_half_width) * flare
+        return (flesh**6 + tail**6) ** (1 / 6)  # a smooth maximum
+
+    def half_thickness_at(self, s: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
+        """Half the thickness in the middle of the section at s."""
+        flesh = self.half_thickness * _bump(s, peak=self.thickest_at, end=0.95, power=0.7)
+        fin = self.fin_half_thickness * _smooth_step(s / 0.2)
+        return (flesh**4 + fin**4) ** (1 / 4)
+
+    def surface(
+        self, s: Float[np.ndarray, "*N"], angle: Float[np.ndarray, "*N"]
+    ) -> Float[np.ndarray, "*N 3"]:
+        """Points (s, y, z) of the surface; the angle (rad) runs around the section at s.
+
+        Sections become thin towards both edges, like the long fins, and those of the tail fin are
+        curved backwards into its two lobes.
+        """
+        across = np.cos(angle)
+        through = np.sign(np.sin(angle)) * np.abs(np.sin(angle)) ** 1.5
+        bow = (
+            self.fork_depth * across**2 * _smooth_step((s - self.tail_from) / (1 - self.tail_from))
+        )
+        return np.stack(
+            [s + bow, self.half_width_at(s) * across, self.half_thickness_at(s) * through], axis=-1
+        )
+
+
+HALIBUT = SimulatedBody()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StraightBody:
+    """The straight body as a closed mesh."""
+
+    points: Float[np.ndarray, "V 3"]  # (s, y, z) in body lengths
+    across: Float[np.ndarray, "V"]  # y as a fraction of the half width there, -1 to 1
+    faces: Int[np.ndarray, "F 3"]  # counter-clockwise outside
+
+
+def draw_body(rng: np.random.Generator, species: SimulatedBody = HALIBUT) -> SimulatedBody:
+    """A random individual: 5 % standard deviation in width, 10 % in thickness (chosen)."""
+    vary = rng.standard_normal(5).clip(-2.0, 2.0)
+    return replace(
+        species,
+        half_width=species.half_width * (1 + 0.05 * vary[0]),
+        half_thickness=species.half_thickness * (1 + 0.10 * vary[1]),
+        widest_at=species.widest_at + 0.015 * vary[2],
+        tail_half_width=species.tail_half_width * (1 + 0.08 * vary[3]),
+        peduncle_half_width=species.peduncle_half_width * (1 + 0.05 * vary[4]),
+    )
+
+
+def straight_body(body: SimulatedBody, *, num_rings: int = 60, num_sides: int = 24) -> StraightBody:
+    """The straight body: rings from snout to tail, denser at the snout, closed at both ends.
+
+    `num_sides` is even: opposite points of the last ring are joined along the edge of the tail
+    fin, so that the fork stays open.
+    """
+    s = np.linspace(0.0, 1.0, num_rings + 1)[1:] ** 1.3
+    angle = 2 * np.pi * np.arange(num_sides) / num_sides
+    rings = body.surface(*np.meshgrid(s, angle, indexing="ij"))
+    return StraightBody(
+        points=np.concatenate([np.zeros((1, 3)), rings.reshape(-1, 3)]),
+        across=np.concatenate([[0.0], np.tile(np.cos(angle), num_rings)]),
+        faces=_faces(num_rings, num_sides),
+    )
+
+
+def keypoints(arcs: tuple[float, ...] = (0.0, CENTER_ARC, 1.0)) -> Float[np.ndarray, "K 3"]:
+    """Points (s, 0, 0) on the straight body's centre line: head, center and tail by default."""
+    return np.array([[arc, 0.0, 0.0] for arc in arcs])
+
+
+def _faces(num_rings: int, num_sides: int) -> Int[np.ndarray, "F 3"]:
+    """Fan at the snout (vertex 0), quads between the rings, a seam along the tail fin's edge."""
+    ring = 1 + np.arange(num_rings * num_sides).reshape(num_rings, num_sides)
+    after = np.roll(ring, -1, axis=1)
+    snout = np.stack([np.zeros_like(ring[0]), after[0], ring[0]], axis=-1)
+    a, b, c, d = ring[:-1], ring[1:], after[1:], after[:-1]
+    sides = [np.stack(corners, axis=-1).reshape(-1, 3) for corners in ((a, c, b), (a, d, c))]
+    last, k = ring[-1], np.arange(num_sides // 2)
+    upper, upper_after = last[k], last[k + 1]
+    lower, lower_after = last[-k], last[-k - 1]
+    seam = np.concatenate(
+        [
+            np.stack([upper, upper_after, lower_after], axis=-1)[:-1],  # the last one has no area
+            np.stack([upper, lower_after, lower], axis=-1)[1:],  # nor has the first one
+        ]
+    )
+    return np.concatenate([snout, *sides, seam])
+
+
+def _bump(
+    s: Float[np.ndarray, "*N"], *, peak: float, end: float, power: float
+) -> Float[np.ndarray, "*N"]:
+    """From 0 at s = 0 up to 1 at `peak` and back to 0 at `end`: a beta density's shape."""
+    x, top = np.clip(s / end, 0.0, 1.0), peak / end
+    return (x / top) ** power * ((1 - x) / (1 - top)) ** (power * (1 - top) / top)
+
+
+def _smooth_step(x: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
+    x = np.clip(x, 0.0, 1.0)
+    return x * x * (3 - 2 * x)
+
+
+NUM_STEPS = 200  # chosen: 0.6 degrees a step in the most severe bend
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CenterLine:
+    """A centre line with a body frame at every point, head first.
+
+    The columns of a frame are the tangent, the direction across the broad side, and the direction
+    through the thickness.
+    """
+
+    points: Float[np.ndarray, "M 3"]  # mm; M = NUM_STEPS + 1, evenly spaced along the curve
+    frames: Float[np.ndarray, "M 3 3"]
+    length_mm: float  # arc length of `points`
+
+    def place(self, points_body: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+        """Map points (s, y, z) of the straight body, in body lengths, to the bent body, in mm.
+
+        Position and frame are interpolated linearly; beyond its ends the line is straight.
+        """
+        s, y, z = points_body.T
+        steps = s.clip(0.0, 1.0) * NUM_STEPS
+        index = np.minimum(steps.astype(int), NUM_STEPS - 1)
+        part = (steps - index)[:, None]
+        on_line = (1 - part) * self.points[index] + part * self.points[index + 1]
+        part = part[:, :, None]
+        frame = (1 - part) * self.frames[index] + part * self.frames[index + 1]
+        beyond = s - s.clip(0.0, 1.0)
+        offset = np.stack([beyond, y, z], axis=-1) * self.length_mm
+        return on_line + np.einsum("nij,nj->ni", frame, offset)
+
+    def moved(
+        self, rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]
+    ) -> "CenterLine":
+        """This line under a rigid motion: point -> rotation @ point + translation."""
+        return CenterLine(
+            points=self.points @ rotation.T + translation,
+            frames=rotation @ self.frames,
+            length_mm=self.length_mm,
+        )
+
+
+def curvature(
+    s: Float[np.ndarray, "N"], bends: Float[np.ndarray, "3 K"]
+) -> Float[np.ndarray, "N 3"]:
+    """Rotation rate of the body frame at s, rad per body length: sum_k bends[:, k] sin(k pi s).
+
+    Row 0 of `bends` twists about the tangent, row 1 bends through the thickness, row 2 within the
+    broad side. The rate is zero at both ends, since skull and tail fin are stiff.
+    """
+    orders = np.arange(1, bends.shape[1] + 1)
+    return np.sin(np.pi * s[:, None] * orders) @ bends.T
+
+
+def total_bend_rad(bends: Float[np.ndarray, "3 K"]) -> float:
+    """Total turning of the tangent from head to tail: the integral of |curvature| without twist."""
+    turning = curvature(_middles(), bends)[:, 1:]
+    return float(np.linalg.norm(turning, axis=1).sum() / NUM_STEPS)
+
+
+def bend_center_line(bends: Float[np.ndarray, "3 K"], *, length_mm: float) -> CenterLine:
+    """Integrate `curvature` along a body of this length, from the origin with tangent +x.
+
+    All steps have the same length, each along the tangent at its middle (exponential midpoint
+    rule), so the arc length of the points is `length_mm` up to rounding for any bend.
+    """
+    turning = curvature(_middles(), bends) / NUM_STEPS
+    whole = Rotation.from_rotvec(turning).as_matrix()
+    half = Rotation.from_rotvec(turning / 2).as_matrix()
+    frames = np.empty((NUM_STEPS + 1, 3, 3))
+    frames[0] = np.eye(3)
+    for index in range(NUM_STEPS):
+        frames[index + 1] = frames[index] @ whole[index]
+    tangents = (frames[:-1] @ half)[:, :, 0]
+    points = np.concatenate([np.zeros((1, 3)), np.cumsum(tangents, axis=0)])
+    return CenterLine(points=points * (length_mm / NUM_STEPS), frames=frames, length_mm=length_mm)
+
+
+def _middles() -> Float[np.ndarray, "N"]:
+    return (np.arange(NUM_STEPS) + 0.5) / NUM_STEPS
+
 
 # World: X right, Y down, Z away from the camera. A straight fish hangs head up along Y with its
 # broad side across X; +z of the body, the side with the eyes, looks at the camera.
@@ -115,3 +344,158 @@ def _hang(fish: SimulatedFish, pose: HangingPose) -> CenterLine:
 
 def _in_camera(line_world: CenterLine, plane: ReferencePlane) -> CenterLine:
     return line_world.moved(plane.rotation, plane.translation_mm)
+
+
+SPECIES: dict[str, SimulatedBody] = {
+    "halibut": HALIBUT,
+    "haddock": SimulatedBody(
+        half_width=0.108,
+        widest_at=0.33,
+        half_thickness=0.068,
+        thickest_at=0.28,
+        peduncle_half_width=0.024,
+        tail_half_width=0.085,
+        fork_depth=0.018,
+    ),
+    "trout": SimulatedBody(
+        half_width=0.118,
+        widest_at=0.43,
+        half_thickness=0.058,
+        thickest_at=0.38,
+        peduncle_half_width=0.045,
+        tail_half_width=0.098,
+        fork_depth=0.012,
+    ),
+    "perch": SimulatedBody(
+        half_width=0.155,
+        widest_at=0.37,
+        half_thickness=0.075,
+        thickest_at=0.32,
+        peduncle_half_width=0.042,
+        tail_half_width=0.11,
+        fork_depth=0.028,
+    ),
+    "gar": SimulatedBody(
+        half_width=0.056,
+        widest_at=0.55,
+        half_thickness=0.046,
+        thickest_at=0.5,
+        peduncle_half_width=0.027,
+        tail_half_width=0.062,
+        fork_depth=0.005,
+    ),
+    "skipjack": SimulatedBody(
+        half_width=0.13,
+        widest_at=0.4,
+        half_thickness=0.1,
+        thickest_at=0.38,
+        peduncle_half_width=0.012,
+        tail_from=0.9,
+        tail_half_width=0.14,
+        fork_depth=0.09,
+    ),
+    "conger": SimulatedBody(
+        half_width=0.046,
+        widest_at=0.34,
+        half_thickness=0.037,
+        thickest_at=0.3,
+        peduncle_half_width=0.02,
+        tail_half_width=0.017,
+        fork_depth=0.0,
+    ),
+}
+
+
+def find_species(names: str) -> list[SimulatedBody]:
+    """The mean bodies of these names, joined by commas. Raises UserError for an unknown one."""
+    for name in names.split(","):
+        if name not in SPECIES:
+            raise UserError(f"--species: expected any of {', '.join(SPECIES)}, got {name!r}")
+    return [SPECIES[name] for name in names.split(",")]
+
+
+_ALONG, _ACROSS = 384, 160  # texture pixels from snout to tail, and across the broad side
+_EYED_BGR = np.array([62.0, 82.0, 92.0], np.float32)
+_BLIND_BGR = np.array([205.0, 214.0, 218.0], np.float32)
+_SKIN = 7  # key of a stream of random numbers; `rail_scene` and `film` have the others
+
+
+def draw_skin(*, seed: int, track_id: int) -> Float32[np.ndarray, "2 S Y 3"]:
+    """Textures of the eyed and the blind side, BGR; rows from snout to tail, columns across."""
+    rng = np.random.default_rng((seed, _SKIN, track_id))
+    return np.stack([_eyed_side(rng), _blind_side(rng)])
+
+
+def noise(
+    rng: np.random.Generator, height: int, width: int, *, grain_px: tuple[float, float]
+) -> Float32[np.ndarray, "H W"]:
+    """Smooth noise of unit variance with a grain of this size along x and along y."""
+    shrink = max(
+        1, int(min(grain_px) / 3)
+    )  # coarse noise is blurred at low resolution, which is faster
+    white = rng.standard_normal((height // shrink + 1, width // shrink + 1), dtype=np.float32)
+    smooth = cv2.GaussianBlur(white, (0, 0), grain_px[0] / shrink, sigmaY=grain_px[1] / shrink)
+    smooth = cv2.resize(smooth, (width, height), interpolation=cv2.INTER_CUBIC)
+    return (smooth - smooth.mean()) / smooth.std()
+
+
+def _eyed_side(rng: np.random.Generator) -> Float32[np.ndarray, "S Y 3"]:
+    s, y = _grid()
+    tone = 1 + 0.20 * _noise(rng, 14.0) + 0.12 * _noise(rng, 5.0) + 0.08 * _noise(rng, 1.5)
+    tone *= rng.uniform(0.8, 1.25)
+    tone += 0.45 * np.clip(_noise(rng, 5.0) - 1.6, 0.0, 1.0)  # pale spots
+    tone *= _fins(s, y) * _lateral_line(s, y)
+    tone *= 1 - 0.35 * _arc(s, y, 0.215)  # the gill cover
+    side = tone[..., None] * _EYED_BGR * rng.uniform(0.92, 1.08, 3).astype(np.float32)
+    for eye_s, eye_y in ((0.075, 0.30), (0.11, -0.22)):
+        _draw_eye(side, eye_s, eye_y)
+    return np.clip(side, 8, 255).astype(np.float32)
+
+
+def _blind_side(rng: np.random.Generator) -> Float32[np.ndarray, "S Y 3"]:
+    s, y = _grid()
+    tone = 1 + 0.035 * _noise(rng, 12.0) + 0.02 * _noise(rng, 2.0)
+    tone *= 1 - 0.10 * (1 - _fins(s, y)) - 0.2 * _arc(s, y, 0.215)
+    side = tone[..., None] * _BLIND_BGR
+    blood = np.clip(_noise(rng, 9.0) - 1.3, 0.0, 1.0)[..., None]  # red blotches, as on hauled fish
+    side *= 1 - blood * np.array([0.22, 0.20, 0.02], np.float32)
+    return np.clip(side, 8, 255).astype(np.float32)
+
+
+def _grid() -> tuple[Float32[np.ndarray, "S 1"], Float32[np.ndarray, "1 Y"]]:
+    s = np.linspace(0.0, 1.03, _ALONG, dtype=np.float32)[:, None]
+    y = np.linspace(-1.0, 1.0, _ACROSS, dtype=np.float32)[None]
+    return s, y
+
+
+def _noise(rng: np.random.Generator, grain: float) -> Float32[np.ndarray, "S Y"]:
+    # The texture is about as dense across as along where the body is broad.
+    return noise(rng, _ALONG, _ACROSS, grain_px=(grain, grain))
+
+
+def _fins(s: Float[np.ndarray, "S 1"], y: Float[np.ndarray, "1 Y"]) -> Float[np.ndarray, "S Y"]:
+    """Darker where the long fins fringe the body, and rays in the tail fin."""
+    fringe = 1 / (1 + np.exp(-(np.abs(y) - 0.78) / 0.03)) * ((s > 0.2) & (s < 0.86))
+    rays = 0.12 * (np.sin(40 * y) > 0) * (s > 0.9) + 0.15 * (s > 0.9)
+    return 1 - 0.28 * fringe - rays
+
+
+def _lateral_line(
+    s: Float[np.ndarray, "S 1"], y: Float[np.ndarray, "1 Y"]
+) -> Float[np.ndarray, "S Y"]:
+    """Straight along the middle, with the arch over the pectoral fin that halibut have."""
+    arch = 0.28 * np.exp(-(((s - 0.30) / 0.06) ** 2))
+    return 1 - 0.30 * np.exp(-(((y - arch) / 0.02) ** 2)) * ((s > 0.2) & (s < 0.9))
+
+
+def _arc(
+    s: Float[np.ndarray, "S 1"], y: Float[np.ndarray, "1 Y"], at: float
+) -> Float[np.ndarray, "S Y"]:
+    return np.exp(-(((s - at + 0.05 * y**2) / 0.006) ** 2)) * (np.abs(y) < 0.8)
+
+
+def _draw_eye(side: Float[np.ndarray, "S Y 3"], s: float, y: float) -> None:
+    center = (round((y + 1) / 2 * (_ACROSS - 1)), round(s / 1.03 * (_ALONG - 1)))
+    # Wider across, since the texture is compressed there: the head is narrow.
+    cv2.ellipse(side, center, (11, 5), 0, 0, 360, (70, 105, 110), -1, cv2.LINE_AA)
+    cv2.ellipse(side, center, (6, 3), 0, 0, 360, (12, 12, 14), -1, cv2.LINE_AA)

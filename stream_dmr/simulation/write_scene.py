@@ -10,13 +10,17 @@ import trimesh
 from jaxtyping import UInt16
 
 from stream_dmr.calibration.calibration_file import save_calibration
-from stream_dmr.csv_file import write_table
 from stream_dmr.errors import OutputError, UserError, reason_of
 from stream_dmr.simulation.film import VisibleBox, film
-from stream_dmr.simulation.pose_sequence import FPS
-from stream_dmr.simulation.rail_scene import RailScene, make_scene
-from stream_dmr.simulation.simulated_body import JOINT_ARCS, keypoints, straight_body
-from stream_dmr.simulation.species import SPECIES, find_species
+from stream_dmr.simulation.rail_scene import FPS, RailScene, make_scene
+from stream_dmr.simulation.simulated_fish import (
+    JOINT_ARCS,
+    SPECIES,
+    find_species,
+    keypoints,
+    straight_body,
+)
+from stream_dmr.tables import write_table
 
 _MAX_FISH = 65535  # the largest id of a 16-bit mask
 

@@ -1,1 +1,1 @@
-"""Frames with capture times from files, folders, cameras and streams."""
+"""Videos, pictures, cameras and positions."""

@@ -1,13 +1,14 @@
-"""Opens what `--source` names: a video, a folder of pictures or clips, a camera or a stream."""
+"""Open sources of frames and of positions by name."""
 
 from pathlib import Path
 
 from stream_dmr.errors import SourceError
-from stream_dmr.sources.clip_folder import ClipFolder, clips_in
+from stream_dmr.sources.folders import ClipFolder, PictureFolder, clips_in
 from stream_dmr.sources.live_stream import LiveStream
-from stream_dmr.sources.picture_folder import PictureFolder
-from stream_dmr.sources.read_settings import ReadFramesSettings
-from stream_dmr.sources.source import Source
+from stream_dmr.sources.position_readers import PositionFile, PositionReceiver
+from stream_dmr.sources.positions import PositionSource
+from stream_dmr.sources.sensors_settings import SensorsSettings
+from stream_dmr.sources.source import ReadFramesSettings, Source
 from stream_dmr.sources.video_file import VideoFile
 
 
@@ -38,3 +39,21 @@ def open_source(source: str, settings: ReadFramesSettings) -> Source:
         f"{source}: expected a video, a folder of pictures or clips, an address such as rtsp://... "
         "or a camera index, found no such file; check the path"
     )
+
+
+def open_positions(
+    address: str, settings: SensorsSettings, *, is_since_1970: bool
+) -> PositionSource:
+    """The positions for the frames of a source.
+
+    `is_since_1970`: those have times of day, as those of a camera, and not from the start of a
+    video. Raises SourceError where nothing can be read from it.
+    """
+    if Path(address).is_file():
+        return PositionFile(Path(address), settings, is_since_1970=is_since_1970)
+    if not is_since_1970:
+        raise SourceError(
+            f"--nmea {address}: expected a file with the positions of the video, got none there; "
+            "a receiver that sends is for cameras"
+        )
+    return PositionReceiver(address, settings)

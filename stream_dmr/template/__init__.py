@@ -1,1 +1,1 @@
-"""Template meshes with their joints and keypoints, and the bundled species."""
+"""Meshes of species."""

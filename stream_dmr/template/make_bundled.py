@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from stream_dmr.template.body_forms import CENTER, JOINTS, BodyForm, load_body_forms
-from stream_dmr.template.ring_mesh import ring_angles, ring_mesh, ring_places
+from stream_dmr.template.from_masks import ring_angles, ring_mesh, ring_places
+from stream_dmr.template.template import CENTER, JOINTS, BodyForm, load_body_forms
 
 _TAIL_FROM = 0.9  # where the lobes of the tail fin begin to reach backwards; chosen
 

@@ -1,10 +1,13 @@
-"""The species' template: a closed mesh with joints, keypoints and a midline, in canonical form."""
+"""Templates, and the proportions of the bundled body forms."""
 
+import tomllib
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
+from scipy.interpolate import PchipInterpolator
 
 from stream_dmr.errors import TemplateError
 from stream_dmr.geometry import arc_lengths
@@ -133,3 +136,50 @@ def _resample(points: Float[np.ndarray, "N 3"], count: int) -> Float[np.ndarray,
     at = arc_lengths(points)
     even = np.linspace(0.0, at[-1], count)
     return np.stack([np.interp(even, at, points[:, k]) for k in range(3)], axis=1)
+
+
+# Every mesh that this project makes has these points on its straight midline, in fork lengths. The
+# paper's template has two joints and does not say where; near the thirds of the body is chosen.
+CENTER = 0.5
+JOINTS = (0.36, 0.68)
+
+_TABLES = Path(__file__).with_name("body_forms.toml")
+_BODY_END = 0.85  # before the tail fin of every form
+
+
+@dataclass(frozen=True, kw_only=True)
+class BodyForm:
+    """Proportions of one species, in fork lengths; the fields are explained in the TOML."""
+
+    name: str
+    title: str
+    source: str
+    condition: float
+    condition_source: str
+    places: tuple[float, ...]
+    half_depth: tuple[float, ...]
+    half_thickness: tuple[float, ...]
+    lobe: float
+
+    def half_depth_at(self, place: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
+        """Half the depth at places along the midline, from 0 to 1."""
+        return PchipInterpolator(self.places, self.half_depth)(place)
+
+    def half_thickness_at(self, place: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
+        """Half the thickness at places along the midline, from 0 to 1."""
+        return PchipInterpolator(self.places, self.half_thickness)(place)
+
+    @property
+    def breadth(self) -> float:
+        """The largest depth, without the tail fin."""
+        return 2 * float(self.half_depth_at(np.linspace(0.0, _BODY_END, 200)).max())
+
+
+def load_body_forms() -> dict[str, BodyForm]:
+    """All body forms, by name."""
+    tables = tomllib.loads(_TABLES.read_text(encoding="utf-8"))
+    rows = ("places", "half_depth", "half_thickness")
+    return {
+        name: BodyForm(name=name, **table | {row: tuple(table[row]) for row in rows})
+        for name, table in tables.items()
+    }

@@ -13,10 +13,9 @@ from jaxtyping import Float
 
 from stream_dmr.errors import OutputError, TemplateError, reason_of
 from stream_dmr.files import read_text
-from stream_dmr.template.body_forms import JOINTS
-from stream_dmr.template.mesh_points import find_points
+from stream_dmr.template.fish_outline import find_points
 from stream_dmr.template.mesh_repair import repair_mesh
-from stream_dmr.template.template import Template, canonical_template
+from stream_dmr.template.template import JOINTS, Template, canonical_template
 
 BUNDLED = Path(__file__).parent / "bundled"
 TAILS = ("fork", "total")

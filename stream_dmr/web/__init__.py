@@ -1,1 +1,1 @@
-"""What the HTTP servers of this machine share: addresses, tokens, requests."""
+"""Report, review, watch and fleet: pages and one server."""

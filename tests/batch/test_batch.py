@@ -19,19 +19,17 @@ import pytest
 from pyarrow import dataset
 
 from stream_dmr.batch.driver import run_batch
-from stream_dmr.batch.layout import results_folder
-from stream_dmr.batch.local_engine import LocalEngine
+from stream_dmr.batch.engines import LocalEngine
 from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
-from stream_dmr.batch.measure_video import measure_video, read_outcome
-from stream_dmr.batch.progress import BatchProgress
-from stream_dmr.batch.verify_batch import verify_all
+from stream_dmr.batch.measure_video import BatchProgress, measure_video, read_outcome
 from stream_dmr.errors import OutputError
-from stream_dmr.results.finished_fish import read_stored_fish
-from stream_dmr.results.provenance import seal_verdicts
-from stream_dmr.results.scale_checks import ScaleCheck, add_check
-from stream_dmr.results.verdicts import Verdict
-from stream_dmr.results.verdicts_table import add_verdict
-from stream_dmr.running.measure_source import measure_source
+from stream_dmr.evidence.seal import seal_verdicts
+from stream_dmr.evidence.verify_batch import verify_all
+from stream_dmr.pipeline.measure_source import measure_source
+from stream_dmr.store.batch_folder import results_folder
+from stream_dmr.store.fish import read_stored_fish
+from stream_dmr.store.scale_checks import ScaleCheck, add_check
+from stream_dmr.store.verdicts import Verdict, add_verdict
 from tests.support.batch_engine import ThisProcess
 from tests.support.command import invoke, rows
 from tests.support.fish_run import FISH, request
@@ -94,7 +92,7 @@ def test_a_batch_measures_a_video_as_run_does(season: Path, tmp_path: Path):
     (job,) = jobs_of(season, tmp_path, row())
     shares = list[float]()
     outcome = measure_video(job, tmp_path, on_progress=shares.append)
-    folder = results_folder(job, tmp_path)
+    folder = results_folder(job.name, tmp_path)
     assert_same_tables(folder, season / "alone")
     assert (outcome.num_frames, outcome.num_fish) == (len(FISH), 2)
     assert shares == sorted(shares)
@@ -142,7 +140,7 @@ def test_a_bad_video_fails_alone(season: Path, tmp_path: Path):
     assert [job.name for job in jobs] == ["video", "video-2", "video-3", "video-4", "missing"]
     statuses = measure(jobs, tmp_path / "out")
     assert list(statuses.values()) == ["done", "done", "failed", "failed", "failed"]
-    assert_same_tables(results_folder(jobs[0], tmp_path / "out"), season / "alone")
+    assert_same_tables(results_folder(jobs[0].name, tmp_path / "out"), season / "alone")
     table = rows(tmp_path / "out" / "videos.csv")
     assert [line["status"] for line in table] == list(statuses.values())
     assert "broken" in table[2]["reason"]
@@ -157,7 +155,7 @@ def test_the_data_set_holds_every_fish_and_every_frame(season: Path, tmp_path: P
     fish = dataset.dataset(tmp_path / "dataset" / "fish", partitioning="hive").to_table()
     frames = dataset.dataset(tmp_path / "dataset" / "frames", partitioning="hive").to_table()
     for job in jobs:
-        folder = results_folder(job, tmp_path)
+        folder = results_folder(job.name, tmp_path)
         measured = rows(folder / "lengths.csv")
         found = [one for one in fish.to_pylist() if one["video"] == job.name]
         assert [one["track_id"] for one in found] == [int(one["track_id"]) for one in measured]
@@ -278,7 +276,7 @@ def test_a_report_shows_all_videos(season: Path, tmp_path: Path):
 def test_the_next_call_takes_verdicts_into_the_data_set(season: Path, tmp_path: Path):
     (job,) = jobs_of(season, tmp_path, row())
     measure([job], tmp_path)
-    database = results_folder(job, tmp_path) / "lengths.db"
+    database = results_folder(job.name, tmp_path) / "lengths.db"
     add_verdict(database, Verdict(track_id=2, kind="reject", reason="a glove", reviewer="Ada"))
     seal_verdicts(database.parent)
     measure([job], tmp_path)
@@ -290,7 +288,7 @@ def test_the_next_call_takes_verdicts_into_the_data_set(season: Path, tmp_path: 
 def test_a_video_whose_tables_can_not_be_written_again_is_named(season: Path, tmp_path: Path):
     jobs = jobs_of(season, tmp_path, row(), row("other"))
     measure(jobs, tmp_path)
-    folder = results_folder(jobs[0], tmp_path)
+    folder = results_folder(jobs[0].name, tmp_path)
     add_verdict(folder / "lengths.db", Verdict(track_id=2, kind="accept", reviewer="Ada"))
     (folder / "frames.csv").unlink()
     lines: list[str] = []
@@ -304,7 +302,7 @@ def test_a_video_whose_tables_can_not_be_written_again_is_named(season: Path, tm
 def test_the_next_call_takes_checks_of_the_scale_into_the_data_set(season: Path, tmp_path: Path):
     (job,) = jobs_of(season, tmp_path, row())
     measure([job], tmp_path)
-    database = results_folder(job, tmp_path) / "lengths.db"
+    database = results_folder(job.name, tmp_path) / "lengths.db"
     check = ScaleCheck(
         source="board.png",
         calibration_sha256=read_stored_fish(database)[0].facts.calibration_sha256,
@@ -382,7 +380,7 @@ def test_only_tables_of_the_data_set_are_removed_from_it(season: Path, tmp_path:
 
 def test_a_damaged_outcome_counts_as_none(season: Path, tmp_path: Path):
     (job,) = jobs_of(season, tmp_path, row())
-    folder = results_folder(job, tmp_path)
+    folder = results_folder(job.name, tmp_path)
     for content in ("", "{", "{}", '{"name": "video"}'):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "outcome.json").write_text(content)
@@ -434,7 +432,7 @@ def workers(out: Path) -> list[int]:
             words = (folder / "cmdline").read_bytes().split(b"\0")
         except OSError:
             continue
-        if b"stream_dmr.batch.worker" in words and str(out).encode() in words:
+        if b"stream_dmr.batch.engines" in words and str(out).encode() in words:
             found.append(int(folder.name))
     return found
 

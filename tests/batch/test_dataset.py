@@ -8,10 +8,9 @@ import pytest
 from pyarrow import parquet
 
 from stream_dmr.batch.dataset import publish, withdraw_others, write_tables
-from stream_dmr.batch.layout import TABLE_KINDS
 from stream_dmr.batch.manifest import Job
-from stream_dmr.results.verdicts import Verdict
-from stream_dmr.results.verdicts_table import add_verdict
+from stream_dmr.store.batch_folder import TABLE_KINDS
+from stream_dmr.store.verdicts import Verdict, add_verdict
 from tests.support.command import rows
 from tests.support.fish_run import measure
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from stream_dmr.batch.engines import PercentPrinter
 from stream_dmr.batch.manifest import Job
-from stream_dmr.batch.progress import BatchProgress, duration
-from stream_dmr.batch.worker import PercentPrinter
+from stream_dmr.batch.measure_video import BatchProgress, duration
 
 
 @pytest.fixture

@@ -10,9 +10,14 @@ from typer.testing import CliRunner
 
 from stream_dmr.calibration.board import calibrate, draw_views
 from stream_dmr.calibration.calibration_file import load_calibration
-from stream_dmr.calibration.corners import find_corners, read_grey
-from stream_dmr.calibration.lens_fit import fit_lens, require_determined
-from stream_dmr.calibration.printed_board import BoardCorners, PrintedBoard, parse_board
+from stream_dmr.calibration.corners import (
+    BoardCorners,
+    PrintedBoard,
+    find_corners,
+    parse_board,
+    read_grey,
+)
+from stream_dmr.calibration.lens import fit_lens, require_determined
 from stream_dmr.errors import CalibrationError, OutputError
 from tests.support.board_views import (
     LENS,

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from stream_dmr.calibration.calibration_file import load_calibration
-from stream_dmr.calibration.charuco import CharucoFinder
-from stream_dmr.calibration.corners import read_grey
+from stream_dmr.calibration.corners import CharucoFinder, PrintedBoard, read_grey
 from stream_dmr.calibration.known_length import scale_of_board
-from stream_dmr.calibration.printed_board import PrintedBoard
 from stream_dmr.camera import Calibration
 from stream_dmr.errors import CalibrationError
 from tests.support.board_views import LENS, BoardRenderer, CharucoRenderer, pose, varied_poses

@@ -11,12 +11,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.calibration.board import calibrate
-from stream_dmr.calibration.board_pose import find_plane
 from stream_dmr.calibration.calibration_file import load_calibration, save_calibration
+from stream_dmr.calibration.corners import BoardCorners
 from stream_dmr.calibration.known_length import scale_of_points
-from stream_dmr.calibration.lens_choice import choose_fit
-from stream_dmr.calibration.lens_fit import fit_lens
-from stream_dmr.calibration.printed_board import BoardCorners
+from stream_dmr.calibration.lens import choose_fit, find_plane, fit_lens
 from stream_dmr.camera import (
     MAX_FISHEYE_ANGLE_RAD,
     Calibration,
@@ -25,8 +23,8 @@ from stream_dmr.camera import (
     crop_from_frame,
     frame_from_crop,
 )
-from stream_dmr.recording.messages.codec import decode, encode
-from stream_dmr.segmentation.masks.crop_geometry import frame_from_crop_map
+from stream_dmr.recording.codec import decode, encode
+from stream_dmr.segmentation.crop_geometry import frame_from_crop_map
 from tests.support.board_views import LENS, BoardRenderer, board_points
 from tests.support.command import invoke
 

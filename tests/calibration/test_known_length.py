@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 
 from stream_dmr.calibration.calibration_file import save_calibration
-from stream_dmr.calibration.corners import seen_board
+from stream_dmr.calibration.corners import PrintedBoard, seen_board
 from stream_dmr.calibration.known_length import scale_of_board, scale_of_points
-from stream_dmr.calibration.printed_board import PrintedBoard
 from stream_dmr.camera import Calibration, ReferencePlane
 from stream_dmr.errors import CalibrationError
 from stream_dmr.files import sha256_of
-from stream_dmr.results.finished_fish import run_notes
-from stream_dmr.results.length_store import LengthStore
-from stream_dmr.results.scale_checks import last_checks
+from stream_dmr.store.fish import run_notes
+from stream_dmr.store.length_store import LengthStore
+from stream_dmr.store.scale_checks import last_checks
 from tests.support.board_views import LENS, BoardRenderer, pose
 from tests.support.command import invoke, rows
 from tests.support.final_estimates import FACTS

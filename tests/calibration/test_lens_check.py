@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.calibration.lens_check import require_lens
+from stream_dmr.calibration.calibration_values import require_lens
 from stream_dmr.camera import Camera
 from stream_dmr.errors import CalibrationError
 from tests.test_camera import cameras

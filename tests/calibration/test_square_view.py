@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from stream_dmr.calibration.board import calibrate_squarely, camera_of_focal_35mm
 from stream_dmr.calibration.calibration_file import load_calibration
 from stream_dmr.calibration.known_length import scale_of_ends
-from stream_dmr.calibration.square_view import calibrate_squarely, camera_of_focal_35mm
 from stream_dmr.errors import CalibrationError
 from tests.support.board_views import LENS
 from tests.support.command import invoke

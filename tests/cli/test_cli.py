@@ -9,7 +9,7 @@ import pytest
 from stream_dmr import __version__
 from stream_dmr.cli.main import one_line
 from stream_dmr.errors import UserError
-from stream_dmr.running.run_request import default_out
+from stream_dmr.pipeline.run_options import default_out
 from tests.support.command import invoke, rows
 
 HEAVY = ["cv2", "torch", "rerun", "mcap", "numpy", "scipy", "trimesh", "numba", "pydantic"]

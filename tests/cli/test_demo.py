@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from stream_dmr.cli.demo import print_beside_truth
+from stream_dmr.cli.run import print_beside_truth
 from tests.support.command import invoke, rows
 from tests.support.tiny_clip import write_clip
 

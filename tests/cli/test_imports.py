@@ -14,8 +14,8 @@ try:
     program.main()
 except SystemExit:
     pass
-import stream_dmr.running.measure_source, stream_dmr.cli.terminal, stream_dmr.watch.watch_observer
-import stream_dmr.segmentation.masks.open_segmenter as segmenters
+import stream_dmr.pipeline.measure_source, stream_dmr.cli.terminal, stream_dmr.web.watch_observer
+import stream_dmr.segmentation.open_segmenter as segmenters
 segmenters.open_segmenter("unet")
 print([name for name in sys.argv[1:] + {unneeded} if name in sys.modules])
 """

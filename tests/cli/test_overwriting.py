@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from stream_dmr.results.own_files import is_made_by, is_of_run, require_writable
-from stream_dmr.results.provenance import seal_files
+from stream_dmr.evidence.own_files import is_made_by, is_of_run, require_writable
+from stream_dmr.evidence.seal import seal_files
 from stream_dmr.simulation import scene_files
 from tests.support.command import Outcome, invoke
 from tests.support.fish_run import measure

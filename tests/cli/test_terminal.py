@@ -18,10 +18,9 @@ from stream_dmr.cli.terminal import (
     status_text,
 )
 from stream_dmr.errors import UserError
-from stream_dmr.replaying.comparator import Mismatch
-from stream_dmr.replaying.difference import Difference
-from stream_dmr.replaying.replay_recording import ReplaySummary
-from stream_dmr.running.pipeline import StageCounters
+from stream_dmr.pipeline.chain import StageCounters
+from stream_dmr.pipeline.comparator import Difference, Mismatch
+from stream_dmr.pipeline.replay_recording import ReplaySummary
 from tests.support.final_estimates import fish
 
 DIFFERENCE = Mismatch(3, 1, "FittedMesh", Difference("shape.iou", "0.9", "0.8"))

@@ -13,18 +13,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.batch.manifest import read_manifest, repeated_videos
-from stream_dmr.cli.learn import crops_of
-from stream_dmr.csv_file import original_cell, safe_cell
+from stream_dmr.cli.templates import crops_of
+from stream_dmr.detection.box_files import load_boxes, unused_boxes
 from stream_dmr.errors import SourceError
-from stream_dmr.recording.reading.open_recording import open_recordings
-from stream_dmr.results.length_store import LengthStore
-from stream_dmr.results.provenance import seal_run
-from stream_dmr.results.verify import verify
-from stream_dmr.running.measure_source import measure_source
-from stream_dmr.running.run_observer import RunObserver
-from stream_dmr.segmentation.annotations.box_files import load_boxes, unused_boxes
+from stream_dmr.evidence.seal import seal_run
+from stream_dmr.evidence.verify_folder import verify
+from stream_dmr.pipeline.measure_source import measure_source
+from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.recording.reading import open_recordings
 from stream_dmr.sources.open_source import open_source
-from stream_dmr.sources.read_settings import ReadFramesSettings
+from stream_dmr.sources.source import ReadFramesSettings
+from stream_dmr.store.length_store import LengthStore
+from stream_dmr.tables import original_cell, safe_cell
 from tests.support.command import invoke, rows
 from tests.support.final_estimates import FACTS, fish
 from tests.support.fish_run import measure, request
@@ -264,9 +264,7 @@ def test_fish_of_two_runs_of_one_video_are_not_counted_twice(out: Path, tmp_path
 
 def test_no_shape_is_learnt_from_rejected_fish(out: Path, monkeypatch: pytest.MonkeyPatch):
     rejected = SimpleNamespace(estimate=SimpleNamespace(track_id=1), counts=False)
-    monkeypatch.setattr(
-        "stream_dmr.results.finished_fish.read_stored_fish", lambda database: [rejected]
-    )
+    monkeypatch.setattr("stream_dmr.store.fish.read_stored_fish", lambda database: [rejected])
     crops = list(crops_of([out], [open_recordings([out])]))
     assert {crop.track_id for crop in crops} == {2}
 
@@ -279,7 +277,7 @@ def test_setup_speaks_of_compiling_where_it_compiles(
         for line in lines:
             on_progress(line)
 
-    monkeypatch.setattr("stream_dmr.running.prepare_kernels.prepare_kernels", prepare)
+    monkeypatch.setattr("stream_dmr.pipeline.prepare_kernels.prepare_kernels", prepare)
     outcome = invoke("setup")
     assert (outcome.code, outcome.out) == (0, "ready, after 0 s\n")
     assert outcome.err.splitlines() == lines[:1]

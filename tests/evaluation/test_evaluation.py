@@ -12,9 +12,9 @@ from stream_dmr.evaluation.compare import (
     distribution_rows,
     evaluate,
     evaluate_histogram,
+    plot_histograms,
     summary_rows,
 )
-from stream_dmr.evaluation.histogram_plot import plot_histograms
 from stream_dmr.evaluation.length_errors import EvaluateSettings
 from tests.support.command import invoke
 from tests.support.fish_run import measure

@@ -3,11 +3,10 @@
 import numpy as np
 from hypothesis import given, settings
 
+from stream_dmr.fitting.body import LOG_SIZE, ROOT_TRANSLATION
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.paper.adam import AdamSolver
-from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_TRANSLATION
-from stream_dmr.fitting.solver import Solver, rank
-from stream_dmr.fitting.target import Target
+from stream_dmr.fitting.target import Solver, Target, rank
 from tests.support.shapes import crop_of, fish_rig, fish_template, pose, seeds
 
 TEMPLATE, RIG = fish_template(), fish_rig()

@@ -9,21 +9,22 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour import deformation, outline, rotation_vector
-from stream_dmr.fitting.contour.deformation import KINDS
-from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
-from stream_dmr.fitting.contour.mesh_terms import face_normals, neighbor_offsets, smoothness_slope
-from stream_dmr.fitting.contour.problem import Problem
-from stream_dmr.fitting.contour.pull_back import pull_back
-from stream_dmr.fitting.contour.visible_rim import rim_slopes, visible_rim
+from stream_dmr.fitting.body import LOG_SIZE, NUM_PER_JOINT, NUM_ROOT, Body
 from stream_dmr.fitting.fit_settings import FitMeshSettings
-from stream_dmr.fitting.paper.losses import laplacian_loss, normal_loss
-from stream_dmr.fitting.paper.objective import Objective
-from stream_dmr.fitting.paper.silhouette import project, silhouette
-from stream_dmr.fitting.paper.silhouette import rim_edges as torch_rim_edges
-from stream_dmr.fitting.paper.skinning import DEFORMATIONS, Parameters, Rig
-from stream_dmr.fitting.parameters import LOG_SIZE, NUM_PER_JOINT, NUM_ROOT
+from stream_dmr.fitting.paper.adam import Objective, laplacian_loss, normal_loss
+from stream_dmr.fitting.paper.torch_body import DEFORMATIONS, Parameters, Rig, project, silhouette
+from stream_dmr.fitting.paper.torch_body import rim_edges as torch_rim_edges
+from stream_dmr.fitting.solver import linear_blend, outline, spine
+from stream_dmr.fitting.solver.descent import evaluate
+from stream_dmr.fitting.solver.mesh_terms import (
+    face_normals,
+    neighbor_offsets,
+    pull_back,
+    smoothness_slope,
+)
+from stream_dmr.fitting.solver.outline import rim_slopes, visible_rim
+from stream_dmr.fitting.solver.problem import Problem
+from stream_dmr.fitting.solver.spine import KINDS
 from stream_dmr.fitting.target import Target, mask_contour
 from stream_dmr.template.template_file import load_template
 from tests.support.shapes import (
@@ -100,7 +101,7 @@ class TestRotation:
     @given(seed=seeds, angle=angles)
     def test_is_scipy_s(self, seed, angle):
         w = self.vector(seed, angle)
-        R, _ = rotation_vector.rotation_and_jacobian(w)
+        R, _ = linear_blend.rotation_and_jacobian(w)
         np.testing.assert_allclose(R, Rotation.from_rotvec(w).as_matrix(), atol=1e-11)
 
     @given(seed=seeds, angle=angles)
@@ -112,17 +113,17 @@ class TestRotation:
         for k in range(1, 60):
             term = term @ -cross / (k + 1)
             total = total + term
-        _, J = rotation_vector.rotation_and_jacobian(w)
+        _, J = linear_blend.rotation_and_jacobian(w)
         np.testing.assert_allclose(J, total, atol=1e-10)
 
     @given(seed=seeds, angle=angles)
     def test_right_jacobian_is_the_slope(self, seed, angle):
         """R(w + d) = R(w) exp(J_r d) to first order."""
         w = self.vector(seed, angle)
-        _, J = rotation_vector.rotation_and_jacobian(w)
+        _, J = linear_blend.rotation_and_jacobian(w)
         slopes = []
         for step in np.eye(3) * 1e-5:
-            ahead, behind = (rotation_vector.rotation_and_jacobian(w + s)[0] for s in (step, -step))
+            ahead, behind = (linear_blend.rotation_and_jacobian(w + s)[0] for s in (step, -step))
             slopes.append(Rotation.from_matrix(behind.T @ ahead).as_rotvec() / 2e-5)
         np.testing.assert_allclose(J, np.transpose(slopes), atol=1e-8)
 
@@ -139,7 +140,7 @@ class TestDeformation:
     @given(seed=seeds, size=st.sampled_from([0.0, 1e-6, 0.3, 1.0]))
     def test_is_torch_s(self, name, kind, seed, size):
         flat = motion(name, seed, size=size)
-        points = deformation.deform(BODIES[name], KINDS[kind], flat[0].numpy())
+        points = spine.deform(BODIES[name], KINDS[kind], flat[0].numpy())
         np.testing.assert_allclose(points, torch_points(name, flat, kind), rtol=1e-9, atol=1e-10)
 
     @five
@@ -149,7 +150,7 @@ class TestDeformation:
         rng = np.random.default_rng(seed)
         chosen = rng.choice(len(BODIES[name].points), 8, replace=False)
         chosen[:2] = BODIES[name].num_vertices + np.array([1, 3])  # the center, the midline's head
-        slopes = deformation.jacobian(BODIES[name], KINDS[kind], flat[0].numpy(), chosen)
+        slopes = spine.jacobian(BODIES[name], KINDS[kind], flat[0].numpy(), chosen)
         expected = torch_slopes(lambda p: torch_points(name, p[None], kind)[chosen], flat)
         np.testing.assert_allclose(slopes, expected, rtol=1e-8, atol=1e-8)
 
@@ -197,7 +198,7 @@ class TestMeshTerms:
     def test_pulled_back_forces_are_those_times_the_jacobian(self, name, kind, seed, size):
         body, flat = BODIES[name], motion(name, seed, size=size)[0].numpy()
         forces = np.random.default_rng(seed).normal(size=(body.num_vertices, 3))
-        slopes = deformation.jacobian(body, KINDS[kind], flat, np.arange(body.num_vertices))
+        slopes = spine.jacobian(body, KINDS[kind], flat, np.arange(body.num_vertices))
         expected = np.einsum("ni,nip->p", forces, slopes)
         if kind == "spine":
             expected[:NUM_ROOT] = 0.0
@@ -216,7 +217,7 @@ class TestMeshTerms:
             laplacian = laplacian_loss(vertices / vector[5].exp(), rig)
             return (0.7 * normal_loss(vertices, rig) + 40.0 * laplacian)[0]
 
-        points = deformation.deform(BODIES[name], KINDS[kind], flat[0].numpy())
+        points = spine.deform(BODIES[name], KINDS[kind], flat[0].numpy())
         normals = face_normals(points, BODIES[name].faces)
         offsets = neighbor_offsets(BODIES[name], points)
         found = smoothness_slope(

@@ -12,26 +12,32 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour import scan
-from stream_dmr.fitting.contour.contour_residuals import Residuals
-from stream_dmr.fitting.contour.contour_solver import ContourSolver, mirror
-from stream_dmr.fitting.contour.deformation import KINDS, deform
-from stream_dmr.fitting.contour.levenberg_marquardt import (
+from stream_dmr.fitting.body import (
+    LOG_SIZE,
+    NUM_PER_JOINT,
+    NUM_ROOT,
+    Body,
+    MeshLevels,
+    Priors,
+    rest_vector,
+)
+from stream_dmr.fitting.fit_settings import FitMeshSettings
+from stream_dmr.fitting.fitter import Fitter
+from stream_dmr.fitting.paper.torch_body import Parameters, Rig, rotation_matrices
+from stream_dmr.fitting.solver import descent
+from stream_dmr.fitting.solver.contour_solver import ContourSolver, mirror
+from stream_dmr.fitting.solver.descent import (
     EXHAUSTED,
     SETTLED,
     STUCK,
     evaluate,
+    normal_equations,
     solve,
+    weighted_squares,
 )
-from stream_dmr.fitting.contour.normal_equations import normal_equations, weighted_squares
-from stream_dmr.fitting.contour.problem import Options, Problem
-from stream_dmr.fitting.contour.regularisers import GAUGE, prior_loss, regularise
-from stream_dmr.fitting.fit_settings import FitMeshSettings
-from stream_dmr.fitting.fitter import Fitter
-from stream_dmr.fitting.mesh_levels import MeshLevels
-from stream_dmr.fitting.paper.skinning import Parameters, Rig, rotation_matrices
-from stream_dmr.fitting.parameters import LOG_SIZE, NUM_PER_JOINT, NUM_ROOT, Priors, rest_vector
+from stream_dmr.fitting.solver.outline import Residuals
+from stream_dmr.fitting.solver.problem import GAUGE, Options, Problem, prior_loss, regularise
+from stream_dmr.fitting.solver.spine import KINDS, deform
 from stream_dmr.fitting.target import Target
 from stream_dmr.geometry import arc_length
 from stream_dmr.template.template_file import load_template
@@ -98,7 +104,7 @@ def energy(target, flat, *, kind="spine"):
 
 def descend(target, start, *, iterations=30, tolerance=1e-4, damping=1e-2, kind="spine"):
     options = Options(iterations, tolerance, damping)
-    return scan.descend(problem_of(target, kind=kind), start, FREE, options)
+    return descent.descend(problem_of(target, kind=kind), start, FREE, options)
 
 
 class TestNormalEquations:
@@ -265,7 +271,7 @@ class TestDescent:
         with ThreadPoolExecutor(4) as pool:
             assert list(pool.map(bits, jobs)) == alone
 
-    @pytest.mark.parametrize("function", [scan.scan_sizes, evaluate])
+    @pytest.mark.parametrize("function", [descent.scan_sizes, evaluate])
     def test_releases_the_gil(self, function):
         assert function.targetoptions["nogil"]
 

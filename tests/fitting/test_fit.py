@@ -7,8 +7,8 @@ import torch
 from stream_dmr.camera import crop_from_frame, frame_from_crop
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fitter
-from stream_dmr.fitting.paper.objective import Objective
-from stream_dmr.fitting.paper.skinning import DEFORMATIONS, Rig, deform
+from stream_dmr.fitting.paper.adam import Objective
+from stream_dmr.fitting.paper.torch_body import DEFORMATIONS, Rig, deform
 from stream_dmr.fitting.target import Target
 from stream_dmr.geometry import arc_length
 from stream_dmr.messages import FishEnds, SolverReport

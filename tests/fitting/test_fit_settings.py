@@ -5,7 +5,7 @@ import torch
 
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fitter
-from stream_dmr.fitting.paper.skinning import Rig
+from stream_dmr.fitting.paper.torch_body import Rig
 from stream_dmr.localization.localize_fish import bow_ratio
 from tests.support.shapes import STRAIGHT, crop_of, fish_template, pose
 

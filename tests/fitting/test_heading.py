@@ -11,7 +11,7 @@ from stream_dmr.camera import crop_from_frame
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.heading import HeadTracker
-from stream_dmr.fitting.paper.skinning import Rig
+from stream_dmr.fitting.paper.torch_body import Rig
 from stream_dmr.messages import FishEnds
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.template.template_file import load_template

@@ -4,11 +4,14 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.joints import blend, cholesky_factors, skinning_weights
-from stream_dmr.fitting.contour.linear_blend import blend_points
-from stream_dmr.fitting.contour.spine import spine_nodes, spine_points
-from stream_dmr.fitting.parameters import NUM_ROOT, joints_of, rest_vector
+from stream_dmr.fitting.body import NUM_ROOT, Body, joints_of, rest_vector
+from stream_dmr.fitting.solver.linear_blend import (
+    blend,
+    blend_points,
+    cholesky_factors,
+    skinning_weights,
+)
+from stream_dmr.fitting.solver.spine import spine_nodes, spine_points
 from stream_dmr.geometry import arc_length
 from tests.support.shapes import fish_template, seeds
 

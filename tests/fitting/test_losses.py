@@ -4,8 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stream_dmr.fitting.distance_map import signed_distance
-from stream_dmr.fitting.paper.losses import (
+from stream_dmr.fitting.paper.adam import (
     boundary_loss,
     iou_loss,
     laplacian_loss,
@@ -13,7 +12,8 @@ from stream_dmr.fitting.paper.losses import (
     scale_loss,
     translation_loss,
 )
-from stream_dmr.fitting.paper.skinning import Parameters, deform, spine
+from stream_dmr.fitting.paper.torch_body import Parameters, deform, spine
+from stream_dmr.fitting.target import signed_distance
 from tests.support.shapes import fish_rig, random_flat, rest_parameters, seeds
 
 RIG = fish_rig()

@@ -6,8 +6,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from stream_dmr.fitting.paper.silhouette import project, rim_edges, silhouette
-from stream_dmr.fitting.paper.skinning import Rig, deform, spine
+from stream_dmr.fitting.paper.torch_body import Rig, deform, project, rim_edges, silhouette, spine
 from stream_dmr.template.template import Template
 from tests.support.shapes import anchor, crop_camera, fish_rig, random_flat, seeds
 

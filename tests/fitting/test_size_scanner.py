@@ -6,17 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
-from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.contour_solver import ContourSolver
-from stream_dmr.fitting.contour.levenberg_marquardt import WARM_DAMPING, evaluate
-from stream_dmr.fitting.contour.problem import Options, Problem
-from stream_dmr.fitting.contour.regularisers import prior_loss
-from stream_dmr.fitting.contour.scan import descend, only_size, scan_sizes
+from stream_dmr.fitting.body import LOG_SIZE, Body, MeshLevels, rest_vector
 from stream_dmr.fitting.fit_settings import FitMeshSettings
-from stream_dmr.fitting.mesh_levels import MeshLevels
-from stream_dmr.fitting.parameters import LOG_SIZE, rest_vector
-from stream_dmr.fitting.size.density import mean_and_std
-from stream_dmr.fitting.size.scanner import SizeScanner
+from stream_dmr.fitting.size import SizeScanner, mean_and_std
+from stream_dmr.fitting.solver.contour_solver import ContourSolver
+from stream_dmr.fitting.solver.descent import WARM_DAMPING, descend, evaluate, only_size, scan_sizes
+from stream_dmr.fitting.solver.problem import Options, Problem, prior_loss
 from stream_dmr.fitting.target import Target
 from stream_dmr.template.template_file import load_template
 from tests.support.batches import PLANE_NORMAL, crops_of_poses, moved

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.fitting.body import bind_to_midline
-from stream_dmr.fitting.paper.skinning import (
+from stream_dmr.fitting.paper.torch_body import (
     DEFORMATIONS,
     Parameters,
     cholesky_factors,

@@ -5,16 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.cold_start import cold_starts
-from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
-from stream_dmr.fitting.contour.problem import Problem
+from stream_dmr.fitting.body import LOG_SIZE, ROOT_TRANSLATION, Body, MeshLevels
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.heading import is_reversed
-from stream_dmr.fitting.mesh_levels import MeshLevels
-from stream_dmr.fitting.parameters import LOG_SIZE, ROOT_TRANSLATION
+from stream_dmr.fitting.solver.descent import evaluate
+from stream_dmr.fitting.solver.problem import Problem
+from stream_dmr.fitting.starts import cold_starts, recentered
 from stream_dmr.fitting.target import Target
-from stream_dmr.fitting.warm_start import recentered
 from stream_dmr.template.template_file import load_template
 from tests.support.shapes import crop_of, fish_rig, fish_template, pose, seeds
 

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from stream_dmr.fitting.distance_map import signed_distance
-from stream_dmr.fitting.target import Target, mask_contour
+from stream_dmr.fitting.target import Target, mask_contour, signed_distance
 from tests.support.shapes import crop_from_mask, seeds
 
 SIZE = 96

@@ -4,20 +4,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.deformation import KINDS, deform
-from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
-from stream_dmr.fitting.contour.outline import project
-from stream_dmr.fitting.contour.problem import Problem
-from stream_dmr.fitting.contour.visible_rim import visible_rim
-from stream_dmr.fitting.fit_settings import FitMeshSettings
-from stream_dmr.fitting.parameters import (
+from stream_dmr.fitting.body import (
     JOINT_TRANSLATION,
     LOG_SIZE,
     NUM_PER_JOINT,
     NUM_ROOT,
     ROOT_TRANSLATION,
+    Body,
 )
+from stream_dmr.fitting.fit_settings import FitMeshSettings
+from stream_dmr.fitting.solver.descent import evaluate
+from stream_dmr.fitting.solver.outline import project, visible_rim
+from stream_dmr.fitting.solver.problem import Problem
+from stream_dmr.fitting.solver.spine import KINDS, deform
 from stream_dmr.fitting.target import Target
 from stream_dmr.fitting.uncertainty import covariance, length_std_ratio
 from stream_dmr.geometry import arc_length

@@ -14,11 +14,7 @@ from stream_dmr.lengths.kalman import (
     run_filter,
     weighted_median,
 )
-from stream_dmr.lengths.track_length import (
-    TrackLength,
-    late_estimate,
-    measurement_of,
-)
+from stream_dmr.lengths.track_record import TrackLength, late_estimate, measurement_of
 from stream_dmr.messages import LocalizedFish
 from stream_dmr.reasons import Reason
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from stream_dmr.camera import Camera
+from stream_dmr.detection.box_files import AnnotatedBox
+from stream_dmr.detection.given_fish import AnnotatedFish
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.segmentation.annotations.annotated_box import AnnotatedBox
-from stream_dmr.segmentation.annotations.annotated_fish import AnnotatedFish
-from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
+from stream_dmr.segmentation.crop import CropFishSettings
 from tests.support.frames import frame_of, grey_frame
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -20,8 +20,8 @@ import sys
 import cv2, numpy as np
 from stream_dmr.messages import Frame
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.segmentation.annotations.annotated_fish import open_annotated_fish
-from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
+from stream_dmr.detection.given_fish import open_annotated_fish
+from stream_dmr.segmentation.crop import CropFishSettings
 mask = np.zeros((90, 120), np.uint8)
 mask[20:60, 30:90] = 3
 cv2.imwrite("000001.png", mask)

@@ -10,9 +10,9 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from stream_dmr.messages import FishCrop, LocalizedFish, Position
 from stream_dmr.recording.mcap.foxglove_topics import FoxgloveTopics
-from stream_dmr.recording.messages.record import make_record
-from stream_dmr.recording.messages.recording_settings import RecordingSettings
+from stream_dmr.recording.record import make_record
 from stream_dmr.recording.recorder import Recorder
+from stream_dmr.recording.topics import RecordingSettings
 from tests.support.recorded_run import header, run
 
 SETTINGS = RecordingSettings(view_px=640)

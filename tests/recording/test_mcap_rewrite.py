@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from stream_dmr.messages import Frame, LocalizedFish
 from stream_dmr.recording.mcap.mcap_recording import McapRecording, is_torn, whole_records
 from stream_dmr.recording.mcap.mcap_sink import McapSink
-from stream_dmr.recording.mcap.rewrite import REWRITTEN, rewrite
-from stream_dmr.recording.messages.record import make_record
-from stream_dmr.recording.messages.recording_settings import RecordingSettings
-from stream_dmr.recording.messages.topics import TOPICS
+from stream_dmr.recording.record import make_record
+from stream_dmr.recording.repair import REWRITTEN, rewrite
+from stream_dmr.recording.topics import TOPICS, RecordingSettings
 from tests.support.recorded_run import header, run
 
 KINDS = list(TOPICS)

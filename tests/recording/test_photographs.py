@@ -11,12 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.messages import FishCrop
-from stream_dmr.recording.messages.photographs import PhotographChooser
-from stream_dmr.recording.messages.recording_settings import RecordingSettings
-from stream_dmr.recording.reading.open_recording import open_recordings
+from stream_dmr.recording.reading import open_recordings
+from stream_dmr.recording.record import PhotographChooser
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.report.drawn_views import draw_views
-from stream_dmr.report.recorded_tracks import read_tracks
+from stream_dmr.recording.topics import RecordingSettings
+from stream_dmr.web.views import draw_views, read_tracks
 from tests.support.reading import read_messages
 from tests.support.recorded_run import assert_same, header, run
 

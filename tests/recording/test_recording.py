@@ -29,19 +29,16 @@ from stream_dmr.messages import (
     LossTerms,
     Message,
 )
+from stream_dmr.recording.codec import CODEC_VERSION, checksum, decode, stored_picture
+from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.mcap.mcap_sink import McapSink
-from stream_dmr.recording.messages.codec import CODEC_VERSION, decode, stored_picture
-from stream_dmr.recording.messages.picture_codec import checksum
-from stream_dmr.recording.messages.recording_settings import RecordingSettings
-from stream_dmr.recording.messages.run_header import RunHeader
-from stream_dmr.recording.messages.sink import SinkFactory
-from stream_dmr.recording.messages.topics import FOXGLOVE_TOPICS, TOPICS, topics_table
-from stream_dmr.recording.recorder import Recorder
-from stream_dmr.recording.segments.recording_files import open_recording_files
-from stream_dmr.recording.segments.repair import repair_recordings
-from stream_dmr.recording.segments.rotating_sink import open_segments
-from stream_dmr.recording.view.view_geometry import place_fit
-from stream_dmr.results.frames_table import FramesTable
+from stream_dmr.recording.record import SinkFactory
+from stream_dmr.recording.recorder import Recorder, open_recording_files
+from stream_dmr.recording.repair import repair_recordings
+from stream_dmr.recording.segments import open_segments
+from stream_dmr.recording.topics import FOXGLOVE_TOPICS, TOPICS, RecordingSettings, topics_table
+from stream_dmr.recording.view_geometry import place_fit
+from stream_dmr.store.run_tables import FramesTable
 from tests.support.reading import read_header, read_messages, read_metadata
 from tests.support.recorded_run import assert_same, header, run, template
 from tests.support.small_disk import file_size_limit
@@ -233,7 +230,7 @@ def test_a_view_that_has_no_room_to_be_repaired_stays(tmp_path: Path, messages: 
     rrd.write_bytes(rrd.read_bytes()[:-200])
     before = rrd.read_bytes()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("stream_dmr.recording.segments.repair.free_bytes", lambda folder: 1000)
+        patch.setattr("stream_dmr.recording.repair.free_bytes", lambda folder: 1000)
         (repair,) = repair_recordings(tmp_path)
     assert "No space left on device; it stays as it is" in repair.line
     assert rrd.read_bytes() == before
@@ -300,7 +297,7 @@ def test_a_flipped_byte_in_a_message_is_found(tmp_path: Path, messages: list[Mes
 def test_a_recording_of_a_newer_codec_is_refused(
     tmp_path: Path, messages: list[Message], monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("stream_dmr.recording.messages.run_header.CODEC_VERSION", 99)
+    monkeypatch.setattr("stream_dmr.recording.header.CODEC_VERSION", 99)
     record(tmp_path, messages)
     with pytest.raises(RecordingError, match="codec version 99"):
         list(read_messages(tmp_path / "recording.mcap"))
@@ -378,9 +375,7 @@ def test_the_documented_topics_are_the_real_ones():
 
 
 def test_rerun_and_its_global_stream_stay_untouched_by_a_reader():
-    code = (
-        "import sys, stream_dmr.recording.reading.open_recording; sys.exit('rerun' in sys.modules)"
-    )
+    code = "import sys, stream_dmr.recording.reading; sys.exit('rerun' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
@@ -389,7 +384,7 @@ def test_recording_leaves_no_global_rerun_stream(tmp_path: Path):
         "import sys; from pathlib import Path; import rerun as rr\n"
         "from tests.support.recorded_run import header, template\n"
         "from stream_dmr.recording.recorder import Recorder\n"
-        "from stream_dmr.recording.messages.recording_settings import RecordingSettings\n"
+        "from stream_dmr.recording.topics import RecordingSettings\n"
         f"Recorder(Path({str(tmp_path)!r}), header(), RecordingSettings()).close()\n"
         "assert rr.get_global_data_recording() is None"
     )

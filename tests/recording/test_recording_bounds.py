@@ -9,11 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.messages import FittedMesh, Frame, LocalizedFish, Message
-from stream_dmr.recording.messages.codec import encode
-from stream_dmr.recording.messages.record import Record
-from stream_dmr.recording.segments.open_tracks import OpenTracks
-from stream_dmr.recording.view.frame_throttle import FrameThrottle, PendingItems
-from stream_dmr.recording.view.palette import PALETTE, color
+from stream_dmr.recording.codec import encode
+from stream_dmr.recording.record import Record
+from stream_dmr.recording.segments import OpenTracks
+from stream_dmr.recording.view_geometry import PALETTE, FrameThrottle, PendingItems, color
 from tests.support.final_estimates import fish as final_estimate
 from tests.support.recorded_run import run
 

@@ -22,15 +22,16 @@ from stream_dmr.messages import (
     LossTerms,
     SolverReport,
 )
-from stream_dmr.recording.messages.codec import (
+from stream_dmr.recording.codec import (
     CODEC_VERSION,
     DATACLASSES,
     check_version,
+    compress,
     decode,
     encode,
+    parse_proto,
+    proto_class,
 )
-from stream_dmr.recording.messages.picture_codec import compress
-from stream_dmr.recording.messages.schema import parse_proto, proto_class
 from stream_dmr.template.template import Template
 from tests.support.recorded_run import assert_same, calibration, template
 

@@ -14,14 +14,13 @@ from hypothesis.extra.numpy import arrays
 
 from stream_dmr.errors import ConfigError, RecordingError
 from stream_dmr.messages import FishCrop, Frame, Message
+from stream_dmr.recording.frame_images import RecordedPictures, has_original_pixels
 from stream_dmr.recording.mcap.h264_topic import H264Topic, decode_video
-from stream_dmr.recording.messages.record import make_record
-from stream_dmr.recording.messages.recording_settings import RecordingSettings
-from stream_dmr.recording.messages.selection import EVERYTHING, Selection
-from stream_dmr.recording.messages.topics import KEY_FRAME_NS
-from stream_dmr.recording.reading.frame_images import RecordedPictures, has_original_pixels
-from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
+from stream_dmr.recording.reading import decoded_messages, open_recordings
+from stream_dmr.recording.record import make_record
 from stream_dmr.recording.recorder import Recorder
+from stream_dmr.recording.selection import EVERYTHING, Selection
+from stream_dmr.recording.topics import KEY_FRAME_NS, RecordingSettings
 from tests.support.reading import read_messages
 from tests.support.recorded_run import FRAME_NS, assert_same, header, run
 

@@ -18,18 +18,17 @@ from hypothesis.extra.numpy import arrays
 from rerun.chunk import RrdReader
 
 from stream_dmr.errors import SourceError
+from stream_dmr.export.coco_masks import mask_in_frame, run_lengths
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LocalizedFish, Message
-from stream_dmr.recording.messages.picture_codec import checksum
-from stream_dmr.recording.messages.record import make_record
-from stream_dmr.recording.messages.recording_settings import RecordingSettings
-from stream_dmr.recording.reading.frame_images import SourcePictures
-from stream_dmr.recording.reading.rrd_conversion import convert
+from stream_dmr.recording.codec import checksum
+from stream_dmr.recording.frame_images import SourcePictures
+from stream_dmr.recording.record import make_record
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.rerun.live_view import LiveView
 from stream_dmr.recording.rerun.scene_drawing import SceneDrawing
-from stream_dmr.recording.view.mesh_rebuilder import MeshRebuilder
-from stream_dmr.recording.view.view_geometry import shrink_by_halves, view_factor
-from stream_dmr.results.coco_masks import mask_in_frame, run_lengths
+from stream_dmr.recording.rerun.viewer import convert
+from stream_dmr.recording.topics import RecordingSettings
+from stream_dmr.recording.view_geometry import MeshRebuilder, shrink_by_halves, view_factor
 from tests.support.command import invoke, rows
 from tests.support.reading import read_header, read_messages
 from tests.support.recorded_run import assert_same, header, run

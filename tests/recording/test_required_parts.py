@@ -8,17 +8,16 @@ import pytest
 
 from stream_dmr.errors import UserError
 from stream_dmr.recording.mcap.mcap_sink import McapSink
-from stream_dmr.recording.messages.record import make_record
-from stream_dmr.recording.messages.recording_settings import RecordingSettings
-from stream_dmr.recording.messages.selection import EVERYTHING, Selection
-from stream_dmr.recording.messages.topics import TOPICS
-from stream_dmr.recording.reading.open_recording import open_recordings
-from stream_dmr.recording.reading.required_parts import (
+from stream_dmr.recording.reading import (
+    open_recordings,
     require_frame,
     require_messages,
     require_selected,
 )
-from stream_dmr.recording.rerun.rrd_sink import RrdSink
+from stream_dmr.recording.record import make_record
+from stream_dmr.recording.rerun.rrd_file import RrdSink
+from stream_dmr.recording.selection import EVERYTHING, Selection
+from stream_dmr.recording.topics import TOPICS, RecordingSettings
 from tests.support.command import invoke, rows
 from tests.support.fish_run import measure
 from tests.support.recorded_run import header

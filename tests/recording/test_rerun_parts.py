@@ -12,16 +12,18 @@ from hypothesis import strategies as st
 
 from stream_dmr.errors import OutputError, RecordingError
 from stream_dmr.messages import LengthEstimate
-from stream_dmr.recording.messages.record import make_record
-from stream_dmr.recording.messages.recording_settings import RecordingSettings
-from stream_dmr.recording.messages.topics import TOPICS
+from stream_dmr.recording.record import make_record
 from stream_dmr.recording.rerun.blueprint import middle_mm
-from stream_dmr.recording.rerun.column_buffer import ColumnBuffer, payload_columns
-from stream_dmr.recording.rerun.rerun_program import copy_readable_chunks, rerun_program
-from stream_dmr.recording.rerun.rrd_recording import RrdRecording, is_closed
-from stream_dmr.recording.rerun.rrd_sink import RrdSink
-from stream_dmr.recording.rerun.scene_drawing import SceneDrawing
-from stream_dmr.recording.rerun.streams import new_stream
+from stream_dmr.recording.rerun.rrd_file import (
+    RrdRecording,
+    RrdSink,
+    copy_readable_chunks,
+    is_closed,
+    new_stream,
+    rerun_program,
+)
+from stream_dmr.recording.rerun.scene_drawing import ColumnBuffer, SceneDrawing, payload_columns
+from stream_dmr.recording.topics import TOPICS, RecordingSettings
 from tests.support.recorded_run import calibration, header, run
 
 MESSAGES = list(run(3, num_fish=1))
@@ -141,7 +143,7 @@ def test_a_plane_behind_the_camera_has_its_origin_for_a_middle():
 
 def test_an_rrd_is_not_begun_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Rerun would wait for ever, and the run with it."""
-    monkeypatch.setattr("stream_dmr.recording.rerun.rrd_sink.free_bytes", lambda folder: 1000)
+    monkeypatch.setattr("stream_dmr.recording.rerun.rrd_file.free_bytes", lambda folder: 1000)
     with pytest.raises(OutputError, match="room to write to, got: No space left"):
         RrdSink(tmp_path / "a.rrd", header(), SETTINGS)
     assert not (tmp_path / "a.rrd").exists()

@@ -12,14 +12,13 @@ import pytest
 
 from stream_dmr.files import free_bytes
 from stream_dmr.messages import FishCrop, Frame, Message
-from stream_dmr.recording.messages.codec import stored_picture
-from stream_dmr.recording.messages.recording_settings import RecordingSettings
-from stream_dmr.recording.messages.topics import TOPICS
-from stream_dmr.recording.reading.open_recording import open_recordings
+from stream_dmr.recording.codec import stored_picture
+from stream_dmr.recording.reading import open_recordings
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.recording.segments.retention import Retention
-from stream_dmr.recording.segments.rotating_sink import open_segments
-from stream_dmr.results.frames_table import FramesTable
+from stream_dmr.recording.retention import Retention
+from stream_dmr.recording.segments import open_segments
+from stream_dmr.recording.topics import TOPICS, RecordingSettings
+from stream_dmr.store.run_tables import FramesTable
 from tests.recording.test_segments import read_by_others, write_clips
 from tests.support.command import invoke, rows
 from tests.support.reading import read_messages

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.errors import SourceError
-from stream_dmr.recording.messages.run_inputs import InputFile, RunInputs, content_sha256
+from stream_dmr.recording.header import InputFile, RunInputs, content_sha256
 
 FILES = st.builds(InputFile, path=st.text(min_size=1), sha256=st.sampled_from(["", "ab12"]))
 INPUTS = st.builds(

@@ -19,27 +19,21 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from stream_dmr.errors import OutputError
+from stream_dmr.evidence.verify_folder import check_signatures, verify
+from stream_dmr.files import FolderLock
 from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish, Message
-from stream_dmr.recording.messages.codec import decode
-from stream_dmr.recording.messages.record import Record
-from stream_dmr.recording.messages.recording_settings import RecordingSettings
-from stream_dmr.recording.messages.sink_states import SinkStates
-from stream_dmr.recording.messages.topics import TOPICS
-from stream_dmr.recording.reading.open_recording import decoded_messages, open_recordings
-from stream_dmr.recording.recorder import Recorder
-from stream_dmr.recording.segments.recording_files import open_recording_files
-from stream_dmr.recording.segments.repair import repair_recordings
-from stream_dmr.recording.segments.rotating_sink import open_segments
-from stream_dmr.recording.segments.segment_files import last_segment_number
-from stream_dmr.recording.segments.unfinished_files import UnfinishedFiles
-from stream_dmr.report.view_pictures import frame_images, recorded_source
-from stream_dmr.results.folder_lock import FolderLock
-from stream_dmr.results.frames_table import FramesTable
-from stream_dmr.results.signatures import load_public_key, make_key
-from stream_dmr.results.store_rows import INTERRUPTED, MAY_COUNT_TWICE
-from stream_dmr.results.verify import verify
-from stream_dmr.results.verify_signatures import check_signatures
-from tests.running.test_run_signals import start, wait_for_rows
+from stream_dmr.recording.codec import decode
+from stream_dmr.recording.reading import decoded_messages, open_recordings
+from stream_dmr.recording.record import Record, SinkStates
+from stream_dmr.recording.recorder import Recorder, open_recording_files
+from stream_dmr.recording.repair import repair_recordings
+from stream_dmr.recording.segments import UnfinishedFiles, last_segment_number, open_segments
+from stream_dmr.recording.topics import TOPICS, RecordingSettings
+from stream_dmr.store.ledger import load_public_key, make_key
+from stream_dmr.store.run_tables import FramesTable
+from stream_dmr.store.schema import INTERRUPTED, MAY_COUNT_TWICE
+from stream_dmr.web.views import frame_images, recorded_source
+from tests.pipeline.test_run_signals import start, wait_for_rows
 from tests.support.command import invoke, rows
 from tests.support.reading import read_header, read_messages
 from tests.support.recorded_run import assert_same, header, run
@@ -47,7 +41,7 @@ from tests.support.tiny_clip import HEIGHT, QUICK, WIDTH, write_clip
 
 NUM_FRAMES, SLOWER = 24, 20  # 2 fish in 24 frames, 2/3 s from one to the next
 SEGMENT_S = 3.0  # 5 frames
-SEGMENT_FILES = "stream_dmr.recording.segments.segment_files"
+SEGMENT_FILES = "stream_dmr.recording.segments"
 SETTINGS = RecordingSettings(rrd=False, flush_s=1e-9, segment_s=SEGMENT_S)
 
 

@@ -5,10 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stream_dmr.simulation.center_line import total_bend_rad
-from stream_dmr.simulation.pose_sequence import FPS, draw_poses
-from stream_dmr.simulation.presets import PRESETS, find_preset
-from stream_dmr.simulation.skin import draw_skin, noise
+from stream_dmr.simulation.rail_scene import FPS, PRESETS, draw_poses, find_preset
+from stream_dmr.simulation.simulated_fish import draw_skin, noise, total_bend_rad
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -9,19 +9,23 @@ from hypothesis import strategies as st
 
 from stream_dmr.errors import UserError
 from stream_dmr.geometry import arc_length, bending_ratio
-from stream_dmr.simulation.center_line import NUM_STEPS, bend_center_line, total_bend_rad
-from stream_dmr.simulation.presets import PRESETS
-from stream_dmr.simulation.rail_scene import draw_calibration, make_scene
+from stream_dmr.simulation.rail_scene import PRESETS, draw_calibration, make_scene
 from stream_dmr.simulation.render import draw_fish_patch, draw_mask, frame_window
-from stream_dmr.simulation.simulated_body import (
+from stream_dmr.simulation.simulated_fish import (
     CENTER_ARC,
     HALIBUT,
+    NUM_STEPS,
+    SPECIES,
+    HangingPose,
+    bend_center_line,
     draw_body,
+    draw_fish,
+    find_species,
     keypoints,
+    pose_fish,
     straight_body,
+    total_bend_rad,
 )
-from stream_dmr.simulation.simulated_fish import HangingPose, draw_fish, pose_fish
-from stream_dmr.simulation.species import SPECIES, find_species
 from tests.support.simulated_view import draw_view
 
 SEEDS = st.integers(0, 2**32 - 1)

@@ -5,7 +5,7 @@ import itertools
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.sources.capture_clock import CaptureClock
+from stream_dmr.sources.live_stream import CaptureClock
 
 SECOND_NS = 10**9
 HOUR_NS = 3600 * SECOND_NS

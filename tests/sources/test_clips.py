@@ -13,10 +13,9 @@ import pytest
 
 from stream_dmr.errors import SourceError
 from stream_dmr.messages import Frame
-from stream_dmr.sources.clip_folder import ClipFolder
+from stream_dmr.sources.folders import ClipFolder
 from stream_dmr.sources.open_source import open_source
-from stream_dmr.sources.read_settings import ReadFramesSettings
-from stream_dmr.sources.source import ResumePoint
+from stream_dmr.sources.source import ReadFramesSettings, ResumePoint
 
 AT_ONCE = ReadFramesSettings(clips_wait_s=0.0)
 OLD_S = 1_700_000_000

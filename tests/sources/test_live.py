@@ -18,8 +18,7 @@ from stream_dmr.messages import Frame
 from stream_dmr.sources.decoder import Decoder, DecodingError, decoding_ahead
 from stream_dmr.sources.decoder_process import NUM_SLOTS
 from stream_dmr.sources.live_stream import LiveStream
-from stream_dmr.sources.read_settings import ReadFramesSettings
-from stream_dmr.sources.source import ResumePoint
+from stream_dmr.sources.source import ReadFramesSettings, ResumePoint
 from stream_dmr.sources.video_file import VideoFile
 from tests.support.camera import Camera, camera, require_server
 

@@ -6,9 +6,9 @@ import pytest
 from PIL import Image
 
 from stream_dmr.errors import SourceError
+from stream_dmr.sources.folders import PictureFolder
 from stream_dmr.sources.open_source import open_source
-from stream_dmr.sources.picture_folder import PictureFolder
-from stream_dmr.sources.read_settings import ReadFramesSettings
+from stream_dmr.sources.source import ReadFramesSettings
 from tests.support.sources import SETTINGS, noise, read, refusal
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stream_dmr.sources.seekable_video import SeekableVideo
+from stream_dmr.sources.video_file import SeekableVideo
 from tests.sources.test_video import write_video
 from tests.support.sources import read
 from tests.support.trip import delay_frames

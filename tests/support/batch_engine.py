@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from stream_dmr.batch import local_engine
+from stream_dmr.batch import engines
 from stream_dmr.batch.manifest import Job
-from stream_dmr.batch.measure_video import Outcome, measure_video
-from stream_dmr.batch.progress import BatchProgress
+from stream_dmr.batch.measure_video import BatchProgress, Outcome, measure_video
 
 
 class ThisProcess:
@@ -24,4 +23,4 @@ class ThisProcess:
 
 def without_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let `stream-dmr batch` measure in this process."""
-    monkeypatch.setattr(local_engine, "LocalEngine", lambda workers: ThisProcess())
+    monkeypatch.setattr(engines, "LocalEngine", lambda workers: ThisProcess())

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from stream_dmr.fitting.paper.skinning import Rig
-from stream_dmr.fitting.parameters import JOINT_ROTATION, NUM_PER_JOINT, NUM_ROOT
+from stream_dmr.fitting.body import JOINT_ROTATION, NUM_PER_JOINT, NUM_ROOT
+from stream_dmr.fitting.paper.torch_body import Rig
 from stream_dmr.template.template_file import load_template
 from tests.support.shapes import POINTS, crop_of, fish_template, pose
 

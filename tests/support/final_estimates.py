@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from stream_dmr.messages import LengthEstimate
-from stream_dmr.results.run_facts import RunFacts
+from stream_dmr.store.run_facts import RunFacts
 
 FACTS = RunFacts(
     source="clip.mp4",

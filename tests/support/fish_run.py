@@ -3,8 +3,8 @@
 import threading
 from pathlib import Path
 
-from stream_dmr.running.measure_source import measure_source
-from stream_dmr.running.run_request import RunRequest
+from stream_dmr.pipeline.measure_source import measure_source
+from stream_dmr.pipeline.run_options import RunRequest
 from tests.support.tiny_clip import write_clip
 
 FISH = [[1], [1, 2], [1, 2], [1, 2], [1, 2], [2]]

@@ -4,9 +4,7 @@ import numpy as np
 
 from stream_dmr.camera import Camera
 from stream_dmr.messages import FishCrop, Frame
-from stream_dmr.segmentation.detection.fish_detection import Detection
-from stream_dmr.segmentation.masks.crop_settings import CropFishSettings
-from stream_dmr.segmentation.masks.cropping import crop_fish
+from stream_dmr.segmentation.crop import CropFishSettings, Detection, crop_fish
 from tests.support.frames import grey_frame
 
 

@@ -18,8 +18,7 @@ from pathlib import Path
 import stream_dmr.fitting.fitter
 from stream_dmr.batch.driver import run_batch
 from stream_dmr.batch.manifest import Job, read_manifest
-from stream_dmr.batch.measure_video import Outcome, measure_video
-from stream_dmr.batch.progress import BatchProgress
+from stream_dmr.batch.measure_video import BatchProgress, Outcome, measure_video
 
 assert stream_dmr.fitting.fitter  # loaded here, once
 

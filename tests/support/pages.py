@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from stream_dmr import messages
+from stream_dmr.pipeline.config import Config
 from stream_dmr.reasons import Reason
-from stream_dmr.recording.messages.topics import topics_table
-from stream_dmr.running.config import Config
+from stream_dmr.recording.topics import topics_table
 from tests.support.plan import draw_plan, read_plan
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"

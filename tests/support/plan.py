@@ -30,9 +30,11 @@ class Plan(NamedTuple):
 
 
 def room_name(module: str) -> str:
-    """The package that a module lies in; the modules beside the packages are one room."""
+    """The package of a module; modules beside the packages are one room, except the API."""
     if module == "stream_dmr":
         return module
+    if module == "stream_dmr.api":
+        return "api"
     first = module.removeprefix("stream_dmr.").partition(".")[0]
     return first if first and (PACKAGE / first).is_dir() else _GROUND
 
@@ -109,6 +111,7 @@ def _description(room: str) -> str:
         loose = [file.stem for file in sorted(PACKAGE.glob("*.py")) if file.stem != "__init__"]
         return ", ".join(loose)
     file = PACKAGE / ("" if room == "stream_dmr" else room) / "__init__.py"
+    file = PACKAGE / "api.py" if room == "api" else file
     text = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8")))
     assert text, f"{file}: expected a docstring, got none; say in one line what the room does"
     return text.splitlines()[0].rstrip(".").replace("`", "")

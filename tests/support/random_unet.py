@@ -5,10 +5,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from stream_dmr.segmentation.network.onnx_session import open_session
-from stream_dmr.segmentation.network.unet import UNet
-from stream_dmr.segmentation.network.unet_export import unet_as_onnx
-from stream_dmr.segmentation.network.unet_segmenter import UNetSegmenter
+from stream_dmr.networks.onnx_session import open_session
+from stream_dmr.networks.unet import UNet, unet_as_onnx
+from stream_dmr.segmentation.unet_segmenter import UNetSegmenter
 
 
 def random_network(seed: int = 0) -> UNet:

@@ -15,8 +15,8 @@ from pathlib import Path
 from ray.cluster_utils import Cluster
 
 from stream_dmr.batch.driver import run_batch
+from stream_dmr.batch.engines import RayEngine
 from stream_dmr.batch.manifest import read_manifest
-from stream_dmr.batch.ray_engine import RayEngine
 from stream_dmr.errors import UserError
 
 

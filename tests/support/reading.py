@@ -4,10 +4,10 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from stream_dmr.messages import Message
-from stream_dmr.recording.messages.codec import decode
-from stream_dmr.recording.messages.run_header import RunHeader
-from stream_dmr.recording.messages.topics import TOPICS
-from stream_dmr.recording.reading.open_recording import open_recordings
+from stream_dmr.recording.codec import decode
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.reading import open_recordings
+from stream_dmr.recording.topics import TOPICS
 
 
 def read_header(path: Path) -> RunHeader:

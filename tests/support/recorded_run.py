@@ -21,7 +21,7 @@ from stream_dmr.messages import (
     Message,
     SolverReport,
 )
-from stream_dmr.recording.messages.run_header import RunHeader
+from stream_dmr.recording.header import RunHeader
 from stream_dmr.template.template import Template
 
 WIDTH, HEIGHT, CROP = 1280, 960, 128

@@ -6,9 +6,8 @@ import trimesh
 from hypothesis import strategies as st
 
 from stream_dmr.camera import Camera
-from stream_dmr.fitting.paper.silhouette import project, silhouette
-from stream_dmr.fitting.paper.skinning import Deformed, Rig, deform, spine
-from stream_dmr.fitting.parameters import rest_vector
+from stream_dmr.fitting.body import rest_vector
+from stream_dmr.fitting.paper.torch_body import Deformed, Rig, deform, project, silhouette, spine
 from stream_dmr.messages import CropQuality, FishCrop
 from stream_dmr.template.template import canonical_template
 

@@ -6,9 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from stream_dmr.camera import Calibration
-from stream_dmr.simulation.pose_sequence import draw_poses
-from stream_dmr.simulation.presets import Preset, find_preset
-from stream_dmr.simulation.rail_scene import draw_calibration
+from stream_dmr.simulation.rail_scene import Preset, draw_calibration, draw_poses, find_preset
 from stream_dmr.simulation.simulated_fish import HangingPose, PosedFish, draw_fish, pose_fish
 
 _VIEW = 2  # key of a stream of random numbers of its own

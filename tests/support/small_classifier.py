@@ -12,9 +12,9 @@ from torch import nn
 
 from stream_dmr.messages import FishCrop
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.running.config import load_config
-from stream_dmr.segmentation.tracking.fish_finder import open_finder
+from stream_dmr.pipeline.config import load_config
 from stream_dmr.sources.open_source import open_source
+from stream_dmr.tracking.finder import open_finder
 
 SIDE_PX = 24
 _STEPS, _BATCH = 100, 32

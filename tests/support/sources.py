@@ -5,7 +5,7 @@ import pytest
 
 from stream_dmr.errors import SourceError
 from stream_dmr.sources.open_source import open_source
-from stream_dmr.sources.read_settings import ReadFramesSettings
+from stream_dmr.sources.source import ReadFramesSettings
 
 SETTINGS = ReadFramesSettings()
 

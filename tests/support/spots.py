@@ -4,8 +4,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from stream_dmr.detection.detector import Candidate
 from stream_dmr.messages import Frame
-from stream_dmr.segmentation.detection.detector import Candidate
 from tests.support.frames import frame_of
 
 WIDTH, HEIGHT = 640, 480

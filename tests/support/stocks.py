@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from stream_dmr.fitting.paper.skinning import Rig
+from stream_dmr.fitting.paper.torch_body import Rig
 from stream_dmr.fitting.shape.candidates import CandidateShape, CandidateShapes
-from stream_dmr.fitting.shape.samples import FishSamples, Sample
 from stream_dmr.fitting.shape.space import (
     BREADTH,
     BREADTH_KNOTS,
@@ -12,6 +11,7 @@ from stream_dmr.fitting.shape.space import (
     form_precision,
     reshaped,
 )
+from stream_dmr.fitting.shape.stocks import FishSamples, Sample
 from stream_dmr.template.template import simplified
 from stream_dmr.template.template_file import load_template
 from tests.support.shapes import crop_of, pose

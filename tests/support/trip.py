@@ -10,10 +10,10 @@ import av
 import numpy as np
 
 from stream_dmr.camera import Calibration, Camera
-from stream_dmr.sensors.sensors_settings import utc_ns_of
 from stream_dmr.simulation.rail_scene import RailScene, Visit, make_scene
-from stream_dmr.simulation.species import find_species
+from stream_dmr.simulation.simulated_fish import find_species
 from stream_dmr.simulation.write_scene import write_scene
+from stream_dmr.sources.sensors_settings import utc_ns_of
 from tests.support.nmea import rmc
 
 START_UTC = "2026-11-22T06:00:00Z"

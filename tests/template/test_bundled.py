@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from stream_dmr.geometry import arc_length
-from stream_dmr.template.body_forms import load_body_forms
 from stream_dmr.template.make_bundled import body_mesh, template_toml
+from stream_dmr.template.template import load_body_forms
 from stream_dmr.template.template_file import BUNDLED, bundled_names, load_template
 from tests.support.template_files import body_of
 

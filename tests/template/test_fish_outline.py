@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stream_dmr.errors import TemplateError
-from stream_dmr.template.body_forms import load_body_forms
 from stream_dmr.template.fish_outline import fish_outline
+from stream_dmr.template.template import load_body_forms
 from stream_dmr.template.template_file import bundled_names, load_template
 
 SIZE = 1000  # px, of square pictures

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.errors import TemplateError
-from stream_dmr.template.mesh_points import find_points
+from stream_dmr.template.fish_outline import find_points
 from stream_dmr.template.template_file import bundled_names, load_template
 from tests.support.shapes import seeds
 

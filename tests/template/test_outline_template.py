@@ -8,7 +8,7 @@ import pytest
 
 from stream_dmr.errors import TemplateError
 from stream_dmr.template.fish_outline import fish_outline
-from stream_dmr.template.outline_template import nearest_form, template_from_masks
+from stream_dmr.template.from_masks import nearest_form, template_from_masks
 from stream_dmr.template.template_file import bundled_names, load_template
 from tests.support.command import invoke
 from tests.support.template_files import body_of

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.template.ring_mesh import (
+from stream_dmr.template.from_masks import (
     NUM_RINGS,
     NUM_SECTORS,
     ring_angles,

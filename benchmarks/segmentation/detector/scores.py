@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float
 
 from benchmarks.segmentation.detector.frame_sources import read_sources
 from benchmarks.segmentation.detector.training_frames import AnnotatedFrame
+from stream_dmr.detection.network_detectors import OnnxDetector, OnnxSettings
+from stream_dmr.geometry import box_iou
 from stream_dmr.messages import Frame
-from stream_dmr.segmentation.detection.detector import box_iou
-from stream_dmr.segmentation.detection.onnx_detector import OnnxDetector, OnnxSettings
 
 _MIN_SCORE = 0.01  # of the boxes that count
 _SAME = 0.5  # IoU from which on a box is a fish's

@@ -26,12 +26,8 @@ from benchmarks.segmentation.detector.loss import detection_loss
 from benchmarks.segmentation.detector.onnx_module import OnnxModule
 from benchmarks.segmentation.detector.scores import score
 from benchmarks.segmentation.detector.training_frames import FrameSource, read_singles
-from stream_dmr.segmentation.training.annotated_samples import (
-    cutout_patch,
-    load_backgrounds,
-    load_fish_cutouts,
-)
-from stream_dmr.segmentation.training.patch_bank import load_or_make_bank
+from stream_dmr.training.annotated_images import cutout_patch, load_backgrounds, load_fish_cutouts
+from stream_dmr.training.image_degradation import load_or_make_bank
 
 _SINGLES = ["fish_market", "caltech_bass", "milkfish_weight", "specimens", "fishial"]
 _BATCH, _RATE, _WEIGHT_DECAY = 16, 1e-3, 1e-4

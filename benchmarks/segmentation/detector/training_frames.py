@@ -17,9 +17,8 @@ from benchmarks.segmentation.real_images import (
     labels_of,
     without_padding,
 )
-from stream_dmr.segmentation.training.annotated_images import read_annotated_images
-from stream_dmr.segmentation.training.image_degradation import add_weather, simulate_camera
-from stream_dmr.segmentation.training.patch_bank import PatchBank
+from stream_dmr.training.annotated_images import read_annotated_images
+from stream_dmr.training.image_degradation import PatchBank, add_weather, simulate_camera
 
 SIDE_PX = 448  # of a training frame: between the sides of a detector's input
 _KEPT_PX = 640  # longer side of the photographs that are kept in memory

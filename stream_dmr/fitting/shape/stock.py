@@ -1,4 +1,24 @@
-"""The mean shape of a stock, from frames of its fish: a bundle adjustment with a prior.
+"""Learn the mean shape of one stock of fish.
+
+Roll, the turn of a fish about its own axis, in which a wrong breadth can hide.
+
+A fish that is rolled by r shows the breadth sqrt(b^2 cos^2 r + t^2 sin^2 r), with its breadth b and
+its thickness t. So a body that is too broad is fitted nearly as well, rolled away from the camera,
+and no step of a descent leads out of there: breadth and roll would have to change together.
+
+Fits of a fish as if it faced the camera squarely: neither rolled, slanted, twisted nor arched.
+
+What these hide or feign of a shape is second order: where a body that is wrong is fitted rolled or
+arched, no step of a descent leads back, since shape and pose would have to change together. So a
+shape is learnt from square fits, in which all that differs from it is its own, and how fish are
+turned is thought of afterwards, for all of them at once (`proportions.py`).
+
+The least-squares problem of one fit over pose and shape together.
+
+The contour residuals of `contour.contour_residuals`, with further columns: a coefficient of
+`space.py` moves rest vertices, and the deformation carries that along as it carries the vertices.
+
+The mean shape of a stock, from frames of its fish: a bundle adjustment with a prior.
 
 Of every frame the pose is free; all fish of a stock share its shape s, from which individuals
 differ by a known covariance. At given poses the normal equations of a frame (`equations.py`) have
@@ -17,19 +37,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.transform import Rotation
 
-from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.levenberg_marquardt import WARM_DAMPING
-from stream_dmr.fitting.contour.problem import Options, Problem
-from stream_dmr.fitting.contour.scan import descend
+from stream_dmr.compiled import compiled
+from stream_dmr.fitting.body import LOG_SIZE, ROOT_ROTATION, Body, joints_of
 from stream_dmr.fitting.fit_settings import FitMeshSettings
-from stream_dmr.fitting.parameters import joints_of
-from stream_dmr.fitting.shape.equations import shape_equations
-from stream_dmr.fitting.shape.evidence import nats_against
-from stream_dmr.fitting.shape.proportions import Proportions, infer_proportions
-from stream_dmr.fitting.shape.roll import rolled_as_seen, unrolled
 from stream_dmr.fitting.shape.space import (
     BREADTH,
     LOBES,
@@ -37,17 +51,178 @@ from stream_dmr.fitting.shape.space import (
     NUM_COEFFICIENTS,
     THICKNESS,
     TRUNK,
+    Proportions,
     directions,
     form_precision,
     individual_covariance,
+    infer_proportions,
     reshaped,
     roundness,
     std_of,
     with_std_of,
 )
-from stream_dmr.fitting.shape.square_fit import square_pose, square_problem
+from stream_dmr.fitting.size import nats_against
+from stream_dmr.fitting.solver.descent import WARM_DAMPING, descend, evaluate, weighted_squares
+from stream_dmr.fitting.solver.linear_blend import (
+    blend,
+    cholesky_factors,
+    dot,
+    fill_rotation,
+    rotation_and_jacobian,
+    skinning_weights,
+)
+from stream_dmr.fitting.solver.outline import (
+    Rendering,
+    RimSlopes,
+    contour_residuals,
+    pixel_slopes,
+    rim_vertices,
+    visible_rim,
+)
+from stream_dmr.fitting.solver.problem import Options, Problem, regularise, roll_and_slope
+from stream_dmr.fitting.solver.spine import jacobian
 from stream_dmr.fitting.target import Target
 from stream_dmr.template.template import Template
+
+
+def unrolled(
+    pose: Float[np.ndarray, "P"], anchor: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "P"]:
+    """The pose turned about the body's axis until the broad side faces the camera."""
+    # A copy: for the read-only arrays of messages numba would compile it once more.
+    return _turned(pose, roll_and_slope(pose.copy(), anchor)[0])
+
+
+def rolled_as_seen(
+    pose: Float[np.ndarray, "P"], log_breadth: float, roundness: float
+) -> Float[np.ndarray, "P"]:
+    """An unrolled pose, rolled until this factor of the breadth is seen, as far as roll can.
+
+    `roundness` is the thickness of the body over its breadth.
+    """
+    seen = np.clip(np.exp(2 * log_breadth), min(roundness**2, 1.0), 1.0)
+    roll = np.arcsin(np.sqrt((1 - seen) / max(1 - roundness**2, 1e-9)).clip(0, 1))
+    return _turned(pose, -float(roll))
+
+
+def _turned(pose: Float[np.ndarray, "P"], angle: float) -> Float[np.ndarray, "P"]:
+    turned = pose.copy()
+    turn = Rotation.from_rotvec(turned[ROOT_ROTATION]) * Rotation.from_euler("x", angle)
+    turned[ROOT_ROTATION] = turn.as_rotvec()
+    return turned
+
+
+# What is held near zero, by priors of these stds; chosen so that none of them can hide a per cent.
+_HELD_ROLL_RAD, _HELD_TILT_RAD = 0.03, 0.02
+_HELD_TWIST_RAD, _HELD_ARCH_RAD = 0.05, 0.05
+_ARCH = 1  # of a joint's rotation: about the axis across the fish, out of the picture
+_OPTIONS = Options(iterations=12, tolerance=1e-6, damping=1e-3)
+
+
+def square_problem(
+    settings: FitMeshSettings,
+    body: Body,
+    target: Target,
+    *,
+    scale_std: float,
+    arch_std_rad: float = _HELD_ARCH_RAD,
+) -> Problem:
+    """The problem of a square fit; joints' log scales and bends out of the picture have a std."""
+    held = settings.model_copy(
+        update={
+            "tilt_std_rad": _HELD_TILT_RAD,
+            "twist_std_rad": _HELD_TWIST_RAD,
+            "lambda_scale": settings.nat / (2 * scale_std**2),
+        }
+    )
+    problem = Problem.from_settings(held, body, target, with_smoothness=False)
+    joint = problem.priors.joint.copy()
+    joint[_ARCH] = settings.prior_weight / arch_std_rad**2
+    roll = settings.nat / _HELD_ROLL_RAD**2
+    return problem._replace(priors=problem.priors._replace(joint=joint, roll=roll))
+
+
+def square_pose(problem: Problem, pose: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
+    """The pose of a square fit, sought from an unrolled one."""
+    return descend(problem, pose, np.zeros(len(pose), np.bool_), _OPTIONS).parameters
+
+
+class ShapeEquations(NamedTuple):
+    """E(pose + x, shape + y) = E + g z + z H z / 2, with z = (x, y)."""
+
+    H: Float[np.ndarray, "Z Z"]
+    g: Float[np.ndarray, "Z"]
+
+
+def shape_equations(
+    problem: Problem,
+    parameters: Float[np.ndarray, "P"],
+    directions: Float[np.ndarray, "V 3 W"],
+) -> ShapeEquations:
+    """H and g of a fit by the spine; `directions` are those of its body's vertices."""
+    rendering = evaluate(problem, parameters, False).rendering  # compiled once, for all
+    return _equations(problem, parameters, rendering, directions)
+
+
+@compiled
+def _equations(
+    problem: Problem,
+    parameters: Float[np.ndarray, "P"],
+    rendering: Rendering,
+    directions: Float[np.ndarray, "V 3 W"],
+) -> ShapeEquations:
+    visible = visible_rim(rendering)
+    row_of, chosen = rim_vertices(problem.body.num_vertices, visible.edges)
+    num_pose, num_shape = len(parameters), directions.shape[2]
+    slopes = np.empty((len(chosen), 3, num_pose + num_shape))
+    to_pose = jacobian(problem.body, problem.kind, parameters, chosen)
+    for c in range(len(chosen)):
+        for i in range(3):
+            for p in range(num_pose):
+                slopes[c, i, p] = to_pose[c, i, p]
+    _carry(problem.body, parameters, directions, chosen, slopes[:, :, num_pose:])
+    moved = RimSlopes(row_of, pixel_slopes(rendering.points, chosen, slopes, problem.target))
+    H, g = weighted_squares(contour_residuals(problem.target, rendering.pixels, visible, moved))
+    pose_H, pose_g = np.zeros((num_pose, num_pose)), np.zeros(num_pose)
+    regularise(problem, parameters, pose_H, pose_g)
+    for p in range(num_pose):
+        g[p] += pose_g[p]
+        for q in range(num_pose):
+            H[p, q] += pose_H[p, q]
+    return ShapeEquations(H, g)
+
+
+@compiled
+def _carry(
+    body: Body,
+    parameters: Float[np.ndarray, "P"],
+    directions: Float[np.ndarray, "V 3 W"],
+    chosen: Int[np.ndarray, "C"],
+    out: Float[np.ndarray, "C 3 W"],
+) -> None:
+    """Where directions at rest point in the deformed body, as `spine_points` carries offsets."""
+    joints, num_joints = joints_of(parameters), len(body.joints)
+    L, S = cholesky_factors(joints.weight), np.exp(joints.log_scale)
+    W, dE = np.empty(num_joints), np.empty((num_joints, 6))
+    blended, turned = np.empty(3), np.empty((3, 3))
+    root, _ = rotation_and_jacobian(parameters[ROOT_ROTATION])
+    size = np.exp(parameters[LOG_SIZE])
+    for c in range(len(chosen)):
+        n = chosen[c]
+        skinning_weights(body.places[body.place_of[n]], body.joints, L, W, dE)
+        blend(W, joints.rotation, blended)
+        fill_rotation(blended, turned)
+        scale = size * dot(W, S)
+        for i in range(3):
+            for k in range(out.shape[2]):
+                out[c, i, k] = 0.0
+            for m in range(3):
+                carried = 0.0
+                for j in range(3):
+                    carried += root[i, j] * turned[j, m]
+                for k in range(out.shape[2]):
+                    out[c, i, k] += scale * carried * directions[n, m, k]
+
 
 # Fish of a stock hang nearer to the plane on average than any one of them.
 _TILT_STD_RAD = 0.15

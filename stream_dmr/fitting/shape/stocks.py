@@ -6,22 +6,115 @@ criterion). Then every fish is refitted with each stock's shape, and the stocks 
 more from their own.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
-from stream_dmr.fitting.cold_start import cold_starts
-from stream_dmr.fitting.contour.contour_solver import ContourSolver
+from stream_dmr.camera import Calibration
+from stream_dmr.fitting.body import MeshLevels
 from stream_dmr.fitting.fit_settings import FitMeshSettings
-from stream_dmr.fitting.mesh_levels import MeshLevels
 from stream_dmr.fitting.shape.candidates import CandidateShape, CandidateShapes
-from stream_dmr.fitting.shape.samples import FishSamples
-from stream_dmr.fitting.shape.side_by_side import side_by_side
 from stream_dmr.fitting.shape.space import NUM_COEFFICIENTS, form_precision, reshaped
 from stream_dmr.fitting.shape.stock import FormOdds, PosedTarget, Stock, StockFitter
+from stream_dmr.fitting.solver.contour_solver import ContourSolver
+from stream_dmr.fitting.starts import cold_starts
 from stream_dmr.fitting.target import Target
+from stream_dmr.fitting.tracks import TrackFitter
+from stream_dmr.messages import FishCrop
+from stream_dmr.species import SpeciesSettings
 from stream_dmr.template.template import Template
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def side_by_side(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """The results in the order of the items; where the caller stops, the rest is not computed."""
+    pool = ThreadPoolExecutor(os.cpu_count() or 1)
+    try:
+        yield from pool.map(function, items)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+FRAMES_PER_FISH = 4  # far apart: more of one passage say little that is new
+_TRIED_PER_FISH = 8  # frames of which the best fitted are taken; chosen
+MAX_FISH = 60  # a stock's mean is known to an eighth of its individuals' spread, then
+# Of a frame; chosen so that only masks of whole fish are learnt from.
+_MIN_VISIBLE = 0.99
+_MIN_CONFIDENCE = 0.52  # of a mask that was found
+
+T = TypeVar("T")
+
+
+@dataclass(eq=False)
+class Sample:
+    """One frame of a fish with the pose in which it was fitted."""
+
+    crop: FishCrop  # without its picture
+    pose: Float[np.ndarray, "P"]
+
+
+@dataclass(eq=False)
+class FishSamples:
+    """The chosen frames of one fish, in order."""
+
+    track_id: int
+    candidate: int  # the shape that it was fitted with
+    samples: list[Sample]
+    against: Float[np.ndarray, "N"]  # nats that its masks say against each shape there is
+
+
+@dataclass
+class GoodCrops:
+    """Crops of one fish that show it whole, evenly over all of them; memory is bounded."""
+
+    _stride: int = 1  # every how many good crops one is kept
+    _num_good: int = 0
+    _kept: list[FishCrop] = field(default_factory=list)
+
+    def add(self, crop: FishCrop) -> None:
+        """Take the next crop of the fish; its picture is not kept."""
+        if not _is_good(crop):
+            return
+        if self._num_good % self._stride == 0:
+            self._kept.append(replace(crop, image=None))
+        self._num_good += 1
+        if len(self._kept) > 2 * _TRIED_PER_FISH:
+            self._kept, self._stride = self._kept[::2], 2 * self._stride
+
+    def chosen(self) -> list[FishCrop]:
+        """A few that are far apart; none where the fish was never seen whole."""
+        return evenly(self._kept, _TRIED_PER_FISH)
+
+
+def good_crops(crops: Iterable[FishCrop]) -> list[list[FishCrop]]:
+    """An even choice of fish, and of each one's crops that show it whole."""
+    tracks: dict[int, GoodCrops] = {}
+    for crop in crops:
+        tracks.setdefault(crop.track_id, GoodCrops()).add(crop)
+    seen_whole = {
+        track_id: chosen for track_id in sorted(tracks) if (chosen := tracks[track_id].chosen())
+    }
+    return evenly([*seen_whole.values()], MAX_FISH)
+
+
+def evenly(items: Sequence[T], most: int) -> list[T]:
+    """At most so many items, evenly over all of them, first and last among them."""
+    places = np.linspace(0, len(items) - 1, min(len(items), most)).round().astype(int)
+    return [items[place] for place in np.unique(places)]
+
+
+def _is_good(crop: FishCrop) -> bool:
+    quality = crop.quality
+    is_sure = quality.mask_confidence is None or quality.mask_confidence >= _MIN_CONFIDENCE
+    return is_sure and not quality.touches_border and quality.visible_fraction >= _MIN_VISIBLE
+
 
 # The frames of a fish, far apart, determine its shape as two independent ones would.
 _FRAMES_WORTH = 2.0
@@ -211,3 +304,51 @@ def _evidence_for_two(a: _Group, b: _Group, both: _Group) -> float:
     apart = a.stock.nats | b.stock.nats
     gains = [_FRAMES_WORTH * (both.stock.nats[fish] - nats) for fish, nats in apart.items()]
     return float(np.clip(gains, _MAX_AGAINST, _MAX_FOR).sum()) - b.num_effective
+
+
+_MIN_IOU = 0.85  # of a fit from which a shape is learnt; chosen
+
+
+def learn_shapes(
+    crops: Iterable[FishCrop],
+    template: Template,
+    forms: CandidateShapes,
+    settings: FitMeshSettings,
+    *,
+    calibration: Calibration | None,
+    species: SpeciesSettings | None = None,
+    suffices: Callable[[CandidateShapes], bool] = lambda stocks: False,
+    progress: Callable[[str], None] = lambda step: None,
+) -> CandidateShapes | None:
+    """The stocks that these fish are of; None where none of them is seen whole.
+
+    `crops` in the order of their capture; of each fish some that are far apart are fitted, with
+    each of the `forms` until one is chosen. `suffices`: see `learn_stocks`.
+    """
+    tracks = TrackFitter(
+        template,
+        settings.model_copy(update={"scan_iterations": 0}),  # shapes need no sizes
+        calibration=calibration,
+        candidates=forms,
+        species=species,
+    )
+
+    def fitted(chosen: list[FishCrop]) -> FishSamples | None:
+        fits = [(crop, shape) for crop in chosen if (shape := tracks.fit(crop).shape) is not None]
+        samples = [Sample(crop, shape.parameters) for crop, shape in fits if shape.iou >= _MIN_IOU]
+        if not samples:
+            return None
+        candidate = fits[-1][1].candidate or 0  # the last one is decided by all before it
+        track_id = chosen[0].track_id
+        against = tracks.against(track_id) + np.log(forms.shares)  # masks alone
+        return FishSamples(track_id, candidate, evenly(samples, FRAMES_PER_FISH), against)
+
+    fish: list[FishSamples] = []
+    for one in side_by_side(fitted, good_crops(crops)):
+        if one is not None:
+            fish.append(one)
+            progress(f"{len(fish)} fish looked at")
+    normal = tracks.fitters[0].plane_normal
+    return learn_stocks(
+        template, forms, fish, settings, plane_normal=normal, suffices=suffices, progress=progress
+    )

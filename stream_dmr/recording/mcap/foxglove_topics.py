@@ -20,14 +20,14 @@ from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import Calibration, Camera
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, Frame, LocalizedFish, Position
-from stream_dmr.recording.messages.picture_codec import compress
-from stream_dmr.recording.messages.record import Record
-from stream_dmr.recording.messages.recording_settings import RecordingSettings
-from stream_dmr.recording.messages.run_header import RunHeader
-from stream_dmr.recording.messages.topics import FOXGLOVE_TOPICS
-from stream_dmr.recording.view.frame_throttle import FrameThrottle, PendingItems
-from stream_dmr.recording.view.palette import color
-from stream_dmr.recording.view.view_geometry import (
+from stream_dmr.recording.codec import compress
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.record import Record
+from stream_dmr.recording.topics import FOXGLOVE_TOPICS, RecordingSettings
+from stream_dmr.recording.view_geometry import (
+    FrameThrottle,
+    PendingItems,
+    color,
     outlines,
     place_fit,
     shrink_by_halves,

@@ -19,8 +19,8 @@ from jaxtyping import UInt8
 
 from stream_dmr.errors import RecordingError
 from stream_dmr.messages import Frame
-from stream_dmr.recording.messages.record import Record
-from stream_dmr.recording.messages.topics import KEY_FRAME_NS, VIDEO
+from stream_dmr.recording.record import Record
+from stream_dmr.recording.topics import KEY_FRAME_NS, VIDEO
 
 _PRESET = "superfast"  # measured: half the time of "veryfast" for 10 % more bytes
 _BT601, _LIMITED = 5, 1  # FFmpeg's AVCOL_SPC_BT470BG and AVCOL_RANGE_MPEG: OpenCV's YUV

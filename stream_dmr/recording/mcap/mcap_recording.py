@@ -25,11 +25,11 @@ from zstandard import ZstdError
 from stream_dmr.errors import RecordingError
 from stream_dmr.files import Snapshot, is_locked
 from stream_dmr.messages import LocalizedFish, Message
+from stream_dmr.recording.codec import check_version, decode
+from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.mcap.mcap_sink import PART
-from stream_dmr.recording.messages.codec import check_version, decode
-from stream_dmr.recording.messages.run_header import RunHeader
-from stream_dmr.recording.messages.selection import EVERYTHING, Selection, Spans
-from stream_dmr.recording.messages.topics import (
+from stream_dmr.recording.selection import EVERYTHING, Selection, Spans
+from stream_dmr.recording.topics import (
     CARRIED_OVER,
     RECOVERED,
     RUN,

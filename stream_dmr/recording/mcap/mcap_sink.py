@@ -21,10 +21,10 @@ from mcap_protobuf.schema import register_schema
 from stream_dmr.errors import OutputError
 from stream_dmr.files import TransactionalFile, rename_durably, sync_path
 from stream_dmr.messages import FishMessage, LocalizedFish
-from stream_dmr.recording.messages.record import Record
-from stream_dmr.recording.messages.run_header import RunHeader
-from stream_dmr.recording.messages.schema import schema_bytes
-from stream_dmr.recording.messages.topics import CARRIED_OVER, RUN, SEGMENT, SPANS, TOPICS
+from stream_dmr.recording.codec import schema_bytes
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.record import Record
+from stream_dmr.recording.topics import CARRIED_OVER, RUN, SEGMENT, SPANS, TOPICS
 from stream_dmr.version import __version__
 
 PART = ".part"  # suffix of a file that is not closed yet

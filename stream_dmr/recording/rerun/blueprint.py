@@ -6,10 +6,10 @@ import rerun.blueprint as rrb
 from jaxtyping import Float, Int
 
 from stream_dmr.camera import Calibration, Camera
-from stream_dmr.recording.messages import topics
-from stream_dmr.recording.messages.run_header import RunHeader
-from stream_dmr.recording.messages.topics import CAMERA, LOG, PLANE
-from stream_dmr.recording.view.palette import color
+from stream_dmr.recording import topics
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.topics import CAMERA, LOG, PLANE
+from stream_dmr.recording.view_geometry import color
 
 _GRID_MM = 100.0
 _GREY = (150, 160, 170, 90)

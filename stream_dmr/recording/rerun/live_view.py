@@ -9,12 +9,11 @@ from threading import Event, Thread
 import rerun as rr
 
 from stream_dmr.errors import OutputError
-from stream_dmr.recording.messages.record import Record
-from stream_dmr.recording.messages.recording_settings import RecordingSettings
-from stream_dmr.recording.messages.run_header import RunHeader
-from stream_dmr.recording.rerun.rrd_sink import log_run
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.record import Record
+from stream_dmr.recording.rerun.rrd_file import log_run, new_stream
 from stream_dmr.recording.rerun.scene_drawing import SceneDrawing
-from stream_dmr.recording.rerun.streams import new_stream
+from stream_dmr.recording.topics import RecordingSettings
 
 _PORT = 9876  # Rerun's default
 _MEMORY = "256MiB"  # of the server, for viewers that connect late; what is older is dropped

@@ -9,15 +9,28 @@ import socket
 import subprocess
 import time
 from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from rerun.experimental import ViewerClient
 
 from stream_dmr.errors import RecordingError
-from stream_dmr.files import writing_to
-from stream_dmr.recording.rerun.rerun_program import rerun_program
+from stream_dmr.files import make_folder, replacing, writing_to
+from stream_dmr.messages import FittedMesh, Frame, Message
+from stream_dmr.recording.frame_images import FrameRestorer, RecordedPictures
+from stream_dmr.recording.reading import (
+    decoded_messages,
+    known_shapes,
+    open_recordings,
+    require_messages,
+    require_selected,
+)
+from stream_dmr.recording.record import Record
+from stream_dmr.recording.rerun.rrd_file import RrdSink, rerun_program
+from stream_dmr.recording.selection import EVERYTHING, Selection
+from stream_dmr.recording.topics import TOPICS, RecordingSettings
+from stream_dmr.recording.view_geometry import MeshRebuilder
 
 WEB_MEMORY = "512MiB"  # of the server; what is older is dropped
 _VIEWER_MEMORY = "4GiB"
@@ -131,3 +144,40 @@ def _running(options: Sequence[str]) -> Generator[subprocess.Popen[str]]:
 def _last_line(output: str) -> str:
     lines = _TERMINAL_COLORS.sub("", output).strip().splitlines()
     return lines[-1] if lines else "nothing"
+
+
+EVERY_FRAME = RecordingSettings(view_rate_hz=1000.0)
+
+
+def convert(
+    recording: Path,
+    rrd: Path,
+    *,
+    source: FrameRestorer | None = None,
+    settings: RecordingSettings = EVERY_FRAME,
+    selection: Selection = EVERYTHING,
+) -> Sequence[str]:
+    """Draw the selected messages of a recording into `rrd`, which can be replayed as well.
+
+    Pictures are those of `source`; without it those that the recording holds. Returns
+    what is lost of the recording, one line each. Raises RecordingError where the recording can't be
+    read, UserError where it has nothing of the selection, SourceError where a picture is not the
+    recorded one, OutputError where `rrd` can't be written.
+    """
+    opened = open_recordings([recording])
+    require_messages(opened)
+    require_selected(opened, selection)
+    meshes = MeshRebuilder(opened.header.template, known_shapes(opened))
+    pictures = source or RecordedPictures(opened, selection)
+    with (
+        replacing(make_folder(rrd.parent) / rrd.name) as draft,
+        closing(RrdSink(draft, opened.header, settings)) as sink,
+    ):
+        for message, payload in decoded_messages(opened, list(TOPICS), selection):
+            whole: Message = message
+            if isinstance(message, Frame):
+                whole = pictures.restore(message, payload)
+            elif isinstance(message, FittedMesh):
+                whole = meshes.with_vertices(message)
+            sink.write(Record.of_payload(message, payload, whole=whole))
+    return opened.warnings

@@ -9,12 +9,12 @@ from stream_dmr.fitting.shape.candidates import (
     CandidateShape,
     CandidateShapes,
     body_forms,
+    describe,
     load_shapes,
     mesh_form,
 )
-from stream_dmr.fitting.shape.describe import describe
 from stream_dmr.fitting.shape.space import BREADTH, NUM_COEFFICIENTS, THICKNESS, reshaped
-from stream_dmr.recording.messages.codec import decode, encode
+from stream_dmr.recording.codec import decode, encode
 from stream_dmr.template.template_file import bundled_names, load_template, save_template
 from tests.support.recorded_run import header
 from tests.support.shapes import STRAIGHT, fish_template

@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 
 from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.contour_solver import loss_of
-from stream_dmr.fitting.contour.levenberg_marquardt import evaluate
-from stream_dmr.fitting.contour.normal_equations import normal_equations
-from stream_dmr.fitting.contour.problem import Problem
 from stream_dmr.fitting.fit_settings import FitMeshSettings
-from stream_dmr.fitting.shape.equations import shape_equations
-from stream_dmr.fitting.shape.length_std import freed, shape_std_ratio
 from stream_dmr.fitting.shape.space import (
     BREADTH,
     LEFT,
@@ -21,7 +15,12 @@ from stream_dmr.fitting.shape.space import (
     individual_covariance,
     reshaped,
 )
+from stream_dmr.fitting.shape.stock import shape_equations
+from stream_dmr.fitting.solver.contour_solver import loss_of
+from stream_dmr.fitting.solver.descent import evaluate, normal_equations
+from stream_dmr.fitting.solver.problem import Problem
 from stream_dmr.fitting.target import Target
+from stream_dmr.fitting.uncertainty import freed, shape_std_ratio
 from tests.support.stocks import TEMPLATE, TOWARD_CAMERA, broader, fish_of
 
 SETTINGS = FitMeshSettings()

@@ -4,15 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.levenberg_marquardt import COLD_DAMPING
-from stream_dmr.fitting.contour.problem import Options, Problem
-from stream_dmr.fitting.contour.roll_angle import roll_and_slope
-from stream_dmr.fitting.contour.scan import descend
+from stream_dmr.fitting.body import ROOT_ROTATION, Body
 from stream_dmr.fitting.fit_settings import FitMeshSettings
-from stream_dmr.fitting.parameters import ROOT_ROTATION
-from stream_dmr.fitting.shape.evidence import nats_against
 from stream_dmr.fitting.shape.space import reshaped
+from stream_dmr.fitting.size import nats_against
+from stream_dmr.fitting.solver.descent import COLD_DAMPING, descend
+from stream_dmr.fitting.solver.problem import Options, Problem, roll_and_slope
 from stream_dmr.fitting.target import Target
 from tests.support.stocks import TEMPLATE, TOWARD_CAMERA, broader, fish_of
 

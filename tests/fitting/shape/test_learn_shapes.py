@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from stream_dmr.fitting.fit_settings import FitMeshSettings
-from stream_dmr.fitting.learn_shapes import learn_shapes
 from stream_dmr.fitting.shape.space import TRUNK
+from stream_dmr.fitting.shape.stocks import learn_shapes
 from tests.support.stocks import TEMPLATE, broader, fish_of, forms
 
 SETTINGS = FitMeshSettings(max_faces=600, contour_iterations=8)

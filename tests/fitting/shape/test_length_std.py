@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.fitting.fit_settings import FitMeshSettings
-from stream_dmr.fitting.shape.length_std import form_std_ratio, freed, slant_std_ratio
+from stream_dmr.fitting.uncertainty import form_std_ratio, freed, slant_std_ratio
 
 
 def test_with_a_known_breadth_no_slant_is_hidden():

@@ -4,8 +4,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.fitting.shape.candidates import CandidateShape, CandidateShapes
-from stream_dmr.fitting.shape.mesh_agreement import (
+from stream_dmr.fitting.shape.candidates import (
+    CandidateShape,
+    CandidateShapes,
     LengthShift,
     is_like_mesh,
     not_like_mesh,

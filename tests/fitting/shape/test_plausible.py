@@ -3,8 +3,12 @@
 import numpy as np
 import pytest
 
-from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
-from stream_dmr.fitting.shape.plausible import is_plausible, why_implausible
+from stream_dmr.fitting.shape.candidates import (
+    CandidateShapes,
+    is_plausible,
+    load_shapes,
+    why_implausible,
+)
 from stream_dmr.fitting.shape.space import BREADTH_KNOTS, LEFT, RIGHT, form_precision
 
 _, FORMS = load_shapes("auto")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stream_dmr.fitting.shape.proportions import Proportions, infer_proportions
+from stream_dmr.fitting.shape.space import Proportions, infer_proportions
 
 BEFORE = Proportions(0.0, 0.3, 0.0, 0.2)
 SLANT_STD = 0.25

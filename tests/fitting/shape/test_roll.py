@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.fitting.contour.roll_angle import roll_and_slope
-from stream_dmr.fitting.parameters import ROOT_ROTATION, rest_vector
-from stream_dmr.fitting.shape.roll import rolled_as_seen, unrolled
+from stream_dmr.fitting.body import ROOT_ROTATION, rest_vector
+from stream_dmr.fitting.shape.stock import rolled_as_seen, unrolled
+from stream_dmr.fitting.solver.problem import roll_and_slope
 
 RAY = np.array([0.1, -0.05, 1.0])
 thirty = settings(max_examples=30)

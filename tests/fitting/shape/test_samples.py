@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.fitting.shape.samples import evenly, good_crops
+from stream_dmr.fitting.shape.stocks import evenly, good_crops
 from tests.support.shapes import crop_from_mask
 
 MASK = np.ones((4, 4), bool)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.fitting.shape.side_by_side import side_by_side
+from stream_dmr.fitting.shape.stocks import side_by_side
 
 
 @given(items=st.lists(st.integers(), max_size=20))

@@ -5,14 +5,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.fitting.body import Body
-from stream_dmr.fitting.contour.roll_angle import roll_and_slope
+from stream_dmr.fitting.body import ROOT_ROTATION, Body, joints_of
 from stream_dmr.fitting.fit_settings import FitMeshSettings
-from stream_dmr.fitting.paper.skinning import Rig
-from stream_dmr.fitting.parameters import ROOT_ROTATION, joints_of
-from stream_dmr.fitting.shape.roll import rolled_as_seen, unrolled
+from stream_dmr.fitting.paper.torch_body import Rig
 from stream_dmr.fitting.shape.space import reshaped, roundness
-from stream_dmr.fitting.shape.square_fit import square_pose, square_problem
+from stream_dmr.fitting.shape.stock import rolled_as_seen, square_pose, square_problem, unrolled
+from stream_dmr.fitting.solver.problem import roll_and_slope
 from stream_dmr.fitting.target import Target
 from tests.support.shapes import crop_of, pose
 from tests.support.stocks import TEMPLATE, TOWARD_CAMERA, broader

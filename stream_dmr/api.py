@@ -1,0 +1,346 @@
+"""Measure, replay and open from Python, with results as typed rows."""
+
+import csv
+import logging
+import threading
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import Literal, TypeVar, get_args, get_type_hints
+
+from stream_dmr.camera import Calibration
+from stream_dmr.errors import UserError
+from stream_dmr.messages import Message
+from stream_dmr.pipeline.measure_source import measure_source
+from stream_dmr.pipeline.replay_recording import replay as replay_recordings
+from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.pipeline.run_options import ReplayRequest, RunRequest, command_of, default_out
+from stream_dmr.recording.reading import decoded_messages, open_recordings
+from stream_dmr.recording.selection import Selection
+from stream_dmr.tables import rotated_files
+from stream_dmr.template.template import Template
+from stream_dmr.web.watch_observer import WatchObserver
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FishRow:
+    """One fish: a row of lengths.csv. `pandas.DataFrame(run.fish)` makes a table of many."""
+
+    track_id: int
+    length_mm: float | None  # snout to tail along the midline; None: not measured, see `status`
+    length_std_mm: float | None
+    ci95_low_mm: float | None
+    ci95_high_mm: float | None
+    frames_seen: int
+    frames_used: int  # that passed every gate
+    first_frame: int  # from 1
+    last_frame: int
+    first_time: float  # capture time in s: from the start of a file, for cameras since 1970
+    last_time: float
+    status: str  # "measured", else why there is no length
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FrameRow:
+    """One fish in one frame: a row of frames.csv. None where there is no value."""
+
+    frame_index: int  # from 1
+    timestamp_ns: int  # capture time
+    track_id: int
+    head_u: float | None  # keypoints in frame pixels, centre of the top-left pixel at (0, 0)
+    head_v: float | None
+    center_u: float | None
+    center_v: float | None
+    tail_u: float | None
+    tail_v: float | None
+    head_x_mm: float | None  # keypoints in the camera frame: x right, y down, z forward
+    head_y_mm: float | None
+    head_z_mm: float | None
+    center_x_mm: float | None
+    center_y_mm: float | None
+    center_z_mm: float | None
+    tail_x_mm: float | None
+    tail_y_mm: float | None
+    tail_z_mm: float | None
+    bending_ratio: float | None  # arc over chord, eq. (13)
+    length_mm: float | None
+    length_std_mm: float | None
+    iou: float | None  # of the fitted silhouette with the mask
+    accepted: bool  # does this frame count towards the length?
+    reason: str  # "" when accepted, else why not
+
+
+Row = TypeVar("Row", FishRow, FrameRow)
+
+_PARSERS: Mapping[object, tuple[Callable[[str], object], str]] = {
+    int: (int, "a whole number"),
+    float: (float, "a number"),
+    float | None: (lambda text: float(text) if text else None, "a number or nothing"),
+    bool: ({"true": True, "false": False}.__getitem__, "true or false"),
+    str: (str, "text"),
+}
+
+
+def read_rows(path: Path, kind: type[Row]) -> list[Row]:
+    """All rows of a table; columns that `kind` does not have are left out.
+
+    UserError where the file can't be read, or a column or a value is not what it should be.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            missing = {field.name for field in fields(kind)} - set(reader.fieldnames or ())
+            if missing:
+                raise UserError(
+                    f"{path}: expected the column {min(missing)}, found {reader.fieldnames}; "
+                    "give the folder of a run"
+                )
+            return [_row(kind, row, f"{path}, line {reader.line_num}") for row in reader]
+    except OSError as error:
+        raise UserError(
+            f"{path}: expected a table of a run, got: {error.strerror}; give the folder of a run"
+        ) from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"{path}: expected a table of a run, got: {error}") from error
+
+
+def _row(kind: type[Row], texts: Mapping[str, str | None], where: str) -> Row:
+    values: dict[str, object] = {}
+    for name, annotation in get_type_hints(kind).items():
+        parse, expected = _PARSERS[annotation]
+        try:
+            values[name] = parse(texts[name] or "")
+        except (ValueError, KeyError) as error:
+            raise UserError(
+                f"{where}: expected {expected} for {name}, got {texts[name]!r}"
+            ) from error
+    return kind(**values)  # type: ignore[arg-type]
+
+
+Location = str | PathLike[str]
+Stage = Literal["crop", "fit", "localize", "smooth"]
+Pose = Literal["hanging", "lying"]
+
+
+@dataclass(frozen=True)
+class Run:
+    """The results in a folder, of `measure`, `replay` or `stream-dmr run`. Tables are read once."""
+
+    out: Path
+
+    def __init__(self, out: Location) -> None:
+        """Opens the folder; what is missing in it raises where it is asked for."""
+        object.__setattr__(self, "out", Path(out))
+
+    @cached_property
+    def fish(self) -> list[FishRow]:
+        """Every finished fish, as in lengths.csv. UserError where that can't be read."""
+        return read_rows(self.out / "lengths.csv", FishRow)
+
+    @cached_property
+    def frames(self) -> list[FrameRow]:
+        """Every fish in every frame, as in frames.csv. UserError where that can't be read."""
+        path = self.out / "frames.csv"
+        return [row for table in (*rotated_files(path), path) for row in read_rows(table, FrameRow)]
+
+    def messages(
+        self, kinds: Collection[type[Message]] | None = None, *, tracks: Collection[int] = ()
+    ) -> Iterator[Message]:
+        """The recorded messages, as `open` gives them."""
+        return iter(open(self.out, kinds, tracks=tracks))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedRun:
+    """A recording: iterate over it for its messages, as often as you like."""
+
+    paths: Sequence[Path]
+    kinds: Collection[type[Message]]
+    selection: Selection
+    calibration: Calibration | None  # None: there are no millimetres
+    template: Template
+    config_toml: str  # every setting of the run
+
+    def __iter__(self) -> Iterator[Message]:
+        """The messages in the order in which they were written: each kind in that of its frames.
+
+        Stages run side by side, so a Frame may come before the LocalizedFish of the frame before;
+        a fish's final length comes when its track has ended. To have one frame's messages together
+        collect them by `frame_index`, or open one kind at a time.
+
+        A frame recorded by reference has an image of shape (0, 0, 3). RecordingError where the
+        recording is damaged; what a crash cut off is logged as a warning, and the rest read.
+        """
+        recording = open_recordings(self.paths)
+        for message, _ in decoded_messages(recording, self.kinds, self.selection):
+            yield message
+        for line in recording.warnings:
+            _LOGGER.warning(line)
+
+
+def measure(
+    source: Location | int,
+    *,
+    out: Location | None = None,
+    calibration: Location | None = None,
+    boxes: Location | None = None,
+    masks: Location | None = None,
+    template: Location = RunRequest.template,
+    pose: Pose = "hanging",
+    stills: bool = False,
+    config: Location | None = None,
+    overwrite: bool = False,
+    live: bool = False,
+    vessel: str = "",
+    trip: str = "",
+    haul: str = "",
+    nmea: Location | None = None,
+    start_utc: str = "",
+    key: Location | None = None,
+    observer: RunObserver | None = None,
+    stop: threading.Event | None = None,
+) -> Run:
+    """Measure the fish of a video, a folder of pictures, an address or a camera, as `run` does.
+
+    `out` is runs/ and the source's name by default. Without `calibration` there are shapes and
+    pixels, no millimetres. Setting `stop` ends the run early, with what was measured so far.
+    Warnings are logged (logger "stream_dmr"), or passed to `observer`. Raises a UserError, in one
+    line, where an input is wrong.
+    """
+    _require_choice("pose", pose, get_args(Pose))
+    request = RunRequest(
+        source=str(source),
+        out=default_out(str(source)) if out is None else Path(out),
+        calibration=_path(calibration),
+        boxes=_path(boxes),
+        masks=_path(masks),
+        template=str(template),
+        pose=pose,
+        stills=stills,
+        config=_path(config),
+        overwrite=overwrite,
+        live=live,
+        vessel=vessel,
+        trip=trip,
+        haul=haul,
+        nmea=None if nmea is None else str(nmea),
+        start_utc=start_utc,
+        key=_path(key),
+    )
+    measure_source(
+        command_of(request),
+        stop=stop or threading.Event(),
+        observer=WatchObserver(observer or LoggingObserver()),
+    )
+    return Run(request.out)
+
+
+def replay(
+    recordings: Location | Sequence[Location],
+    *,
+    out: Location,
+    first: Stage = "fit",
+    calibration: Location | None = None,
+    template: Location | None = None,
+    config: Location | None = None,
+    tracks: Collection[int] = (),
+    time_s: tuple[float, float] | None = None,
+    overwrite: bool = False,
+    key: Location | None = None,
+    observer: RunObserver | None = None,
+    stop: threading.Event | None = None,
+) -> Run:
+    """Recompute a recording from the stage `first` on, as `stream-dmr replay` does.
+
+    `recordings`: files, folders of runs or of segments, in order. What is None is as it was
+    recorded; `tracks` and `time_s` (from, to, capture time) take a part of it. Raises a UserError
+    where an input is wrong.
+    """
+    _require_choice("first", first, get_args(Stage))
+    request = ReplayRequest(
+        recordings=_paths(recordings),
+        first=first,
+        config=_path(config),
+        calibration=_path(calibration),
+        template=None if template is None else str(template),
+        selection=_selection(time_s, tracks),
+        out=Path(out),
+        overwrite=overwrite,
+        key=_path(key),
+    )
+    replay_recordings(
+        request, stop=stop or threading.Event(), observer=observer or LoggingObserver()
+    )
+    return Run(out)
+
+
+def open(
+    recordings: Location | Sequence[Location],
+    kinds: Collection[type[Message]] | None = None,
+    *,
+    tracks: Collection[int] = (),
+    time_s: tuple[float, float] | None = None,
+) -> RecordedRun:
+    """Open a recording (.mcap, .rrd), the folder of a run, or several in order, for iteration.
+
+    `kinds`: only these messages, such as [LengthEstimate]; `tracks`, `time_s`: only these fish and
+    this capture time (from, to). RecordingError where it can't be read, another UserError where
+    the time is none.
+    """
+    selection = _selection(time_s, tracks)
+    paths = _paths(recordings)
+    header = open_recordings(paths).header
+    return RecordedRun(
+        paths=paths,
+        kinds=get_args(Message) if kinds is None else kinds,
+        selection=selection,
+        calibration=header.calibration,
+        template=header.template,
+        config_toml=header.config_toml,
+    )
+
+
+_LOGGER = logging.getLogger("stream_dmr")
+
+
+class LoggingObserver(RunObserver):
+    """Logs the warnings of a run, each once."""
+
+    def __init__(self) -> None:
+        """Has logged nothing yet."""
+        self._logged: set[str] = set()
+
+    def warn(self, line: str) -> None:  # noqa: D102
+        if line not in self._logged:
+            self._logged.add(line)
+            _LOGGER.warning(line)
+
+    def serving(self, address: str) -> None:  # noqa: D102
+        _LOGGER.info("watch it with: %s", address)
+
+
+def _require_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    """Raise UserError for a value that is none of the choices."""
+    if value not in choices:
+        raise UserError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+
+
+def _selection(time_s: tuple[float, float] | None, tracks: Collection[int]) -> Selection:
+    """The selected part; UserError for a time that ends before it begins."""
+    if time_s is not None and not time_s[0] < time_s[1]:
+        raise UserError(
+            f"time_s: expected (from, to) in seconds, such as (60, 90), got {time_s!r}; the first "
+            "must be less"
+        )
+    return Selection.from_seconds(time_s, frozenset(tracks) or None)
+
+
+def _path(location: Location | None) -> Path | None:
+    return None if location is None else Path(location)
+
+
+def _paths(locations: Location | Sequence[Location]) -> list[Path]:
+    several = [locations] if isinstance(locations, str | PathLike) else locations
+    return [Path(location) for location in several]

@@ -1,1 +1,0 @@
-"""What `import stream_dmr` offers: measure, replay and open, and their results as typed rows."""

@@ -1,0 +1,104 @@
+"""The commands `report`, `verify` and `keygen`."""
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stream_dmr.cli.shared_options import OverwriteOption, warn
+
+_Source = Annotated[
+    str | None,
+    typer.Option(
+        help="The recorded clip, for pictures of the fish.",
+        show_default="the one that was measured, if it is still there",
+    ),
+]
+_Config = Annotated[
+    Path | None, typer.Option(help="A config.toml; its [fisheries] replaces the run's.")
+]
+
+
+def verify(
+    folder: Annotated[Path, typer.Argument(help="The --out of runs or of exports.", metavar="DIR")],
+    key: Annotated[
+        Path | None,
+        typer.Option(help="The device's FILE.pub: all that it signed is checked by it as well."),
+    ] = None,
+) -> None:
+    """Check that results are still what their run measured; exit 1 and say what was changed."""
+    from stream_dmr.errors import OutputError
+    from stream_dmr.evidence.verify_batch import verify_all
+    from stream_dmr.evidence.verify_folder import Change, check_signatures
+    from stream_dmr.store.fish import run_notes
+    from stream_dmr.store.ledger import load_public_key
+    from stream_dmr.store.schema import NAME
+
+    signed_by = None if key is None else load_public_key(key)
+    changes, num_files = verify_all(folder)
+    databases, notes = sorted(folder.rglob(NAME)), list[str]()
+    if signed_by is not None:
+        if not databases:
+            changes.append(Change(folder, f"has no {NAME}, so nothing in it is signed"))
+        for database in databases:
+            check = check_signatures(database.parent, signed_by)
+            changes += [Change(database.parent, what) for what in check.changes]
+            notes += [f"{database.parent}: {note}" for note in check.notes]
+    for change in changes:
+        print(f"{change.path}: {change.what}")
+    for note in notes:
+        print(note)
+    for database in databases:
+        with suppress(OutputError):  # damaged, which is said above
+            for line in run_notes(database.parent):
+                print(f"{database}: {line}")
+    if changes:
+        raise typer.Exit(1)
+    print(f"{folder}: {num_files} files, nothing was changed")
+
+
+def report(
+    path: Annotated[
+        Path,
+        typer.Argument(help="The --out of a run or of a batch, or a recording.", metavar="DIR|REC"),
+    ],
+    out: Annotated[Path, typer.Option(help="The page to write.")] = Path("report.html"),
+    source: _Source = None,
+    config: _Config = None,
+    coast: Annotated[
+        Path | None, typer.Option(help="Coastlines for the map, as GeoJSON in degrees.")
+    ] = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Write results as one page that opens offline: plots, a table of fish, their best frames."""
+    from stream_dmr.errors import UserError
+    from stream_dmr.evidence.own_files import is_made_by, require_writable
+    from stream_dmr.web.open_reports import is_batch, open_batch, open_report, write_report
+    from stream_dmr.web.trip_map import load_coast
+
+    require_writable(out, overwrite=overwrite, is_own=is_made_by("report"))
+    shores = [] if coast is None else load_coast(coast)
+    failed = list[str]()
+    if is_batch(path):
+        if source is not None:
+            raise UserError(f"--source: {path} is of a batch, whose videos have their own")
+        reports, failed = open_batch(path, config=config)
+    else:
+        reports = [open_report(path, source=source, config=config)]
+    size = write_report(reports, out, title=path.resolve().name, notes=failed, coast=shores)
+    warn(line for report in reports for line in report.recording.warnings)
+    print(f"{out}: {sum(len(report.fish) for report in reports)} fish, {size / 1e6:.1f} MB")
+
+
+def keygen(
+    file: Annotated[Path, typer.Argument(help="The private key to write.", metavar="FILE")],
+) -> None:
+    """Make a device key: FILE signs what `run --key FILE` measures, FILE.pub checks it.
+
+    FILE stays on the device, readable by its owner alone; FILE.pub goes ashore, for `verify --key`.
+    """
+    from stream_dmr.store.ledger import make_key
+
+    public = make_key(file)
+    print(f"{file}: private, mode 600; keep it on the device\n{public}: public; take it ashore")

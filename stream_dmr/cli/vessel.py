@@ -1,0 +1,179 @@
+"""The commands `haul` and `fleet`."""
+
+import json
+import time
+import urllib.error
+import urllib.request
+from getpass import getuser
+from http.client import HTTPException
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from stream_dmr.cli.shared_options import OverwriteOption, stop_on_signals
+
+_TIMEOUT_S = 10.0
+
+
+def haul(
+    what: Annotated[Literal["start", "end"], typer.Argument(help="start or end")],
+    target: Annotated[
+        str,
+        typer.Argument(
+            help="Address of a run's status page, or the --out of a run.", metavar="URL|DIR"
+        ),
+    ],
+    name: Annotated[
+        str, typer.Option(help="Name of the haul.", show_default="the next number")
+    ] = "",
+    at: Annotated[
+        str | None,
+        typer.Option(
+            help="When: UTC as 2026-11-22T06:00:00Z, or seconds as in lengths.csv; for a DIR.",
+        ),
+    ] = None,
+    token_file: Annotated[
+        Path | None, typer.Option(help="The access token of the status page.")
+    ] = None,
+) -> None:
+    """Begin or end a haul; its fish are those whose middle frame lies in it."""
+    from stream_dmr.errors import UserError
+
+    if target.startswith(("http://", "https://")):
+        if at is not None:
+            raise UserError(
+                f"--at: expected with the folder of a run alone, a running box takes a haul as of "
+                f"now, got {at} with {target}; leave it out, or give the box's --out"
+            )
+        print(_post(target, what, name, token_file))
+    elif "://" in target:
+        raise UserError(
+            f"{target}: expected http:// or https:// of a run's status page, or the --out of a "
+            "run, got another kind of address"
+        )
+    else:
+        print(_write(Path(target), what, name, at))
+
+
+def _post(address: str, what: str, name: str, token_file: Path | None) -> str:
+    from stream_dmr.errors import UserError
+
+    headers = {"Content-Type": "application/json"}
+    if token_file is not None:
+        headers["Authorization"] = f"Bearer {_read_token(token_file)}"
+    content = json.dumps({"what": what, "name": name, "said_by": getuser()}).encode()
+    try:
+        request = urllib.request.Request(f"{address.rstrip('/')}/haul", content, headers)
+        with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
+            return f"haul {json.loads(answer.read())['name']}: {what}"
+    except urllib.error.HTTPError as error:
+        with error:
+            is_ours = error.headers.get_content_type() == "text/plain"
+            said = error.read(500).decode(errors="replace").strip() if is_ours else ""
+        raise UserError(f"{address}: expected it to take the haul, got: {said or error}") from error
+    except (OSError, ValueError, KeyError, TypeError, HTTPException) as error:
+        raise UserError(
+            f"{address}: expected the status page of a run ([watch] port), got: {error}"
+        ) from error
+
+
+def _read_token(path: Path) -> str:
+    from stream_dmr.errors import UserError, reason_of
+
+    try:
+        return path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(
+            f"--token-file {path}: expected a file with the access token, got: {reason_of(error)}"
+        ) from error
+
+
+def _write(folder: Path, what: str, name: str, at: str | None) -> str:
+    from stream_dmr.pipeline.haul_log import write_haul
+
+    written = write_haul(folder, what, name=name, at=at, said_by=getuser())
+    return f"haul {written}: {what}"
+
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from stream_dmr.web.fleet_page import BoxState
+
+
+def fleet(
+    boxes: Annotated[
+        list[str],
+        typer.Argument(
+            help="Addresses of status pages, such as http://10.0.0.7:8480/, or files with one "
+            "NAME ADDRESS a line.",
+            metavar="URL|FILE...",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="The page to write.")] = Path("fleet.html"),
+    every: Annotated[
+        float,
+        typer.Option(help="Ask again and write it again every so many seconds; 0: once.", min=0),
+    ] = 0.0,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Write one page with health, fish an hour, alarms, disk and last contact of each box.
+
+    A box that does not answer is shown with what it said last, which is kept in a .json of the
+    page's name. The page needs no server; with --every, Ctrl-C ends it.
+    """
+    from stream_dmr.errors import UserError
+    from stream_dmr.evidence.own_files import is_made_by, require_writable
+    from stream_dmr.web.fleet_page import (
+        ask_all,
+        fleet_page,
+        load_boxes,
+        read_memory,
+        replace_text,
+        write_memory,
+    )
+
+    memory = out.with_suffix(".json")
+    if memory == out:
+        raise UserError(f"--out: expected a page such as fleet.html, got {out}")
+    require_writable(out, memory, overwrite=overwrite, is_own=is_made_by("fleet"))
+    states = read_memory(memory, load_boxes(boxes))
+    changes = _Changes()
+    with stop_on_signals() as stop:
+        while not stop.is_set():
+            began_s = time.monotonic()
+            states = ask_all(states)
+            page = fleet_page(states, title="Fleet", every_s=every, now_ns=time.time_ns())
+            write_memory(memory, states)
+            replace_text(out, page)
+            changes.show(states)
+            if not every or stop.wait(max(0.0, every - (time.monotonic() - began_s))):
+                break
+
+
+class _Changes:
+    """Prints a line for each box whose state or alarms are others than at the last look."""
+
+    def __init__(self) -> None:
+        self._told: dict[str, list[str]] = {}  # by address
+
+    def show(self, states: "Iterable[BoxState]") -> None:
+        """Print what is new."""
+        from stream_dmr.web.fleet_page import alarms_of, state_text
+
+        for state in states:
+            told = [state_text(state), *alarms_of(state)]
+            if self._told.get(state.box.address) != told:
+                print(f"{state.box.name}: {'; '.join(told)}; {_figures(state)}", flush=True)
+            self._told[state.box.address] = told
+
+
+def _figures(state: "BoxState") -> str:
+    from stream_dmr.web.fleet_page import disk_text, minute_text
+
+    if state.contact_ns is None or state.reading is None:
+        return "never answered"
+    if state.error:
+        return f"last contact {minute_text(state.contact_ns)}"
+    return f"{state.reading.fish_per_hour:.0f} fish an hour, {disk_text(state.reading)} free"

@@ -1,0 +1,309 @@
+"""The background of a moving camera.
+
+Motion of a camera that is held by hand, rolls, pans or heaves, from what stands still before it.
+
+Sparse optical flow (Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000)
+and a similarity by RANSAC. A sea drifts, so the best similarity explains only part of what changes,
+and the vessel's rail, which it would move as well, stays in place. A camera's own motion explains
+nearly all changes everywhere. Accumulated over many pictures, this distinguishes a moving camera
+from a moving sea before a camera at rest.
+
+A running model of the picture without fish, in the pixels of a moving camera.
+
+Pixel by pixel a running mean, as in Stauffer and Grimson ("Adaptive background mixture models for
+real-time tracking", CVPR 1999) with one mode, that moves with the camera as in Yi et al.
+("Detection of moving objects with non-stationary cameras in 5.8 ms", CVPR workshops 2013).
+Deviations from the mean are judged by the colour covariance of their surroundings: waves vary along
+one line of colours, from trough to foam, and a fish stands out by lying beside that line.
+"""
+
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from stream_dmr.compiled import compiled
+
+# Chosen on simulated scenes, whose sea drifts before a camera at rest, and on the hand-held trout
+# clip; see docs/research/raw-video.md.
+_MAX_FEATURES = 120
+_FEATURE_QUALITY, _FEATURE_DISTANCE_PX = 0.02, 10
+_MIN_FEATURES = 12  # that a motion may rest on
+_MAX_INLIER_ERROR_PX = 1.0
+_MIN_INLIER_SHARE = 0.5
+_NOISE_LEVEL = 2.5  # grey levels: pictures that differ by less on average are no evidence
+_MIN_EXPLAINED = 0.5  # of the changes, from which on the camera moves
+_EVIDENCE_DECAY = 0.95  # per picture
+_CELL_PX = 20  # the picture is compared in cells of this size
+_MIN_CELL_CHANGE = 1.5  # grey levels by which the motion must change a cell to tell anything
+_MAX_UNMOVED_CHANGE = 0.6  # of that change; a cell that changed by less has not moved
+_MAX_UNMOVED_CELLS = 0.03  # of all cells; with more of them unmoved the camera is at rest
+_REST_FRAMES = 4  # skipped after a camera was found at rest
+
+Affine = Float[np.ndarray, "2 3"]
+
+
+class CameraMotion:
+    """Camera motion through consecutive grey pictures of one size."""
+
+    def __init__(self) -> None:
+        self._before: UInt8[np.ndarray, "H W"] | None = None
+        self._explained, self._changed = 0.0, 1e-9  # decaying sums over pictures
+        # Decaying counts by cell: of changes that the motion predicts, and of those missing.
+        self._predicted, self._unmoved = np.zeros(()), np.zeros(())
+        self._rest_frames = 0  # still to be skipped
+
+    def step(
+        self, picture: UInt8[np.ndarray, "H W"], *, is_background: Bool[np.ndarray, "H W"]
+    ) -> Affine | None:
+        """The similarity from the previous picture to this one, px; None for a camera at rest.
+
+        `is_background`: where the previous picture shows no fish.
+        """
+        before, self._before = self._before, picture
+        self._rest_frames = max(0, self._rest_frames - 1)
+        if before is None or self._rest_frames:
+            return None
+        affine = estimate_similarity(before, picture, is_background=is_background)
+        if affine is None:
+            return None
+        moved = warp(before, affine)
+        changed, remaining = cv2.absdiff(before, picture), cv2.absdiff(moved, picture)
+        self._add_explained(changed[is_background].mean(), remaining[is_background].mean())
+        self._add_unmoved(_cell_means(changed), _cell_means(cv2.absdiff(before, moved)))
+        is_explained = self._explained > _MIN_EXPLAINED * self._changed
+        is_at_rest = np.mean(self._unmoved > 0.5 * self._predicted) > _MAX_UNMOVED_CELLS
+        if is_at_rest:
+            self._rest_frames = _REST_FRAMES
+        return affine if is_explained and not is_at_rest else None
+
+    def _add_explained(self, changed: float, remaining: float) -> None:
+        """Add how much of the change the motion explains; large changes weigh more than noise."""
+        weight = max(changed - _NOISE_LEVEL, 0.0) ** 2
+        self._changed = _EVIDENCE_DECAY * self._changed + weight
+        explained = weight * (1 - remaining / max(changed, 1e-9))
+        self._explained = _EVIDENCE_DECAY * self._explained + explained
+
+    def _add_unmoved(
+        self, changed: Float[np.ndarray, "h w"], predicted: Float[np.ndarray, "h w"]
+    ) -> None:
+        """Count the cells that the motion would have changed, and those that did not change."""
+        is_predicted = predicted > _MIN_CELL_CHANGE
+        is_unmoved = is_predicted & (changed < _MAX_UNMOVED_CHANGE * predicted)
+        self._unmoved = _EVIDENCE_DECAY * self._unmoved + is_unmoved
+        self._predicted = _EVIDENCE_DECAY * self._predicted + is_predicted
+
+
+def estimate_similarity(
+    before: UInt8[np.ndarray, "H W"],
+    picture: UInt8[np.ndarray, "H W"],
+    *,
+    is_background: Bool[np.ndarray, "H W"],
+) -> Affine | None:
+    """The similarity of most background features between two pictures, px; None without one."""
+    # OpenCV's stubs do not tell that these results may be None.
+    points: Any = cv2.goodFeaturesToTrack(
+        before,
+        _MAX_FEATURES,
+        _FEATURE_QUALITY,
+        _FEATURE_DISTANCE_PX,
+        mask=is_background.astype(np.uint8),
+    )
+    if points is None or len(points) < _MIN_FEATURES:
+        return None
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(before, picture, points, np.empty_like(points))
+    found = found.ravel() == 1
+    if np.count_nonzero(found) < _MIN_FEATURES:
+        return None
+    cv2.setRNGSeed(0)  # RANSAC draws at random; equal pictures must give equal motions
+    affine: Any
+    affine, inliers = cv2.estimateAffinePartial2D(
+        points[found], moved[found], ransacReprojThreshold=_MAX_INLIER_ERROR_PX
+    )
+    min_inliers = max(_MIN_FEATURES, _MIN_INLIER_SHARE * np.count_nonzero(found))
+    return None if affine is None or inliers.sum() < min_inliers else affine
+
+
+def _cell_means(difference: UInt8[np.ndarray, "H W"]) -> Float[np.ndarray, "h w"]:
+    size = [max(1, side // _CELL_PX) for side in difference.shape[::-1]]
+    return cv2.resize(difference.astype(np.float64), size, interpolation=cv2.INTER_AREA)
+
+
+def warp(picture: np.ndarray, affine: Affine) -> np.ndarray:
+    """The picture after the motion, of the same size; its edge is replicated into new areas."""
+    size = (picture.shape[1], picture.shape[0])
+    return cv2.warpAffine(picture, affine, size, borderMode=cv2.BORDER_REPLICATE)
+
+
+def compose(second: Affine, first: Affine) -> Affine:
+    """The affine map that applies `first`, then `second`."""
+    return second[:, :2] @ first + np.column_stack([np.zeros((2, 2)), second[:, 2]])
+
+
+# Chosen on simulated scenes (seeds 900 to 903) and the trout clip; see docs/research/raw-video.md.
+_REGION = 1 / 8  # of the longer side, over which the colour covariance is taken
+_STRIDE = 3  # px: the statistics of regions use every third pixel
+_SENSOR_STD = 2.0  # grey levels; least difference of two pictures of the same thing
+_MAX_INLIER_DISTANCE = 9.0  # squared distance; pixels above it are left out of the covariance
+_TRIMMING_CORRECTION = 1.1  # full over trimmed second moments of a normal distribution
+_NUM_TRIMMINGS = 4  # of the first picture's covariance; converged by then
+_INITIAL_WINDOW = 1 / 6  # of the longer side: a median over so much shows no fish
+_COVARIANCE_FRAMES = 10  # over which a region's covariance is learnt
+# What always changes, such as a shaking edge, may raise its own variance by so much.
+_MAX_VARIANCE_RATIO = np.float32(8)
+# Constants of compiled code; other types would make its sums float64.
+_ONE, _TWO = np.float32(1), np.float32(2)
+_NUM_CHANNELS = np.float32(3)  # the mean of a squared Mahalanobis distance of colours
+
+
+class BackgroundModel:
+    """The running model; pictures of one size, as planes of blue, green and red.
+
+    It is initialised from one picture, which may contain fish.
+    """
+
+    def __init__(self, picture: Float32[np.ndarray, "3 H W"], *, memory_frames: float) -> None:
+        """`memory_frames`: frames over which the mean is learnt."""
+        height, width = picture.shape[1:]
+        self._memory_frames = memory_frames
+        self._size = (width, height)
+        self._region_px = max(3, round(_REGION * max(width, height) / _STRIDE)) | 1  # strides
+        window_px = max(3, round(_INITIAL_WINDOW * max(width, height) / 4)) | 1
+        self.mean = np.stack([_wide_median(plane, window_px) for plane in picture])
+        self._age = np.zeros((height, width), np.float32)  # frames learnt; -1: not yet seen
+        self._variance_ratio = np.ones((height, width), np.float32)  # over that of the region
+        self._light = np.zeros_like(self.mean)  # difference of the picture's regions to the mean
+        weight = np.ones((height, width), np.float32)
+        for _ in range(_NUM_TRIMMINGS):
+            self._light, self._moments = self._region_statistics(picture, weight)
+            self._precision = _precision(self._moments, self._size)
+            weight = (self.distance(picture) < _MAX_INLIER_DISTANCE).astype(np.float32)
+        # What is not foreign is background as it is, with its texture.
+        is_background = self.distance(picture) < 3 * _MAX_INLIER_DISTANCE
+        np.copyto(self.mean, picture, where=is_background)
+        self._age[is_background] = 1
+
+    def shift(self, x: int, y: int) -> None:
+        """Follow the view by whole pixels, which blurs nothing; new areas are marked as unseen."""
+        affine = np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
+        self.mean = np.stack([warp(plane, affine) for plane in self.mean])
+        self._variance_ratio = warp(self._variance_ratio, affine)
+        self._age = cv2.warpAffine(self._age, affine, self._size, borderValue=-1)
+
+    def fill_unseen(self, picture: Float32[np.ndarray, "3 H W"]) -> None:
+        """Take a picture as the mean where the view was not seen before."""
+        is_unseen = self._age < 0
+        np.copyto(self.mean, picture, where=is_unseen)
+        self._age[is_unseen] = 0
+
+    def distance(self, picture: Float32[np.ndarray, "3 H W"]) -> Float32[np.ndarray, "H W"]:
+        """Squared Mahalanobis distance of each pixel from the background; about 3 on average."""
+        return _distance(picture, self.mean, self._light, self._precision, self._variance_ratio)
+
+    def learn(
+        self,
+        picture: Float32[np.ndarray, "3 H W"],
+        distance: Float32[np.ndarray, "H W"],
+        rate: Float32[np.ndarray, "H W"],
+    ) -> None:
+        """Update the model by a picture and its `distance`; `rate` from 0 (not) to 1 (full)."""
+        inlier_rate = rate * (distance < _MAX_INLIER_DISTANCE)
+        self._light, moments = self._region_statistics(picture, inlier_rate)
+        self._moments += (_TRIMMING_CORRECTION * moments - self._moments) / _COVARIANCE_FRAMES
+        self._precision = _precision(self._moments, self._size)
+        min_speed = np.float32(1 / self._memory_frames)
+        _learn(picture, distance, rate, min_speed, self.mean, self._variance_ratio, self._age)
+
+    def _region_statistics(
+        self, picture: Float32[np.ndarray, "3 H W"], weight: Float32[np.ndarray, "H W"]
+    ) -> tuple[Float32[np.ndarray, "3 H W"], Float32[np.ndarray, "6 h w"]]:
+        """By region: the change of light, and second moments BB, GG, RR, BG, BR, GR without it."""
+        weight = weight[::_STRIDE, ::_STRIDE]
+        total = self._box_mean(weight) + np.float32(1e-3)
+        change = picture[:, ::_STRIDE, ::_STRIDE] - self.mean[:, ::_STRIDE, ::_STRIDE]
+        light = np.stack([self._box_mean(weight * plane) / total for plane in change])
+        b, g, r = change - light
+        products = [b * b, g * g, r * r, b * g, b * r, g * r]
+        moments = np.stack([self._box_mean(weight * product) / total for product in products])
+        return _enlarged(light, self._size), moments
+
+    def _box_mean(self, layer: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+        return cv2.blur(layer, (self._region_px, self._region_px), borderType=cv2.BORDER_REFLECT)
+
+
+def _wide_median(plane: Float32[np.ndarray, "H W"], window_px: int) -> Float32[np.ndarray, "H W"]:
+    """Medians over windows of four times `window_px`, from a picture of a quarter of the size."""
+    small = cv2.resize(plane.astype(np.uint8), None, fx=0.25, fy=0.25)
+    return cv2.resize(cv2.medianBlur(small, window_px), plane.shape[::-1]).astype(np.float32)
+
+
+@compiled
+def _distance(
+    picture: Float32[np.ndarray, "3 H W"],
+    mean: Float32[np.ndarray, "3 H W"],
+    light: Float32[np.ndarray, "3 H W"],
+    precision: Float32[np.ndarray, "6 H W"],
+    variance_ratio: Float32[np.ndarray, "H W"],
+) -> Float32[np.ndarray, "H W"]:
+    """Pixel by pixel d' S^-1 d / ratio with d = picture - mean - light; S^-1 as BB, GG, ..."""
+    squared = np.empty_like(variance_ratio)
+    for i in range(variance_ratio.shape[0]):
+        for j in range(variance_ratio.shape[1]):
+            b = picture[0, i, j] - mean[0, i, j] - light[0, i, j]
+            g = picture[1, i, j] - mean[1, i, j] - light[1, i, j]
+            r = picture[2, i, j] - mean[2, i, j] - light[2, i, j]
+            along_b = precision[0, i, j] * b
+            along_b += _TWO * (precision[3, i, j] * g + precision[4, i, j] * r)
+            along_g = precision[1, i, j] * g + _TWO * precision[5, i, j] * r
+            total = b * along_b + g * along_g + precision[2, i, j] * r * r
+            squared[i, j] = total / variance_ratio[i, j]
+    return squared
+
+
+@compiled
+def _learn(
+    picture: Float32[np.ndarray, "3 H W"],
+    distance: Float32[np.ndarray, "H W"],
+    rate: Float32[np.ndarray, "H W"],
+    min_speed: np.float32,
+    mean: Float32[np.ndarray, "3 H W"],
+    variance_ratio: Float32[np.ndarray, "H W"],
+    age: Float32[np.ndarray, "H W"],
+) -> None:
+    """Move mean and variance ratio towards the picture, in place; increase the age.
+
+    At first a plain mean over the frames seen, later an exponential one.
+    """
+    for i in range(variance_ratio.shape[0]):
+        for j in range(variance_ratio.shape[1]):
+            speed = max(_ONE / (age[i, j] + _ONE), min_speed) * rate[i, j]
+            observed = distance[i, j] * variance_ratio[i, j] / _NUM_CHANNELS
+            observed = min(max(observed, _ONE), _MAX_VARIANCE_RATIO)
+            variance_ratio[i, j] += speed * (observed - variance_ratio[i, j])
+            for channel in range(3):
+                mean[channel, i, j] += speed * (picture[channel, i, j] - mean[channel, i, j])
+            if rate[i, j] > 0:
+                age[i, j] += _ONE
+
+
+def _precision(
+    moments: Float32[np.ndarray, "6 h w"], size: tuple[int, int]
+) -> Float32[np.ndarray, "6 H W"]:
+    """The inverse covariance of every pixel: BB, GG, RR, BG, BR, GR; adjugate over determinant."""
+    a, b, c, d, e, f = moments
+    a, b, c = (variance + np.float32(_SENSOR_STD**2) for variance in (a, b, c))
+    adjugate = [b * c - f * f, a * c - e * e, a * b - d * d]
+    adjugate += [e * f - c * d, d * f - b * e, d * e - a * f]
+    determinant = a * adjugate[0] + d * adjugate[3] + e * adjugate[4]
+    return _enlarged(np.stack(adjugate) / determinant, size)
+
+
+def _enlarged(
+    layers: Float32[np.ndarray, "N h w"], size: tuple[int, int]
+) -> Float32[np.ndarray, "N H W"]:
+    """Layers interpolated to a size (width, height)."""
+    enlarged = np.empty((len(layers), size[1], size[0]), np.float32)
+    for layer, target in zip(layers, enlarged, strict=True):
+        cv2.resize(layer, size, dst=target)
+    return enlarged

@@ -1,0 +1,341 @@
+"""Read boxes from MOT, COCO and CVAT files.
+
+Boxes from COCO's JSON (cocodataset.org, "Data format"), as annotation tools export it.
+
+Pictures of a folder are known by their names. Frames of a video are those that names of six and
+more digits say, as `export --masks` writes them, else counted from 1 in the natural order of the
+pictures' file names. The track id is
+`track_id` or `instance_id`, of the annotation itself or among its `attributes`; boxes without
+either get `UNKNOWN_ID`.
+
+Boxes from CVAT's XML, version 1.1 (docs.cvat.ai, "CVAT"), for videos and for pictures.
+
+CVAT counts frames, pictures and tracks from 0, this package from 1. Pictures of a folder are known
+by their names, since CVAT may have another order. A box inside a video's track
+gets the track's id; a box of a single picture gets `UNKNOWN_ID`.
+"""
+
+import json
+import math
+import re
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.errors import AnnotationError
+from stream_dmr.files import natural_order, read_text
+from stream_dmr.pictures import pictures_in
+
+UNKNOWN_ID = 0  # `track_id` of a box whose file does not follow fish from frame to frame
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class AnnotatedBox:
+    """One fish of one frame, as a boxes file gives it."""
+
+    track_id: int  # 1 or more, or UNKNOWN_ID
+    bbox_xyxy_px: Float[np.ndarray, "4"]  # half-open, frame pixels; may extend beyond the frame
+    visibility: float  # visible fraction of the fish, 0 to 1; 1 where not given
+    score: float = 1.0  # confidence of the detector, 0 to 1; 1 where not given
+
+
+def box_from_xywh(
+    x: float, y: float, width: float, height: float, *, where: str
+) -> Float[np.ndarray, "4"]:
+    """Left, top, right, bottom of a box, in px. Raises AnnotationError for an empty one.
+
+    `where` is the place in the file, for the message.
+    """
+    if not all(map(math.isfinite, (x, y, width, height))) or width <= 0 or height <= 0:
+        raise AnnotationError(
+            f"{where}: expected a width and height above 0, got {width:g} x {height:g}"
+        )
+    return np.array([x, y, x + width, y + height])
+
+
+def group_by_frame(boxes: Iterable[tuple[str, int, AnnotatedBox]]) -> dict[int, list[AnnotatedBox]]:
+    """Boxes by frame (from 1), within a frame by id.
+
+    Each box comes with its place in the file, for messages, and its frame. Raises AnnotationError
+    where a fish has two boxes in a frame, or only some boxes have ids.
+    """
+    frames: dict[int, list[AnnotatedBox]] = {}
+    seen: set[tuple[int, int]] = set()
+    has_ids: bool | None = None
+    for where, frame_index, box in boxes:
+        has_id = box.track_id != UNKNOWN_ID
+        if has_ids is not None and has_id != has_ids:
+            raise AnnotationError(
+                f"{where}: expected ids for all boxes or for none; complete them or leave them out"
+            )
+        has_ids = has_id
+        if has_id and (frame_index, box.track_id) in seen:
+            raise AnnotationError(
+                f"{where}: expected one box per fish and frame, "
+                f"got a second one of id {box.track_id} in frame {frame_index}; remove one"
+            )
+        seen.add((frame_index, box.track_id))
+        frames.setdefault(frame_index, []).append(box)
+    return {i: sorted(frames[i], key=lambda box: box.track_id) for i in sorted(frames)}
+
+
+COLUMNS = "frame,id,x,y,w,h,conf,class,visibility"
+
+
+def parse_mot(text: str, path: Path) -> dict[int, list[AnnotatedBox]]:
+    """Boxes by frame (from 1), within a frame by id, from a file's text.
+
+    Columns: frame, id, x, y, w, h, conf and optionally class and visibility; with ten columns the
+    last three are MOT15's world coordinates. The class is not used. A visibility of -1 means "not
+    given", as everywhere in MOT, and so does an id of -1, in all lines or in none.
+
+    Raises AnnotationError with the line's number and what was expected there.
+    """
+    return group_by_frame(_parse_lines(text, path))
+
+
+def _parse_lines(text: str, path: Path) -> Iterator[tuple[str, int, AnnotatedBox]]:
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.strip():
+            yield _parse_line(line, f"{path}, line {number}")
+
+
+def _parse_line(line: str, where: str) -> tuple[str, int, AnnotatedBox]:
+    values = _parse_numbers(line, where)
+    frame, track_id, x, y, width, height, confidence = values[:7]
+    if frame < 1 or frame != int(frame):
+        raise AnnotationError(f"{where}: expected a frame number, counted from 1, got {frame:g}")
+    if track_id != -1 and (track_id < 1 or track_id != int(track_id)):
+        raise AnnotationError(
+            f"{where}: expected an id of 1 or more that follows one fish, "
+            f"or -1 in every line for detections, got {track_id:g}"
+        )
+    bbox = box_from_xywh(x, y, width, height, where=where)
+    visibility = values[8] if len(values) == 9 else -1.0
+    if visibility != -1 and not 0 <= visibility <= 1:
+        raise AnnotationError(f"{where}: expected a visibility from 0 to 1, got {visibility:g}")
+    box = AnnotatedBox(
+        track_id=UNKNOWN_ID if track_id == -1 else int(track_id),
+        bbox_xyxy_px=bbox,
+        visibility=1.0 if visibility == -1 else visibility,
+        score=confidence if 0 <= confidence <= 1 else 1.0,
+    )
+    return where, int(frame), box
+
+
+def _parse_numbers(line: str, where: str) -> list[float]:
+    try:
+        values = [float(column) for column in line.split(",")]
+    except ValueError:
+        values = []
+    if not 7 <= len(values) <= 10 or not all(map(math.isfinite, values)):
+        raise AnnotationError(
+            f"{where}: expected numbers {COLUMNS}, separated by commas, got {line.strip()[:60]!r}"
+        )
+    return values
+
+
+def frames_by_name(
+    names: Mapping[int, str], pictures: Sequence[Path], *, where: Path
+) -> dict[int, int]:
+    """The frames of named pictures by their keys in `names`; none where no name is known.
+
+    `pictures` of the source, in its order; empty of a video. A picture is known by its file name,
+    else by that without its suffix. One that the source does not have gets a frame past its end.
+    Raises AnnotationError, about `where`, where two names are one picture.
+    """
+    stems = Counter(path.stem for path in pictures)
+    frames = {path.stem: i for i, path in enumerate(pictures, start=1) if stems[path.stem] == 1}
+    frames |= {path.name: i for i, path in enumerate(pictures, start=1)}
+    files = {key: Path(re.split(r"[\\/]", name)[-1]) for key, name in names.items()}
+    found = {key: frames.get(file.name, frames.get(file.stem, 0)) for key, file in files.items()}
+    if not any(found.values()):
+        return {}
+    keys = dict[int, int]()
+    for key, frame in found.items():
+        if frame and keys.setdefault(frame, key) != key:
+            raise AnnotationError(
+                f"{where}: expected each picture of the source once, got {names[keys[frame]]} and "
+                f"{names[key]}; give the boxes of this folder alone"
+            )
+    past_end = iter(range(len(pictures) + 1, len(pictures) + len(found) + 1))
+    return {key: frame or next(past_end) for key, frame in found.items()}
+
+
+_NUMBER = re.compile(r"[0-9]{6,}")  # of a frame, as masks are named
+_ID_NAMES = ("track_id", "instance_id")
+_TOO_LARGE = (OverflowError, RecursionError)  # an infinite number; deeply nested brackets
+
+
+def parse_coco(
+    text: str, path: Path, pictures: Sequence[Path] = ()
+) -> dict[int, list[AnnotatedBox]]:
+    """Boxes by frame, from a file's text; `path` is for messages.
+
+    `pictures` of the source, in its order; empty of a video. Raises AnnotationError with what was
+    expected, and where.
+    """
+    try:
+        table = json.loads(text)
+        names = {int(image["id"]): str(image["file_name"]) for image in table["images"]}
+        annotations = list(table["annotations"])
+    except (ValueError, KeyError, TypeError, AttributeError, *_TOO_LARGE) as error:
+        raise AnnotationError(
+            f'{path}: expected COCO\'s JSON with "images" (id, file_name) and "annotations", '
+            f"got: {type(error).__name__} {error}"
+        ) from None
+    return group_by_frame(_annotation_boxes(annotations, _frames_of(names, pictures, path), path))
+
+
+def _frames_of(names: dict[int, str], pictures: Sequence[Path], path: Path) -> dict[int, int]:
+    """The frame of each image by its id."""
+    if known := frames_by_name(names, pictures, where=path):
+        return known
+    order = sorted(names, key=lambda image_id: natural_order(Path(names[image_id])))
+    if pictures and len(pictures) != len(names):
+        raise AnnotationError(
+            f"{path}: expected images named like the {len(pictures)} pictures of the source, got "
+            f"{len(names)} of other names, such as {names[order[0]] if order else 'none'}; correct "
+            "the names"
+        )
+    stems = {image_id: Path(name).stem for image_id, name in names.items()}
+    if all(_NUMBER.fullmatch(stem) and int(stem) for stem in stems.values()):
+        return {image_id: int(stem) for image_id, stem in stems.items()}
+    return {image_id: number for number, image_id in enumerate(order, start=1)}
+
+
+def _annotation_boxes(
+    annotations: list[Any], frames: dict[int, int], path: Path
+) -> Iterator[tuple[str, int, AnnotatedBox]]:
+    for number, annotation in enumerate(annotations, start=1):
+        where = f"{path}, annotation {number}"
+        try:
+            frame_index = frames[int(annotation["image_id"])]
+            x, y, width, height = (float(value) for value in annotation["bbox"])
+            track_id = _track_id(annotation)
+            score = float(annotation.get("score", 1.0))
+        except (ValueError, KeyError, TypeError, AttributeError, *_TOO_LARGE):
+            raise AnnotationError(
+                f"{where}: expected the image_id of one of the images and a bbox of x, y, width, "
+                f"height, got {str(annotation)[:80]}"
+            ) from None
+        box = box_from_xywh(x, y, width, height, where=where)
+        yield (
+            where,
+            frame_index,
+            AnnotatedBox(track_id=track_id, bbox_xyxy_px=box, visibility=1.0, score=score),
+        )
+
+
+def _track_id(annotation: dict[str, Any]) -> int:
+    """The annotation's track id; UNKNOWN_ID where it has none."""
+    for place in (annotation, annotation.get("attributes") or {}):
+        for name in _ID_NAMES:
+            if place.get(name) is not None:
+                track_id = int(place[name])
+                if track_id < 1:
+                    raise ValueError(f"{name} {track_id}")
+                return track_id
+    return UNKNOWN_ID
+
+
+def parse_cvat(
+    text: str, path: Path, pictures: Sequence[Path] = ()
+) -> dict[int, list[AnnotatedBox]]:
+    """Boxes by frame, from a file's text; `path` is for messages.
+
+    `pictures` of the source, in its order; empty of a video. Raises AnnotationError with what was
+    expected, and where.
+    """
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as error:
+        raise AnnotationError(f"{path}: expected CVAT's XML, got: {error}") from None
+    if root.tag != "annotations":
+        raise AnnotationError(f"{path}: expected CVAT's <annotations>, got <{root.tag}>")
+    return group_by_frame(_track_boxes(root, path, pictures))
+
+
+def _track_boxes(
+    root: ET.Element, path: Path, pictures: Sequence[Path]
+) -> Iterator[tuple[str, int, AnnotatedBox]]:
+    for track in root.iter("track"):
+        for box in track.iter("box"):
+            where = f"{path}, track {track.get('id')}, frame {box.get('frame')}"
+            if box.get("outside") != "1":
+                yield _box(box, box.get("frame"), track.get("id"), where)
+    images = [*root.iter("image")]
+    names = {number: image.get("name", "") for number, image in enumerate(images)}
+    frames = frames_by_name(names, pictures, where=path)
+    for number, image in enumerate(images):
+        where = f"{path}, image {image.get('id')}"
+        frame = str(frames[number] - 1) if frames else image.get("id")
+        for box in image.iter("box"):
+            yield _box(box, frame, None, where)
+
+
+def _box(
+    element: ET.Element, frame: str | None, track: str | None, where: str
+) -> tuple[str, int, AnnotatedBox]:
+    try:
+        x0, y0, x1, y1 = (float(element.attrib[name]) for name in ("xtl", "ytl", "xbr", "ybr"))
+        frame_index = int(frame or "") + 1
+        track_id = UNKNOWN_ID if track is None else int(track) + 1
+    except (KeyError, ValueError):
+        raise AnnotationError(
+            f"{where}: expected a frame's number and a box with xtl, ytl, xbr, ybr, "
+            f"got {element.attrib}"
+        ) from None
+    box = box_from_xywh(x0, y0, x1 - x0, y1 - y0, where=where)
+    return where, frame_index, AnnotatedBox(track_id=track_id, bbox_xyxy_px=box, visibility=1.0)
+
+
+_MAX_BYTES = 1 << 29  # chosen: some ten million boxes
+_PARSERS = {".json": parse_coco, ".xml": parse_cvat}
+
+
+def load_boxes(path: Path, *, pictures: Path | None = None) -> dict[int, list[AnnotatedBox]]:
+    """Boxes by frame (from 1), within a frame by id; none from an empty text file.
+
+    `.json` is read as COCO, `.xml` as CVAT, everything else as MOT Challenge text. `pictures`: the
+    source of the frames; where it is a folder, COCO and CVAT name its pictures. Raises
+    AnnotationError with the place in the file and what was expected there.
+    """
+    text, suffix = _read_text(path), path.suffix.lower()
+    if suffix not in _PARSERS:
+        return parse_mot(text, path)
+    named = pictures_in(pictures) if pictures is not None and pictures.is_dir() else []
+    return _PARSERS[suffix](text, path, named)
+
+
+def unused_boxes(frames: Mapping[int, Sequence[AnnotatedBox]], last_frame: int) -> list[str]:
+    """A line where no frame up to the last one had boxes, or some are beyond it."""
+    if not any(frames.values()):
+        return ["boxes: the file has none, so there are no fish"]
+    beyond = sorted(index for index, boxes in frames.items() if boxes and index > last_frame)
+    if not beyond:
+        return []
+    which = "all" if len(beyond) == sum(map(bool, frames.values())) else "some"
+    return [
+        f"boxes: {which} are past the end of the source, {len(beyond)} frames from {beyond[0]} on, "
+        f"and it ended at frame {last_frame}; are they of another video?"
+    ]
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return read_text(path, encoding="utf-8-sig", max_bytes=_MAX_BYTES)
+    except UnicodeDecodeError:
+        raise AnnotationError(
+            f"{path}: expected a text file of boxes ({COLUMNS}), got binary data"
+        ) from None
+    except OSError as error:
+        raise AnnotationError(
+            f"{path}: expected a file of boxes, but it can't be read: {error.strerror}"
+        ) from None

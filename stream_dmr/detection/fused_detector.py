@@ -1,0 +1,124 @@
+"""Fish by their motion and by their looks.
+
+Motion finds what a network has never seen, with an outline, and also plants that sway; it misses
+what hangs still, of a fish that fills the picture it sees parts, and of one behind a gaff two
+pieces. Looks find fish that don't move, and also marks that look like fish. What either finds is
+followed; what counts is said by `tracking.fish_evidence`.
+"""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.detection.detector import Candidate, Detector
+from stream_dmr.detection.motion_detector import MotionDetector
+from stream_dmr.geometry import box_iou, fraction_inside, whole_pixels
+from stream_dmr.messages import Frame
+
+_MIN_IOU = 0.3  # of what moves with the box that says how much it looks like a fish
+# A box that has so much surely shows one whole fish, one with so much shows something of its own.
+_SURE, _SEEN = 0.6, 0.3
+_MIN_INSIDE = 0.8  # of a piece of a fish, inside the fish's box
+_MIN_WHOLE_IOU = 0.5  # of all pieces together with that box
+# The part of the frame around a closer look: in sizes of what is looked at, and at least in px.
+_SURROUNDINGS, _MIN_SURROUNDINGS_PX = 4.0, 208
+
+
+class FusedDetector:
+    """A `Detector` of what moves, and of what looks like fish."""
+
+    def __init__(self, motion: MotionDetector, looks: Detector) -> None:
+        self._motion = motion
+        self._looks = looks
+        self._beside = ThreadPoolExecutor(1, "looks")  # both take as long as each other
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """The moving shapes of all frames that were no candidates, by reason."""
+        return self._motion.refused
+
+    def find(self, frame: Frame) -> list[Candidate]:
+        """The candidates of one frame."""
+        looking = self._beside.submit(self._looks.find, frame)
+        moving, seen = self._motion.find(frame), looking.result()
+        return [
+            replace(one, place_px=self._place(one, frame), looks=_looks(one.bbox_xyxy_px, seen))
+            for one in fuse(moving, seen)
+        ]
+
+    def look_closer(self, frame: Frame, bbox_xyxy_px: Float[np.ndarray, "4"]) -> float:
+        """How much the content of a box looks like a fish in a picture of its surroundings alone.
+
+        What has less than 20 px in the detector's picture of the whole frame can't be told there.
+        """
+        size_px = float((bbox_xyxy_px[2:] - bbox_xyxy_px[:2]).max())
+        side = max(_SURROUNDINGS * size_px, _MIN_SURROUNDINGS_PX)
+        middle = (bbox_xyxy_px[:2] + bbox_xyxy_px[2:]) / 2
+        limits = np.array(frame.image.shape[1::-1])
+        low = np.round(middle - side / 2).clip(0, np.maximum(limits - side, 0)).astype(int)
+        high = np.minimum(low + round(side), limits)
+        part = np.ascontiguousarray(frame.image[low[1] : high[1], low[0] : high[0]])
+        return _looks(bbox_xyxy_px - np.tile(low, 2), self._looks.find(replace(frame, image=part)))
+
+    def _place(self, one: Candidate, frame: Frame) -> Float[np.ndarray, "2"]:
+        middle = (one.bbox_xyxy_px[:2] + one.bbox_xyxy_px[2:]) / 2
+        return np.asarray(self._motion.scene_point(middle, shape=frame.image.shape[:2]))
+
+
+def fuse(moving: Sequence[Candidate], seen: Sequence[Candidate]) -> list[Candidate]:
+    """What moves, whose outline is known, and what is seen where nothing moves."""
+    moving = _without_pieces(moving, seen)
+    still = [
+        fish
+        for fish in seen
+        if not any(_show_the_same(fish.bbox_xyxy_px, one.bbox_xyxy_px) for one in moving)
+    ]
+    return [*moving, *still]
+
+
+def _without_pieces(moving: Sequence[Candidate], seen: Sequence[Candidate]) -> list[Candidate]:
+    """What moves, with those that lie in one box of one fish joined to one."""
+    found = list(moving)
+    for fish in sorted(seen, key=lambda one: -one.score):
+        if fish.score < _SURE:
+            break
+        others = [one for one in seen if one is not fish and one.score >= _SEEN]
+        pieces = [one for one in found if _is_piece(one, fish, others)]
+        if len(pieces) > 1:
+            whole = _join(pieces)
+            if box_iou(whole.bbox_xyxy_px, fish.bbox_xyxy_px) >= _MIN_WHOLE_IOU:
+                found = [*(one for one in found if one not in pieces), whole]
+    return found
+
+
+def _is_piece(one: Candidate, fish: Candidate, others: Sequence[Candidate]) -> bool:
+    """True for what lies in a fish's box and doesn't rather look like another fish."""
+    box, whole = one.bbox_xyxy_px, fish.bbox_xyxy_px
+    alike = max(_MIN_IOU, box_iou(box, whole))
+    is_inside = one.foreground is not None and fraction_inside(box, whole) >= _MIN_INSIDE
+    return is_inside and not any(box_iou(box, other.bbox_xyxy_px) > alike for other in others)
+
+
+def _join(pieces: Sequence[Candidate]) -> Candidate:
+    """One candidate with the silhouettes of all pieces."""
+    corners = np.array([whole_pixels(one.bbox_xyxy_px) for one in pieces])
+    left, top = corners[:, :2].min(axis=0)
+    right, bottom = corners[:, 2:].max(axis=0)
+    foreground = np.zeros((bottom - top, right - left), bool)
+    for one, (x0, y0, x1, y1) in zip(pieces, corners, strict=True):
+        foreground[y0 - top : y1 - top, x0 - left : x1 - left] |= one.foreground
+    box = np.array([left, top, right, bottom], np.float64)
+    return replace(pieces[0], bbox_xyxy_px=box, foreground=foreground)
+
+
+def _looks(bbox_xyxy_px: Float[np.ndarray, "4"], seen: Sequence[Candidate]) -> float:
+    """How much the content of a box looks like a fish: the best score of the boxes around it."""
+    scores = (fish.score for fish in seen if _show_the_same(bbox_xyxy_px, fish.bbox_xyxy_px))
+    return max(scores, default=0.0)
+
+
+def _show_the_same(one: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> bool:
+    return box_iou(one, other) >= _MIN_IOU

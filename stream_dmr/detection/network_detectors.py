@@ -1,0 +1,369 @@
+"""Candidates by ONNX detectors and by the U-Net.
+
+Decode the outputs of families of detectors into boxes and scores.
+
+yolo: (1, 4 + C, N), x, y, w, h of the center and C scores, input pixels (YOLOv8 and later).
+yolov5: (1, N, 5 + C), x, y, w, h, objectness, C scores, input pixels (YOLOv5, YOLOX decoded).
+yolo-nms: (1, N, 6), left, top, right, bottom, score, class, input pixels (exported with NMS).
+detr: boxes (1, N, 4) as x, y, w, h, fractions of the input, and logits (1, N, C + 1), the last of
+them "nothing" (DETR). rt-detr: the same with C independent logits (RT-DETR, RF-DETR, DINO).
+
+A user's detector from an ONNX file, run by onnxruntime on the CPU.
+
+It is tried on three pictures before the first frame, so that an unusable model is refused at once
+and not in the middle of a run.
+
+Fish in the whole frame by the network that also finds masks, at low resolution, without boxes.
+
+For cameras and seas that move so much that no fish stands out by its motion.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+from pydantic import Field
+
+from stream_dmr.detection.detector import Candidate
+from stream_dmr.errors import ModelError
+from stream_dmr.geometry import components
+from stream_dmr.messages import Frame
+from stream_dmr.networks.onnx_session import open_session
+from stream_dmr.networks.unet_interface import SIZE_MULTIPLE_PX
+from stream_dmr.segmentation.unet_segmenter import UNetSegmenter
+from stream_dmr.settings import Settings
+
+Layout = Literal["yolo", "yolov5", "yolo-nms", "detr", "rt-detr"]
+NUM_OUTPUTS = {"yolo": 1, "yolov5": 1, "yolo-nms": 1, "detr": 2, "rt-detr": 2}
+
+# x0, y0, x1, y1 in input pixels; scores by class
+BoxesAndScores = tuple[Float[np.ndarray, "N 4"], Float[np.ndarray, "N C"]]
+
+
+class OutputShapeError(ValueError):
+    """The outputs are not of the layout; the message says what was expected."""
+
+
+def decode(
+    outputs: Sequence[np.ndarray], layout: str, *, input_size: tuple[int, int]
+) -> BoxesAndScores:
+    """Boxes x0, y0, x1, y1 in input pixels, and their scores by class.
+
+    `input_size` is (width, height). Raises OutputShapeError.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):  # NaN is refused later
+        return _DECODERS[layout]([np.asarray(o, np.float64) for o in outputs], input_size)
+
+
+def _yolo(outputs: list[np.ndarray], _: tuple[int, int]) -> BoxesAndScores:
+    (rows,) = outputs
+    if rows.ndim != 3 or rows.shape[0] != 1 or rows.shape[1] < 5:
+        raise OutputShapeError("(1, 4 + classes, boxes)")
+    if rows.shape[1] > rows.shape[2]:
+        raise OutputShapeError("(1, 4 + classes, boxes) with more boxes than classes")
+    return _corners(rows[0, :4].T), rows[0, 4:].T
+
+
+def _yolov5(outputs: list[np.ndarray], _: tuple[int, int]) -> BoxesAndScores:
+    (rows,) = outputs
+    if rows.ndim != 3 or rows.shape[0] != 1 or rows.shape[2] < 6:
+        raise OutputShapeError("(1, boxes, 5 + classes)")
+    return _corners(rows[0, :, :4]), rows[0, :, 4:5] * rows[0, :, 5:]
+
+
+def _yolo_nms(outputs: list[np.ndarray], _: tuple[int, int]) -> BoxesAndScores:
+    (rows,) = outputs
+    if rows.ndim != 3 or rows.shape[0] != 1 or rows.shape[2] != 6:
+        raise OutputShapeError("(1, boxes, 6)")
+    classes = np.maximum(rows[0, :, 5], 0).astype(int)
+    scores = np.zeros((len(classes), int(classes.max(initial=0)) + 1))
+    scores[np.arange(len(classes)), classes] = rows[0, :, 4]
+    return rows[0, :, :4], scores
+
+
+def _detr(outputs: list[np.ndarray], input_size: tuple[int, int]) -> BoxesAndScores:
+    boxes, logits = _boxes_and_logits(outputs)
+    odds = np.exp(logits - logits.max(axis=1, keepdims=True))
+    return boxes * np.tile(input_size, 2), (odds / odds.sum(axis=1, keepdims=True))[:, :-1]
+
+
+def _rt_detr(outputs: list[np.ndarray], input_size: tuple[int, int]) -> BoxesAndScores:
+    boxes, logits = _boxes_and_logits(outputs)
+    return boxes * np.tile(input_size, 2), 1 / (1 + np.exp(-logits.clip(-60, 60)))
+
+
+def _boxes_and_logits(outputs: list[np.ndarray]) -> BoxesAndScores:
+    """The two outputs, in either order; boxes still as fractions of the input."""
+    shapes = [output.shape for output in outputs]
+    if any(len(shape) != 3 or shape[0] != 1 for shape in shapes) or shapes[0][1] != shapes[1][1]:
+        raise OutputShapeError("(1, boxes, 4) and (1, boxes, classes)")
+    boxes = [i for i, shape in enumerate(shapes) if shape[2] == 4]
+    if not boxes:
+        raise OutputShapeError("(1, boxes, 4) and (1, boxes, classes)")
+    # Where both have four columns, the boxes are the one with values from 0 to 1.
+    first = min(boxes, key=lambda i: float(np.abs(outputs[i] - 0.5).max(initial=0.0)))
+    return _corners(outputs[first][0]), outputs[1 - first][0]
+
+
+def _corners(boxes: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
+    """Center and size as left, top, right, bottom."""
+    half = boxes[:, 2:] / 2
+    return np.concatenate([boxes[:, :2] - half, boxes[:, :2] + half], axis=1)
+
+
+_DECODERS: dict[str, Callable[[list[np.ndarray], tuple[int, int]], BoxesAndScores]] = {
+    "yolo": _yolo,
+    "yolov5": _yolov5,
+    "yolo-nms": _yolo_nms,
+    "detr": _detr,
+    "rt-detr": _rt_detr,
+}
+
+
+_GREY_LEVEL = 114  # of the bars, as the YOLO family is trained
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Letterbox:
+    """Input pixels are frame pixels times `scale` plus `offset`, counted from pixel edges.
+
+    A frame is resized to whole pixels, so its two sides may scale by slightly different factors.
+    """
+
+    input_size: tuple[int, int]  # width, height
+    resized: tuple[int, int]  # of the frame inside the input; width, height
+    offset: Float[np.ndarray, "2"]
+    scale: Float[np.ndarray, "2"]
+
+    @classmethod
+    def from_sizes(cls, *, frame_size: tuple[int, int], input_size: tuple[int, int]) -> "Letterbox":
+        """The largest picture of a frame's proportions, centered in the input; (width, height)."""
+        ratio = min(input_size[0] / frame_size[0], input_size[1] / frame_size[1])
+        resized = tuple(max(1, round(side * ratio)) for side in frame_size)
+        offset = [(inner - side) // 2 for inner, side in zip(input_size, resized, strict=True)]
+        return cls(
+            input_size=input_size,
+            resized=(resized[0], resized[1]),
+            offset=np.array(offset, np.float64),
+            scale=np.array(resized, np.float64) / np.array(frame_size, np.float64),
+        )
+
+    def apply(self, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
+        """The input for a frame: resized, with grey bars."""
+        width, height = self.input_size
+        x, y = self.offset.astype(int).tolist()
+        framed = np.full((height, width, 3), _GREY_LEVEL, np.uint8)
+        small = cv2.resize(image, self.resized, interpolation=cv2.INTER_LINEAR)
+        framed[y : y + self.resized[1], x : x + self.resized[0]] = small
+        return framed
+
+    def to_frame(self, boxes_xyxy_px: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
+        """Boxes of the input as boxes of the frame, half-open, px."""
+        return (boxes_xyxy_px - np.tile(self.offset, 2)) / np.tile(self.scale, 2)
+
+
+_MIN_INPUT_PX = 32  # the stride of the usual detectors
+_SCORE_TOLERANCE = 1e-3  # rounding may put a score of 1 above 1
+_IMAGENET_MEAN = np.array([0.485, 0.456, 0.406], np.float32)  # RGB
+_IMAGENET_STD = np.array([0.229, 0.224, 0.225], np.float32)
+
+
+class OnnxSettings(Settings):
+    """The part of `[detect_fish]` that a detector from an ONNX file reads."""
+
+    onnx_layout: Layout = Field(
+        default="yolo",
+        description="output format of the model; docs/models.md has the shapes",
+    )
+    onnx_input_px: int = Field(
+        default=640,
+        ge=_MIN_INPUT_PX,
+        le=4096,
+        description="input side of a model of any size, px",
+    )
+    onnx_imagenet: bool = Field(
+        default=False, description="input by ImageNet's mean and std, as DETR wants; else 0 to 1"
+    )
+    onnx_classes: list[Annotated[int, Field(ge=0)]] = Field(
+        default=[], description="the model's classes that are fish, counted from 0; empty: all"
+    )
+    onnx_overlap: float = Field(
+        default=0.6, ge=0, le=1, description="boxes with a higher IoU are one fish"
+    )
+
+
+class OnnxDetector:
+    """A `Detector` of boxes and scores, without silhouettes."""
+
+    def __init__(
+        self,
+        path: Path,
+        settings: OnnxSettings,
+        *,
+        min_score: float = _SCORE_TOLERANCE,
+        threads: int = 2,  # users' models may be large
+    ) -> None:
+        """`min_score`: of the boxes that are found. Raises ModelError for no usable detector."""
+        self._path, self._settings, self._min_score = path, settings, min_score
+        self._session = open_session(path, threads=threads)
+        self._input_name, self._input_size = self._read_input()
+        if len(self._session.get_outputs()) != NUM_OUTPUTS[settings.onnx_layout]:
+            raise self._refusal(
+                f"{NUM_OUTPUTS[settings.onnx_layout]} outputs",
+                f"{len(self._session.get_outputs())}",
+                remedy="set [detect_fish] onnx_layout to what the model was exported as",
+            )
+        width, height = self._input_size
+        noise = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+        for picture in (noise, np.zeros_like(noise), np.full_like(noise, 255)):
+            self._try(picture)
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Empty: what was not found is not known."""
+        return {}
+
+    def find(self, frame: Frame) -> list[Candidate]:
+        """The boxes of a frame after non-maximum suppression."""
+        height, width = frame.image.shape[:2]
+        letterbox = Letterbox.from_sizes(frame_size=(width, height), input_size=self._input_size)
+        boxes, scores = self._run(letterbox.apply(frame.image))
+        boxes = letterbox.to_frame(boxes).clip(0, [width, height, width, height])
+        sides = boxes[:, 2:] - boxes[:, :2]
+        usable = np.isfinite(boxes).all(axis=1) & (sides >= 1).all(axis=1)
+        usable &= scores >= self._min_score  # not NaN
+        boxes, scores = boxes[usable], scores[usable]
+        kept = cv2.dnn.NMSBoxes(
+            np.column_stack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]]).tolist(),
+            scores.tolist(),
+            self._min_score,
+            self._settings.onnx_overlap,
+        )
+        return [
+            Candidate(bbox_xyxy_px=boxes[i], score=float(min(scores[i], 1.0)))
+            for i in np.array(kept, int).ravel()
+        ]
+
+    def _read_input(self) -> tuple[str, tuple[int, int]]:
+        """Name, and width and height, of the model's image input."""
+        inputs = self._session.get_inputs()
+        shape = inputs[0].shape if inputs else []
+        takes_pictures = (
+            len(inputs) == 1
+            and inputs[0].type == "tensor(float)"
+            and len(shape) == 4
+            and (shape[0] == 1 or not isinstance(shape[0], int))
+            and shape[1] == 3
+        )
+        side = self._settings.onnx_input_px
+        sides = [n if isinstance(n, int) else side for n in shape[2:]]
+        if not takes_pictures or min(sides) < _MIN_INPUT_PX:
+            got = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs) or "none"
+            raise self._refusal("one float input of shape (1, 3, height, width)", got)
+        return inputs[0].name, (sides[1], sides[0])
+
+    def _run(
+        self, picture: UInt8[np.ndarray, "h w 3"]
+    ) -> tuple[Float[np.ndarray, "N 4"], Float[np.ndarray, "N"]]:
+        """Boxes x0, y0, x1, y1 in input pixels, and the best score of any fish class."""
+        values = picture[..., ::-1].astype(np.float32) / 255
+        if self._settings.onnx_imagenet:
+            values = (values - _IMAGENET_MEAN) / _IMAGENET_STD
+        blob = np.ascontiguousarray(values.transpose(2, 0, 1)[None])
+        outputs = self._session.run(None, {self._input_name: blob})
+        boxes, scores = decode(outputs, self._settings.onnx_layout, input_size=self._input_size)
+        return boxes, self._fish_scores(scores).max(axis=1, initial=0.0)
+
+    def _fish_scores(self, scores: Float[np.ndarray, "N C"]) -> Float[np.ndarray, "N F"]:
+        """The scores of the classes that `onnx_classes` names."""
+        classes = self._settings.onnx_classes
+        if not classes:
+            return scores
+        if self._settings.onnx_layout == "yolo-nms":  # has as many columns as classes were found
+            classes = [c for c in classes if c < scores.shape[1]]
+        elif max(classes) >= scores.shape[1]:
+            raise OutputShapeError(f"with class {max(classes)}, which onnx_classes names")
+        return scores[:, classes]
+
+    def _try(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Raise ModelError where the model fails on a picture or gives impossible outputs."""
+        layout = self._settings.onnx_layout
+        try:
+            boxes, scores = self._run(picture)
+        except OutputShapeError as error:
+            shapes = ", ".join(str(tuple(o.shape)) for o in self._session.get_outputs())
+            raise self._refusal(
+                f'outputs of [detect_fish] onnx_layout = "{layout}", {error}', shapes
+            ) from None
+        except Exception as error:  # onnxruntime's errors share no base class
+            raise self._refusal(
+                f"a model that takes a picture of {self._input_size[0]}x{self._input_size[1]} px",
+                f"{error}".strip().splitlines()[0][:120],
+                remedy="set [detect_fish] onnx_input_px",
+            ) from None
+        if not (np.isfinite(boxes).all() and np.isfinite(scores).all()):
+            raise self._refusal("finite boxes and scores", "NaN or infinity", remedy="export again")
+        if (
+            len(scores)
+            and not -_SCORE_TOLERANCE <= scores.min() <= scores.max() <= 1 + _SCORE_TOLERANCE
+        ):
+            raise self._refusal("scores from 0 to 1", f"{scores.min():.3g} to {scores.max():.3g}")
+
+    def _refusal(self, expected: str, got: str, *, remedy: str = "") -> ModelError:
+        remedy = remedy or "export it again, or set [detect_fish] onnx_layout"
+        return ModelError(f"{self._path}: expected {expected}, got {got}; {remedy}")
+
+
+_MIN_AREA_PX = 24  # in the network's input; chosen by hand, a few pixels wide and high
+
+
+class UNetDetector:
+    """A `Detector` of connected shapes with fish probability above 0.5; the score is their mean."""
+
+    def __init__(self, segmenter: UNetSegmenter, *, longer_px: int) -> None:
+        """`longer_px`: longer side of the network's input; fish should be 40 to 140 px in it."""
+        self._segmenter = segmenter
+        self._longer_px = longer_px
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Empty: what was not found is not known."""
+        return {}
+
+    def find(self, frame: Frame) -> list[Candidate]:
+        """The candidates of one frame."""
+        height, width = frame.image.shape[:2]
+        scale = self._longer_px / max(width, height)
+        size = [
+            SIZE_MULTIPLE_PX * max(1, round(side * scale / SIZE_MULTIPLE_PX))
+            for side in (width, height)
+        ]
+        small = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
+        probability = self._segmenter.segment_all(small)
+        fish = cv2.resize(probability, (width, height), interpolation=cv2.INTER_LINEAR)
+        min_area_px = _MIN_AREA_PX * width * height / (size[0] * size[1])
+        return [_candidate(shape, fish) for shape in _large_components(fish > 0.5, min_area_px)]
+
+
+def _large_components(
+    fish: Bool[np.ndarray, "H W"], min_area_px: float
+) -> list[Bool[np.ndarray, "H W"]]:
+    count, labels, stats = components(fish.astype(np.uint8))
+    large = [i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] >= min_area_px]
+    return [labels == i for i in large]
+
+
+def _candidate(
+    shape: Bool[np.ndarray, "H W"], probability: Float32[np.ndarray, "H W"]
+) -> Candidate:
+    x, y, w, h = cv2.boundingRect(shape.view(np.uint8))
+    foreground = shape[y : y + h, x : x + w].copy()
+    return Candidate(
+        bbox_xyxy_px=np.array([x, y, x + w, y + h], np.float64),
+        score=float(probability[shape].mean()),
+        foreground=foreground,
+    )

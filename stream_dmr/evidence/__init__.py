@@ -1,0 +1,1 @@
+"""Seal and verify the folder of a run."""

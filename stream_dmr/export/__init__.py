@@ -1,0 +1,1 @@
+"""Export results, one file per kind of format."""

@@ -1,0 +1,121 @@
+"""Tables in the manner of WCPFC's longline monitoring and of ICES' RDBES; docs/trip.md maps them.
+
+What a camera can't know stays empty: nothing is guessed. Sources: draft longline EM fields
+(WCPFC-SC16-2020/ST-IP-07) and the SPC/FFA longline observer form; the RDBES data model and the ICES
+vocabularies TypeMeasured and ValueUnitOrScale.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from stream_dmr.files import writing_to
+from stream_dmr.lengths.fate import FATE_OF_ZONE
+from stream_dmr.store.effort import HaulEffort
+from stream_dmr.store.fish import FishResult, sure_code
+from stream_dmr.tables import utc_text, write_table
+from stream_dmr.template.template import Template
+
+Row = dict[str, str]
+
+WCPFC_COLUMNS = [
+    *("vessel_name", "trip_number", "set_number", "catch_date_utc", "catch_time_utc"),
+    *("latitude", "longitude", "hook_number", "species_code", "length_cm", "length_code"),
+    *("sex", "condition_when_caught", "fate_code", "condition_when_released", "tag_number"),
+    "comments",
+]
+RDBES_COLUMNS = [
+    *("FOstationNumber", "FOlatitude", "FOlongitude", "SAspeciesCodeFAO", "SAcatchCategory"),
+    *("BVrecordType", "BVnationalUniqueFishId", "BVstateOfProcessing", "BVpresentation"),
+    *("BVspecimensState", "BVtypeMeasured", "BVtypeAssessment", "BVvalueMeasured"),
+    *("BVvalueUnitOrScale", "BVmethod", "BVmeasurementEquipment", "BVaccuracy", "BVsampler"),
+]
+_FATE_COLUMNS = {f"num_{zone}": fate for zone, fate in FATE_OF_ZONE.items()}
+HAUL_COLUMNS = [
+    *("haul", "began_utc", "ended_utc", "hours_watched", "share_measured", "num_fish"),
+    *("num_measured", *_FATE_COLUMNS),
+]
+_WCPFC_LENGTHS = {"fork": "UF", "total": "TL"}  # upper jaw to fork; tip of snout to end of tail
+ICES_LENGTHS = {"fork": "LengthFork", "total": "LengthTotal"}
+
+
+def wcpfc_row(fish: FishResult, template: Template) -> Row:
+    """The catch line of one fish."""
+    date, _, time = (utc_text(fish.utc_ns) or "").partition("T")
+    length_mm, where = fish.length_mm, fish.where
+    notes = [
+        fish.fate and f"fate by {'zones' if fish.review.fate is None else 'review'}: {fish.fate}",
+        fish.review.decision and f"review: {fish.review.decision}",
+    ]
+    return {
+        "vessel_name": fish.facts.vessel,
+        "trip_number": fish.facts.trip,
+        "set_number": fish.haul,
+        "catch_date_utc": date,
+        "catch_time_utc": time[:8],
+        "latitude": _degrees(where.latitude, "NS", digits=2),
+        "longitude": _degrees(where.longitude, "EW", digits=3),
+        "species_code": sure_code(fish),
+        "length_cm": "" if length_mm is None else str(int(length_mm // 10)),
+        "length_code": ""
+        if length_mm is None
+        else _WCPFC_LENGTHS.get(template.tail_gives or "", ""),
+        "comments": "; ".join(note for note in notes if note),
+    }
+
+
+def rdbes_row(fish: FishResult, template: Template) -> Row:
+    """One measured length, as a biological variable with the sample's and the haul's keys."""
+    kind, length_mm = ICES_LENGTHS.get(template.tail_gives or "", ""), fish.length_mm
+    is_measured = length_mm is not None
+    place = fish.where.latitude, fish.where.longitude
+    return {
+        "FOstationNumber": fish.haul,
+        "FOlatitude": "" if place[0] is None else f"{place[0]:.5f}",
+        "FOlongitude": "" if place[1] is None else f"{place[1]:.5f}",
+        "SAspeciesCodeFAO": sure_code(fish),
+        "BVrecordType": "BV",
+        "BVnationalUniqueFishId": f"{fish.run_id[:8]}-{fish.estimate.track_id}",
+        "BVtypeMeasured": kind if is_measured else "",
+        "BVtypeAssessment": kind if is_measured else "",
+        "BVvalueMeasured": f"{length_mm:.0f}" if length_mm is not None else "",
+        "BVvalueUnitOrScale": "Lengthmm" if is_measured else "",
+    }
+
+
+def haul_row(effort: HaulEffort, *, utc_zero_ns: int | None) -> Row:
+    """One haul with its effort; `utc_zero_ns` added to capture times gives UTC."""
+
+    def utc(time_ns: int | None) -> str:
+        if time_ns is None or utc_zero_ns is None:
+            return ""
+        return utc_text(time_ns + utc_zero_ns) or ""
+
+    share, fates = effort.share_measured, effort.fates
+    return {
+        "haul": effort.haul,
+        "began_utc": utc(effort.began_ns),
+        "ended_utc": utc(effort.ended_ns),
+        "hours_watched": f"{effort.hours_watched:.4f}",
+        "share_measured": "" if share is None else f"{share:.4f}",
+        "num_fish": str(effort.num_fish),
+        "num_measured": str(effort.num_measured),
+        **{
+            column: "" if fates is None else str(fates.get(fate, 0))
+            for column, fate in _FATE_COLUMNS.items()
+        },
+    }
+
+
+def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> Path:
+    """Write a table as CSV; what a row lacks stays empty."""
+    with writing_to(path):
+        write_table(path, columns, ([row.get(name, "") for name in columns] for row in rows))
+    return path
+
+
+def _degrees(value: float | None, letters: str, *, digits: int) -> str:
+    """Degrees and minutes with three decimals, such as 5701.234N."""
+    if value is None:
+        return ""
+    whole, minutes = divmod(round(abs(value) * 60_000), 60_000)
+    return f"{whole:0{digits}d}{minutes / 1000:06.3f}{letters[value < 0]}"

@@ -1,0 +1,107 @@
+"""Masks as COCO JSON with run lengths, in the pixels of their frames."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool
+
+from stream_dmr.camera import crop_from_frame, frame_from_crop
+from stream_dmr.messages import FishCrop
+from stream_dmr.pictures import PICTURE_SUFFIXES
+from stream_dmr.recording.codec import EncodedPicture
+
+
+def coco_masks(
+    pictures: Iterable[tuple[int, str, EncodedPicture]],
+    crops: Iterable[FishCrop],
+    codes: Mapping[int, str],
+) -> dict[str, Any]:
+    """COCO's object; `pictures` with frame index and source, `codes` by track id, "" for none.
+
+    Categories are the codes, and "fish" where there is none.
+    """
+    names = ["fish", *sorted({code for code in codes.values() if code})]
+    return {
+        "images": [_image(*picture) for picture in pictures],
+        "annotations": [
+            _annotation(
+                crop, number=k, category=1 + names.index(codes.get(crop.track_id) or "fish")
+            )
+            for k, crop in enumerate(crops, start=1)
+        ],
+        "categories": [
+            {"id": k, "name": name, "supercategory": "fish"}
+            for k, name in enumerate(names, start=1)
+        ],
+    }
+
+
+def mask_in_frame(crop: FishCrop) -> Bool[np.ndarray, "H W"]:
+    """The mask of a crop in the pixels of its frame.
+
+    A frame pixel belongs to it where the crop's mask, interpolated, is above one half: a crop is
+    coarser than its frame, and its nearest pixel would leave steps along the outline.
+    """
+    frame = crop.frame_camera
+    mask = np.zeros((frame.height, frame.width), bool)
+    x0, y0, x1, y1 = _extent(crop)
+    if x1 <= x0 or y1 <= y0:
+        return mask
+    x, y = np.meshgrid(np.arange(x0, x1), np.arange(y0, y1))
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1).astype(float)
+    at = crop_from_frame(pixels, crop_camera=crop.crop_camera, frame_camera=frame)
+    u, v = at.reshape(*x.shape, 2).astype(np.float32).transpose(2, 0, 1)
+    share = cv2.remap(crop.mask.astype(np.float32), u, v, cv2.INTER_LINEAR)
+    mask[y0:y1, x0:x1] = share > 0.5
+    return mask
+
+
+def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
+    """COCO's counts: pixels off, on, off, ... column by column, beginning with those off."""
+    pixels = mask.ravel(order="F")
+    changes = np.flatnonzero(np.diff(pixels)) + 1
+    edges = np.concatenate([[0], changes, [len(pixels)]])
+    counts = np.diff(edges).tolist()
+    return [0, *counts] if pixels[0] else counts
+
+
+def _extent(crop: FishCrop) -> tuple[int, int, int, int]:
+    """A box of frame pixels that holds the crop's mask, half-open."""
+    contours, _ = cv2.findContours(
+        crop.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+    )
+    if not contours:
+        return 0, 0, 0, 0
+    outline = np.concatenate(contours)[:, 0].astype(float)
+    pixels = frame_from_crop(outline, crop_camera=crop.crop_camera, frame_camera=crop.frame_camera)
+    scale = float((crop.frame_camera.K[[0, 1], [0, 1]] / crop.crop_camera.K[[0, 1], [0, 1]]).max())
+    low, high = pixels.min(axis=0) - 2 * scale - 1, pixels.max(axis=0) + 2 * scale + 2
+    limits = [crop.frame_camera.width, crop.frame_camera.height]
+    x0, y0 = np.clip(low, 0, limits).astype(int)
+    x1, y1 = np.clip(high, 0, limits).astype(int)
+    return int(x0), int(y0), int(x1), int(y1)
+
+
+def _image(frame_index: int, source: str, picture: EncodedPicture) -> dict[str, Any]:
+    """A picture of a folder has its own name, a frame of a video its number."""
+    is_picture = "://" not in source and Path(source).suffix.lower() in PICTURE_SUFFIXES
+    name = source if is_picture else f"{frame_index:06d}.png"
+    return {"id": frame_index, "file_name": name, "width": picture.width, "height": picture.height}
+
+
+def _annotation(crop: FishCrop, *, number: int, category: int) -> dict[str, Any]:
+    mask = mask_in_frame(crop)
+    x0, y0, x1, y1 = crop.bbox_xyxy_px.tolist()
+    return {
+        "id": number,
+        "image_id": crop.frame_index,
+        "category_id": category,
+        "track_id": crop.track_id,
+        "bbox": [x0, y0, x1 - x0, y1 - y0],
+        "area": int(mask.sum()),
+        "iscrowd": 0,
+        "segmentation": {"size": list(mask.shape), "counts": run_lengths(mask)},
+    }

@@ -1,0 +1,201 @@
+"""fish.csv (or .parquet): one row a fish with all that fisheries and auditors need of it."""
+
+import json
+from collections.abc import Callable, Sequence
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from stream_dmr.export.agency_tables import ICES_LENGTHS
+from stream_dmr.files import writing_to
+from stream_dmr.species import CODE
+from stream_dmr.store.fish import FishResult, code_of, is_same_species, species_of
+from stream_dmr.store.fisheries import Derived, FisheriesSettings, derive
+from stream_dmr.store.scale_checks import ScaleCheck, last_checks
+from stream_dmr.tables import seconds, utc_text, write_table
+from stream_dmr.template.template import Template
+
+
+class _Row(NamedTuple):
+    """What the columns of one fish are made of."""
+
+    fish: FishResult
+    template: Template
+    settings: FisheriesSettings
+    species: str  # "": neither a reviewer nor a classifier said it
+    derived: Derived
+    check: ScaleCheck | None  # the last one with the calibration of its run
+
+
+_Column = tuple[type, Callable[[_Row], Any]]
+"""Type, as in Parquet, and value, which may be None."""
+
+
+def _same(kind: type, part: str, *names: str) -> dict[str, _Column]:
+    """Columns that are attributes of these names of a part of the row."""
+    return {name: (kind, attrgetter(f"{part}.{name}")) for name in names}
+
+
+_COLUMNS: dict[str, _Column] = {
+    **_same(str, "fish.facts", "vessel", "trip"),
+    **_same(str, "fish", "haul"),
+    **_same(int, "fish.estimate", "track_id"),
+    **_same(str, "fish", "origin"),
+    "template": (str, lambda row: row.template.name),
+    "species": (str, lambda row: row.species or row.template.name),
+    "species_code": (str, lambda row: code_of(row.fish)),
+    **_same(str, "fish", "fate"),
+    **_same(str, "fish.estimate", "status"),
+    # What a reviewer says has no share.
+    "species_share": (
+        float,
+        lambda row: None if row.fish.review.species else row.fish.catch.species_share,
+    ),
+    "fate_share": (
+        float,
+        lambda row: row.fish.catch.fate_share if row.fish.review.fate is None else None,
+    ),
+    **_same(str, "fish.review", "condition"),
+    **_same(float, "fish.estimate", "length_mm", "length_std_mm"),
+    "ci95_low_mm": (float, lambda row: _ci95_mm(row, 0)),
+    "ci95_high_mm": (float, lambda row: _ci95_mm(row, 1)),
+    "length_from": (str, lambda row: _length_from(row.fish)),  # as are the five after it
+    **_same(float, "derived", "fork_length_mm", "total_length_mm"),
+    **_same(int, "derived", "length_cm"),
+    **_same(float, "derived", "weight_kg"),
+    **_same(bool, "derived", "is_legal_size"),
+    **_same(int, "fish.estimate", "frames_seen", "frames_used", "first_frame", "last_frame"),
+    "first_time": (str, lambda row: seconds(row.fish.estimate.first_timestamp_ns)),
+    "last_time": (str, lambda row: seconds(row.fish.estimate.last_timestamp_ns)),
+    "time_utc": (str, lambda row: utc_text(row.fish.utc_ns)),  # at the middle of its frames
+    "time_utc_ns": (int, lambda row: row.fish.utc_ns),  # the same, since 1970
+    **_same(float, "fish.where", "latitude", "longitude", "speed_knots"),
+    "position_gap_s": (float, lambda row: row.fish.where.gap_s),
+    # JSON: reason -> number of frames
+    "refused": (str, lambda row: json.dumps(dict(row.fish.estimate.refused))),
+    **_same(float, "fish", "iou"),
+    "flags": (str, lambda row: json.dumps(list(row.fish.flags))),
+    "verdict": (str, lambda row: row.fish.review.decision or None),
+    "verdict_reason": (str, lambda row: row.fish.review.reason or None),
+    **_same(int, "fish.review", "duplicate_of"),
+    "corrected_length_mm": (float, lambda row: row.fish.review.length_mm),
+    "corrected_length_std_mm": (float, lambda row: row.fish.review.length_std_mm),
+    "reviewer": (str, lambda row: row.fish.review.reviewer or None),
+    "reviewed_utc": (str, lambda row: utc_text(row.fish.review.written_ns or None)),
+    "reviewed_ns": (int, lambda row: row.fish.review.written_ns or None),  # since 1970
+    "weight_source": (
+        str,
+        lambda row: None if row.derived.weight_kg is None else row.settings.weight_source,
+    ),
+    "legal_source": (
+        str,
+        lambda row: None if row.derived.is_legal_size is None else row.settings.legal_source,
+    ),
+    **_same(str, "fish.facts", "source"),
+    **_same(str, "fish", "run_id"),
+    **_same(str, "fish.facts", "software_version", "config_sha256", "calibration_sha256"),
+    **_same(str, "fish.facts", "template_sha256", "ended_by"),
+    **_same(int, "fish.facts", "frames_done", "frames_promised"),
+    "scale_error_percent": (float, lambda row: row.check and row.check.error_percent),
+    "scale_checked_ns": (int, lambda row: row.check and row.check.time_ns),  # since 1970
+    # Which length `length_mm` is, by the ICES vocabulary.
+    "length_type": (str, lambda row: ICES_LENGTHS.get(row.template.tail_gives or "")),
+}
+FISH_TABLE: dict[str, type] = {name: kind for name, (kind, _) in _COLUMNS.items()}
+
+
+def fish_record(
+    fish: FishResult,
+    template: Template,
+    settings: FisheriesSettings,
+    *,
+    check: ScaleCheck | None = None,
+) -> dict[str, Any]:
+    """The values of FISH_TABLE; None where there is none.
+
+    `check`: the last one with the calibration of the fish's run.
+    """
+    found = species_of(fish)
+    named = "" if CODE.fullmatch(fish.review.species) else fish.review.species
+    species = named or (found.english_name if found else "") or fish.review.species
+    derived = derive(fish.length_mm, template, settings, species=species)
+    row = _Row(fish, template, settings, species, derived, check)
+    return {name: value(row) for name, (_, value) in _COLUMNS.items()}
+
+
+def fish_records(
+    fish: Sequence[FishResult],
+    template: Template,
+    settings: FisheriesSettings,
+    *,
+    database: Path | None,
+) -> list[dict[str, Any]]:
+    """`fish_record` of all, with the last check of the scale that their lengths.db knows."""
+    checks = {} if database is None else last_checks(database)
+    return [
+        fish_record(one, template, settings, check=checks.get(one.facts.calibration_sha256))
+        for one in fish
+    ]
+
+
+def unweighed_note(records: Sequence[dict[str, Any]], settings: FisheriesSettings) -> list[str]:
+    """A line where weight or legal size are asked for, and no fish is of their species."""
+    species = sorted({record["species"] for record in records if record["length_mm"] is not None})
+    is_asked = settings.weight_a > 0 or settings.legal_cm > 0
+    if not is_asked or not species or any(is_same_species(s, settings.species) for s in species):
+        return []
+    return [
+        f"[fisheries] species: no fish is '{settings.species}' (column species: "
+        f"{', '.join(species)}), so none has a weight or a legal size; set [fisheries] to the "
+        "species that they are, or name it with `stream-dmr review`"
+    ]
+
+
+def _ci95_mm(row: _Row, end: int) -> float | None:
+    ci95_mm = row.fish.estimate.ci95_mm
+    return None if ci95_mm is None else float(ci95_mm[end])
+
+
+def _length_from(fish: FishResult) -> str | None:
+    if fish.length_mm is None:
+        return None
+    return "measurement" if fish.review.length_mm is None else "review"
+
+
+def write_csv(path: Path, records: Sequence[dict[str, Any]]) -> Path:
+    """Write records of FISH_TABLE as `path`.csv; lengths are rounded as in lengths.csv."""
+    target = path.with_suffix(".csv")
+    rows = ([_text(record[name]) for name in FISH_TABLE] for record in records)
+    with writing_to(target):
+        write_table(target, FISH_TABLE, rows)
+    return target
+
+
+def write_parquet(path: Path, records: Sequence[dict[str, Any]]) -> Path:
+    """Write records of FISH_TABLE as `path`.parquet, exact."""
+    from pyarrow import Table, parquet
+
+    target = path.with_suffix(".parquet")
+    with writing_to(target):
+        parquet.write_table(Table.from_pylist(list(records), arrow_schema(FISH_TABLE)), target)
+    return target
+
+
+def arrow_schema(columns: dict[str, type]) -> Any:
+    """The schema of a table in Parquet."""
+    import pyarrow as pa
+
+    kinds = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
+    return pa.schema([(name, kinds[kind]) for name, kind in columns.items()])
+
+
+def _text(value: object) -> str:
+    match value:
+        case None:
+            return ""
+        case bool():
+            return str(value).lower()
+        case float():
+            return f"{value:.6f}"
+        case _:
+            return str(value)

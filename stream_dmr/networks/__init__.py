@@ -1,0 +1,1 @@
+"""The U-Net and sessions of ONNX models."""

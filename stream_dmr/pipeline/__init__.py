@@ -1,0 +1,1 @@
+"""Runs and replays: configuration, sessions, outputs, folders."""

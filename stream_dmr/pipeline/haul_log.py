@@ -1,0 +1,224 @@
+"""Hauls that begin and end, during a run and after it."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from stream_dmr.errors import OutputError, UserError
+from stream_dmr.evidence.seal import seal_hauls
+from stream_dmr.files import is_locked
+from stream_dmr.messages import LengthEstimate, Position
+from stream_dmr.pipeline.config import HaulsSettings
+from stream_dmr.sources.sensors_settings import utc_ns_of
+from stream_dmr.store.fish import database_of, read_runs
+from stream_dmr.store.length_store import LengthStore
+from stream_dmr.store.schema import read_added
+from stream_dmr.store.trip import (
+    END,
+    HAULS,
+    START,
+    WATCHED,
+    Haul,
+    add_haul,
+    haul_at,
+    haul_values,
+    hauls_of,
+    next_name,
+)
+
+_RULE = "rule"
+_FAST_NS = 60_000_000_000  # so long must the vessel be fast; chosen
+_WATCHED_NS = 300_000_000_000  # a row of `watched` at least so often
+_PAUSE_NS = 10_000_000_000  # between two frames: what was watched is cut there
+
+
+class HaulLog:
+    """Called in the threads of the chain and of the server. Thread-safe."""
+
+    def __init__(
+        self,
+        store: LengthStore,
+        settings: HaulsSettings,
+        *,
+        frames_lost: Callable[[], int] = lambda: 0,
+    ) -> None:
+        """`frames_lost`: frames of the camera so far that the chain did not get."""
+        self._frames_lost = frames_lost
+        self._store = store
+        self._pause_ns = round(settings.pause_min * 60e9)
+        self._fast_knots = settings.end_speed_knots or float("inf")
+        self._lock = threading.RLock()
+        self._known: list[Haul] = []
+        self._ruled: str | None = None  # the haul that the rule began and has not ended
+        self._last_fish_ns = 0
+        self._in_view: dict[int, int] = {}  # tracks that have not ended, and when they began
+        self._in_chain: deque[int] = deque()  # capture times of the frames there, in order
+        self._fast_since_ns: int | None = None
+        self._now_ns = 0  # capture time of the latest frame
+        self._watched: list[int] | None = None  # first and last capture time, frames, lost
+        self._lost_before = 0
+
+    def hauls(self) -> list[Haul]:
+        """All hauls of the folder so far; those that others wrote into it as well."""
+        with self._lock, suppress(OutputError):
+            self._known = hauls_of(read_added(self._store.path, HAULS))
+        return self._known
+
+    def current(self) -> Haul | None:
+        """The haul that goes on."""
+        hauls = self.hauls()
+        return hauls[-1] if hauls and hauls[-1].ended_ns is None else None
+
+    def tell(self, what: str, name: str = "", *, said_by: str) -> str:
+        """Begin or end a haul now; returns its name. Raises UserError where that has no sense."""
+        with self._lock:
+            current = self.current()
+            if what == START:
+                name = name.strip() or next_name(self.hauls())
+            elif what == END and current is not None:
+                name = current.name
+            else:
+                raise UserError(
+                    f"haul: expected start, or end of a haul that goes on, got {what!r}; "
+                    "begin one first"
+                )
+            self._ruled = None
+            self._add(what, name, self._now_ns, said_by)
+            return name
+
+    def take_frame(self, timestamp_ns: int) -> None:
+        """A frame passes; its fish are not known yet."""
+        with self._lock:
+            self._watch(timestamp_ns, self._frames_lost())
+            self._now_ns = timestamp_ns
+            self._in_chain.append(timestamp_ns)
+
+    def frame_done(self) -> None:
+        """A frame has left the last stage: all fish that began in it or before are known.
+
+        A rule looks at these frames alone. The camera is ahead of them, after a pause by hours.
+        """
+        with self._lock:
+            pause_ns = self._in_chain.popleft() - self._last_fish_ns
+            if self._ruled is not None and not self._in_view and pause_ns > self._pause_ns:
+                self._end_ruled(self._last_fish_ns)
+
+    def take_fish(self, estimate: LengthEstimate) -> None:
+        """One more frame of a fish, or the end of its track."""
+        with self._lock:
+            self._last_fish_ns = max(self._last_fish_ns, estimate.last_timestamp_ns)
+            self._in_view.setdefault(estimate.track_id, estimate.first_timestamp_ns)
+            if not estimate.is_final:
+                return
+            if self._pause_ns and self._ruled is None and self.current() is None:
+                self._ruled = next_name(self.hauls())
+                # With all that are in view: one of them may have been there before.
+                self._add(START, self._ruled, min(self._in_view.values()), _RULE)
+            del self._in_view[estimate.track_id]
+
+    def take_position(self, position: Position) -> None:
+        """The vessel's speed may end a haul."""
+        with self._lock:
+            if position.speed_knots is None or position.speed_knots <= self._fast_knots:
+                self._fast_since_ns = None
+                return
+            self._fast_since_ns = self._fast_since_ns or position.timestamp_ns
+            if self._ruled and position.timestamp_ns - self._fast_since_ns >= _FAST_NS:
+                self._end_ruled(self._fast_since_ns)
+
+    def finish(self) -> None:
+        """The last frame has passed."""
+        with self._lock:
+            self._write_watched()
+            if self._ruled is not None:
+                self._end_ruled(self._last_fish_ns)
+
+    def _end_ruled(self, timestamp_ns: int) -> None:
+        if self._ruled is not None:
+            self._add(END, self._ruled, max(timestamp_ns, self._last_fish_ns) + 1, _RULE)
+        self._ruled = None
+
+    def _add(self, what: str, name: str, timestamp_ns: int, said_by: str) -> None:
+        self._store.append(HAULS, name, haul_values(what, name, timestamp_ns, said_by))
+
+    def _watch(self, timestamp_ns: int, lost: int) -> None:
+        new_lost, self._lost_before = max(0, lost - self._lost_before), lost
+        if self._watched is not None:
+            first_ns, last_ns, _, _ = self._watched
+            if timestamp_ns - last_ns > _PAUSE_NS:
+                self._write_watched()
+            elif timestamp_ns - first_ns > _WATCHED_NS:
+                self._watched[1] = timestamp_ns
+                self._write_watched()
+        if self._watched is None:
+            self._watched = [timestamp_ns, timestamp_ns, 0, 0]
+        self._watched[1] = timestamp_ns
+        self._watched[2] += 1
+        self._watched[3] += new_lost
+
+    def _write_watched(self) -> None:
+        if self._watched is not None:
+            names = ("first_ns", "last_ns", "frames", "frames_lost")
+            values: dict[str, object] = dict(zip(names, self._watched, strict=True))
+            name = str(self._watched[0])
+            self._store.append(WATCHED, name, values, is_urgent=False)
+        self._watched = None
+
+
+_MAX_SECONDS = 9e9  # what 64 bits of nanoseconds hold: the year 2255
+
+
+def write_haul(folder: Path, what: str, *, name: str, at: str | None, said_by: str) -> str:
+    """Begin or end a haul; returns its name. `at` as in `stream-dmr haul`. Raises UserError."""
+    database = database_of(folder)
+    if database is None:
+        raise UserError(
+            f"{folder}: expected the --out of a run, found no lengths.db; check the path"
+        )
+    hauls = hauls_of(read_added(database, HAULS))
+    timestamp_ns = _timestamp_ns(folder, database, at)
+    if what == END:
+        name = haul_at(hauls, timestamp_ns)
+        if not name:
+            raise UserError(
+                f"{folder}: expected a haul that goes on at that time, got none; begin one first"
+            )
+    name = name.strip() or next_name(hauls)
+    add_haul(database, haul_values(what, name, timestamp_ns, said_by))
+    if not is_locked(folder):
+        seal_hauls(folder)
+    return name
+
+
+def _timestamp_ns(folder: Path, database: Path, at: str | None) -> int:
+    """A time of the user on the clock of the frames."""
+    seconds = _seconds(at)
+    if seconds is not None:
+        return round(seconds * 1e9)
+    zeros = [facts.utc_zero_ns for facts in read_runs(database).values()]
+    zero_ns = zeros[-1] if zeros else None
+    if at is None and not is_locked(folder):
+        raise UserError(f"{folder}: no run goes on here; say when, with --at")
+    if zero_ns is None:
+        raise UserError(
+            f"{folder}: its run does not know the time of day of its frames; give --at in seconds, "
+            "as in lengths.csv"
+        )
+    try:
+        return (time.time_ns() if at is None else utc_ns_of(at)) - zero_ns
+    except ValueError as error:
+        raise UserError(f"--at: expected {error}") from error
+
+
+def _seconds(at: str | None) -> float | None:
+    """`at` as seconds; None where it is no number. Raises UserError where it is no time."""
+    try:
+        seconds = float(at or "")
+    except ValueError:
+        return None
+    if not abs(seconds) < _MAX_SECONDS:
+        raise UserError(f"--at: expected seconds as in lengths.csv, got {at}")
+    return seconds

@@ -1,0 +1,475 @@
+"""Learn the shapes of fish: before a run, during it, and against a given mesh.
+
+Compares a mesh that was given for fish with the fish themselves.
+
+Their shape is learnt beginning at the mesh. Where that stays near it, some of the fish are measured
+by both: a mesh of the right breadth may still be broader or slimmer enough at head and tail to make
+them longer or shorter.
+
+A first pass over a source, for the shapes of its fish, before any of them is measured.
+
+For `--template auto`, and only for sources with an end: the last fish are learnt from before the
+first one is measured. A mesh that was given is compared with the fish once they are measured.
+
+Learns the shapes of a camera's fish while they are measured, for those that come after.
+
+A length once given stays as it is, with the interval that was honest then; `replay --template auto`
+ashore measures all fish anew by what all of them show.
+"""
+
+import itertools
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import chain
+from pathlib import Path
+from threading import Event
+from typing import TypeVar
+
+import numpy as np
+
+from stream_dmr.errors import OutputError
+from stream_dmr.evidence.seal import add_files
+from stream_dmr.fitting.shape.candidates import (
+    AUTO,
+    CandidateShapes,
+    LengthShift,
+    are_like_mesh,
+    describe,
+    load_shapes,
+    mesh_form,
+    not_like_mesh,
+    why_implausible,
+)
+from stream_dmr.fitting.shape.space import reshaped
+from stream_dmr.fitting.shape.stocks import FRAMES_PER_FISH, MAX_FISH, GoodCrops, evenly, good_crops
+from stream_dmr.messages import FishCrop, Frame, LearntShapes, LengthEstimate, Message
+from stream_dmr.nodes.crop_fish import CropFish
+from stream_dmr.nodes.fit_mesh import FitMesh
+from stream_dmr.nodes.read_frames import ReadFrames
+from stream_dmr.pipeline.chain import Node
+from stream_dmr.pipeline.run_folder import require_folder
+from stream_dmr.pipeline.run_inputs import Inputs
+from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.pipeline.run_outputs import Outputs
+from stream_dmr.pipeline.session import MeasuringSetup, keep_crops, later_nodes
+from stream_dmr.store.open_results import (
+    LEARNT,
+    MADE_BY_RUN,
+    is_mesh_by,
+    mesh_comment,
+    require_free_names,
+)
+from stream_dmr.template.template import Template
+from stream_dmr.template.template_file import save_template
+
+_MAX_FISH = 12  # that are measured by both shapes: how their lengths differ is much alike
+# Of the largest shift of lengths that is allowed: beyond it the shape is learnt once more, with new
+# poses, before it is judged.
+_SURELY_ALLOWED = 0.5
+
+Lengths = dict[int, tuple[float, float]]
+"""By track id: the log length, and its std."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MeshComparison:
+    """What fish say of the mesh that was given for them."""
+
+    mesh: CandidateShapes
+    stocks: CandidateShapes | None  # learnt beginning at the mesh; None: it fits none of the masks
+    shift: LengthShift | None  # None where the shapes differ already
+
+    @property
+    def is_like_mesh(self) -> bool:
+        """Whether the mesh can be believed."""
+        return self.stocks is not None and self.shift is not None and self.shift.off <= 1
+
+    @property
+    def not_like_mesh(self) -> str:
+        """How the fish differ from it."""
+        return not_like_mesh(self.mesh, self.stocks, self.shift)
+
+
+def compare_with_mesh(
+    crops: Sequence[FishCrop],
+    setup: MeasuringSetup,
+    *,
+    progress: Callable[[str], None] = lambda step: None,
+) -> MeshComparison:
+    """Compare the template with the fish of these crops, in the order of their capture.
+
+    `progress` is called at each step of the work, and may raise.
+    """
+    mesh = mesh_form(setup.template)
+    measured = evenly(good_crops(crops), _MAX_FISH)
+    frames = [frame for fish in measured for frame in evenly(fish, FRAMES_PER_FISH)]
+
+    @cache
+    def by_mesh() -> Lengths:
+        return _lengths(frames, setup, None)
+
+    @cache  # stocks that suffice are asked for twice
+    def shift_of(stocks: CandidateShapes) -> LengthShift | None:
+        if not are_like_mesh(stocks):
+            return None
+        progress("measuring some of them by both shapes")
+        return _shift(by_mesh(), _lengths(frames, setup, stocks))
+
+    def suffices(stocks: CandidateShapes) -> bool:
+        shift = shift_of(stocks)
+        return shift is not None and shift.off <= _SURELY_ALLOWED
+
+    # Only what would be disbelieved is looked at longer.
+    stocks = setup.learn(crops, mesh, suffices=suffices, progress=progress)
+    return MeshComparison(
+        mesh=mesh, stocks=stocks, shift=None if stocks is None else shift_of(stocks)
+    )
+
+
+def _lengths(
+    crops: Sequence[FishCrop], setup: MeasuringSetup, candidates: CandidateShapes | None
+) -> Lengths:
+    """The fish's lengths by these frames; empty without a calibration."""
+    messages: Sequence[Message] = crops
+    nodes = later_nodes(
+        setup.config,
+        template=setup.template,
+        candidates=candidates,
+        calibration=setup.calibration,
+    )
+    for node in nodes:
+        messages = [*chain.from_iterable(map(node.step, messages)), *node.close()]
+    return {
+        one.track_id: (float(np.log(one.length_mm)), one.length_std_mm / one.length_mm)
+        for one in messages
+        if isinstance(one, LengthEstimate)
+        and one.is_final
+        and one.length_mm is not None
+        and one.length_std_mm is not None
+    }
+
+
+def _shift(by_mesh: Lengths, by_stocks: Lengths) -> LengthShift:
+    """None at all where no fish has both lengths."""
+    both = [track_id for track_id in by_mesh if track_id in by_stocks]
+    if not both:
+        return LengthShift()
+    return LengthShift(
+        float(np.mean([by_stocks[n][0] - by_mesh[n][0] for n in both])),
+        float(np.mean([by_mesh[n][1] for n in both])),
+        len(both),
+    )
+
+
+S = TypeVar("S", bound=MeasuringSetup)
+
+
+def with_learnt_shapes(
+    inputs: Inputs, crop_fish: CropFish, *, stop: Event, observer: RunObserver
+) -> Inputs:
+    """The inputs with the shapes of the source's own fish, and its crops.
+
+    As they are where nothing is to be learnt: a mesh was given, the settings say so, or the source
+    has no end.
+    """
+    config, request, forms = inputs.config, inputs.request, inputs.candidates
+    if forms is None or inputs.is_endless or not config.fit_mesh.are_shapes_learnt:
+        return inputs
+    require_folder(request.out, overwrite=request.overwrite)  # before the work
+    require_free_names(request.out, overwrite=request.overwrite)
+    observer.stage("finding the fish, for their shapes")
+    crops = keep_crops(
+        inputs.reader, crop_fish, config.recording, stop=stop, on_frame=observer.frame_done
+    )
+    inputs.reader.close()
+    reader = ReadFrames(request.source, config.read_frames)
+    inputs = replace(inputs, reader=reader, crops=crops)
+    if stop.is_set():
+        return inputs
+    return replace(inputs, candidates=_learn_aloud(crops, inputs, forms, observer))
+
+
+def learnt_from(crops: Iterable[FishCrop], setup: S, observer: RunObserver) -> S:
+    """The setup with the shapes that all these fish together have, told to the observer.
+
+    Without candidates these are the template's own, unless the fish show another: then their shapes
+    are learnt as by `--template auto`.
+    """
+    seen_whole = [*itertools.chain.from_iterable(good_crops(crops))]
+    forms = setup.candidates
+    if forms is None:
+        if is_mesh_theirs(seen_whole, setup, observer):
+            return setup
+        template, forms = load_shapes(AUTO)
+        assert forms is not None
+        setup = replace(setup, template=template)
+    return replace(setup, candidates=_learn_aloud(seen_whole, setup, forms, observer))
+
+
+def is_mesh_theirs(crops: Sequence[FishCrop], setup: MeasuringSetup, observer: RunObserver) -> bool:
+    """Whether the fish of these good crops are like a mesh that was given for them.
+
+    True where there are none. The observer is told.
+    """
+    name = setup.template.name
+    if not crops:
+        observer.warn(f"no fish was seen whole: whether they are like {name} is not known")
+        return True
+    observer.stage(f"comparing the fish with {name}")
+    found = compare_with_mesh(crops, setup)
+    if found.is_like_mesh and found.stocks is not None:
+        for line in describe(found.mesh, found.stocks):
+            observer.notice(line)
+        return True
+    observer.warn(
+        f"{found.not_like_mesh}; they are measured by the shapes learnt from them, as with "
+        "--template auto"
+    )
+    return False
+
+
+def _learn_aloud(
+    crops: Iterable[FishCrop],
+    setup: MeasuringSetup,
+    forms: CandidateShapes,
+    observer: RunObserver,
+) -> CandidateShapes:
+    """The stocks of all fish; the forms where none is seen whole, or a stock can't be of fish.
+
+    The observer is told.
+    """
+    stocks = setup.learn(
+        crops, forms, progress=lambda step: observer.stage(f"learning their shapes: {step}")
+    )
+    if stocks is None:
+        observer.warn("no fish was seen whole: each is measured as the form it is most like")
+        return forms
+    if (reason := why_implausible(forms, stocks)) is not None:
+        observer.warn(reason)
+        return forms
+    for line in describe(forms, stocks):
+        observer.notice(line)
+    return stocks
+
+
+def save_stocks(
+    template: Template, stocks: CandidateShapes, path: Path, *, made_by: str, source: str
+) -> list[Path]:
+    """Write the mesh of each stock, the largest to `path`, others beside it. Raises OutputError.
+
+    Those that the command `made_by` wrote there before are replaced or removed.
+    """
+    for number in itertools.count(len(stocks) + 1):
+        mesh = path.with_stem(f"{path.stem}-{number}")
+        if not mesh.exists():
+            break
+        if is_mesh_by(made_by, mesh):
+            for leftover in (mesh, mesh.with_suffix(".toml")):
+                leftover.unlink(missing_ok=True)
+    paths = stock_paths(path, len(stocks))
+    for stock, one in zip(stocks, paths, strict=True):
+        save_template(
+            replace(reshaped(template, stock.coefficients), name=stock.name),
+            one,
+            comment=mesh_comment(
+                made_by, f"the mean shape of {stock.share:.0%} of the fish of {source}"
+            ),
+        )
+    return paths
+
+
+def stock_paths(path: Path, num_stocks: int) -> list[Path]:
+    """The names of the meshes of so many stocks: `path`, then PATH-2, PATH-3, ..."""
+    return [path, *(path.with_stem(f"{path.stem}-{n}") for n in range(2, num_stocks + 1))]
+
+
+class SeenFish:
+    """Good crops of the last fish that are finished. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._tracks: dict[int, GoodCrops] = {}
+        self._fish: deque[list[FishCrop]] = deque(maxlen=MAX_FISH)
+        self._num = 0
+
+    def take(self, message: Message) -> None:
+        """Take any message of the chain."""
+        match message:
+            case FishCrop(track_id=track_id):
+                with self._lock:
+                    self._tracks.setdefault(track_id, GoodCrops()).add(message)
+            case LengthEstimate(is_final=True, track_id=track_id):
+                self._finish(track_id)
+            case _:
+                pass
+
+    @property
+    def num(self) -> int:
+        """How many were seen whole and are finished, those included that are not kept any more."""
+        with self._lock:
+            return self._num
+
+    def crops(self) -> list[FishCrop]:
+        """The crops that are kept, fish after fish."""
+        with self._lock:
+            return [*chain.from_iterable(self._fish)]
+
+    def _finish(self, track_id: int) -> None:
+        with self._lock:
+            crops = self._tracks.pop(track_id, GoodCrops()).chosen()
+            if crops:
+                self._fish.append(crops)
+                self._num += 1
+
+
+# Finished fish after which shapes are learnt, then after twice as many, and so on. What an earlier
+# run has learnt is known from more fish than the first ones after a restart.
+_FIRST, _AFTER_RESTART = 3, 48
+_NICENESS = 10  # frames come first
+
+Learn = Callable[[Sequence[FishCrop], Callable[[str], None]], CandidateShapes | None]
+"""Crops, and what is called at each step of the work, which may raise -> the stocks, if any."""
+
+
+class LiveShapes:
+    """Learns from the fish that were seen, in a thread of its own."""
+
+    def __init__(
+        self,
+        seen: SeenFish,
+        learn: Learn,
+        on_learnt: Callable[[LearntShapes], object],
+        *,
+        knows_shapes: bool,
+    ) -> None:
+        """`on_learnt` gets what fish may be that are first seen in the frame at hand, or later.
+
+        `knows_shapes`: an earlier run has learnt some.
+        """
+        self._seen, self._learn, self._on_learnt = seen, learn, on_learnt
+        self._stop = threading.Event()
+        self._next_at = _AFTER_RESTART if knows_shapes else _FIRST
+        self._worker = ThreadPoolExecutor(1, "shapes", initializer=_be_nice)
+        self._work: Future[tuple[CandidateShapes | None, int]] | None = None
+
+    def take(self, frame: Frame) -> None:
+        """Learn if there are fish enough, and pass on what was learnt by this frame."""
+        if self._work is None:
+            num_fish = self._seen.num
+            if num_fish >= self._next_at:
+                self._next_at = 2 * num_fish
+                self._work = self._worker.submit(self._learn_from, self._seen.crops(), num_fish)
+        elif self._work.done():
+            work, self._work = self._work, None
+            stocks, num_fish = work.result()
+            if stocks is not None:
+                self._on_learnt(_message(stocks, num_fish, frame))
+
+    def close(self) -> None:
+        """End the work, whose result is lost. Idempotent."""
+        self._stop.set()
+        self._worker.shutdown()
+
+    def _learn_from(
+        self, crops: Sequence[FishCrop], num_fish: int
+    ) -> tuple[CandidateShapes | None, int]:
+        return self._learn(crops, self._go_on), min(num_fish, MAX_FISH)
+
+    def _go_on(self, step: str) -> None:
+        if self._stop.is_set():
+            raise InterruptedError("the run has ended")
+
+
+def follow_shapes(
+    inputs: Inputs,
+    outputs: Outputs,
+    fit_mesh: Node,
+    seen: SeenFish,
+    *,
+    write: Callable[[LearntShapes], object],
+    observer: RunObserver,
+) -> LiveShapes | None:
+    """Let `fit_mesh` know what earlier runs have learnt, and what this one learns.
+
+    None where there is nothing to learn: the settings say so, or the source has an end, whose fish
+    were looked at before (`shape_pass.py`).
+    """
+    given = inputs.candidates
+    if given is None or not inputs.is_endless or not inputs.config.fit_mesh.are_shapes_learnt:
+        return None
+    assert isinstance(fit_mesh, FitMesh)
+    known, compared = given, None
+    for learnt in outputs.learnt:
+        known = known.extended(learnt)
+    fit_mesh.learn(known)
+
+    def learn(crops: Sequence[FishCrop], progress: Callable[[str], None]) -> CandidateShapes | None:
+        nonlocal compared
+        if not given.is_given_mesh:
+            stocks = inputs.learn(crops, given, progress=progress)
+            reason = None if stocks is None else why_implausible(given, stocks)
+            if reason is None:
+                return stocks
+            observer.warn(reason)
+            return None
+        compared = compare_with_mesh(crops, inputs, progress=progress)
+        if compared.stocks is None:
+            observer.warn(compared.not_like_mesh)
+        return None if compared.is_like_mesh else compared.stocks
+
+    def on_learnt(learnt: LearntShapes) -> None:
+        nonlocal known
+        more = known.extended(learnt)
+        stocks = more.stocks()
+        assert stocks is not None
+        known = more
+        write(learnt)
+        fit_mesh.learn(known)
+        if compared is not None:
+            observer.warn(
+                f"{compared.not_like_mesh}; fish to come may have the shape learnt from "
+                "these; measure those so far anew: stream-dmr replay --from fit --template auto"
+            )
+        else:
+            for line in describe(given, stocks):
+                observer.notice(f"learnt from the fish so far: {line}")
+        try:
+            _save_meshes(inputs, stocks)
+        except OutputError as error:
+            observer.warn(str(error))
+
+    return LiveShapes(seen, learn, on_learnt, knows_shapes=bool(outputs.learnt))
+
+
+def _save_meshes(inputs: Inputs, stocks: CandidateShapes) -> None:
+    """Write the mesh of each stock into the run's folder. Raises OutputError."""
+    path = inputs.request.out / LEARNT
+    require_free_names(path.parent, overwrite=inputs.request.overwrite)
+    meshes = save_stocks(
+        inputs.template, stocks, path, made_by=MADE_BY_RUN, source=inputs.source.name
+    )
+    add_files(path.parent, [*meshes, *(mesh.with_suffix(".toml") for mesh in meshes)])
+
+
+def _message(stocks: CandidateShapes, num_fish: int, frame: Frame) -> LearntShapes:
+    """The next fish is none of these stocks as likely as each of the others was (Laplace)."""
+    return LearntShapes(
+        frame_index=frame.frame_index,
+        timestamp_ns=frame.timestamp_ns,
+        names=stocks.names,
+        coefficients=stocks.coefficients,
+        covariances=stocks.covariances,
+        shares=stocks.shares * num_fish / (num_fish + 1),
+    )
+
+
+def _be_nice() -> None:
+    """Lower the priority of this thread, where the system lets one do that."""
+    with suppress(AttributeError, OSError):
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)

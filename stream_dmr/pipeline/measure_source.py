@@ -1,0 +1,356 @@
+"""Measure the fish of one source."""
+
+import threading
+import time
+from collections.abc import Callable, Collection, Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+
+from stream_dmr.camera import Calibration
+from stream_dmr.errors import OutputError, UserError
+from stream_dmr.fitting.fitter import Fitter
+from stream_dmr.fitting.shape.candidates import AUTO
+from stream_dmr.messages import Frame, LengthEstimate, Message, Position
+from stream_dmr.nodes.crop_fish import CropFish
+from stream_dmr.pipeline.chain import ErrorPolicy, Node, StageCounters, run_chain
+from stream_dmr.pipeline.drift import DriftAlarms
+from stream_dmr.pipeline.learn_shapes import (
+    SeenFish,
+    follow_shapes,
+    is_mesh_theirs,
+    save_stocks,
+    with_learnt_shapes,
+)
+from stream_dmr.pipeline.prepare_kernels import compile_kernels, prepare_kernels
+from stream_dmr.pipeline.run_folder import result_names
+from stream_dmr.pipeline.run_inputs import Inputs, checked_inputs, start_notices
+from stream_dmr.pipeline.run_observer import RunObserver, RunTotals
+from stream_dmr.pipeline.run_options import RunRequest
+from stream_dmr.pipeline.run_outputs import Outputs, ResultWriter, open_outputs, resume_source
+from stream_dmr.pipeline.session import continue_tracks, later_nodes, records_covariance
+from stream_dmr.sources.positions import PositionSource
+from stream_dmr.store.length_store import LengthStore
+from stream_dmr.store.open_results import LEARNT, MADE_BY_RUN
+from stream_dmr.store.run_facts import ENDLESS_STOPPED, SOURCE_ENDED, STOPPED
+
+
+class PositionFeed:
+    """Called in the thread of the source, and at the end of the run."""
+
+    def __init__(self, source: PositionSource | None, write: Callable[[Position], object]) -> None:
+        """`source` None: there are no positions."""
+        self._source, self._write = source, write
+        self._num_written = 0
+
+    def take(self, frame: Frame) -> None:
+        """Write the positions up to a frame."""
+        for position in () if self._source is None else self._source.take(frame):
+            self._num_written += 1
+            self._write(position)
+
+    def finish(self) -> str:
+        """Write those after the last frame; returns what a user must know of them all, or ""."""
+        if self._source is None:
+            return ""
+        for position in self._source.finish():
+            self._write(position)
+        lines = [self._source.counts.left_out()]
+        if not self._num_written:
+            lines.insert(
+                0,
+                "none is of the time of the frames; check [sensors] start_utc and offset_s, or the "
+                "receiver",
+            )
+        said = "; ".join(line for line in lines if line)
+        return said and f"positions of {self._source.name}: {said}"
+
+
+_MAX_SUMMARY_FISH = 100  # of an endless run, for the table at its end; the store has all fish
+
+
+class MessageFlow:
+    """Everyone who takes a run's messages beside the next stage, in the order in which they do."""
+
+    def __init__(
+        self,
+        inputs: Inputs,
+        nodes: Sequence[Node],
+        outputs: Outputs,
+        seen: SeenFish,
+        observer: RunObserver,
+    ) -> None:
+        """The source is made to go on after earlier runs, positions begin to come."""
+        self.totals = RunTotals(max_fish=_MAX_SUMMARY_FISH if inputs.is_endless else None)
+        self.policy = ErrorPolicy(is_endless=inputs.is_endless, on_notice=observer.warn)
+        self._seen, self._observer = seen, observer
+        self._writer = _result_writer(inputs, outputs, on_notice=observer.warn)
+        _begin_positions(inputs, outputs, observer)
+        self._positions = PositionFeed(inputs.positions, self._take_position)
+        self._shapes = follow_shapes(
+            inputs, outputs, nodes[1], seen, write=self._writer.write, observer=observer
+        )
+
+    def take(self, message: Message) -> Message:
+        """Take any message of the chain; return what the next stage gets."""
+        message = self._writer.write(message)
+        self.totals.take(message)
+        self._observer.take(message)
+        self._seen.take(message)
+        if isinstance(message, Frame):
+            self._positions.take(message)
+            if self._shapes is not None:
+                self._shapes.take(message)
+        return message
+
+    def frame_done(self) -> None:
+        """A frame has left the last stage."""
+        for receiver in (self.policy, self._writer, self.totals, self._observer):
+            receiver.frame_done()
+
+    def finish(self) -> None:
+        """Write what is left, after the last frame or an error."""
+        if self._shapes is not None:
+            self._shapes.close()
+        if line := self._positions.finish():
+            self._observer.warn(line)
+        self._writer.finish()
+
+    def _take_position(self, position: Position) -> None:
+        self._observer.take(self._writer.write(position))
+
+
+def _begin_positions(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> None:
+    if inputs.positions is not None:
+        inputs.positions.listen(observer.warn)
+        is_live = inputs.source.is_live
+        after_ns = outputs.store.resume_after_ns() if is_live else 0
+        inputs.positions.begin(after_ns=after_ns)
+
+
+def _result_writer(
+    inputs: Inputs, outputs: Outputs, *, on_notice: Callable[[str], None]
+) -> ResultWriter:
+    """The writer of a run; its source is made to continue after earlier runs."""
+    store = outputs.store
+    clips = resume_source(inputs.source, store, on_notice=on_notice)
+    if inputs.numbers_frames_on:
+        inputs.reader.number_after(store.before.frame_index)
+    has_drift_alarms = inputs.is_endless and inputs.calibration is not None
+    return ResultWriter(
+        store,
+        outputs.lengths,
+        outputs.recorder,
+        clips=clips,
+        interrupted=outputs.interrupted,
+        drift=DriftAlarms(store, inputs.config.drift, on_notice=on_notice)
+        if has_drift_alarms
+        else None,
+        sensors=inputs.config.sensors,
+        hauls=outputs.hauls,
+        on_notice=on_notice,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSummary:
+    """The results of a run."""
+
+    fish: Sequence[LengthEstimate]  # final, by track id; of an endless source the last 100
+    may_count_twice: Collection[int]  # the ids of those that were in view at a crash
+    num_frames: int  # that went through the whole chain
+    frames_promised: int | None  # by the source; None where it doesn't
+    shapes_s: float  # in which the shapes of the fish were learnt, or compared with a mesh
+    elapsed_s: float  # of the chain
+    calibration: Calibration | None
+    counters: Sequence[StageCounters]
+    files: Sequence[Path]  # names of segments as a pattern
+
+
+def measure_source(
+    request: RunRequest, *, stop: threading.Event, observer: RunObserver | None = None
+) -> RunSummary:
+    """Measure the fish of a source, with every stage recorded in `request.out`.
+
+    All inputs are checked before the first frame; setting `stop` ends the run soon, with valid
+    results of the frames so far. Raises a UserError where an input is wrong, also in the middle of
+    the source; what was computed before is kept, and a note of the exception says where.
+
+    Where the fish turn out not to be like the mesh that was given, they are measured once more as
+    with `--template auto`, and those results replace the first ones.
+    """
+    observer = observer or RunObserver()
+    # The stages run side by side, so that OpenCV's own threads only add a sixth to the work.
+    cv2.setNumThreads(1)
+    summary = _measure(request, stop=stop, observer=observer)
+    if summary is None:
+        auto = replace(request, template=AUTO, overwrite=True)
+        summary = _measure(auto, stop=stop, observer=observer)
+    assert summary is not None
+    return summary
+
+
+def _measure(
+    request: RunRequest, *, stop: threading.Event, observer: RunObserver
+) -> RunSummary | None:
+    """Measure the fish of a source; None where the mesh that was given is not theirs."""
+    inputs = checked_inputs(request)
+    unused: list[str] = []
+    try:
+        prepare_kernels(observer.stage, stop=stop)
+        crop_fish = _crop_fish(inputs)
+        began = time.perf_counter()
+        inputs = with_learnt_shapes(inputs, crop_fish, stop=stop, observer=observer)
+        shapes_s = time.perf_counter() - began
+        nodes = [
+            inputs.crops or crop_fish,
+            *later_nodes(
+                inputs.config,
+                template=inputs.template,
+                candidates=inputs.candidates,
+                calibration=inputs.calibration,
+            ),
+        ]
+        if inputs.is_endless:  # no frame of a camera shall wait for a compiler
+            _compile_kernels_for(inputs)
+        with open_outputs(inputs, observer) as outputs:
+            crop_fish.number_after(outputs.store.before.track_id)
+            continue_tracks(nodes, outputs.interrupted)
+            _save_learnt_meshes(inputs)
+            _report_start(inputs, outputs, observer)
+            observer.begin(inputs.source.num_frames)
+            seen = SeenFish()
+            summary = _run_chain(
+                inputs, nodes, outputs, seen, observer, shapes_s=shapes_s, stop=stop
+            )
+        if stop.is_set():
+            return summary
+        unused = inputs.finder.unused  # only now is it known what the source has no frames for
+        began = time.perf_counter()
+        if not _has_the_right_mesh(inputs, seen, observer):
+            return None
+        return replace(summary, shapes_s=shapes_s + time.perf_counter() - began)
+    finally:
+        inputs.reader.close()
+        if inputs.positions is not None:
+            inputs.positions.close()
+        for line in (*inputs.source.warnings, *inputs.finder.warnings, *unused):
+            observer.warn(line)
+
+
+def _has_the_right_mesh(inputs: Inputs, seen: SeenFish, observer: RunObserver) -> bool:
+    """False where a mesh was given that is not that of the fish."""
+    is_given = inputs.candidates is None and inputs.config.fit_mesh.are_shapes_learnt
+    return not is_given or is_mesh_theirs(seen.crops(), inputs, observer)
+
+
+def _compile_kernels_for(inputs: Inputs) -> None:
+    fitter = Fitter(
+        inputs.template,
+        inputs.config.fit_mesh,
+        with_covariance=records_covariance(inputs.config),
+    )
+    compile_kernels(fitter)
+
+
+def _save_learnt_meshes(inputs: Inputs) -> None:
+    """Write the meshes of what the first pass learnt, if anything, into the run's folder."""
+    if inputs.candidates is not None and inputs.candidates.are_learnt:
+        save_stocks(
+            inputs.template,
+            inputs.candidates,
+            inputs.request.out / LEARNT,
+            made_by=MADE_BY_RUN,
+            source=inputs.source.name,
+        )
+
+
+def _report_start(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> None:
+    for repair in outputs.repairs:
+        observer.warn(repair.line)
+    if outputs.recorder.live_address is not None:
+        observer.serving(f"stream-dmr view {outputs.recorder.live_address}")
+    if observer.address is not None:
+        observer.serving(observer.address)
+    for line in start_notices(inputs):
+        observer.warn(line)
+
+
+def _crop_fish(inputs: Inputs) -> CropFish:
+    camera = None if inputs.calibration is None else inputs.calibration.camera
+    return CropFish(
+        inputs.config.crop_fish,
+        camera=camera,
+        finder=inputs.finder,
+        species_model=inputs.config.species.model,
+    )
+
+
+def _run_chain(
+    inputs: Inputs,
+    nodes: Sequence[Node],
+    outputs: Outputs,
+    seen: SeenFish,
+    observer: RunObserver,
+    *,
+    shapes_s: float,
+    stop: threading.Event,
+) -> RunSummary:
+    began = time.perf_counter()
+    outputs.store.count_frames(inputs.source.num_frames)
+    flow = MessageFlow(inputs, nodes, outputs, seen, observer)
+    try:
+        with _noting_the_end(inputs, outputs.store, stop):
+            counters = run_chain(
+                inputs.reader,
+                nodes,
+                on_message=flow.take,
+                on_frame=flow.frame_done,
+                on_start=observer.attach,
+                on_failure=flow.policy.continues_after,
+                stop=stop,
+            )
+    finally:
+        flow.finish()
+    names = result_names(inputs.config.recording, is_endless=inputs.is_endless)
+    return RunSummary(
+        fish=flow.totals.fish(),
+        may_count_twice=outputs.store.may_count_twice(),
+        num_frames=flow.totals.num_frames,
+        frames_promised=inputs.source.num_frames,
+        shapes_s=shapes_s,
+        elapsed_s=time.perf_counter() - began,
+        calibration=inputs.calibration,
+        counters=counters,
+        files=[inputs.request.out / name for name in names],
+    )
+
+
+@contextmanager
+def _noting_the_end(inputs: Inputs, store: LengthStore, stop: threading.Event) -> Generator[None]:
+    """Let lengths.db say what ended the block."""
+    try:
+        yield
+    except UserError as error:
+        store.end(f"an error: {error}", promised=_frames_received(inputs))
+        if not isinstance(error, OutputError):  # which says so itself
+            error.add_note(f"what was computed before is kept in {inputs.request.out}")
+        raise
+    except BaseException as error:
+        store.end(f"an error: {type(error).__name__}: {error}")
+        raise
+    store.end(_end_of(inputs, stop), promised=_frames_received(inputs))
+
+
+def _end_of(inputs: Inputs, stop: threading.Event) -> str:
+    """What ended a run that no error ended."""
+    if not stop.is_set():
+        return SOURCE_ENDED
+    return ENDLESS_STOPPED if inputs.is_endless else STOPPED
+
+
+def _frames_received(inputs: Inputs) -> int | None:
+    """The frames that came from a camera; None for another source."""
+    return None if inputs.source.counts is None else inputs.source.counts.received

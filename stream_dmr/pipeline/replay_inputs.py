@@ -1,0 +1,259 @@
+"""The files and settings that a replay reads."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from stream_dmr.calibration.calibration_file import load_calibration, require_size
+from stream_dmr.camera import Calibration
+from stream_dmr.errors import UserError
+from stream_dmr.fitting.shape.candidates import load_shapes
+from stream_dmr.messages import FishCrop, Frame
+from stream_dmr.pipeline.config import (
+    Config,
+    load_config,
+    lying,
+    parse_config,
+    stills,
+    to_toml,
+    toml_value,
+)
+from stream_dmr.pipeline.learn_shapes import learnt_from
+from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.pipeline.run_options import ReplayRequest
+from stream_dmr.pipeline.session import STAGES, MeasuringSetup
+from stream_dmr.recording.codec import stored_picture
+from stream_dmr.recording.header import InputFile, RunHeader, RunInputs
+from stream_dmr.recording.reading import Recording, known_shapes, messages_of
+
+_READ = "read"  # comes before all stages of a replay, whose frames are those of the recording
+# The settings that a replay from a later stage on leaves as they were, by their stage.
+_TABLES = {
+    "read_frames": _READ,
+    "detect_fish": "crop",
+    "track_fish": "crop",
+    "crop_fish": "crop",
+    "fit_mesh": "fit",
+    "localize": "localize",
+}
+_KEYS = {"species": {"model": "crop", "forms": "fit"}}  # of tables that several stages use
+
+
+def replay_config(
+    given: Path | None,
+    recorded_toml: str,
+    *,
+    first: str,
+    on_notice: Callable[[str], None] = lambda line: None,
+) -> Config:
+    """The settings of a replay from the stage `first` on.
+
+    Of a given config.toml the recorded settings of the stages before `first` are left out;
+    `on_notice` is told of those that it has otherwise. Raises ConfigError where one of the two
+    can't be read.
+    """
+    recorded = parse_config(recorded_toml, where="the recording's config.toml")
+    if given is None:
+        return recorded
+    mine = load_config(given)
+    config = _in_conditions_of(recorded, mine)
+    changes: dict[str, object] = {}
+    unused: list[str] = []
+    for table, stages in _stages_before(first, config).items():
+        settings, earlier = getattr(config, table), getattr(recorded, table)
+        said = getattr(mine, table).model_fields_set if table in mine.model_fields_set else ()
+        kept = {key: getattr(earlier, key) for key in stages}
+        unused += [
+            f"[{table}] {key} = {toml_value(value)}"
+            for key, value in kept.items()
+            if key in said and getattr(settings, key) != value
+        ]
+        changes[table] = settings.model_copy(update=kept)
+    if unused:
+        on_notice(
+            f"--config {given}: settings of stages before {first} stay as they were recorded: "
+            + ", ".join(unused)
+        )
+    return config.model_copy(update=changes)
+
+
+def _in_conditions_of(recorded: Config, given: Config) -> Config:
+    """The given settings with those of --pose lying and --stills, where the run had these."""
+    config = given
+    if recorded.localize.rests_on_plane and "rests_on_plane" not in given.localize.model_fields_set:
+        config = lying(config)
+    is_stills = not recorded.track_fish.across_frames
+    if is_stills and "across_frames" not in given.track_fish.model_fields_set:
+        config = stills(config, is_calibrated=True)  # the size of pictures stays as recorded
+    return config
+
+
+def _stages_before(first: str, config: Config) -> Mapping[str, Mapping[str, str]]:
+    """Table -> key -> stage, of the settings that belong to a stage before `first`."""
+    keys = {
+        table: dict.fromkeys(type(getattr(config, table)).model_fields, stage)
+        for table, stage in _TABLES.items()
+    }
+    earlier = {_READ, *[*STAGES][: [*STAGES].index(first)]}
+    return {
+        table: {key: stage for key, stage in stages.items() if stage in earlier}
+        for table, stages in (keys | _KEYS).items()
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class CropFiles:
+    """What a replay cuts crops out of."""
+
+    source: str | None  # None: not found, for the reason in `missing_source`
+    boxes: Path | None
+    masks: Path | None
+    missing_source: str = ""
+
+
+def find_crop_files(
+    header: RunHeader, *, source: str | None, boxes: Path | None, masks: Path | None
+) -> CropFiles:
+    """The given files; for a source, or for boxes and masks, that aren't given the run's own.
+
+    Raises UserError, which asks for boxes or masks, where the run's are gone or changed, or where
+    the recording is so old that it has no hash of them.
+    """
+    missing_source = ""
+    if source is None:
+        source, missing_source = _find_source(header)
+    inputs = header.known_inputs
+    if boxes is None and masks is None and inputs is not None:
+        boxes, masks = _unchanged(inputs.boxes, "--boxes"), _unchanged(inputs.masks, "--masks")
+    return CropFiles(source=source, boxes=boxes, masks=masks, missing_source=missing_source)
+
+
+def inputs_with(
+    recorded: RunInputs | None,
+    *,
+    source: str | None,
+    boxes: Path | None,
+    masks: Path | None,
+    calibration: Path | None,
+) -> RunInputs | None:
+    """The recorded inputs, those that are given in the place of the recorded ones."""
+    if recorded is None:
+        return None
+    given = {"source": source, "boxes": boxes, "masks": masks, "calibration": calibration}
+    if boxes is not None or masks is not None:
+        recorded = replace(recorded, boxes=None, masks=None)
+    files = {name: InputFile.read(path) for name, path in given.items() if path is not None}
+    return replace(recorded, **files)
+
+
+def _find_source(header: RunHeader) -> tuple[str | None, str]:
+    """The place of the run's source, or None and what to say of it.
+
+    One without a hash is found by its place: each of its pictures has a checksum in the recording.
+    """
+    if header.inputs is None:
+        return None, "give --source"
+    source = header.inputs.source
+    is_found = source.is_unchanged() if source.sha256 else source.exists()
+    return (source.path, "") if is_found else (None, _complaint(source, "--source"))
+
+
+def _unchanged(file: InputFile | None, option: str) -> Path | None:
+    if file is None:
+        return None
+    if not file.sha256:
+        raise UserError(
+            "--from crop: expected boxes or masks of the fish, since the recording is too old "
+            "to hold it; give the run's --boxes, --masks or both"
+        )
+    if not file.is_unchanged():
+        raise UserError(f"--from crop: {_complaint(file, option)}")
+    return Path(file.path)
+
+
+def _complaint(file: InputFile, option: str) -> str:
+    found = "other content, by its SHA-256" if file.exists() else "nothing"
+    return f"expected the run's {option} at {file.path}, found {found} there; give {option}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayInputs(MeasuringSetup):
+    """What the nodes of a replay are made of."""
+
+    files: CropFiles | None  # None where no crop is cut again
+
+
+def read_inputs(
+    request: ReplayRequest, recording: Recording, observer: RunObserver
+) -> ReplayInputs:
+    """Read the given inputs and take the others from the recording. Raises a UserError.
+
+    `observer` is told what of the settings is not used, what was repaired of a template, and what
+    was learnt of the fish.
+    """
+    header = recording.header
+    config = replay_config(
+        request.config, header.config_toml, first=request.first, on_notice=observer.warn
+    )
+    calibration = header.calibration
+    if request.calibration is not None:
+        calibration = load_calibration(request.calibration)
+        _require_size_of_frames(calibration, recording)
+    files = None
+    if request.first == "crop":
+        files = find_crop_files(
+            header, source=request.source, boxes=request.boxes, masks=request.masks
+        )
+        if len({run.frames_before for run in header.runs}) < len(header.runs):
+            observer.warn(
+                "--from crop: runs with given boxes or masks do not record at which frame each of "
+                "them began, so fish of all but the first have other numbers than recorded; "
+                "--from fit keeps them"
+            )
+    if request.template is None:
+        template, candidates = header.template, known_shapes(recording)
+    else:
+        template, candidates = load_shapes(request.template, on_notice=observer.warn)
+    inputs = ReplayInputs(
+        config=config,
+        template=template,
+        candidates=candidates,
+        calibration=calibration,
+        files=files,
+    )
+    if request.template is None or not config.fit_mesh.are_shapes_learnt:
+        return inputs
+    return learnt_from(messages_of(recording, FishCrop), inputs, observer)
+
+
+def new_header(request: ReplayRequest, recorded: RunHeader, inputs: ReplayInputs) -> RunHeader:
+    """The header of the recording that the replay writes."""
+    calibration, is_cut_anew = request.calibration, inputs.files is not None
+    calibration_file = recorded.calibration_file
+    if calibration is not None:
+        calibration_file = calibration.read_bytes()
+    return RunHeader(
+        source=recorded.source,
+        command=request.command,
+        config_toml=to_toml(inputs.config),
+        template=inputs.template,
+        candidates=inputs.candidates,
+        calibration=inputs.calibration,
+        calibration_file=calibration_file,
+        inputs=inputs_with(
+            recorded.inputs,
+            source=request.source if is_cut_anew else None,
+            boxes=request.boxes if is_cut_anew else None,
+            masks=request.masks if is_cut_anew else None,
+            calibration=calibration,
+        ),
+        runs=recorded.runs,
+    )
+
+
+def _require_size_of_frames(calibration: Calibration, recording: Recording) -> None:
+    """Raise CalibrationError where a recording's first frame has another size; see `run`."""
+    first = next(recording.payloads([Frame]), None)
+    if first is not None:
+        picture = stored_picture(first[1])
+        require_size(calibration, width=picture.width, height=picture.height)

@@ -1,0 +1,474 @@
+"""Replay a recording from any stage."""
+
+import threading
+import time
+from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+from stream_dmr.errors import OutputError, UserError
+from stream_dmr.evidence.seal import SignedFiles, sealed
+from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish, Message, Position
+from stream_dmr.nodes.crop_fish import CropFish
+from stream_dmr.pipeline.chain import Node, StageCounters, run_chain
+from stream_dmr.pipeline.comparator import MessageComparator, Mismatch
+from stream_dmr.pipeline.learn_shapes import save_stocks
+from stream_dmr.pipeline.replay_inputs import CropFiles, ReplayInputs, new_header, read_inputs
+from stream_dmr.pipeline.run_folder import prepare_folder
+from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.pipeline.run_options import ReplayRequest
+from stream_dmr.pipeline.run_outputs import ResultWriter
+from stream_dmr.pipeline.session import (
+    STAGES,
+    CropFishOfRuns,
+    PlaybackNode,
+    RecordedMessages,
+    continue_tracks,
+    later_nodes,
+    stages_from,
+)
+from stream_dmr.recording.frame_images import open_pictures
+from stream_dmr.recording.header import REPRODUCIBLE_BY, RunHeader, RunStart
+from stream_dmr.recording.reading import (
+    Recording,
+    open_recordings,
+    require_messages,
+    require_selected,
+)
+from stream_dmr.recording.record import Record, as_recorded
+from stream_dmr.recording.recorder import Recorder
+from stream_dmr.recording.topics import RecordingSettings
+from stream_dmr.store.fish import database_of, read_measured_fish, read_runs
+from stream_dmr.store.ledger import Signer
+from stream_dmr.store.length_store import LengthStore
+from stream_dmr.store.open_results import LEARNT, MADE_BY_RUN, require_free_names
+from stream_dmr.store.run_facts import SOURCE_ENDED, STOPPED, RunFacts, cut_short, run_facts
+from stream_dmr.store.run_tables import FramesTable, LengthsTable
+from stream_dmr.tracking.finder import open_finder
+
+
+@dataclass(frozen=True, kw_only=True)
+class OriginalRun:
+    """What the lengths.db beside a recording knows and the recording doesn't."""
+
+    facts: RunFacts | None = None  # None: there is no such run in it, or no lengths.db
+    flags: Mapping[int, Sequence[str]] = field(default_factory=dict[int, Sequence[str]])
+
+
+def read_recorded_run(recordings: Sequence[Path], header: RunHeader) -> OriginalRun:
+    """The run that made the recordings. Raises OutputError where lengths.db is damaged."""
+    folders = [path if path.is_dir() else path.parent for path in recordings]
+    databases = [database for folder in folders if (database := database_of(folder)) is not None]
+    expected = run_facts(header)
+    facts, flags = None, dict[int, Sequence[str]]()
+    for database in dict.fromkeys(databases):
+        flags |= {one.estimate.track_id: one.flags for one in read_measured_fish(database)}
+        made = [run for run in read_runs(database).values() if _is_same(run, expected)]
+        facts = made[-1] if made else facts
+    return OriginalRun(facts=facts, flags=flags)
+
+
+def _is_same(run: RunFacts, expected: RunFacts) -> bool:
+    names = ("command", "config_sha256", "calibration_sha256", "template_sha256")
+    return all(getattr(run, name) == getattr(expected, name) for name in names)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayOutputs:
+    """What a replay with --out writes to."""
+
+    recorder: Recorder
+    results: ResultWriter
+
+
+@contextmanager
+def open_replay_outputs(
+    request: ReplayRequest,
+    out: Path,
+    header: RunHeader,
+    inputs: ReplayInputs,
+    recorded: OriginalRun,
+    *,
+    stop: threading.Event,
+    observer: RunObserver,
+    in_one_thread: bool,
+) -> Generator[ReplayOutputs]:
+    """Open everything that a replay writes to; it is closed in the reverse order.
+
+    Raises OutputError where the folder can't be written to, or holds an earlier run's results.
+    """
+    signer = None if request.key is None else Signer(request.key)
+    stocks = None if inputs.candidates is None else inputs.candidates.stocks()
+    if stocks is not None:
+        require_free_names(out, overwrite=request.overwrite)
+    prepare_folder(out, overwrite=request.overwrite)
+    facts, known = run_facts(header), recorded.facts
+    if known is not None:
+        told = {name: getattr(known, name) for name in ("vessel", "trip", "haul", "utc_zero_ns")}
+        facts = replace(facts, **told)
+    with ExitStack() as stack:
+        stack.enter_context(sealed(out, with_recordings=True, on_notice=observer.warn))
+        store = stack.enter_context(closing(LengthStore(out, facts, signer=signer)))
+        files = SignedFiles(out)
+        files.attach(store, repaired=[])
+        stack.callback(partial(files.finish, with_recordings=True))
+        store.count_frames(None if known is None else known.frames_promised)
+        lengths = stack.enter_context(closing(LengthsTable(out, store)))
+        if stocks is not None:
+            place, source = out / LEARNT, header.source
+            save_stocks(inputs.template, stocks, place, made_by=MADE_BY_RUN, source=source)
+        recorder = Recorder(
+            out,
+            header,
+            inputs.config.recording,
+            sinks=[FramesTable(out)],
+            in_one_thread=in_one_thread,
+        )
+        stack.enter_context(recorder)
+        results = ResultWriter(
+            store,
+            lengths,
+            recorder,
+            flags=recorded.flags,
+            sensors=inputs.config.sensors,
+            on_notice=observer.warn,
+        )
+        try:
+            yield ReplayOutputs(recorder=recorder, results=results)
+        except BaseException as error:
+            store.end(f"an error: {error}")
+            raise
+        finally:
+            results.finish()
+        store.end(STOPPED if stop.is_set() else _end_of(request, known))
+
+
+def _end_of(request: ReplayRequest, recorded: RunFacts | None) -> str:
+    """What ended a replay that nobody stopped."""
+    if not request.selection.is_everything:
+        return "the end of the selected part of a recording"
+    if recorded is not None and cut_short(recorded):
+        return f"the end of the recording, whose run was ended by {recorded.ended_by}"
+    return SOURCE_ENDED
+
+
+class ReplayWriter:
+    """Passes every message of the chain on as a recording gives it back."""
+
+    def __init__(
+        self,
+        recorded: RecordedMessages,
+        *,
+        recomputed: Sequence[type[Message]],
+        settings: RecordingSettings,
+        outputs: ReplayOutputs | None,
+        comparator: MessageComparator | None,
+    ) -> None:
+        self._recorded, self._recomputed, self._settings = recorded, recomputed, settings
+        self._outputs, self._comparator = outputs, comparator
+        self._first_ns: int | None = None
+        self._last_ns = 0
+        self._positions = recorded.of_type(Position, keep_payloads=False)
+        self._next_position = None if outputs is None else next(self._positions, None)
+        self.final: list[LengthEstimate] = []
+        self.num_frames = 0
+
+    @property
+    def recorded_s(self) -> float:
+        """Capture time from the first frame to the last, in seconds."""
+        return (self._last_ns - (self._first_ns or 0)) / 1e9 if self.num_frames else 0.0
+
+    def write(self, message: Message) -> Message:
+        """Record, compare and count a message; returns it as the next node is to get it."""
+        if type(message) in self._recomputed:
+            return self._write_recomputed(message)
+        payload = self._recorded.payload(message)
+        if isinstance(message, Frame):
+            self.num_frames += 1
+            self._first_ns = message.timestamp_ns if self._first_ns is None else self._first_ns
+            self._last_ns = message.timestamp_ns
+        if self._outputs is not None:
+            self._outputs.results.store(message)
+            self._outputs.recorder.put(Record.of_payload(message, payload))
+            if isinstance(message, Frame):
+                self._put_positions(self._outputs, message.frame_index)
+        return message
+
+    def finish(self) -> None:
+        """Record the positions after the last frame."""
+        if self._outputs is not None:
+            self._put_positions(self._outputs, None)
+
+    def _put_positions(self, outputs: ReplayOutputs, until_frame: int | None) -> None:
+        """Record the positions up to a frame, as they were recorded; None: all that are left."""
+        while (position := self._next_position) is not None:
+            if until_frame is not None and position.frame_index > until_frame:
+                return
+            outputs.results.write(position)
+            self._next_position = next(self._positions, None)
+
+    def frame_done(self) -> None:
+        """Take note that a frame has left the last stage."""
+        if self._outputs is not None:
+            self._outputs.results.frame_done()
+
+    def _write_recomputed(self, message: Message) -> Message:
+        if self._outputs is not None:
+            message = self._outputs.results.write(message)
+        else:
+            message = as_recorded(message, self._settings)
+        if self._comparator is not None:
+            self._comparator.compare(message)
+        if isinstance(message, LengthEstimate) and message.is_final:
+            self.final.append(message)
+        return message
+
+
+# Relative, of lengths, where the last bits are rounded differently: a fit stops at a tolerance of
+# its own, so it may stop an iteration sooner or later. Measured differences were about 0.1 %.
+LENGTH_TOLERANCE = 5e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplaySummary:
+    """How a replay went."""
+
+    fish: Sequence[LengthEstimate]  # the final ones, by track id
+    num_frames: int
+    elapsed_s: float
+    recorded_s: float  # capture time from the first frame to the last
+    counters: Sequence[StageCounters]
+    num_compared: int
+    num_left_out: int  # of fish that were in view before the recording began, see docs/replay.md
+    num_beyond: int  # recomputed where the recording was cut off before them
+    mismatches: Sequence[Mismatch]
+    # Of the recording's versions and arithmetic those that are others here; empty: bits must agree.
+    other_versions: Sequence[str] = ()
+    length_change: float = 0.0  # largest relative difference of a final length
+
+    @property
+    def is_as_recorded(self) -> bool:
+        """True where all bits agree, or lengths do within the tolerance for other versions."""
+        is_near = bool(self.other_versions) and self.length_change <= LENGTH_TOLERANCE
+        return not self.mismatches or is_near
+
+
+def replay(
+    request: ReplayRequest, *, stop: threading.Event, observer: RunObserver | None = None
+) -> ReplaySummary:
+    """Recompute a recording from one stage on; with `check`, compare with what was recorded.
+
+    Raises a UserError where an input is wrong or the recording is damaged. A torn recording is
+    replayed as far as it is whole, and `observer` is warned of what is lost.
+    """
+    observer = observer or RunObserver()
+    recording = open_recordings(request.recordings)
+    _refuse_impossible(request, recording)
+    inputs = read_inputs(request, recording, observer)
+    recorded = RecordedMessages(recording, request.selection)
+    carried_over = _carried_over(request, recorded)
+    with ExitStack() as stack:
+        frames, nodes = _open_chain(request, recorded, inputs, recording.header.runs, stack)
+        continue_tracks(nodes, carried_over)
+        outputs = None
+        if request.out is not None:
+            opening = _open_outputs(request, request.out, recording, inputs, stop, observer)
+            outputs = stack.enter_context(opening)
+        comparator = _open_comparator(request, recorded, {fish.track_id for fish in carried_over})
+        writer = ReplayWriter(
+            recorded,
+            recomputed=stages_from(request.first),
+            settings=inputs.config.recording,
+            outputs=outputs,
+            comparator=comparator,
+        )
+
+        def on_frame() -> None:
+            writer.frame_done()
+            observer.frame_done()
+
+        observer.begin(None)
+        began = time.perf_counter()
+        counters = run_chain(
+            frames,
+            nodes,
+            on_message=writer.write,
+            on_frame=on_frame,
+            stop=stop,
+            in_one_thread=_is_light(request),
+        )
+        writer.finish()
+    if comparator is not None:
+        comparator.finish()
+    for line in (*recording.warnings, *recorded.notes):
+        observer.warn(line)
+    return ReplaySummary(
+        fish=sorted(writer.final, key=lambda estimate: estimate.track_id),
+        num_frames=writer.num_frames,
+        elapsed_s=time.perf_counter() - began,
+        recorded_s=writer.recorded_s,
+        counters=counters,
+        num_compared=comparator.num_compared if comparator else 0,
+        num_left_out=comparator.num_left_out if comparator else 0,
+        num_beyond=comparator.num_beyond if comparator else 0,
+        mismatches=comparator.mismatches if comparator else [],
+        other_versions=_other_versions(recording),
+        length_change=comparator.length_change if comparator else 0.0,
+    )
+
+
+def _is_light(request: ReplayRequest) -> bool:
+    """True where no stage computes outside of Python for long."""
+    return FittedMesh not in stages_from(request.first)
+
+
+def _open_outputs(
+    request: ReplayRequest,
+    out: Path,
+    recording: Recording,
+    inputs: ReplayInputs,
+    stop: threading.Event,
+    observer: RunObserver,
+) -> AbstractContextManager[ReplayOutputs]:
+    return open_replay_outputs(
+        request,
+        out,
+        new_header(request, recording.header, inputs),
+        inputs,
+        _recorded_run(request, recording, observer),
+        stop=stop,
+        observer=observer,
+        in_one_thread=_is_light(request),
+    )
+
+
+def _other_versions(recording: Recording) -> list[str]:
+    here = recording.header.metadata()
+    return [name for name in REPRODUCIBLE_BY if recording.metadata.get(name) != here[name]]
+
+
+def _recorded_run(
+    request: ReplayRequest, recording: Recording, observer: RunObserver
+) -> OriginalRun:
+    try:
+        return read_recorded_run(request.recordings, recording.header)
+    except OutputError as error:
+        observer.warn(f"{error}; vessel, trip, haul and flags are not taken over from it")
+        return OriginalRun()
+
+
+def _refuse_impossible(request: ReplayRequest, recording: Recording) -> None:
+    folders = {(path if path.is_dir() else path.parent).resolve() for path in request.recordings}
+    if request.out is not None and request.out.resolve() in folders:
+        raise UserError(
+            f"--out {request.out}: expected another folder than that of the recording, which would "
+            "be lost; choose another"
+        )
+    if request.first == "fit" and recording.is_thinned:
+        raise UserError(
+            "--from fit: expected a recording with masks, but some of them were removed to free "
+            "disk space; use --from localize"
+        )
+    if request.check and request.selection.time_ns is not None:
+        raise UserError(
+            "--check with --time: each fit starts from the frame before, so a part of a recording "
+            "can't equal the whole; leave out one of them"
+        )
+    _refuse_unused(request)
+    require_messages(recording)
+    require_selected(recording, request.selection)
+    if request.first == "crop" and request.selection.tracks is not None:
+        raise UserError("--track with --from crop: crops are made of whole frames; use --from fit")
+
+
+def _refuse_unused(request: ReplayRequest) -> None:
+    """Raise UserError for an input of a stage that is not recomputed."""
+    given = (
+        ("--template", "a template matters to the fit", request.template, "fit"),
+        ("--calibration", "a calibration matters to millimetres", request.calibration, "localize"),
+        ("--source", "pictures matter to crops", request.source, "crop"),
+        ("--boxes", "boxes matter to crops", request.boxes, "crop"),
+        ("--masks", "masks matter to crops", request.masks, "crop"),
+    )
+    for option, meaning, value, last in given:
+        if value is not None and [*STAGES].index(request.first) > [*STAGES].index(last):
+            raise UserError(
+                f"{option} with --from {request.first}: {meaning}; use --from {last}, or leave it "
+                "out"
+            )
+
+
+def _carried_over(request: ReplayRequest, recorded: RecordedMessages) -> list[LocalizedFish]:
+    """The frames from before the recording that count towards a length; notes say which don't."""
+    carried_over = recorded.carried_over()
+    if not carried_over or request.first == "smooth":
+        return carried_over
+    tracks = ", ".join(str(track_id) for track_id in sorted({f.track_id for f in carried_over}))
+    in_view = f"fish {tracks} came into view before this recording began"
+    if request.calibration is not None or request.config is not None:
+        recorded.notes.append(f"{in_view}: only what is in it counts")
+        return []
+    if request.first in ("crop", "fit"):
+        recorded.notes.append(
+            f"{in_view}: their fits start from others, and --check leaves them out"
+        )
+    return carried_over
+
+
+def _open_comparator(
+    request: ReplayRequest, recorded: RecordedMessages, carried_over: Collection[int]
+) -> MessageComparator | None:
+    if not request.check:
+        return None
+    # The first fit of a track that was carried over starts from another one than in the run.
+    leave_out = carried_over if FittedMesh in stages_from(request.first) else ()
+    return MessageComparator(recorded, stages_from(request.first), leave_out=leave_out)
+
+
+def _open_chain(
+    request: ReplayRequest,
+    recorded: RecordedMessages,
+    inputs: ReplayInputs,
+    runs: Sequence[RunStart],
+    stack: ExitStack,
+) -> tuple[Iterable[Frame], list[Node]]:
+    """The frames and the nodes; playback nodes that only a new recording needs only with `out`."""
+    first, config = [*STAGES].index(request.first), inputs.config
+    computed = later_nodes(
+        config,
+        template=inputs.template,
+        candidates=inputs.candidates,
+        calibration=inputs.calibration,
+    )
+    if inputs.files is None:
+        played = [*STAGES.values()][:first]
+        if request.out is None:
+            played = played[-1:]
+        playback = [PlaybackNode(recorded, kind) for kind in played]
+        return recorded.of_type(Frame), [*playback, *computed[first - 1 :]]
+    files, restorer = inputs.files, None
+    if files.source is not None:
+        restorer = stack.enter_context(open_pictures(files.source, config.read_frames))
+    frames = recorded.frames_with_images(
+        restorer, exact=request.check, missing_source=files.missing_source
+    )
+    crop_fish = CropFishOfRuns(partial(_open_crop_fish, inputs, files), runs)
+    return frames, [crop_fish, *computed]
+
+
+def _open_crop_fish(inputs: ReplayInputs, files: CropFiles) -> CropFish:
+    config = inputs.config
+    return CropFish(
+        config.crop_fish,
+        camera=None if inputs.calibration is None else inputs.calibration.camera,
+        finder=open_finder(
+            boxes=files.boxes,
+            masks=files.masks,
+            detect=config.detect_fish,
+            track=config.track_fish,
+            pictures=None if files.source is None else Path(files.source),
+        ),
+        species_model=config.species.model,
+    )

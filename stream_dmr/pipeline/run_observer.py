@@ -1,0 +1,84 @@
+"""The interface by which a run shows how it goes: to a display, a log, a status page."""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from stream_dmr.messages import LengthEstimate, Message
+from stream_dmr.pipeline.chain import Chain
+from stream_dmr.pipeline.config import Config
+from stream_dmr.pipeline.haul_log import HaulLog
+from stream_dmr.recording.record import SinkStates
+from stream_dmr.sources.positions import PositionSource
+from stream_dmr.sources.source import Source
+from stream_dmr.store.length_store import LengthStore
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenRun:
+    """What can be observed of a run beside its messages."""
+
+    config: Config
+    source: Source
+    positions: PositionSource | None = None
+    store: LengthStore
+    hauls: HaulLog
+    out: Path
+    sinks: SinkStates
+
+
+class RunObserver:
+    """Is called as a run goes on, from the run's threads. This base class ignores all of it."""
+
+    address: str | None = None  # where it shows the run, once `open` has been called
+
+    def warn(self, line: str) -> None:
+        """The user should know this; the same line may come again."""
+
+    def stage(self, line: str) -> None:
+        """What is being done before the first frame is measured, and how far it is."""
+
+    def notice(self, line: str) -> None:
+        """Something worth knowing that is no reason to worry."""
+
+    def serving(self, address: str) -> None:
+        """The view can be watched at `address` from now on."""
+
+    def open(self, run: OpenRun) -> None:
+        """Inputs and outputs are open; raise a UserError to refuse the run."""
+
+    def attach(self, chain: Chain) -> None:
+        """The chain with its counters is about to take its first frame."""
+
+    def close(self) -> None:
+        """The run is over, however it ended. Idempotent."""
+
+    def begin(self, num_frames: int | None) -> None:
+        """Measuring starts; `num_frames` is as the source promises, None where it doesn't."""
+
+    def take(self, message: Message) -> None:
+        """A stage has given a message; this is how the next stage gets it."""
+
+    def frame_done(self) -> None:
+        """A frame has left the last stage."""
+
+
+class RunTotals(RunObserver):
+    """Counts frames and keeps the finished fish, for the summary at the end."""
+
+    def __init__(self, *, max_fish: int | None) -> None:
+        """`max_fish`: only so many of the last fish are kept; None: all."""
+        self.num_frames = 0
+        self._fish: deque[LengthEstimate] = deque(maxlen=max_fish)
+
+    def take(self, message: Message) -> None:  # noqa: D102
+        if isinstance(message, LengthEstimate) and message.is_final:
+            self._fish.append(message)
+
+    def frame_done(self) -> None:  # noqa: D102
+        self.num_frames += 1
+
+    def fish(self) -> Sequence[LengthEstimate]:
+        """The final estimates by track id."""
+        return sorted(self._fish, key=lambda estimate: estimate.track_id)

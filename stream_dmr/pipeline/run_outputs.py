@@ -1,0 +1,377 @@
+"""Write all outputs of a run: recording, database, tables, events."""
+
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from statistics import median
+from types import MappingProxyType
+
+from stream_dmr.errors import OutputError, RecordingError
+from stream_dmr.evidence.seal import SignedFiles, sealed
+from stream_dmr.files import natural_order
+from stream_dmr.messages import (
+    FishCrop,
+    Frame,
+    LearntShapes,
+    LengthEstimate,
+    LocalizedFish,
+    Message,
+    Position,
+)
+from stream_dmr.pipeline.drift import DriftAlarms
+from stream_dmr.pipeline.haul_log import HaulLog
+from stream_dmr.pipeline.run_folder import prepare_folder
+from stream_dmr.pipeline.run_inputs import Inputs
+from stream_dmr.pipeline.run_observer import OpenRun, RunObserver
+from stream_dmr.recording.header import RunHeader, RunStart
+from stream_dmr.recording.reading import learnt_shapes, open_recordings
+from stream_dmr.recording.record import SinkFactory, SinkStates
+from stream_dmr.recording.recorder import STEM, Recorder, open_recording_files
+from stream_dmr.recording.repair import Repair
+from stream_dmr.recording.retention import Retention
+from stream_dmr.recording.segments import open_segments, unfinished_frames
+from stream_dmr.sources.sensors_settings import SensorsSettings
+from stream_dmr.sources.source import ResumePoint, Source
+from stream_dmr.store.fish import flagged_fish
+from stream_dmr.store.ledger import Signer
+from stream_dmr.store.length_store import LengthStore
+from stream_dmr.store.run_facts import CatchFacts, run_facts
+from stream_dmr.store.run_tables import FramesTable, LengthsTable
+from stream_dmr.store.schema import INTERRUPTED
+from stream_dmr.store.trip import POSITIONS, KeptPosition, PositionThinner, position_values
+
+_SENSORS = SensorsSettings()
+
+
+class ResultWriter:
+    """Writes every message of the chain, called in the thread of its stage.
+
+    A finished fish goes to the store first, so that no failure of what follows can lose it.
+    """
+
+    def __init__(
+        self,
+        store: LengthStore,
+        lengths: LengthsTable,
+        recorder: Recorder,
+        *,
+        clips: Mapping[str, int] | None = None,
+        interrupted: Sequence[LocalizedFish] = (),
+        flags: Mapping[int, Sequence[str]] = MappingProxyType({}),
+        drift: DriftAlarms | None = None,
+        sensors: SensorsSettings = _SENSORS,
+        hauls: HaulLog | None = None,
+        on_notice: Callable[[str], None],
+    ) -> None:
+        """`clips`: frames done of each clip before; None where the source has no clips.
+
+        `interrupted`: frames of fish that a crash interrupted, and that this run finishes. `flags`:
+        what is known already, by track, of the fish of a recording.
+        """
+        self._store, self._lengths, self._recorder = store, lengths, recorder
+        self._flags = flags
+        self._hauls = hauls
+        self._thinner = PositionThinner(keep_s=sensors.keep_s, max_gap_s=sensors.max_gap_s)
+        self._drift, self._on_notice = drift, on_notice
+        self._clips = None if clips is None else Counter(clips)
+        self._clips_in_chain: deque[str] = deque()  # of the frames that are in the chain, in order
+        self._interrupted = {fish.track_id for fish in interrupted}
+        self._ious: defaultdict[int, list[float]] = defaultdict(list)  # by track, while it is open
+        for fish in interrupted:
+            self._take_iou(fish)
+
+    def write(self, message: Message) -> Message:
+        """Write a message; returns it as the next stage must get it, see `Recorder.write`."""
+        self.store(message)
+        message = self._recorder.write(message)
+        self.tabulate(message)
+        return message
+
+    def store(self, message: Message) -> None:
+        """Keep what lengths.db holds of a message, before anything else is done with it."""
+        match message:
+            case Frame():
+                self._take_frame(message)
+            case FishCrop():
+                self._store.reserve_track(message.track_id)
+            case LocalizedFish():
+                self._take_iou(message)
+            case LengthEstimate(is_final=True):
+                self._store_fish(message)
+            case LengthEstimate():
+                self._take_fish(message)
+            case Position():
+                self._take_position(message)
+            case _:
+                pass
+        states = self._recorder.states
+        states.report(self._store.path.name, self._store.trouble)
+        if self._store.trouble:
+            self._on_notice(f"{self._store.path}: {self._store.trouble}; lengths wait in memory")
+
+    def tabulate(self, message: Message) -> None:
+        """Append a finished fish to lengths.csv."""
+        if isinstance(message, LengthEstimate) and message.is_final:
+            self._lengths.add(message)
+            self._recorder.states.report("lengths.csv", self._lengths.trouble)
+
+    def frame_done(self) -> None:
+        """Take note that a frame has left the last stage: its clip is measured so far."""
+        self._store.frame_done()
+        if self._hauls is not None:
+            self._hauls.frame_done()
+        if self._clips is not None:
+            clip = self._clips_in_chain.popleft()
+            self._clips[clip] += 1
+            self._store.clip_progress(clip, frames_done=self._clips[clip])
+
+    def finish(self) -> None:
+        """The last message was written: keep the last position, from which others are interpolated.
+
+        Idempotent.
+        """
+        self._keep_positions(self._thinner.finish())
+        if self._hauls is not None:
+            self._hauls.finish()
+
+    def _take_position(self, position: Position) -> None:
+        if self._hauls is not None:
+            self._hauls.take_position(position)
+        kept = self._thinner.take(position)
+        if self._thinner.gap_s:
+            line = f"no positions for {self._thinner.gap_s:.0f} s"
+            self._store.note("positions", line, timestamp_ns=position.timestamp_ns)
+        self._keep_positions(kept)
+
+    def _keep_positions(self, positions: Sequence[KeptPosition]) -> None:
+        for kept in positions:
+            name = str(kept.timestamp_ns)
+            self._store.append(POSITIONS, name, position_values(kept), is_urgent=False)
+
+    def _take_frame(self, frame: Frame) -> None:
+        if self._hauls is not None:
+            self._hauls.take_frame(frame.timestamp_ns)
+        if self._clips is not None:
+            self._clips_in_chain.append(frame.source)
+        if self._drift is not None:
+            self._drift.take_frame(frame)
+        self._store.frame_passed(frame_index=frame.frame_index, timestamp_ns=frame.timestamp_ns)
+
+    def _take_iou(self, fish: LocalizedFish) -> None:
+        if fish.accepted and fish.iou is not None:
+            self._ious[fish.track_id].append(fish.iou)
+
+    def _store_fish(self, estimate: LengthEstimate) -> None:
+        ious = self._ious.pop(estimate.track_id, [])
+        iou = median(ious) if ious else None
+        flags = [*self._flags.get(estimate.track_id, ())]
+        if self._drift is not None:
+            flags += self._drift.take_fish(iou, estimate.timestamp_ns)
+        if estimate.track_id in self._interrupted:
+            flags.append(INTERRUPTED)
+        self._take_fish(estimate)
+        self._store.add(estimate, iou=iou, flags=flags, catch=CatchFacts.of(estimate))
+
+    def _take_fish(self, estimate: LengthEstimate) -> None:
+        if self._hauls is not None:
+            self._hauls.take_fish(estimate)
+
+
+def resume_source(
+    source: Source, store: LengthStore, *, on_notice: Callable[[str], None]
+) -> dict[str, int] | None:
+    """Let a source begin after what earlier runs measured.
+
+    Returns the frames done of each unfinished clip, None where the source has no clips.
+    """
+    done, frames_done = store.clips_before()
+    after_ns = store.resume_after_ns() if source.is_live else store.before.timestamp_ns
+    source.listen(on_notice)
+    source.resume(
+        ResumePoint(after_ns=after_ns, clips_done=frozenset(done), frames_done=frames_done)
+    )
+    return frames_done if source.has_clips else None
+
+
+def learnt_before(out: Path, header: RunHeader) -> list[LearntShapes]:
+    """What earlier runs in a folder learnt of their fish, from its last segment.
+
+    Nothing where that can't be read, or where fish had other candidate shapes then.
+    """
+    segments = [*out.glob(f"{STEM}-*.mcap"), *out.glob(f"{STEM}-*.rrd")]
+    if header.candidates is None or not segments:
+        return []
+    try:
+        last = open_recordings([max(segments, key=natural_order)])
+        earlier = last.header.candidates
+        is_same = earlier is not None and earlier.names == header.candidates.names
+        return learnt_shapes(last) if is_same else []
+    except RecordingError:
+        return []
+
+
+def interrupted_tracks(
+    repairs: Sequence[Repair], store: LengthStore, *, on_notice: Callable[[str], None]
+) -> list[LocalizedFish]:
+    """The frames of fish that were in view at a crash, from the recordings repaired after it."""
+    torn = [repair.path for repair in repairs if repair.path.suffix == ".mcap"]
+    if not torn:
+        return []
+    finished = {estimate.track_id for estimate in store.estimates()}
+    try:
+        return list(unfinished_frames(open_recordings(torn), finished=finished))
+    except RecordingError as error:
+        on_notice(f"fish that were in view at the crash can't be finished: {error}")
+        return []
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outputs:
+    """What a run writes to, and what it found in the folder."""
+
+    store: LengthStore
+    hauls: HaulLog
+    lengths: LengthsTable
+    recorder: Recorder
+    repairs: Sequence[Repair]  # of recordings that a crash left unfinished
+    interrupted: Sequence[LocalizedFish]  # frames of fish that were in view at that crash
+    learnt: Sequence[LearntShapes]  # by earlier runs of a camera, of its fish
+
+
+@contextmanager
+def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
+    """Open everything that a run writes to; it is closed in the reverse order.
+
+    Raises OutputError where the folder can't be written to, or holds an earlier run's results. An
+    endless run warns of what the disk refuses, and tries again.
+    """
+    out, is_endless = inputs.request.out, inputs.is_endless
+    on_refusal = observer.warn if is_endless else None
+    files, states = SignedFiles(out), SinkStates()
+    retention = _free_space(inputs, files, observer)
+    overwrite, resume = inputs.request.overwrite, inputs.resumes
+    repairs = prepare_folder(out, overwrite=overwrite, resume=resume, waits_for_room=is_endless)
+    header = inputs.header()
+    with ExitStack() as stack:
+        # At the end lengths.csv is complete before it is signed, it is signed while the store is
+        # open, and the provenance is made of all that there is then.
+        stack.enter_context(sealed(out, with_recordings=not is_endless, on_notice=observer.warn))
+        store = stack.enter_context(closing(_open_store(inputs, header)))
+        files.attach(store, repaired=[repair.path for repair in repairs])
+        stack.callback(partial(files.finish, with_recordings=not is_endless))
+        lengths = LengthsTable(out, store, resume=resume, on_refusal=on_refusal)
+        stack.enter_context(closing(lengths))
+        # The observer may refuse the run, so it is asked before anything is recorded, and it sees
+        # the recording's end.
+        stack.enter_context(closing(observer))
+        hauls = HaulLog(store, inputs.config.hauls, frames_lost=partial(_frames_lost, inputs))
+        observer.open(_open_run(inputs, store, hauls, states))
+        # What earlier runs recorded is read before a new segment stands beside it.
+        interrupted = interrupted_tracks(
+            repairs if is_endless else [], store, on_notice=observer.warn
+        )
+        learnt = learnt_before(out, header) if is_endless else []
+        recording = open_recording_files
+        if is_endless:
+            recording = partial(
+                open_segments,
+                interrupted=interrupted,
+                learnt=learnt,
+                on_notice=observer.warn,
+                on_closed=files.changed,
+                states=states,
+            )
+        header = replace(header, runs=(_start_of(inputs, store),))
+        recorder = _open_recorder(inputs, header, recording, on_refusal=on_refusal, states=states)
+        stack.enter_context(recorder)
+        stack.enter_context(closing(retention))
+        retention.start()
+        yield Outputs(
+            store=store,
+            hauls=hauls,
+            lengths=lengths,
+            recorder=recorder,
+            repairs=repairs,
+            interrupted=interrupted,
+            learnt=learnt,
+        )
+
+
+def _open_run(inputs: Inputs, store: LengthStore, hauls: HaulLog, states: SinkStates) -> OpenRun:
+    return OpenRun(
+        config=inputs.config,
+        source=inputs.source,
+        positions=inputs.positions,
+        store=store,
+        hauls=hauls,
+        out=inputs.request.out,
+        sinks=states,
+    )
+
+
+def _free_space(inputs: Inputs, files: SignedFiles, observer: RunObserver) -> Retention:
+    """Make room for the run, before anything of it is written; what keeps it free, not started."""
+    out, keep_free_gb = inputs.request.out, inputs.config.recording.keep_free_gb
+    retention = Retention(
+        out,
+        free_bytes=round(keep_free_gb * 1e9) if inputs.is_endless else 0,
+        flagged=partial(flagged_fish, out),
+        on_notice=observer.warn,
+        on_changed=files.changed,
+    )
+    with suppress(OSError, OutputError):  # it tries again while the run goes on
+        retention.free_space()
+    return retention
+
+
+def _open_store(inputs: Inputs, header: RunHeader) -> LengthStore:
+    request = inputs.request
+    facts = replace(
+        run_facts(header),
+        vessel=request.vessel,
+        trip=request.trip,
+        haul=request.haul,
+        utc_zero_ns=inputs.utc_zero_ns,
+    )
+    signer = None if request.key is None else Signer(request.key)
+    return LengthStore(request.out, facts, waits_for_disk=inputs.is_endless, signer=signer)
+
+
+def _open_recorder(
+    inputs: Inputs,
+    header: RunHeader,
+    files: SinkFactory,
+    *,
+    on_refusal: Callable[[str], None] | None,
+    states: SinkStates,
+) -> Recorder:
+    request, settings = inputs.request, inputs.config.recording
+    frames = FramesTable(request.out, resume=inputs.resumes, is_endless=inputs.is_endless)
+    return Recorder(
+        request.out,
+        header,
+        settings,
+        live=request.live,
+        sinks=[frames],
+        files=files,
+        on_refusal=on_refusal,
+        states=states,
+        photographs=settings.keeps_photographs(is_live=inputs.source.is_live),
+    )
+
+
+def _start_of(inputs: Inputs, store: LengthStore) -> RunStart:
+    """Where this run begins in its folder, for a replay that finds the fish again."""
+    return RunStart(
+        frames_before=store.before.frame_index if inputs.numbers_frames_on else 0,
+        tracks_before=store.before.track_id,
+    )
+
+
+def _frames_lost(inputs: Inputs) -> int:
+    """The frames that came from a camera and that nobody measured."""
+    counts = inputs.source.counts
+    return 0 if counts is None else counts.dropped + counts.failed

@@ -1,0 +1,314 @@
+"""The nodes of a chain over one setup, fed live, from a recording, or from both."""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from tempfile import SpooledTemporaryFile
+from threading import Event
+from typing import IO, TypeVar
+
+from stream_dmr.camera import Calibration
+from stream_dmr.errors import RecordingError
+from stream_dmr.fitting.shape.candidates import CandidateShapes
+from stream_dmr.fitting.shape.stocks import learn_shapes
+from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
+from stream_dmr.nodes.crop_fish import CropFish
+from stream_dmr.nodes.fit_mesh import FitMesh
+from stream_dmr.nodes.localize import Localize
+from stream_dmr.nodes.read_frames import ReadFrames
+from stream_dmr.nodes.smooth_length import SmoothLength
+from stream_dmr.pipeline.chain import Node, run_chain
+from stream_dmr.pipeline.config import Config
+from stream_dmr.recording.codec import decode, encode
+from stream_dmr.recording.frame_images import FrameRestorer, RecordedPictures, has_original_pixels
+from stream_dmr.recording.header import RunStart
+from stream_dmr.recording.reading import Recording
+from stream_dmr.recording.record import make_record
+from stream_dmr.recording.selection import EVERYTHING, Selection
+from stream_dmr.recording.topics import RecordingSettings
+from stream_dmr.template.template import Template
+
+STAGES: dict[str, type[Message]] = {
+    "crop": FishCrop,
+    "fit": FittedMesh,
+    "localize": LocalizedFish,
+    "smooth": LengthEstimate,
+}
+
+
+def stages_from(first: str) -> Sequence[type[Message]]:
+    """The messages of a stage and of those after it."""
+    return [*STAGES.values()][[*STAGES].index(first) :]
+
+
+def later_nodes(
+    config: Config,
+    *,
+    template: Template,
+    calibration: Calibration | None,
+    candidates: CandidateShapes | None = None,
+) -> list[Node]:
+    """The nodes after CropFish: fit, localization, length."""
+    camera = None if calibration is None else calibration.camera
+    frame_size = None if camera is None else (camera.width, camera.height)
+    return [
+        FitMesh(
+            config.fit_mesh,
+            template=template,
+            candidates=candidates,
+            calibration=calibration,
+            with_covariance=records_covariance(config),
+            species=config.species,
+        ),
+        Localize(config.localize, calibration=calibration),
+        SmoothLength(
+            config.smooth_length,
+            zones=config.zones,
+            species=config.species,
+            frame_size=frame_size,
+        ),
+    ]
+
+
+def records_covariance(config: Config) -> bool:
+    """Whether fits carry the covariance of their parameters, which is recorded with vertices."""
+    return config.recording.meshes == "vertices"
+
+
+def continue_tracks(nodes: Sequence[Node], interrupted: Iterable[LocalizedFish]) -> None:
+    """Give a chain's last node the frames of fish that an earlier recording has."""
+    for fish in interrupted:
+        nodes[-1].step(fish)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuringSetup:
+    """What fish are measured by."""
+
+    config: Config
+    template: Template
+    candidates: CandidateShapes | None  # the shapes that the fish may have; None: the template's
+    calibration: Calibration | None
+
+    def learn(
+        self,
+        crops: Iterable[FishCrop],
+        forms: CandidateShapes,
+        *,
+        suffices: Callable[[CandidateShapes], bool] = lambda stocks: False,
+        progress: Callable[[str], None] = lambda step: None,
+    ) -> CandidateShapes | None:
+        """The stocks that these fish are of, starting from `forms`: see `learn_shapes`."""
+        return learn_shapes(
+            crops,
+            self.template,
+            forms,
+            self.config.fit_mesh,
+            calibration=self.calibration,
+            species=self.config.species,
+            suffices=suffices,
+            progress=progress,
+        )
+
+
+_IN_MEMORY = 1 << 26  # bytes of crops: some 100,000 masks; more are kept on the disk
+
+
+class KeptCrops:
+    """The crops of a first pass: in place of CropFish, a node that gives them again."""
+
+    def __init__(self, *, in_memory: int = _IN_MEMORY) -> None:
+        """Beyond so many bytes they go to the disk."""
+        self._file: IO[bytes] = SpooledTemporaryFile(in_memory)  # noqa: SIM115, see `close`
+        self._places: dict[int, list[tuple[int, int]]] = {}  # of each frame: offsets and sizes
+
+    def keep(self, crop: FishCrop) -> None:
+        """Take one more crop."""
+        data = encode(crop)
+        self._places.setdefault(crop.frame_index, []).append((self._file.tell(), len(data)))
+        self._file.write(data)
+
+    def __iter__(self) -> Iterator[FishCrop]:
+        """All crops, in the order in which they came."""
+        return (crop for frame_index in self._places for crop in self._of(frame_index))
+
+    def step(self, frame: Frame, /) -> Sequence[FishCrop]:
+        """The crops of a frame."""
+        return self._of(frame.frame_index)
+
+    def tick(self, timestamp_ns: int, /) -> Sequence[FishCrop]:
+        """Nothing waits for time to pass."""
+        return ()
+
+    def close(self) -> Sequence[FishCrop]:
+        """Close the file; no output at the end."""
+        self._file.close()
+        return ()
+
+    def _of(self, frame_index: int) -> list[FishCrop]:
+        crops: list[FishCrop] = []
+        for offset, size in self._places.get(frame_index, []):
+            self._file.seek(offset)
+            crops.append(decode(FishCrop, self._file.read(size)))
+        return crops
+
+
+def keep_crops(
+    frames: ReadFrames,
+    crop_fish: CropFish,
+    settings: RecordingSettings,
+    *,
+    stop: Event,
+    on_frame: Callable[[], None],
+) -> KeptCrops:
+    """The crops of a source, as a recording with these settings would hold them."""
+    kept = KeptCrops()
+
+    def take(message: Message) -> Message:
+        message = make_record(message, settings).message  # from decoded pixels, as in the run
+        if isinstance(message, FishCrop):
+            kept.keep(message)
+        return message
+
+    run_chain(frames, [crop_fish], on_message=take, on_frame=on_frame, stop=stop)
+    return kept
+
+
+class CropFishOfRuns:
+    """A CropFish for each run: its tracks end with it, and the next one numbers its fish on."""
+
+    def __init__(self, open_crop_fish: Callable[[], CropFish], runs: Sequence[RunStart]) -> None:
+        """`runs` by their frames; none: one run, whose fish count from 1."""
+        self._open, self._runs = open_crop_fish, deque(runs)
+        self._crop_fish, self._is_new = open_crop_fish(), True
+        self._frames_before = -1  # of the run that goes on
+
+    def step(self, frame: Frame, /) -> list[FishCrop]:
+        """The fish of one frame, as the run had them that recorded it.
+
+        Of runs that began at one frame, as those with given boxes say, the first goes on.
+        """
+        while self._runs and self._runs[0].frames_before < frame.frame_index:
+            run = self._runs.popleft()
+            if run.frames_before > self._frames_before:
+                self._begin(run)
+        self._is_new = False
+        return self._crop_fish.step(frame)
+
+    def _begin(self, run: RunStart) -> None:
+        if not self._is_new:
+            self._crop_fish, self._is_new = self._open(), True
+        self._crop_fish.number_after(run.tracks_before)
+        self._frames_before = run.frames_before
+
+    def tick(self, timestamp_ns: int, /) -> Sequence[FishCrop]:
+        """No output: crops do not wait for time to pass."""
+        return ()
+
+    def close(self) -> Sequence[FishCrop]:
+        """No output at the end."""
+        return ()
+
+
+M = TypeVar("M", bound=Message)
+
+
+class RecordedMessages:
+    """The selected messages of a recording, type by type, each in their order."""
+
+    def __init__(self, recording: Recording, selection: Selection = EVERYTHING) -> None:
+        self._recording = recording
+        self._selection = selection
+        self.notes: list[str] = []  # what the user should know of this replay
+        self._payloads: dict[int, bytes] = {}  # by id() of messages on their way through the chain
+
+    @property
+    def ends_early(self) -> bool:
+        """True where the run went on after the end of the recording."""
+        return self._recording.ends_early
+
+    def carried_over(self) -> list[LocalizedFish]:
+        """The frames from before the recording of the tracks that were open when it began.
+
+        None of a selection in time, which begins without them.
+        """
+        if self._selection.time_ns is not None:
+            return []
+        fish = [decode(LocalizedFish, payload) for payload in self._recording.carried_over()]
+        return [message for message in fish if self._selection.includes(message)]
+
+    def of_type(self, kind: type[M], *, keep_payloads: bool = True) -> Iterator[M]:
+        """The messages of one type; `payload` gives the encoding of each that was kept.
+
+        Frames have no images where they were recorded by reference.
+        """
+        for _, payload in self._recording.payloads([kind], self._selection):
+            message = decode(kind, payload)
+            if self._selection.includes(message):
+                if keep_payloads:
+                    self._payloads[id(message)] = payload
+                yield message
+
+    def frames_with_images(
+        self, restorer: FrameRestorer | None, *, exact: bool, missing_source: str
+    ) -> Iterator[Frame]:
+        """The frames with the images of `restorer`, or with those that the recording holds.
+
+        Raises RecordingError where it holds none (`missing_source` says why the source was not
+        found) and, with `exact`, where they are not the very pixels that the run continued with;
+        without `exact`, `notes` says so.
+        """
+        restorer = restorer or RecordedPictures(self._recording, self._selection)
+        for frame in self.of_type(Frame):
+            payload = self._payloads.pop(id(frame))
+            restored = restorer.restore(frame, payload)
+            if restored.image.size == 0:
+                raise RecordingError(
+                    f"--from crop: the recording refers to its source's pictures: {missing_source}"
+                )
+            if not has_original_pixels(restored, payload):
+                self._note_lossy_pictures(exact=exact)
+            self._payloads[id(restored)] = payload
+            yield restored
+
+    def _note_lossy_pictures(self, *, exact: bool) -> None:
+        line = "the recording's pictures are for viewing, the run used better ones"
+        if exact:
+            raise RecordingError(f"--from crop --check: {line}; give --source")
+        note = f"{line}: crops differ a little; give --source to avoid that"
+        if note not in self.notes:
+            self.notes.append(note)
+
+    def payload(self, message: Message) -> bytes:
+        """The encoding of a message that came from here; only once."""
+        return self._payloads.pop(id(message))
+
+
+class PlaybackNode:
+    """Takes the place of a node and returns the messages that the node returned in the run."""
+
+    def __init__(self, recorded: RecordedMessages, kind: type[Message]) -> None:
+        self._messages = recorded.of_type(kind)
+        self._next = next(self._messages, None)
+
+    def step(self, message: Frame | FishCrop | FittedMesh, /) -> Sequence[Message]:
+        """The recorded messages of a frame, or that of one fish in a frame."""
+        recorded: list[Message] = []
+        while self._next is not None and self._next.frame_index <= message.frame_index:
+            if self._next.frame_index == message.frame_index:
+                if not isinstance(message, Frame) and self._track_id() != message.track_id:
+                    break
+                recorded.append(self._next)
+            self._next = next(self._messages, None)
+        return recorded
+
+    def _track_id(self) -> int:
+        return getattr(self._next, "track_id", 0)
+
+    def tick(self, timestamp_ns: int, /) -> Sequence[Message]:
+        """Nothing: `step` returns everything that was recorded."""
+        return ()
+
+    def close(self) -> Sequence[Message]:
+        """Nothing: `step` returns everything that was recorded."""
+        return ()

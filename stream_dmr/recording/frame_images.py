@@ -1,0 +1,221 @@
+"""Restore the images of recorded frames."""
+
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8
+
+from stream_dmr.errors import RecordingError, SourceError
+from stream_dmr.messages import Frame
+from stream_dmr.recording.codec import checksum, stored_picture
+from stream_dmr.recording.reading import Recording, decoded_messages, recorded_settings
+from stream_dmr.recording.selection import Selection
+from stream_dmr.recording.topics import KEY_FRAME_NS
+from stream_dmr.sources.folders import clips_in
+from stream_dmr.sources.open_source import open_source
+from stream_dmr.sources.source import ReadFramesSettings
+from stream_dmr.sources.video_file import SeekableVideo, VideoFile
+
+
+@runtime_checkable
+class FrameRestorer(Protocol):
+    """Gives the recorded frames their images, in the order of the recording."""
+
+    def restore(self, frame: Frame, payload: bytes) -> Frame:
+        """The frame with its image, if there is one; `payload` is its encoding."""
+        ...
+
+
+def has_original_pixels(frame: Frame, payload: bytes) -> bool:
+    """True where a frame has the very pixels that the run continued with."""
+    crc32 = stored_picture(payload).crc32
+    return frame.image.size > 0 and (crc32 == 0 or checksum(frame.image) == crc32)
+
+
+class SourcePictures:
+    """The images of the source, each checked by its checksum."""
+
+    def __init__(self, frames: Iterable[Frame]) -> None:
+        self._frames: Iterator[Frame] = iter(frames)
+
+    def restore(self, frame: Frame, payload: bytes) -> Frame:
+        """The frame with its image. Raises SourceError where the source doesn't have it."""
+        if has_original_pixels(frame, payload):
+            return frame
+        for found in self._frames:
+            if found.frame_index == frame.frame_index:
+                break
+        else:
+            raise SourceError(
+                f"the recording has frame {frame.frame_index}, the source ends before it; "
+                "give the source that was recorded"
+            )
+        restored = replace(frame, image=found.image)
+        if stored_picture(payload).crc32 and not has_original_pixels(restored, payload):
+            raise SourceError(
+                f"frame {frame.frame_index}: the source's picture is not the recorded one; "
+                "give the source that was recorded"
+            )
+        return restored
+
+
+class ClipPictures:
+    """The images of a folder of clips: each frame is found in its clip by its checksum.
+
+    Frames are numbered over all clips and restarts, so their numbers say nothing of the clips.
+    """
+
+    def __init__(self, folder: Path, settings: ReadFramesSettings) -> None:
+        self._folder, self._settings = folder, settings
+        self._name = ""  # of the open clip
+        self._video: VideoFile | None = None
+        self._frames: Iterator[Frame] = iter(())
+
+    def restore(self, frame: Frame, payload: bytes) -> Frame:
+        """The frame with its image. Raises SourceError where its clip doesn't have it."""
+        if has_original_pixels(frame, payload):
+            return frame
+        crc32 = stored_picture(payload).crc32
+        is_open = self._name == frame.source
+        for _ in range(1 + is_open):  # after a restart a clip goes on from before where it was
+            if not is_open:
+                self._open(frame.source)
+            for found in self._frames:
+                if checksum(found.image) == crc32:
+                    return replace(frame, image=found.image)
+            is_open = False
+        raise SourceError(
+            f"{self._folder / frame.source}: expected the picture of frame {frame.frame_index}, "
+            "found none with its checksum; give the folder that was recorded"
+        )
+
+    def close(self) -> None:
+        """Release the open clip."""
+        if self._video is not None:
+            self._video.close()
+
+    def _open(self, name: str) -> None:
+        self.close()
+        self._name, self._frames = name, iter(())
+        self._video = VideoFile(self._folder / Path(name).name, self._settings)
+        self._frames = iter(self._video)
+
+
+@contextmanager
+def open_pictures(source: str, settings: ReadFramesSettings) -> Generator[FrameRestorer]:
+    """The images of a source that was recorded. Raises SourceError where it can't be read."""
+    if Path(source).is_dir() and clips_in(Path(source)):
+        with closing(ClipPictures(Path(source), settings)) as pictures:
+            yield pictures
+    else:
+        with closing(open_source(source, settings)) as frames:
+            yield SourcePictures(frames)
+
+
+class RecordedPictures:
+    """The images that the recording holds: JPEG or PNG as they are, and H.264."""
+
+    def __init__(self, recording: Recording, selection: Selection) -> None:
+        # An H.264 picture builds on those before it, back to a key frame.
+        earlier = replace(selection, lead_ns=KEY_FRAME_NS)
+        self._pictures = _decoded_video(recording.video(earlier))
+        self._next = next(self._pictures, None)
+
+    def restore(self, frame: Frame, payload: bytes) -> Frame:
+        """The frame with its image; unchanged where the recording holds none."""
+        while self._next is not None and self._next[0] < frame.timestamp_ns:
+            self._next = next(self._pictures, None)
+        if frame.image.size or self._next is None or self._next[0] > frame.timestamp_ns:
+            return frame
+        size = stored_picture(payload)
+        return replace(frame, image=self._next[1][: size.height, : size.width])
+
+
+def _decoded_video(samples: Iterator[bytes]) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
+    """Capture times in ns and BGR images; FFmpeg is needed only where there are samples."""
+    first = next(samples, None)
+    if first is None:
+        return
+    try:
+        from stream_dmr.recording.mcap.h264_topic import decode_video
+    except ModuleNotFoundError as error:
+        raise RecordingError(
+            f"the recording's pictures are H.264: expected the package {error.name}, found none; "
+            "install it with: pip install 'stream-dmr[h264]', or give --source"
+        ) from error
+    yield from decode_video(chain([first], samples))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FoundFrame:
+    """A recorded frame with its picture, which is empty where neither source nor recording has it.
+
+    `is_original`: these are the very pixels that the run measured.
+    """
+
+    frame: Frame
+    is_original: bool
+
+
+class FrameLookup:
+    """Finds frames by capture time. Thread-safe."""
+
+    def __init__(self, recording: Recording, source: str | None) -> None:
+        """`source`: the path of the recorded source, where it is at hand."""
+        self._recording = recording
+        self._source = source
+        self._video: SeekableVideo | None = None
+        if source is not None and Path(source).is_file():
+            self._video = SeekableVideo(Path(source))
+
+    def frames(self, time_ns: tuple[int, int]) -> Iterator[FoundFrame]:
+        """The frames from a capture time (included) to another (excluded), in order."""
+        selection = Selection(time_ns=time_ns)
+        recorded = RecordedPictures(self._recording, selection)
+        missing: list[tuple[Frame, bytes]] = []
+        for message, payload in decoded_messages(self._recording, [Frame], selection):
+            assert isinstance(message, Frame)
+            found = self._of_video(message, payload)
+            if not has_original_pixels(found, payload):
+                found = recorded.restore(message, payload)
+            if found.image.size == 0 and self._source is not None:
+                missing.append((message, payload))  # a folder is read from its start
+                continue
+            is_original = has_original_pixels(found, payload)
+            yield FoundFrame(frame=found, is_original=is_original)
+        yield from self._of_source(missing)
+
+    def close(self) -> None:
+        """Release the source."""
+        if self._video is not None:
+            self._video.close()
+
+    def _of_video(self, frame: Frame, payload: bytes) -> Frame:
+        """The frame as the video has it; unchanged where it isn't the recorded one."""
+        if self._video is None or has_original_pixels(frame, payload):
+            return frame
+        image = self._video.image_at(frame.timestamp_ns)
+        restored = frame if image is None else replace(frame, image=image)
+        if image is not None and not has_original_pixels(restored, payload):
+            self._video = self._source = None  # another file of the same name
+            return frame
+        return restored
+
+    def _of_source(self, missing: list[tuple[Frame, bytes]]) -> Iterator[FoundFrame]:
+        """Frames that no search finds: the source is read up to them."""
+        if not missing or self._source is None:
+            return
+        settings = recorded_settings(self._recording, "read_frames", ReadFramesSettings)
+        with open_pictures(self._source, settings) as pictures:
+            for frame, payload in missing:
+                try:
+                    found = pictures.restore(frame, payload)
+                except SourceError:  # another file of the same name
+                    found = frame
+                is_original = has_original_pixels(found, payload)
+                yield FoundFrame(frame=found, is_original=is_original)

@@ -1,0 +1,275 @@
+"""The header of a recording: run, inputs, software, processor."""
+
+import os
+import platform
+import shlex
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cache, cached_property
+from importlib.metadata import PackageNotFoundError, version
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from stream_dmr.camera import Calibration
+from stream_dmr.errors import RecordingError, SourceError
+from stream_dmr.files import sha256_of, sha256_of_files
+from stream_dmr.fitting.shape.candidates import CandidateShapes
+from stream_dmr.pictures import PICTURE_SUFFIXES
+from stream_dmr.recording.codec import CODEC_VERSION, decode, encode
+from stream_dmr.template.template import Template
+from stream_dmr.version import __version__
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class InputFile:
+    """One file or folder that a run was given."""
+
+    path: str  # absolute; of a camera or a stream its name, without a password
+    sha256: str = ""  # see `content_sha256`; "" for what can't be read twice, or wasn't recorded
+
+    @classmethod
+    def read(cls, path: str | Path) -> "InputFile":
+        """The place and the content of a file or folder. SourceError where it can't be read."""
+        return cls(path=os.path.abspath(path), sha256=content_sha256(Path(path)))
+
+    def exists(self) -> bool:
+        """True where there is a file or folder at that place."""
+        return Path(self.path).exists()
+
+    def is_unchanged(self) -> bool:
+        """True where the place has the recorded content; unknown content is never the same."""
+        return (
+            self.sha256 != "" and self.exists() and content_sha256(Path(self.path)) == self.sha256
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RunInputs:
+    """What a run was given; None where it was given no such file."""
+
+    source: InputFile
+    boxes: InputFile | None = None
+    masks: InputFile | None = None
+    calibration: InputFile | None = None
+    nmea: InputFile | None = None  # positions: a file, or the address of a receiver
+    species_model: InputFile | None = None  # the classifier of `[species] model`
+
+    def metadata(self) -> dict[str, str]:
+        """As the recording's metadata have it: `source_path`, `source_sha256`, `boxes_path`, ..."""
+        metadata = dict[str, str]()
+        for field in fields(self):
+            file: InputFile | None = getattr(self, field.name)
+            if file is not None:
+                # A file name of undecodable bytes must not stop a run.
+                path = file.path.encode("utf-8", "backslashreplace").decode()
+                metadata |= {f"{field.name}_path": path, f"{field.name}_sha256": file.sha256}
+        return metadata
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, str]) -> "RunInputs | None":
+        """The inverse of `metadata`; None where a recording is too old to have them."""
+        files = {
+            field.name: InputFile(path=path, sha256=metadata.get(f"{field.name}_sha256", ""))
+            for field in fields(cls)
+            if (path := metadata.get(f"{field.name}_path"))
+        }
+        return cls(**files) if "source" in files else None
+
+    @classmethod
+    def from_facts(cls, facts: Mapping[str, str]) -> "RunInputs | None":
+        """What metadata or `RunFacts` of any age say, of old ones by `from_command`."""
+        return cls.from_metadata(facts) or cls.from_command(facts["command"])
+
+    @classmethod
+    def from_command(cls, command: str) -> "RunInputs | None":
+        """What the command of an old recording says: paths as typed, and no hashes.
+
+        None where it is no `stream-dmr run` or names no source.
+        """
+        try:
+            words = [part for word in shlex.split(command) for part in _option_and_value(word)]
+        except ValueError:  # not as a shell would read it
+            return None
+        names = {f"--{field.name}": field.name for field in fields(cls)}
+        files = {
+            names[word]: InputFile(path=value) for word, value in pairwise(words) if word in names
+        }
+        return cls(**files) if "source" in files and "run" in words else None
+
+
+def content_sha256(path: Path) -> str:
+    """SHA-256 of a file, or of the names and contents of the pictures in a folder, in hex.
+
+    Raises SourceError where one can't be read.
+    """
+    try:
+        if not path.is_dir():
+            return sha256_of(path)
+        pictures = (file for file in path.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES)
+        return sha256_of_files(pictures)
+    except OSError as error:
+        raise SourceError(
+            f"{error.filename}: expected a file that can be read, got: {error.strerror}"
+        ) from error
+
+
+def _option_and_value(word: str) -> list[str]:
+    """`--option=value` as two words."""
+    return word.split("=", 1) if word.startswith("--") else [word]
+
+
+@cache
+def arithmetic_checksum() -> str:
+    """CRC-32 of the bits of fixed sums, products, solutions and functions, as hexadecimal digits.
+
+    Where it differs, so may the last bits of results, with equal versions of everything: OpenBLAS
+    for one has other kernels for AVX2 than for AVX-512, and OPENBLAS_CORETYPE overrides its choice.
+    """
+    values = np.modf(np.arange(1, 145) * np.sqrt(2.0))[0]
+    A, b = values.reshape(12, 12), values[:12]
+    parts = [
+        A @ A,
+        A @ b,
+        A[:3, :3] @ b[:3],
+        np.linalg.solve(A, b),
+        np.linalg.lstsq(A[:, :2], b, rcond=None)[0],
+        np.linalg.inv(A),
+        np.exp(A),
+        np.sin(A),
+        np.array([A.sum(), np.linalg.norm(A)]),
+    ]
+    return f"{zlib.crc32(b''.join(part.tobytes() for part in parts)):08x}"
+
+
+_LIBRARIES = ("numpy", "opencv-python-headless", "torch", "scipy", "numba", "mcap", "rerun-sdk")
+# Of the metadata: where all of these are the same, so are the bits of all results.
+REPRODUCIBLE_BY = ("stream_dmr", "arithmetic", *_LIBRARIES)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RunStart:
+    """Where a run in a folder began: with nothing seen, after the numbers of earlier runs there."""
+
+    frames_before: int  # frames of earlier runs have at most this number
+    tracks_before: int  # fish of earlier runs have at most this id
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunHeader:
+    """The inputs of a run that are not messages."""
+
+    source: str  # file name or address
+    command: str  # as typed
+    config_toml: str
+    template: Template
+    candidates: CandidateShapes | None = None  # None: fish have the template's own shape
+    calibration: Calibration | None = None
+    calibration_file: bytes = b""  # the user's file as it was; empty where there is none
+    inputs: RunInputs | None = None  # None: recorded before these were
+    runs: tuple[RunStart, ...] = ()  # those that are in it, by their frames; none in old recordings
+
+    @property
+    def known_inputs(self) -> RunInputs | None:
+        """`inputs`, or of an old recording what its command says of them."""
+        return self.inputs or RunInputs.from_command(self.command)
+
+    @cached_property
+    def checksum(self) -> int:
+        """CRC-32 of the attachments: equal for runs that differ only in source, boxes or masks."""
+        return _checksum(self.attachments())
+
+    def metadata(self) -> dict[str, str]:
+        """The metadata record `run`: the inputs, and the versions of what wrote the recording."""
+        given = {} if self.inputs is None else self.inputs.metadata()
+        return {
+            "source": self.source,
+            "command": self.command,
+            **given,
+            **({"runs": _runs_text(self.runs)} if self.runs else {}),
+            "codec_version": str(CODEC_VERSION),
+            "attachments_crc32": str(self.checksum),
+            "stream_dmr": __version__,
+            "python": platform.python_version(),
+            "platform": f"{platform.system()} {platform.machine()} {' '.join(platform.libc_ver())}",
+            "cpu": _cpu(),
+            "arithmetic": arithmetic_checksum(),
+            **{name: _version(name) for name in _LIBRARIES},
+        }
+
+    def attachments(self) -> dict[str, bytes]:
+        """Name -> content. The .pb ones are exact, for replay; the others can be read by people."""
+        files = {"config.toml": self.config_toml.encode(), "template.pb": encode(self.template)}
+        if self.candidates is not None:
+            files["shapes.pb"] = encode(self.candidates)
+        if self.calibration is not None:
+            files["calibration.pb"] = encode(self.calibration)
+            files["calibration.yaml"] = self.calibration_file
+        return files
+
+    @classmethod
+    def from_parts(cls, metadata: dict[str, str], attachments: dict[str, bytes]) -> "RunHeader":
+        """The exact inverse of `metadata` and `attachments`.
+
+        Raises KeyError where a part is missing, RecordingError where one is damaged.
+        """
+        calibration, shapes = attachments.get("calibration.pb"), attachments.get("shapes.pb")
+        header = cls(
+            source=metadata["source"],
+            command=metadata["command"],
+            config_toml=attachments["config.toml"].decode(),
+            template=decode(Template, attachments["template.pb"]),
+            candidates=None if shapes is None else decode(CandidateShapes, shapes),
+            calibration=None if calibration is None else decode(Calibration, calibration),
+            calibration_file=attachments.get("calibration.yaml", b""),
+            inputs=RunInputs.from_metadata(metadata),
+            runs=_runs_in(metadata.get("runs", "")),
+        )
+        recorded = metadata.get("attachments_crc32")  # the first recordings have none
+        if recorded is not None and recorded != str(_checksum(attachments)):
+            raise RecordingError("its config, template or calibration is damaged or missing")
+        return header
+
+
+def joined_runs(headers: Iterable[RunHeader]) -> tuple[RunStart, ...]:
+    """The runs of several segments, each once, by their frames."""
+    runs = {run for header in headers for run in header.runs}
+    return tuple(sorted(runs, key=lambda run: (run.frames_before, run.tracks_before)))
+
+
+def _runs_text(runs: Sequence[RunStart]) -> str:
+    """Such as: 0 0, 1400 7."""
+    return ", ".join(f"{run.frames_before} {run.tracks_before}" for run in runs)
+
+
+def _runs_in(text: str) -> tuple[RunStart, ...]:
+    """The inverse of `_runs_text`."""
+    pairs = [part.split() for part in text.split(",") if part]
+    return tuple(RunStart(frames_before=int(f), tracks_before=int(t)) for f, t in pairs)
+
+
+def _checksum(attachments: Mapping[str, bytes]) -> int:
+    """CRC-32 over names and contents: the mcap library checks no attachment when it reads one."""
+    crc32 = 0
+    for name, data in sorted(attachments.items()):
+        crc32 = zlib.crc32(name.encode() + data, crc32)
+    return crc32
+
+
+def _cpu() -> str:
+    """The processor's name: another one may round the last bits of sines and sums differently."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or platform.machine()
+
+
+def _version(library: str) -> str:
+    try:
+        return version(library)
+    except PackageNotFoundError:
+        return "not installed"

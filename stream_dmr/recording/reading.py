@@ -1,0 +1,216 @@
+"""Open recordings, iterate over their messages, and require what a command needs."""
+
+import tomllib
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol, TypeVar, runtime_checkable
+
+from stream_dmr.errors import RecordingError, UserError
+from stream_dmr.files import natural_order
+from stream_dmr.fitting.shape.candidates import CandidateShapes
+from stream_dmr.messages import Frame, LearntShapes, LocalizedFish, Message
+from stream_dmr.recording.codec import decode
+from stream_dmr.recording.header import RunHeader, joined_runs
+from stream_dmr.recording.mcap.mcap_recording import McapRecording
+from stream_dmr.recording.mcap.mcap_sink import PART
+from stream_dmr.recording.rerun.rrd_file import RrdRecording
+from stream_dmr.recording.selection import EVERYTHING, Selection
+from stream_dmr.recording.topics import TOPICS
+from stream_dmr.settings import Settings
+
+MessageTypes = Collection[type[Message]]
+M = TypeVar("M", bound=Message)
+
+
+@runtime_checkable
+class Recording(Protocol):
+    """An opened recording: one file, or the segments of one run."""
+
+    header: RunHeader
+    metadata: dict[str, str]  # what recorded it, with which versions
+    is_thinned: bool  # its pictures and masks were removed to free disk space
+    ends_early: bool  # a segment, or cut off by a crash: the run went on after its end
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """What is lost, one line each; complete once everything was read."""
+        ...
+
+    def payloads(
+        self, kinds: MessageTypes, selection: Selection = EVERYTHING
+    ) -> Iterator[tuple[type[Message], bytes]]:
+        """Type and encoding of the messages of `kinds`, in the order in which they were written.
+
+        Only those of the selected time and, where the recording has an index, of the time in which
+        the selected tracks were seen; `decoded_messages` leaves out the other tracks. Raises
+        RecordingError where the recording is damaged.
+        """
+        ...
+
+    def carried_over(self) -> Iterator[bytes]:
+        """The LocalizedFish from before this recording of tracks that were open at its start."""
+        ...
+
+    def video(self, selection: Selection = EVERYTHING) -> Iterator[bytes]:
+        """The encoded CompressedVideo messages of `frames = "h264"`; an .rrd has none."""
+        ...
+
+
+def open_recordings(paths: Sequence[Path]) -> Recording:
+    """One recording of all paths: files, and folders of a run or of its segments.
+
+    Raises RecordingError where one can't be read, or where they are not of the same run.
+    """
+    files = [file for path in paths for file in files_of(path)]
+    segments = [RrdRecording(f) if f.suffix == ".rrd" else McapRecording(f) for f in files]
+    return segments[0] if len(segments) == 1 else _Segments(files, segments)
+
+
+def decoded_messages(
+    recording: Recording, kinds: MessageTypes, selection: Selection = EVERYTHING
+) -> Iterator[tuple[Message, bytes]]:
+    """The selected messages of a recording, each with its encoding. Raises RecordingError."""
+    for kind, payload in recording.payloads(kinds, selection):
+        message = decode(kind, payload)
+        if selection.includes(message):
+            yield message, payload
+
+
+def messages_of(
+    recording: Recording, kind: type[M], selection: Selection = EVERYTHING
+) -> Iterator[M]:
+    """The selected messages of one kind. Raises RecordingError."""
+    for _, payload in recording.payloads([kind], selection):
+        message = decode(kind, payload)
+        if selection.includes(message):
+            yield message
+
+
+def files_of(path: Path) -> list[Path]:
+    """A file itself; of a folder its .mcap files, whole or torn, or else its .rrd files."""
+    if not path.is_dir():
+        return [path]
+    # One that a run renames meanwhile is in both lists, and counts once.
+    unfinished, whole = list(path.glob(f"*.mcap{PART}")), list(path.glob("*.mcap"))
+    parts = [file for file in unfinished if file.with_suffix("") not in whole]
+    if found := [*whole, *parts] or list(path.glob("*.rrd")):
+        return sorted(found, key=natural_order)
+    raise RecordingError(f"{path}: expected a folder with a recording, found no .mcap and no .rrd")
+
+
+class _Segments:
+    """Segments of one run, one after the other."""
+
+    def __init__(self, files: Sequence[Path], segments: Sequence[Recording]) -> None:
+        self._segments = segments
+        runs = joined_runs(segment.header for segment in segments)
+        self.header = replace(segments[0].header, runs=runs)
+        self.metadata = segments[0].metadata
+        self.ends_early = any(segment.ends_early for segment in segments)
+        self.is_thinned = any(segment.is_thinned for segment in segments)
+        for file, segment in zip(files, segments, strict=True):
+            if segment.header.checksum != self.header.checksum:
+                raise RecordingError(
+                    f"{file}: expected a segment of the same run as {files[0]}, got one with "
+                    "another config, template or calibration; replay them one by one"
+                )
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """What is lost of each segment."""
+        return [line for segment in self._segments for line in segment.warnings]
+
+    def payloads(
+        self, kinds: MessageTypes, selection: Selection = EVERYTHING
+    ) -> Iterator[tuple[type[Message], bytes]]:
+        """The payloads of each segment in turn."""
+        for segment in self._segments:
+            yield from segment.payloads(kinds, selection)
+
+    def carried_over(self) -> Iterator[bytes]:
+        """What the first segment took over: the others continue it."""
+        return self._segments[0].carried_over()
+
+    def video(self, selection: Selection = EVERYTHING) -> Iterator[bytes]:
+        """The video of each segment in turn."""
+        for segment in self._segments:
+            yield from segment.video(selection)
+
+
+def require_messages(recording: Recording) -> None:
+    """Raise RecordingError where a recording was cut off before its first whole message."""
+    if recording.ends_early and next(recording.payloads([*TOPICS]), None) is None:
+        lost = "; ".join(recording.warnings) or "it has none"
+        raise RecordingError(f"expected a recording with whole messages, got none: {lost}")
+
+
+def require_selected(recording: Recording, selection: Selection) -> None:
+    """Raise UserError where a recording has no frame of the selected time, or lacks a fish."""
+    require_time(recording, selection)
+    if selection.tracks is not None:
+        require_tracks(selection, localized_tracks(recording, selection))
+
+
+def require_time(recording: Recording, selection: Selection) -> None:
+    """Raise UserError where a recording has no frame of the selected time."""
+    if selection.time_ns is None:
+        return
+    selected = Selection(time_ns=selection.time_ns)
+    if next(messages_of(recording, Frame, selected), None) is None:
+        times = [frame.timestamp_ns for frame in messages_of(recording, Frame)]
+        first, last = (ns / 1e9 for ns in selection.time_ns)
+        spans = f", from {min(times) / 1e9:g} to {max(times) / 1e9:g} s" if times else ""
+        raise UserError(
+            f"--time {first:g}:{last:g}: expected a time of the recording{spans}, got none"
+        )
+
+
+def require_tracks(selection: Selection, known: Collection[int]) -> None:
+    """Raise UserError where a selected fish is not among the `known` ones."""
+    missing = (selection.tracks or frozenset()) - {*known}
+    if missing:
+        raise UserError(f"--track {min(missing)}: expected a fish of the recording, got none")
+
+
+def require_frame(recording: Recording, frame_index: int, selection: Selection) -> None:
+    """Raise UserError where a recording has no frame of this number in the selected time."""
+    found = messages_of(recording, Frame, Selection(time_ns=selection.time_ns))
+    frames = [frame.frame_index for frame in found]
+    if frame_index not in frames:
+        spans = f", from {min(frames)} to {max(frames)}" if frames else ""
+        raise UserError(
+            f"--frame {frame_index}: expected a frame of the recording{spans}, got none"
+        )
+
+
+def localized_tracks(recording: Recording, selection: Selection) -> set[int]:
+    """The ids of the selected fish that a recording has."""
+    return {fish.track_id for fish in messages_of(recording, LocalizedFish, selection)}
+
+
+def learnt_shapes(recording: Recording) -> list[LearntShapes]:
+    """What the camera of a recording learnt, in its order; each segment holds all before it."""
+    found = {learnt.timestamp_ns: learnt for learnt in messages_of(recording, LearntShapes)}
+    return [found[timestamp_ns] for timestamp_ns in sorted(found)]
+
+
+def known_shapes(recording: Recording) -> CandidateShapes | None:
+    """All candidates to which `FittedShape.candidate` is an index; None: the template's own shape.
+
+    Raises RecordingError where the recording is damaged.
+    """
+    candidates = recording.header.candidates
+    if candidates is not None:
+        for learnt in learnt_shapes(recording):
+            candidates = candidates.extended(learnt)
+    return candidates
+
+
+Table = TypeVar("Table", bound=Settings)
+
+
+def recorded_settings(recording: Recording, table: str, kind: type[Table]) -> Table:
+    """The table `[table]` of the run's config.toml; defaults where an older run had none."""
+    config = tomllib.loads(recording.header.config_toml)
+    return kind.model_validate(config.get(table, {}))

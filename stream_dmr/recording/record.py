@@ -1,0 +1,201 @@
+"""Records and the sinks that take them."""
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from stream_dmr.messages import FishCrop, FittedMesh, Frame, Message
+from stream_dmr.recording.codec import checksum, compress, decompress, encode
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.topics import TOPICS, RecordingSettings, Topic
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Record:
+    """A message and its encoding, made once for all sinks."""
+
+    message: Message  # as a recording gives it back, but a frame may keep the pixels it came with
+    whole: Message  # with what the recording leaves out: for drawing
+    encoding: Callable[[], bytes]
+
+    @classmethod
+    def of_payload(
+        cls, message: Message, payload: bytes, *, whole: Message | None = None
+    ) -> "Record":
+        """A message that was recorded before, with the encoding that it had."""
+        return cls(message=message, whole=whole or message, encoding=partial(bytes, payload))
+
+    @cached_property
+    def payload(self) -> bytes:
+        """The bytes that `codec.encode` gives."""
+        return self.encoding()
+
+    @property
+    def topic(self) -> Topic:
+        """Where the message lies in each kind of recording."""
+        return TOPICS[type(self.message)]
+
+
+def make_record(message: Message, settings: RecordingSettings) -> Record:
+    """The record of a message: parts may be left out and pictures may be lossy.
+
+    Where a replay starts from a lossy picture, the run continues from it too. The picture of a
+    frame is only for viewing where crops are kept, since a replay then starts from those.
+    """
+    if isinstance(message, Frame):
+        return _record_frame(message, settings)
+    recorded, picture = message, None
+    match message:
+        case FishCrop(image=image) if image is not None and settings.crops == "jpeg":
+            picture = compress(image, format="jpeg", jpeg_quality=settings.jpeg_quality)
+            recorded = replace(message, image=decompress(picture))
+        case FishCrop() if not settings.keeps_crops:
+            recorded = replace(message, image=None)
+        case FittedMesh(shape=shape) if shape is not None and settings.meshes == "parameters":
+            recorded = replace(message, shape=replace(shape, vertices=None, covariance=None))
+        case _:
+            pass
+    return Record(
+        message=recorded, whole=message, encoding=partial(encode, recorded, picture=picture)
+    )
+
+
+def as_recorded(message: Message, settings: RecordingSettings) -> Message:
+    """The message that a recording gives back: what a replay compares with and continues from."""
+    return make_record(message, settings).message
+
+
+def _record_frame(frame: Frame, settings: RecordingSettings) -> Record:
+    """A frame by reference or with a picture for viewing keeps its own pixels in the run."""
+    if settings.frames != "jpeg":
+        encoding = partial(_encode_by_reference, frame)
+    elif settings.keeps_crops:
+        encoding = partial(_encode_for_viewing, frame, settings.jpeg_quality)
+    else:
+        picture = compress(frame.image, format="jpeg", jpeg_quality=settings.jpeg_quality)
+        decoded = replace(frame, image=decompress(picture))
+        encoding = partial(encode, decoded, picture=picture)
+        return Record(message=decoded, whole=frame, encoding=encoding)
+    return Record(message=frame, whole=frame, encoding=encoding)
+
+
+def _encode_by_reference(frame: Frame) -> bytes:
+    return encode(frame, picture=compress(frame.image, format="reference"))
+
+
+def _encode_for_viewing(frame: Frame, jpeg_quality: int) -> bytes:
+    picture = compress(frame.image, format="jpeg", jpeg_quality=jpeg_quality)
+    return encode(frame, picture=replace(picture, crc32=checksum(frame.image)))
+
+
+@runtime_checkable
+class Sink(Protocol):
+    """One kind of output."""
+
+    @property
+    def name(self) -> str:
+        """What people know it by: the name of its file."""
+        ...
+
+    def write(self, record: Record, /) -> None:
+        """Take one record. Raises OutputError where the disk refuses it."""
+        ...
+
+    def close(self) -> None:
+        """Leave a valid file. Idempotent. Raises OutputError where the disk refuses its end."""
+        ...
+
+
+@runtime_checkable
+class BufferedSink(Sink, Protocol):
+    """A sink that keeps records for a moment and writes them together."""
+
+    def flush_due(self) -> None:
+        """Write what was kept long enough. Raises OutputError where the disk refuses it."""
+        ...
+
+
+@runtime_checkable
+class FileSink(Sink, Protocol):
+    """A sink that writes one file."""
+
+    path: Path  # of the file when it is closed
+
+
+SinkFactory = Callable[[Path, RunHeader, RecordingSettings], Sequence[Sink]]
+"""Opens the sinks that record a run in a folder. Raises as `open_recording_files` does."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SinkState:
+    """One output, such as `frames.csv`."""
+
+    name: str
+    is_failing: bool
+    since_ns: int  # wall clock, ns since 1970: it works, or fails, since then
+    last_error: str = ""  # also after it works again
+
+    @property
+    def problem(self) -> str:
+        """Why it fails, for people; "" while it works."""
+        return f"{self.name} can't be written: {self.last_error}" if self.is_failing else ""
+
+
+class SinkStates:
+    """The state of each output, as those who write it report it. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._states: dict[str, SinkState] = {}
+
+    def report(self, name: str, error: str = "") -> None:
+        """An output was written to, or was refused with `error`."""
+        with self._lock:
+            state, is_failing = self._states.get(name), bool(error)
+            if state is None or state.is_failing != is_failing:
+                last_error = "" if state is None else state.last_error
+                state = SinkState(
+                    name=name,
+                    is_failing=is_failing,
+                    since_ns=time.time_ns(),
+                    last_error=last_error,
+                )
+            self._states[name] = replace(state, last_error=error) if error else state
+
+    def all(self) -> list[SinkState]:
+        """The states of all outputs, in the order in which they were first written to."""
+        with self._lock:
+            return list(self._states.values())
+
+    def problems(self) -> list[str]:
+        """A line for each output that fails."""
+        return [state.problem for state in self.all() if state.is_failing]
+
+
+_MAX_TRACKS = 1000  # that are counted at a time: those that came last; chosen
+
+
+class PhotographChooser:
+    """Chooses the 1st, 2nd, 4th, 8th, ... crop in which a fish does not touch the border.
+
+    So a fish has a few photographs from all of the time that it is in view: 1 + log2(n) of n crops.
+    Of one that always touches the border, the first is chosen.
+    """
+
+    def __init__(self) -> None:
+        self._inside: dict[int, int] = {}  # crops of each track inside the picture
+
+    def takes(self, crop: FishCrop) -> bool:
+        """True for a crop whose picture is to be kept; each crop is asked about once, in order."""
+        is_new = crop.track_id not in self._inside
+        count = self._inside.setdefault(crop.track_id, 0)
+        if len(self._inside) > _MAX_TRACKS:
+            del self._inside[next(iter(self._inside))]
+        if crop.quality.touches_border:
+            return is_new
+        self._inside[crop.track_id] = count = count + 1
+        return count & (count - 1) == 0

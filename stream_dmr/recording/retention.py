@@ -1,0 +1,154 @@
+"""Frees disk space by deleting the oldest recordings, step by step; lengths are never deleted."""
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
+from pathlib import Path
+from threading import Event, Thread
+
+from stream_dmr.errors import OutputError, RecordingError
+from stream_dmr.files import free_bytes, natural_order, rename_durably
+from stream_dmr.messages import FishCrop, Frame
+from stream_dmr.recording.codec import decode, without_picture
+from stream_dmr.recording.mcap.mcap_recording import McapRecording
+from stream_dmr.recording.mcap.mcap_sink import PART
+from stream_dmr.recording.record import PhotographChooser
+from stream_dmr.recording.recorder import STEM
+from stream_dmr.recording.repair import rewrite
+from stream_dmr.recording.rerun.rrd_file import is_closed
+from stream_dmr.recording.topics import FOXGLOVE_TOPICS, THINNED, TOPICS, VIDEO
+from stream_dmr.tables import rotated_files
+
+_THINNED_TOPICS = {VIDEO, *FOXGLOVE_TOPICS}
+_PERIOD_S = 5.0  # chosen: a run writes some 10 MB in that time
+
+
+class Retention:
+    """Frees space in the folder of a run whenever the disk has less than `free_bytes` left.
+
+    Deleted first are old tables of frames, whose rows the segments have, then the views and the
+    pictures and masks of the oldest segments but for some photographs, then whole segments;
+    segments with a track of `flagged()` after all others. Files that are being written are kept.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        free_bytes: int,
+        flagged: Callable[[], Collection[int]],
+        on_notice: Callable[[str], None],
+        on_changed: Callable[[Path], None] = lambda path: None,
+    ) -> None:
+        self._folder, self._free_bytes = folder, free_bytes
+        self._flagged, self._on_notice, self._on_changed = flagged, on_notice, on_changed
+        self._known: dict[str, tuple[Collection[int], bool]] = {}  # by stem, see `_facts`
+        self._stop = Event()
+        self._thread = Thread(target=self._watch, name="retention", daemon=True)
+
+    def start(self) -> None:
+        """Check the free space from now on, in a thread of its own."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop the thread. Idempotent."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def free_space(self) -> None:
+        """Delete until enough is free or nothing is left to delete.
+
+        Raises OSError or OutputError where the disk fails.
+        """
+        if not self._free_bytes or not self._folder.is_dir():
+            return
+        done: Counter[str] = Counter()
+        steps = self._steps()
+        while self._is_short() and not self._stop.is_set() and (step := next(steps, None)):
+            done[step] += 1
+        if done:
+            what = ", ".join(f"{step} of {count}" for step, count in done.items())
+            gigabytes = self._free_bytes / 1e9
+            self._on_notice(
+                f"less than {gigabytes:g} GB were free, so the oldest recordings went: {what}"
+            )
+
+    def _watch(self) -> None:
+        while not self._stop.wait(_PERIOD_S):
+            with suppress(OSError, OutputError):  # measuring goes on
+                self.free_space()
+
+    def _is_short(self) -> bool:
+        return free_bytes(self._folder) < self._free_bytes
+
+    def _steps(self) -> Iterator[str]:
+        """Delete one thing at a time, and yield its name for the notice."""
+        for table in rotated_files(self._folder / "frames.csv"):
+            yield from self._remove(table, "the table of frames")
+        stems, flagged = self._finished_stems(), set(self._flagged())
+        has_flagged = {stem: bool(flagged & set(self._facts(stem)[0])) for stem in stems}
+        for flag in (False, True):
+            group = [stem for stem in stems if has_flagged[stem] is flag]
+            for stem in group:
+                yield from self._remove(stem.with_suffix(".rrd"), "the view")
+                yield from self._thin(stem.with_suffix(".mcap"))
+            for stem in group:
+                yield from self._remove(stem.with_suffix(".mcap"), "all")
+
+    def _finished_stems(self) -> list[Path]:
+        """Segments that are not being written, the oldest first, without suffix."""
+        recordings = [*self._folder.glob(f"{STEM}-*.mcap"), *self._folder.glob(f"{STEM}-*.rrd")]
+        stems = {path.with_suffix("") for path in recordings}
+        return sorted((stem for stem in stems if not _is_open(stem)), key=natural_order)
+
+    def _facts(self, stem: Path) -> tuple[Collection[int], bool]:
+        """The track ids of a segment, and True where its pictures and masks are gone."""
+        if stem.name not in self._known:
+            try:
+                file = McapRecording(stem.with_suffix(".mcap"))
+                self._known[stem.name] = file.tracks(), file.is_thinned
+            except RecordingError:
+                self._known[stem.name] = (), True
+        return self._known[stem.name]
+
+    def _remove(self, path: Path, what: str) -> Iterator[str]:
+        if path.exists():
+            path.unlink()
+            self._on_changed(path)
+            yield what
+
+    def _thin(self, path: Path) -> Iterator[str]:
+        """Remove pictures and masks; without room for the copy, do nothing."""
+        tracks, is_thinned = self._facts(path.with_suffix(""))
+        if is_thinned:
+            return
+        with suppress(OSError, RecordingError):
+            copy, _ = rewrite(path, note=THINNED, edit=_Thinning().edit)
+            rename_durably(copy, path)
+            self._on_changed(path)
+            self._known[path.stem] = tracks, True
+            yield "pictures and masks"
+
+
+def _is_open(stem: Path) -> bool:
+    rrd = stem.with_suffix(".rrd")
+    return stem.with_name(f"{stem.name}.mcap{PART}").exists() or (
+        rrd.exists() and not is_closed(rrd)
+    )
+
+
+class _Thinning:
+    """Takes pictures and masks out of one segment, but for a few photographs of each fish."""
+
+    def __init__(self) -> None:
+        self._chooser = PhotographChooser()
+
+    def edit(self, topic: str, data: bytes) -> bytes | None:
+        """What a message becomes; None: it goes."""
+        if topic == TOPICS[FishCrop].topic:
+            crop = decode(FishCrop, data)
+            return data if crop.image is not None and self._chooser.takes(crop) else None
+        if topic in _THINNED_TOPICS:
+            return None
+        return without_picture(data) if topic == TOPICS[Frame].topic else data

@@ -1,0 +1,188 @@
+"""Geometry, colours and frame rate of what viewers show."""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Generic, TypeVar
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+
+from stream_dmr.camera import frame_from_crop
+from stream_dmr.fitting.body import Body
+from stream_dmr.fitting.shape.candidates import CandidateShapes
+from stream_dmr.fitting.shape.space import reshaped
+from stream_dmr.fitting.solver.spine import KINDS, Kind, deform
+from stream_dmr.geometry import arc_length
+from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, Frame, LocalizedFish
+from stream_dmr.template.template import Template
+
+T = TypeVar("T")
+
+# Frames, or fish in a frame, that later stages may still report on: the chain's queues hold fewer.
+_MAX_PENDING = 64
+
+
+class FrameThrottle:
+    """Selects the frames that are shown: the first of each 1 / `rate_hz` of capture time."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._rate_hz = rate_hz
+        self._slot = -1
+        self._shown: deque[int] = deque(maxlen=_MAX_PENDING)
+
+    def shows(self, frame: Frame) -> bool:
+        """Decide about the next frame, and remember the decision."""
+        slot = int(frame.timestamp_ns * self._rate_hz // 1e9)
+        if slot == self._slot:
+            return False
+        self._slot = slot
+        self._shown.append(frame.frame_index)
+        return True
+
+    def has_shown(self, frame_index: int) -> bool:
+        """True where a recent frame was shown."""
+        return frame_index in self._shown
+
+
+class PendingItems(Generic[T]):
+    """Items of one stage, kept per fish and frame until a later stage takes them."""
+
+    def __init__(self) -> None:
+        self._items: dict[tuple[int, int], T] = {}
+
+    def put(self, fish: FishCrop | FittedMesh, item: T) -> None:
+        """Keep `item`; beyond `_MAX_PENDING` the oldest one is dropped."""
+        self._items[fish.track_id, fish.frame_index] = item
+        if len(self._items) > _MAX_PENDING:  # a live view misses messages
+            del self._items[next(iter(self._items))]
+
+    def take(self, fish: LocalizedFish) -> T | None:
+        """Remove and return the item of the same fish in the same frame, if there is one."""
+        return self._items.pop((fish.track_id, fish.frame_index), None)
+
+
+class MeshRebuilder:
+    """Deforms the template of a recording, or its candidate shapes, by recorded parameters."""
+
+    def __init__(self, template: Template, candidates: CandidateShapes | None) -> None:
+        shapes = (
+            [] if candidates is None else [reshaped(template, c.coefficients) for c in candidates]
+        )
+        self._bodies = [Body.from_template(shape) for shape in shapes or [template]]
+
+    def with_vertices(self, fit: FittedMesh) -> FittedMesh:
+        """The fit, with vertices computed where it lacks them: the original ones within 1e-12."""
+        shape, report = fit.shape, fit.report
+        if shape is None or report is None or shape.vertices is not None:
+            return fit
+        return replace(fit, shape=self._deformed(shape, KINDS[report.deformation]))
+
+    def _deformed(self, shape: FittedShape, kind: Kind) -> FittedShape:
+        body = self._bodies[shape.candidate or 0]
+        points = deform(body, kind, shape.parameters)
+        v = body.num_vertices
+        # The recorded keypoints say where the fit stands along the viewing ray of its crop.
+        offset = (shape.keypoints - points[v : v + 3]).mean(axis=0)
+        return replace(shape, vertices=points[:v] + offset)
+
+
+# RGB after Okabe and Ito, "Color Universal Design" (2008): distinct also for the colour-blind.
+# Black is left out and blue is brighter than theirs, since the views are dark.
+PALETTE = (
+    (230, 159, 0),
+    (86, 180, 233),
+    (0, 158, 115),
+    (240, 228, 66),
+    (204, 121, 167),
+    (213, 94, 0),
+    (122, 130, 255),
+)
+
+
+def color(track_id: int) -> tuple[int, int, int]:
+    """The RGB colour of a track; it repeats after seven."""
+    return PALETTE[track_id % len(PALETTE)]
+
+
+# Chosen by eye. The unit vector points to the light: above, to the right of and behind the camera.
+_LIGHT = np.array([0.3, -0.6, -0.742])
+_AMBIENT = 0.25
+
+
+def place_fit(
+    shape: FittedShape, fish: LocalizedFish
+) -> tuple[Float[np.ndarray, "V 3"] | None, Float[np.ndarray, "3 3"], Float[np.ndarray, "M 3"]]:
+    """Vertices, keypoints and midline of a fit at its localized place, mm in the camera frame.
+
+    Fit and camera frame have the same orientation, so a scale (the ratio of the midlines' arc
+    lengths) and a shift (center keypoint to center keypoint) suffice. Without millimetres the shape
+    is scaled about the camera to a body length of 1, which leaves its projection unchanged.
+    Vertices are None where the shape has none.
+    """
+    arc, vertices = arc_length(shape.midline), shape.vertices
+    if fish.keypoints_mm is None or fish.midline_mm is None:
+        placed = None if vertices is None else vertices / arc
+        return placed, shape.keypoints / arc, shape.midline / arc
+    scale = arc_length(fish.midline_mm) / arc
+    if vertices is not None:
+        vertices = (vertices - shape.keypoints[1]) * scale + fish.keypoints_mm[1]
+    return vertices, fish.keypoints_mm, fish.midline_mm
+
+
+def outlines(crop: FishCrop) -> list[Float[np.ndarray, "N 2"]]:
+    """The outlines of the mask, each closed, in frame pixels."""
+    contours, _ = cv2.findContours(
+        crop.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE
+    )
+    cameras = {"crop_camera": crop.crop_camera, "frame_camera": crop.frame_camera}
+    closed = [np.concatenate([contour, contour[:1]])[:, 0] for contour in contours]
+    return [frame_from_crop(line.astype(float), **cameras) for line in closed]
+
+
+def fill_outlines(
+    labels: UInt8[np.ndarray, "H W"], outlines: Sequence[Float[np.ndarray, "_ 2"]], *, label: int
+) -> None:
+    """Write `label` inside closed outlines, whose origin is the corner of the top-left pixel."""
+    cv2.fillPoly(labels, [np.round(line - 0.5).astype(np.int32) for line in outlines], label)
+
+
+def shades(
+    vertices: Float32[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> UInt8[np.ndarray, "V 3"]:
+    """Grey level of each vertex under a light above the camera: a third of the bytes of normals.
+
+    A vertex's normal is the area-weighted mean of its faces' normals, the sum of cross products.
+    """
+    a, b, c = (vertices.T[:, corner] for corner in faces.T)
+    u, v = b - a, c - a
+    weighted = [u[k] * v[m] - u[m] * v[k] for k, m in ((1, 2), (2, 0), (0, 1))]
+    corners = faces.ravel()
+    sums = [np.bincount(corners, np.repeat(one, 3), len(vertices)) for one in weighted]
+    normals = np.stack(sums, axis=1)
+    lit = normals @ _LIGHT / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
+    grey = 255 * (_AMBIENT + (1 - _AMBIENT) * (0.5 + 0.5 * lit))
+    return grey.astype(np.uint8)[:, None].repeat(3, axis=1)
+
+
+def view_factor(width: int, height: int, *, most_px: int) -> int:
+    """Frame pixels per pixel of the view: a power of two that divides both sides of the frame.
+
+    The smallest with which no side is longer than `most_px`, or else the largest there is.
+    """
+    factor = 1
+    while max(width, height) > most_px * factor and not (width | height) // factor % 2:
+        factor *= 2
+    return factor
+
+
+def shrink_by_halves(
+    image: UInt8[np.ndarray, "H W 3"], *, most_px: int
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The image at 1 / `view_factor` of its size, halved repeatedly, which is fast."""
+    height, width = image.shape[:2]
+    for _ in range(view_factor(width, height, most_px=most_px).bit_length() - 1):
+        height, width = height // 2, width // 2
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    return image

@@ -1,1 +1,0 @@
-"""Recomputes recordings from any stage, and compares the results with the recorded ones."""

@@ -1,1 +1,0 @@
-"""Finished lengths: database, tables, exports, provenance and its verification."""

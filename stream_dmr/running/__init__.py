@@ -1,1 +1,0 @@
-"""One run: configuration, inputs, the chain of nodes, outputs, recovery."""

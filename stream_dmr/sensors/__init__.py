@@ -1,1 +1,0 @@
-"""Sensors beside the camera: the receiver of positions, from files and while it sends."""

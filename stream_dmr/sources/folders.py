@@ -1,0 +1,352 @@
+"""Frames of folders: pictures, and clips that keep coming."""
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Event
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8, UInt16
+
+from stream_dmr.errors import SourceError
+from stream_dmr.files import natural_order
+from stream_dmr.messages import Frame
+from stream_dmr.pictures import (
+    MAX_PIXELS,
+    PICTURE_SUFFIXES,
+    is_turned,
+    pictures_in,
+    read_picture,
+    size_if_huge,
+)
+from stream_dmr.sources.source import ReadFramesSettings, ResumePoint, Source, nominal_ns
+from stream_dmr.sources.video_file import VideoFile
+
+OtherSizes = Literal["refuse", "leave_out", "take"]
+_DEPTHS = {"uint8", "uint16"}
+# What telephones and cameras write and OpenCV does not read.
+_UNREADABLE = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2"}
+
+
+class PictureFolder(Source):
+    """A folder of pictures in natural order (`2.png` before `10.png`), usually of one size.
+
+    Grey and 16-bit pictures become 8-bit BGR. One that can't be decoded, or is cut off, is left out
+    with a warning but keeps its frame index, so that boxes and masks stay with their pictures.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        fps: float,
+        other_sizes: OtherSizes = "refuse",
+        as_sensor: bool = False,
+    ) -> None:
+        """`other_sizes`: what becomes of pictures whose size is not the first one's.
+
+        Those that are left out are not of the size that most have. `as_sensor`: pictures are not
+        turned upright, see `[read_frames] orientation`. Raises SourceError where no picture can be
+        decoded.
+        """
+        self._paths, unreadable = _pictures_in(folder)
+        self._is_closed = False
+        self._other_sizes = other_sizes
+        self.name = folder.resolve().name
+        self.num_frames = len(self._paths)
+        self.fps = fps
+        self.warnings = [] if not unreadable else [_not_read(unreadable)]
+        self._as_sensor, self._is_warned = as_sensor, False
+        first = next((p for p in map(self._read, self._paths) if p is not None), None)
+        if first is None:
+            raise SourceError(
+                f"{folder}: expected pictures, but none of its {len(self._paths)} can be decoded"
+            )
+        self.height, self.width = first.shape[:2]
+        if other_sizes == "leave_out":  # one picture of another telephone may be the first
+            sizes = Counter(p.shape[:2] for p in self._sample()) or {first.shape[:2]: 1}
+            self.height, self.width = max(sizes, key=lambda size: sizes[size])
+        self._white = self._full_scale() if first.dtype == np.uint16 else 2**16 - 1
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frame_index, path in enumerate(self._paths, start=1):
+            if self._is_closed:
+                return
+            picture = self._read(path)
+            if picture is None:
+                self.warnings.append(
+                    f"{path.name}: can't be decoded, or is cut off, so was left out"
+                )
+                continue
+            self._warn_if_turned(path)
+            size = picture.shape[1], picture.shape[0]
+            if self._other_sizes == "refuse":
+                self._require_size(size, path)
+            elif self._other_sizes == "leave_out" and size != (self.width, self.height):
+                self.warnings.append(
+                    f"{path.name}: {size[0]}x{size[1]} px, the calibration is for {self.width}x"
+                    f"{self.height}, so was left out; calibrate its camera and run it by itself"
+                )
+                continue
+            yield Frame(
+                frame_index=frame_index,
+                timestamp_ns=nominal_ns(frame_index, self.fps),
+                image=_to_8_bit(picture, self._white),
+                source=path.name,
+            )
+
+    def _read(self, path: Path) -> np.ndarray | None:
+        """As BGR of its own depth; None if it can't be read, or not to its end.
+
+        Raises SourceError for one that is too large, before it takes the memory.
+        """
+        if huge := size_if_huge(path):
+            raise SourceError(
+                f"{path}: expected a picture of {MAX_PIXELS // 10**6} megapixels or less, got "
+                f"{huge}"
+            )
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+        try:
+            picture = read_picture(
+                path, flags | cv2.IMREAD_IGNORE_ORIENTATION if self._as_sensor else flags
+            )
+        except OSError:
+            return None
+        return picture if picture is not None and picture.dtype.name in _DEPTHS else None
+
+    def _full_scale(self) -> int:
+        """The value of white in a folder of 16-bit pictures: 4095 or 65535.
+
+        Sensors of 12 bits often write their values unscaled into 16 bits, where they come out all
+        but black. A folder is taken for 12 bits where a sample stays below 4096.
+        """
+        brightest = max((int(p.max()) for p in self._sample()), default=2**16 - 1)
+        return 2**12 - 1 if brightest < 2**12 else 2**16 - 1
+
+    def _sample(self) -> Iterator[np.ndarray]:
+        """About five pictures, evenly spaced; those that can be read."""
+        sample = map(self._read, self._paths[:: max(1, len(self._paths) // 4)])
+        return (picture for picture in sample if picture is not None)
+
+    def _warn_if_turned(self, path: Path) -> None:
+        if self._as_sensor and not self._is_warned and is_turned(path):
+            self._is_warned = True
+            self.warnings.append(
+                f"pictures such as {path.name} are to be turned by their EXIF; with a calibration "
+                "they are measured as the sensor saw them, and masks and boxes must be so"
+            )
+
+    def _require_size(self, size: tuple[int, int], path: Path) -> None:
+        if size != (self.width, self.height):
+            raise SourceError(
+                f"{path}: expected {self.width}x{self.height} px, as the first picture has, got "
+                f"{size[0]}x{size[1]} px; give --stills where pictures stand for themselves, or "
+                'set [read_frames] other_sizes to "leave_out" or "take"'
+            )
+
+    def close(self) -> None:
+        """End the iteration; no file is held."""
+        self._is_closed = True
+
+
+def _pictures_in(folder: Path) -> tuple[list[Path], list[str]]:
+    """Those that can be read, in natural order, and the names of others. SourceError for none."""
+    try:
+        pictures = pictures_in(folder)
+        files = [p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")]
+    except OSError as error:
+        raise SourceError(
+            f"{folder}: expected a folder of pictures, but it can't be read: {error.strerror}"
+        ) from None
+    unreadable = sorted(p.name for p in files if p.suffix.lower() in _UNREADABLE)
+    if pictures:
+        return pictures, unreadable
+    suffixes = ", ".join(sorted(PICTURE_SUFFIXES))
+    found = _not_read(unreadable) if unreadable else "found none"
+    raise SourceError(f"{folder}: expected a folder of pictures ({suffixes}) or of videos, {found}")
+
+
+def _not_read(names: list[str]) -> str:
+    return f"{len(names)} pictures such as {names[0]} can't be read; save them as JPEG or PNG"
+
+
+def _to_8_bit(
+    picture: UInt8[np.ndarray, "H W 3"] | UInt16[np.ndarray, "H W 3"], full_scale: int
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Scaled by one factor for the whole folder, so that brightness does not flicker; clipped."""
+    if picture.dtype == np.uint8:
+        return picture
+    return cv2.convertScaleAbs(picture, alpha=255 / full_scale)
+
+
+_SUFFIXES = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv"}
+_SETTLE_S = 5.0  # a clip that has not grown for so long is complete, or never will be; chosen
+_POLL_S = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class _FileState:
+    """Size and time of the last write of a file, to see whether it still grows."""
+
+    num_bytes: int
+    modified_ns: int
+
+
+class ClipFolder(Source):
+    """The clips of a folder in natural order of their names, all of one size.
+
+    Frames are numbered through all clips. A clip is read once it has stopped growing or a later
+    one is there; what comes into it after that, such as after a pause of its recorder, is read as
+    well. One that can't be read, or has another size, is left out with a warning. Capture
+    times: a clip ends when its file was last modified, but never begins before its predecessor
+    ended.
+    """
+
+    def __init__(self, folder: Path, settings: ReadFramesSettings) -> None:
+        """Raises SourceError where no clip can be read."""
+        self.name = folder.resolve().name
+        self.warnings: list[str] = []
+        self._folder = folder
+        self._settings = settings
+        self._closing = Event()
+        self._begun: set[str] = set()  # names of clips that were read, are being read or left out
+        self._frames_done: dict[str, int] = {}
+        self._bytes_read: dict[str, int] = {}  # sizes of the clips when their reading began
+        self._after_ns = 0
+        self._video: VideoFile | None = None
+        first = self._first_clip()
+        self.width, self.height, self.fps = first.width, first.height, first.fps
+        self.num_frames = None
+        first.close()
+
+    @property
+    def is_endless(self) -> bool:
+        """True: the folder may grow; it ends when no new clip came for `clips_wait_s`."""
+        return True
+
+    @property
+    def has_clips(self) -> bool:
+        """True."""
+        return True
+
+    def resume(self, point: ResumePoint) -> None:
+        """Skip the clips and frames that were done, and begin after the last capture time."""
+        self._begun.update(point.clips_done)
+        self._frames_done, self._after_ns = {**point.frames_done}, point.after_ns
+
+    def __iter__(self) -> Iterator[Frame]:
+        frame_index, last_ns = 0, self._after_ns
+        while (path := self._next_clip()) is not None:
+            if path.name in self._bytes_read:
+                done = self._frames_done.get(path.name, 0)
+                self.warnings.append(f"{path.name}: grew after its {done} frames were read")
+            self._begun.add(path.name)
+            state = _state_of(path)
+            self._bytes_read[path.name] = 0 if state is None else state.num_bytes
+            self._video = self._open(path)
+            if self._video is None:
+                continue
+            start_ns = max(_start_ns(path, self._video), last_ns + round(1e9 / self._video.fps))
+            for frame in self._video:
+                frame_index += 1
+                last_ns = start_ns + frame.timestamp_ns
+                if frame.frame_index > self._frames_done.get(path.name, 0):
+                    self._frames_done[path.name] = frame.frame_index
+                    yield replace(frame, frame_index=frame_index, timestamp_ns=last_ns)
+            self.warnings += self._video.warnings
+
+    def close(self) -> None:
+        """Release the clip; the iteration ends."""
+        self._closing.set()
+        if self._video is not None:
+            self._video.close()
+
+    def _first_clip(self) -> VideoFile:
+        problem = SourceError(f"{self._folder}: expected clips, found none")
+        for path in clips_in(self._folder):
+            try:
+                return VideoFile(path, self._settings)
+            except SourceError as error:
+                problem = error
+        raise problem
+
+    def _open(self, path: Path) -> VideoFile | None:
+        try:
+            video = VideoFile(path, self._settings)
+        except SourceError as error:
+            self.warnings.append(f"{error}; the clip was left out")
+            return None
+        if (video.width, video.height) != (self.width, self.height):
+            video.close()
+            self.warnings.append(
+                f"{path.name}: expected {self.width}x{self.height} px as the first clip has, got "
+                f"{video.width}x{video.height} px; the clip was left out"
+            )
+            return None
+        return video
+
+    def _has_more(self, path: Path) -> bool:
+        """True for a clip that was not read, or has grown since."""
+        if path.name not in self._begun:
+            return True
+        state, num_bytes = _state_of(path), self._bytes_read.get(path.name)
+        return state is not None and num_bytes is not None and state.num_bytes > num_bytes
+
+    def _next_clip(self) -> Path | None:
+        """Wait for a complete clip; None when closed, or when none came for `clips_wait_s`."""
+        seen: dict[str, _FileState] = {}
+        unchanged_since = waiting_since = time.monotonic()
+        while not self._closing.is_set():
+            paths = [path for path in clips_in(self._folder) if self._has_more(path)]
+            if len(paths) > 1:
+                return paths[0]
+            now = time.monotonic()
+            if paths:
+                state = _state_of(paths[0])
+                if state is None:
+                    continue
+                if state != seen.get(paths[0].name):
+                    seen[paths[0].name] = state
+                    unchanged_since = waiting_since = now
+                if now - unchanged_since >= _SETTLE_S or _is_old(state):
+                    return paths[0]
+            elif now - waiting_since >= self._settings.clips_wait_s:
+                return None
+            self._closing.wait(_POLL_S)
+        return None
+
+
+def clips_in(folder: Path) -> list[Path]:
+    """The videos of a folder, in natural order. Raises SourceError where it can't be read."""
+    try:
+        files = [path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES]
+        files = [path for path in files if path.is_file() and not path.name.startswith(".")]
+    except OSError as error:
+        raise SourceError(
+            f"{folder}: expected a folder of clips, but it can't be read: {error.strerror}"
+        ) from None
+    return sorted(files, key=natural_order)
+
+
+def _state_of(path: Path) -> _FileState | None:
+    """Size and time of the last write; None where the file was removed meanwhile."""
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        return None
+    return _FileState(num_bytes=status.st_size, modified_ns=status.st_mtime_ns)
+
+
+def _is_old(state: _FileState) -> bool:
+    """Whether the last write was longer ago than `_SETTLE_S`, by the wall clock that files use."""
+    return time.time_ns() - state.modified_ns > _SETTLE_S * 1e9
+
+
+def _start_ns(path: Path, video: VideoFile) -> int:
+    """Capture time of the first frame: last write minus duration, ns since 1970; 0 if removed."""
+    state, duration_s = _state_of(path), (video.num_frames or 0) / video.fps
+    return 0 if state is None else state.modified_ns - round(duration_s * 1e9)

@@ -1,0 +1,195 @@
+"""Species that fisheries land, and the evidence of frames for the species of a fish.
+
+The species that reviewers choose from, and that codes stand for.
+
+`species.csv` has 101 species that fisheries with hooks land, with codes and names from the ASFIS
+List of Species for Fishery Statistics Purposes (FAO, 2022), and the bundled body form that each is
+near to. A user's own file adds others, or replaces them.
+"""
+
+import csv
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import NamedTuple
+
+from pydantic import Field, field_validator
+
+from stream_dmr.errors import ConfigError, reason_of
+from stream_dmr.files import read_text
+from stream_dmr.settings import Settings
+
+CODE = re.compile(r"[A-Z0-9]{3}")  # FAO 3-alpha
+_EXPECTED = "code,scientific_name,english_name,form"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Species:
+    """One species, or a group of them that has a code."""
+
+    code: str  # FAO 3-alpha
+    scientific_name: str
+    english_name: str
+    form: str = ""  # bundled body form that it is near to; "": none
+
+
+_COLUMNS = [field.name for field in fields(Species)]
+
+
+def load_species(own: str = "") -> list[Species]:
+    """The bundled species and those of the CSV file `own`, by code. Raises ConfigError."""
+    known = {one.code: one for one in _bundled()}
+    if own:
+        try:
+            text = read_text(Path(own))
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(
+                f"[species] own_list: expected a CSV with {_EXPECTED}, {own}: {reason_of(error)}"
+            ) from error
+        known |= {one.code: one for one in _parse(text, where=own)}
+    return [known[code] for code in sorted(known)]
+
+
+def find_species(text: str, species: Sequence[Species]) -> Species | None:
+    """The species whose code or name is this text, whatever its capitals; None: there is none."""
+    return next((one for one in species if is_called(one, text)), None)
+
+
+def is_called(species: Species, text: str) -> bool:
+    """True where a text is the code or one of the names of a species, whatever its capitals."""
+    wanted = text.strip().casefold()
+    names = (species.code, species.scientific_name, species.english_name)
+    return wanted in [name.casefold() for name in names]
+
+
+@cache
+def _bundled() -> list[Species]:
+    path = files("stream_dmr").joinpath("species.csv")
+    return _parse(path.read_text("utf-8"), where="species.csv")
+
+
+def _parse(text: str, *, where: str) -> list[Species]:
+    reader = csv.DictReader(text.splitlines())
+    given = list(reader.fieldnames or [])
+    if not set(_COLUMNS[:3]) <= set(given) <= set(_COLUMNS):
+        raise ConfigError(
+            f"{where}: expected the columns {_EXPECTED} (form may be left out), got "
+            f"{','.join(given) or 'none'}"
+        )
+    found = list[Species]()
+    for row in reader:
+        values = {name: (row.get(name) or "").strip() for name in _COLUMNS}
+        if not CODE.fullmatch(values["code"]) or not values["scientific_name"]:
+            raise ConfigError(
+                f"{where}, line {reader.line_num}: expected a code of three capitals or digits and "
+                f"a name, got {values['code']!r}, {values['scientific_name']!r}"
+            )
+        found.append(Species(**values))
+    return found
+
+
+class SpeciesSettings(Settings):
+    """`[species]`: which species a fish is of."""
+
+    model: str = Field(
+        default="", description='classifier of crops (.onnx), see docs/species.md; "": none'
+    )
+    min_share: float = Field(
+        default=0.9,
+        gt=0,
+        le=1,
+        description='least probability of the likeliest species; a fish below it is "unsure"',
+    )
+    frame_correlation: float = Field(
+        default=0.25,
+        ge=0,
+        le=1,
+        description="how alike a classifier's mistakes in a fish's frames are: all frames together "
+        "count as 1 / this independent ones at most; 0: each counts",
+    )
+    own_list: str = Field(
+        default="",
+        description="CSV with the columns code,scientific_name,english_name,form whose species are "
+        'added to the bundled ones, for reviewers and for body forms; "": none',
+    )
+    forms: list[str] = Field(
+        default=[],
+        description='body forms of species by code, such as ["HAP=halibut"], beside those of the '
+        "list; a sure species gives its fish the form",
+    )
+
+    @field_validator("forms")
+    @classmethod
+    def _is_pair(cls, pairs: list[str]) -> list[str]:
+        if any(len([part for part in pair.split("=") if part.strip()]) != 2 for pair in pairs):
+            raise ValueError('pairs such as "HAP=halibut"')
+        return pairs
+
+
+UNSURE = "unsure"
+_LEAST = 1e-3  # what one frame says against a species is never more: it may show a hand. Chosen.
+
+
+class SpeciesFound(NamedTuple):
+    """The likeliest species of a fish."""
+
+    code: str  # FAO 3-alpha
+    share: float  # its posterior probability
+
+
+class SpeciesEvidence:
+    """Takes the frames of one fish.
+
+    Of n frames with probabilities p_t, the posterior of species s is
+
+        p(s) = exp(m mean_t log p_t(s)) / sum,    m = n / (1 + (n - 1) r)
+
+    where m is the number of independent frames that n frames are worth whose errors have the
+    correlation r, as for the mean of equally correlated numbers (Kish, Survey Sampling, 1965, 5.4).
+    All species are as likely beforehand.
+    """
+
+    def __init__(self, settings: SpeciesSettings) -> None:
+        self._correlation = settings.frame_correlation
+        self._sums: dict[str, float] = {}  # of log probabilities, by code
+        self._num_frames = 0
+
+    def add(self, probabilities: Mapping[str, float]) -> None:
+        """Take one frame; nothing where no classifier looked at it."""
+        if not probabilities:
+            return
+        self._num_frames += 1
+        for code, probability in probabilities.items():
+            self._sums[code] = self._sums.get(code, 0.0) + math.log(max(probability, _LEAST))
+
+    def posterior(self) -> dict[str, float]:
+        """The probability of each species; empty where no frame says anything."""
+        if not self._num_frames:
+            return {}
+        worth = self._num_frames / (1 + (self._num_frames - 1) * self._correlation)
+        logs = {code: worth * total / self._num_frames for code, total in self._sums.items()}
+        largest = max(logs.values())
+        weights = {code: math.exp(log - largest) for code, log in logs.items()}
+        total = sum(weights.values())
+        return {code: weight / total for code, weight in weights.items()}
+
+    def best(self) -> SpeciesFound | None:
+        """The likeliest species; None where no frame says anything."""
+        posterior = self.posterior()
+        if not posterior:
+            return None
+        code = max(posterior, key=lambda one: posterior[one])
+        return SpeciesFound(code, posterior[code])
+
+
+def forms_of_species(settings: SpeciesSettings) -> dict[str, str]:
+    """The body form that each species is near to, by code. Raises ConfigError."""
+    forms = {one.code: one.form for one in load_species(settings.own_list) if one.form}
+    for pair in settings.forms:
+        code, _, form = pair.partition("=")
+        forms[code.strip()] = form.strip()
+    return forms

@@ -1,0 +1,1 @@
+"""The database of lengths: fish, trip, verdicts, edits, ledger."""

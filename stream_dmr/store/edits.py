@@ -1,0 +1,287 @@
+"""Which frames each fish has, after what reviewers added, split and merged.
+
+The tracks of a run stay as they were recorded. A fish that reviewers made is a list of parts of
+tracks; its length is that of the frames in them, filtered as in a run (`edited_lengths`).
+"""
+
+import json
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from heapq import merge
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from stream_dmr.errors import UserError
+from stream_dmr.lengths.kalman import SmoothLengthSettings
+from stream_dmr.lengths.track_record import TrackLength
+from stream_dmr.messages import (
+    FishCrop,
+    FishMessage,
+    FittedMesh,
+    LengthEstimate,
+    LocalizedFish,
+    Message,
+)
+from stream_dmr.recording.codec import decode
+from stream_dmr.recording.reading import Recording, decoded_messages, messages_of, recorded_settings
+from stream_dmr.recording.selection import Selection
+from stream_dmr.store.schema import fish_row
+from stream_dmr.store.verdicts import (
+    EDITS,
+    AddedFrame,
+    Verdict,
+    read_added_frames,
+    read_verdicts,
+    standing,
+)
+
+_LAST = 2**62  # a frame number that no recording reaches
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackPart:
+    """The frames of one track from `first_frame` to `last_frame`, both included."""
+
+    track_id: int  # as recorded, or as added
+    first_frame: int = 0
+    last_frame: int = _LAST
+
+    def has(self, track_id: int, frame_index: int) -> bool:
+        """True for a frame of this part."""
+        return track_id == self.track_id and self.first_frame <= frame_index <= self.last_frame
+
+    def before(self, frame_index: int) -> "TrackPart":
+        """The part before a frame; it may be empty."""
+        return replace(self, last_frame=min(self.last_frame, frame_index - 1))
+
+    def since(self, frame_index: int) -> "TrackPart":
+        """The part from a frame on; it may be empty."""
+        return replace(self, first_frame=max(self.first_frame, frame_index))
+
+    @property
+    def is_empty(self) -> bool:
+        """True where it has room for no frame."""
+        return self.first_frame > self.last_frame
+
+
+@dataclass(frozen=True, kw_only=True)
+class EditedFish:
+    """A fish whose frames are not those of one recorded track."""
+
+    kind: str  # the last edit: add, split or merge
+    parts: tuple[TrackPart, ...]
+    row: Mapping[str, Any]  # its final estimate, as a row of `fish`
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackEdits:
+    """The fish that reviewers made."""
+
+    fish: Mapping[int, EditedFish] = field(default_factory=dict[int, EditedFish])  # by track id
+    merged: Mapping[int, int] = field(default_factory=dict[int, int])  # fish -> that goes on
+
+    def parts_of(self, track_id: int) -> tuple[TrackPart, ...]:
+        """The parts of a fish; of one that was not edited its whole track."""
+        edited = self.fish.get(track_id)
+        return (TrackPart(track_id=track_id),) if edited is None else edited.parts
+
+    def fish_of(self, track_id: int, frame_index: int) -> int:
+        """The fish that a frame of a recorded or added track belongs to."""
+        for fish, edited in self.fish.items():
+            if any(part.has(track_id, frame_index) for part in edited.parts):
+                return fish
+        return track_id
+
+    def after(self, verdict: Verdict) -> "TrackEdits":
+        """The fish after one more add, split or merge."""
+        rows = {row["track_id"]: row for row in json.loads(verdict.fish or "[]")}
+        fish, merged = dict(self.fish), dict(self.merged)
+        parts: dict[int, tuple[TrackPart, ...]] = {}
+        if verdict.kind == "add":
+            parts = {verdict.track_id: (TrackPart(track_id=verdict.track_id),)}
+        elif verdict.kind == "split" and verdict.other_fish is not None:
+            parts = self.split(verdict.track_id, verdict.frame_index or 0, verdict.other_fish)
+        elif verdict.kind == "merge" and verdict.other_fish is not None:
+            parts = {verdict.other_fish: self.merge(verdict.track_id, verdict.other_fish)}
+            fish.pop(verdict.track_id, None)
+            merged[verdict.track_id] = verdict.other_fish
+        for track_id, of_fish in parts.items():
+            row = rows.get(track_id, {})
+            fish[track_id] = EditedFish(kind=verdict.kind, parts=of_fish, row=row)
+        return TrackEdits(fish=fish, merged=merged)
+
+    def split(
+        self, track_id: int, frame_index: int, new_fish: int
+    ) -> dict[int, tuple[TrackPart, ...]]:
+        """The parts of a fish before a frame, and those from there on, which are a new fish."""
+        parts = self.parts_of(track_id)
+        before = (part.before(frame_index) for part in parts)
+        since = (part.since(frame_index) for part in parts)
+        return {
+            track_id: tuple(part for part in before if not part.is_empty),
+            new_fish: tuple(part for part in since if not part.is_empty),
+        }
+
+    def merge(self, track_id: int, into: int) -> tuple[TrackPart, ...]:
+        """The parts of two fish that are one."""
+        return (*self.parts_of(into), *self.parts_of(track_id))
+
+
+NO_EDITS = TrackEdits()
+
+
+def edits_of(verdicts: Sequence[Verdict]) -> TrackEdits:
+    """The fish that the verdicts make."""
+    edits = NO_EDITS
+    for verdict in standing(verdicts):
+        if verdict.kind in EDITS:
+            edits = edits.after(verdict)
+    return edits
+
+
+def changed_fish(before: TrackEdits, after: TrackEdits) -> set[int]:
+    """The fish that have other frames, that came or that went."""
+    fish = before.fish.keys() | after.fish.keys()
+    merged = before.merged.keys() ^ after.merged.keys()
+    return merged | {one for one in fish if before.fish.get(one) != after.fish.get(one)}
+
+
+Frames = Mapping[int, Sequence[LocalizedFish]]  # by recorded or added track, in order
+
+
+def settings_of(recording: Recording) -> SmoothLengthSettings:
+    """The filter's settings of the run that was recorded."""
+    return recorded_settings(recording, "smooth_length", SmoothLengthSettings)
+
+
+def frames_of_tracks(
+    recording: Recording, database: Path, track_ids: Iterable[int], last_frames: Mapping[int, int]
+) -> Frames:
+    """All frames of some tracks, of those that were added too.
+
+    `last_frames` by track: what came after it, under an id that had ended, never counted. Raises
+    RecordingError and OutputError.
+    """
+    wanted = frozenset(track_ids)
+    carried = [decode(LocalizedFish, payload) for payload in recording.carried_over()]
+    recorded = messages_of(recording, LocalizedFish, Selection(tracks=wanted))
+    added = read_added_frames(database)
+    frames: dict[int, list[LocalizedFish]] = {track_id: [] for track_id in wanted}
+    for fish in (*carried, *recorded):
+        if fish.track_id in wanted:
+            last = last_frames.get(fish.track_id)
+            if last is None or fish.frame_index <= last:
+                frames[fish.track_id].append(fish)
+    for track_id in wanted & added.keys():
+        frames[track_id] = [localized(frame) for frame in added[track_id]]
+    return frames
+
+
+def localized(frame: AddedFrame) -> LocalizedFish:
+    """The last message of a frame that a reviewer added."""
+    return decode(LocalizedFish, frame.fish)
+
+
+def frames_of_parts(
+    frames: Frames, parts: Iterable[TrackPart], *, fish: int
+) -> list[LocalizedFish]:
+    """The frames of a fish in their order. Raises UserError where two are of one moment."""
+    chosen = [
+        replace(one, track_id=fish)
+        for part in parts
+        for one in frames[part.track_id]
+        if part.has(one.track_id, one.frame_index)
+    ]
+    if len({one.frame_index for one in chosen}) < len(chosen):
+        raise UserError(
+            "verdict: expected two tracks that follow each other, got two that are in view "
+            "together; one may be a duplicate of the other"
+        )
+    return sorted(chosen, key=lambda one: one.frame_index)
+
+
+def length_of_frames(
+    frames: Sequence[LocalizedFish], settings: SmoothLengthSettings
+) -> list[LengthEstimate]:
+    """The running estimate after each frame, and the final one at the end."""
+    track = TrackLength(frames[0], settings)
+    return [*(track.add(fish) for fish in frames), track.finish()]
+
+
+def edited_row(
+    frames: Sequence[LocalizedFish], settings: SmoothLengthSettings, flags: Sequence[str]
+) -> dict[str, Any]:
+    """The row of `fish` that a run would have written for these frames."""
+    ious = [fish.iou for fish in frames if fish.accepted and fish.iou is not None]
+    estimate = length_of_frames(frames, settings)[-1]
+    return fish_row(estimate, flags) | {"iou": median(ious) if ious else None}
+
+
+_STAGES: Mapping[type[Message], str] = {FishCrop: "crop", FittedMesh: "fit", LocalizedFish: "fish"}
+
+
+class ReviewedMessages:
+    """Messages of the stages of each fish in each frame; those of `LengthEstimate` are the run's.
+
+    Without a database, or where reviewers changed no track, they are those of the recording.
+    """
+
+    def __init__(self, recording: Recording, database: Path | None, selection: Selection) -> None:
+        """`selection` by the numbers that fish have after the review."""
+        self._recording, self._selection = recording, selection
+        verdicts = [] if database is None else read_verdicts(database)
+        self.edits: TrackEdits = edits_of(verdicts) if verdicts else NO_EDITS
+        self._added: Mapping[int, Sequence[AddedFrame]] = {}
+        if database is not None and self.edits.fish:
+            self._added = read_added_frames(database)
+
+    def of(self, kinds: Collection[type[Message]]) -> Iterator[Message]:
+        """In the order of their time."""
+        if not self.edits.fish:
+            found = decoded_messages(self._recording, kinds, self._selection)
+            yield from (message for message, _ in found)
+            return
+        recorded = decoded_messages(self._recording, kinds, self._by_track())
+        messages = merge(
+            (message for message, _ in recorded),
+            self._of_added(kinds),
+            key=lambda message: message.timestamp_ns,
+        )
+        for message in messages:
+            if isinstance(message, FishMessage) and not isinstance(message, LengthEstimate):
+                fish = self.edits.fish_of(message.track_id, message.frame_index)
+                message = replace(message, track_id=fish)
+            if self._selection.includes(message):
+                yield message
+
+    def estimates(self) -> dict[int, dict[int, LengthEstimate]]:
+        """Of each fish that reviewers made, by frame: the running estimate after it."""
+        frames = defaultdict[int, list[LocalizedFish]](list)
+        for message in self.of([LocalizedFish]) if self.edits.fish else ():
+            if isinstance(message, LocalizedFish) and message.track_id in self.edits.fish:
+                frames[message.track_id].append(message)
+        settings = settings_of(self._recording)
+        return {
+            fish: {one.frame_index: one for one in length_of_frames(of_fish, settings)[:-1]}
+            for fish, of_fish in frames.items()
+        }
+
+    def _by_track(self) -> Selection:
+        """The selection of the recorded tracks that the selected fish consist of."""
+        fish = self._selection.tracks
+        if fish is None:
+            return self._selection
+        parts = (part.track_id for one in fish for part in self.edits.parts_of(one))
+        return replace(self._selection, tracks=frozenset(parts))
+
+    def _of_added(self, kinds: Collection[type[Message]]) -> Iterator[Message]:
+        wanted = [(kind, name) for kind, name in _STAGES.items() if kind in kinds]
+        standing = {part.track_id for fish in self.edits.fish.values() for part in fish.parts}
+        frames = [one for track, of in self._added.items() if track in standing for one in of]
+        for frame in sorted(frames, key=lambda one: one.frame_index):
+            for kind, name in wanted:
+                message = decode(kind, getattr(frame, name))
+                if self._selection.includes_time(message.timestamp_ns):
+                    yield message

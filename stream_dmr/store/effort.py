@@ -1,0 +1,98 @@
+"""How much was watched and measured, by haul: what counts of fish are to be divided by."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from stream_dmr.store.fish import FishResult, read_runs
+from stream_dmr.store.schema import read_added
+from stream_dmr.store.trip import HAULS, WATCHED, Haul, hauls_of
+
+_HOUR_NS = 3_600_000_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class HaulEffort:
+    """One haul, or the time outside of hauls with the name ""."""
+
+    haul: str
+    began_ns: int | None = None  # on the clock of the frames; None: of no event
+    ended_ns: int | None = None
+    hours_watched: float = 0.0  # of which there are frames
+    share_measured: float | None = None  # of the frames that came; None: not known
+    num_fish: int = 0
+    num_measured: int = 0  # with a length
+    fates: Mapping[str, int] | None = None  # number of fish; None: nobody looked for any's fate
+
+
+def read_effort(database: Path, fish: Sequence[FishResult]) -> list[HaulEffort]:
+    """The effort of each haul of a folder, and of what is outside of them. Raises OutputError."""
+    hauls = hauls_of(read_added(database, HAULS))
+    watched = read_added(database, WATCHED)
+    if hauls:
+        efforts = [_effort_of_hauls(named, watched, fish) for named in _by_name(hauls)]
+        shares = [1.0 - _overlap(row, hauls) for row in watched]
+        outside = _effort("", watched, shares, fish)
+        is_worth_a_row = outside.num_fish or outside.hours_watched > 1e-3
+        return [*efforts, *([outside] if is_worth_a_row else [])]
+    by_run = {run_id: facts.haul for run_id, facts in read_runs(database).items()}
+    return [
+        _effort(name, watched, [float(by_run.get(r["run_id"]) == name) for r in watched], fish)
+        for name in dict.fromkeys(by_run.values())
+    ]
+
+
+def _by_name(hauls: Sequence[Haul]) -> list[list[Haul]]:
+    """The hauls of each name: one may be begun, ended, and begun again after others."""
+    named: dict[str, list[Haul]] = {}
+    for haul in hauls:
+        named.setdefault(haul.name, []).append(haul)
+    return list(named.values())
+
+
+def _effort_of_hauls(
+    hauls: Sequence[Haul], watched: Sequence[Mapping[str, Any]], fish: Sequence[FishResult]
+) -> HaulEffort:
+    """Of hauls of one name; from the first start to the last end, without what lies between."""
+    effort = _effort(hauls[0].name, watched, [_overlap(row, hauls) for row in watched], fish)
+    return replace(effort, began_ns=hauls[0].began_ns, ended_ns=hauls[-1].ended_ns)
+
+
+def _effort(
+    name: str,
+    watched: Sequence[Mapping[str, Any]],
+    shares: Sequence[float],
+    fish: Sequence[FishResult],
+) -> HaulEffort:
+    """`shares` (one a row of `watched`, 0 to 1): what of each watched time belongs to it."""
+    parts = list(zip(watched, shares, strict=True))
+    frames = sum(row["frames"] * share for row, share in parts)
+    lost = sum(row["frames_lost"] * share for row, share in parts)
+    of_haul = [one for one in fish if one.haul == name]
+    has_fates = any(one.fate is not None for one in fish)
+    return HaulEffort(
+        haul=name,
+        hours_watched=sum((_hours(row) * share for row, share in parts), start=0.0),
+        share_measured=frames / (frames + lost) if frames + lost else None,
+        num_fish=len(of_haul),
+        num_measured=sum(one.length_mm is not None for one in of_haul),
+        fates=Counter(one.fate for one in of_haul if one.fate) if has_fates else None,
+    )
+
+
+def _hours(row: Mapping[str, Any]) -> float:
+    return (row["last_ns"] - row["first_ns"]) / _HOUR_NS
+
+
+def _overlap(row: Mapping[str, Any], hauls: Sequence[Haul]) -> float:
+    """The share of a watched time that lies in hauls."""
+    span_ns = row["last_ns"] - row["first_ns"]
+    if span_ns <= 0:
+        return float(any(haul.includes(row["first_ns"]) for haul in hauls))
+    covered = 0
+    for haul in hauls:
+        end_ns = row["last_ns"] if haul.ended_ns is None else min(row["last_ns"], haul.ended_ns)
+        covered += max(0, end_ns - max(row["first_ns"], haul.began_ns))
+    return covered / span_ns

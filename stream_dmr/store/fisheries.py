@@ -1,0 +1,111 @@
+"""Quantities of a fishery from a length: total and fork length, cm, weight, legal size."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from pydantic import Field
+
+from stream_dmr.settings import Settings
+from stream_dmr.store.fish import is_same_species
+from stream_dmr.template.template import Template
+
+
+class FisheriesSettings(Settings):
+    """`[fisheries]`: the columns of `stream-dmr export --fish` that follow from a length."""
+
+    species: str = Field(
+        default="halibut",
+        description="code or name of the species to which weight and legal size apply, or its "
+        "template; others get neither",
+    )
+    rounding: Literal["down", "nearest"] = Field(
+        default="down",
+        description='whole centimetres: "down" (to the centimetre below, as boards do), "nearest"',
+    )
+    weight_a: float = Field(
+        default=3.139e-6, ge=0, description="a of W = a L^b, kg and cm; 0: no weight"
+    )
+    weight_b: float = Field(default=3.24, ge=1, le=5, description="b of W = a L^b (no unit)")
+    weight_length: Literal["fork", "total"] = Field(
+        default="fork", description="the L of W = a L^b"
+    )
+    weight_source: str = Field(
+        default="Clark 1992, IPHC Report of Assessment and Research Activities 1991: 113-116; "
+        "net weight (gutted, head off), 6.921e-6 lb cm^-3.24",
+        description="source of a and b, copied into the exports; how the default was "
+        "checked, and against what: docs/research/fishery-numbers.md",
+    )
+    legal_cm: float = Field(
+        default=81.3, ge=0, description="smallest length that may be landed, cm; 0: no flag"
+    )
+    legal_length: Literal["fork", "total"] = Field(
+        default="fork", description="length that the legal size refers to"
+    )
+    legal_source: str = Field(
+        default="IPHC-IB-2017-01: 32 inches, commercial, head on; lower jaw to middle of tail",
+        description="source of the legal size, copied into the exports; see "
+        "docs/research/fishery-numbers.md",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Derived:
+    """What follows from one length; None where it is not known."""
+
+    fork_length_mm: float | None = None
+    total_length_mm: float | None = None
+    length_cm: int | None = None  # of the length by which the species is measured, see `derive`
+    weight_kg: float | None = None
+    is_legal_size: bool | None = None
+
+
+def derive(
+    length_mm: float | None,
+    template: Template,
+    settings: FisheriesSettings,
+    *,
+    species: str | None = None,
+) -> Derived:
+    """All that follows from the length from snout to tail keypoint, in mm.
+
+    The template says which length its tail keypoint ends, and total over fork length; without the
+    one neither is known, without the other only the first. Whole centimetres are those of the
+    length as it is measured. Weight and legal size are for the settings' species alone; `species`:
+    the fish's, where it is not the template's.
+    """
+    if length_mm is None:
+        return Derived()
+    lengths = _both_lengths(length_mm, template)
+    is_species = is_same_species(species or template.name, settings.species)
+    weighed, legal = lengths[settings.weight_length], lengths[settings.legal_length]
+    has_weight = is_species and settings.weight_a > 0 and weighed is not None
+    has_legal = is_species and settings.legal_cm > 0 and legal is not None
+    return Derived(
+        fork_length_mm=lengths["fork"],
+        total_length_mm=lengths["total"],
+        length_cm=whole_cm(length_mm, settings.rounding),
+        weight_kg=weight_kg(weighed, settings) if has_weight and weighed is not None else None,
+        is_legal_size=legal / 10 >= settings.legal_cm if has_legal and legal is not None else None,
+    )
+
+
+def weight_kg(length_mm: float, settings: FisheriesSettings) -> float:
+    """W = a L^b."""
+    return settings.weight_a * (length_mm / 10) ** settings.weight_b
+
+
+def whole_cm(length_mm: float, rounding: str) -> int:
+    """Whole centimetres, down or to the nearest (a half goes up)."""
+    return math.floor(length_mm / 10 + (0.5 if rounding == "nearest" else 0.0))
+
+
+def _both_lengths(length_mm: float, template: Template) -> dict[str, float | None]:
+    factor = template.total_per_fork
+    match template.tail_gives:
+        case "fork":
+            return {"fork": length_mm, "total": None if factor is None else length_mm * factor}
+        case "total":
+            return {"fork": None if factor is None else length_mm / factor, "total": length_mm}
+        case _:
+            return {"fork": None, "total": None}

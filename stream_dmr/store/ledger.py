@@ -1,0 +1,213 @@
+"""Device keys (Ed25519), and the chain of signed entries over what a device wrote.
+
+Each entry holds a number, the hash of the entry before it, and the hash of one thing: a fish, an
+event, a run or a file. So nothing can be changed, removed, put in or moved without the key.
+"""
+
+import json
+import os
+import sqlite3
+import stat
+import time
+from base64 import b64decode, b64encode
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from hashlib import sha256
+from pathlib import Path
+
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+from stream_dmr.errors import OutputError, UserError
+from stream_dmr.store.schema import Statement, has_table, insertion, rows_of
+
+# Of an entry. A file that was "found" lay there when a run started, after a crash or renamed.
+FISH, EVENT, RUN, END, FILE, FOUND, REMOVED = (
+    *("fish", "event", "run", "end", "file", "found", "removed"),
+)
+STATE, CHECKS = "state", "checks"  # at the end of a run: what `store_state` reads
+FILE_KINDS = (FILE, FOUND, REMOVED)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChainEntry:
+    """One link of the chain, as a row of the table `chain` in lengths.db."""
+
+    number: int  # from 1, without gaps
+    previous: str  # `sha256_of` the entry before it; "" of the first
+    kind: str
+    name: str  # track id, run id or file name
+    content_sha256: str  # "" of a file that was removed
+    time_ns: int  # wall clock
+    signature: str = ""  # Ed25519 over `signed_bytes`, base64
+
+    @property
+    def signed_bytes(self) -> bytes:
+        """All but the signature."""
+        return _canonical({k: v for k, v in asdict(self).items() if k != "signature"})
+
+    @property
+    def sha256(self) -> str:
+        """Of the whole entry, for the one after it."""
+        return sha256(_canonical(asdict(self))).hexdigest()
+
+    def is_signed_by(self, key: Ed25519PublicKey) -> bool:
+        """True where the signature is this key's, and of this entry."""
+        try:
+            key.verify(b64decode(self.signature), self.signed_bytes)
+        except (InvalidSignature, ValueError):
+            return False
+        return True
+
+
+class Signer:
+    """Signs entries with a device's private key, each after the one before."""
+
+    def __init__(self, key_file: Path) -> None:
+        """Raises UserError where the file is no private key, or others may read it."""
+        self._key = _load_private_key(key_file)
+        self._last: ChainEntry | None = None
+
+    def continue_after(self, last: ChainEntry | None) -> None:
+        """Go on with the chain of a folder; None: begin one."""
+        self._last = last
+
+    def sign(self, kind: str, name: str, content_sha256: str) -> ChainEntry:
+        """The next entry."""
+        unsigned = ChainEntry(
+            number=1 if self._last is None else self._last.number + 1,
+            previous="" if self._last is None else self._last.sha256,
+            kind=kind,
+            name=name,
+            content_sha256=content_sha256,
+            time_ns=time.time_ns(),
+        )
+        signature = b64encode(self._key.sign(unsigned.signed_bytes)).decode()
+        self._last = replace(unsigned, signature=signature)
+        return self._last
+
+
+def lines_sha256(lines: Iterable[str]) -> str:
+    """SHA-256 of the rows of a database, a line each."""
+    return sha256("\n".join(lines).encode()).hexdigest()
+
+
+def content_sha256(values: Mapping[str, object]) -> str:
+    """SHA-256 of a row: its columns by name, without those that have no value."""
+    return sha256(_canonical({k: v for k, v in values.items() if v is not None})).hexdigest()
+
+
+def make_key(path: Path) -> Path:
+    """Write a private key that only its owner can read, and `path`.pub; returns the latter.
+
+    Raises OutputError where one of them exists or can't be written.
+    """
+    key, public = Ed25519PrivateKey.generate(), path.with_name(f"{path.name}.pub")
+    private = key.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    )
+    shared = key.public_key().public_bytes(
+        serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo
+    )
+    try:
+        for target, data, mode in ((path, private, 0o600), (public, shared, 0o644)):
+            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+            with os.fdopen(os.open(target, flags, mode), "wb") as file:
+                file.write(data)
+    except OSError as error:
+        raise OutputError(
+            f"{error.filename}: expected a name that is free for a key, got: {error.strerror}; "
+            "choose another"
+        ) from error
+    return public
+
+
+def load_public_key(path: Path) -> Ed25519PublicKey:
+    """The public key of a device. Raises UserError where it is none."""
+    try:
+        key = serialization.load_pem_public_key(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise _no_key(path, "public", error) from error
+    if not isinstance(key, Ed25519PublicKey):
+        raise _no_key(path, "public", "a key of another kind")
+    return key
+
+
+def _load_private_key(path: Path) -> Ed25519PrivateKey:
+    try:
+        mode = path.stat().st_mode
+        key = serialization.load_pem_private_key(path.read_bytes(), password=None)
+    except (OSError, ValueError, TypeError) as error:
+        raise _no_key(path, "private", error) from error
+    if not isinstance(key, Ed25519PrivateKey):
+        raise _no_key(path, "private", "a key of another kind")
+    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise UserError(
+            f"--key {path}: expected a private key that only its owner can read, got mode "
+            f"{stat.S_IMODE(mode):o}; do: chmod 600 {path}"
+        )
+    return key
+
+
+def _no_key(path: Path, kind: str, error: object) -> UserError:
+    got = error.strerror if isinstance(error, OSError) else "something else"
+    return UserError(
+        f"--key {path}: expected the {kind} key of a device, got: {got}; make one with "
+        "stream-dmr keygen"
+    )
+
+
+def _canonical(values: Mapping[str, object]) -> bytes:
+    return json.dumps(values, sort_keys=True, separators=(",", ":")).encode()
+
+
+_NAMES = ", ".join(field.name for field in fields(ChainEntry))
+_TABLE = """
+CREATE TABLE IF NOT EXISTS chain (
+    number INTEGER PRIMARY KEY, -- from 1, without gaps
+    previous TEXT NOT NULL, -- SHA-256 of the entry before it
+    -- of what: fish, event, run, end, file, found, removed, state, checks
+    kind TEXT NOT NULL, name TEXT NOT NULL,
+    content_sha256 TEXT NOT NULL,
+    time_ns INTEGER NOT NULL, -- wall clock
+    signature TEXT NOT NULL -- Ed25519, base64
+) STRICT
+"""
+
+
+class ChainWriter:
+    """Gives the statements that sign what a store writes, for the same transaction.
+
+    Without a signer there are none.
+    """
+
+    def __init__(self, signer: Signer | None, database: sqlite3.Connection) -> None:
+        self._signer = signer
+        self._is_begun = False
+        if signer is not None:
+            entries = read_chain(database)
+            signer.continue_after(entries[-1] if entries else None)
+
+    def row(self, kind: str, name: str, values: Mapping[str, object]) -> list[Statement]:
+        """Sign a row by its columns."""
+        return [] if self._signer is None else self.content(kind, name, content_sha256(values))
+
+    def content(self, kind: str, name: str, sha256: str) -> list[Statement]:
+        """Sign anything by its hash."""
+        if self._signer is None:
+            return []
+        begin: list[Statement] = [] if self._is_begun else [(_TABLE, ())]
+        self._is_begun = True
+        entry = self._signer.sign(kind, name, sha256)
+        return [*begin, insertion("chain", asdict(entry))]
+
+
+def read_chain(database: sqlite3.Connection) -> Sequence[ChainEntry]:
+    """All entries in their order; none where nothing was signed."""
+    if not has_table(database, "chain"):
+        return []
+    query = f"SELECT {_NAMES} FROM chain ORDER BY number"
+    return [ChainEntry(**row) for row in rows_of(database, query)]

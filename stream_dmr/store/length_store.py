@@ -1,0 +1,432 @@
+"""LengthStore: writes every finished fish into lengths.db, durable the moment its track ends.
+
+The database also holds what a restart must not use again: track ids, frame numbers and capture
+times.
+"""
+
+import sqlite3
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from threading import RLock
+from typing import Literal
+from uuid import uuid4
+
+from stream_dmr.errors import OutputError
+from stream_dmr.files import FolderLock, ReservedSpace
+from stream_dmr.messages import LengthEstimate
+from stream_dmr.store.ledger import (
+    CHECKS,
+    END,
+    EVENT,
+    FILE_KINDS,
+    FISH,
+    RUN,
+    STATE,
+    ChainWriter,
+    Signer,
+    lines_sha256,
+    read_chain,
+)
+from stream_dmr.store.run_facts import END_COLUMNS, NOT_ENDED, UNKNOWN_CATCH, CatchFacts, RunFacts
+from stream_dmr.store.schema import (
+    MAY_COUNT_TWICE,
+    NAME,
+    REVIEWED_ID,
+    AddedTable,
+    DiskRefusal,
+    Statement,
+    check_lines,
+    copy_in_memory,
+    fish_row,
+    insertion,
+    open_for_writing,
+    read_estimates,
+    read_state,
+    transaction,
+)
+
+MARK = "INSERT INTO marks VALUES (?1, ?2) ON CONFLICT (name) DO UPDATE SET value = ?2"
+WRITTEN = "written"
+"""The mark of how many statements were committed: a commit that failed may have been one."""
+_GET_WRITTEN = "SELECT value FROM marks WHERE name = ?"
+
+
+class WaitingRows:
+    """Statements for a lengths.db, in order, and its connection. Not thread-safe.
+
+    What the disk refuses stays in memory and is tried again with everything that follows; meanwhile
+    a copy of the file in memory answers questions.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        reserve: ReservedSpace,
+        *,
+        waits_for_disk: bool,
+        state: Callable[[], Iterable[Statement]],
+    ) -> None:
+        """`state` is what every commit writes as well, as it is at that moment.
+
+        Raises OutputError where the file can't be used; with `waits_for_disk` only where that is
+        not for the disk.
+        """
+        self._path, self._reserve, self._state = path, reserve, state
+        self.pending: list[Statement] = []
+        self.trouble = ""  # why the last row could not be written; "" when all are
+        self.database, self.is_reached = self._open(waits_for_disk=waits_for_disk)
+        self._is_stand_in = not self.is_reached
+        self._written = _num_written(self.database)
+
+    def write(self, *statements: Statement) -> None:
+        """Commit all that waits, and these; where that fails, with the reserved space once more."""
+        self.pending += statements
+        for is_last in (False, True):
+            try:
+                self._reach_file()
+                self._commit()
+                return
+            except sqlite3.IntegrityError:  # a fish that is there already: our own mistake
+                raise
+            except (sqlite3.Error, OutputError) as error:
+                self.trouble = str(error.__cause__ or error)
+            self.is_reached = False
+            if not is_last:
+                self._reserve.release()
+
+    def close(self) -> None:
+        """Close the file; what still waits is lost."""
+        with suppress(sqlite3.Error):
+            self.database.close()
+
+    def _open(self, *, waits_for_disk: bool) -> tuple[sqlite3.Connection, bool]:
+        """The file and True, or a copy of it in memory and False."""
+        try:
+            return open_for_writing(self._path), True
+        except DiskRefusal as error:
+            if not waits_for_disk:
+                raise
+            self.trouble = str(error.__cause__)
+        self._reserve.release()
+        with suppress(DiskRefusal):
+            return open_for_writing(self._path), True
+        return copy_in_memory(self._path), False
+
+    def _commit(self) -> None:
+        written = self._written + len(self.pending)
+        with transaction(self.database):
+            for statement, values in (*self.pending, *self._state(), (MARK, (WRITTEN, written))):
+                self.database.execute(statement, values)
+        self._written = written
+        self.pending.clear()
+        self.trouble = ""
+
+    def _reach_file(self) -> None:
+        """Open the file again after an error; forget rows that were committed in spite of it."""
+        if self.is_reached:
+            return
+        if not self._is_stand_in:
+            self.database.close()  # SQLite may hold on to a state of the file that never was
+        try:
+            fresh = open_for_writing(self._path)
+        except DiskRefusal:
+            if not self._is_stand_in:
+                self.database, self._is_stand_in = copy_in_memory(self._path), True
+            raise
+        self.database.close()
+        self.database, self.is_reached, self._is_stand_in = fresh, True, False
+        written = _num_written(fresh)
+        del self.pending[: max(0, written - self._written)]
+        self._written = written
+
+
+def _num_written(database: sqlite3.Connection) -> int:
+    row = database.execute(_GET_WRITTEN, (WRITTEN,)).fetchone()
+    return 0 if row is None else row[0]
+
+
+_MARK_EVERY_NS = 5_000_000_000  # capture times that a crash may leave unmarked; chosen
+_FRAMES_AHEAD = 1000  # frame numbers that are marked as used at a time; a crash skips the rest
+_COUNTS = "UPDATE runs SET frames_done = ?, frames_promised = ? WHERE run_id = ?"
+_END = f"UPDATE runs SET {' = ?, '.join(END_COLUMNS)} = ? WHERE run_id = ?"
+_CLIP = "INSERT OR REPLACE INTO clips VALUES (?, ?, ?)"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Marks:
+    """The last numbers that runs in this folder have used; 0 where there was none."""
+
+    track_id: int = 0
+    frame_index: int = 0
+    timestamp_ns: int = 0  # capture time
+
+
+class LengthStore:
+    """The lengths of one output folder, which it locks for this run. Thread-safe.
+
+    A row that the disk refuses stays in memory and is tried again with everything that follows;
+    `trouble` has the reason meanwhile, and `close` raises OutputError if it was never written.
+    """
+
+    def __init__(
+        self,
+        out_dir: Path,
+        facts: RunFacts,
+        *,
+        waits_for_disk: bool = False,
+        signer: Signer | None = None,
+    ) -> None:
+        """Raises OutputError where another run writes there or the file can't be used.
+
+        With `waits_for_disk`, rows wait in memory from the start where the disk refuses the file.
+        With a `signer`, everything that is written is signed in the same transaction.
+        """
+        self.path = out_dir / NAME
+        self.run_id = uuid4().hex
+        self._facts = replace(facts, ended_by=NOT_ENDED)
+        self._reserve = ReservedSpace(out_dir)
+        self._lock = RLock()
+        self._clip: tuple[str, int] | None = None  # in work, and its frames done
+        self._lock_of_folder = FolderLock(out_dir)
+        try:
+            self._rows = WaitingRows(
+                self.path, self._reserve, waits_for_disk=waits_for_disk, state=self._state
+            )
+            self.before = self._used = _marks(self._rows.database)
+            self.is_signing = signer is not None
+            self._chain = ChainWriter(signer, self._rows.database)
+            self._begin_run(waits_for_disk=waits_for_disk)
+        except BaseException:
+            self._lock_of_folder.release()
+            raise
+        self._marked_at_ns = time.monotonic_ns()
+        self._reserve.reserve()
+
+    @property
+    def trouble(self) -> str:
+        """Why the last row could not be written; "" when all are."""
+        return self._rows.trouble
+
+    def add(
+        self,
+        estimate: LengthEstimate,
+        *,
+        iou: float | None = None,
+        flags: Sequence[str] = (),
+        catch: CatchFacts = UNKNOWN_CATCH,
+    ) -> None:
+        """Write a final estimate durably; `flags`: what a reader of this length must know.
+
+        `iou`: median over its accepted frames, of mesh and mask.
+        """
+        values = fish_row(estimate, flags) | {"iou": iou, "run_id": self.run_id} | asdict(catch)
+        values["written_ns"] = time.time_ns()
+        with self._lock:
+            signature = self._chain.row(FISH, str(estimate.track_id), values)
+            self._write(insertion("fish", values), *signature)
+
+    def reserve_track(self, track_id: int) -> None:
+        """Mark an id as used, durably: no later run in this folder uses it again."""
+        if track_id > self._used.track_id:
+            self._mark(track_id=track_id)
+
+    def frame_passed(self, *, frame_index: int, timestamp_ns: int) -> None:
+        """Mark a frame: its number durably at once, its capture time within seconds."""
+        is_due = time.monotonic_ns() - self._marked_at_ns > _MARK_EVERY_NS
+        if is_due or frame_index > self._used.frame_index:
+            self._marked_at_ns = time.monotonic_ns()
+            self._mark(frame_index=frame_index + _FRAMES_AHEAD, timestamp_ns=timestamp_ns)
+
+    def count_frames(self, promised: int | None) -> None:
+        """Count the frames that are done from now on, of as many as the source promises."""
+        self._facts = replace(self._facts, frames_done=0, frames_promised=promised)
+
+    def frame_done(self) -> None:
+        """A frame went through the whole chain; durable with the next fish or mark."""
+        with self._lock:
+            self._facts = replace(self._facts, frames_done=(self._facts.frames_done or 0) + 1)
+
+    def end(self, ended_by: str, *, promised: int | None = None) -> None:
+        """Say what ended the run, before `close`; `promised`: where that is known only now."""
+        promised = self._facts.frames_promised if promised is None else promised
+        self._facts = replace(self._facts, ended_by=ended_by, frames_promised=promised)
+
+    def clip_progress(self, name: str, *, frames_done: int) -> None:
+        """Mark how far a clip is measured; durable with the next fish or mark.
+
+        So a restart neither repeats a finished fish nor begins the clip again.
+        """
+        with self._lock:
+            if self._clip is not None and self._clip[0] != name:
+                self._rows.pending.append((_CLIP, (*self._clip, 1)))
+            self._clip = name, frames_done
+
+    def clips_before(self) -> tuple[set[str], dict[str, int]]:
+        """The clips that earlier runs have finished, and the frames done of others."""
+        rows = self._rows.database.execute(
+            "SELECT name, frames_done, is_done FROM clips"
+        ).fetchall()
+        done = {name for name, _, is_done in rows if is_done}
+        return done, {name: frames for name, frames, is_done in rows if not is_done}
+
+    def resume_after_ns(self) -> int:
+        """The capture time after which a live source goes on, whatever the clock was set to."""
+        mark_ns = self.before.timestamp_ns
+        return mark_ns if time.time_ns() > mark_ns else mark_ns + _MARK_EVERY_NS
+
+    @property
+    def calibration_sha256(self) -> str:
+        """Of the file that this run was given; "" without one."""
+        return self._facts.calibration_sha256
+
+    def scene(self) -> bytes | None:
+        """The static scene (see `DriftAlarms`) when this run's calibration was first used here."""
+        query = "SELECT data FROM scenes WHERE calibration_sha256 = ?"
+        row = self._rows.database.execute(query, (self._facts.calibration_sha256,)).fetchone()
+        return None if row is None else row[0]
+
+    def keep_scene(self, data: bytes) -> None:
+        """Write the static scene of this calibration, for this run and later ones."""
+        key = self._facts.calibration_sha256
+        self._write(("INSERT OR IGNORE INTO scenes VALUES (?, ?)", (key, data)))
+
+    def first_ious(self, count: int) -> list[float]:
+        """The IoU of the first `count` fish that were measured here with this calibration."""
+        query = (
+            "SELECT iou FROM fish JOIN runs USING (run_id) "
+            "WHERE calibration_sha256 = ? AND iou IS NOT NULL ORDER BY number LIMIT ?"
+        )
+        rows = self._rows.database.execute(query, (self._facts.calibration_sha256, count))
+        return [iou for (iou,) in rows]
+
+    def note(self, kind: str, text: str, *, timestamp_ns: int) -> None:
+        """Write an event that readers of the lengths must know."""
+        values = {"run_id": self.run_id, "kind": kind, "text": text}
+        values |= {"timestamp_ns": timestamp_ns, "written_ns": time.time_ns()}
+        with self._lock:
+            signature = self._chain.row(EVENT, kind, values)
+            self._write(insertion("events", values), *signature)
+
+    def append(
+        self, table: AddedTable, name: str, values: Mapping[str, object], *, is_urgent: bool = True
+    ) -> None:
+        """Add a row of this run to a table, signed by `name`.
+
+        Not `is_urgent`: it is durable with the next fish or mark.
+        """
+        row = {"run_id": self.run_id, **values, "written_ns": time.time_ns()}
+        with self._lock:
+            signature = self._chain.row(table.kind, name, row)
+            self._rows.pending += [(table.statement, ()), insertion(table.name, row), *signature]
+            if is_urgent:
+                self._rows.write()
+
+    def sign_file(self, kind: str, name: str, sha256: str) -> None:
+        """Sign a file of the folder by its hash, durably; nothing without a signer."""
+        with self._lock:
+            self._write(*self._chain.content(kind, name, sha256))
+
+    def signed_files(self) -> set[str]:
+        """The names of all files that were ever signed here."""
+        with self._lock:
+            entries = read_chain(self._rows.database)
+        return {entry.name for entry in entries if entry.kind in FILE_KINDS}
+
+    def estimates(self, *, last: int | None = None) -> list[LengthEstimate]:
+        """The finished fish of this folder, in the order in which tracks ended; the `last` few."""
+        with self._lock:
+            try:
+                return list(read_estimates(self._rows.database, last=last))
+            except sqlite3.Error as error:
+                raise OutputError(
+                    f"{self.path}: expected a database of lengths, got: {error}; make room, or "
+                    "choose another --out"
+                ) from error
+
+    def may_count_twice(self) -> set[int]:
+        """The track ids of the fish that were in view at a crash."""
+        query = "SELECT track_id FROM fish WHERE flags LIKE ?"
+        with self._lock:
+            return {i for (i,) in self._rows.database.execute(query, (f"%{MAY_COUNT_TWICE}%",))}
+
+    def counts(self, column: Literal["status", "species_code", "fate"]) -> dict[str, int]:
+        """The number of finished fish by what stands in a column; not of those without it."""
+        query = f"SELECT {column}, COUNT(*) FROM fish WHERE {column} NOT NULL GROUP BY {column}"
+        with self._lock:
+            return dict(self._rows.database.execute(query))
+
+    def close(self) -> None:
+        """End the run and leave one file. Idempotent.
+
+        Raises OutputError where rows could not be written.
+        """
+        if not self._lock_of_folder.is_held:
+            return
+        values = {"ended_ns": time.time_ns()}
+        values |= {name: getattr(self._facts, name) for name in END_COLUMNS if name not in values}
+        with self._lock:
+            self._write(*self._signed_state())
+            signature = self._chain.row(END, self.run_id, {"run_id": self.run_id} | values)
+            self._write((_END, (*values.values(), self.run_id)), *signature)
+        self._rows.close()
+        self._reserve.release()
+        self._lock_of_folder.release()
+        if self.trouble:
+            raise OutputError(
+                f"{self.path}: expected room for {len(self._rows.pending)} more rows, got: "
+                f"{self.trouble}; the recording has them: make room and run stream-dmr recover"
+            )
+
+    def _signed_state(self) -> list[Statement]:
+        """Signs what else the file holds, once all of it is written."""
+        self._rows.write()
+        if not self.is_signing or self.trouble:
+            return []
+        state, checks = read_state(self._rows.database), check_lines(self._rows.database)
+        return [
+            *self._chain.row(STATE, self.run_id, state),
+            *self._chain.content(CHECKS, str(len(checks)), lines_sha256(checks)),
+        ]
+
+    def _begin_run(self, *, waits_for_disk: bool) -> None:
+        values = {"run_id": self.run_id, "started_ns": time.time_ns()}
+        values |= {field.name: getattr(self._facts, field.name) for field in fields(self._facts)}
+        begun = {k: v for k, v in values.items() if k not in END_COLUMNS}
+        signature = self._chain.row(RUN, self.run_id, begun)
+        self._rows.pending += [insertion("runs", values), *signature]
+        if self._rows.is_reached:
+            self._rows.write()
+            if self.trouble and not waits_for_disk:
+                raise OutputError(
+                    f"{self.path}: expected a database of lengths to write to, got: "
+                    f"{self.trouble}; make room, or choose another --out"
+                )
+
+    def _mark(self, **marks: int) -> None:
+        with self._lock:
+            higher = {n: max(v, getattr(self._used, n)) for n, v in marks.items()}
+            self._used = replace(self._used, **higher)
+            self._rows.write()
+
+    def _write(self, *statements: Statement) -> None:
+        with self._lock:
+            self._rows.write(*statements)
+
+    def _state(self) -> Iterator[Statement]:
+        """What every commit writes as it is then: the clip in work, frames done, what is used."""
+        if self._clip is not None:
+            yield _CLIP, (*self._clip, 0)
+        yield _COUNTS, (self._facts.frames_done, self._facts.frames_promised, self.run_id)
+        for field in fields(self._used):
+            yield MARK, (field.name, getattr(self._used, field.name))
+
+
+def _marks(database: sqlite3.Connection) -> Marks:
+    """What was used; ids that reviewers gave to added and split fish are used as well."""
+    values = {"track_id": 0} | dict(database.execute("SELECT name, value FROM marks"))
+    reviewed = values.pop(REVIEWED_ID, 0)
+    values.pop(WRITTEN, None)
+    return Marks(**values | {"track_id": max(values["track_id"], reviewed)})

@@ -1,0 +1,105 @@
+"""Facts of a run and of a caught fish, as lengths.db and provenance.json hold them."""
+
+from dataclasses import dataclass, fields
+from hashlib import sha256
+from typing import Any
+
+from stream_dmr.messages import LengthEstimate
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.version import __version__
+
+# What `ended_by` says; beside these "an error: ..." with the error's line.
+SOURCE_ENDED = "the end of the source"
+STOPPED = "a stop before the end of the source"
+ENDLESS_STOPPED = "a stop; the source has no end"
+NOT_ENDED = "nothing so far: it goes on, or a crash ended it"
+# The columns of `runs` that a run writes at its end.
+END_COLUMNS = ("ended_ns", "ended_by", "frames_done", "frames_promised")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFacts:
+    """The facts of one run; hashes are SHA-256 in hex; "" where there is none.
+
+    Each field is a column of `runs`, which older databases get when they are next written to.
+    """
+
+    source: str
+    command: str
+    software_version: str
+    config_sha256: str
+    calibration_sha256: str
+    template_sha256: str
+    source_path: str = ""  # the files that the run was given, see `RunInputs`
+    source_sha256: str = ""
+    boxes_path: str = ""
+    boxes_sha256: str = ""
+    masks_path: str = ""
+    masks_sha256: str = ""
+    calibration_path: str = ""
+    nmea_path: str = ""
+    nmea_sha256: str = ""
+    species_model_path: str = ""
+    species_model_sha256: str = ""
+    vessel: str = ""
+    trip: str = ""
+    haul: str = ""
+    ended_by: str = ""  # "": an older stream-dmr, which didn't say
+    frames_done: int | None = None  # that went through the whole chain
+    frames_promised: int | None = None  # by the source; of a camera: that came; None: unknown
+    utc_zero_ns: int | None = None  # added to capture times gives UTC since 1970; None: unknown
+
+
+def cut_short(facts: RunFacts) -> str:
+    """Which share of its source a run measured, and why it ended; "" where that is all of it."""
+    done, promised = facts.frames_done, facts.frames_promised
+    # A container's number of frames, duration x rate, may be one too many.
+    is_whole = done is None or promised is None or done >= promised - 1
+    if not facts.ended_by or (is_whole and facts.ended_by in (SOURCE_ENDED, ENDLESS_STOPPED)):
+        return ""
+    if done is not None and promised:
+        if is_whole and facts.ended_by == STOPPED:
+            return ""
+        share = f"{done} of {promised} frames ({100 * done / promised:.0f} %)"
+    else:
+        share = f"{'an unknown number of' if done is None else done} frames"
+    return f"{share} of {facts.source} were measured; what ended the run: {facts.ended_by}"
+
+
+def run_facts(header: RunHeader) -> RunFacts:
+    """The facts that a header has of its run; each hash is of the bytes of the recording."""
+    parts = header.attachments()
+    hashes = {name: sha256(data).hexdigest() for name, data in parts.items()}
+    given = {} if header.inputs is None else header.inputs.metadata()
+    facts: dict[str, Any] = {
+        **given,
+        "source": header.source,
+        "command": header.command,
+        "software_version": __version__,
+        "config_sha256": hashes["config.toml"],
+        "calibration_sha256": hashes.get("calibration.yaml", ""),
+        "template_sha256": hashes["template.pb"],
+    }
+    return RunFacts(**facts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CatchFacts:
+    """What a run found out about a fish; None where it did not.
+
+    Each field is a column of `fish`, which older databases get when they are next written to. A
+    value of None stands in no checksum, so that these stay as they were sealed.
+    """
+
+    species_code: str | None = None  # FAO 3-alpha, or "unsure"
+    species_share: float | None = None  # posterior probability of the likeliest species
+    fate: str | None = None  # what became of it: "landed", ...
+    fate_share: float | None = None  # of its body in that zone when it was last seen
+
+    @classmethod
+    def of(cls, estimate: LengthEstimate) -> "CatchFacts":
+        """Those that a final estimate has."""
+        return cls(**{field.name: getattr(estimate, field.name) for field in fields(cls)})
+
+
+UNKNOWN_CATCH = CatchFacts()

@@ -1,0 +1,188 @@
+"""Write lengths.csv and frames.csv."""
+
+from collections import deque
+from collections.abc import Callable, Collection, Iterable
+from contextlib import closing
+from pathlib import Path
+
+from stream_dmr.errors import OutputError
+from stream_dmr.files import replacing
+from stream_dmr.messages import LengthEstimate, LocalizedFish
+from stream_dmr.recording.record import Record
+from stream_dmr.store.length_store import LengthStore
+from stream_dmr.store.schema import MAY_COUNT_TWICE
+from stream_dmr.tables import CsvFile, number, numbers, seconds
+
+LENGTHS_COLUMNS = [
+    *("track_id", "length_mm", "length_std_mm", "ci95_low_mm", "ci95_high_mm"),
+    *("frames_seen", "frames_used", "first_frame", "last_frame", "first_time", "last_time"),
+    "status",
+]
+
+
+class LengthsTable:
+    """lengths.csv of a run, while it goes on.
+
+    It begins (with `resume`) and ends as a whole export of the store, so that no crash loses a row
+    of either; meanwhile each finished fish is appended.
+    """
+
+    def __init__(
+        self,
+        out_dir: Path,
+        store: LengthStore,
+        *,
+        resume: bool = False,
+        on_refusal: Callable[[str], None] | None = None,
+    ) -> None:
+        """Raises OutputError where the disk refuses the table.
+
+        With `on_refusal` that gets the reason instead, here and later: a refused row is tried again
+        with the next one, and the whole table at the end and by the next run.
+        """
+        self._path, self._store, self._on_refusal = out_dir / "lengths.csv", store, on_refusal
+        self.trouble = ""  # why the last row could not be written; "" when all are
+        self._waiting: deque[LengthEstimate] = deque()
+        if resume:
+            self._export()
+        self._rows = CsvFile(
+            self._path, LENGTHS_COLUMNS, resume=resume, retry_open=on_refusal is not None
+        )
+
+    def add(self, estimate: LengthEstimate) -> None:
+        """Append the row of a final estimate."""
+        self._waiting.append(estimate)
+        try:
+            while self._waiting:
+                estimate = self._waiting[0]
+                is_doubtful = estimate.track_id in self._store.may_count_twice()
+                self._rows.add(lengths_row(estimate, may_count_twice=is_doubtful))
+                self._waiting.popleft()
+            self.trouble = ""
+        except OutputError as error:
+            self._refuse(error)
+
+    def close(self) -> None:
+        """Write the whole table from the store. Idempotent."""
+        self._rows.close()
+        self._export()
+
+    def _export(self) -> None:
+        if self._store.trouble:  # its file lacks fish; the next run exports them
+            return
+        try:
+            store = self._store
+            write_lengths(self._path, store.estimates(), may_count_twice=store.may_count_twice())
+        except OutputError as error:
+            self._refuse(error)
+
+    def _refuse(self, error: OutputError) -> None:
+        if self._on_refusal is None:
+            raise error
+        self.trouble = str(error)
+        self._on_refusal(str(error))
+
+
+def write_lengths(
+    path: Path, estimates: Iterable[LengthEstimate], *, may_count_twice: Collection[int] = ()
+) -> None:
+    """Replace lengths.csv in one step.
+
+    `may_count_twice`: the ids of the fish of which `status` says so. Raises OutputError where the
+    disk refuses it.
+    """
+    with replacing(path) as draft, closing(CsvFile(draft, LENGTHS_COLUMNS)) as table:
+        for estimate in estimates:
+            is_doubtful = estimate.track_id in may_count_twice
+            table.add(lengths_row(estimate, may_count_twice=is_doubtful))
+        table.sync()
+
+
+def lengths_row(estimate: LengthEstimate, *, may_count_twice: bool = False) -> list[str]:
+    """The cells of a final estimate; times in seconds, exact to the nanosecond."""
+    return [
+        str(estimate.track_id),
+        number(estimate.length_mm),
+        number(estimate.length_std_mm),
+        *numbers(estimate.ci95_mm, 2),
+        str(estimate.frames_seen),
+        str(estimate.frames_used),
+        str(estimate.first_frame),
+        str(estimate.last_frame),
+        seconds(estimate.first_timestamp_ns),
+        seconds(estimate.last_timestamp_ns),
+        f"{estimate.status}; {MAY_COUNT_TWICE}" if may_count_twice else estimate.status,
+    ]
+
+
+FRAMES_COLUMNS = [
+    *("frame_index", "timestamp_ns", "track_id"),
+    *("head_u", "head_v", "center_u", "center_v", "tail_u", "tail_v"),
+    *("head_x_mm", "head_y_mm", "head_z_mm"),
+    *("center_x_mm", "center_y_mm", "center_z_mm"),
+    *("tail_x_mm", "tail_y_mm", "tail_z_mm"),
+    *("bending_ratio", "length_mm", "length_std_mm", "iou", "accepted", "reason"),
+]
+_MAX_BYTES = 64 << 20  # of one file of an endless run: some hours of two fish
+
+
+class FramesTable:
+    """Writes frames.csv; a sink of the recorder.
+
+    A row waits for the running LengthEstimate that follows its LocalizedFish, since only that says
+    whether the frame was used.
+    """
+
+    name = "frames.csv"
+
+    def __init__(self, out_dir: Path, *, resume: bool = False, is_endless: bool = False) -> None:
+        """With `resume`, the whole rows of an earlier run stay.
+
+        In an endless run a large table is renamed frames-000001.csv and so on, and a file that the
+        disk refuses is opened with a later row; the rows refused meanwhile are lost here, and are
+        in the recording.
+        """
+        self._table = CsvFile(
+            out_dir / self.name,
+            FRAMES_COLUMNS,
+            resume=resume,
+            retry_open=is_endless,
+            max_bytes=_MAX_BYTES if is_endless else None,
+        )
+        self._waiting: dict[tuple[int, int], LocalizedFish] = {}  # by track and frame
+
+    def write(self, record: Record) -> None:
+        """Take any record; raises OutputError where the disk refuses a row."""
+        message = record.message
+        if isinstance(message, LocalizedFish):
+            self._waiting[message.track_id, message.frame_index] = message
+        elif isinstance(message, LengthEstimate):
+            fish = self._waiting.pop((message.track_id, message.frame_index), None)
+            if fish is not None:
+                self._table.add(frames_row(fish, message.is_frame_used, message.frame_reason))
+
+    def close(self) -> None:
+        """Write the rows that no estimate followed, with the localization's verdict. Idempotent."""
+        try:
+            for fish in self._waiting.values():
+                self._table.add(frames_row(fish, fish.accepted, fish.reason))
+        finally:
+            self._waiting.clear()
+            self._table.close()
+
+
+def frames_row(fish: LocalizedFish, accepted: bool, reason: str) -> list[str]:
+    """The cells of one fish in one frame, with the final verdict on the frame."""
+    return [
+        str(fish.frame_index),
+        str(fish.timestamp_ns),
+        str(fish.track_id),
+        *numbers(fish.keypoints_px, 6),
+        *numbers(fish.keypoints_mm, 9),
+        number(fish.bending_ratio),
+        number(fish.length_mm),
+        number(fish.length_std_mm),
+        number(fish.iou),
+        "true" if accepted else "false",
+        reason,
+    ]

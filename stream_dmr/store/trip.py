@@ -1,0 +1,276 @@
+"""Hauls, positions and the track of the vessel."""
+
+import time
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from stream_dmr.errors import OutputError
+from stream_dmr.messages import Position
+from stream_dmr.store.schema import AddedTable, insertion, open_for_writing, read_added
+
+START, END = "start", "end"
+HAULS = AddedTable(
+    name="hauls",
+    kind="haul",
+    columns="""
+    run_id TEXT NOT NULL, -- the run that was told; '': a folder, after its run
+    what TEXT NOT NULL, -- start, end
+    name TEXT NOT NULL, -- of the haul
+    timestamp_ns INTEGER NOT NULL, -- on the clock of the frames
+    said_by TEXT NOT NULL, -- who or what said so
+    written_ns INTEGER NOT NULL -- wall clock
+""",
+)
+WATCHED = AddedTable(
+    name="watched",
+    kind="watched",
+    columns="""
+    run_id TEXT NOT NULL REFERENCES runs,
+    first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, -- frames without a pause, capture times
+    frames INTEGER NOT NULL, -- that were measured
+    frames_lost INTEGER NOT NULL, -- that came from the camera and were not
+    written_ns INTEGER NOT NULL -- wall clock
+""",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Haul:
+    """One haul, by its times on the clock of the frames."""
+
+    name: str
+    began_ns: int
+    ended_ns: int | None = None  # None: it goes on
+
+    def includes(self, timestamp_ns: int) -> bool:
+        """True for a time within it."""
+        return self.began_ns <= timestamp_ns and (
+            self.ended_ns is None or timestamp_ns < self.ended_ns
+        )
+
+
+def hauls_of(rows: Iterable[Mapping[str, Any]]) -> list[Haul]:
+    """The hauls that events make, in their order.
+
+    A start ends the haul before it; an end without a start means nothing.
+    """
+    hauls: list[Haul] = []
+    for row in sorted(rows, key=lambda row: row["timestamp_ns"]):
+        if hauls and hauls[-1].ended_ns is None:
+            last = hauls.pop()
+            hauls.append(Haul(name=last.name, began_ns=last.began_ns, ended_ns=row["timestamp_ns"]))
+        if row["what"] == START:
+            hauls.append(Haul(name=row["name"], began_ns=row["timestamp_ns"]))
+    return hauls
+
+
+def haul_at(hauls: Sequence[Haul], timestamp_ns: int) -> str:
+    """The name of the haul at a time; "" between hauls."""
+    return next((haul.name for haul in hauls if haul.includes(timestamp_ns)), "")
+
+
+def next_name(hauls: Iterable[Haul]) -> str:
+    """The number of a haul that nobody gives a name: that after the highest so far."""
+    numbers = [int(haul.name) for haul in hauls if haul.name.isdecimal()]
+    return str(max(numbers, default=0) + 1)
+
+
+def haul_values(what: str, name: str, timestamp_ns: int, said_by: str) -> dict[str, Any]:
+    """The columns of an event, without the run and the time of writing."""
+    return {"what": what, "name": name, "timestamp_ns": timestamp_ns, "said_by": said_by}
+
+
+def add_haul(database: Path, values: Mapping[str, Any]) -> None:
+    """Write an event into a lengths.db, durably and not signed. Raises OutputError."""
+    row = {"run_id": "", **values, "written_ns": time.time_ns()}
+    try:
+        with closing(open_for_writing(database)) as connection:
+            connection.execute(HAULS.statement)
+            connection.execute(*insertion(HAULS.name, row))
+    except OSError as error:
+        raise OutputError(f"{database}: expected room for a haul, got: {error}") from error
+
+
+POSITIONS = AddedTable(
+    name="positions",
+    kind="position",
+    columns="""
+    run_id TEXT NOT NULL REFERENCES runs,
+    timestamp_ns INTEGER NOT NULL, -- on the clock of the frames
+    utc_ns INTEGER, -- the receiver's, since 1970; NULL: it gave no date
+    latitude REAL NOT NULL, longitude REAL NOT NULL, -- degrees, WGS 84
+    speed_knots REAL, course_deg REAL, -- over ground
+    is_joined INTEGER NOT NULL, -- 0: positions are missing between the row before and this one
+    written_ns INTEGER NOT NULL -- wall clock
+""",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeptPosition:
+    """One row of `positions`, without the run and the time of writing."""
+
+    timestamp_ns: int
+    utc_ns: int | None
+    latitude: float
+    longitude: float
+    speed_knots: float | None
+    course_deg: float | None
+    is_joined: bool  # may be interpolated from the one before
+
+
+_NAMES = [field.name for field in fields(KeptPosition)]
+
+
+class PositionThinner:
+    """Keeps a position every `keep_s`, and those at both ends of a gap."""
+
+    def __init__(self, *, keep_s: float, max_gap_s: float) -> None:
+        """Positions further apart than `max_gap_s` have a gap between them."""
+        self._keep_ns, self._max_gap_ns = round(keep_s * 1e9), round(max_gap_s * 1e9)
+        self._kept: KeptPosition | None = None  # the last one
+        self._last: Position | None = None  # the last one that came
+        self.gap_s = 0.0  # before the last one that came, where that is a gap
+
+    def take(self, position: Position) -> list[KeptPosition]:
+        """The positions to keep now, in their order."""
+        last, self._last = self._last, position
+        self.gap_s = 0.0
+        if last is None or self._kept is None:
+            return [self._keep(position, is_joined=False)]
+        if position.timestamp_ns <= last.timestamp_ns:  # a clock was set back: not in order
+            self._last = last
+            return []
+        if position.timestamp_ns - last.timestamp_ns > self._max_gap_ns:
+            self.gap_s = (position.timestamp_ns - last.timestamp_ns) / 1e9
+            return [*self._keep_last(last), self._keep(position, is_joined=False)]
+        if position.timestamp_ns - self._kept.timestamp_ns < self._keep_ns:
+            return []
+        if position.timestamp_ns - self._kept.timestamp_ns > self._max_gap_ns:  # keep_s is longer
+            return [*self._keep_last(last), self._keep(position, is_joined=True)]
+        return [self._keep(position, is_joined=True)]
+
+    def finish(self) -> list[KeptPosition]:
+        """The last position, where it was not kept."""
+        return [] if self._last is None else self._keep_last(self._last)
+
+    def _keep_last(self, last: Position) -> list[KeptPosition]:
+        if self._kept is not None and last.timestamp_ns > self._kept.timestamp_ns:
+            return [self._keep(last, is_joined=True)]
+        return []
+
+    def _keep(self, position: Position, *, is_joined: bool) -> KeptPosition:
+        values = {name: getattr(position, name) for name in _NAMES if name != "is_joined"}
+        self._kept = KeptPosition(**values, is_joined=is_joined)
+        return self._kept
+
+
+def position_values(kept: KeptPosition) -> Mapping[str, object]:
+    """The columns of a row."""
+    return asdict(kept) | {"is_joined": int(kept.is_joined)}
+
+
+def read_positions(database: Path) -> list[KeptPosition]:
+    """All positions of a lengths.db, in the order of writing. Raises OutputError."""
+    return positions_of(read_added(database, POSITIONS))
+
+
+def positions_of(rows: Sequence[Mapping[str, Any]]) -> list[KeptPosition]:
+    """The rows of the table as positions."""
+    return [
+        KeptPosition(
+            **{name: row[name] for name in _NAMES if name != "is_joined"},
+            is_joined=bool(row["is_joined"]),
+        )
+        for row in rows
+    ]
+
+
+def kept_of(
+    positions: Iterable[Position], *, keep_s: float, max_gap_s: float
+) -> Iterator[KeptPosition]:
+    """Those of a recording that a lengths.db would have."""
+    thinner = PositionThinner(keep_s=keep_s, max_gap_s=max_gap_s)
+    for position in positions:
+        yield from thinner.take(position)
+    yield from thinner.finish()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Whereabouts:
+    """Place, speed and time of one moment; None where not known."""
+
+    utc_ns: int | None = None
+    latitude: float | None = None  # degrees, WGS 84
+    longitude: float | None = None
+    speed_knots: float | None = None
+    gap_s: float | None = None  # between the positions around it, where that is too long
+
+
+NOWHERE = Whereabouts()
+
+
+class VesselTrack:
+    """The positions of a folder, by their time on the clock of the frames."""
+
+    def __init__(self, positions: Iterable[KeptPosition]) -> None:
+        by_time = {kept.timestamp_ns: kept for kept in positions}  # a resumed video has some twice
+        self.positions = [by_time[time_ns] for time_ns in sorted(by_time)]
+        self._times_ns = [kept.timestamp_ns for kept in self.positions]
+
+    def at(self, timestamp_ns: int) -> Whereabouts:
+        """Where the vessel was; linear between two positions, the short way round the earth."""
+        index = bisect_left(self._times_ns, timestamp_ns)
+        if index < len(self.positions) and self._times_ns[index] == timestamp_ns:
+            return _exactly(self.positions[index])
+        if not 0 < index < len(self.positions):
+            return NOWHERE
+        before, after = self.positions[index - 1], self.positions[index]
+        span_ns = after.timestamp_ns - before.timestamp_ns
+        if not after.is_joined:
+            return Whereabouts(gap_s=span_ns / 1e9)
+        share = (timestamp_ns - before.timestamp_ns) / span_ns
+        turn = (after.longitude - before.longitude + 180) % 360 - 180
+        longitude = (before.longitude + share * turn + 180) % 360 - 180
+        return Whereabouts(
+            utc_ns=_utc_between(before, after, timestamp_ns),
+            latitude=before.latitude + share * (after.latitude - before.latitude),
+            longitude=longitude,
+            speed_knots=_between(before.speed_knots, after.speed_knots, share),
+        )
+
+    def pieces(self) -> list[Sequence[KeptPosition]]:
+        """The track, cut at its gaps."""
+        pieces: list[list[KeptPosition]] = []
+        for kept in self.positions:
+            if kept.is_joined and pieces:
+                pieces[-1].append(kept)
+            else:
+                pieces.append([kept])
+        return [*pieces]
+
+
+def _exactly(kept: KeptPosition) -> Whereabouts:
+    return Whereabouts(
+        utc_ns=kept.utc_ns,
+        latitude=kept.latitude,
+        longitude=kept.longitude,
+        speed_knots=kept.speed_knots,
+    )
+
+
+def _between(before: float | None, after: float | None, share: float) -> float | None:
+    return None if before is None or after is None else before + share * (after - before)
+
+
+def _utc_between(before: KeptPosition, after: KeptPosition, timestamp_ns: int) -> int | None:
+    """In integers: a double has no nanoseconds of the year."""
+    if before.utc_ns is None or after.utc_ns is None:
+        return None
+    span_ns = after.timestamp_ns - before.timestamp_ns
+    passed_ns = timestamp_ns - before.timestamp_ns
+    return before.utc_ns + (after.utc_ns - before.utc_ns) * passed_ns // span_ns

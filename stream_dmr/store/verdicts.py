@@ -1,0 +1,350 @@
+"""Verdicts of reviewers on fish: a log, to which rows are only added (`verdicts_table`).
+
+Measurements stay as they were. The review of a fish is what its verdicts say together: the last
+decision, species, fate, condition and correction; `withdraw` takes back all before it, `undo` one
+verdict. `add`, `split` and `merge` say which frames a fish has (`track_edits`). A blind reading
+changes no review: it is only compared with it.
+"""
+
+import json
+import sqlite3
+import time
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass, field, fields, replace
+from hashlib import sha256
+from pathlib import Path
+
+from stream_dmr.errors import OutputError, UserError
+from stream_dmr.lengths.fate import CONDITIONS, FATES
+from stream_dmr.store.schema import (
+    REVIEWED_ID,
+    DiskRefusal,
+    add_columns,
+    columns_of,
+    has_table,
+    insertion,
+    open_for_reading,
+    open_for_writing,
+    rows_of,
+    transaction,
+)
+
+DECISIONS = ("accept", "reject", "duplicate", "merge")
+NOT_COUNTED = frozenset(DECISIONS[1:])  # decisions after which a fish stands in no sum
+EDITS = ("add", "split", "merge")
+KINDS = (
+    *(*DECISIONS[:3], "species", "fate", "condition", "correct", "withdraw"),
+    *(*EDITS, "undo"),
+)
+BLIND = "blind"  # the reading of somebody who does not see what others decided
+Ends = tuple[tuple[float, float], tuple[float, float]]  # head and tail, frame pixels
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """One row: the verdict of one reviewer on one fish."""
+
+    track_id: int
+    kind: str  # of KINDS
+    reviewer: str
+    reason: str = ""
+    species: str = ""
+    duplicate_of: int | None = None
+    frame_index: int | None = None
+    head_u: float | None = None
+    head_v: float | None = None
+    tail_u: float | None = None
+    tail_v: float | None = None
+    length_mm: float | None = None
+    length_std_mm: float | None = None
+    written_ns: int = 0
+    # Columns that the first tables lack; a value of None stands in no checksum.
+    undoes: int | None = None  # number of the verdict that this one takes back, from 1
+    other_fish: int | None = None  # of a split: the new fish; of a merge: the one that goes on
+    fish: str | None = None  # of an edit: the final rows of the fish that it makes, as JSON
+    frames_sha256: str | None = None  # of an added fish: of its rows in `added_frames`
+    reading: str | None = None  # BLIND, or None
+    fate: str | None = None  # of FATES
+    condition: str | None = None  # of CONDITIONS
+
+    @property
+    def moved(self) -> dict[int, Ends]:
+        """Head and tail of a correction by its frame; empty for other kinds."""
+        head_u, head_v, tail_u, tail_v = self.head_u, self.head_v, self.tail_u, self.tail_v
+        if self.frame_index is None or head_u is None or head_v is None:
+            return {}
+        if tail_u is None or tail_v is None:
+            return {}
+        return {self.frame_index: ((head_u, head_v), (tail_u, tail_v))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Review:
+    """The state of one fish's review; "" and None where no verdict says anything."""
+
+    decision: str = ""  # of DECISIONS
+    reason: str = ""
+    duplicate_of: int | None = None
+    species: str = ""
+    fate: str | None = None
+    condition: str | None = None
+    length_mm: float | None = None  # corrected
+    length_std_mm: float | None = None
+    moved: Mapping[int, Ends] = field(default_factory=dict[int, Ends])  # corrections, by frame
+    reviewer: str = ""  # the last one
+    written_ns: int = 0
+
+    def after(self, verdict: Verdict) -> "Review":
+        """The review after one more verdict."""
+        before = Review() if verdict.kind == "withdraw" else self
+        now = replace(before, reviewer=verdict.reviewer, written_ns=verdict.written_ns)
+        match verdict.kind:
+            case "withdraw":
+                return now
+            case "species":
+                return replace(now, species=verdict.species)
+            case "fate":
+                return replace(now, fate=verdict.fate)
+            case "condition":
+                return replace(now, condition=verdict.condition)
+            case "correct":
+                return replace(
+                    now,
+                    length_mm=verdict.length_mm,
+                    length_std_mm=verdict.length_std_mm,
+                    moved={**now.moved, **verdict.moved},
+                )
+            case "add" | "split":
+                return now
+            case "merge":
+                return replace(now, decision="merge", duplicate_of=verdict.other_fish)
+            case _:
+                return replace(
+                    now,
+                    decision=verdict.kind,
+                    reason=verdict.reason,
+                    duplicate_of=verdict.duplicate_of,
+                )
+
+
+NOT_REVIEWED = Review()
+
+
+def standing(verdicts: Sequence[Verdict]) -> list[Verdict]:
+    """The verdicts that count: not taken back by an `undo`, and of no blind reading."""
+    return [verdict for _, verdict in _not_undone(verdicts) if verdict.reading is None]
+
+
+def blind_readings(verdicts: Sequence[Verdict]) -> dict[str, list[Verdict]]:
+    """What each blind reader said, by name, as verdicts that `reviews_of` counts."""
+    readings: dict[str, list[Verdict]] = {}
+    for _, verdict in _not_undone(verdicts):
+        if verdict.reading == BLIND:
+            readings.setdefault(verdict.reviewer, []).append(replace(verdict, reading=None))
+    return readings
+
+
+def last_of(verdicts: Sequence[Verdict], reviewer: str, reading: str | None) -> int | None:
+    """Number of the last verdict of a reviewer that was not taken back; None without any."""
+    mine = (reviewer, reading)
+    numbers = (n for n, one in _not_undone(verdicts) if (one.reviewer, one.reading) == mine)
+    return max(numbers, default=None)
+
+
+def _not_undone(verdicts: Sequence[Verdict]) -> list[tuple[int, Verdict]]:
+    """The verdicts with their numbers, without `undo` and what it takes back."""
+    undone = {verdict.undoes for verdict in verdicts}
+    numbered = enumerate(verdicts, start=1)
+    return [(n, one) for n, one in numbered if one.kind != "undo" and n not in undone]
+
+
+def check_verdict(verdict: Verdict, track_ids: set[int], reviews: Mapping[int, Review]) -> None:
+    """Raise UserError where a verdict contradicts itself or the reviews so far.
+
+    `track_ids`: the fish of the run as reviewed, without those merged into others. Of fish that are
+    duplicates of each other, one must remain.
+    """
+    known = verdict.track_id in track_ids
+    problems = {
+        f"a fish of this run, got {verdict.track_id}": not known,
+        f"one of {', '.join(KINDS)}, got {verdict.kind!r}": verdict.kind not in KINDS,
+        "the reviewer's name": not verdict.reviewer.strip(),
+        "a reason for the rejection": verdict.kind == "reject" and not verdict.reason.strip(),
+        "the name of a species": verdict.kind == "species" and not verdict.species.strip(),
+        f"a fate of {', '.join(FATES)}, got {verdict.fate!r}": verdict.kind == "fate"
+        and verdict.fate not in FATES,
+        f"a condition of {', '.join(CONDITIONS)}, got {verdict.condition!r}": (
+            verdict.kind == "condition" and verdict.condition not in CONDITIONS
+        ),
+        "another fish that this one repeats": verdict.kind == "duplicate"
+        and (verdict.duplicate_of not in track_ids or verdict.duplicate_of == verdict.track_id),
+        f"a fish that is not itself a duplicate of fish {verdict.track_id}; withdraw that first": (
+            verdict.kind == "duplicate" and verdict.track_id in _originals(verdict, reviews)
+        ),
+    }
+    for expected, is_wrong in problems.items():
+        if is_wrong:
+            raise UserError(f"verdict: expected {expected}")
+
+
+def _originals(verdict: Verdict, reviews: Mapping[int, Review]) -> list[int]:
+    """The fish that this one duplicates, directly and by earlier verdicts, until one repeats."""
+    originals, track_id = list[int](), verdict.duplicate_of
+    while track_id is not None and track_id not in originals:
+        originals.append(track_id)
+        track_id = reviews.get(track_id, NOT_REVIEWED).duplicate_of
+    return originals
+
+
+def reviews_of(verdicts: Sequence[Verdict]) -> dict[int, Review]:
+    """The review of each fish that has a verdict which counts, by track id.
+
+    A verdict that closes a circle of duplicates doesn't count: one of the fish must remain.
+    """
+    reviews: dict[int, Review] = {}
+    for verdict in standing(verdicts):
+        if verdict.kind == "duplicate" and verdict.track_id in _originals(verdict, reviews):
+            continue
+        reviews[verdict.track_id] = reviews.get(verdict.track_id, NOT_REVIEWED).after(verdict)
+    return reviews
+
+
+_ADDED_COLUMNS = {
+    **dict.fromkeys(("undoes", "other_fish"), "INTEGER"),
+    **dict.fromkeys(("fish", "frames_sha256", "reading", "fate", "condition"), "TEXT"),
+}
+_TABLES = """
+CREATE TABLE IF NOT EXISTS verdicts (
+    number INTEGER PRIMARY KEY,
+    track_id INTEGER NOT NULL,
+    kind TEXT NOT NULL,
+    reason TEXT NOT NULL, -- of a rejection
+    species TEXT NOT NULL,
+    duplicate_of INTEGER, -- track id
+    frame_index INTEGER, -- of a correction: where its points were set; of a split: the first after
+    head_u REAL, head_v REAL, tail_u REAL, tail_v REAL, -- of a correction, frame pixels
+    length_mm REAL, length_std_mm REAL, -- of all frames that are corrected so far
+    reviewer TEXT NOT NULL,
+    written_ns INTEGER NOT NULL -- wall clock
+) STRICT;
+CREATE TABLE IF NOT EXISTS added_frames (
+    track_id INTEGER NOT NULL, frame_index INTEGER NOT NULL,
+    crop BLOB NOT NULL, fit BLOB NOT NULL, fish BLOB NOT NULL, -- messages, encoded as recorded
+    PRIMARY KEY (track_id, frame_index)
+) STRICT;
+"""
+_USED = (
+    f"INSERT INTO marks VALUES ('{REVIEWED_ID}', ?1) ON CONFLICT (name) DO UPDATE SET value = ?1"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AddedFrame:
+    """One frame of a fish that a reviewer added; its messages encoded as in a recording."""
+
+    track_id: int
+    frame_index: int
+    crop: bytes
+    fit: bytes
+    fish: bytes
+
+
+def frames_sha256(frames: Sequence[AddedFrame]) -> str:
+    """SHA-256 of added frames, for the verdict that adds them."""
+    return sha256(repr([tuple(asdict(frame).values()) for frame in frames]).encode()).hexdigest()
+
+
+def add_verdict(
+    path: Path,
+    verdict: Verdict,
+    *,
+    frames: Sequence[AddedFrame] = (),
+    new_fish: int | None = None,
+    known: int | None = None,
+) -> Verdict:
+    """Write a verdict into a lengths.db, durably; returns it with its time.
+
+    `frames` are those of an added fish, `new_fish` is a track id that it uses. With `known`, the
+    number of verdicts that it builds on, UserError where another reviewer has written meanwhile.
+    Raises OutputError where the disk refuses it.
+    """
+    verdict = replace(verdict, written_ns=time.time_ns())
+    with _refusing(path), closing(_open_for_verdicts(path)) as database:
+        _prepare(database)
+        with transaction(database):
+            (count,) = database.execute("SELECT COUNT(*) FROM verdicts").fetchone()
+            if known is not None and count != known:
+                raise UserError(
+                    "verdict: expected the fish as this page shows them, but another reviewer "
+                    "has changed them meanwhile; look again, and repeat it"
+                )
+            database.execute(*insertion("verdicts", asdict(verdict)))
+            for frame in frames:
+                database.execute(*insertion("added_frames", asdict(frame)))
+            if new_fish is not None:
+                database.execute(_USED, (new_fish,))  # no later run may use it
+    return verdict
+
+
+def read_verdicts(path: Path) -> list[Verdict]:
+    """All verdicts of a lengths.db in the order of writing. Raises OutputError."""
+    with _refusing(path), closing(open_for_reading(path)) as database:
+        if not (there := columns_of(database, "verdicts")):
+            return []
+        names = [field.name for field in fields(Verdict) if field.name in there]
+        query = f"SELECT {', '.join(names)} FROM verdicts ORDER BY number"
+        return [Verdict(**row) for row in rows_of(database, query)]
+
+
+def read_added_frames(path: Path) -> dict[int, list[AddedFrame]]:
+    """The frames of the fish that reviewers added, by track id. Raises OutputError."""
+    frames: dict[int, list[AddedFrame]] = {}
+    with _refusing(path), closing(open_for_reading(path)) as database:
+        if not has_table(database, "added_frames"):
+            return {}
+        names = [field.name for field in fields(AddedFrame)]
+        query = f"SELECT {', '.join(names)} FROM added_frames ORDER BY track_id, frame_index"
+        for row in rows_of(database, query):
+            frame = AddedFrame(**row)
+            frames.setdefault(frame.track_id, []).append(frame)
+    return frames
+
+
+def next_track_id(path: Path) -> int:
+    """A track id that neither a run nor a reviewer has used in this folder. Raises OutputError."""
+    with _refusing(path), closing(open_for_reading(path)) as database:
+        query = (
+            "SELECT MAX(n) FROM (SELECT MAX(track_id) AS n FROM fish UNION "
+            f"SELECT value FROM marks WHERE name IN ('track_id', '{REVIEWED_ID}'))"
+        )
+        return 1 + (database.execute(query).fetchone()[0] or 0)
+
+
+def verdict_line(verdict: Verdict) -> str:
+    """A verdict as JSON, for checksums: later columns only where they have a value."""
+    values = asdict(verdict)
+    return json.dumps({n: v for n, v in values.items() if v is not None or n not in _ADDED_COLUMNS})
+
+
+def _prepare(database: sqlite3.Connection) -> None:
+    database.executescript(_TABLES)
+    add_columns(database, "verdicts", _ADDED_COLUMNS)
+
+
+def _open_for_verdicts(path: Path) -> sqlite3.Connection:
+    try:
+        return open_for_writing(path)
+    except DiskRefusal as error:
+        raise OutputError(
+            f"{path}: expected a disk to write verdicts to, got: {error.__cause__}; review a copy "
+            "of the folder"
+        ) from error
+
+
+@contextmanager
+def _refusing(path: Path) -> Generator[None]:
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise OutputError(f"{path}: expected a database of lengths, got: {error}") from error

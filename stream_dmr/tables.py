@@ -1,0 +1,171 @@
+"""CSV files and their cells."""
+
+import csv
+import io
+import os
+from collections.abc import Iterable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.errors import OutputError
+from stream_dmr.files import TransactionalFile, natural_order
+
+_BLOCK_BYTES = 1 << 16  # read at once when searching for the last line, backwards
+
+
+class CsvFile:
+    """A CSV file with its header as the first line; every row in it is complete."""
+
+    def __init__(
+        self,
+        path: Path,
+        columns: list[str],
+        *,
+        resume: bool = False,
+        retry_open: bool = False,
+        max_bytes: int | None = None,
+    ) -> None:
+        """Open `path` for writing; raises OutputError where the disk refuses it.
+
+        `resume`: complete rows that are in the file stay. `retry_open`: where the file can't be
+        opened now, it is opened with a later row instead of raising. `max_bytes`: a file that has
+        grown to this size is renamed (see `rotated_files`), and a new one begins.
+        """
+        self._path, self._columns, self._max_bytes = path, columns, max_bytes
+        self._file: TransactionalFile | None = None
+        try:
+            self._open(resume=resume)
+        except OSError as error:
+            if not retry_open:
+                raise self._refusal(error) from error
+
+    def add(self, row: list[str]) -> None:
+        """Append a row. Raises OutputError where the disk refuses it; nothing of it stays then."""
+        try:
+            file = self._file or self._open(resume=True)
+            if self._max_bytes is not None and file.tell() >= self._max_bytes:
+                file = self._rotate()
+            file.write(_line(row))
+        except OSError as error:
+            raise self._refusal(error) from error
+
+    def sync(self) -> None:
+        """Wait until the rows are on the disk."""
+        if self._file is not None:
+            self._file.sync()
+
+    def close(self) -> None:
+        """Close the file. Idempotent."""
+        if self._file is not None:
+            self._file.close()
+
+    def _open(self, *, resume: bool) -> TransactionalFile:
+        keep = _complete_bytes(self._path) if resume and self._path.exists() else 0
+        file = TransactionalFile(self._path, keep=keep)
+        try:
+            if keep == 0:
+                file.write(_line(self._columns))
+        except OSError:
+            file.close()
+            raise
+        self._file = file
+        return file
+
+    def _rotate(self) -> TransactionalFile:
+        self.close()
+        self._file = None
+        number = 1 + _last_rotation(self._path)
+        self._path.rename(self._path.with_stem(f"{self._path.stem}-{number:06d}"))
+        return self._open(resume=False)
+
+    def _refusal(self, error: OSError) -> OutputError:
+        return OutputError(
+            f"{self._path}: expected a file to write to, got: {error.strerror}; "
+            "make room or choose another --out"
+        )
+
+
+def rotated_files(path: Path) -> list[Path]:
+    """The files `frames-000001.csv`, ... that a large `frames.csv` was renamed to, oldest first."""
+    return sorted(path.parent.glob(f"{path.stem}-[0-9]*{path.suffix}"), key=natural_order)
+
+
+def _last_rotation(path: Path) -> int:
+    """The highest number of a rotated file; 0 where there is none."""
+    names = (rotated.stem.rpartition("-")[2] for rotated in rotated_files(path))
+    return max((int(name) for name in names if name.isdecimal()), default=0)
+
+
+def _complete_bytes(path: Path) -> int:
+    """The size of a file up to the end of its last complete line."""
+    with path.open("rb") as file:
+        end = file.seek(0, os.SEEK_END)
+        while end > 0:
+            start = max(0, end - _BLOCK_BYTES)
+            file.seek(start)
+            newline = file.read(end - start).rfind(b"\n")
+            if newline >= 0:
+                return start + newline + 1
+            end = start
+    return 0
+
+
+def safe_cell(text: str) -> str:
+    """A cell that no spreadsheet takes for a formula: others than numbers get an apostrophe."""
+    if not text.startswith(("=", "+", "-", "@", "\t", "\r")):
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}"
+    return text
+
+
+def original_cell(text: str) -> str:
+    """The inverse of `safe_cell`."""
+    return text[1:] if text[:1] == "'" and safe_cell(text[1:]) == text else text
+
+
+def write_table(path: Path, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+    """Write a whole CSV file at once. Raises OSError."""
+    with path.open("wb") as file:
+        file.write(_line(columns))
+        file.writelines(map(_line, rows))
+
+
+def _line(row: Iterable[object]) -> bytes:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow(safe_cell(str(cell)) for cell in row)
+    return text.getvalue().encode("utf-8", "backslashreplace")
+
+
+def seconds(timestamp_ns: int) -> str:
+    """Nanoseconds as seconds with nine decimals, exact: computed with integers."""
+    sign = "-" if timestamp_ns < 0 else ""
+    whole, rest = divmod(abs(timestamp_ns), 1_000_000_000)
+    return f"{sign}{whole}.{rest:09d}"
+
+
+def utc_text(utc_ns: int | None) -> str | None:
+    """A time in ISO 8601, to the millisecond below; None for None and for no date of a calendar."""
+    if utc_ns is None:
+        return None
+    seconds_since, rest_ns = divmod(utc_ns, 1_000_000_000)
+    try:
+        moment = datetime.fromtimestamp(seconds_since, UTC)
+    except (OverflowError, ValueError, OSError):
+        return None
+    return f"{moment:%Y-%m-%dT%H:%M:%S}.{rest_ns // 1_000_000:03d}Z"
+
+
+def number(value: float | None) -> str:
+    """A number with six decimals; blank for None."""
+    return "" if value is None else f"{value:.6f}"
+
+
+def numbers(values: Float[np.ndarray, "..."] | None, count: int) -> list[str]:
+    """The cells of an array of `count` numbers in C order; blanks for None."""
+    return [""] * count if values is None else [number(float(value)) for value in values.flat]

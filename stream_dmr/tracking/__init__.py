@@ -1,0 +1,1 @@
+"""Follow candidates over frames and decide which are fish."""

@@ -1,0 +1,188 @@
+"""Confirm a track as a fish once it was clearly segmented in enough frames inside the zone.
+
+The tracker follows whatever moves. Gaffs and waves are distinguished from fish by their masks,
+which are empty or of low confidence.
+
+What tells a fish from what only moves, and from what only looks like one.
+
+Plants sway and marks glitter in their places, rock passes by before a camera that moves; none of
+them looks like a fish. Letters and stones may, but stay where they are.
+"""
+
+from collections import Counter
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field, field_validator
+
+from stream_dmr.detection.detector import FISH_LIKE, Candidate
+from stream_dmr.messages import FishCrop
+from stream_dmr.settings import Settings
+
+# Bounds the memory of a run of weeks; tracks live for seconds, so older ones have ended long ago.
+_MAX_UNCONFIRMED_TRACKS = 1000
+# After so many frames in a row whose masks show as good as nothing, a track is at another thing:
+# the place where its fish was. Of simulated fish at most three frames in a row are unclear.
+_MAX_EMPTY_FRAMES, _NOTHING = 5, 0.2
+
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+class ConfirmationSettings(Settings):
+    """The part of `[track_fish]` that decides which tracks count as fish; each counts once."""
+
+    min_track_frames: int = Field(
+        default=4, ge=1, description="frames in which a fish is clearly seen before it counts"
+    )
+    min_fish_like_frames: int = Field(
+        default=2,
+        ge=0,
+        description="frames in which what moves has to look like a fish to the network as well; "
+        "0: motion and a mask are enough",
+    )
+    min_mask_confidence: float = Field(
+        default=0.52, ge=0, le=1, description="mask_confidence from which on a fish is clearly seen"
+    )
+    zone: list[Fraction] = Field(
+        default=[0.0, 0.0, 1.0, 1.0],
+        min_length=4,
+        max_length=4,
+        description="left, top, right, bottom of where fish count, as fractions of the picture",
+    )
+
+    @field_validator("zone")
+    @classmethod
+    def _has_positive_area(cls, zone: list[float]) -> list[float]:
+        left, top, right, bottom = zone
+        if not (left < right and top < bottom):
+            raise ValueError("left, top, right, bottom with left < right and top < bottom")
+        return zone
+
+
+class FishConfirmation:
+    """Decides which tracks are fish; a confirmed one stays confirmed, and counts while seen."""
+
+    def __init__(self, settings: ConfirmationSettings) -> None:
+        self._settings = settings
+        self._confirmed: set[int] = set()  # track numbers
+        self._num_clear_frames: Counter[int] = Counter()  # of unconfirmed tracks
+        self._num_empty_frames: Counter[int] = Counter()  # of confirmed ones, in a row
+
+    def is_confirmed(self, number: int) -> bool:
+        """True for a track that counts as a fish."""
+        return number in self._confirmed
+
+    def update(self, number: int, crop: FishCrop, *, may_count: bool = True) -> bool:
+        """Take a track's crop of one frame into account; True for a confirmed fish that it shows.
+
+        `may_count`: False while the other evidence doubts it. A confirmed fish remains one
+        outside the zone. A crop without `mask_confidence` (a given mask) counts as clearly seen.
+        """
+        confidence = crop.quality.mask_confidence
+        if number not in self._confirmed:
+            if confidence is None or confidence >= self._settings.min_mask_confidence:
+                self._num_clear_frames[number] += 1
+                if len(self._num_clear_frames) > _MAX_UNCONFIRMED_TRACKS:
+                    del self._num_clear_frames[min(self._num_clear_frames)]
+            if not (may_count and self._is_confirmed_by(number, crop)):
+                return False
+            self._confirmed.add(number)
+            del self._num_clear_frames[number]
+        if confidence is None or confidence >= _NOTHING:
+            self._num_empty_frames.pop(number, None)
+        else:
+            self._num_empty_frames[number] += 1
+        return self._num_empty_frames[number] <= _MAX_EMPTY_FRAMES
+
+    def _is_confirmed_by(self, number: int, crop: FishCrop) -> bool:
+        width, height = crop.frame_camera.width, crop.frame_camera.height
+        x0, y0, x1, y1 = crop.bbox_xyxy_px.tolist()
+        left, top, right, bottom = self._settings.zone
+        is_in_zone = (
+            left * width <= (x0 + x1) / 2 <= right * width
+            and top * height <= (y0 + y1) / 2 <= bottom * height
+        )
+        return is_in_zone and self._num_clear_frames[number] >= self._settings.min_track_frames
+
+
+_SURE = 0.6  # of how much it looks like a fish: in so many frames it need not move
+_MIN_SURE_FRAMES = 4
+# Of all frames: a stone that is seen for hours looks like a fish in a few of them. Chosen; visible
+# fish of real clips look like one in 40 % and more.
+_MIN_SURE_SHARE, _MIN_FISH_LIKE_SHARE = 0.25, 0.1
+# Sizes from where it was first seen. What went far is looked at in its own box alone, since the
+# network for masks loses a thin fish in a wider one.
+_MIN_MOTION = 0.25
+_FAR = 0.5
+
+
+class FishEvidence:
+    """Of one track, over all its frames."""
+
+    def __init__(self, candidate: Candidate, size_px: float) -> None:
+        """`size_px`: the longer side of what is followed."""
+        self._first_edges_px = _edges_px(candidate)
+        self._need_not_move = candidate.place_px is None  # somebody found it
+        self._motion = 0.0
+        self._judged_frames = self._fish_like_frames = self._sure_frames = 0
+        self.closer_looks = self._fish_like_closer = 0  # how many there were, and of a fish
+        self.add(candidate, size_px)
+
+    def add(self, candidate: Candidate, size_px: float) -> None:
+        """Take the candidate of another frame into account."""
+        edges_px = _edges_px(candidate)
+        if edges_px is not None and self._first_edges_px is not None:
+            is_outlined = candidate.foreground is not None
+            distance_px = _distance(self._first_edges_px, edges_px, is_outlined=is_outlined)
+            self._motion = max(self._motion, distance_px / size_px)
+        if candidate.looks is not None:
+            self._judged_frames += 1
+            self._fish_like_frames += candidate.looks >= FISH_LIKE
+            self._sure_frames += candidate.looks >= _SURE
+
+    def add_closer_look(self, looks: float) -> None:
+        """Take into account how much it looks like a fish in a picture of its surroundings."""
+        self.closer_looks += 1
+        self._fish_like_closer += looks >= FISH_LIKE
+
+    @property
+    def has_moved(self) -> bool:
+        """True once it left its place, and for what need not move."""
+        return self._is_sure or self._motion > _MIN_MOTION
+
+    @property
+    def went_far(self) -> bool:
+        """True once it is far from its first place, and for what need not move."""
+        return self._is_sure or self._motion > _FAR
+
+    @property
+    def _is_sure(self) -> bool:
+        """True for what somebody found, and for what looked like a fish often enough."""
+        needed = max(_MIN_SURE_FRAMES, _MIN_SURE_SHARE * self._judged_frames)
+        return self._need_not_move or self._sure_frames >= needed
+
+    def looks_like_a_fish(self, min_frames: int) -> bool:
+        """True once it did in so many frames, and for what nothing judged."""
+        is_rare = self._fish_like_frames < _MIN_FISH_LIKE_SHARE * self._judged_frames
+        seen = self._fish_like_closer + (0 if is_rare else self._fish_like_frames)
+        return self._judged_frames == 0 or seen >= min_frames
+
+
+def _edges_px(candidate: Candidate) -> Float[np.ndarray, "2 2"] | None:
+    """Left and top, right and bottom of its box where it is in the scene."""
+    if candidate.place_px is None:
+        return None
+    half = (candidate.bbox_xyxy_px[2:] - candidate.bbox_xyxy_px[:2]) / 2
+    return np.stack([candidate.place_px - half, candidate.place_px + half])
+
+
+def _distance(
+    before: Float[np.ndarray, "2 2"], now: Float[np.ndarray, "2 2"], *, is_outlined: bool
+) -> float:
+    """How far a box has moved: its middle, or of a network's box, which may jump, both edges."""
+    shifts = now - before
+    if is_outlined:
+        return float(np.hypot(*shifts.mean(axis=0)))
+    is_shared = shifts[0] * shifts[1] > 0
+    return float(np.hypot(*np.where(is_shared, np.abs(shifts).min(axis=0), 0.0)))

@@ -1,0 +1,300 @@
+"""Find the fish of a video: detector, tracker and confirmation together.
+
+Fish that a detector found twice in one picture, and parts of fish that it took for others.
+
+A box with a fish's tail and one without it, or a fish and its fin, overlap too little to be one
+box. Their masks tell: fish share no pixels.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.detection.box_files import UNKNOWN_ID, load_boxes
+from stream_dmr.detection.detector import Detector
+from stream_dmr.detection.fused_detector import FusedDetector
+from stream_dmr.detection.given_fish import (
+    AnnotatedFish,
+    BoxDetector,
+    NamedPictures,
+    names_pictures,
+    open_annotated_fish,
+)
+from stream_dmr.detection.mask_folder import MaskFolder
+from stream_dmr.detection.open_detector import DetectFishSettings, open_detector
+from stream_dmr.messages import FishCrop, Frame
+from stream_dmr.segmentation.crop import Detection
+from stream_dmr.tracking.box_correction import BoxCorrector
+from stream_dmr.tracking.confirmation import ConfirmationSettings, FishConfirmation, FishEvidence
+from stream_dmr.tracking.tracker import Tracker, TrackerSettings
+
+
+@dataclass(kw_only=True)
+class Sightings:
+    """What was seen in the frames so far."""
+
+    frames: int = 0
+    candidates: int = 0  # shapes that a detector took for possible fish, over all frames
+    tracks: int = 0  # followed ones
+    any_moved: bool = False  # one of them moved from its place
+    any_fish_like: bool = False  # one of those looked like a fish
+    best_confidence: float = 0.0  # highest `mask_confidence` of any crop
+
+
+def explain_no_fish(
+    seen: Sightings,
+    refused: Mapping[str, int],
+    *,
+    min_frames: int,
+    min_confidence: float,
+) -> str:
+    """One line: why no fish was found in these frames, and what to do.
+
+    `refused` are the detector's shapes that were no candidates, by reason; `min_frames` and
+    `min_confidence` are `[track_fish] min_track_frames` and `min_mask_confidence`.
+    """
+    begin = f"no fish in {seen.frames} frames: "
+    if seen.candidates == 0 and not refused:
+        return begin + (
+            "nothing moved or looked like a fish; fish that hardly move and look unlike others "
+            "need a detector of your own (.onnx), or --boxes"
+        )
+    if seen.candidates == 0:
+        shapes = ", ".join(f"{count} {reason}" for reason, count in _commonest(refused))
+        return begin + (
+            f"all {sum(refused.values())} moving shapes were refused ({shapes}); change that "
+            "setting where these were fish"
+        )
+    if seen.tracks > 0 and not seen.any_moved:
+        return begin + (
+            f"{seen.tracks} shapes were followed, none left its place by a quarter of its size, "
+            "as plants and glitter don't; fish that stay need a detector of your own (.onnx) or "
+            "--boxes; --stills for single pictures"
+        )
+    if seen.tracks > 0 and not seen.any_fish_like:
+        return begin + (
+            f"{seen.tracks} shapes were followed, none looked like a fish to the network; set "
+            "[track_fish] min_fish_like_frames = 0 where they are fish"
+        )
+    if seen.best_confidence < min_confidence:
+        return begin + (
+            f"{seen.candidates} shapes were looked at, and no mask was as sure as [track_fish] "
+            f"min_mask_confidence = {min_confidence:g} (the surest {seen.best_confidence:.2f}); "
+            "lower it, or train the network on these pictures"
+        )
+    return begin + (
+        f"{seen.tracks} shapes were followed, none with a sure mask in {min_frames} frames within "
+        "the zone; lower [track_fish] min_track_frames, or widen zone; --stills for single pictures"
+    )
+
+
+def _commonest(refused: Mapping[str, int]) -> list[tuple[str, int]]:
+    return sorted(refused.items(), key=lambda item: -item[1])
+
+
+# Of a mask that lies inside another one. In 70 stills, repeats and fins had 0.85 and more of theirs
+# in the fish's, neighbours at most 0.14; see docs/research/real-lengths.md.
+_SAME = 0.5
+
+
+def without_repeats(crops: Mapping[int, FishCrop], scores: Mapping[int, float]) -> list[int]:
+    """The ids of crops of one picture without those whose masks lie in one of a higher score."""
+    kept: list[int] = []
+    for one in sorted(crops, key=lambda one: -scores[one]):
+        if all(share_inside(crops[one], crops[other]) <= _SAME for other in kept):
+            kept.append(one)
+    return sorted(kept)
+
+
+def share_inside(crop: FishCrop, other: FishCrop) -> float:
+    """The share of a crop's mask that lies in another crop's of the same frame; 0 if it is empty.
+
+    Both cameras have the frame camera's orientation and no distortion.
+    """
+    crop_from_other = crop.crop_camera.K @ np.linalg.inv(other.crop_camera.K)
+    seen = cv2.warpAffine(
+        other.mask.view(np.uint8) * np.uint8(255), crop_from_other[:2], crop.mask.shape[::-1]
+    )
+    return np.count_nonzero(crop.mask & (seen > 127)) / max(np.count_nonzero(crop.mask), 1)
+
+
+_MAX_CLOSER_LOOKS = 6  # at a track; each takes as long as one at a frame
+
+
+class TrackFishSettings(TrackerSettings, ConfirmationSettings):
+    """`[track_fish]`: how detected fish are followed, and which count."""
+
+
+class TrackedFish:
+    """A `FishFinder` that tracks a detector's candidates and confirms those with fish masks."""
+
+    def __init__(self, detector: Detector, settings: TrackFishSettings) -> None:
+        self._detector = detector
+        self._tracker = Tracker(settings)
+        self._confirmation = FishConfirmation(settings)
+        self._corrector = BoxCorrector()
+        self._settings = settings
+        self._seen = Sightings()
+        # Single pictures in which a detector's boxes are all that speaks for a fish.
+        self._are_stills = not settings.across_frames and not isinstance(detector, BoxDetector)
+        self._evidence: dict[int, FishEvidence] = {}  # of the frame's tracks
+        self._scores: dict[int, float] = {}  # of the detector, likewise
+        self._found_any = False
+
+    def detect(self, frame: Frame) -> list[Detection]:
+        """All tracks seen in a frame, by track number. Frames must come in order."""
+        candidates = self._detector.find(frame)
+        tracked = self._tracker.step(frame, candidates)
+        self._seen.frames += 1
+        self._seen.candidates += len(candidates)
+        boxes = {one.track_number: one.candidate.bbox_xyxy_px for one in tracked}
+        visible = {one.track_number: one.visible_fraction for one in tracked}
+        self._evidence = {one.track_number: one.evidence for one in tracked}
+        self._scores = {one.track_number: one.candidate.score for one in tracked}
+        self._look_closer(frame, boxes)
+        self._seen.any_moved |= any(one.has_moved for one in self._evidence.values())
+        self._seen.any_fish_like |= any(map(self._may_count, self._evidence))
+        return [
+            replace(one, may_be_no_fish=not self._is_surely_fish(one.source_id))
+            for one in self._corrector.correct(boxes, visible, frame)
+        ]
+
+    def _look_closer(self, frame: Frame, boxes: Mapping[int, Float[np.ndarray, "4"]]) -> None:
+        """Look at one of those that move and, small as they are, look like no fish from afar."""
+        if not isinstance(self._detector, FusedDetector):
+            return
+        waiting = [
+            track
+            for track, one in self._evidence.items()
+            if one.has_moved and not self._may_count(track) and one.closer_looks < _MAX_CLOSER_LOOKS
+        ]
+        if waiting:
+            track = min(waiting, key=lambda track: self._evidence[track].closer_looks)
+            looks = self._detector.look_closer(frame, boxes[track])
+            self._evidence[track].add_closer_look(looks)
+
+    def _is_surely_fish(self, track: int) -> bool:
+        """True for a confirmed track, and for one that went far or that need not move."""
+        if self._are_stills:
+            return False
+        return self._evidence[track].went_far or self._confirmation.is_confirmed(track)
+
+    def _may_count(self, track: int) -> bool:
+        evidence = self._evidence[track]
+        min_frames = self._settings.min_fish_like_frames
+        return evidence.has_moved and evidence.looks_like_a_fish(min_frames)
+
+    @property
+    def knows_ids(self) -> bool:
+        """False: track numbers also count what turns out to be no fish."""
+        return False
+
+    def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:
+        """The track numbers of confirmed fish; `crops` are those of all detections of the frame."""
+        self._corrector.update(crops)
+        fish = [
+            track
+            for track, crop in crops.items()
+            if self._confirmation.update(track, crop, may_count=self._may_count(track))
+        ]
+        if self._are_stills:
+            fish = without_repeats({track: crops[track] for track in fish}, self._scores)
+        self._found_any = self._found_any or bool(fish)
+        self._seen.tracks = max(self._seen.tracks, *crops) if crops else self._seen.tracks
+        for crop in crops.values():
+            confidence = crop.quality.mask_confidence or 0.0
+            self._seen.best_confidence = max(self._seen.best_confidence, confidence)
+        return fish
+
+    @property
+    def gives_masks(self) -> bool:
+        """False: the segmenter finds the masks."""
+        return False
+
+    @property
+    def warnings(self) -> list[str]:
+        """Why there are no fish, where there are none; a missed one of several is not noticed."""
+        if self._found_any or self._seen.frames == 0:
+            return []
+        return [
+            explain_no_fish(
+                self._seen,
+                self._detector.refused,
+                min_frames=self._settings.min_track_frames,
+                min_confidence=self._settings.min_mask_confidence,
+            ),
+        ]
+
+    @property
+    def unused(self) -> list[str]:
+        """Boxes of a file that are beyond the last frame so far; nothing without such a file."""
+        return self._detector.unused if isinstance(self._detector, BoxDetector) else []
+
+
+@runtime_checkable
+class FishFinder(Protocol):
+    """Finds the fish of each frame: `detect` before the crops are cut, then `confirm`."""
+
+    @property
+    def gives_masks(self) -> bool:
+        """True where every detection comes with a mask, so that no segmenter is needed."""
+        ...
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the user should know of the frames so far, one line each; complete at the end."""
+        ...
+
+    @property
+    def unused(self) -> list[str]:
+        """What of the given files no frame so far had, one line each.
+
+        True of the whole source only once it was read to its end.
+        """
+        ...
+
+    def detect(self, frame: Frame) -> list[Detection]:
+        """What may be fish in one frame. Raises AnnotationError for an unusable mask."""
+        ...
+
+    @property
+    def knows_ids(self) -> bool:
+        """True where `source_id` is the id that somebody gave the fish."""
+        ...
+
+    def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:
+        """Those of the frame's detections that are fish; `crops` and results by `source_id`."""
+        ...
+
+
+def open_finder(
+    *,
+    boxes: Path | None,
+    masks: Path | None,
+    detect: DetectFishSettings,
+    track: TrackFishSettings,
+    pictures: Path | None = None,
+) -> FishFinder:
+    """Fish from annotation files where given; tracked ones otherwise, and for boxes without ids.
+
+    `pictures`: the source of the frames, after which masks and boxes may be named.
+    Raises AnnotationError or ModelError where a file cannot be read.
+    """
+    if boxes is None and masks is None:
+        return TrackedFish(open_detector(detect), track)
+    if boxes is not None and names_pictures(boxes):
+        folder = None if masks is None else MaskFolder(masks, pictures=pictures)
+        return NamedPictures(boxes, folder or open_detector(detect))
+    if boxes is None or masks is not None:
+        return open_annotated_fish(
+            boxes=boxes, masks=masks, pictures=pictures, across_frames=track.across_frames
+        )
+    frames = load_boxes(boxes, pictures=pictures)
+    if any(box.track_id == UNKNOWN_ID for found in frames.values() for box in found):
+        return TrackedFish(BoxDetector(frames), track)
+    return AnnotatedFish(boxes=frames, masks=None, across_frames=track.across_frames)

@@ -1,0 +1,270 @@
+"""Multi-object tracking: each fish keeps its number through gaps, merged blobs and crossings.
+
+A constant-velocity Kalman filter per fish and the cheapest assignment of fish to candidates, after
+Bewley et al., "Simple online and realtime tracking", ICIP 2016. Where fish meet, their boxes say
+little, so area and colour weigh as well; a blob that contains several fish is split by
+`split_blobs` or assigned to none of them, and `occlusion` settles their identities afterwards.
+
+The one place where a fish gets its `track_id`.
+
+Three numbers name a fish on its way. A detection's `source_id` is that of its annotation file or of
+its track in the tracker, and stays inside of segmentation. `TrackNumbering` turns it into the
+`track_id` of the FishCrop, once; every later message, table, database and recording has that one.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydantic import Field
+from scipy.optimize import linear_sum_assignment
+
+from stream_dmr.detection.detector import Candidate
+from stream_dmr.messages import Frame
+from stream_dmr.settings import Settings
+from stream_dmr.tracking.observation import Observation
+from stream_dmr.tracking.occlusion import IMPOSSIBLE, reidentify
+from stream_dmr.tracking.split_blobs import split_merged_blob
+from stream_dmr.tracking.track import Track, TrackedCandidate
+
+# Chosen on simulated scenes and crossings by IDF1 and fish counted; see docs/research/tracking.md.
+_MIN_MERGED_FRACTION = 0.55  # of a fish's predicted box inside a candidate that contains the fish
+_MIN_MERGED_AREA_RATIO = 1.3  # of a merged blob over the largest fish in it
+_MAX_OVERLAP_OF_NEW = 0.3  # of a new candidate inside a followed fish's box; above, it is a part
+_MAX_COVERED_FRAMES = 30  # that a fish may be hidden by another one
+_MIN_KNOWN_FRAMES = 8  # frames seen before a fish can be re-identified
+
+
+class TrackerSettings(Settings):
+    """The part of `[track_fish]` that says how fish are followed from frame to frame."""
+
+    max_lost_frames: int = Field(
+        default=7, ge=0, description="a fish unseen for more consecutive frames is gone"
+    )
+    max_hidden_frames: int = Field(
+        default=0,
+        ge=0,
+        description="a fish lost in the open is re-identified within so many frames; 0 at a rail, "
+        "where the next fish soon hangs in its place",
+    )
+    across_frames: bool = Field(
+        default=True,
+        description="false: each picture stands for itself, as with --stills",
+    )
+    min_score: float = Field(
+        default=0.3, ge=0, le=1, description="least score of a detector's candidate that counts"
+    )
+
+
+class Tracker:
+    """Follows every candidate; `confirmation` decides which tracks are fish."""
+
+    def __init__(self, settings: TrackerSettings) -> None:
+        self._settings = settings
+        self._tracks: list[Track] = []
+        self._hidden: list[Track] = []  # lost for longer, but may come out from behind something
+        self._num_started = 0
+
+    def step(self, frame: Frame, candidates: Sequence[Candidate]) -> list[TrackedCandidate]:
+        """The tracks seen in a frame. Frames must come in order; some may be missing."""
+        observations = [
+            Observation(frame.image, candidate)
+            for candidate in candidates
+            if candidate.score >= self._settings.min_score
+        ]
+        if not self._settings.across_frames:
+            self._tracks, self._hidden = [], []
+        for track in (*self._tracks, *self._hidden):
+            track.predict(frame.frame_index)
+        observations = [piece for one in observations for piece in self._split(frame, one)]
+        observations = self._without_merged(observations)
+        unassigned = self._assign(observations)
+        self._keep_covered(observations)
+        self._drop_lost(frame)
+        self._start_tracks(self._reidentify(unassigned), frame.frame_index)
+        return [
+            t.tracked_candidate() for t in self._tracks if t.lost_frames == 0 and t.was_separate
+        ]
+
+    def _fish_inside(self, observation: Observation) -> list[Track]:
+        """The tracks whose predicted box lies mostly inside an observation's."""
+        return [
+            track
+            for track in self._tracks
+            if track.may_be_hidden and track.fraction_inside(observation.box) > _MIN_MERGED_FRACTION
+        ]
+
+    def _split(self, frame: Frame, observation: Observation) -> list[Observation]:
+        """The pieces of a blob that several fish share; `[observation]` for any other."""
+        fish = self._fish_inside(observation)
+        largest = max((track.area for track in fish), default=np.inf)
+        is_merged = observation.area >= _MIN_MERGED_AREA_RATIO * largest
+        if not is_merged or any(track.observation.touches_border for track in fish):
+            return [observation]
+        silhouettes = [track.predicted_silhouette() for track in fish]
+        pieces = split_merged_blob(
+            observation.candidate, [one for one in silhouettes if one is not None]
+        )
+        if len(pieces) < 2:
+            return [observation]
+        return [Observation(frame.image, one, whole=observation.candidate) for one in pieces]
+
+    def _without_merged(self, observations: Sequence[Observation]) -> list[Observation]:
+        """Drop observations that contain several fish; those fish are kept inside them."""
+        separate = []
+        for observation in observations:
+            fish = self._fish_inside(observation)
+            largest = max((track.area for track in fish), default=0.0)
+            if len(fish) > 1 and observation.area > _MIN_MERGED_AREA_RATIO * largest:
+                for track in fish:
+                    track.merge_into(observation)
+            else:
+                separate.append(observation)
+        return separate
+
+    def _assign(self, observations: Sequence[Observation]) -> list[Observation]:
+        """Update each track with its observation; returns the unassigned observations."""
+        if not self._tracks or not observations:
+            return list(observations)
+        costs = np.array([[track.cost(one) for one in observations] for track in self._tracks])
+        assigned = set()
+        for row, column in zip(*linear_sum_assignment(costs), strict=True):
+            if costs[row, column] < IMPOSSIBLE:
+                self._tracks[row].update(observations[column])
+                assigned.add(column)
+        return [one for i, one in enumerate(observations) if i not in assigned]
+
+    def _keep_covered(self, observations: Sequence[Observation]) -> None:
+        """Keep lost fish that are predicted where another one has just been seen: behind it."""
+        for track in self._tracks:
+            if track.lost_frames > 0 and track.may_be_hidden:
+                for observation in observations:
+                    if track.fraction_inside(observation.box) > _MIN_MERGED_FRACTION:
+                        track.merge_into(observation)
+                        break
+
+    def _drop_lost(self, frame: Frame) -> None:
+        """Drop tracks that left the frame or were lost for too long, unless they may be hidden."""
+        height, width = frame.image.shape[:2]
+        tracks = [track for track in self._tracks if track.is_in_frame(width, height)]
+        max_lost_frames = self._settings.max_lost_frames
+        self._tracks = [track for track in tracks if track.lost_frames <= max_lost_frames]
+        lost = [track for track in tracks if track.lost_frames > max_lost_frames]
+        self._hidden = [
+            track
+            for track in (*self._hidden, *lost)
+            if track.lost_frames - 1 <= self._max_hidden_frames(track)  # this frame may show it
+            and track.frames_seen >= _MIN_KNOWN_FRAMES
+            and not track.observation.touches_border
+        ]
+
+    def _max_hidden_frames(self, track: Track) -> int:
+        is_covered = track.snapshot is not None and track.snapshot.is_covered
+        return max(self._settings.max_hidden_frames, _MAX_COVERED_FRAMES if is_covered else 0)
+
+    def _start_tracks(self, observations: Sequence[Observation], frame_index: int) -> None:
+        """Start a track for each observation that is no part of a fish that is seen."""
+        seen = [track for track in self._tracks if track.lost_frames == 0]
+        for observation in observations:
+            is_apart = not any(
+                observation.fraction_inside(track.observation.box) > _MAX_OVERLAP_OF_NEW
+                for track in seen
+            )
+            if observation.is_piece or is_apart:
+                self._num_started += 1
+                self._tracks.append(Track(observation, self._num_started, frame_index))
+
+    def _reidentify(self, unassigned: Sequence[Observation]) -> list[Observation]:
+        """Settle the identities of fish that were merged or lost; returns what is still unassigned.
+
+        Tracks too young to be known count as new observations: they may be an older fish.
+        """
+        may_be_behind = self._settings.max_hidden_frames > 0
+        for track in self._tracks:
+            is_unclear = (may_be_behind and track.lost_frames > 0) or track.observation.is_piece
+            if is_unclear and track.frames_seen >= _MIN_KNOWN_FRAMES:
+                track.make_uncertain()
+        uncertain = [t for t in (*self._tracks, *self._hidden) if t.snapshot is not None]
+        young = [
+            t for t in self._tracks if t.frames_seen < _MIN_KNOWN_FRAMES and t.lost_frames == 0
+        ]
+        new = [*unassigned, *(track.observation for track in young)]
+        new = [one for one in new if not one.is_piece and not one.touches_border]
+        taken = self._exchange(uncertain, new)
+        self._tracks = [t for t in self._tracks if t not in young or t.observation not in taken]
+        self._tracks += [track for track in self._hidden if track.lost_frames == 0]
+        self._hidden = [track for track in self._hidden if track.lost_frames > 0]
+        self._settle(uncertain)
+        return [one for one in unassigned if one not in taken]
+
+    def _exchange(
+        self, uncertain: Sequence[Track], new: Sequence[Observation]
+    ) -> list[Observation]:
+        """Reassign the uncertain fish to their tracks' and to new observations; returns the taken.
+
+        Where a track shows another fish, the fish's number and snapshot move to it.
+        """
+        owners = [t for t in uncertain if t.lost_frames == 0 and not t.observation.is_piece]
+        if not uncertain or not (owners or new):
+            return []
+        observations = [*(track.observation for track in owners), *new]
+        fish = [(track.number, track.make_uncertain()) for track in uncertain]
+        fish_of = reidentify(
+            [snapshot for _, snapshot in fish],
+            [uncertain.index(track) for track in owners],
+            observations,
+        )
+        track_of = {row: owners[i] for i, row in fish_of.items() if i < len(owners)}
+        _distribute_others(track_of, uncertain)
+        for row, track in track_of.items():
+            track.take_identity(*fish[row])
+        taken = {i: row for i, row in fish_of.items() if i >= len(owners)}
+        for i, row in taken.items():
+            track_of[row].resume(observations[i])
+        return [observations[i] for i in taken]
+
+    def _settle(self, uncertain: Sequence[Track]) -> None:
+        """Settle fish seen separately; keep the others inside the blobs that may hide them."""
+        seen = [track for track in uncertain if track.lost_frames == 0]
+        for track in uncertain:
+            blobs = [one.observation.outer_box for one in (seen if track.lost_frames else [track])]
+            track.make_uncertain().constrain_to_one_of(blobs)
+        lost = [track.make_uncertain() for track in uncertain if track.lost_frames > 0]
+        for track in seen:
+            if track.is_settled and not any(one.is_inside(track.observation.box) for one in lost):
+                track.settle()
+
+
+def _distribute_others(track_of: dict[int, Track], uncertain: Sequence[Track]) -> None:
+    """Give every fish without a track one of those left over, its own where possible.
+
+    `track_of`: tracks by the fish's index in `uncertain`; completed in place.
+    """
+    spare = [track for track in uncertain if track not in track_of.values()]
+    rows = [row for row in range(len(uncertain)) if row not in track_of]
+    for row in sorted(rows, key=lambda row: uncertain[row] not in spare):  # own tracks first
+        track_of[row] = uncertain[row] if uncertain[row] in spare else spare[0]
+        spare.remove(track_of[row])
+
+
+class TrackNumbering:
+    """Assigns track ids, each to one fish of the output folder, from 1.
+
+    An annotated fish keeps the id of its file; tracked ones are numbered as they come. Both are
+    counted on after the ids of earlier runs in the same folder.
+    """
+
+    def __init__(self, *, keeps_source_ids: bool) -> None:
+        """`keeps_source_ids`: the ids of annotation files, instead of new numbers."""
+        self._keeps_source_ids = keeps_source_ids
+        self._last_id = 0  # of earlier runs
+        self._ids: dict[int, int] = {}  # by source id
+
+    def resume_after(self, track_id: int) -> None:
+        """Number all fish after this id of an earlier run; call it before the first fish."""
+        self._last_id = track_id
+
+    def track_id(self, source_id: int) -> int:
+        """The id of a fish, always the same for the same `source_id`."""
+        if self._keeps_source_ids:
+            return self._last_id + source_id
+        return self._ids.setdefault(source_id, self._last_id + len(self._ids) + 1)

@@ -1,0 +1,312 @@
+"""Training examples from a user's own pictures and masks."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Integer, UInt8
+
+from stream_dmr.errors import AnnotationError
+from stream_dmr.networks.unet_interface import box_coverage
+from stream_dmr.pictures import MAX_PIXELS, PICTURE_SUFFIXES, size_if_huge
+from stream_dmr.training.image_degradation import add_weather, simulate_camera
+from stream_dmr.training.random_fish import PATCH_PX, RIM_PX
+from stream_dmr.training.samples import TrainingSample, crop_affine, draw_part_box, jitter_box
+from stream_dmr.training.surroundings import BACKGROUND_PX
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AnnotatedImage:
+    """One image with the masks of its fish."""
+
+    path: Path
+    image: UInt8[np.ndarray, "H W 3"]  # BGR
+    masks: list[Bool[np.ndarray, "H W"]]
+
+
+def read_annotated_images(images: Path, masks: Path) -> Iterator[AnnotatedImage]:
+    """The annotated images, ordered by name.
+
+    `masks` is a folder with STEM.png for each image, whose pixel values are fish ids and 0 is
+    background, or a COCO file. Beside ids the largest value of the type is unknown, as in a run.
+    Raises AnnotationError where images and masks do not match.
+    """
+    paths = list_images(images)
+    if masks.is_dir() and masks.samefile(images):
+        raise AnnotationError(
+            f"{masks}: expected masks in a folder of their own, got that of the images; move them"
+        )
+    if masks.is_dir():
+        yield from _read_folder(paths, masks)
+    elif masks.suffix.lower() == ".json":
+        yield from _read_coco(paths, masks)
+    else:
+        raise AnnotationError(f"{masks}: expected a folder of PNG masks or a COCO .json")
+
+
+def list_images(folder: Path) -> dict[str, Path]:
+    """The images of a folder by name, in its order. Raises AnnotationError where it has none."""
+    if not folder.is_dir():
+        raise AnnotationError(f"{folder}: expected a folder of images, found none there")
+    files = sorted(folder.iterdir())
+    paths = {path.name: path for path in files if path.suffix.lower() in PICTURE_SUFFIXES}
+    if not paths:
+        suffixes = ", ".join(sorted(PICTURE_SUFFIXES))
+        raise AnnotationError(f"{folder}: expected images ({suffixes}), found none")
+    return paths
+
+
+def _read_folder(paths: dict[str, Path], masks: Path) -> Iterator[AnnotatedImage]:
+    missing = [path.name for path in paths.values() if not (masks / f"{path.stem}.png").exists()]
+    if missing:
+        raise AnnotationError(
+            f"{masks}: expected a mask for each of {len(paths)} images, found none for "
+            f"{len(missing)}, the first of them {missing[0]}; a mask is named like its image, .png"
+        )
+    files = {path: masks / f"{path.stem}.png" for path in paths.values()}
+    # Fish that are drawn as 255 alone are fish; beside ids that is what hides them.
+    have_ids = any(_ids(labels).any() for labels in map(_read_labels, files.values()))
+    for path, mask in files.items():
+        image, labels = read_image(path), _read_labels(mask)
+        _check_size(mask, labels.shape, image)
+        labels = _ids(labels) if have_ids else labels
+        ids = np.unique(labels[labels > 0]).tolist()
+        yield AnnotatedImage(path=path, image=image, masks=[labels == one for one in ids])
+
+
+def _read_labels(mask: Path) -> Integer[np.ndarray, "H W"]:
+    _refuse_huge(mask)
+    labels = cv2.imread(str(mask), cv2.IMREAD_UNCHANGED)
+    if labels is None or labels.ndim != 2:
+        raise AnnotationError(f"{mask}: expected a PNG of one channel, the ids of fish")
+    return labels
+
+
+def _ids(labels: Integer[np.ndarray, "H W"]) -> Integer[np.ndarray, "H W"]:
+    """Without what is unknown."""
+    return np.where(labels == np.iinfo(labels.dtype).max, 0, labels)
+
+
+def _read_coco(paths: dict[str, Path], file: Path) -> Iterator[AnnotatedImage]:
+    pictures, annotations = _parse_coco(file)
+    for picture in pictures:
+        name = Path(str(picture["file_name"])).name
+        of_it = [one for one in annotations if one.get("image_id") == picture["id"]]
+        found = [one for one in of_it if not one.get("iscrowd")]  # several fish as one
+        if not found:
+            continue
+        if name not in paths:
+            raise AnnotationError(f"{file}: expected {name} among the images, found it not there")
+        image = read_image(paths[name])
+        masks = [_decode(one, file, image.shape[:2]) for one in found]
+        yield AnnotatedImage(path=paths[name], image=image, masks=masks)
+
+
+def _parse_coco(file: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        pictures, annotations = content["images"], content["annotations"]
+        pictures = sorted(pictures, key=lambda one: str(one["file_name"]))
+        if all("id" in one for one in pictures) and all("segmentation" in a for a in annotations):
+            return pictures, annotations
+    except OSError as error:
+        raise AnnotationError(f"{file}: expected a COCO .json, got: {error.strerror}") from None
+    except (ValueError, TypeError, KeyError):
+        pass
+    raise AnnotationError(
+        f'{file}: expected COCO\'s JSON with "images" (id, file_name) and "annotations" (image_id, '
+        "segmentation)"
+    )
+
+
+def _decode(
+    annotation: dict[str, Any], file: Path, shape: tuple[int, ...]
+) -> Bool[np.ndarray, "H W"]:
+    """A mask from polygons (x, y, ... from the image's corner) or from run lengths.
+
+    COCO's runs go down the columns and begin with background.
+    """
+    segmentation = annotation["segmentation"]
+    try:
+        if isinstance(segmentation, dict):
+            counts = segmentation["counts"]
+            runs = _unpack(counts) if isinstance(counts, str) else counts
+            if sum(runs) != shape[0] * shape[1] or list(segmentation["size"]) != list(shape):
+                raise AnnotationError(
+                    f"{file}: expected a mask of {shape[1]}x{shape[0]} px, got one of another size "
+                    f"(annotation {annotation.get('id')})"
+                )
+            values = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
+            return np.ascontiguousarray(values.reshape(shape[1], shape[0]).T)
+        canvas = np.zeros(shape, np.uint8)
+        corners = [np.array(ring, np.float64).reshape(-1, 2) - 0.5 for ring in segmentation]
+        cv2.fillPoly(canvas, [np.round(ring * 16).astype(np.int32) for ring in corners], 1, shift=4)
+        return canvas > 0
+    except (ValueError, TypeError, KeyError):
+        raise AnnotationError(
+            f"{file}: expected polygons or run lengths, got something else "
+            f"(annotation {annotation.get('id')})"
+        ) from None
+
+
+def _unpack(text: str) -> list[int]:
+    """COCO's compressed run lengths: 5 bits a character, differences to the last run but one.
+
+    After `rleFrString` of the COCO API (github.com/cocodataset/cocoapi, common/maskApi.c).
+    """
+    runs: list[int] = []
+    value = shift = 0
+    for byte in text.encode("ascii"):
+        bits = byte - 48
+        value |= (bits & 31) << shift
+        shift += 5
+        if bits & 32:
+            continue
+        if bits & 16:
+            value -= 1 << shift
+        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+        value = shift = 0
+    return runs
+
+
+def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+    """The image, BGR. Raises AnnotationError where it can't be decoded, or is too large for it."""
+    _refuse_huge(path)
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise AnnotationError(f"{path}: expected an image, but it can't be decoded")
+    return image
+
+
+def _refuse_huge(path: Path) -> None:
+    if huge := size_if_huge(path):
+        raise AnnotationError(
+            f"{path}: expected a picture of {MAX_PIXELS // 10**6} megapixels or less, got {huge}"
+        )
+
+
+def _check_size(mask: Path, shape: tuple[int, ...], image: UInt8[np.ndarray, "H W 3"]) -> None:
+    height, width = image.shape[:2]
+    if shape != (height, width):
+        raise AnnotationError(
+            f"{mask}: expected a mask of its image's size, {width}x{height} px, "
+            f"got {shape[1]}x{shape[0]} px"
+        )
+
+
+_CUTOUT_PX = 448  # width and height of a cutout: the fish is longer than in a crop
+_MARGIN = 0.6  # on each side, of the fish's longer side: room to rotate it
+_MIN_AREA_PX = 64  # of a fish's mask, as `[crop_fish] min_mask_area_px`
+_PART_SHARE = 0.055  # of the crops, whose box is around a part of the fish
+_VALIDATION_EVERY = 5  # images, of which one is kept for validation
+
+
+Cutout = UInt8[np.ndarray, "C C 4"]  # one fish with its surroundings: BGR, and mask (0 or 255)
+
+
+def load_fish_cutouts(images: Path, masks: Path) -> tuple[list[Cutout], list[Cutout]]:
+    """The fish to train on, and those of every fifth image, for validation.
+
+    Raises AnnotationError where images and masks do not match, or have too few fish.
+    """
+    training: list[Cutout] = []
+    validation: list[Cutout] = []
+    for index, annotated in enumerate(read_annotated_images(images, masks)):
+        fish = [
+            _cut_out(annotated.image, mask)
+            for mask in annotated.masks
+            if np.count_nonzero(mask) >= _MIN_AREA_PX
+        ]
+        (validation if index % _VALIDATION_EVERY == _VALIDATION_EVERY - 1 else training).extend(
+            fish
+        )
+    if not training or not validation:
+        raise AnnotationError(
+            f"{masks}: expected fish of at least {_MIN_AREA_PX} px in at least {_VALIDATION_EVERY} "
+            f"images, every fifth of which is for validation, got {len(training)} fish to train on "
+            f"and {len(validation)} for validation"
+        )
+    return training, validation
+
+
+def draw_annotated_sample(
+    rng: np.random.Generator, cutout: Cutout, *, size_px: int
+) -> TrainingSample:
+    """One crop of a fish, rotated, perhaps mirrored, around a box with random errors."""
+    center = (_CUTOUT_PX - 1) / 2
+    angle_deg = 90.0 * rng.integers(4) + rng.normal(0.0, 12.0)
+    rotation = cv2.getRotationMatrix2D((center, center), angle_deg, 1.0)
+    if rng.random() < 0.5:
+        rotation = rotation @ np.array([[-1.0, 0.0, 2 * center], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    rows, columns = np.nonzero(cutout[..., 3])
+    points = np.column_stack([columns, rows]) @ rotation[:, :2].T + rotation[:, 2]
+    box = np.concatenate([points.min(axis=0) - 0.5, points.max(axis=0) + 0.5])
+    if rng.random() < _PART_SHARE:
+        box = draw_part_box(rng, box, points)
+    everywhere = np.array([-np.inf, -np.inf, np.inf, np.inf])
+    box = jitter_box(rng, box, limits=everywhere)
+    crop_from_rotated = crop_affine(box, margin=rng.uniform(0.08, 0.22), size=size_px)
+    crop_from_cutout = crop_from_rotated @ np.vstack([rotation, [0.0, 0.0, 1.0]])
+    crop = cv2.warpAffine(cutout, crop_from_cutout, (size_px, size_px), flags=cv2.INTER_LINEAR)
+    picture = crop[..., :3].astype(np.float32)
+    image = crop[..., :3]
+    if rng.random() < 0.7:
+        image = simulate_camera(rng, add_weather(rng, picture) if rng.random() < 0.5 else picture)
+    edges = box.reshape(2, 2) @ crop_from_rotated[:, :2].T + crop_from_rotated[:, 2] + 0.5
+    return TrainingSample(
+        image=np.ascontiguousarray(image),
+        mask=crop[..., 3].astype(np.float32) / 255,
+        in_box=box_coverage(edges.ravel(), size=size_px),
+        ends_px=None,
+    )
+
+
+def cutout_patch(cutout: Cutout) -> UInt8[np.ndarray, "P P 4"]:
+    """The fish alone, its long axis horizontal, filling a patch: BGR times coverage, coverage."""
+    fish = cutout[..., 3] > 0
+    rows, columns = np.nonzero(fish)
+    points = np.column_stack([columns, rows]).astype(np.float64)
+    center = points.mean(axis=0)
+    _, axes = np.linalg.eigh(np.cov((points - center).T))
+    turn = np.stack([axes[:, 1], axes[::-1, 1] * [-1, 1]])  # long axis to x, without mirroring
+    turned = points @ turn.T
+    low, high = turned.min(axis=0), turned.max(axis=0)
+    scale = (PATCH_PX - 2 * RIM_PX) / max(float((high - low).max()), 1.0)
+    affine = np.column_stack([scale * turn, (PATCH_PX - 1) / 2 - scale * (low + high) / 2])
+    # The outermost pixels are partly background, so they are left out.
+    inner = cv2.erode(fish.astype(np.float32), np.ones((3, 3), np.uint8))
+    coverage = cv2.GaussianBlur(inner, (0, 0), 0.6)[..., None]
+    layer = np.dstack([cutout[..., :3] * coverage, 255 * coverage])
+    patch = cv2.warpAffine(layer, affine, (PATCH_PX, PATCH_PX), flags=cv2.INTER_LINEAR)
+    return np.clip(np.round(patch), 0, 255).astype(np.uint8)
+
+
+def load_backgrounds(folder: Path) -> list[UInt8[np.ndarray, "B B 3"]]:
+    """The middle square of every photograph in a folder, at the size of simulated backgrounds."""
+    squares = []
+    for path in list_images(folder).values():
+        image = read_image(path)
+        side = min(image.shape[:2])
+        top, left = (image.shape[0] - side) // 2, (image.shape[1] - side) // 2
+        square = image[top : top + side, left : left + side]
+        squares.append(cv2.resize(square, (BACKGROUND_PX,) * 2, interpolation=cv2.INTER_AREA))
+    return squares
+
+
+def _cut_out(image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]) -> Cutout:
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    edges = np.array([x, y, x + width, y + height]) - 0.5
+    cutout_from_image = crop_affine(edges, margin=_MARGIN, size=_CUTOUT_PX)
+    layers = np.dstack([image, mask.astype(np.uint8) * 255])
+    shrink = int(1 / cutout_from_image[0, 0])
+    if shrink > 1:  # average pixels that would be skipped
+        layers = cv2.blur(layers, (shrink, shrink))
+    cutout = cv2.warpAffine(
+        layers, cutout_from_image, (_CUTOUT_PX, _CUTOUT_PX), flags=cv2.INTER_LINEAR
+    )
+    cutout[..., 3] = np.where(cutout[..., 3] > 127, 255, 0)
+    return cutout

@@ -1,0 +1,406 @@
+"""Random backgrounds, and objects that hide fish.
+
+Random backgrounds: sea, murk, rock, deck, table, steel, clutter, or two of them.
+
+The ranges were chosen by hand.
+
+Random objects between the camera and a fish: poles, gloves, ropes, edges, lines.
+
+Each is a set of polygons in scene units (fish lengths, the fish at the origin), so that it can be
+drawn into any crop. The ranges were chosen by hand.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from stream_dmr.simulation.simulated_fish import noise
+
+BACKGROUND_PX = 256  # width and height; so that each crop of 128 px is another piece
+
+Picture = Float[np.ndarray, "B B 3"]
+Layer = Float[np.ndarray, "B B"]
+
+
+def draw_background(rng: np.random.Generator) -> UInt8[np.ndarray, "B B 3"]:
+    """One picture, BGR; in 20 % two kinds meet at an edge."""
+    picture = _draw_one(rng)
+    if rng.random() < 0.2:
+        other, share = _draw_one(rng), _half_plane(rng)[..., None]
+        picture = picture + share * (other - picture)
+    if rng.random() < 0.15:
+        _draw_net(rng, picture)
+    picture *= _draw_illumination(rng)[..., None]
+    return np.clip(picture, 0, 255).astype(np.uint8)
+
+
+def _draw_one(rng: np.random.Generator) -> Picture:
+    kinds: list[Callable[[np.random.Generator], Picture]] = [
+        *(_draw_sea, _draw_sea, _draw_murk, _draw_murk, _draw_rock, _draw_rock),
+        *(_draw_deck, _draw_table, _draw_steel, _draw_clutter, _draw_clutter),
+    ]
+    return kinds[rng.integers(len(kinds))](rng).astype(np.float32)
+
+
+def _draw_sea(rng: np.random.Generator) -> Picture:
+    """Waves coloured by their height, with foam on the crests."""
+    grain = rng.uniform(2.0, 14.0)
+    stretch = rng.uniform(1.2, 3.5)
+    ridged = 1 - np.abs(_noise(rng, stretch * grain, grain))
+    finer = 1 - np.abs(_noise(rng, 0.4 * stretch * grain, 0.4 * grain))
+    swell = _noise(rng, rng.uniform(30.0, 60.0), rng.uniform(15.0, 40.0))
+    waves = ridged + rng.uniform(0.2, 0.7) * finer + rng.uniform(0.0, 1.0) * swell
+    dark = _water_colour(rng) * 0.4
+    stops = np.stack([dark, dark * 1.8 + 10, dark * 2.6 + 40, [225.0, 225.0, 220.0]])
+    foam_from = rng.uniform(0.75, 1.3)
+    heights = np.clip((waves - waves.min()) / np.ptp(waves) / foam_from, 0, 1)
+    return _colour_map(heights, stops, [0.0, 0.5, 0.85, 1.0])
+
+
+def _draw_murk(rng: np.random.Generator) -> Picture:
+    """Clouds of three colours, as of sea out of focus or of turbid water."""
+    colours = [_water_colour(rng) * rng.uniform(0.3, 1.3) for _ in range(3)]
+    picture = np.zeros((BACKGROUND_PX, BACKGROUND_PX, 3)) + colours[0]
+    for colour in colours[1:]:
+        cloud = _noise(rng, rng.uniform(15.0, 70.0), rng.uniform(15.0, 70.0))
+        picture += (1 / (1 + np.exp(-1.5 * cloud)))[..., None] * (colour - picture)
+    if rng.random() < 0.6:
+        picture *= 1 + rng.uniform(0.02, 0.15) * _noise(rng, 6.0, 6.0)[..., None]
+    return picture
+
+
+def _draw_rock(rng: np.random.Generator) -> Picture:
+    """Layers with hard, lit edges: rock, weed, wood, coral."""
+    main = _any_colour(rng)
+    is_colourful = rng.random() < 0.35
+    picture = main * rng.uniform(0.2, 0.8) + np.zeros((BACKGROUND_PX, BACKGROUND_PX, 1))
+    for _ in range(rng.integers(2, 7)):
+        grain = rng.uniform(4.0, 30.0)
+        height = _noise(rng, grain * rng.uniform(0.5, 2.0), grain)
+        height = height + 0.4 * _noise(rng, 0.3 * grain, 0.3 * grain)
+        mask = (height > rng.uniform(-0.3, 1.0)).astype(np.float32)
+        relief = cv2.Sobel(height, cv2.CV_32F, *((1, 0) if rng.random() < 0.5 else (0, 1)))
+        tone = 1 + rng.uniform(0.0, 0.5) * relief / (relief.std() + 1e-6)
+        tone = tone + rng.uniform(0.0, 0.3) * _noise(rng, 1.5, 1.5)
+        own = (
+            _any_colour(rng)
+            if is_colourful
+            else main * rng.uniform(0.4, 1.5) * rng.uniform(0.8, 1.2, 3)
+        )
+        colour = own * np.clip(tone, 0.2, 2.5)[..., None]
+        picture += cv2.GaussianBlur(mask, (0, 0), 0.7)[..., None] * (colour - picture)
+    return picture
+
+
+def _draw_deck(rng: np.random.Generator) -> Picture:
+    """Planks, slats or a belt's ribs, with seams and stains."""
+    angle, period = rng.uniform(0, np.pi), rng.uniform(10.0, 70.0)
+    y, x = np.mgrid[:BACKGROUND_PX, :BACKGROUND_PX]
+    across = (x * np.cos(angle) + y * np.sin(angle)) / period
+    planks = rng.uniform(0.75, 1.25, 64)[np.floor(across).astype(int) % 64]
+    seam = np.exp(-(((across % 1 - 0.5) / rng.uniform(0.02, 0.15)) ** 2))
+    tone = planks * (1 - rng.uniform(-0.5, 0.8) * seam) + 0.08 * _noise(rng, 1.0, 1.0)
+    stain = 1 + rng.uniform(0.0, 0.3) * _noise(rng, 20.0, 20.0)
+    return (np.clip(tone * stain, 0.1, 3.0)[..., None] * _any_colour(rng)).astype(np.float32)
+
+
+def _draw_table(rng: np.random.Generator) -> Picture:
+    """A plain board or tray, perhaps with a ruler of dark and light squares, or a grid."""
+    tone = 1 + rng.uniform(0.0, 0.06) * _noise(rng, 1.0, 1.0)
+    tone = tone + rng.uniform(0.0, 0.1) * _noise(rng, 40.0, 40.0)
+    picture = (tone[..., None] * _any_colour(rng)).astype(np.float32)
+    for _ in range(rng.integers(0, 3)):
+        top, size = int(rng.integers(BACKGROUND_PX)), int(rng.integers(5, 26))
+        light, dark = _any_colour(rng) + 40, _any_colour(rng) * 0.3
+        columns = np.arange(BACKGROUND_PX) // size % 2
+        row = np.where(columns[:, None] == 0, light, dark)
+        picture[top : top + int(size * rng.uniform(0.5, 2.0))] = row
+    if rng.random() < 0.3:
+        picture = np.ascontiguousarray(picture.transpose(1, 0, 2))
+    return picture
+
+
+def _draw_steel(rng: np.random.Generator) -> Picture:
+    """Painted metal with rust, a lit edge and bolts."""
+    paint = _any_colour(rng) * (1 + 0.08 * _noise(rng, 30.0, 8.0))[..., None]
+    rust = np.clip(_noise(rng, rng.uniform(2, 8), rng.uniform(8, 40)) - rng.uniform(0.6, 1.6), 0, 1)
+    picture = paint + rust[..., None] * (np.array([38.0, 66.0, 112.0]) - paint)
+    picture = np.ascontiguousarray(picture, np.float32)
+    for _ in range(rng.integers(0, 4)):
+        _draw_shape(rng, picture, _any_colour(rng))
+    return picture
+
+
+def _draw_clutter(rng: np.random.Generator) -> Picture:
+    """Shapes upon shapes, each with a texture of its own."""
+    picture = np.ascontiguousarray(
+        _any_colour(rng) + np.zeros((BACKGROUND_PX, BACKGROUND_PX, 3)), np.float32
+    )
+    for _ in range(rng.integers(3, 16)):
+        _draw_shape(rng, picture, _any_colour(rng))
+    grain = rng.uniform(1.0, 8.0)
+    texture = 1 + rng.uniform(0.0, 0.3) * _noise(rng, grain, grain * rng.uniform(0.4, 2.5))
+    return picture * texture[..., None]
+
+
+def _draw_shape(rng: np.random.Generator, picture: Picture, colour: np.ndarray) -> None:
+    """An ellipse, a bar lit along its middle, or a polygon, drawn in place."""
+    """An ellipse, a bar lit along its middle, or a polygon, drawn in place."""
+    center = rng.integers(0, BACKGROUND_PX, 2)
+    size = rng.uniform(6.0, 90.0)
+    match int(rng.integers(4)):
+        case 0:
+            axes = (round(size), round(size * rng.uniform(0.2, 1.0)))
+            angle_deg = float(rng.uniform(0, 180))
+            cv2.ellipse(
+                picture, center.tolist(), axes, angle_deg, 0, 360, colour.tolist(), -1, cv2.LINE_AA
+            )
+        case 1:
+            other = rng.integers(0, BACKGROUND_PX, 2)
+            width = int(rng.integers(1, 22))
+            cv2.line(picture, center.tolist(), other.tolist(), colour.tolist(), width, cv2.LINE_AA)
+            lit = (colour * 1.4).tolist()
+            cv2.line(picture, center.tolist(), other.tolist(), lit, max(1, width // 3), cv2.LINE_AA)
+        case _:
+            angles = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 9)))
+            corners = center + size * np.column_stack([np.cos(angles), np.sin(angles)])
+            points = np.round(corners).astype(np.int32)
+            cv2.fillPoly(picture, [points], colour.tolist(), cv2.LINE_AA)
+
+
+def _draw_net(rng: np.random.Generator, picture: Picture) -> None:
+    """A net of slanted meshes, drawn in place."""
+    """A net of slanted meshes, drawn in place."""
+    mesh, width = int(rng.integers(10, 50)), int(rng.integers(1, 4))
+    slope = int(rng.integers(-BACKGROUND_PX, BACKGROUND_PX))
+    colour = _any_colour(rng).tolist()
+    for at in range(-BACKGROUND_PX, 2 * BACKGROUND_PX, mesh):
+        cv2.line(picture, (at, 0), (at + slope, BACKGROUND_PX), colour, width, cv2.LINE_AA)
+        cv2.line(picture, (0, at), (BACKGROUND_PX, at - slope), colour, width, cv2.LINE_AA)
+
+
+def _half_plane(rng: np.random.Generator) -> Layer:
+    """1 on one side of a random, slightly wavy edge, 0 on the other."""
+    """1 on one side of a random, slightly wavy edge, 0 on the other."""
+    y, x = np.mgrid[:BACKGROUND_PX, :BACKGROUND_PX] - BACKGROUND_PX / 2
+    angle = rng.choice([0.0, np.pi / 2, rng.uniform(0, 2 * np.pi)])
+    distance_px = x * np.cos(angle) + y * np.sin(angle) - rng.uniform(-80.0, 80.0)
+    distance_px = distance_px + rng.uniform(0.0, 6.0) * _noise(rng, 12.0, 12.0)
+    return np.clip(distance_px / rng.uniform(1.0, 4.0) + 0.5, 0.0, 1.0).astype(np.float32)
+
+
+def _draw_illumination(rng: np.random.Generator) -> Layer:
+    """Brightness factors that change linearly across the picture."""
+    """Brightness factors that change linearly across the picture."""
+    y, x = (np.mgrid[:BACKGROUND_PX, :BACKGROUND_PX] / BACKGROUND_PX - 0.5).astype(np.float32)
+    slope = rng.normal(0.0, 0.35, 2)
+    return np.clip(1 + slope[0] * x + slope[1] * y, 0.3, 1.7).astype(np.float32)
+
+
+def _water_colour(rng: np.random.Generator) -> np.ndarray:
+    """BGR from blue to green to grey, of any brightness."""
+    hue, saturation = rng.uniform(70.0, 125.0), rng.uniform(10.0, 220.0)
+    return _from_hsv(hue, saturation, rng.uniform(50.0, 230.0))
+
+
+def _any_colour(rng: np.random.Generator) -> np.ndarray:
+    """BGR of any hue; low saturations are more frequent."""
+    """BGR of any hue; low saturations are more frequent."""
+    return _from_hsv(rng.uniform(0.0, 180.0), 255 * rng.beta(1.0, 1.8), rng.uniform(20.0, 240.0))
+
+
+def _from_hsv(hue: float, saturation: float, value: float) -> np.ndarray:
+    pixel = np.array([[[hue, saturation, value]]]).astype(np.uint8)
+    return cv2.cvtColor(pixel, cv2.COLOR_HSV2BGR)[0, 0].astype(np.float64)
+
+
+def _colour_map(heights: Layer, colours: np.ndarray, stops: list[float]) -> Picture:
+    return np.stack([np.interp(heights, stops, channel) for channel in colours.T], axis=-1)
+
+
+def _noise(rng: np.random.Generator, grain_x: float, grain_y: float) -> Layer:
+    return noise(rng, BACKGROUND_PX, BACKGROUND_PX, grain_px=(grain_x, grain_y))
+
+
+_SUBPIXEL_BITS = 4  # of OpenCV's `shift`: coordinates in sixteenths of a pixel
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Occluder:
+    """Opaque polygons in tones of one colour, later ones over earlier ones."""
+
+    polygons: list[Float[np.ndarray, "_ 2"]]  # scene units
+    tones: list[float]  # factor of the colour, per polygon
+    colour: Float[np.ndarray, "3"]  # BGR
+    hides: bool  # its pixels are not fish; False for lines, too thin to matter
+
+
+def draw_occluders(rng: np.random.Generator) -> list[Occluder]:
+    """No occluder in 59 % of all scenes, else mostly one."""
+    chances = {_draw_pole: 0.26, _draw_glove: 0.10, _draw_rope: 0.06, _draw_edge: 0.05}
+    return [draw(rng) for draw, chance in chances.items() if rng.random() < chance]
+
+
+def draw_line(rng: np.random.Generator, start: Float[np.ndarray, "2"]) -> Occluder:
+    """A fishing line from a point upwards, out of the picture; half of them with a hook."""
+    angle = np.radians(rng.normal(-90.0, 12.0))
+    end = start + 3.0 * np.array([np.cos(angle), np.sin(angle)])
+    width = rng.uniform(0.004, 0.02)
+    bars = [_bar(start, end, width, width)]
+    if rng.random() < 0.5:
+        bars += _hook(rng, start, angle, radius=rng.uniform(0.015, 0.04), width=0.012)
+    shade = rng.uniform(20, 245) * rng.uniform(0.85, 1.15, 3)
+    return Occluder(polygons=bars, tones=[1.0] * len(bars), colour=shade, hides=False)
+
+
+def draw_ruler(rng: np.random.Generator, along_rad: float) -> Occluder:
+    """A ruler or a measuring tape beside the fish, along it, with its marks."""
+    along, width = _direction(along_rad + rng.normal(0.0, 0.06)), rng.uniform(0.02, 0.1)
+    beside = along[::-1] * [-1.0, 1.0]  # at a right angle
+    side = rng.choice([-1.0, 1.0])
+    middle = side * (rng.uniform(0.08, 0.4) + width / 2) * beside + rng.normal(0.0, 0.2) * along
+    half = rng.uniform(0.4, 1.5)
+    polygons, tones = [_strip(middle - half * along, middle + half * along, width)], [1.0]
+    edge = middle + rng.choice([-0.5, 0.5]) * width * beside
+    inwards = np.sign((middle - edge) @ beside) * rng.uniform(0.3, 0.9) * width * beside
+    mark, pitch = rng.uniform(0.1, 0.6), rng.uniform(0.03, 0.1)
+    for place in np.arange(-half + pitch, half, pitch):
+        start = edge + place * along
+        polygons.append(_strip(start, start + inwards, rng.uniform(0.1, 0.3) * pitch))
+        tones.append(mark)
+    yellow_or_white = [40, 205, 235] if rng.random() < 0.5 else [225, 230, 230]
+    colour = np.array(yellow_or_white) * rng.uniform(0.6, 1.05)
+    return Occluder(polygons=polygons, tones=tones, colour=colour, hides=True)
+
+
+def draw_into(
+    occluder: Occluder, crop_from_scene: Float[np.ndarray, "2 3"], *, size: int
+) -> tuple[Float32[np.ndarray, "S S"], Float32[np.ndarray, "S S"]]:
+    """The covered fraction of each crop pixel (0 to 1), and the tone there."""
+    covered = np.zeros((size, size), np.float32)
+    tones = np.ones((size, size), np.float32)
+    for polygon, tone in zip(occluder.polygons, occluder.tones, strict=True):
+        points = polygon @ crop_from_scene[:, :2].T + crop_from_scene[:, 2]
+        fixed = np.round(np.clip(points, -2000, 2000) * (1 << _SUBPIXEL_BITS)).astype(np.int32)
+        canvas = np.zeros((size, size), np.uint8)
+        cv2.fillPoly(canvas, [fixed], 255, cv2.LINE_AA, _SUBPIXEL_BITS)
+        part = canvas.astype(np.float32) / np.float32(255)
+        covered = np.maximum(covered, part)
+        tones += part * (np.float32(tone) - tones)
+    return covered, tones
+
+
+def _draw_pole(rng: np.random.Generator) -> Occluder:
+    """A gaff: a pole, lit along its middle, with its tip on or near the fish."""
+    tip = rng.normal(0.0, 0.2, 2)
+    angle = rng.uniform(0.0, 2 * np.pi)
+    width = rng.uniform(0.02, 0.09)
+    bars, tones = _lit_bar(rng, tip, tip + 3.0 * _direction(angle), width)
+    if rng.random() < 0.7:
+        hook = _hook(rng, tip, angle, radius=rng.uniform(0.04, 0.09), width=0.3 * width)
+        bars, tones = bars + hook, tones + [rng.uniform(0.7, 1.6)] * len(hook)
+    return Occluder(polygons=bars, tones=tones, colour=_colour(rng), hides=True)
+
+
+def _draw_glove(rng: np.random.Generator) -> Occluder:
+    """A gloved hand on the fish: an arm, a palm, three to five fingers."""
+    palm = rng.normal(0.0, 0.28, 2)
+    angle = rng.uniform(0.0, 2 * np.pi)
+    size = rng.uniform(0.06, 0.16)
+    polygons = [_bar(palm, palm + 3.0 * _direction(angle), 1.5 * size, 2.2 * size)]
+    polygons.append(_blob(rng, palm, size))
+    for spread in np.linspace(-0.9, 0.9, rng.integers(3, 6)):
+        bend = angle + np.pi + spread + rng.normal(0.0, 0.1)
+        tip = palm + rng.uniform(1.2, 2.4) * size * _direction(bend)
+        polygons.append(_bar(palm, tip, 0.55 * size, 0.4 * size))
+    tones = rng.uniform(0.8, 1.2, len(polygons)).tolist()
+    return Occluder(polygons=polygons, tones=tones, colour=_colour(rng), hides=True)
+
+
+def _draw_rope(rng: np.random.Generator) -> Occluder:
+    """A rope straight across the picture."""
+    """A rope straight across the picture."""
+    center, half = rng.normal(0.0, 0.3, 2), 3.0 * _direction(rng.uniform(0.0, np.pi))
+    bars, tones = _lit_bar(rng, center - half, center + half, rng.uniform(0.03, 0.08))
+    return Occluder(polygons=bars, tones=tones, colour=_colour(rng), hides=True)
+
+
+def _draw_edge(rng: np.random.Generator) -> Occluder:
+    """A rail, a crate or a shoulder that covers one side."""
+    outwards = _direction(rng.uniform(0.0, 2 * np.pi))
+    near = outwards * rng.uniform(0.05, 0.5)
+    wall = _bar(near, near + 3.0 * outwards, 5.0, 5.0)
+    return Occluder(polygons=[wall], tones=[1.0], colour=_colour(rng), hides=True)
+
+
+def _lit_bar(
+    rng: np.random.Generator,
+    start: Float[np.ndarray, "2"],
+    end: Float[np.ndarray, "2"],
+    width: float,
+) -> tuple[list[Float[np.ndarray, "_ 2"]], list[float]]:
+    """A round bar: darker at its sides, with a highlight; 25 % are flat."""
+    shares = [1.0, rng.uniform(0.45, 0.8), rng.uniform(0.1, 0.3)]
+    tones = np.cumprod([rng.uniform(0.5, 1.0), rng.uniform(1.1, 1.9), rng.uniform(1.0, 1.5)])
+    if rng.random() < 0.25:
+        tones[:] = 1.0
+    return [_bar(start, end, share * width, share * width) for share in shares], tones.tolist()
+
+
+def _hook(
+    rng: np.random.Generator,
+    at: Float[np.ndarray, "2"],
+    angle: float,
+    *,
+    radius: float,
+    width: float,
+) -> list[Float[np.ndarray, "_ 2"]]:
+    """A bent wire that begins at `at`, opposite to a bar that leaves at `angle`."""
+    turns = angle + np.pi + np.linspace(-0.4, 2.6, 9) * rng.choice([-1.0, 1.0])
+    arc = radius * np.column_stack([np.cos(turns), np.sin(turns)])
+    arc = arc - arc[0] + at
+    return [_bar(a, b, width, width) for a, b in pairwise(arc)]
+
+
+def _direction(angle: float) -> Float[np.ndarray, "2"]:
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+def _bar(
+    start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"], width: float, end_width: float
+) -> Float[np.ndarray, "_ 2"]:
+    """A bar with half-round ends."""
+    along = (end - start) / (np.linalg.norm(end - start) + 1e-9)
+    angle = np.arctan2(along[1], along[0])
+    turns = angle + np.linspace(np.pi / 2, 3 * np.pi / 2, 7)
+    cap = np.column_stack([np.cos(turns), np.sin(turns)])
+    return np.concatenate([start + width / 2 * cap, end - end_width / 2 * cap])
+
+
+def _strip(
+    start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"], width: float
+) -> Float[np.ndarray, "4 2"]:
+    """A bar with square ends."""
+    along = (end - start) / (np.linalg.norm(end - start) + 1e-9)
+    beside = width / 2 * along[::-1] * [-1.0, 1.0]
+    return np.array([start + beside, end + beside, end - beside, start - beside])
+
+
+def _blob(rng: np.random.Generator, center: np.ndarray, size: float) -> Float[np.ndarray, "_ 2"]:
+    turns = np.linspace(0.0, 2 * np.pi, 12, endpoint=False)
+    radii = size * rng.uniform(0.8, 1.2, 12)[:, None]
+    return center + radii * np.column_stack([np.cos(turns), np.sin(turns)])
+
+
+def _colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+    """BGR of wood, skin, steel, orange and blue gloves, or any other."""
+    known = np.array(
+        [[84, 122, 160], [130, 150, 200], [165, 168, 168], [30, 110, 230], [170, 110, 40]]
+    )
+    if rng.random() < 0.6:
+        return known[rng.integers(len(known))] * rng.uniform(0.5, 1.2)
+    return rng.uniform(10.0, 245.0, 3)

@@ -1,0 +1,292 @@
+"""Train a U-Net: command, plots, checkpoints."""
+
+import json
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, UInt8
+
+from stream_dmr.errors import ModelError, OutputError
+from stream_dmr.networks.unet import SHIPPED, load_weights
+from stream_dmr.segmentation.segmenter import resize
+from stream_dmr.training.annotated_images import (
+    Cutout,
+    cutout_patch,
+    draw_annotated_sample,
+    load_backgrounds,
+    load_fish_cutouts,
+)
+from stream_dmr.training.image_degradation import PatchBank, load_or_make_bank
+from stream_dmr.training.samples import Draw, SampleDataset, TrainingSample, draw_sample
+from stream_dmr.training.train_settings import TrainSettings
+from stream_dmr.training.unet_trainer import EpochScores, UNetTrainer
+from stream_dmr.version import __version__
+
+_NUM_WORST = 32
+_PER_ROW = 8
+TILE_PX = 192
+_WIDTH, _HEIGHT, _EDGE = 720, 400, 48  # px of the curve
+_TRUE_BGR, _FOUND_BGR = (80, 220, 80), (60, 60, 255)
+_TEXT, _GRID = (60, 60, 60), (225, 225, 225)
+
+
+def draw_training_curve(history: Sequence[EpochScores], path: Path) -> None:
+    """Write scores from 0 to 1 over the epochs, and the loss relative to its highest value."""
+    canvas = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
+    for tenth in range(0, 11, 2):
+        left, right = _place(0.0, tenth / 10), _place(1.0, tenth / 10)
+        cv2.line(canvas, left, right, _GRID, 1)
+        _write(canvas, f"{tenth / 10:.1f}", (8, left[1] + 4), _TEXT)
+    highest = max((scores.loss for scores in history if scores.loss is not None), default=1.0)
+    curves = {
+        "mean IoU": ([s.iou for s in history], (180, 90, 0)),
+        "10th percentile of IoU": ([s.iou_p10 for s in history], (220, 170, 90)),
+        "heads found at the head": ([s.ends_right for s in history], (60, 140, 30)),
+        f"loss / {highest:.2f}": (
+            [None if s.loss is None else s.loss / highest for s in history],
+            (90, 90, 200),
+        ),
+    }
+    for index, (name, (values, colour)) in enumerate(curves.items()):
+        steps = max(len(values) - 1, 1)
+        points = [_place(k / steps, v) for k, v in enumerate(values) if v is not None]
+        for one, other in pairwise(points):
+            cv2.line(canvas, one, other, colour, 2)
+        _write(canvas, name, (_EDGE + 170 * index, 18), colour)
+    _write(canvas, f"{history[-1].epoch} epochs", (_WIDTH - 110, _HEIGHT - 12), _TEXT)
+    cv2.imwrite(str(path), canvas)
+
+
+def draw_worst_masks(training: UNetTrainer, validation: SampleDataset, path: Path) -> None:
+    """Write the validation pictures of least IoU; green: true outline, red: found one."""
+    ious = training.ious
+    worst = np.argsort(ious.numpy())[:_NUM_WORST].tolist()
+    samples = {index: validation[index] for index in worst}
+    tiles = [
+        _tile(sample, training.predict(sample), float(ious[index]))
+        for index, sample in samples.items()
+    ]
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % _PER_ROW)
+    rows = [np.hstack(tiles[k : k + _PER_ROW]) for k in range(0, len(tiles), _PER_ROW)]
+    cv2.imwrite(str(path), np.vstack(rows))
+
+
+def _tile(
+    sample: TrainingSample, found: Bool[np.ndarray, "S S"], iou: float
+) -> UInt8[np.ndarray, "T W 3"]:
+    """The picture, and below it the same with both outlines."""
+    drawn = sample.image.copy()
+    for mask, colour in ((sample.mask > 0.5, _TRUE_BGR), (found, _FOUND_BGR)):
+        outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(drawn, outlines, -1, colour, 1)
+    drawn = resize(drawn, TILE_PX)
+    _write(drawn, f"{iou:.2f}", (3, 12), (255, 255, 255))
+    return np.vstack([resize(sample.image, TILE_PX), drawn])
+
+
+def _place(along: float, value: float) -> tuple[int, int]:
+    """Pixel of a point of the plot; `along` and `value` from 0 to 1."""
+    x = _EDGE + along * (_WIDTH - 2 * _EDGE)
+    y = _HEIGHT - _EDGE + 12 - value * (_HEIGHT - 2 * _EDGE)
+    return round(x), round(y)
+
+
+def _write(
+    canvas: UInt8[np.ndarray, "H W 3"], text: str, at: tuple[int, int], colour: tuple[int, int, int]
+) -> None:
+    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
+
+
+_VALIDATION_BANK_DIVISOR = 10  # of the training bank's size: the validation bank's
+
+TRAINING_FILES = ("unet.pt", "last.pt", "scores.json", "curve.png", "worst.png")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainRequest:
+    """The options of `stream-dmr train`."""
+
+    out: Path
+    settings: TrainSettings
+    images: Path | None = None  # the user's, given with `masks`; None: simulated ones alone
+    masks: Path | None = None
+    backgrounds: Path | None = None  # photographs without fish, behind simulated and own fish
+    init: Path | None = None  # initial weights; None: the shipped ones with `images`, else random
+    device: str = "cpu"  # or "cuda"
+    resume: bool = False
+    command: str = ""  # as typed, for scores.json
+
+
+class TrainObserver:
+    """Receives the progress of a training; this one ignores it."""
+
+    def patches_drawn(self, num_done: int, num_all: int) -> None:
+        """The bank of simulated fish and backgrounds has `num_done` of `num_all` items."""
+
+    def crops_trained(self, num_crops: int) -> None:
+        """Another `num_crops` were trained on."""
+
+    def epoch_done(self, scores: EpochScores, *, is_best: bool) -> None:
+        """An epoch was trained and validated."""
+
+
+def train_unet(
+    request: TrainRequest, *, stop: threading.Event, observer: TrainObserver | None = None
+) -> EpochScores | None:
+    """Train the U-Net; returns the best scores, None where `stop` was set before any.
+
+    Fine-tuning counts its initial weights as epoch 0, so it never ends with worse ones.
+
+    After every epoch `request.out` has the best weights as `unet.onnx`, for runs, and as `unet.pt`,
+    to train on from; `last.pt` (to resume from), `scores.json`, `curve.png` and `worst.png`. Raises
+    a UserError where an input is wrong, before anything is trained.
+    """
+    observer = observer or TrainObserver()
+    training = _prepare(request)
+    draw, draw_validation = _sources(request, observer)
+    validation = SampleDataset(
+        draw_validation,
+        size=request.settings.validation_crops,
+        batch_size=request.settings.batch_size,
+        seed=(request.settings.seed, 0),
+    )
+    began = time.monotonic()
+    if training.is_fine_tuning and not training.history:
+        observer.epoch_done(training.check_start(validation), is_best=True)
+        _write_report(request, training, validation, elapsed_s=time.monotonic() - began)
+    while not training.is_over and not stop.is_set():
+        scores = training.run_epoch(draw, validation, stop=stop, progress=observer.crops_trained)
+        if scores is None:
+            break
+        observer.epoch_done(scores, is_best=scores.iou == training.best)
+        _write_report(request, training, validation, elapsed_s=time.monotonic() - began)
+    return max(training.history, key=lambda scores: scores.iou, default=None)
+
+
+def _prepare(request: TrainRequest) -> UNetTrainer:
+    if request.device == "cuda" and not torch.cuda.is_available():
+        raise ModelError(
+            "--device cuda: expected a CUDA device, found none that PyTorch can use; "
+            "train with --device cpu"
+        )
+    if (request.out / "last.pt").exists() and not request.resume:
+        raise OutputError(
+            f"{request.out}: expected a folder without a training, found last.pt of an earlier "
+            "one; choose another --out, or add --resume"
+        )
+    init = request.init or (SHIPPED if request.images is not None else None)
+    network = None if init is None else load_weights(init)
+    try:
+        request.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"{request.out}: expected a folder to write to, got: {error.strerror}; "
+            "choose another --out"
+        ) from error
+    training = UNetTrainer(
+        settings=request.settings,
+        device=torch.device(request.device),
+        out=request.out,
+        is_fine_tuning=init is not None,
+    )
+    if request.resume:
+        training.resume()
+    else:
+        training.begin(network)
+    return training
+
+
+def _sources(request: TrainRequest, observer: TrainObserver) -> tuple[Draw, Draw]:
+    """The functions that draw training and validation examples."""
+    if request.images is None or request.masks is None:
+        simulated = _SimulatedSource(_bank(request, observer))
+        return simulated, _SimulatedSource(_bank(request, observer, is_validation=True))
+    training, validation = load_fish_cutouts(request.images, request.masks)
+    bank = _bank(request, observer).with_photographs(
+        [cutout_patch(one) for one in training],
+        load_backgrounds(request.backgrounds) if request.backgrounds is not None else [],
+    )
+    mixed = _MixedSource(_SimulatedSource(bank), training, request.settings.own_share)
+    return mixed, _AnnotatedSource(validation)
+
+
+def _bank(
+    request: TrainRequest, observer: TrainObserver, *, is_validation: bool = False
+) -> PatchBank:
+    settings = request.settings
+    counts = (settings.bank_fish, settings.bank_backgrounds)
+    num_fish, num_backgrounds = (
+        (max(1, n // _VALIDATION_BANK_DIVISOR) for n in counts) if is_validation else counts
+    )
+    done = 0
+
+    def progress() -> None:
+        nonlocal done
+        done += 1
+        observer.patches_drawn(done, num_fish + num_backgrounds)
+
+    return load_or_make_bank(
+        request.out / "cache",
+        num_fish=num_fish,
+        num_backgrounds=num_backgrounds,
+        seed=settings.seed + is_validation,
+        progress=progress,
+    )
+
+
+@dataclass(frozen=True)
+class _SimulatedSource:
+    """A class, not a closure: worker processes receive it pickled."""
+
+    bank: PatchBank
+
+    def __call__(self, rng: np.random.Generator, size_px: int) -> TrainingSample:
+        return draw_sample(rng, self.bank, size_px=size_px)
+
+
+@dataclass(frozen=True)
+class _AnnotatedSource:
+    cutouts: Sequence[Cutout]
+
+    def __call__(self, rng: np.random.Generator, size_px: int) -> TrainingSample:
+        cutout = self.cutouts[int(rng.integers(len(self.cutouts)))]
+        return draw_annotated_sample(rng, cutout, size_px=size_px)
+
+
+@dataclass(frozen=True)
+class _MixedSource:
+    simulated: _SimulatedSource
+    cutouts: Sequence[Cutout]
+    own_share: float
+
+    def __call__(self, rng: np.random.Generator, size_px: int) -> TrainingSample:
+        is_own = rng.random() < self.own_share
+        source = _AnnotatedSource(self.cutouts) if is_own else self.simulated
+        return source(rng, size_px)
+
+
+def _write_report(
+    request: TrainRequest, training: UNetTrainer, validation: SampleDataset, *, elapsed_s: float
+) -> None:
+    best = max(training.history, key=lambda scores: scores.iou)
+    report = {
+        "version": __version__,
+        "command": request.command,
+        "settings": request.settings.model_dump(),
+        "device": request.device,
+        "images": None if request.images is None else request.images.name,
+        "elapsed_s": round(elapsed_s, 1),  # since the start or the last --resume
+        "best": asdict(best),
+        "history": [asdict(scores) for scores in training.history],
+    }
+    (request.out / "scores.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
+    draw_training_curve(training.history, request.out / "curve.png")
+    if best is training.history[-1]:
+        draw_worst_masks(training, validation, request.out / "worst.png")

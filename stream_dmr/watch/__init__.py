@@ -1,1 +1,0 @@
-"""Status page, metrics and health of a run that is in progress."""

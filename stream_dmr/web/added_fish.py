@@ -1,0 +1,223 @@
+"""Fish that a reviewer adds, splits and merges; added ones are measured."""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.detection.box_files import AnnotatedBox
+from stream_dmr.detection.given_fish import AnnotatedFish
+from stream_dmr.errors import UserError
+from stream_dmr.files import is_locked
+from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
+from stream_dmr.nodes.crop_fish import CropFish
+from stream_dmr.pipeline.config import Config
+from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.recording.codec import encode
+from stream_dmr.recording.frame_images import FoundFrame, FrameLookup
+from stream_dmr.recording.header import RunHeader
+from stream_dmr.recording.reading import known_shapes
+from stream_dmr.recording.record import as_recorded
+from stream_dmr.store.edits import TrackPart, edited_row, frames_of_parts, frames_of_tracks
+from stream_dmr.store.fish import read_measured_fish
+from stream_dmr.store.verdicts import AddedFrame, Verdict, frames_sha256, next_track_id
+from stream_dmr.web.report_page import RunReport
+
+Boxes = Mapping[int, Float[np.ndarray, "4"]]  # by frame index: x0, y0, x1, y1 in frame pixels
+
+
+def boxes_between(drawn: Boxes, frame_indices: Sequence[int]) -> Boxes:
+    """The boxes of all `frame_indices` from the first drawn one to the last.
+
+    Corners move evenly from one drawn box to the next.
+    """
+    known = sorted(drawn)
+    corners = np.array([drawn[frame_index] for frame_index in known], float)
+    between = [index for index in frame_indices if known[0] <= index <= known[-1]]
+    columns = [np.interp(between, known, corners[:, k]) for k in range(4)]
+    return dict(zip(between, np.stack(columns, axis=1), strict=True))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredBoxes:
+    """The frames of a fish that was measured in boxes."""
+
+    frames: Sequence[AddedFrame]
+    fish: Sequence[LocalizedFish]  # the last message of each
+    is_original: bool  # measured on the very pixels of the run
+
+
+def measure_boxes(
+    found: Sequence[FoundFrame],
+    drawn: Boxes,
+    *,
+    track_id: int,
+    header: RunHeader,
+    config: Config,
+) -> MeasuredBoxes:
+    """Cut out, segment, fit and localize the fish of the boxes, as `run --boxes` does.
+
+    `found` are the frames from the first box to the last. Shapes are those that the run knew or
+    has learnt. Raises UserError where there are no pictures.
+    """
+    pictures = [one for one in found if one.frame.image.size]
+    boxes = boxes_between(drawn, [one.frame.frame_index for one in pictures])
+    pictures = [one for one in pictures if one.frame.frame_index in boxes]
+    if not pictures:
+        raise UserError(
+            "verdict: expected pictures to measure the fish in, but neither the recording nor its "
+            "source has them; give --source"
+        )
+    chain = list(_chain(pictures, boxes, track_id=track_id, header=header, config=config))
+    return MeasuredBoxes(
+        frames=[
+            AddedFrame(
+                track_id=track_id,
+                frame_index=fish.frame_index,
+                crop=encode(crop),
+                fit=encode(fit),
+                fish=encode(fish),
+            )
+            for crop, fit, fish in chain
+        ],
+        fish=[fish for _, _, fish in chain],
+        is_original=all(one.is_original for one in pictures),
+    )
+
+
+def _chain(
+    pictures: Sequence[FoundFrame],
+    boxes: Boxes,
+    *,
+    track_id: int,
+    header: RunHeader,
+    config: Config,
+) -> Iterator[tuple[FishCrop, FittedMesh, LocalizedFish]]:
+    """The messages of the nodes, each as the recording would give it to the next node."""
+    annotated = {
+        index: [AnnotatedBox(track_id=track_id, bbox_xyxy_px=box, visibility=1.0)]
+        for index, box in boxes.items()
+    }
+    crop_fish = CropFish(
+        config.crop_fish,
+        camera=None if header.calibration is None else header.calibration.camera,
+        finder=AnnotatedFish(boxes=annotated, masks=None),
+    )
+    fit_mesh, localize, _ = later_nodes(
+        config,
+        template=header.template,
+        candidates=header.candidates,
+        calibration=header.calibration,
+    )
+    settings = config.recording
+    for one in pictures:
+        for cut in crop_fish.step(one.frame):
+            crop = as_recorded(cut, settings)
+            fit = as_recorded(fit_mesh.step(crop)[0], settings)
+            fish = as_recorded(localize.step(fit)[0], settings)
+            assert isinstance(crop, FishCrop)
+            assert isinstance(fit, FittedMesh)
+            assert isinstance(fish, LocalizedFish)
+            yield crop, fit, fish
+
+
+ADDED = "added by a reviewer"
+OTHER_PIXELS = "measured on pictures of the recording, which are not quite those of the run"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackEdit:
+    """A verdict that changes which frames fish have, ready to be written."""
+
+    verdict: Verdict
+    frames: Sequence[AddedFrame] = ()
+    new_fish: int | None = None
+
+
+class TrackEditor:
+    """Makes edits of the tracks of one run; nothing is written here."""
+
+    def __init__(self, database: Path, pictures: FrameLookup) -> None:
+        self._database = database
+        self._pictures = pictures
+
+    def split(self, report: RunReport, verdict: Verdict) -> TrackEdit:
+        """From `verdict.frame_index` on it is another fish. UserError where that leaves none."""
+        track_id, frame_index = verdict.track_id, verdict.frame_index
+        new_fish = self._new_fish()
+        if frame_index is None:
+            raise UserError("verdict: expected the first frame of the other fish")
+        parts = report.edits.split(track_id, frame_index, new_fish)
+        rows = self._rows(report, parts)
+        made = replace(verdict, other_fish=new_fish, fish=json.dumps(rows))
+        return TrackEdit(verdict=made, new_fish=new_fish)
+
+    def merge(self, report: RunReport, verdict: Verdict) -> TrackEdit:
+        """`verdict.other_fish` goes on as this one; UserError where both are in view together."""
+        self._refuse_beside_a_run()
+        other = verdict.other_fish
+        there = {one.estimate.track_id for one in report.fish} - report.edits.merged.keys()
+        if other is None or other == verdict.track_id or other not in there:
+            raise UserError("verdict: expected the number of the other fish of this one's track")
+        rows = self._rows(report, {other: report.edits.merge(verdict.track_id, other)})
+        return TrackEdit(verdict=replace(verdict, fish=json.dumps(rows)))
+
+    def add(
+        self, report: RunReport, verdict: Verdict, drawn: Boxes, time_ns: tuple[int, int]
+    ) -> TrackEdit:
+        """A fish that was missed, measured in the drawn boxes; `time_ns`: of the first and last."""
+        new_fish = self._new_fish()
+        measured = measure_boxes(
+            list(self._pictures.frames((time_ns[0], time_ns[1] + 1))),
+            drawn,
+            track_id=new_fish,
+            header=replace(report.recording.header, candidates=known_shapes(report.recording)),
+            config=report.config,
+        )
+        if not measured.fish:
+            raise UserError("verdict: expected boxes inside the picture, got none")
+        flags = [ADDED, *([] if measured.is_original else [OTHER_PIXELS])]
+        row = edited_row(measured.fish, report.config.smooth_length, flags)
+        made = replace(
+            verdict,
+            track_id=new_fish,
+            fish=json.dumps([row]),
+            frames_sha256=frames_sha256(measured.frames),
+        )
+        return TrackEdit(verdict=made, frames=measured.frames, new_fish=new_fish)
+
+    def _rows(
+        self, report: RunReport, parts: Mapping[int, Iterable[TrackPart]]
+    ) -> list[dict[str, Any]]:
+        """The final row of each fish. UserError where one has no frame."""
+        tracks = {part.track_id for of_fish in parts.values() for part in of_fish}
+        measured = {one.estimate.track_id: one for one in read_measured_fish(self._database)}
+        last = {track_id: one.estimate.last_frame for track_id, one in measured.items()}
+        frames = frames_of_tracks(report.recording, self._database, tracks, last)
+        flags = {one.estimate.track_id: one.flags for one in report.fish}
+        rows: list[dict[str, Any]] = []
+        for fish, of_fish in parts.items():
+            chosen = frames_of_parts(frames, of_fish, fish=fish)
+            if not chosen:
+                raise UserError(
+                    "verdict: expected a frame that has some of the fish's frames before it"
+                )
+            known = [flags.get(fish, ()), *(flags.get(part.track_id, ()) for part in of_fish)]
+            said = list(dict.fromkeys(flag for some in known for flag in some))
+            rows.append(edited_row(chosen, report.config.smooth_length, said))
+        return rows
+
+    def _new_fish(self) -> int:
+        self._refuse_beside_a_run()
+        return next_track_id(self._database)
+
+    def _refuse_beside_a_run(self) -> None:
+        if is_locked(self._database.parent):
+            raise UserError(
+                "verdict: expected a run that has ended, but one goes on in this folder; add, "
+                "split and merge fish after it"
+            )

@@ -1,0 +1,171 @@
+"""How well readings of the same fish agree: decisions, species and lengths."""
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from pathlib import Path
+from statistics import fmean, stdev
+
+from stream_dmr.errors import UserError
+from stream_dmr.store.fish import database_of, read_measured_fish
+from stream_dmr.store.verdicts import Review, blind_readings, read_verdicts, reviews_of
+
+REVIEW, MEASUREMENT = "review", "measurement"
+_Fish = tuple[str, int]  # folder and track id
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelAgreement:
+    """Labels that two readers gave to the same things."""
+
+    count: int
+    same: int
+    kappa: float | None  # Cohen's; None where both always say one and the same
+
+    @property
+    def text(self) -> str:
+        """For people."""
+        if self.count == 0:
+            return "none in common"
+        kappa = "not defined" if self.kappa is None else f"{self.kappa:.2f}"
+        return f"{self.same} of {self.count} the same, Cohen's kappa {kappa}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LengthAgreement:
+    """Lengths of the same fish by two readers, the second minus the first, mm."""
+
+    count: int
+    mean_mm: float | None
+    limits_mm: tuple[float, float] | None  # of agreement, 95 %; None of fewer than two fish
+
+    @property
+    def text(self) -> str:
+        """For people."""
+        if self.mean_mm is None:
+            return "none in common"
+        limits = ""
+        if self.limits_mm is not None:
+            low, high = self.limits_mm
+            limits = f", 95 % limits of agreement {low:+.1f} to {high:+.1f} mm"
+        return f"{self.count} fish, mean difference {self.mean_mm:+.1f} mm{limits}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """What one reader said of the fish as they were measured."""
+
+    name: str
+    decisions: Mapping[_Fish, str] = field(default_factory=dict[_Fish, str])
+    species: Mapping[_Fish, str] = field(default_factory=dict[_Fish, str])
+    lengths_mm: Mapping[_Fish, float] = field(default_factory=dict[_Fish, float])
+
+    @property
+    def is_empty(self) -> bool:
+        """True where nothing was said."""
+        return not (self.decisions or self.species or self.lengths_mm)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadingPair:
+    """How well two readings agree."""
+
+    first: str
+    second: str
+    decisions: LabelAgreement
+    species: LabelAgreement
+    lengths: LengthAgreement
+
+
+def cohens_kappa(first: Sequence[str], second: Sequence[str]) -> float | None:
+    """Agreement beyond chance: (p_o - p_e) / (1 - p_e).
+
+    p_o is the share of equal labels, p_e the share that readers would have who give their labels by
+    chance, each as often as they did. None without labels or where p_e is 1. Cohen, "A Coefficient
+    of Agreement for Nominal Scales", Educational and Psychological Measurement 20 (1960).
+    """
+    count = len(first)
+    if count == 0:
+        return None
+    observed = sum(a == b for a, b in zip(first, second, strict=True)) / count
+    one, other = Counter(first), Counter(second)
+    expected = sum(one[label] * other[label] for label in one) / count**2
+    return None if expected == 1 else (observed - expected) / (1 - expected)
+
+
+def length_agreement(differences_mm: Sequence[float]) -> LengthAgreement:
+    """Mean difference, and the limits between which 95 % of differences lie: mean +- 1.96 sd.
+
+    Bland and Altman, "Statistical methods for assessing agreement", The Lancet 327 (1986).
+    """
+    count = len(differences_mm)
+    if count == 0:
+        return LengthAgreement(count=0, mean_mm=None, limits_mm=None)
+    mean = fmean(differences_mm)
+    reach = 1.96 * stdev(differences_mm) if count > 1 else math.nan
+    limits = (mean - reach, mean + reach) if count > 1 else None
+    return LengthAgreement(count=count, mean_mm=mean, limits_mm=limits)
+
+
+def agreements(folders: Sequence[Path]) -> list[ReadingPair]:
+    """Each pair of readings of the fish of some runs: the review, and each blind reading.
+
+    The measurement itself stands beside them with its lengths. Raises UserError where there are no
+    two readings.
+    """
+    readings = [one for one in _readings(folders) if not one.is_empty]
+    if len(readings) < 2:
+        raise UserError(
+            f"{folders[0]}: expected verdicts to compare, found none; take them with stream-dmr "
+            "review, and a second reading with --blind"
+        )
+    return [_compared(one, other) for one, other in combinations(readings, 2)]
+
+
+def _readings(folders: Sequence[Path]) -> Iterator[Reading]:
+    measured: dict[_Fish, float] = {}
+    reviews: dict[str, dict[_Fish, Review]] = {REVIEW: {}}
+    for folder in folders:
+        database = database_of(folder)
+        if database is None:
+            raise UserError(f"{folder}: expected the --out of a run, found no lengths.db")
+        fish = read_measured_fish(database)
+        there = {one.estimate.track_id for one in fish}
+        for one in fish:
+            if one.estimate.length_mm is not None:
+                measured[str(folder), one.estimate.track_id] = one.estimate.length_mm
+        verdicts = read_verdicts(database)
+        said = {REVIEW: verdicts} | blind_readings(verdicts)
+        for name, of_reader in said.items():
+            found = reviews_of(of_reader)
+            known = {(str(folder), track): r for track, r in found.items() if track in there}
+            reviews.setdefault(name, {}).update(known)
+    yield Reading(name=MEASUREMENT, lengths_mm=measured)
+    for name, by_fish in reviews.items():
+        lengths = {fish: r.length_mm for fish, r in by_fish.items() if r.length_mm is not None}
+        yield Reading(
+            name=name,
+            decisions={fish: r.decision for fish, r in by_fish.items() if r.decision},
+            species={fish: r.species.casefold() for fish, r in by_fish.items() if r.species},
+            lengths_mm=lengths,
+        )
+
+
+def _compared(first: Reading, second: Reading) -> ReadingPair:
+    both = [fish for fish in first.lengths_mm if fish in second.lengths_mm]
+    return ReadingPair(
+        first=first.name,
+        second=second.name,
+        decisions=_labels(first.decisions, second.decisions),
+        species=_labels(first.species, second.species),
+        lengths=length_agreement([second.lengths_mm[f] - first.lengths_mm[f] for f in both]),
+    )
+
+
+def _labels(first: Mapping[_Fish, str], second: Mapping[_Fish, str]) -> LabelAgreement:
+    both = [fish for fish in first if fish in second]
+    one, other = [first[fish] for fish in both], [second[fish] for fish in both]
+    same = sum(a == b for a, b in zip(one, other, strict=True))
+    return LabelAgreement(count=len(both), same=same, kappa=cohens_kappa(one, other))

@@ -1,0 +1,151 @@
+"""Tells a webhook or a mail address when a run becomes unhealthy, and when it is healthy again."""
+
+import json
+import re
+import smtplib
+import ssl
+import threading
+import urllib.request
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from email.message import EmailMessage
+from pathlib import Path
+
+from stream_dmr.errors import ConfigError, reason_of
+from stream_dmr.pipeline.config import AlertSettings
+
+_LOOK_S = 2.0  # between two looks at the health
+_SETTLE_LOOKS = 3  # equal looks after which a change counts: a camera that blinks is no news
+_TIMEOUT_S = 10.0  # of a delivery
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 5.0, 3600.0  # after a delivery that failed: doubled each time
+_MAIL_PORT = 587
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alert:
+    """A change of a run's health, as it is sent."""
+
+    run: str  # the name of its folder
+    healthy: bool
+    problems: Sequence[str]
+    time: str  # ISO 8601, UTC
+
+    @property
+    def title(self) -> str:
+        """One line for a subject."""
+        state = "is healthy again" if self.healthy else f"is unhealthy: {'; '.join(self.problems)}"
+        return f"stream-dmr: {self.run} {state}"
+
+
+class AlertSender:
+    """Looks at a run's health in a thread of its own, and sends each change once.
+
+    What can't be delivered is tried again, later and later; only the latest state is sent then.
+    """
+
+    def __init__(
+        self,
+        settings: AlertSettings,
+        *,
+        run: str,
+        problems: Callable[[], Sequence[str]],
+        on_notice: Callable[[str], None],
+        look_s: float = _LOOK_S,
+        first_pause_s: float = _FIRST_PAUSE_S,
+    ) -> None:
+        """Raises ConfigError where the settings do not fit together."""
+        self._deliver = _deliveries(settings)
+        self._run, self._problems, self._on_notice = run, problems, on_notice
+        self._look_s, self._first_pause_s = look_s, first_pause_s
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="alerts", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop. Idempotent."""
+        self._ended.set()
+        self._thread.join(_TIMEOUT_S)
+
+    def _watch(self) -> None:
+        told: list[str] = []  # the kinds of problems that were sent last
+        seen, num_equal = list[str](), 0
+        while not self._ended.wait(self._look_s):
+            problems = list(self._problems())
+            kinds = _kinds(problems)
+            num_equal, seen = (num_equal + 1 if kinds == seen else 1), kinds
+            if kinds != told and num_equal >= _SETTLE_LOOKS and self._send(problems):
+                told = kinds
+
+    def _send(self, problems: Sequence[str]) -> bool:
+        """Deliver by every way; False where the health changed or the run ended before."""
+        alert = Alert(
+            run=self._run,
+            healthy=not problems,
+            problems=problems,
+            time=datetime.now(UTC).isoformat(timespec="seconds"),
+        )
+        waiting, pause_s = list(self._deliver), self._first_pause_s
+        while True:
+            waiting = [deliver for deliver in waiting if not self._try(deliver, alert)]
+            if not waiting:
+                return True
+            if self._ended.wait(pause_s):
+                return False
+            pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+            if _kinds(self._problems()) != _kinds(problems):
+                return False
+
+    def _try(self, deliver: Callable[[Alert], None], alert: Alert) -> bool:
+        try:
+            deliver(alert)
+        except (OSError, smtplib.SMTPException, ValueError) as error:
+            self._on_notice(f"[alerts] could not be sent, tried again later: {reason_of(error)}")
+            return False
+        return True
+
+
+def _kinds(problems: Sequence[str]) -> list[str]:
+    """Problems without their figures, which change from one look to the next."""
+    return sorted({re.sub(r"\d+", "#", problem) for problem in problems})
+
+
+def _deliveries(settings: AlertSettings) -> list[Callable[[Alert], None]]:
+    deliveries: list[Callable[[Alert], None]] = []
+    if settings.webhook:
+        if not settings.webhook.startswith(("http://", "https://")):
+            raise ConfigError(
+                f"[alerts] webhook: expected http://... or https://..., got {settings.webhook!r}"
+            )
+        deliveries.append(lambda alert: _post(settings.webhook, alert))
+    if settings.mail_to:
+        if not (settings.mail_server and settings.mail_from):
+            raise ConfigError("[alerts] mail_to: expected mail_server and mail_from beside it")
+        deliveries.append(lambda alert: _mail(settings, alert))
+    return deliveries
+
+
+def _post(address: str, alert: Alert) -> None:
+    """POST it as JSON; its `text` is what chat services show."""
+    content = json.dumps(asdict(alert) | {"text": alert.title}).encode()
+    request = urllib.request.Request(address, content, {"Content-Type": "application/json"})
+    with urllib.request.urlopen(request, timeout=_TIMEOUT_S):
+        pass
+
+
+def _mail(settings: AlertSettings, alert: Alert) -> None:
+    message = EmailMessage()
+    message["Subject"] = " ".join(alert.title.split())[:200]
+    message["From"], message["To"] = settings.mail_from, settings.mail_to
+    message.set_content("\n".join([alert.title, *alert.problems, alert.time]))
+    host, _, port = settings.mail_server.partition(":")
+    # Without a password any encryption is better than none; a password goes to that server alone.
+    context = ssl.create_default_context() if settings.mail_password_file else None
+    with smtplib.SMTP(host, int(port or _MAIL_PORT), timeout=_TIMEOUT_S) as server:
+        server.ehlo()
+        if server.has_extn("starttls") or settings.mail_password_file:
+            server.starttls(context=context)
+        if settings.mail_password_file:
+            password = Path(settings.mail_password_file).read_text(encoding="utf-8").strip()
+            server.login(settings.mail_from, password)
+        server.send_message(message)

@@ -1,0 +1,344 @@
+"""One page about all boxes of a fleet, asked one by one."""
+
+import json
+import time
+import urllib.error
+import urllib.request
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import partial
+from html import escape
+from http.client import HTTPException
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Annotated, Any
+from urllib.parse import SplitResult, parse_qs, urlsplit
+
+from prometheus_client.parser import text_string_to_metric_families
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from stream_dmr.errors import ConfigError, OutputError, reason_of
+from stream_dmr.files import read_text, replacing
+
+_TIMEOUT_S = 10.0  # chosen: a link by satellite takes a second or two
+_MAX_ANSWER_BYTES = 1_000_000  # chosen: a hundred times what a box says
+_MAX_AT_ONCE = 16
+_MAX_ALARM_CHARACTERS = 300
+_MAX_WARNINGS = 5  # shown of each box, the latest
+_WARNING_AGE_S = 86_400.0  # older ones are history
+_UNAUTHORIZED, _UNAVAILABLE = 401, 503  # the second is how an unhealthy box answers
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box:
+    """A box: its status page's address, which ends in "/", and the token that it asks for."""
+
+    name: str
+    address: str
+    token: str = field(default="", repr=False)
+
+
+class BoxReading(BaseModel):
+    """What a box said of itself."""
+
+    model_config = ConfigDict(frozen=True, strict=True, allow_inf_nan=False)
+
+    is_healthy: bool
+    problems: Annotated[tuple[str, ...], Field(strict=False)]
+    warnings: Annotated[tuple[str, ...], Field(strict=False)]
+    num_fish: int = Field(ge=0)
+    fish_per_hour: float = Field(ge=0)
+    frames_per_s: float = Field(ge=0)
+    disk_free_bytes: int = Field(ge=0)
+    last_frame_age_s: float | None = None  # None: its source is no camera
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoxState:
+    """How a box is: its last reading and when that was (UTC), and why there is none now."""
+
+    box: Box
+    contact_ns: int | None = None  # None: never
+    reading: BoxReading | None = None
+    error: str = ""  # of this attempt; "": it answered
+
+    @property
+    def kind(self) -> str:
+        """`silent`: no answer; `unhealthy`; `healthy`."""
+        if self.error or self.reading is None:
+            return "silent"
+        return "healthy" if self.reading.is_healthy else "unhealthy"
+
+
+def load_boxes(given: Sequence[str]) -> list[Box]:
+    """The boxes of addresses, and of files with one `NAME ADDRESS` or `ADDRESS` a line.
+
+    An address is that of a status page, with `?token=...` where it asks for one; # begins a
+    comment. Raises ConfigError for files and addresses that can't be used, and doubled ones.
+    """
+    boxes = list[Box]()
+    for one in given:
+        boxes += [_box(one, where=one)] if "://" in one else _read_file(Path(one))
+    for number, box in enumerate(boxes):
+        if any(box.address == other.address for other in boxes[:number]):
+            raise ConfigError(f"{box.address}: expected each box once, got it twice; remove one")
+    if not boxes:
+        raise ConfigError(f"{', '.join(given)}: expected at least one box, got none; add a line")
+    return boxes
+
+
+def _read_file(path: Path) -> list[Box]:
+    try:
+        lines = read_text(path).splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"{path}: expected http://HOST:PORT/ or a file with such lines, got: {reason_of(error)}"
+        ) from error
+    boxes = list[Box]()
+    for number, line in enumerate(lines, start=1):
+        if words := line.split("#")[0].split():
+            *name, address = words
+            boxes.append(_box(address, where=f"{path}, line {number}", name=" ".join(name)))
+    return boxes
+
+
+def _box(text: str, *, where: str, name: str = "") -> Box:
+    expected = f"{where}: expected the address of a status page, such as http://10.0.0.7:8480/"
+    try:
+        parts = urlsplit(text)
+        host, port = parts.hostname, parts.port
+    except ValueError as error:
+        raise ConfigError(f"{expected}, got: {error}") from error
+    if parts.scheme not in ("http", "https") or not host or parts.username:
+        raise ConfigError(f"{expected}, got {_without_secrets(parts)!r}")
+    token = parse_qs(parts.query).get("token", [""])[0]
+    address = f"{parts.scheme}://{parts.netloc}{parts.path.rstrip('/')}/"
+    return Box(
+        name=name or (host if port is None else f"{host}:{port}"), address=address, token=token
+    )
+
+
+def _without_secrets(parts: SplitResult) -> str:
+    return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
+
+
+def ask_all(states: Iterable[BoxState], *, timeout_s: float = _TIMEOUT_S) -> list[BoxState]:
+    """Ask every box, several at once; those that don't answer keep their last reading."""
+    with ThreadPoolExecutor(_MAX_AT_ONCE) as pool:
+        return list(pool.map(partial(_ask, timeout_s=timeout_s), states))
+
+
+def _ask(before: BoxState, *, timeout_s: float) -> BoxState:
+    box = before.box
+    try:
+        health = json.loads(_get(box, "health", timeout_s))
+        reading = _reading(health, _values(_get(box, "metrics", timeout_s).decode()))
+    except (KeyError, TypeError, ValueError, ValidationError, RecursionError):
+        error = "something answers there that is no stream-dmr run, or one of another version"
+    except (OSError, HTTPException) as failure:
+        error = _failure(failure)
+    else:
+        return BoxState(box=box, contact_ns=time.time_ns(), reading=reading)
+    return BoxState(box=box, contact_ns=before.contact_ns, reading=before.reading, error=error)
+
+
+def _failure(failure: Exception) -> str:
+    """Why a box did not answer, for people."""
+    if isinstance(failure, urllib.error.HTTPError):
+        if failure.code == _UNAUTHORIZED:
+            return "it asks for a token, or for another: ADDRESS?token=..."
+        return f"it answers {failure.code}, not as a stream-dmr run does"
+    reason = failure.reason if isinstance(failure, urllib.error.URLError) else failure
+    if isinstance(reason, TimeoutError):
+        return "no answer in time"
+    return f"no answer: {reason_of(reason) if isinstance(reason, Exception) else reason}"
+
+
+def _get(box: Box, path: str, timeout_s: float) -> bytes:
+    headers = {"Authorization": f"Bearer {box.token}"} if box.token else {}
+    request = urllib.request.Request(box.address + path, headers=headers)
+    try:
+        with urllib.request.urlopen(request, timeout=timeout_s) as answer:
+            return answer.read(_MAX_ANSWER_BYTES)
+    except urllib.error.HTTPError as error:
+        with error:
+            if error.code != _UNAVAILABLE:
+                raise
+            return error.read(_MAX_ANSWER_BYTES)
+
+
+def _values(text: str) -> dict[str, float]:
+    """Metrics by name, those of all labels added up."""
+    values = dict[str, float]()
+    for family in text_string_to_metric_families(text):
+        for sample in family.samples:
+            values[sample.name] = values.get(sample.name, 0.0) + sample.value
+    return values
+
+
+def _reading(health: Any, values: dict[str, float]) -> BoxReading:
+    recent = [one for one in health["warnings"] if one["age_s"] <= _WARNING_AGE_S]
+    return BoxReading(
+        is_healthy=health["healthy"],
+        problems=tuple(str(one)[:_MAX_ALARM_CHARACTERS] for one in health["problems"]),
+        warnings=tuple(str(one["line"])[:_MAX_ALARM_CHARACTERS] for one in recent[:_MAX_WARNINGS]),
+        num_fish=int(values.get("stream_dmr_fish_total", 0)),
+        fish_per_hour=values["stream_dmr_fish_per_hour"],
+        frames_per_s=values["stream_dmr_frames_per_second"],
+        disk_free_bytes=int(values["stream_dmr_disk_free_bytes"]),
+        last_frame_age_s=values.get("stream_dmr_last_frame_age_seconds"),
+    )
+
+
+_MAX_BYTES = 20_000_000
+
+
+class _KeptBox(BaseModel):
+    model_config = ConfigDict(strict=True)
+
+    contact_ns: int  # since 1970, UTC
+    reading: Annotated[BoxReading, Field(strict=False)]
+
+
+class _Kept(BaseModel):
+    made_by: str = "stream-dmr fleet"
+    boxes: dict[str, _KeptBox] = {}  # by address
+
+
+def read_memory(path: Path, boxes: Iterable[Box]) -> list[BoxState]:
+    """The last contact of each box; none where there is no file yet.
+
+    Raises OutputError for a file that is no such memory.
+    """
+    try:
+        kept = _Kept.model_validate(json.loads(read_text(path, max_bytes=_MAX_BYTES))).boxes
+    except FileNotFoundError:
+        kept = dict[str, _KeptBox]()
+    except (OSError, ValueError, ValidationError) as error:
+        raise OutputError(
+            f"{path}: expected what an earlier stream-dmr fleet kept there, it can't be read; "
+            "choose another --out, or remove it"
+        ) from error
+    return [
+        BoxState(box=box, contact_ns=one.contact_ns, reading=one.reading)
+        if (one := kept.get(box.address))
+        else BoxState(box=box)
+        for box in boxes
+    ]
+
+
+def write_memory(path: Path, states: Iterable[BoxState]) -> None:
+    """Keep the last contacts, without tokens. Raises OutputError."""
+    kept = {
+        one.box.address: _KeptBox(contact_ns=one.contact_ns, reading=one.reading)
+        for one in states
+        if one.contact_ns is not None and one.reading is not None
+    }
+    replace_text(path, _Kept(boxes=kept).model_dump_json(indent=1))
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a text in one step: who reads meanwhile gets the old or the new. Raises OutputError."""
+    with replacing(path) as draft:
+        draft.write_text(text, encoding="utf-8")
+
+
+_WORDS = {"healthy": "measures", "unhealthy": "has a problem", "silent": "does not answer"}
+_SUMMARY = {"healthy": "measuring", "unhealthy": "with a problem", "silent": "silent"}
+_ORDER = tuple(reversed(_WORDS))  # what needs a look comes first
+
+
+def fleet_page(states: Sequence[BoxState], *, title: str, every_s: float, now_ns: int) -> str:
+    """The HTML of the page; with `every_s` above 0 a browser loads it again as often."""
+    ordered = sorted(states, key=lambda state: (_ORDER.index(state.kind), state.box.name))
+    template = Template(files("stream_dmr.web").joinpath("watch/fleet.html").read_text("utf-8"))
+    refresh = f'<meta http-equiv="refresh" content="{max(1, round(every_s))}">' if every_s else ""
+    return template.substitute(
+        refresh=refresh,
+        title=escape(title),
+        summary=escape(f"{fleet_summary(states)}; written {minute_text(now_ns)}"),
+        rows="\n".join(_row(state) for state in ordered),
+        every=f"{every_s:g}",
+        written=_iso(now_ns),
+    )
+
+
+def fleet_summary(states: Sequence[BoxState]) -> str:
+    """One line: how many boxes are in which state, and their fish an hour together."""
+    counts = Counter(state.kind for state in states)
+    parts = [f"{counts[kind]} {words}" for kind, words in _SUMMARY.items() if counts[kind]]
+    hourly = sum(s.reading.fish_per_hour for s in states if s.reading and not s.error)
+    boxes = "1 box" if len(states) == 1 else f"{len(states)} boxes"
+    return f"{boxes}: {', '.join(parts)}; {hourly:.0f} fish an hour"
+
+
+def state_text(state: BoxState) -> str:
+    """How a box is, in some words."""
+    if state.reading is None:
+        return "never answered"
+    return _WORDS[state.kind]
+
+
+def alarms_of(state: BoxState) -> list[str]:
+    """What is wrong now: the failed contact, or the problems that the box says."""
+    if state.error or state.reading is None:
+        return [state.error]
+    return list(state.reading.problems)
+
+
+def disk_text(reading: BoxReading) -> str:
+    """Free space in GB."""
+    return f"{reading.disk_free_bytes / 1e9:.1f} GB"
+
+
+def minute_text(time_ns: int) -> str:
+    """A time for people, to the minute, UTC."""
+    return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):%Y-%m-%d %H:%M} UTC"
+
+
+def _iso(time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns // 10**9, UTC).isoformat()
+
+
+def _row(state: BoxState) -> str:
+    """A row of the table; what a silent box said last stays, in grey."""
+    reading, box = state.reading, state.box
+    contact = "never"
+    if state.contact_ns is not None:
+        contact = (
+            f'<span>{minute_text(state.contact_ns)}<small data-time="{_iso(state.contact_ns)}">'
+            "</small></span>"
+        )
+    numbers = ["", "", "", ""]
+    if reading is not None:
+        numbers = [
+            f"{reading.fish_per_hour:.0f}",
+            f"{reading.num_fish}",
+            f"{reading.frames_per_s:.1f}",
+            disk_text(reading),
+        ]
+    titles = ("Fish an hour", "Fish", "Pictures a second", "Disk free", "Last contact")
+    cells = [
+        f'<td class="number{"" if text else " empty"}" data-title="{title}">{text}</td>'
+        for title, text in zip(titles, [*numbers, contact], strict=True)
+    ]
+    link = f'<a href="{escape(box.address)}">{escape(box.name)}</a>'
+    return (
+        f'<tr class="{state.kind}"><td>{link}</td>'
+        f'<td><span class="state">{state_text(state)}</span></td>'
+        f'<td class="said">{_alarms(state)}</td>{"".join(cells)}</tr>'
+    )
+
+
+def _alarms(state: BoxState) -> str:
+    now = [f'<li class="now">{escape(line)}</li>' for line in alarms_of(state)]
+    reading = state.reading
+    said = [] if reading is None else list(reading.warnings)
+    if reading is not None and state.error:
+        said = [*reading.problems, *said]
+    lines = now + [f"<li>{escape(line)}</li>" for line in said]
+    return f"<ul>{''.join(lines)}</ul>" if lines else "no alarm"

@@ -1,0 +1,193 @@
+"""Opens the results of a run or a batch for a report, and writes its page."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from stream_dmr.errors import UserError
+from stream_dmr.evidence.seal import add_files
+from stream_dmr.files import make_folder, writing_to
+from stream_dmr.pipeline.config import Config, load_config, parse_config
+from stream_dmr.recording.frame_images import FrameLookup
+from stream_dmr.recording.reading import require_messages
+from stream_dmr.recording.selection import Selection
+from stream_dmr.store.batch_folder import DONE, FAILED, VIDEO_FOLDERS, VIDEOS, read_videos
+from stream_dmr.store.edits import NO_EDITS, edits_of
+from stream_dmr.store.effort import read_effort
+from stream_dmr.store.fish import (
+    database_of,
+    read_fish,
+    read_measured_fish,
+    recorded_track,
+    run_notes,
+)
+from stream_dmr.store.open_results import LostRecording, open_results, require_recording
+from stream_dmr.store.trip import VesselTrack, read_positions
+from stream_dmr.store.verdicts import read_added_frames, read_verdicts
+from stream_dmr.web.report_page import RunReport, render_page
+from stream_dmr.web.trip_map import Line
+from stream_dmr.web.views import ReviewedTracks, draw_views, read_tracks
+
+
+def open_report(
+    path: Path,
+    *,
+    source: str | None = None,
+    config: Path | None = None,
+    as_measured: bool = False,
+) -> RunReport:
+    """Read the report of a run's folder or of a recording; `as_measured`: without any review.
+
+    Raises a UserError where they can't be read, or where `source` is not the recorded one.
+    """
+    recording = open_results(path)
+    header = recording.header
+    of_run = parse_config(header.config_toml, where=f"{path}: its config.toml")
+    reviewed = None if as_measured else reviewed_tracks(path, of_run)
+    database = database_of(path)
+    if database is None:
+        require_messages(recording)
+    if as_measured and database is not None:
+        fish = read_measured_fish(database)
+    else:
+        fish = read_fish(path, recording)
+    is_lost = isinstance(recording, LostRecording)
+    tracks = {} if is_lost else read_tracks(recording, reviewed=reviewed)
+    return RunReport(
+        path=path,
+        recording=recording,
+        fish=fish,
+        tracks=tracks,
+        views={} if is_lost else draw_views(tracks, recording, source),
+        config=of_run,
+        settings=(of_run if config is None else load_config(config)).fisheries,
+        edits=NO_EDITS if reviewed is None else reviewed.edits,
+        source=source,
+        efforts=[]
+        if database is None
+        else read_effort(database, [one for one in fish if one.counts]),
+        track=recorded_track(recording)
+        if database is None
+        else VesselTrack(read_positions(database)),
+        notes=run_notes(path),
+    )
+
+
+def reviewed_tracks(path: Path, config: Config) -> ReviewedTracks | None:
+    """What reviewers changed of a run's tracks; None of a recording without its database."""
+    database = database_of(path)
+    if database is None:
+        return None
+    return ReviewedTracks(
+        edits=edits_of(read_verdicts(database)),
+        added=read_added_frames(database),
+        settings=config.smooth_length,
+    )
+
+
+def reread_fish(report: RunReport, changed: frozenset[int], pictures: FrameLookup) -> RunReport:
+    """The report after more edits of reviewers, with the frames and views of the `changed` fish."""
+    reviewed = reviewed_tracks(report.path, report.config)
+    if reviewed is None:
+        return report
+    parts = (part for fish in changed for part in reviewed.edits.parts_of(fish))
+    selection = Selection(tracks=frozenset(part.track_id for part in parts))
+    read = read_tracks(report.recording, selection=selection, reviewed=reviewed)
+    tracks = {fish: track for fish, track in read.items() if fish in changed}
+    views = draw_views(tracks, report.recording, pictures=pictures)
+    gone = changed - tracks.keys()
+    return replace(
+        report,
+        fish=read_fish(report.path, report.recording),
+        tracks={k: v for k, v in {**report.tracks, **tracks}.items() if k not in gone},
+        views={k: v for k, v in {**report.views, **views}.items() if k not in gone},
+        edits=reviewed.edits,
+    )
+
+
+def is_batch(path: Path) -> bool:
+    """True for the --out of a batch."""
+    return (path / VIDEOS).is_file()
+
+
+def open_batch(
+    out: Path, *, config: Path | None = None, as_measured: bool = False
+) -> tuple[list[RunReport], list[str]]:
+    """A report of each video that is done, and a line for each that failed. Raises UserError."""
+    done = run_folders([out])
+    if not done:
+        raise UserError(f"{out / VIDEOS}: expected videos that are done, got none")
+    reports = [open_report(one, config=config, as_measured=as_measured) for one in done]
+    _require_one_template(reports, out)
+    rows = read_videos(out)
+    failed = [f"{row['name']}: {row['reason']}" for row in rows if row["status"] == FAILED]
+    return reports, failed
+
+
+def run_folders(folders: Sequence[Path]) -> list[Path]:
+    """The folders of runs, those of batches taken apart into their videos that are done."""
+    found = list[Path]()
+    for folder in folders:
+        if is_batch(folder):
+            done = (row["name"] for row in read_videos(folder) if row["status"] == DONE)
+            found += [folder / VIDEO_FOLDERS / name for name in done]
+        else:
+            found.append(folder)
+    return found
+
+
+def open_folders(
+    folders: Sequence[Path],
+    *,
+    source: str | None = None,
+    config: Path | None = None,
+    as_measured: bool = False,
+) -> tuple[list[RunReport], list[str]]:
+    """A report of each run of several folders and batches, and a line for each video that failed.
+
+    Raises UserError, also where their fish can't stand in one page.
+    """
+    reports, failed = list[RunReport](), list[str]()
+    for folder in folders:
+        if is_batch(folder):
+            opened, lines = open_batch(folder, config=config, as_measured=as_measured)
+            failed += lines
+        else:
+            opened = [open_report(folder, source=source, config=config, as_measured=as_measured)]
+        reports += opened
+    for report in reports:
+        require_recording(report.recording, where=report.path, what="a review")
+    if source is not None and len(reports) > 1:
+        raise UserError("--source: expected one run, got several, which have their own")
+    _require_one_template(reports, folders[0])
+    return reports, failed
+
+
+def _require_one_template(reports: Sequence[RunReport], where: Path) -> None:
+    names = {report.recording.header.template.name for report in reports}
+    if len(names) > 1:
+        raise UserError(
+            f"{where}: expected videos of one template, got {', '.join(sorted(names))}; take them "
+            f"one by one: {reports[0].path}, ..."
+        )
+
+
+def write_report(
+    reports: Sequence[RunReport],
+    out: Path,
+    *,
+    title: str,
+    notes: Sequence[str] = (),
+    coast: Sequence[Line] = (),
+) -> int:
+    """Write the page and return its bytes; beside results, `verify` checks it as one of them.
+
+    `coast` is drawn on the map.
+    """
+    make_folder(out.parent)
+    with writing_to(out):
+        out.write_text(
+            render_page(reports, title=title, notes=notes, coast=coast), encoding="utf-8"
+        )
+    add_files(out.parent, [out])
+    return out.stat().st_size

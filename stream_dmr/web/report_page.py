@@ -1,0 +1,394 @@
+"""One self-contained HTML page about a run or a batch."""
+
+import json
+import math
+from base64 import b64encode
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.camera import crop_from_frame
+from stream_dmr.export.agency_tables import haul_row
+from stream_dmr.export.fish_table import fish_record
+from stream_dmr.fitting.shape.candidates import AUTO, describe, load_shapes
+from stream_dmr.lengths.fate import CONDITIONS, FATES
+from stream_dmr.pipeline.config import Config
+from stream_dmr.recording.reading import Recording, known_shapes
+from stream_dmr.store.edits import NO_EDITS, TrackEdits
+from stream_dmr.store.effort import HaulEffort
+from stream_dmr.store.fish import FishResult, sure_code
+from stream_dmr.store.fisheries import FisheriesSettings
+from stream_dmr.store.trip import VesselTrack
+from stream_dmr.tables import utc_text
+from stream_dmr.template.template_file import bundled_names
+from stream_dmr.version import __version__
+from stream_dmr.web.trip_map import Line, draw_map
+from stream_dmr.web.views import DrawnView, DrawnViews, FishFrame, RecordedTrack
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunReport:
+    """The results of one run with what was recorded of each fish."""
+
+    path: Path
+    recording: Recording
+    fish: Sequence[FishResult]
+    tracks: Mapping[int, RecordedTrack]  # by track id
+    views: DrawnViews
+    config: Config  # of the run
+    settings: FisheriesSettings
+    edits: TrackEdits = NO_EDITS  # of reviewers, which `fish`, `tracks` and `views` follow
+    source: str | None = None  # where the user says that the source is
+    efforts: Sequence[HaulEffort] = ()  # of its hauls; none of a recording without its database
+    track: VesselTrack | None = None  # None: likewise
+    notes: Sequence[str] = ()  # what a reader must know of the run
+
+    @property
+    def title(self) -> str:
+        """The name of the results' folder or file."""
+        return self.path.resolve().name
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """Capture times of the first and of the last fish; 0 and 0 without any."""
+        estimates = [one.estimate for one in self.fish]
+        first = min((one.first_timestamp_ns for one in estimates), default=0)
+        return first / 1e9, max((one.last_timestamp_ns for one in estimates), default=0) / 1e9
+
+
+_HEAD = ("haul", "UTC", "watched", "measured", "fish", "with length", "mean", "species", "fate")
+
+
+def trip_section(
+    reports: Sequence[RunReport], *, coast: Sequence[Line] = (), is_folded: bool = False
+) -> str:
+    """HTML: who and when, a row for each haul, and where; "" where nothing of it is known.
+
+    `is_folded`: only the heading, until somebody asks for more.
+    """
+    fish = [one for report in reports for one in report.fish if one.counts]
+    rows = [row for report in reports for row in _haul_rows(report, many=len(reports) > 1)]
+    table = ""
+    if rows:
+        head = "".join(f"<th>{name}</th>" for name in _HEAD)
+        table = f'<div class="wide"><table><tr>{head}</tr>{"".join(rows)}</table></div>'
+    drawn = draw_map([report.track for report in reports if report.track is not None], fish, coast)
+    heading = _heading(fish)
+    if not (heading or drawn or any(one.haul for one in fish)):
+        return ""
+    title = f"<h2>{escape(heading)}</h2>"
+    if is_folded:
+        return f"<details><summary>{title}</summary>{table}{drawn}</details>"
+    return f"{title}{table}{drawn}"
+
+
+def _heading(fish: Sequence[FishResult]) -> str:
+    """Vessel, trip and hauls, and the time from the first fish to the last."""
+    parts = [
+        _named("", {one.facts.vessel for one in fish}),
+        _named("trip", {one.facts.trip for one in fish}),
+        _named("haul", {one.haul for one in fish}),
+    ]
+    what = ", ".join(part for part in parts if part)
+    times = sorted(one.utc_ns for one in fish if one.utc_ns is not None)
+    if times:
+        span = _span(*(utc_text(time_ns) or "" for time_ns in (times[0], times[-1])))
+        what += f"{': ' if what else ''}{span} UTC"
+    return what
+
+
+def _named(what: str, names: Iterable[str]) -> str:
+    known = sorted(name for name in names if name)
+    plural = "s" if what and len(known) > 1 else ""
+    return f"{what}{plural} {', '.join(known)}".strip() if known else ""
+
+
+def _span(*times: str) -> str:
+    """Times in ISO 8601 to the minute, for people; the day stands once where it is the same."""
+    first, last = (time[:16].replace("T", " ") for time in times)
+    if not (first and last):
+        return first or last
+    return f"{first} to {last[11:] if last[:10] == first[:10] else last}"
+
+
+def _haul_rows(report: RunReport, *, many: bool) -> list[str]:
+    counted = [one for one in report.fish if one.counts]
+    zeros = {one.facts.utc_zero_ns for one in counted}
+    zero_ns = zeros.pop() if len(zeros) == 1 else None
+    return [
+        _haul_row(effort, counted, zero_ns, title=report.title if many else "")
+        for effort in report.efforts
+    ]
+
+
+def _haul_row(
+    effort: HaulEffort, counted: Sequence[FishResult], zero_ns: int | None, *, title: str
+) -> str:
+    fish = [one for one in counted if one.haul == effort.haul]
+    row = haul_row(effort, utc_zero_ns=zero_ns)
+    share, lengths = effort.share_measured, [one.length_mm for one in fish if one.length_mm]
+    name = effort.haul or "-"
+    cells = [
+        f"{title}: {name}" if title else name,
+        _span(row["began_utc"], row["ended_utc"]),
+        _hours(effort.hours_watched),
+        "" if share is None else f"{100 * share:.0f} %",
+        str(len(fish)),
+        str(len(lengths)),
+        f"{mean(lengths) / 10:.1f} cm" if lengths else "",
+        _counted(_species(one) for one in fish),
+        _counted(one.fate or "" for one in fish),
+    ]
+    named = zip(_HEAD, cells, strict=True)
+    row_cells = "".join(f'<td data-name="{name}">{escape(cell)}</td>' for name, cell in named)
+    return f"<tr>{row_cells}</tr>"
+
+
+def _species(fish: FishResult) -> str:
+    """Its code; without one what was said of it."""
+    return sure_code(fish) or fish.review.species or fish.catch.species_code or ""
+
+
+def _hours(hours: float) -> str:
+    if hours >= 1:
+        return f"{hours:.1f} h"
+    return f"{60 * hours:.1f} min" if hours >= 1 / 60 else f"{3600 * hours:.1f} s"
+
+
+def _counted(names: Iterable[str]) -> str:
+    found = Counter(name for name in names if name)
+    return ", ".join(f"{count} {name}" for name, count in found.most_common())
+
+
+_SCRIPTS = ("table.js", "plots.js", "detail.js")
+_REVIEW_SCRIPTS = ("clip.js", "boxes.js", "points.js", "review.js", "keys.js")
+_MAX_TRACKS = 10**9  # of one run, in the numbers of a page of many
+_MAX_COORDINATE = 32000  # the coordinates of a mesh are int16
+
+
+def render_page(
+    reports: Sequence[RunReport],
+    *,
+    title: str,
+    notes: Sequence[str] = (),
+    review: Mapping[str, Any] | None = None,
+    coast: Sequence[Line] = (),
+) -> str:
+    """The page of one report, or of all reports of a batch; these have the same template.
+
+    With a `review` it takes verdicts and sends them to its server; it has the `reviewer`, `blind`
+    and perhaps the `sample`.
+    """
+    template = reports[0].recording.header.template
+    about = {
+        "title": title,
+        "software": __version__,
+        "template": template.name,
+        "faces": _packed(template.faces.astype("<u4")),
+        "fisheries": reports[0].settings.model_dump(),
+        "runs": {one.run_id: asdict(one.facts) for report in reports for one in report.fish},
+        "notes": [
+            *notes,
+            *(line for one in reports for line in (*one.notes, *one.recording.warnings)),
+        ],
+        "shapes": [line for one in reports for line in _shape_notes(one)],
+        "review": review,
+        "fates": FATES,
+        "conditions": CONDITIONS,
+    }
+    rows, details = list[dict[str, Any]](), list[str]()
+    for placed in place(reports):
+        for fish in placed.report.fish:
+            row = placed.row(fish)
+            rows.append(row)
+            detail = fish_detail(fish, placed.report)
+            details.append(json_element(f"fish-{row['id']}", detail))
+    data = json_element("data", about | {"fish": rows}) + "".join(details)
+    scripts = [*_SCRIPTS, *(_REVIEW_SCRIPTS if review else ()), "page.js"]
+    return _fill_template(
+        title, data, scripts, trip=trip_section(reports, coast=coast, is_folded=bool(review))
+    )
+
+
+def _shape_notes(report: RunReport) -> Iterator[str]:
+    """How the stocks that a run learnt differ from their body forms."""
+    shapes = known_shapes(report.recording)
+    stocks = None if shapes is None else shapes.stocks()
+    if stocks is None:
+        return
+    if not {shape.name for shape in stocks} <= set(bundled_names()):
+        return  # learnt from a mesh of the user's own, which the recording does not have
+    _, forms = load_shapes(AUTO)
+    if forms is not None:
+        yield from describe(forms, stocks)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PlacedReport:
+    """A report among those of a page."""
+
+    report: RunReport
+    run: int  # from 0
+    is_one_of_many: bool
+    shift_s: float  # videos whose clocks start at zero follow each other in time
+
+    def row_id(self, track_id: int) -> int:
+        """The number of a fish in the page."""
+        return self.run * _MAX_TRACKS + track_id
+
+    def row(self, fish: FishResult) -> dict[str, Any]:
+        """The row of a fish in the table of the page; `id` is its number in the page."""
+        row = summary_row(fish, self.report)
+        if not self.is_one_of_many:
+            return row
+        return row | {
+            "run": self.run,
+            "id": self.row_id(fish.estimate.track_id),
+            "video": self.report.title,
+            "time_s": row["time_s"] + self.shift_s,
+        }
+
+
+def place(reports: Sequence[RunReport]) -> list[PlacedReport]:
+    """The reports of a page, with what tells their fish apart."""
+    placed, end_s = list[PlacedReport](), -math.inf
+    for run, report in enumerate(reports):
+        first_s, last_s = report.span_s
+        shift_s = max(0.0, end_s - first_s)
+        end_s = last_s + shift_s
+        many = len(reports) > 1
+        placed.append(PlacedReport(report=report, run=run, is_one_of_many=many, shift_s=shift_s))
+    return placed
+
+
+def _fill_template(title: str, data: str, scripts: Sequence[str], *, trip: str) -> str:
+    """page.html with its parts filled in."""
+    folder = files("stream_dmr.web").joinpath("report")
+    parts = {
+        "TRIP": trip,
+        "TITLE": title.replace("&", "&amp;").replace("<", "&lt;"),
+        "STYLE": folder.joinpath("page.css").read_text(encoding="utf-8"),
+        "PLOTLY": files("plotly").joinpath("package_data/plotly.min.js").read_text("utf-8"),
+        "DATA": data,
+        "CODE": "".join(folder.joinpath(name).read_text(encoding="utf-8") for name in scripts),
+    }
+    text = folder.joinpath("page.html").read_text(encoding="utf-8")
+    pieces = text.split("@@")  # text, name, text, name, ..., text
+    return "".join(parts[piece] if k % 2 else piece for k, piece in enumerate(pieces))
+
+
+def summary_row(fish: FishResult, report: RunReport) -> dict[str, Any]:
+    """The row of a fish in the table: that of fish.csv, and its best view, small."""
+    record = fish_record(fish, report.recording.header.template, report.settings)
+    of_run = asdict(fish.facts)
+    row = {name: value for name, value in record.items() if name not in of_run}
+    views = report.views.get(fish.estimate.track_id, [])
+    return row | {
+        "id": fish.estimate.track_id,  # in the page
+        "run": 0,
+        "video": "",
+        "unit": "mm" if fish.facts.calibration_sha256 else "body lengths",
+        "vessel": fish.facts.vessel,
+        "trip": fish.facts.trip,
+        "haul": fish.haul,
+        "time_s": fish.estimate.first_timestamp_ns / 1e9,
+        "refused": dict(fish.estimate.refused),
+        "flags": list(fish.flags),
+        "thumbnail": _uri(views[0].thumbnail) if views else "",
+        "moved": _moved_points(fish, views),
+    }
+
+
+def _moved_points(fish: FishResult, views: Sequence[DrawnView]) -> dict[int, Any]:
+    """Frame index -> the head and tail points that a reviewer has set, in pixels of the crop."""
+    by_frame = {view.recorded.row.fish.frame_index: view for view in views}
+    return {
+        frame_index: np.round(
+            crop_from_frame(
+                np.array(points), crop_camera=view.crop_camera, frame_camera=view.frame_camera
+            ),
+            2,
+        ).tolist()
+        for frame_index, points in fish.review.moved.items()
+        if (view := by_frame.get(frame_index)) is not None
+    }
+
+
+def fish_detail(fish: FishResult, report: RunReport) -> dict[str, Any]:
+    """What a row opens: best views, every frame, the mesh."""
+    views = report.views.get(fish.estimate.track_id, [])
+    track = report.tracks.get(fish.estimate.track_id)
+    return {
+        "frames": [_frame_values(row) for row in track.rows] if track else [],
+        "views": [_view_values(view) for view in views],
+        "mesh": _mesh_values(views[0]) if views else None,
+    }
+
+
+def _frame_values(row: FishFrame) -> list[Any]:
+    """Frame, time, length, std, used, reason, IoU, running length, its low and high end."""
+    fish, estimate = row.fish, row.estimate
+    low, high = (None, None) if estimate.ci95_mm is None else estimate.ci95_mm.tolist()
+    numbers = (fish.length_mm, fish.length_std_mm)
+    running = (estimate.length_mm, low, high)
+    return [
+        fish.frame_index,
+        round(fish.timestamp_ns / 1e9, 4),
+        *(None if number is None else round(number, 2) for number in numbers),
+        int(estimate.is_frame_used),
+        estimate.frame_reason,
+        None if fish.iou is None else round(fish.iou, 4),
+        *(None if number is None else round(number, 2) for number in running),
+    ]
+
+
+def _view_values(view: DrawnView) -> dict[str, Any]:
+    fish = view.recorded.row.fish
+    return {
+        "frame": fish.frame_index,
+        "size": view.crop_camera.width,
+        "uri": _uri(view.picture),
+        "mask": [_points(line) for line in view.outlines.mask],
+        "mesh": [_points(line) for line in view.outlines.mesh],
+        "keypoints": np.round(view.outlines.keypoints, 2).tolist(),
+    }
+
+
+def _points(line: Float[np.ndarray, "N 2"]) -> str:
+    """The points of an SVG polygon."""
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in line)
+
+
+def _mesh_values(view: DrawnView) -> dict[str, Any] | None:
+    if view.vertices is None:
+        return None
+    center = view.vertices.mean(axis=0)
+    points = np.vstack([view.vertices, view.midline]) - center
+    step = float(np.abs(points).max()) / _MAX_COORDINATE
+    return {
+        "step": step,
+        "vertices": len(view.vertices),
+        "points": _packed(np.round(points / step).astype("<i2")),
+    }
+
+
+def json_element(name: str, content: object) -> str:
+    """An element with JSON for the page's scripts; no text in it can end the element."""
+    text = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    return f'<script type="application/json" id="{name}">{text}</script>\n'
+
+
+def _packed(array: np.ndarray) -> str:
+    return b64encode(np.ascontiguousarray(array).tobytes()).decode()
+
+
+def _uri(webp: bytes) -> str:
+    return f"data:image/webp;base64,{b64encode(webp).decode()}"

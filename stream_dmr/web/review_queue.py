@@ -1,0 +1,246 @@
+"""The server of `review`, and the order in which it offers fish."""
+
+import secrets
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from http import HTTPStatus
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+
+from stream_dmr.errors import ConfigError, OutputError, UserError
+from stream_dmr.species import load_species
+from stream_dmr.store.fish import FishResult, database_of, read_measured_fish
+from stream_dmr.store.verdicts import NOT_REVIEWED
+from stream_dmr.web.clip import fish_clip
+from stream_dmr.web.report_page import PlacedReport, RunReport, fish_detail, place, render_page
+from stream_dmr.web.token_server import TokenHandler, TokenServer
+from stream_dmr.web.verdict_recorder import VerdictRecorder, parse_verdict
+
+
+@dataclass(frozen=True, kw_only=True)
+class AuditSample:
+    """How many fish are drawn at random, and from which seed."""
+
+    size: int
+    seed: int = 0
+
+
+class ReviewQueue:
+    """Takes the verdicts of one reviewer on the fish of all reports. Thread-safe."""
+
+    def __init__(
+        self,
+        reports: Sequence[RunReport],
+        *,
+        reviewer: str,
+        blind: bool = False,
+        sample: AuditSample | None = None,
+    ) -> None:
+        """UserError where a report has no database."""
+        self._reviewer, self._blind = reviewer, blind
+        self.placed = place(reports)
+        self._recorders = [VerdictRecorder(report, reviewer, blind=blind) for report in reports]
+        self._measured = set[int]() if sample is None else measured_numbers(self.placed)
+        self._chosen = None if sample is None else sampled(self._measured, sample)
+        self._about: dict[str, Any] = {"reviewer": reviewer, "blind": blind}
+        self._about["species"] = species_choices(reports[0].config.species.own_list)
+        if sample is not None:
+            self._about["sample"] = {"size": sample.size, "seed": sample.seed}
+
+    def page(self, title: str) -> str:
+        """The page as it is now."""
+        reports = [
+            replace(
+                recorder.report, fish=[fish for fish, row in self._fish(run) if self._is_shown(row)]
+            )
+            for run, recorder in enumerate(self._recorders)
+        ]
+        return render_page(reports, title=title, review=self._about)
+
+    def reviewed_rows(self) -> list[dict[str, Any]]:
+        """The rows of all fish that any verdict was about, or `{"id": ..., "gone": true}`."""
+        rows: list[dict[str, Any]] = []
+        for run, recorder in enumerate(self._recorders):
+            _, _, named = recorder.said()
+            rows += self._rows(run, named) if named else []
+        return rows
+
+    def record(self, content: bytes) -> list[dict[str, Any]]:
+        """Take a verdict in JSON; the rows of the fish that it changes. UserError if it is none."""
+        submitted = parse_verdict(content)
+        recorder = self._recorder(submitted.run)
+        return self._rows(submitted.run, recorder.record(submitted))
+
+    def detail(self, run: int, track_id: int) -> dict[str, Any]:
+        """What a row opens. UserError where there is no such fish."""
+        for fish, _ in self._fish(run):
+            if fish.estimate.track_id == track_id:
+                return fish_detail(fish, self._recorder(run).report)
+        raise UserError(f"expected a fish of this review, got {track_id}")
+
+    def clip(self, run: int, track_id: int, shift: int) -> Iterator[bytes]:
+        """The clip around a fish, see `fish_clip`. UserError where there is no such fish."""
+        recorder = self._recorder(run)
+        return fish_clip(recorder.report, recorder.pictures, track_id, shift=shift)
+
+    def close(self) -> None:
+        """Release the sources."""
+        for recorder in self._recorders:
+            recorder.pictures.close()
+
+    def _recorder(self, run: int) -> VerdictRecorder:
+        if not 0 <= run < len(self._recorders):
+            raise UserError(f"expected a run of this review, got {run}")
+        return self._recorders[run]
+
+    def _rows(self, run: int, track_ids: Sequence[int] | set[int]) -> list[dict[str, Any]]:
+        rows = {fish.estimate.track_id: row for fish, row in self._fish(run, set(track_ids))}
+        placed = self.placed[run]
+        gone = [{"id": placed.row_id(one), "gone": True} for one in track_ids if one not in rows]
+        return [*(row for row in rows.values() if self._is_shown(row)), *gone]
+
+    def _fish(
+        self, run: int, wanted: set[int] | None = None
+    ) -> Iterator[tuple[FishResult, dict[str, Any]]]:
+        """The fish of a run as this reader sees them, with their rows."""
+        report, reviews, _ = self._recorder(run).said()
+        placed = replace(self.placed[run], report=report)
+        for fish in report.fish:
+            track_id = fish.estimate.track_id
+            if wanted is None or track_id in wanted:
+                seen = replace(fish, review=reviews.get(track_id, NOT_REVIEWED))
+                yield seen, placed.row(seen)
+
+    def _is_shown(self, row: dict[str, Any]) -> bool:
+        """True for the fish of the sample, and for those that were not there to be drawn."""
+        return self._chosen is None or row["id"] in self._chosen or row["id"] not in self._measured
+
+
+def species_choices(own_list: str) -> list[dict[str, str]]:
+    """Codes and names that a reviewer may type, and the `value` that becomes the verdict.
+
+    A species of the user's own list stands by its code, which every reader of the verdict knows.
+    """
+    bundled = {one.code for one in load_species()}
+    try:
+        known = load_species(own_list)
+    except ConfigError:  # the list is not on this machine
+        known = load_species()
+    return [
+        {
+            "code": one.code,
+            "name": one.english_name or one.scientific_name,
+            "scientific": one.scientific_name,
+            "value": one.scientific_name if one.code in bundled else one.code,
+        }
+        for one in known
+    ]
+
+
+def measured_numbers(placed: Sequence[PlacedReport]) -> set[int]:
+    """The numbers, in the page, of the fish that were measured."""
+    return {
+        one.row_id(fish.estimate.track_id)
+        for one in placed
+        if (database := database_of(one.report.path)) is not None
+        for fish in read_measured_fish(database)
+    }
+
+
+def sampled(numbers: set[int], sample: AuditSample) -> set[int]:
+    """Those that are drawn at random; equal seeds draw equal ones from the same numbers."""
+    rng = np.random.default_rng(sample.seed)
+    size = min(sample.size, len(numbers))
+    return set(rng.choice(sorted(numbers), size, replace=False).tolist())
+
+
+_HOST = "127.0.0.1"
+_MAX_VERDICT_BYTES = 1 << 16
+
+
+class ReviewServer:
+    """Serves the page from the start, to those who have the token in `address`."""
+
+    def __init__(self, queue: ReviewQueue, *, title: str, port: int = 0) -> None:
+        """OutputError where the port is taken."""
+        self._queue = queue
+        try:
+            self._server = _ReviewHttpServer(queue, title, port)
+        except OSError as error:
+            raise OutputError(
+                f"{_HOST}:{port}: expected a free port, got: {error.strerror}; choose another "
+                "--port"
+            ) from error
+        self.address = (
+            f"http://{_HOST}:{self._server.server_address[1]}/?token={self._server.token}"
+        )
+        self._server.start()
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._server.stop()
+        self._queue.close()
+
+
+class _ReviewHttpServer(TokenServer):
+    def __init__(self, queue: ReviewQueue, title: str, port: int) -> None:
+        self.queue = queue
+        self.title = title
+        super().__init__((_HOST, port), _ReviewHandler, token=secrets.token_urlsafe(24))
+
+
+class _ReviewHandler(TokenHandler):
+    server: _ReviewHttpServer  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def answer_get(self, path: str) -> None:
+        queue = self.server.queue
+        try:
+            match path:
+                case "/":
+                    page = queue.page(self.server.title).encode()
+                    self.answer(HTTPStatus.OK, "text/html; charset=utf-8", page)
+                case "/reviewed.json":
+                    self.answer_json(HTTPStatus.OK, queue.reviewed_rows())
+                case "/fish.json":
+                    run, fish, _ = self._numbers()
+                    self.answer_json(HTTPStatus.OK, queue.detail(run, fish))
+                case "/clip":
+                    self._answer_in_parts(queue.clip(*self._numbers()))
+                case _:
+                    self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
+        except UserError as error:
+            self.answer_json(HTTPStatus.BAD_REQUEST, {"error": str(error)})
+
+    def answer_post(self, path: str) -> None:
+        """Take a verdict. Only this page's own scripts can send JSON with the cookie."""
+        length = self.headers.get("Content-Length", "")
+        if path != "/verdict" or self.headers.get_content_type() != "application/json":
+            return self.answer_json(HTTPStatus.NOT_FOUND, {"error": "expected a verdict as JSON"})
+        if not length.isdecimal() or int(length) > _MAX_VERDICT_BYTES:
+            return self.answer_json(HTTPStatus.BAD_REQUEST, {"error": "expected a short verdict"})
+        try:
+            rows = self.server.queue.record(self.rfile.read(int(length)))
+        except UserError as error:
+            return self.answer_json(HTTPStatus.BAD_REQUEST, {"error": str(error)})
+        self.answer_json(HTTPStatus.OK, rows)
+
+    def _numbers(self) -> tuple[int, int, int]:
+        """The numbers of run and fish in an address, and of a clip before or after its own."""
+        query = parse_qs(urlsplit(self.path).query)
+        try:
+            run, fish, shift = (int(query.get(n, ["0"])[0]) for n in ("run", "fish", "shift"))
+        except ValueError:
+            raise UserError("expected numbers in the address") from None
+        return run, fish, shift
+
+    def _answer_in_parts(self, parts: Iterator[bytes]) -> None:
+        """Answer with bytes as they come; the connection ends with them."""
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", "application/octet-stream")
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.end_headers()
+        for part in parts:
+            self.wfile.write(part)

@@ -1,0 +1,324 @@
+"""The state of a run that its status page and its Prometheus metrics show."""
+
+import shutil
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from prometheus_client import CollectorRegistry
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from stream_dmr.lengths.fate import ZonesSettings
+from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish, Message, Position
+from stream_dmr.pipeline.chain import Chain
+from stream_dmr.pipeline.haul_log import HaulLog
+from stream_dmr.reasons import without_counts
+from stream_dmr.recording.record import SinkStates
+from stream_dmr.sources.positions import COUNTED, PositionSource
+from stream_dmr.sources.source import Source
+from stream_dmr.store.length_store import LengthStore
+
+_MAX_FRAMES = 16  # more than the chain's queues hold, so that a fish finds its frame
+_MAX_FISH = 4 * _MAX_FRAMES  # in these frames
+MAX_FINISHED = 20  # in the page's table
+_MAX_WARNINGS = 50
+_MAX_FITS = 1000  # for quantiles of their time
+_HOUR_S = 3600.0
+_MIN_RATE_WINDOW_S = 60.0  # else one fish in the first second would be thousands an hour
+_RATE_WINDOW_S = 10.0
+_MAX_RATE_FRAMES = 300  # in this window
+_MAX_HOURLY_FISH = 10_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class RepeatedWarning:
+    """A warning, how often it came, and when last (monotonic clock)."""
+
+    line: str
+    count: int
+    last_s: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MeasuredFrame:
+    """A frame with the fish that were localized in it."""
+
+    frame: Frame
+    fish: tuple[LocalizedFish, ...]
+    lengths_mm: dict[int, float]  # the running estimates, by track id
+
+
+class RunState:
+    """Takes every message in the chain's threads; the server reads it in its own. Thread-safe."""
+
+    def __init__(
+        self,
+        source: Source,
+        out_dir: Path,
+        *,
+        silence_s: float,
+        stuck_s: float,
+        sinks: SinkStates | None = None,
+        zones: ZonesSettings | None = None,
+        positions: PositionSource | None = None,
+        hauls: HaulLog | None = None,
+        scale_alarm: Callable[[], str] = str,
+    ) -> None:
+        """A camera that is silent for `silence_s` and a frame that takes `stuck_s` are problems.
+
+        So is a line of `scale_alarm`, that a known length was measured wrong.
+        """
+        self.source = source
+        self.positions, self.hauls = positions, hauls
+        self.position: Position | None = None  # the latest
+        self.chain: Chain | None = None
+        self.sinks = sinks or SinkStates()
+        self.finished: deque[LengthEstimate] = deque(maxlen=MAX_FINISHED)  # newest last
+        self.num_fish: Counter[str] = Counter()  # finished ones, by status
+        self.species: Counter[str] = Counter()  # of finished fish, by code
+        self.fates: Counter[str] = Counter()
+        self.fit_s: deque[float] = deque(maxlen=_MAX_FITS)
+        self.zones = zones or ZonesSettings()
+        self._out_dir = out_dir
+        self._silence_s = silence_s
+        self._stuck_s = stuck_s
+        self._scale_alarm = scale_alarm
+        self._began_s = time.monotonic()
+        self._lock = threading.Lock()
+        self._frames: deque[Frame] = deque(maxlen=_MAX_FRAMES)
+        self._fish: deque[LocalizedFish] = deque(maxlen=_MAX_FISH)
+        self._lengths_mm: dict[int, float] = {}
+        self._frames_done_s: deque[float] = deque(maxlen=_MAX_RATE_FRAMES)
+        self._fish_done_s: deque[float] = deque(maxlen=_MAX_HOURLY_FISH)
+        self._warnings: dict[str, RepeatedWarning] = {}  # the latest last
+
+    def continue_after(self, store: LengthStore) -> None:
+        """Begin with the fish of earlier runs in the folder: their numbers, and the last ones."""
+        for status, number in store.counts("status").items():
+            self.num_fish[without_counts(status)] += number
+        self.species.update(store.counts("species_code"))
+        self.fates.update(store.counts("fate"))
+        self.finished.extend(store.estimates(last=MAX_FINISHED))
+
+    def take(self, message: Message) -> None:
+        """Keep what the page shows of a message; no picture is copied."""
+        with self._lock:
+            match message:
+                case Frame():
+                    self._frames.append(message)
+                case Position():
+                    self.position = message
+                case FittedMesh(report=report) if report is not None:
+                    self.fit_s.append(report.elapsed_ns / 1e9)
+                case LocalizedFish():
+                    self._fish.append(message)
+                case LengthEstimate(is_final=True):
+                    self._finish(message)
+                case LengthEstimate(length_mm=length_mm) if length_mm is not None:
+                    self._lengths_mm[message.track_id] = length_mm
+                case _:
+                    pass
+
+    def frame_done(self) -> None:
+        """Count a frame that has left the chain."""
+        with self._lock:
+            self._frames_done_s.append(time.monotonic())
+
+    def warn(self, line: str) -> None:
+        """Keep a warning, or count it again."""
+        with self._lock:
+            before = self._warnings.pop(line, None)
+            count = 1 if before is None else before.count + 1
+            self._warnings[line] = RepeatedWarning(line=line, count=count, last_s=time.monotonic())
+            if len(self._warnings) > _MAX_WARNINGS:
+                del self._warnings[next(iter(self._warnings))]
+
+    def warnings(self) -> list[RepeatedWarning]:
+        """The warnings, the latest first."""
+        with self._lock:
+            return list(self._warnings.values())[::-1]
+
+    def latest_frame(self) -> MeasuredFrame | None:
+        """The latest frame whose fish are localized; the latest of all where there are no fish."""
+        with self._lock:
+            if not self._frames:
+                return None
+            frame = self._frames[-1]
+            by_index = {kept.frame_index: kept for kept in self._frames}
+            if self._fish and self._fish[-1].frame_index in by_index:
+                frame = by_index[self._fish[-1].frame_index]
+            fish = [one for one in self._fish if one.frame_index == frame.frame_index]
+            return MeasuredFrame(frame=frame, fish=tuple(fish), lengths_mm=dict(self._lengths_mm))
+
+    def frames_per_s(self) -> float:
+        """Frames that left the chain, over the last ten seconds."""
+        with self._lock:
+            now_s = time.monotonic()
+            recent = sum(now_s - done_s <= _RATE_WINDOW_S for done_s in self._frames_done_s)
+        return recent / max(min(_RATE_WINDOW_S, now_s - self._began_s), 1e-3)
+
+    def fish_per_hour(self) -> float:
+        """Fish that were finished, over the last hour or since the start."""
+        with self._lock:
+            now_s = time.monotonic()
+            recent = sum(now_s - done_s <= _HOUR_S for done_s in self._fish_done_s)
+        window_s = min(_HOUR_S, max(now_s - self._began_s, _MIN_RATE_WINDOW_S))
+        return recent * _HOUR_S / window_s
+
+    def fit_quantiles(self) -> dict[float, float]:
+        """Quantile -> seconds that a fit took, of the last thousand; empty without any."""
+        with self._lock:
+            fit_s = list(self.fit_s)
+        return {q: float(np.quantile(fit_s, q)) for q in (0.5, 0.9, 0.99)} if fit_s else {}
+
+    def last_frame_age_s(self) -> float | None:
+        """Time since the last frame came from the camera; None where the source is no camera."""
+        counts = self.source.counts
+        if counts is None:
+            return None
+        return (time.monotonic_ns() - counts.last_arrival_ns) / 1e9
+
+    def disk_free_bytes(self) -> int:
+        """Room where the results go; 0 where that folder is away."""
+        try:
+            return shutil.disk_usage(self._out_dir).free
+        except OSError:
+            return 0
+
+    def problems(self) -> list[str]:
+        """Why this run is not healthy, for people; empty when it is."""
+        problems: list[str] = []
+        age_s = self.last_frame_age_s()
+        if age_s is not None and age_s > self._silence_s:
+            problems.append(f"no picture from the camera for {age_s:.0f} s")
+        if self.is_stuck():
+            problems.append("the measurement hangs")
+        if self.positions is not None:
+            problems += self.positions.problems()
+        if alarm := self._scale_alarm():
+            problems.append(alarm)
+        return problems + self.sinks.problems()
+
+    def is_stuck(self) -> bool:
+        """True where a stage has had one frame for longer than any fit takes."""
+        return self.chain is not None and self.chain.longest_busy_s() > self._stuck_s
+
+    def _finish(self, estimate: LengthEstimate) -> None:
+        self.finished.append(estimate)
+        self.num_fish[without_counts(estimate.status)] += 1
+        self.species.update([estimate.species_code] if estimate.species_code else [])
+        self.fates.update([estimate.fate] if estimate.fate else [])
+        self._fish_done_s.append(time.monotonic())
+        self._lengths_mm.pop(estimate.track_id, None)
+
+
+class RunMetrics(Collector):
+    """Collects a run's metrics. Of each stage, in = processed + dropped + failed + in work."""
+
+    def __init__(self, state: RunState) -> None:
+        self._state = state
+
+    def collect(self) -> Iterator[Metric]:
+        """Give all metrics as they are now."""
+        yield from self._stages()
+        yield from self._camera()
+        yield from self._positions()
+        yield from self._results()
+
+    def _stages(self) -> Iterator[Metric]:
+        chain = self._state.chain
+        if chain is None:
+            return
+        frames = CounterMetricFamily(
+            "stream_dmr_frames", "Frames of each stage.", labels=["stage", "outcome"]
+        )
+        waiting = GaugeMetricFamily(
+            "stream_dmr_queue_frames", "Frames that wait before a stage.", labels=["stage"]
+        )
+        for one in chain.counters:
+            for outcome in ("in", "processed", "dropped", "failed"):
+                frames.add_metric([one.stage, outcome], getattr(one, f"frames_{outcome}"))
+        for one, number in zip(chain.counters[1:], chain.waiting(), strict=True):
+            waiting.add_metric([one.stage], number)
+        yield frames
+        yield waiting
+
+    def _camera(self) -> Iterator[Metric]:
+        counts = self._state.source.counts
+        if counts is None:
+            return
+        frames = CounterMetricFamily(
+            "stream_dmr_camera_frames", "Frames that came from the camera.", labels=["outcome"]
+        )
+        for outcome in ("received", "passed_on", "dropped", "failed"):
+            frames.add_metric([outcome], getattr(counts, outcome))
+        yield frames
+        yield _gauge("camera_queue_frames", "Frames that wait for the chain.", counts.waiting)
+        yield CounterMetricFamily(
+            "stream_dmr_camera_reconnects",
+            "How often a lost camera was found again.",
+            value=counts.reconnects,
+        )
+        age_s = self._state.last_frame_age_s()
+        yield _gauge("last_frame_age_seconds", "Since the last frame came.", age_s or 0.0)
+
+    def _positions(self) -> Iterator[Metric]:
+        if self._state.positions is None:
+            return
+        sentences = CounterMetricFamily(
+            "stream_dmr_position_sentences",
+            "Sentences from the receiver of positions, and what became of them.",
+            labels=["outcome"],
+        )
+        counts = asdict(self._state.positions.counts)
+        for outcome in COUNTED:
+            sentences.add_metric([outcome], counts[outcome])
+        yield sentences
+
+    def _results(self) -> Iterator[Metric]:
+        fish = CounterMetricFamily("stream_dmr_fish", "Finished fish.", labels=["status"])
+        for status, number in dict(self._state.num_fish).items():
+            fish.add_metric([status], number)
+        yield fish
+        for name, text, counts in (
+            ("fates", "Finished fish by what became of them.", self._state.fates),
+            ("species", "Finished fish by FAO code.", self._state.species),
+        ):
+            family = CounterMetricFamily(f"stream_dmr_{name}", text, labels=[name])
+            for value, number in dict(counts).items():
+                family.add_metric([value], number)
+            yield family
+        fit = GaugeMetricFamily(
+            "stream_dmr_fit_seconds", "Time of a fit, of the last 1000.", labels=["quantile"]
+        )
+        for quantile, seconds in self._state.fit_quantiles().items():
+            fit.add_metric([f"{quantile:g}"], seconds)
+        yield fit
+        yield _gauge("fish_per_hour", "Of the last hour.", self._state.fish_per_hour())
+        yield _gauge("frames_per_second", "That left the chain.", self._state.frames_per_s())
+        yield _gauge("disk_free_bytes", "Room for results.", self._state.disk_free_bytes())
+        sinks = GaugeMetricFamily(
+            "stream_dmr_output_works", "1: can be written, 0: not.", labels=["name"]
+        )
+        for sink in self._state.sinks.all():
+            sinks.add_metric([sink.name], 0.0 if sink.is_failing else 1.0)
+        yield sinks
+        warnings = sum(warning.count for warning in self._state.warnings())
+        yield _gauge("warnings", "Warnings that are shown.", warnings)
+        yield _gauge("healthy", "1: healthy, 0: not.", 0.0 if self._state.problems() else 1.0)
+
+
+def _gauge(name: str, text: str, value: float | int) -> Metric:
+    return GaugeMetricFamily(f"stream_dmr_{name}", text, value=value)
+
+
+def make_registry(state: RunState) -> CollectorRegistry:
+    """A registry with the metrics of this run alone."""
+    registry = CollectorRegistry()
+    registry.register(RunMetrics(state))
+    return registry

@@ -1,0 +1,190 @@
+"""The map of a trip: track, hauls, fish, coastline."""
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from stream_dmr.errors import UserError, reason_of
+from stream_dmr.files import read_text
+from stream_dmr.store.fish import FishResult, sure_code
+from stream_dmr.store.trip import VesselTrack
+
+Line = Sequence[tuple[float, float]]  # longitude and latitude of each point, degrees
+
+_MAX_BYTES = 100_000_000  # Natural Earth's finest has a fifth of it
+# How deep the lists of coordinates are nested above a line, by type of geometry (RFC 7946, 3.1).
+_DEPTHS = {"LineString": 0, "MultiLineString": 1, "Polygon": 1, "MultiPolygon": 2}
+
+
+def load_coast(path: Path) -> list[Line]:
+    """The lines of a file, and the edges of its areas. Raises UserError where it has none."""
+    try:
+        lines = list(_lines(json.loads(read_text(path, max_bytes=_MAX_BYTES))))
+    except (OSError, UnicodeDecodeError) as error:
+        raise _refusal(path, reason_of(error)) from error
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
+        raise _refusal(path, f"something else ({type(error).__name__})") from error
+    if not lines:
+        raise _refusal(path, "a file without lines or areas")
+    return lines
+
+
+def _refusal(path: Path, what: str) -> UserError:
+    return UserError(
+        f"--coast: expected GeoJSON with lines or areas in degrees, got {what}: {path}; Natural "
+        "Earth has such files"
+    )
+
+
+def _lines(element: Any) -> Iterator[Line]:
+    """Of a collection, a feature or a geometry; points are left out."""
+    match element["type"]:
+        case "FeatureCollection":
+            for feature in element["features"]:
+                yield from _lines(feature)
+        case "GeometryCollection":
+            for geometry in element["geometries"]:
+                yield from _lines(geometry)
+        case "Feature":
+            if element["geometry"] is not None:
+                yield from _lines(element["geometry"])
+        case kind if kind in _DEPTHS:
+            yield from _unpacked(element["coordinates"], _DEPTHS[kind])
+        case _:
+            pass
+
+
+def _unpacked(coordinates: Any, depth: int) -> Iterator[Line]:
+    if depth:
+        for part in coordinates:
+            yield from _unpacked(part, depth - 1)
+        return
+    yield [(float(point[0]), float(point[1])) for point in coordinates]
+
+
+_WIDTH, _HEIGHT, _MARGIN = 720.0, 360.0, 34.0
+_M_PER_DEGREE = 111_195.0  # of latitude, on a sphere of the earth's mean radius
+_MIN_SPAN_M = 200.0  # of the map: less would show the receiver's noise
+_MAX_POINTS = 3000  # of the track
+_COLOURS = ("#1668a8", "#d55e00", "#16824a", "#8a4fa3", "#b8860b", "#b3372c")
+
+
+def draw_map(
+    tracks: Sequence[VesselTrack], fish: Sequence[FishResult], coast: Sequence[Line] = ()
+) -> str:
+    """A figure of SVG with its key; "" without a position. Fish have a colour for each haul."""
+    pieces = [
+        [(kept.longitude, kept.latitude) for kept in piece]
+        for track in tracks
+        for piece in track.pieces()
+    ]
+    places = [place for piece in pieces for place in piece]
+    if not places:
+        return ""
+    view = _View(places)
+    step = max(1, len(places) // _MAX_POINTS)
+    lines = "".join(
+        f'<polyline points="{" ".join(view.point(p) for p in [*piece[::step], piece[-1]])}"/>'
+        for piece in pieces
+    )
+    shores = "".join(f'<polyline points="{p}"/>' for one in coast for p in view.pieces(one))
+    shores = f'<g class="coast">{shores}</g>' if shores else ""
+    hauls = sorted({one.haul for one in fish})
+    dots = "".join(_dot(one, view, _COLOURS[hauls.index(one.haul) % len(_COLOURS)]) for one in fish)
+    keys = "".join(
+        f'<span style="color: {_COLOURS[i % len(_COLOURS)]}">'
+        f"\u25cf {escape(f'haul {haul}' if haul else 'no haul')}</span> "
+        for i, haul in enumerate(hauls)
+    )
+    return (
+        f'<figure id="map"><svg viewBox="0 0 {_WIDTH:.0f} {_HEIGHT:.0f}" role="img" '
+        f'aria-label="Track of the vessel and its fish">{shores}<g class="track">{lines}</g>{dots}'
+        f"{view.scale_bar()}</svg><figcaption>{keys}{view.middle()}</figcaption></figure>"
+    )
+
+
+def _dot(fish: FishResult, view: "_View", colour: str) -> str:
+    where = fish.where
+    if where.latitude is None or where.longitude is None:
+        return ""
+    x, y = view.point((where.longitude, where.latitude)).split(",")
+    length = "no length" if fish.length_mm is None else f"{fish.length_mm / 10:.1f} cm"
+    facts = (f"fish {fish.estimate.track_id}", length, sure_code(fish), fish.fate)
+    title = escape(", ".join(fact for fact in facts if fact))
+    return f'<circle cx="{x}" cy="{y}" r="4" fill="{colour}"><title>{title}</title></circle>'
+
+
+class _View:
+    """Longitude and latitude to points of the picture: equirectangular, true at its middle."""
+
+    def __init__(self, places: Sequence[tuple[float, float]]) -> None:
+        self._origin = places[0][0]
+        xs = [self._unwrapped(longitude) for longitude, _ in places]
+        ys = [latitude for _, latitude in places]
+        self._middle = (min(xs) + max(xs)) / 2, (min(ys) + max(ys)) / 2
+        self._squeeze = max(0.01, math.cos(math.radians(self._middle[1])))
+        wide_m = max(_MIN_SPAN_M, (max(xs) - min(xs)) * self._squeeze * _M_PER_DEGREE)
+        high_m = max(_MIN_SPAN_M, (max(ys) - min(ys)) * _M_PER_DEGREE)
+        self.px_per_m = min((_WIDTH - 2 * _MARGIN) / wide_m, (_HEIGHT - 2 * _MARGIN) / high_m)
+
+    def _unwrapped(self, longitude: float) -> float:
+        """Near the first one, so that no track is torn at 180 degrees."""
+        return self._origin + (longitude - self._origin + 180) % 360 - 180
+
+    def point(self, place: tuple[float, float]) -> str:
+        """`x,y` of a longitude and latitude."""
+        x, y = self._xy(place)
+        return f"{x:.1f},{y:.1f}"
+
+    def pieces(self, line: Line) -> Iterator[str]:
+        """The points of each part of a line that comes into the picture, or near it."""
+        points, near = [self._xy(place) for place in line], list[int]()
+        for k in range(1, len(points) + 1):
+            if k < len(points) and self._is_near(points[k - 1], points[k]):
+                near.append(k)
+            elif near:
+                yield " ".join(f"{x:.1f},{y:.1f}" for x, y in points[near[0] - 1 : near[-1] + 1])
+                near.clear()
+
+    def _is_near(self, a: tuple[float, float], b: tuple[float, float]) -> bool:
+        """True where the box around two points meets the picture; False across the other side."""
+        half_px = 180 * self._squeeze * _M_PER_DEGREE * self.px_per_m
+        return (
+            abs(b[0] - a[0]) <= half_px
+            and min(a[0], b[0]) <= _WIDTH
+            and max(a[0], b[0]) >= 0
+            and min(a[1], b[1]) <= _HEIGHT
+            and max(a[1], b[1]) >= 0
+        )
+
+    def _xy(self, place: tuple[float, float]) -> tuple[float, float]:
+        """Pixels of the picture, to the right and down."""
+        east = (self._unwrapped(place[0]) - self._middle[0]) * self._squeeze * _M_PER_DEGREE
+        north = (place[1] - self._middle[1]) * _M_PER_DEGREE
+        return _WIDTH / 2 + east * self.px_per_m, _HEIGHT / 2 - north * self.px_per_m
+
+    def scale_bar(self) -> str:
+        """A round number of metres or kilometres, about a fifth of the width."""
+        target_m = _WIDTH / 5 / self.px_per_m
+        power = 10 ** math.floor(math.log10(target_m))
+        metres = max(f for f in (power, 2 * power, 5 * power) if f <= target_m)
+        text = f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m"
+        x1, y = _WIDTH - _MARGIN, _HEIGHT - 12.0
+        x0 = x1 - metres * self.px_per_m
+        return (
+            f'<line x1="{x0:.1f}" y1="{y}" x2="{x1:.1f}" y2="{y}" class="scale"/>'
+            f'<text x="{x0:.1f}" y="{y - 5}">{text}</text>'
+        )
+
+    def middle(self) -> str:
+        """The place of the middle, and where north is, in words."""
+        longitude, latitude = self._middle
+        longitude = (longitude + 180) % 360 - 180
+        place = (
+            f"{abs(latitude):.3f}° {'NS'[latitude < 0]}, {abs(longitude):.3f}° "
+            f"{'EW'[longitude < 0]}"
+        )
+        return f"middle: {place}; north is up"

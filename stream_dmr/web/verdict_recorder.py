@@ -1,0 +1,337 @@
+"""Check what a reviewer submits and write it as verdicts, edits and corrected lengths."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from threading import Lock
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from stream_dmr.camera import Calibration, frame_from_crop
+from stream_dmr.errors import UserError
+from stream_dmr.evidence.seal import seal_verdicts
+from stream_dmr.lengths.track_record import TrackLength
+from stream_dmr.localization.localize_fish import localize
+from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate, LocalizedFish
+from stream_dmr.pipeline.config import Config
+from stream_dmr.recording.codec import decode
+from stream_dmr.recording.frame_images import FrameLookup
+from stream_dmr.store.edits import changed_fish, edits_of
+from stream_dmr.store.fish import database_of
+from stream_dmr.store.verdicts import (
+    BLIND,
+    EDITS,
+    NOT_REVIEWED,
+    Ends,
+    Review,
+    Verdict,
+    add_verdict,
+    blind_readings,
+    check_verdict,
+    last_of,
+    read_verdicts,
+    reviews_of,
+    standing,
+)
+from stream_dmr.web.added_fish import TrackEdit, TrackEditor
+from stream_dmr.web.open_reports import reread_fish
+from stream_dmr.web.report_page import RunReport
+from stream_dmr.web.views import RecordedView, recorded_source
+
+Point = tuple[float, float]  # x, y
+_DIGITS = r"^\d{1,19}$"
+
+
+class DrawnBox(BaseModel):
+    """A box around a fish that was missed, in pixels of the frame."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    frame_index: int
+    timestamp_ns: str = Field(pattern=_DIGITS)  # text: a number of JavaScript rounds it
+    x0: float = Field(allow_inf_nan=False)
+    y0: float = Field(allow_inf_nan=False)
+    x1: float = Field(allow_inf_nan=False)
+    y1: float = Field(allow_inf_nan=False)
+
+    @property
+    def corners(self) -> Float[np.ndarray, "4"]:
+        """x0, y0, x1, y1."""
+        return np.array([self.x0, self.y0, self.x1, self.y1])
+
+
+class SubmittedVerdict(BaseModel):
+    """A verdict; head and tail are in pixels of the frame's crop."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    run: int = 0  # of the page, from 0
+    track_id: int = 0  # of an `add`: none
+    kind: str = Field(max_length=20)
+    reason: str = Field(default="", max_length=500)
+    species: str = Field(default="", max_length=200)
+    fate: str = Field(default="", max_length=20)
+    condition: str = Field(default="", max_length=20)
+    duplicate_of: int | None = None
+    frame_index: int | None = None
+    head: Point | None = None
+    tail: Point | None = None
+    other_fish: int | None = None
+    boxes: list[DrawnBox] = Field(default_factory=list[DrawnBox], max_length=500)
+
+
+def parse_verdict(content: bytes) -> SubmittedVerdict:
+    """The verdict in JSON. Raises UserError where it is none."""
+    try:
+        return SubmittedVerdict.model_validate_json(content)
+    except ValidationError as error:
+        raise UserError(f"verdict: {error.errors()[0]['msg']}") from error
+
+
+def drawn_boxes(
+    boxes: Sequence[DrawnBox],
+) -> tuple[dict[int, Float[np.ndarray, "4"]], tuple[int, int]]:
+    """The boxes by frame, and the capture times of the first and the last frame, ns.
+
+    Raises UserError without any, and where one is empty.
+    """
+    if not boxes:
+        raise UserError("verdict: expected a box around the fish; draw one on a frame of the clip")
+    for box in boxes:
+        if box.x1 - box.x0 < 1 or box.y1 - box.y0 < 1:
+            raise UserError(f"verdict: expected a box in frame {box.frame_index}, got a point")
+    times = [int(box.timestamp_ns) for box in boxes]
+    return {box.frame_index: box.corners for box in boxes}, (min(times), max(times))
+
+
+def corrected_fish(
+    fit: FittedMesh,
+    points_px: Float[np.ndarray, "2 2"],
+    *,
+    config: Config,
+    calibration: Calibration | None,
+) -> LocalizedFish:
+    """Localize a frame of a fish again with its head and tail at `points_px`, in frame pixels.
+
+    Shape, center and bend stay those of the fit. The gates of quality are left out, since the
+    reviewer has looked; UserError where these points give no length.
+    """
+    shape = fit.shape
+    if shape is None:
+        raise UserError(f"frame {fit.frame_index} has no fit to correct: {fit.refusal}")
+    keypoints_px = np.stack([points_px[0], shape.keypoints_px[1], points_px[1]])
+    moved = replace(fit, shape=replace(shape, keypoints_px=keypoints_px))
+    fish = localize(moved, settings=config.localize, calibration=calibration)
+    if fish.length_mm is None or fish.length_std_mm is None:
+        raise UserError(
+            f"frame {fit.frame_index}: these points give no length ({fish.reason}); set them on "
+            "the ends of the fish"
+        )
+    return replace(fish, accepted=True, reason="")
+
+
+def corrected_length(frames: Mapping[int, LocalizedFish], config: Config) -> LengthEstimate:
+    """The length from the corrected frames alone, filtered as in a run."""
+    settings = config.smooth_length.model_copy(update={"min_frames": 1, "max_std_ratio": math.inf})
+    ordered = [frames[index] for index in sorted(frames)]
+    track = TrackLength(ordered[0], settings)
+    for fish in ordered:
+        track.add(fish)
+    return track.finish()
+
+
+class VerdictRecorder:
+    """Verdicts of one reviewer on the fish of one run. Thread-safe."""
+
+    def __init__(self, report: RunReport, reviewer: str, *, blind: bool = False) -> None:
+        """UserError without a database to write to.
+
+        A `blind` reading sees the fish as they were measured, and changes no review.
+        """
+        database = database_of(report.path)
+        if database is None:
+            raise UserError(
+                f"{report.path}: expected the folder of a run, with its lengths.db, for the "
+                "verdicts; got a recording alone"
+            )
+        self._database: Path = database
+        self._report = report
+        self._reviewer = reviewer
+        self._reading = BLIND if blind else None
+        self.pictures = FrameLookup(
+            report.recording, report.source or recorded_source(report.recording)
+        )
+        self._editor = TrackEditor(database, self.pictures)
+        self._lock = Lock()
+
+    @property
+    def report(self) -> RunReport:
+        """The fish as they are now."""
+        return self._report
+
+    def record(self, submitted: SubmittedVerdict) -> list[int]:
+        """Check and write a verdict; returns the fish that it changes.
+
+        UserError where it contradicts itself or what is known.
+        """
+        with self._lock:
+            said = read_verdicts(self._database)
+            self._follow(said)
+            verdict = self._verdict(submitted)
+            if verdict.kind == "undo":
+                edit = TrackEdit(verdict=self._undo(verdict, said))
+            else:
+                edit = self._checked(verdict, submitted, said)
+            is_edit, before = verdict.kind in (*EDITS, "undo"), self._report.edits
+            add_verdict(
+                self._database,
+                edit.verdict,
+                frames=edit.frames,
+                new_fish=edit.new_fish,
+                known=len(said) if is_edit else None,
+            )
+            seal_verdicts(self._database.parent)
+            self._follow(read_verdicts(self._database))
+            return sorted({edit.verdict.track_id} | changed_fish(before, self._report.edits))
+
+    def said(self) -> tuple[RunReport, dict[int, Review], set[int]]:
+        """The fish as they are now, their reviews, and all fish that a verdict ever spoke of."""
+        with self._lock:
+            verdicts = read_verdicts(self._database)
+            self._follow(verdicts)
+            named = {one.track_id for one in verdicts} | {one.other_fish for one in verdicts}
+            return self._report, self._reviews(verdicts), {one for one in named if one is not None}
+
+    def _reviews(self, verdicts: Sequence[Verdict]) -> dict[int, Review]:
+        """Of this reading: a blind reader sees no other verdicts."""
+        if self._reading is None:
+            return reviews_of(verdicts)
+        return reviews_of(blind_readings(verdicts).get(self._reviewer, []))
+
+    def _follow(self, verdicts: Sequence[Verdict]) -> None:
+        """Take over what any reviewer has added, split, merged or undone."""
+        if self._reading is not None:
+            return
+        changed = changed_fish(self._report.edits, edits_of(verdicts))
+        if changed:
+            self._report = reread_fish(self._report, frozenset(changed), self.pictures)
+
+    def _verdict(self, submitted: SubmittedVerdict) -> Verdict:
+        kind = submitted.kind
+        return Verdict(
+            track_id=submitted.track_id,
+            kind=kind,
+            reviewer=self._reviewer,
+            reason=submitted.reason.strip() if kind == "reject" else "",
+            species=submitted.species.strip() if kind == "species" else "",
+            fate=submitted.fate.strip().lower() if kind == "fate" else None,
+            condition=submitted.condition.strip().upper() if kind == "condition" else None,
+            duplicate_of=submitted.duplicate_of if kind == "duplicate" else None,
+            frame_index=submitted.frame_index if kind == "split" else None,
+            other_fish=submitted.other_fish if kind == "merge" else None,
+            reading=self._reading,
+        )
+
+    def _checked(
+        self, verdict: Verdict, submitted: SubmittedVerdict, said: Sequence[Verdict]
+    ) -> TrackEdit:
+        """The verdict with what follows from it."""
+        report = self._report
+        if verdict.kind in EDITS and self._reading is not None:
+            raise UserError(
+                "verdict: expected accept, reject, duplicate, species or moved points: a blind "
+                "reading is of the fish as they were measured"
+            )
+        if verdict.kind == "add":
+            return self._editor.add(report, verdict, *drawn_boxes(submitted.boxes))
+        there = {one.estimate.track_id for one in report.fish} - report.edits.merged.keys()
+        reviews = self._reviews(said)
+        check_verdict(verdict, there, reviews)
+        if verdict.kind in EDITS:
+            _require_unmoved(reviews, verdict.track_id, verdict.other_fish)
+        match verdict.kind:
+            case "split":
+                return self._editor.split(report, verdict)
+            case "merge":
+                return self._editor.merge(report, verdict)
+            case "correct":
+                moved = reviews.get(verdict.track_id, NOT_REVIEWED).moved
+                return TrackEdit(verdict=self._corrected(verdict, submitted, moved))
+            case _:
+                return TrackEdit(verdict=verdict)
+
+    def _undo(self, verdict: Verdict, said: Sequence[Verdict]) -> Verdict:
+        """Take back the last verdict of this reviewer. UserError where others build on it."""
+        number = last_of(said, self._reviewer, self._reading)
+        if number is None:
+            raise UserError(f"undo: expected a verdict of {self._reviewer}, got none")
+        undone = said[number - 1]
+        if undone.kind in EDITS:
+            fish, counted = {undone.track_id, undone.other_fish} - {None}, standing(said)
+            for later in said[number:]:
+                if later in counted and fish & {
+                    later.track_id,
+                    later.other_fish,
+                    later.duplicate_of,
+                }:
+                    raise UserError(
+                        f"undo: {later.reviewer} has decided on fish {later.track_id} since; that "
+                        "must be undone first"
+                    )
+        return replace(verdict, track_id=undone.track_id, undoes=number)
+
+    def _corrected(
+        self, verdict: Verdict, submitted: SubmittedVerdict, moved: Mapping[int, Ends]
+    ) -> Verdict:
+        """The verdict with its points in frame pixels and the length that follows."""
+        if submitted.frame_index is None or submitted.head is None or submitted.tail is None:
+            raise UserError("verdict: expected a frame with its head and tail points")
+        crop = decode(FishCrop, self._view(submitted.track_id, submitted.frame_index).crop)
+        head, tail = frame_from_crop(
+            np.array([submitted.head, submitted.tail], float),
+            crop_camera=crop.crop_camera,
+            frame_camera=crop.frame_camera,
+        ).tolist()
+        verdict = replace(
+            verdict,
+            frame_index=submitted.frame_index,
+            head_u=head[0],
+            head_v=head[1],
+            tail_u=tail[0],
+            tail_v=tail[1],
+        )
+        length = self._corrected_length(submitted.track_id, {**moved, **verdict.moved})
+        return replace(verdict, length_mm=length.length_mm, length_std_mm=length.length_std_mm)
+
+    def _corrected_length(self, track_id: int, moved: Mapping[int, Ends]) -> LengthEstimate:
+        report = self._report
+        frames = {
+            frame_index: corrected_fish(
+                decode(FittedMesh, self._view(track_id, frame_index).fit),
+                np.array(points, float),
+                config=report.config,
+                calibration=report.recording.header.calibration,
+            )
+            for frame_index, points in moved.items()
+        }
+        return corrected_length(frames, report.config)
+
+    def _view(self, track_id: int, frame_index: int) -> RecordedView:
+        track = self._report.tracks.get(track_id)
+        for view in track.views if track else ():
+            if view.row.fish.frame_index == frame_index:
+                return view
+        raise UserError(f"verdict: fish {track_id} is not shown in frame {frame_index}")
+
+
+def _require_unmoved(reviews: Mapping[int, Review], *fish: int | None) -> None:
+    """Points that were moved are of a fish as it was: UserError before it gets other frames."""
+    for one in fish:
+        if one is not None and reviews.get(one, NOT_REVIEWED).moved:
+            raise UserError(
+                f"verdict: expected a fish without moved points, but fish {one} has some; "
+                "withdraw its verdicts first"
+            )

@@ -1,0 +1,392 @@
+"""Pictures of recorded fish with mask, mesh and keypoints."""
+
+from collections import defaultdict
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, nullcontext, suppress
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from stream_dmr.camera import Camera, crop_from_frame
+from stream_dmr.errors import SourceError
+from stream_dmr.lengths.kalman import SmoothLengthSettings
+from stream_dmr.messages import (
+    FishCrop,
+    FittedMesh,
+    FittedShape,
+    Frame,
+    LengthEstimate,
+    LocalizedFish,
+)
+from stream_dmr.recording.codec import decode
+from stream_dmr.recording.frame_images import (
+    FrameLookup,
+    FrameRestorer,
+    RecordedPictures,
+    open_pictures,
+)
+from stream_dmr.recording.reading import (
+    Recording,
+    decoded_messages,
+    known_shapes,
+    recorded_settings,
+)
+from stream_dmr.recording.selection import EVERYTHING, Selection
+from stream_dmr.recording.view_geometry import MeshRebuilder, place_fit
+from stream_dmr.segmentation.crop_geometry import frame_from_crop_map
+from stream_dmr.sources.source import ReadFramesSettings
+from stream_dmr.store.edits import TrackEdits, length_of_frames
+from stream_dmr.store.verdicts import AddedFrame
+
+_MASK_BGR, _MESH_BGR = (80, 220, 255), (90, 230, 90)
+_KEYPOINTS_BGR = (60, 60, 255), (255, 255, 255), (255, 160, 60)  # head, center, tail
+_OVERSAMPLING = 2  # of the crop's pixels, for the outline of a mesh
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Outlines:
+    """What is drawn over a crop, in its pixels, whose centres are integers."""
+
+    mask: Sequence[Float[np.ndarray, "_ 2"]]
+    mesh: Sequence[Float[np.ndarray, "_ 2"]]
+    keypoints: Float[np.ndarray, "3 2"]
+
+
+def crop_outlines(crop: FishCrop, shape: FittedShape, faces: Int[np.ndarray, "F 3"]) -> Outlines:
+    """The outlines of the mask and of the fitted mesh, and the keypoints."""
+    keypoints = crop_from_frame(
+        shape.keypoints_px, crop_camera=crop.crop_camera, frame_camera=crop.frame_camera
+    )
+    mesh: list[Float[np.ndarray, "_ 2"]] = []
+    if shape.vertices is not None:
+        size = crop.mask.shape[0] * _OVERSAMPLING
+        drawn = np.zeros((size, size), np.uint8)
+        pixels = (crop.crop_camera.project(shape.vertices) + 0.5) * _OVERSAMPLING - 0.5
+        for face in np.round(pixels).astype(np.int32)[faces]:
+            cv2.fillConvexPoly(drawn, face, 1)
+        mesh = [
+            (line + 0.5) / _OVERSAMPLING - 0.5 for line in _polygons(drawn > 0, tolerance_px=1.0)
+        ]
+    return Outlines(mask=_polygons(crop.mask, tolerance_px=0.5), mesh=mesh, keypoints=keypoints)
+
+
+def _polygons(mask: Bool[np.ndarray, "H W"], *, tolerance_px: float) -> list[np.ndarray]:
+    lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    simple = (cv2.approxPolyDP(line, tolerance_px, closed=True)[:, 0] for line in lines)
+    return [line.astype(float) for line in simple if len(line) > 2]
+
+
+def crop_picture(
+    crop: FishCrop, frame: UInt8[np.ndarray, "H W 3"] | None, *, size: int
+) -> UInt8[np.ndarray, "N N 3"]:
+    """A crop of `size` by `size` px: from `frame`, else as recorded, else its mask in grey."""
+    if frame is not None:
+        x, y = frame_from_crop_map(_resized(crop.crop_camera, size), frame_camera=crop.frame_camera)
+        return cv2.remap(frame, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    image = crop.image
+    if image is None:
+        image = (40 + 80 * crop.mask.astype(np.uint8))[..., None].repeat(3, axis=2)
+    return cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
+
+
+def draw_outlines(
+    picture: UInt8[np.ndarray, "N N 3"], outlines: Outlines, *, crop_size: int
+) -> UInt8[np.ndarray, "N N 3"]:
+    """The picture with mask, mesh and keypoints drawn over it."""
+    image, scale = picture.copy(), picture.shape[0] / crop_size
+
+    def to_picture(points: Float[np.ndarray, "N 2"]) -> Int[np.ndarray, "N 2"]:
+        return np.round((points + 0.5) * scale * 16 - 8).astype(np.int32)  # 1/16 px
+
+    for lines, colour in ((outlines.mask, _MASK_BGR), (outlines.mesh, _MESH_BGR)):
+        polygons = [to_picture(line) for line in lines]
+        cv2.polylines(image, polygons, True, colour, 1, cv2.LINE_AA, 4)
+    for point, colour in zip(to_picture(outlines.keypoints), _KEYPOINTS_BGR, strict=True):
+        cv2.circle(image, point.tolist(), 2 * 16, colour, -1, cv2.LINE_AA, 4)
+    return image
+
+
+def frame_images(
+    recording: Recording, wanted: set[int], source: str | None, *, is_given: bool
+) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
+    """The images of the wanted frames, from `source`, or from the recording where it has any.
+
+    A source that is not the recorded one raises SourceError where it `is_given` by the user; else
+    its frames are left out.
+    """
+    with _open_pictures(recording, source) as pictures:
+        for message, payload in decoded_messages(recording, [Frame], EVERYTHING):
+            if message.frame_index not in wanted or not isinstance(message, Frame):
+                continue
+            with nullcontext() if is_given else suppress(SourceError):
+                frame = pictures.restore(message, payload)
+                if frame.image.size:
+                    yield frame.frame_index, frame.image
+
+
+@contextmanager
+def _open_pictures(recording: Recording, source: str | None) -> Generator[FrameRestorer]:
+    if source is None:
+        yield RecordedPictures(recording, EVERYTHING)
+    else:
+        settings = recorded_settings(recording, "read_frames", ReadFramesSettings)
+        with open_pictures(source, settings) as pictures:
+            yield pictures
+
+
+def recorded_source(recording: Recording) -> str | None:
+    """Path of the recorded source, where there is still a file or folder."""
+    inputs = recording.header.known_inputs
+    return inputs.source.path if inputs is not None and inputs.source.exists() else None
+
+
+def _resized(camera: Camera, size: int) -> Camera:
+    """The same camera with `size` by `size` pixels."""
+    scale = size / camera.width
+    K = camera.K.copy()
+    K[:2] *= scale
+    K[:2, 2] += 0.5 * scale - 0.5  # pixel centres are integers
+    return replace(camera, K=K, width=size, height=size)
+
+
+_Key = tuple[int, int]  # frame index, track id
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReviewedTracks:
+    """What reviewers changed of the tracks."""
+
+    edits: TrackEdits
+    added: Mapping[int, Sequence[AddedFrame]]  # by track id
+    settings: SmoothLengthSettings  # of the run
+
+
+@dataclass(frozen=True, kw_only=True)
+class FishFrame:
+    """One fish in one frame: its own length, and the running estimate after it."""
+
+    fish: LocalizedFish
+    estimate: LengthEstimate
+
+
+class Encoded(NamedTuple):
+    """What a recording holds of one fish in one frame, encoded; None: nothing."""
+
+    crop: bytes | None
+    fit: bytes | None
+    has_picture: bool  # of the crop
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedView:
+    """One fish in one frame with its crop and fit, encoded: a season of masks fills no memory."""
+
+    crop: bytes
+    fit: bytes
+    row: FishFrame
+    has_picture: bool  # of the crop
+
+    @property
+    def rank(self) -> tuple[bool, bool, float]:
+        """For sorting; the best view is the largest.
+
+        Used frames come first, then those that the recording has a picture of, then by their IoU.
+        """
+        return self.row.estimate.is_frame_used, self.has_picture, self.row.fish.iou or 0.0
+
+    def decode(self, meshes: MeshRebuilder) -> tuple[FishCrop, FittedMesh]:
+        """Crop and fit, the fit with its vertices."""
+        return decode(FishCrop, self.crop), meshes.with_vertices(decode(FittedMesh, self.fit))
+
+
+@dataclass(kw_only=True)
+class RecordedTrack:
+    """All frames of one fish, and its best views."""
+
+    rows: list[FishFrame] = field(default_factory=list[FishFrame])
+    views: list[RecordedView] = field(default_factory=list[RecordedView])  # the best first
+
+    def add(self, row: FishFrame, encoded: Encoded, *, max_views: int) -> None:
+        """Add a frame; keep its crop and fit if it is among the `max_views` best so far."""
+        self.rows.append(row)
+        crop, fit, has_picture = encoded
+        if crop is None or fit is None or row.fish.keypoints_px is None:
+            return
+        self.views.append(RecordedView(crop=crop, fit=fit, row=row, has_picture=has_picture))
+        self.views.sort(key=lambda view: view.rank, reverse=True)
+        del self.views[max_views:]
+
+    def filter_again(self, settings: SmoothLengthSettings) -> None:
+        """Compute the running estimates from the frames in their order."""
+        fish = sorted((row.fish for row in self.rows), key=lambda one: one.frame_index)
+        running = length_of_frames(fish, settings)[:-1]
+        self.rows = [FishFrame(fish=f, estimate=e) for f, e in zip(fish, running, strict=True)]
+
+
+def read_tracks(
+    recording: Recording,
+    *,
+    selection: Selection = EVERYTHING,
+    max_views: int = 3,
+    reviewed: ReviewedTracks | None = None,
+) -> dict[int, RecordedTrack]:
+    """Every fish of a recording with its `max_views` best views. Raises RecordingError.
+
+    Without `reviewed` fish are the recorded tracks.
+    """
+    tracks: dict[int, RecordedTrack] = {}
+    added = () if reviewed is None else _added_rows(reviewed, selection)
+    for row, encoded in chain(_read_rows(recording, selection), added):
+        fish = row.fish
+        if reviewed is not None:
+            fish_id = reviewed.edits.fish_of(fish.track_id, fish.frame_index)
+            row = replace(row, fish=replace(fish, track_id=fish_id))
+        track = tracks.setdefault(row.fish.track_id, RecordedTrack())
+        track.add(row, encoded, max_views=max_views)
+    if reviewed is not None:
+        for fish_id in tracks.keys() & reviewed.edits.fish.keys():
+            tracks[fish_id].filter_again(reviewed.settings)
+    return tracks
+
+
+def _added_rows(
+    reviewed: ReviewedTracks, selection: Selection
+) -> Iterator[tuple[FishFrame, Encoded]]:
+    """The frames of added fish, each with the running estimate of its fish."""
+    for track_id, frames in reviewed.added.items():
+        if selection.tracks is not None and track_id not in selection.tracks:
+            continue
+        fish = [decode(LocalizedFish, frame.fish) for frame in frames]
+        running = length_of_frames(fish, reviewed.settings)[:-1]
+        for frame, one, estimate in zip(frames, fish, running, strict=True):
+            encoded = Encoded(frame.crop, frame.fit, has_picture=False)
+            yield FishFrame(fish=one, estimate=estimate), encoded
+
+
+def _read_rows(recording: Recording, selection: Selection) -> Iterator[tuple[FishFrame, Encoded]]:
+    """Each fish in each frame, with the encodings of its crop and its fit."""
+    crops, fits = dict[_Key, tuple[bytes, bool]](), dict[_Key, bytes]()
+    located = dict[_Key, LocalizedFish]()
+    kinds = (FishCrop, FittedMesh, LocalizedFish, LengthEstimate)
+    for message, payload in decoded_messages(recording, kinds, selection):
+        key = message.frame_index, getattr(message, "track_id", 0)
+        match message:
+            case FishCrop():
+                crops[key] = payload, message.image is not None
+            case FittedMesh():
+                fits[key] = payload
+            case LocalizedFish():
+                located[key] = message
+            case LengthEstimate() if (fish := located.pop(key, None)) is not None:
+                row = FishFrame(fish=fish, estimate=message)
+                crop, has_picture = crops.pop(key, (None, False))
+                yield row, Encoded(crop, fits.pop(key, None), has_picture)
+            case _:
+                pass
+
+
+_PICTURE_PX, _THUMBNAIL_PX = 240, 72
+_WEBP_QUALITY = 75  # half the bytes of a JPEG that looks the same
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DrawnView:
+    """The pictures and outlines of one fish in one frame."""
+
+    recorded: RecordedView
+    crop_camera: Camera  # the outlines are in its pixels
+    frame_camera: Camera
+    picture: bytes  # WebP, as the camera saw the fish
+    thumbnail: bytes  # WebP, with mask, mesh and keypoints drawn over it
+    outlines: Outlines
+    vertices: Float[np.ndarray, "V 3"] | None  # camera frame, mm; body lengths without calibration
+    midline: Float[np.ndarray, "M 3"]
+
+
+DrawnViews = Mapping[int, list[DrawnView]]  # track id -> its best views, the best first
+
+
+def draw_views(
+    tracks: Mapping[int, RecordedTrack],
+    recording: Recording,
+    source: str | None = None,
+    *,
+    pictures: FrameLookup | None = None,
+) -> DrawnViews:
+    """Draw the views of all tracks, with the pictures of `source` or of the recording.
+
+    Without `source`, the recorded one is tried. With `pictures`, which find a frame without
+    reading all before it, nothing else is read; so a video that was recorded is searched. Fish
+    without a picture are drawn by their masks. Raises SourceError where a given `source` is not the
+    recorded one.
+    """
+    path = recorded_source(recording) if pictures is None and source is None else None
+    if path is not None and Path(path).is_file():
+        with closing(FrameLookup(recording, path)) as found:
+            return draw_views(tracks, recording, pictures=found)
+    meshes = MeshRebuilder(recording.header.template, known_shapes(recording))
+    waiting: defaultdict[int, list[tuple[int, RecordedView]]] = defaultdict(list)
+    for track_id, track in tracks.items():
+        for view in track.views:
+            waiting[view.row.fish.frame_index].append((track_id, view))
+    drawn_views: defaultdict[int, list[DrawnView]] = defaultdict(list)
+    if pictures is None:
+        images = _read_frames(recording, set(waiting), source)
+    else:
+        times = {view.row.fish.timestamp_ns for views in waiting.values() for _, view in views}
+        found = (one.frame for t in sorted(times) for one in pictures.frames((t, t + 1)))
+        images = ((frame.frame_index, frame.image) for frame in found if frame.image.size)
+    for frame_index, image in images:
+        for track_id, view in waiting.pop(frame_index, []):
+            drawn_views[track_id].append(_draw_view(view, meshes, recording, image))
+    for views in waiting.values():
+        for track_id, view in views:
+            drawn_views[track_id].append(_draw_view(view, meshes, recording, None))
+    for of_track in drawn_views.values():
+        of_track.sort(key=lambda view: view.recorded.rank, reverse=True)
+    return drawn_views
+
+
+def _read_frames(
+    recording: Recording, wanted: set[int], source: str | None
+) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
+    if source is not None:
+        yield from frame_images(recording, wanted, source, is_given=True)
+        return
+    with suppress(SourceError):  # a file of the same name that is not the recorded one
+        yield from frame_images(recording, wanted, recorded_source(recording), is_given=False)
+
+
+def _draw_view(
+    view: RecordedView,
+    meshes: MeshRebuilder,
+    recording: Recording,
+    frame: UInt8[np.ndarray, "H W 3"] | None,
+) -> DrawnView:
+    crop, fit = view.decode(meshes)
+    shape = fit.shape
+    assert shape is not None  # a view has keypoints
+    outlines = crop_outlines(crop, shape, recording.header.template.faces)
+    picture = crop_picture(crop, frame, size=_PICTURE_PX)
+    size = crop.mask.shape[0]
+    small = cv2.resize(picture, (2 * _THUMBNAIL_PX,) * 2, interpolation=cv2.INTER_AREA)
+    vertices, _, midline = place_fit(shape, view.row.fish)
+    return DrawnView(
+        recorded=view,
+        crop_camera=crop.crop_camera,
+        frame_camera=crop.frame_camera,
+        picture=_webp(picture),
+        thumbnail=_webp(draw_outlines(small, outlines, crop_size=size)),
+        outlines=outlines,
+        vertices=vertices,
+        midline=midline,
+    )
+
+
+def _webp(image: UInt8[np.ndarray, "H W 3"]) -> bytes:
+    return cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY])[1].tobytes()

@@ -1,0 +1,236 @@
+"""Observe a run for its status page, its log in JSON and systemd.
+
+Tells systemd that the service is ready, and that it is alive.
+
+The protocol of sd_notify(3): a line to the datagram socket that NOTIFY_SOCKET names.
+"""
+
+import json
+import logging
+import os
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, closing, suppress
+from typing import Any
+
+from stream_dmr.messages import LengthEstimate, Message
+from stream_dmr.pipeline.chain import Chain
+from stream_dmr.pipeline.run_observer import OpenRun, RunObserver
+from stream_dmr.store.scale_checks import ScaleAlarm
+from stream_dmr.web.alerts import AlertSender
+from stream_dmr.web.run_state import RunState
+from stream_dmr.web.watch_page import WatchServer
+
+_REPEAT_INTERVAL_S = 60.0
+_MAX_KINDS = 200  # of lines that are remembered; beyond it, the one that was silent longest goes
+_PROGRESS_INTERVAL_S = 60.0
+
+
+class JsonFormatter(logging.Formatter):
+    """Formats a record as JSON: time, level, event, and its facts."""
+
+    def format(self, record: logging.LogRecord) -> str:  # noqa: D102
+        facts: dict[str, Any] = getattr(record, "facts", {})
+        line = {"time": record.created, "level": record.levelname.lower(), "event": record.msg}
+        return json.dumps(line | facts, ensure_ascii=False)
+
+
+class RepeatFilter(logging.Filter):
+    """Passes equal lines once a minute; the next that passes counts those held back."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._passed_s: dict[tuple[object, ...], float] = {}  # the longest silent first
+        self._held_back: dict[tuple[object, ...], int] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:  # noqa: D102
+        facts: dict[str, Any] = getattr(record, "facts", {})
+        kind = (record.msg, facts.get("text"), facts.get("track_id"))
+        now_s = time.monotonic()
+        if now_s - self._passed_s.get(kind, -_REPEAT_INTERVAL_S) < _REPEAT_INTERVAL_S:
+            self._held_back[kind] = self._held_back.get(kind, 0) + 1
+            return False
+        self._passed_s.pop(kind, None)
+        self._passed_s[kind] = now_s
+        if held_back := self._held_back.pop(kind, 0):
+            record.facts = facts | {"held_back": held_back}
+        if len(self._passed_s) > _MAX_KINDS:
+            oldest = next(iter(self._passed_s))
+            del self._passed_s[oldest]
+            self._held_back.pop(oldest, None)
+        return True
+
+
+class JsonLog(RunObserver):
+    """Logs the events of a run, for a service's log."""
+
+    def __init__(self) -> None:
+        self._log = logging.getLogger("stream_dmr.run")
+        self._log.setLevel(logging.INFO)
+        self._log.propagate = False
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(JsonFormatter())
+        handler.addFilter(RepeatFilter())
+        self._log.handlers = [handler]
+        self._num_frames = 0
+        self._progress_s = time.monotonic()
+
+    def warn(self, line: str) -> None:  # noqa: D102
+        self._log_event(logging.WARNING, "warning", text=line)
+
+    def serving(self, address: str) -> None:  # noqa: D102
+        self._log_event(logging.INFO, "serving", text=address)
+
+    def begin(self, num_frames: int | None) -> None:  # noqa: D102
+        self._log_event(logging.INFO, "begin", frames_promised=num_frames)
+
+    def frame_done(self) -> None:  # noqa: D102
+        self._num_frames += 1
+        now_s = time.monotonic()
+        if now_s - self._progress_s >= _PROGRESS_INTERVAL_S:
+            self._progress_s = now_s
+            self._log_event(logging.INFO, "progress", frames=self._num_frames)
+
+    def take(self, message: Message) -> None:  # noqa: D102
+        if isinstance(message, LengthEstimate) and message.is_final:
+            self._log_fish(message)
+
+    def _log_fish(self, estimate: LengthEstimate) -> None:
+        self._log_event(
+            logging.INFO,
+            "fish",
+            track_id=estimate.track_id,
+            length_mm=estimate.length_mm,
+            length_std_mm=estimate.length_std_mm,
+            frames_used=estimate.frames_used,
+            frames_seen=estimate.frames_seen,
+            status=estimate.status,
+        )
+
+    def _log_event(self, level: int, event: str, **facts: object) -> None:
+        self._log.log(level, event, extra={"facts": facts})
+
+
+class SystemdWatchdog:
+    """Sends READY at once, then WATCHDOG twice per interval while `is_alive` returns True.
+
+    The interval is WATCHDOG_USEC. Without a NOTIFY_SOCKET it does nothing.
+    """
+
+    def __init__(self, is_alive: Callable[[], bool]) -> None:
+        self._is_alive = is_alive
+        self._ended = threading.Event()
+        interval_s = _microseconds("WATCHDOG_USEC") / 1e6
+        notify("READY=1")
+        self._thread = threading.Thread(
+            target=self._run, args=(interval_s / 2,), name="watchdog", daemon=True
+        )
+        if interval_s > 0:
+            self._thread.start()
+
+    def close(self) -> None:
+        """Send STOPPING, and end."""
+        notify("STOPPING=1")
+        self._ended.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _run(self, pause_s: float) -> None:
+        while not self._ended.is_set():
+            if self._is_alive():
+                notify("WATCHDOG=1")
+            self._ended.wait(pause_s)
+
+
+def notify(line: str) -> None:
+    """Send a line to systemd, where it started this process."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address:
+        return
+    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+        sender.connect("\0" + address[1:] if address.startswith("@") else address)
+        sender.sendall(line.encode())
+
+
+def _microseconds(name: str) -> int:
+    value = os.environ.get(name, "0")
+    return int(value) if value.isdecimal() else 0
+
+
+class WatchObserver(RunObserver):
+    """Passes everything on to another observer, serves it, and tells systemd that the run lives."""
+
+    def __init__(self, observer: RunObserver) -> None:
+        self._observer = observer
+        self._state: RunState | None = None  # from `open` on
+        self._opened = ExitStack()
+
+    def open(self, run: OpenRun) -> None:
+        """Serve as `[watch]` says; ConfigError or OutputError where it can't listen as asked."""
+        self._observer.open(run)
+        settings, silence_s = run.config.watch, run.config.read_frames.silence_s
+        state = RunState(
+            run.source,
+            run.out,
+            silence_s=silence_s,
+            stuck_s=settings.stuck_s,
+            sinks=run.sinks,
+            zones=run.config.zones,
+            positions=run.positions,
+            hauls=run.hauls,
+            scale_alarm=ScaleAlarm(run.store.path, run.store.calibration_sha256).line,
+        )
+        state.continue_after(run.store)
+        if settings.port:
+            server = self._opened.enter_context(closing(WatchServer(state, settings)))
+            self.address = server.address
+        alerts = run.config.alerts
+        if alerts.webhook or alerts.mail_to:
+            sender = AlertSender(
+                alerts, run=run.out.resolve().name, problems=state.problems, on_notice=self.warn
+            )
+            self._opened.enter_context(closing(sender))
+        self._opened.enter_context(closing(SystemdWatchdog(lambda: not state.is_stuck())))
+        self._state = state
+
+    def attach(self, chain: Chain) -> None:
+        """Show this chain's counters."""
+        if self._state is not None:
+            self._state.chain = chain
+        self._observer.attach(chain)
+
+    def close(self) -> None:
+        """Stop serving. Idempotent."""
+        self._opened.close()
+        self.address = None
+        self._observer.close()
+
+    def take(self, message: Message) -> None:  # noqa: D102
+        if self._state is not None:
+            self._state.take(message)
+        self._observer.take(message)
+
+    def warn(self, line: str) -> None:  # noqa: D102
+        if self._state is not None:
+            self._state.warn(line)
+        self._observer.warn(line)
+
+    def stage(self, line: str) -> None:  # noqa: D102
+        self._observer.stage(line)
+
+    def notice(self, line: str) -> None:  # noqa: D102
+        self._observer.notice(line)
+
+    def serving(self, address: str) -> None:  # noqa: D102
+        self._observer.serving(address)
+
+    def begin(self, num_frames: int | None) -> None:  # noqa: D102
+        self._observer.begin(num_frames)
+
+    def frame_done(self) -> None:  # noqa: D102
+        if self._state is not None:
+            self._state.frame_done()
+        self._observer.frame_done()

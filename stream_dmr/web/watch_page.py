@@ -1,0 +1,269 @@
+"""The status page of a run, with health, metrics and pictures."""
+
+import json
+import threading
+import time
+from contextlib import suppress
+from datetime import UTC, datetime
+from http import HTTPStatus
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+
+from stream_dmr.errors import ConfigError, OutputError, UserError
+from stream_dmr.lengths.fate import FATE_OF_ZONE
+from stream_dmr.pipeline.config import WatchSettings
+from stream_dmr.sources.positions import COUNTED
+from stream_dmr.tables import utc_text
+from stream_dmr.web.run_state import MeasuredFrame, RunState, make_registry
+from stream_dmr.web.token_server import TokenHandler, TokenServer, is_loopback
+
+_MAX_SIDE_PX = 960
+_ACCEPTED_BGR, _REFUSED_BGR = (90, 230, 90), (60, 140, 255)
+_JPEG_QUALITY = 75
+
+
+def draw_fish(measured: MeasuredFrame) -> UInt8[np.ndarray, "H W 3"]:
+    """The frame, no longer than 960 px, with head, center and tail of each fish and its length."""
+    image = measured.frame.image
+    scale = min(1.0, _MAX_SIDE_PX / max(image.shape[:2]))
+    drawn = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    for fish in measured.fish:
+        if fish.keypoints_px is None:
+            continue
+        points = np.round(fish.keypoints_px * scale).astype(np.int32)
+        colour = _ACCEPTED_BGR if fish.accepted else _REFUSED_BGR
+        cv2.polylines(drawn, [points], isClosed=False, color=colour, thickness=3)
+        for point in points:
+            cv2.circle(drawn, point.tolist(), 4, colour, thickness=-1)
+        length_mm = measured.lengths_mm.get(fish.track_id)
+        text = f"{fish.track_id}" if length_mm is None else f"{fish.track_id}: {length_mm:.0f} mm"
+        _write_label(drawn, text, at=(int(points[0, 0]) + 8, int(points[0, 1])))
+    return drawn
+
+
+def encode_jpeg(image: UInt8[np.ndarray, "H W 3"]) -> bytes:
+    """The image as a JPEG file."""
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+
+
+def _write_label(drawn: UInt8[np.ndarray, "H W 3"], text: str, *, at: tuple[int, int]) -> None:
+    for colour, thickness in (((0, 0, 0), 6), ((255, 255, 255), 2)):
+        cv2.putText(drawn, text, at, cv2.FONT_HERSHEY_SIMPLEX, 1.0, colour, thickness, cv2.LINE_AA)
+
+
+_PICTURE_INTERVAL_S = 0.5  # one picture for all who ask meanwhile: measuring must not slow down
+_MIN_TOKEN_CHARACTERS = 16
+_MAX_HAUL_BYTES = 1000
+
+
+class WatchServer:
+    """Serves a run from threads of its own, from the start until `close`."""
+
+    def __init__(self, state: RunState, settings: WatchSettings) -> None:
+        """ConfigError where others could read along without a token; OutputError for the port."""
+        token = _read_token(settings)
+        try:
+            self._server = _WatchHttpServer((settings.host, settings.port), state, token)
+        except OSError as error:
+            raise OutputError(
+                f"[watch] {settings.host}:{settings.port}: expected an address to listen on, got: "
+                f"{error.strerror}; choose another host or port"
+            ) from error
+        host, port = self._server.server_address[:2]
+        self.address = f"http://{host}:{port}/"
+        self._server.start()
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._server.stop()
+
+
+def _read_token(settings: WatchSettings) -> str:
+    """The token that readers need; "" where the server is for this machine alone."""
+    if not settings.token_file:
+        if is_loopback(settings.host):
+            return ""
+        raise ConfigError(
+            f"[watch] host = {settings.host!r}: expected a token_file beside it, since others can "
+            "reach this address; make one with: openssl rand -hex 16 > token"
+        )
+    try:
+        token = Path(settings.token_file).read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not text"
+        raise ConfigError(
+            f"[watch] token_file: expected a file with a token, {settings.token_file} can't be "
+            f"read: {reason}"
+        ) from error
+    if len(token) < _MIN_TOKEN_CHARACTERS:
+        raise ConfigError(
+            f"[watch] token_file: expected a token of {_MIN_TOKEN_CHARACTERS} characters or more, "
+            f"got {len(token)}; make one with: openssl rand -hex 16"
+        )
+    return token
+
+
+class _WatchHttpServer(TokenServer):
+    def __init__(self, address: tuple[str, int], state: RunState, token: str) -> None:
+        self.state = state
+        self.registry = make_registry(state)
+        self._picture_lock = threading.Lock()
+        self._picture, self._picture_until_s = b"", 0.0
+        super().__init__(address, _WatchHandler, token=token)
+
+    def picture(self) -> bytes:
+        """The latest measured frame as JPEG; empty before the first."""
+        with self._picture_lock:
+            if time.monotonic() >= self._picture_until_s:
+                measured = self.state.latest_frame()
+                self._picture = b"" if measured is None else encode_jpeg(draw_fish(measured))
+                self._picture_until_s = time.monotonic() + _PICTURE_INTERVAL_S
+            return self._picture
+
+
+class _WatchHandler(TokenHandler):
+    server: _WatchHttpServer  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def answer_get(self, path: str) -> None:
+        state = self.server.state
+        match path:
+            case "/":
+                self._answer_page("page.html")
+            case "/zones":
+                self._answer_page("zones.html")
+            case "/zones.json":
+                self.answer_json(HTTPStatus.OK, zones_json(state))
+            case "/status.json":
+                self.answer_json(HTTPStatus.OK, status_json(state))
+            case "/picture.jpg":
+                self.answer(HTTPStatus.OK, "image/jpeg", self.server.picture())
+            case "/metrics":
+                self.answer(
+                    HTTPStatus.OK, CONTENT_TYPE_LATEST, generate_latest(self.server.registry)
+                )
+            case "/health":
+                health = health_json(state)
+                code = HTTPStatus.OK if health["healthy"] else HTTPStatus.SERVICE_UNAVAILABLE
+                self.answer_json(code, health)
+            case _:
+                self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
+
+    def answer_post(self, path: str) -> None:
+        """Begin or end a haul. Only this page's own scripts can send JSON with the cookie."""
+        length, hauls = self.headers.get("Content-Length", ""), self.server.state.hauls
+        is_json = self.headers.get_content_type() == "application/json"
+        is_short = length.isdecimal() and int(length) <= _MAX_HAUL_BYTES
+        if path != "/haul" or hauls is None or not is_json or not is_short:
+            return self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"expected a haul as JSON\n")
+        try:
+            told = _parse_haul(self.rfile.read(int(length)))
+            what, name, said_by = (str(told.get(key) or "") for key in ("what", "name", "said_by"))
+            name = hauls.tell(what, name, said_by=said_by)
+        except UserError as error:
+            return self.answer(HTTPStatus.BAD_REQUEST, "text/plain", f"{error}\n".encode())
+        self.answer_json(HTTPStatus.OK, {"name": name})
+
+    def _answer_page(self, name: str) -> None:
+        page = files("stream_dmr.web").joinpath("watch", name).read_bytes()
+        self.answer(HTTPStatus.OK, "text/html; charset=utf-8", page)
+
+
+def _parse_haul(content: bytes) -> dict[str, Any]:
+    """The JSON object of a haul. Raises UserError where it is none."""
+    with suppress(ValueError):
+        if isinstance(told := json.loads(content), dict):
+            return told
+    got = content.decode(errors="replace")
+    raise UserError(f"expected a haul as a JSON object with what, name, said_by, got {got!r}")
+
+
+def zones_json(state: RunState) -> dict[str, Any]:
+    """The zones of the run by their names in config.toml, and the size of its frames, px."""
+    zones = {name: getattr(state.zones, name) for name in FATE_OF_ZONE}
+    return {"size": [state.source.width, state.source.height], "zones": zones}
+
+
+def health_json(state: RunState) -> dict[str, Any]:
+    """Whether a run is healthy, why not, what it warned of, and how each of its outputs is."""
+    problems = state.problems()
+    sinks = [
+        {
+            "name": sink.name,
+            "state": "fails" if sink.is_failing else "works",
+            "since": datetime.fromtimestamp(sink.since_ns / 1e9, UTC).isoformat(),
+            "last_error": sink.last_error,
+        }
+        for sink in state.sinks.all()
+    ]
+    return {
+        "healthy": not problems,
+        "problems": problems,
+        "warnings": _warnings_json(state),
+        "sinks": sinks,
+        "positions": positions_json(state),
+    }
+
+
+def positions_json(state: RunState) -> dict[str, Any] | None:
+    """The last position, and what came from the receiver; None of a run without positions."""
+    if state.positions is None:
+        return None
+    last, counts = state.position, state.positions.counts
+    return {
+        "latitude": None if last is None else last.latitude,
+        "longitude": None if last is None else last.longitude,
+        "speed_knots": None if last is None else last.speed_knots,
+        "utc": None if last is None else utc_text(last.utc_ns),
+        "left_out": counts.left_out(),
+        "counts": {name: getattr(counts, name) for name in COUNTED},
+    }
+
+
+def _warnings_json(state: RunState) -> list[dict[str, Any]]:
+    """The warnings, the latest first; `age_s` is since the last time that it came."""
+    now_s = time.monotonic()
+    return [
+        {"line": warning.line, "count": warning.count, "age_s": now_s - warning.last_s}
+        for warning in state.warnings()
+    ]
+
+
+def haul_json(state: RunState) -> dict[str, Any] | None:
+    """The haul that goes on: None of a run that takes none, with the name "" between hauls."""
+    if state.hauls is None:
+        return None
+    current = state.hauls.current()
+    return {"name": "" if current is None else current.name}
+
+
+def status_json(state: RunState) -> dict[str, Any]:
+    """What the status page shows, for JSON."""
+    return {
+        "problems": state.problems(),
+        "num_fish": sum(state.num_fish.values()),
+        "species": dict(state.species.most_common()),
+        "fates": dict(state.fates.most_common()),
+        "fish_per_hour": state.fish_per_hour(),
+        "positions": positions_json(state),
+        "haul": haul_json(state),
+        "frames_per_s": state.frames_per_s(),
+        "last_frame_age_s": state.last_frame_age_s(),
+        "fish": [
+            {
+                "track_id": fish.track_id,
+                "length": "-" if fish.length_mm is None else f"{fish.length_mm / 10:.1f} cm",
+                "note": fish.status
+                if fish.length_std_mm is None
+                else f"± {1.96 * fish.length_std_mm / 10:.1f} cm",
+                "kind": ", ".join(text for text in (fish.species_code, fish.fate) if text),
+            }
+            for fish in reversed(list(state.finished))
+        ],
+        "warnings": _warnings_json(state),
+    }

@@ -1,0 +1,111 @@
+"""The background model: what it learns, and which colours it finds foreign."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stream_dmr.detection.background_model import BackgroundModel
+
+HEIGHT, WIDTH = 96, 128
+EVERYWHERE = np.ones((HEIGHT, WIDTH), np.float32)
+seeds = st.integers(0, 99)
+
+
+def noise(seed: int, *, level: float = 120.0, std: float = 6.0) -> np.ndarray:
+    """A calm picture with noise of this standard deviation in each channel."""
+    rng = np.random.default_rng(seed)
+    return (level + std * rng.standard_normal((3, HEIGHT, WIDTH))).astype(np.float32)
+
+
+def waves(seed: int) -> np.ndarray:
+    """A picture that varies along one line of colours, dark green to white."""
+    heights = np.random.default_rng(seed).standard_normal((HEIGHT, WIDTH))
+    line = np.array([20.0, 16.0, 8.0])[:, None, None]
+    return (100 + heights * line).astype(np.float32)
+
+
+def learnt(pictures: list[np.ndarray], *, memory_frames: float = 1e6) -> BackgroundModel:
+    model = BackgroundModel(pictures[0], memory_frames=memory_frames)
+    for picture in pictures[1:]:
+        model.learn(picture, model.distance(picture), EVERYWHERE)
+    return model
+
+
+@settings(max_examples=10)
+@given(seeds)
+def test_the_distance_of_the_background_averages_the_number_of_channels(seed: int):
+    model = learnt([noise(10 * seed + i) for i in range(10)])
+    distance = model.distance(noise(10 * seed + 99))
+    assert (distance >= 0).all()
+    assert distance.mean() == pytest.approx(3, rel=0.35)
+
+
+@settings(max_examples=10)
+@given(seeds)
+def test_the_mean_is_that_of_the_pictures_seen(seed: int):
+    pictures = [noise(5 * seed + i) for i in range(5)]
+    is_known = (learnt(pictures[:1]).mean == pictures[0]).all(axis=0)  # others begin as foreign
+    assert is_known.mean() > 0.97
+    mean, expected = learnt(pictures).mean, np.mean(pictures, axis=0)
+    np.testing.assert_allclose(mean[:, is_known], expected[:, is_known], atol=1e-2)
+
+
+def test_a_short_memory_forgets_exponentially():
+    model = learnt([noise(i) for i in range(5)], memory_frames=2.0)
+    before, picture = model.mean.copy(), noise(9)
+    model.learn(picture, model.distance(picture), EVERYWHERE)
+    np.testing.assert_allclose(model.mean, (before + picture) / 2, atol=1e-3)
+
+
+def test_nothing_is_learnt_at_rate_zero():
+    model = learnt([noise(0), noise(1)])
+    before = model.mean.copy()
+    model.learn(noise(2), model.distance(noise(2)), 0 * EVERYWHERE)
+    np.testing.assert_array_equal(model.mean, before)
+
+
+def test_a_colour_beside_the_line_of_the_waves_is_more_foreign_than_one_along_it():
+    model = learnt([waves(i) for i in range(8)])
+    along, beside = model.mean.copy(), model.mean.copy()
+    along += np.array([20.0, 16.0, 8.0], np.float32)[:, None, None]
+    beside += np.array([-8.0, 0.0, 20.0], np.float32)[:, None, None]  # as far, at a right angle
+    assert np.median(model.distance(beside)) > 20 * np.median(model.distance(along))
+
+
+def test_a_fish_in_the_first_picture_is_not_taken_for_background():
+    picture = np.tile(noise(0), (1, 2, 2))
+    picture[:, 80:86, 100:112] += 80
+    model = BackgroundModel(picture, memory_frames=20.0)
+    assert np.median(model.distance(picture)[80:86, 100:112]) > 25
+    assert np.median(model.mean[:, 80:86, 100:112]) < 140
+
+
+def test_a_change_of_light_is_not_foreign():
+    model = learnt([noise(i) for i in range(5)])
+    lit = noise(7) + np.float32(15)
+    model.learn(lit, 0 * EVERYWHERE, EVERYWHERE)
+    assert model.distance(noise(8) + np.float32(15)).mean() < 6
+
+
+def test_a_pixel_that_always_changes_becomes_tolerant_by_eight_times_at_most():
+    model = learnt([noise(i) for i in range(3)])
+    changing = (slice(None), slice(None), slice(0, None, 16))  # every sixteenth column
+    for i in range(3, 60):
+        picture = noise(i)
+        picture[changing] += 60 * (-1) ** i
+        model.learn(picture, model.distance(picture), EVERYWHERE)
+    distance = model.distance(model.mean + 60)
+    ratio = np.median(distance[:, 8::16]) / np.median(distance[changing[1:]])
+    assert 5 < ratio < 9
+
+
+def test_the_model_moves_with_the_view_and_fills_what_comes_into_it():
+    model = learnt([noise(0), noise(1)])
+    before = model.mean.copy()
+    model.shift(5, -3)
+    picture = noise(2)
+    model.fill_unseen(picture)
+    np.testing.assert_array_equal(model.mean[:, :-3, 5:], before[:, 3:, :-5])
+    np.testing.assert_array_equal(model.mean[:, -3:], picture[:, -3:])
+    np.testing.assert_array_equal(model.mean[:, :, :5], picture[:, :, :5])

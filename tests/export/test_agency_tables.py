@@ -1,0 +1,128 @@
+"""Tables for agencies and for DIVE: each value where it belongs, nothing guessed."""
+
+import csv
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stream_dmr.export.agency_tables import RDBES_COLUMNS, WCPFC_COLUMNS, rdbes_row, wcpfc_row
+from stream_dmr.export.viame_csv import ViameTracks
+from stream_dmr.store.fish import FishResult, sure_code
+from stream_dmr.store.run_facts import CatchFacts
+from stream_dmr.store.trip import Whereabouts
+from stream_dmr.store.verdicts import Review, Verdict, add_verdict
+from stream_dmr.template.template_file import load_template
+from tests.support.command import invoke
+from tests.support.final_estimates import FACTS, fish
+from tests.support.fish_run import measure
+from tests.support.nmea import START_NS
+
+TEMPLATE = load_template("halibut")
+HALIBUT = FishResult(
+    estimate=fish(7, length_mm=1234.5),
+    facts=replace(FACTS, vessel="Sea Bird", trip="T1"),
+    run_id="0123456789abcdef",
+    haul="3",
+    catch=CatchFacts(species_code="HAL", species_share=0.9, fate="landed", fate_share=1.0),
+    where=Whereabouts(utc_ns=START_NS, latitude=57.5, longitude=-152.25, speed_knots=3.0),
+)
+
+
+def test_a_line_of_each_table():
+    wcpfc, rdbes = wcpfc_row(HALIBUT, TEMPLATE), rdbes_row(HALIBUT, TEMPLATE)
+    assert wcpfc.keys() <= set(WCPFC_COLUMNS)
+    assert rdbes.keys() <= set(RDBES_COLUMNS)
+    assert (wcpfc["catch_date_utc"], wcpfc["catch_time_utc"]) == ("2026-11-22", "06:00:00")
+    assert (wcpfc["latitude"], wcpfc["longitude"]) == ("5730.000N", "15215.000W")
+    assert (wcpfc["set_number"], wcpfc["species_code"], wcpfc["length_cm"]) == ("3", "HAL", "123")
+    assert wcpfc["length_code"] == {"fork": "UF", "total": "TL"}[TEMPLATE.tail_gives or ""]
+    assert "fate_code" not in wcpfc
+    assert (rdbes["BVvalueMeasured"], rdbes["BVvalueUnitOrScale"]) == ("1234", "Lengthmm")
+
+
+def test_what_is_not_known_stays_empty():
+    unknown = replace(
+        HALIBUT,
+        estimate=fish(7, length_mm=None),
+        where=Whereabouts(),
+        catch=CatchFacts(species_code="unsure", species_share=0.4),
+    )
+    for row in (wcpfc_row(unknown, TEMPLATE), rdbes_row(unknown, TEMPLATE)):
+        known = {name for name, value in row.items() if value}
+        assert known <= {
+            *("vessel_name", "trip_number", "set_number", "FOstationNumber", "BVrecordType"),
+            "BVnationalUniqueFishId",
+        }
+
+
+@pytest.mark.parametrize(
+    ("reviewed", "expected"), [("", "HAL"), ("COD", "COD"), ("Albacore", "ALB"), ("sea hag", "")]
+)
+def test_the_reviewers_species_comes_first(reviewed: str, expected: str):
+    assert sure_code(replace(HALIBUT, review=Review(species=reviewed))) == expected
+
+
+@pytest.mark.parametrize("decision", ["reject", "duplicate", "merge"])
+def test_what_a_reviewer_left_out_does_not_count(decision: str):
+    assert not replace(HALIBUT, review=Review(decision=decision)).counts
+    assert replace(HALIBUT, review=Review(decision="accept")).counts
+    assert HALIBUT.counts
+
+
+def test_viame_rows_have_box_length_species_and_outline():
+    tracks = ViameTracks([HALIBUT], fps=10.0)
+    mask = np.zeros((40, 60), bool)
+    mask[10:20, 5:50] = True
+    tracks.add(
+        track_id=7,
+        frame_index=1,
+        timestamp_ns=61_500_000_000,
+        bbox_xyxy_px=np.array([5.0, 10.0, 50.0, 20.0]),
+        mask=mask,
+        keypoints_px=np.array([[5.0, 15.0], [25.0, 15.0], [49.0, 15.0]]),
+    )
+    head, fps, row = tracks.text().splitlines()
+    assert head.startswith("# 1: Detection or Track-id,")
+    assert fps == "# metadata,fps: 10"
+    cells = next(csv.reader([row]))
+    assert cells[:3] == ["7", "00:01:01.500000", "0"]
+    assert cells[3:9] == ["5.0", "10.0", "50.0", "20.0", "1.0", "1234.5"]
+    assert cells[9:13] == ["HAL", "0.900", "(kp) head 5.0 15.0", "(kp) tail 49.0 15.0"]
+    # DIVE's own pattern of a polygon
+    assert re.fullmatch(r"\(poly\)((?: -?[0-9]+\.*[0-9]*)+)", cells[13])
+
+
+def test_every_export_of_a_run(tmp_path: Path):
+    out = measure(tmp_path, vessel="Sea Bird", trip="T1", haul="2")
+    both = "--agency wcpfc --agency rdbes --agency wcpfc"
+    options = {"--viame": None, "--hauls": None, "--masks": None, "--fish": "csv"}
+    done = invoke(f"export {out} {both}", {"--out": str(tmp_path / "exp")} | options)
+    assert done.code == 0, done.err
+    assert done.out.count("rdbes.csv") == done.out.count("wcpfc.csv") == 1
+    tables: dict[str, list[dict[str, str]]] = {}
+    for name in ("wcpfc", "rdbes", "hauls", "fish"):
+        with (tmp_path / "exp" / f"{name}.csv").open(newline="") as file:
+            tables[name] = list(csv.DictReader(file))
+    assert len(tables["wcpfc"]) == len(tables["rdbes"]) == len(tables["fish"]) == 2
+    assert {row["set_number"] for row in tables["wcpfc"]} == {"2"}
+    (haul,) = tables["hauls"]
+    assert (haul["haul"], haul["num_fish"], haul["share_measured"]) == ("2", "2", "1.0000")
+    rows = (tmp_path / "exp" / "tracks.viame.csv").read_text().splitlines()
+    assert len(rows) == 2 + 10  # a fish in two frames, two in four
+    assert invoke("verify", {str(tmp_path / "exp"): None}).code == 0
+    shutil.rmtree(tmp_path / "exp")
+
+
+@pytest.mark.parametrize("kind", ["reject", "duplicate"])
+def test_tracks_are_of_the_fish_that_count(tmp_path: Path, kind: str):
+    out = measure(tmp_path)
+    verdict = Verdict(track_id=1, kind=kind, reason="a glove", duplicate_of=2, reviewer="Ada")
+    add_verdict(out / "lengths.db", verdict)
+    done = invoke(f"export {out} --viame", {"--out": str(tmp_path / "exp")})
+    assert done.code == 0, done.err
+    lines = (tmp_path / "exp" / "tracks.viame.csv").read_text().splitlines()
+    assert {line.split(",")[0] for line in lines if not line.startswith("#")} == {"2"}

@@ -1,0 +1,62 @@
+"""Alarms of an endless run in its store: noted when they change, flags of the fish meanwhile."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stream_dmr.messages import Frame
+from stream_dmr.pipeline.config import DriftSettings
+from stream_dmr.pipeline.drift import DriftAlarms
+from stream_dmr.store.length_store import LengthStore
+from tests.support.final_estimates import FACTS, fish
+
+SETTINGS = DriftSettings(reference_fish=20, recent_fish=10)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[LengthStore]:
+    with closing(LengthStore(tmp_path, FACTS)) as store:
+        yield store
+
+
+def flags_of(alarms: DriftAlarms, ious: np.ndarray) -> list[list[str]]:
+    return [alarms.take_fish(float(iou), timestamp_ns=k) for k, iou in enumerate(ious)]
+
+
+def test_worse_fish_are_flagged_and_the_change_is_noted_once(store: LengthStore):
+    rng, notices = np.random.default_rng(1), list[str]()
+    alarms = DriftAlarms(store, SETTINGS, on_notice=notices.append)
+    assert not any(flags_of(alarms, rng.normal(0.93, 0.01, 20)))
+    flags = flags_of(alarms, rng.normal(0.85, 0.01, 30))
+    assert flags[-1] == flags[-2] != []
+    assert len(notices) == 1
+    assert flags_of(alarms, rng.normal(0.93, 0.01, 30))[-1] == []
+    assert len(notices) == 2
+
+
+def test_a_fish_without_an_iou_changes_nothing(store: LengthStore):
+    alarms = DriftAlarms(store, SETTINGS, on_notice=lambda line: None)
+    assert alarms.take_fish(None, timestamp_ns=1) == []
+
+
+def test_the_fish_of_earlier_runs_are_the_reference(store: LengthStore):
+    for track_id in range(1, 21):
+        store.add(fish(track_id), iou=0.93 + 0.001 * (track_id % 3))
+    alarms = DriftAlarms(store, SETTINGS, on_notice=lambda line: None)
+    assert flags_of(alarms, np.full(10, 0.85))[-1] != []
+
+
+def test_the_first_static_scene_of_a_calibration_is_kept(store: LengthStore):
+    picture = np.random.default_rng(2).integers(0, 255, (60, 80, 3)).astype(np.uint8)
+    alarms = DriftAlarms(store, DriftSettings(sample_s=1.0), on_notice=lambda line: None)
+    assert store.scene() is None
+    for k in range(40):
+        frame = Frame(frame_index=k + 1, timestamp_ns=k * 10**9, image=picture, source="camera")
+        alarms.take_frame(frame)
+    kept = store.scene()
+    assert kept is not None
+    DriftAlarms(store, SETTINGS, on_notice=lambda line: None).take_frame(frame)
+    assert store.scene() == kept

@@ -1,0 +1,245 @@
+"""A camera's run learns the shapes of its fish while it measures them."""
+
+import shutil
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stream_dmr.camera import Camera
+from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
+from stream_dmr.messages import FishCrop, FittedMesh, LearntShapes
+from stream_dmr.pipeline.learn_shapes import LiveShapes, SeenFish
+from stream_dmr.pipeline.measure_source import measure_source
+from stream_dmr.pipeline.replay_recording import ReplayRequest, replay
+from stream_dmr.pipeline.run_inputs import Inputs
+from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.recording.codec import decode, encode
+from stream_dmr.recording.reading import (
+    decoded_messages,
+    known_shapes,
+    learnt_shapes,
+    open_recordings,
+)
+from stream_dmr.store.open_results import LEARNT
+from tests.support.command import rows
+from tests.support.final_estimates import fish as finished
+from tests.support.fish_run import request
+from tests.support.frames import frame_of
+from tests.support.given_masks import crop_of
+from tests.support.tiny_clip import calibration, draw_mask, write_clip, write_template
+
+FORMS = load_shapes("auto")[1]
+CAMERA: Camera = calibration().camera
+# The source is some frames ahead of the chain's end, so the fourth fish comes late.
+SEEN = [[1]] * 3 + [[2]] * 3 + [[3]] * 3 + [[]] * 16 + [[4]] * 3 + [[]] * 3
+
+
+class Immediate:
+    """Does what it is given at once, so that what a run learns does not depend on the clock."""
+
+    def __init__(self, *arguments: object, **options: object) -> None:
+        pass
+
+    def submit(self, work: Callable[..., Any], *arguments: object) -> "Future[Any]":
+        done: Future[Any] = Future()
+        done.set_result(work(*arguments))
+        return done
+
+    def shutdown(self) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The folder of an endless run, and a copy of it after a second run has gone on there."""
+    folder = tmp_path_factory.mktemp("live")
+    write_clip(folder / "clip", fish=SEEN)
+    config = folder / "clip" / "quick.toml"
+    quick = config.read_text().replace("learn_shapes = false", "max_faces = 600")
+    config.write_text(f"{quick}\n[smooth_length]\ntrack_timeout_s = 0.15\n")
+    found = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Inputs, "is_endless", property(lambda inputs: True))
+        patch.setattr("stream_dmr.pipeline.learn_shapes.ThreadPoolExecutor", Immediate)
+        for _ in range(2):
+            asked = request(folder / "clip", folder / "out", template="auto")
+            measure_source(asked, stop=threading.Event())
+            found.append(folder / f"out-{len(found)}")
+            shutil.copytree(folder / "out", found[-1])
+    return found
+
+
+def candidates_of(folder: Path) -> dict[int, int | None]:
+    """The candidate of each fish's last fit."""
+    fits = (message for message, _ in decoded_messages(open_recordings([folder]), [FittedMesh]))
+    return {
+        fit.track_id: fit.shape.candidate
+        for fit in fits
+        if isinstance(fit, FittedMesh) and fit.shape is not None
+    }
+
+
+def test_fish_after_the_first_ones_may_have_the_shape_of_those(runs: list[Path]):
+    assert FORMS is not None
+    [learnt] = learnt_shapes(open_recordings([runs[0]]))
+    known = known_shapes(open_recordings([runs[0]]))
+    assert known is not None
+    assert len(known) == len(FORMS) + len(learnt.shares)
+    found = candidates_of(runs[0])
+    assert [(found[fish] or 0) >= len(FORMS) for fish in (1, 2, 3, 4)] == [False] * 3 + [True]
+    assert (runs[0] / LEARNT).exists()
+
+
+def test_a_restart_knows_what_was_learnt(runs: list[Path]):
+    last = max(runs[1].glob("recording-*.mcap"))
+    assert last not in runs[0].iterdir()
+    [earlier], [later] = (learnt_shapes(open_recordings([one])) for one in (runs[0], last))
+    np.testing.assert_array_equal(earlier.coefficients, later.coefficients)
+
+
+class Warned(RunObserver):
+    """Keeps the warnings of a run."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def warn(self, line: str) -> None:
+        self.lines.append(line)
+
+
+def test_a_mesh_of_the_user_stays_and_the_camera_measures_on(
+    runs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / LEARNT).write_text("mine")
+    monkeypatch.setattr(Inputs, "is_endless", property(lambda inputs: True))
+    monkeypatch.setattr("stream_dmr.pipeline.learn_shapes.ThreadPoolExecutor", Immediate)
+    observer = Warned()
+    asked = request(runs[0].parent / "clip", tmp_path, template="auto")
+    measure_source(asked, stop=threading.Event(), observer=observer)
+    assert (tmp_path / LEARNT).read_text() == "mine"
+    assert [line for line in observer.lines if f"{LEARNT}: expected a name that is free" in line]
+    assert len(rows(tmp_path / "lengths.csv")) == 4
+
+
+@pytest.mark.parametrize(("half_breadth", "is_believed"), [(17, True), (11, False)])
+def test_a_given_mesh_is_compared_with_the_first_fish(
+    runs: list[Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    half_breadth: float,
+    is_believed: bool,
+):
+    write_template(tmp_path, "mine", half_breadth=half_breadth)
+    monkeypatch.setattr(Inputs, "is_endless", property(lambda inputs: True))
+    monkeypatch.setattr("stream_dmr.pipeline.learn_shapes.ThreadPoolExecutor", Immediate)
+    observer, mesh, out = Warned(), str(tmp_path / "mine.ply"), tmp_path / "out"
+    asked = request(runs[0].parent / "clip", out, template=mesh)
+    measure_source(asked, stop=threading.Event(), observer=observer)
+    lines = [line for line in observer.lines if "the fish are not like mine: " in line]
+    assert len(lines) == (0 if is_believed else 1)
+    assert candidates_of(out) == {1: 0, 2: 0, 3: 0, 4: 0 if is_believed else 1}
+    assert (out / LEARNT).exists() != is_believed
+    [recording] = out.glob("recording-*.mcap")
+    again = replay(
+        ReplayRequest(recordings=[recording], first="fit", check=True), stop=threading.Event()
+    )
+    assert again.num_compared > 0
+    assert again.mismatches == []
+
+
+@pytest.mark.parametrize("kind", ["mcap", "rrd"])
+def test_a_replay_gives_the_same_bits(runs: list[Path], kind: str):
+    for recording in sorted(runs[1].glob(f"recording-*.{kind}")):
+        asked = ReplayRequest(recordings=[recording], first="fit", check=True)
+        summary = replay(asked, stop=threading.Event())
+        assert summary.num_compared > 0
+        assert summary.mismatches == []
+
+
+def message(shares: Sequence[float], timestamp_ns: int) -> LearntShapes:
+    assert FORMS is not None
+    num = len(shares)
+    return LearntShapes(
+        frame_index=1,
+        timestamp_ns=timestamp_ns,
+        names=",".join(["cod"] * num),
+        coefficients=FORMS.coefficients[:num],
+        covariances=FORMS.covariances[:num],
+        shares=np.array(shares),
+    )
+
+
+@given(
+    times=st.lists(st.integers(0, 10**18), min_size=1, max_size=4, unique=True).map(sorted),
+    first_seen_ns=st.integers(0, 10**18),
+    num_stocks=st.integers(1, 3),
+)
+def test_a_fish_may_be_of_any_form_or_of_the_stocks_known_last(
+    times: list[int], first_seen_ns: int, num_stocks: int
+):
+    assert FORMS is not None
+    known = FORMS
+    for timestamp_ns in times:
+        known = known.extended(message([0.9 / num_stocks] * num_stocks, timestamp_ns))
+    choice = known.choice(first_seen_ns)
+    before = sum(timestamp_ns <= first_seen_ns for timestamp_ns in times)
+    first = len(FORMS) + num_stocks * (before - 1)
+    stocks = list(range(first, first + num_stocks)) if before else []
+    assert list(choice.indices) == [*range(len(FORMS)), *stocks]
+    assert choice.shares.sum() == pytest.approx(1.0)
+    again = decode(CandidateShapes, encode(known)).choice(first_seen_ns)
+    np.testing.assert_array_equal(again.shares, choice.shares)
+
+
+def crop(track_id: int) -> FishCrop:
+    return replace(crop_of(draw_mask(1, [1]) > 0, CAMERA), track_id=track_id)
+
+
+def see(seen: SeenFish, live: LiveShapes, track_id: int) -> None:
+    seen.take(crop(track_id))
+    seen.take(finished(track_id))
+    for _ in range(2):
+        live.take(frame_of(np.zeros((4, 4, 3), np.uint8), track_id))
+
+
+def test_shapes_are_learnt_after_three_fish_and_twice_as_many():
+    assert FORMS is not None
+    seen, learnt_from, passed_on = SeenFish(), list[int](), list[LearntShapes]()
+
+    def learn(crops: Sequence[FishCrop], progress: Callable[[str], None]) -> CandidateShapes:
+        learnt_from.append(len({crop.track_id for crop in crops}))
+        return replace(FORMS, are_learnt=True)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stream_dmr.pipeline.learn_shapes.ThreadPoolExecutor", Immediate)
+        live = LiveShapes(seen, learn, passed_on.append, knows_shapes=False)
+    for track_id in range(1, 14):
+        see(seen, live, track_id)
+    live.close()
+    assert learnt_from == [3, 6, 12]
+    assert [one.timestamp_ns for one in passed_on] == [3, 6, 12]
+    assert passed_on[0].shares.sum() == pytest.approx(3 / 4)
+
+
+def test_the_end_of_a_run_ends_the_work():
+    seen, began = SeenFish(), threading.Event()
+
+    def learn(crops: Sequence[FishCrop], progress: Callable[[str], None]) -> None:
+        while True:
+            progress("another fish")
+            began.set()
+
+    live = LiveShapes(seen, learn, lambda learnt: None, knows_shapes=False)
+    for track_id in (1, 2, 3):
+        see(seen, live, track_id)
+    assert began.wait(10)
+    live.close()
+    assert not any(thread.name.startswith("shapes") for thread in threading.enumerate())

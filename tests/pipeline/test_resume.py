@@ -1,0 +1,132 @@
+"""A run continues where earlier ones in its folder ended, and finishes their fish."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from stream_dmr.errors import OutputError
+from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish
+from stream_dmr.pipeline.run_folder import FROM_RECORDING, recover_folder
+from stream_dmr.pipeline.run_outputs import interrupted_tracks, resume_source
+from stream_dmr.recording.mcap.mcap_sink import McapSink
+from stream_dmr.recording.record import make_record
+from stream_dmr.recording.repair import repair_recordings
+from stream_dmr.recording.topics import RecordingSettings
+from stream_dmr.sources.source import ResumePoint, Source
+from stream_dmr.store.length_store import LengthStore
+from tests.support.command import rows
+from tests.support.final_estimates import FACTS, fish
+from tests.support.recorded_run import header, run
+
+MESSAGES = list(run(6))
+FINAL = [m for m in MESSAGES if isinstance(m, LengthEstimate) and m.is_final]
+
+
+def refuse_notices(line: str) -> None:
+    pytest.fail(line)
+
+
+class MadeUpSource(Source):
+    """A camera or a folder of clips without frames; keeps where it is to resume."""
+
+    def __init__(self, *, is_live: bool = False, has_clips: bool = False) -> None:
+        self._is_live, self._has_clips = is_live, has_clips
+        self.point: ResumePoint | None = None
+
+    @property
+    def is_live(self) -> bool:
+        return self._is_live
+
+    @property
+    def has_clips(self) -> bool:
+        return self._has_clips
+
+    def resume(self, point: ResumePoint) -> None:
+        self.point = point
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(())
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[LengthStore]:
+    with closing(LengthStore(tmp_path, FACTS)) as store:
+        yield store
+
+
+def again(store: LengthStore, folder: Path) -> LengthStore:
+    store.close()
+    return LengthStore(folder, FACTS)
+
+
+def record(folder: Path, *, is_torn: bool) -> None:
+    sink = McapSink(folder / "recording.mcap", header(), flush_s=0.0)
+    for message in MESSAGES:
+        sink.write(make_record(message, RecordingSettings()))
+    if not is_torn:
+        sink.close()
+
+
+def test_clips_that_were_done_are_left_out_and_others_go_on(store: LengthStore, tmp_path: Path):
+    store.clip_progress("a.mp4", frames_done=9)
+    store.clip_progress("b.mp4", frames_done=4)
+    store.frame_passed(frame_index=13, timestamp_ns=1300)
+    with closing(again(store, tmp_path)) as later:
+        source = MadeUpSource(has_clips=True)
+        assert resume_source(source, later, on_notice=print) == {"b.mp4": 4}
+        assert source.point is not None
+        assert source.point.clips_done == {"a.mp4"}
+        assert source.point.frames_done == {"b.mp4": 4}
+
+
+def test_times_of_a_camera_are_later_than_all_before(store: LengthStore, tmp_path: Path):
+    store.frame_passed(frame_index=13, timestamp_ns=1300)
+    with closing(again(store, tmp_path)) as later:
+        source = MadeUpSource(is_live=True)
+        assert resume_source(source, later, on_notice=print) is None
+        assert source.point is not None
+        assert source.point.after_ns >= 1300
+
+
+def test_fish_in_view_at_a_crash_are_finished_by_their_recorded_frames(
+    store: LengthStore, tmp_path: Path
+):
+    record(tmp_path, is_torn=True)
+    store.add(fish(2))
+    repairs = list(repair_recordings(tmp_path))
+    frames = interrupted_tracks(repairs, store, on_notice=refuse_notices)
+    recorded = [m for m in MESSAGES if isinstance(m, LocalizedFish) and m.track_id == 1]
+    assert [f.frame_index for f in frames] == [m.frame_index for m in recorded]
+
+
+def test_without_a_crash_no_track_was_interrupted(store: LengthStore):
+    assert interrupted_tracks([], store, on_notice=refuse_notices) == []
+
+
+def test_lengths_that_only_a_recording_has_are_taken_over_once(store: LengthStore, tmp_path: Path):
+    store.add(FINAL[0])
+    store.close()
+    record(tmp_path, is_torn=False)
+    lines = list(recover_folder(tmp_path))
+    assert len(lines) == len(FINAL) - 1
+    lengths = {row["track_id"]: row["length_mm"] for row in rows(tmp_path / "lengths.csv")}
+    assert set(lengths) == {str(estimate.track_id) for estimate in FINAL}
+    assert list(recover_folder(tmp_path)) == []
+    with closing(LengthStore(tmp_path, FACTS)) as later:
+        assert len(later.estimates()) == len(FINAL)
+    assert FROM_RECORDING in (tmp_path / "lengths.db").read_bytes().decode(errors="replace")
+
+
+def test_a_folder_in_use_is_not_repaired(store: LengthStore, tmp_path: Path):
+    with pytest.raises(OutputError, match="another run"):
+        list(recover_folder(tmp_path))
+
+
+def test_no_folder_is_a_users_mistake(tmp_path: Path):
+    with pytest.raises(OutputError, match="check the path"):
+        list(recover_folder(tmp_path / "none"))

@@ -1,0 +1,17 @@
+"""Settings of a run, as its recording has them."""
+
+from pathlib import Path
+
+from stream_dmr.lengths.kalman import SmoothLengthSettings
+from stream_dmr.pipeline.config import parse_config
+from stream_dmr.recording.reading import open_recordings, recorded_settings
+
+GOLDEN = Path(__file__).parents[2] / "recordings" / "golden"
+
+
+def test_a_table_is_the_run_s_and_a_newer_one_has_its_defaults():
+    recording = open_recordings([GOLDEN])
+    of_run = parse_config(recording.header.config_toml, where="golden").smooth_length
+    assert recorded_settings(recording, "smooth_length", SmoothLengthSettings) == of_run
+    newer = recorded_settings(recording, "not_yet_there", SmoothLengthSettings)
+    assert newer == SmoothLengthSettings()

@@ -1,0 +1,204 @@
+"""Hauls: what events make of them, and the effort that counts are divided by."""
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stream_dmr.errors import UserError
+from stream_dmr.export.agency_tables import haul_row
+from stream_dmr.messages import LengthEstimate, Position
+from stream_dmr.pipeline.config import HaulsSettings
+from stream_dmr.pipeline.haul_log import HaulLog, write_haul
+from stream_dmr.store.effort import read_effort
+from stream_dmr.store.fish import read_stored_fish
+from stream_dmr.store.length_store import LengthStore
+from stream_dmr.store.run_facts import CatchFacts
+from stream_dmr.store.trip import haul_at, haul_values, hauls_of
+from tests.support.final_estimates import FACTS, fish
+
+SECOND = 1_000_000_000
+MINUTE = 60 * SECOND
+
+
+def at(track_id: int, time_s: float) -> LengthEstimate:
+    time_ns = round(time_s * SECOND)
+    return fish(track_id, first_timestamp_ns=time_ns - SECOND, last_timestamp_ns=time_ns + SECOND)
+
+
+@given(st.lists(st.tuples(st.sampled_from(["start", "end"]), st.integers(0, 50)), max_size=12))
+def test_hauls_never_overlap(events: list[tuple[str, int]]):
+    rows = [haul_values(what, str(i), time, "x") for i, (what, time) in enumerate(events)]
+    hauls = hauls_of(rows)
+    assert len(hauls) == sum(what == "start" for what, _ in events)
+    for before, after in pairwise(hauls):
+        assert before.ended_ns is not None
+        assert before.began_ns <= before.ended_ns <= after.began_ns
+    for time in range(51):
+        assert sum(haul.includes(time) for haul in hauls) <= 1
+
+
+def test_a_fish_belongs_to_the_haul_of_its_middle():
+    rows = [haul_values(w, n, t, "x") for w, n, t in [("start", "A", 10), ("end", "A", 20)]]
+    assert [haul_at(hauls_of(rows), time) for time in (9, 10, 19, 20)] == ["", "A", "A", ""]
+
+
+def test_a_run_that_is_told_of_hauls(tmp_path: Path):
+    store = LengthStore(tmp_path, FACTS)
+    log = HaulLog(store, HaulsSettings(), frames_lost=lambda: 0)
+    with pytest.raises(UserError, match="begin one first"):
+        log.tell("end", said_by="Ada")
+    told = {60: ("start", "north"), 240: ("end", ""), 300: ("start", "")}
+    names: list[str] = []
+    for second in range(0, 601, 5):
+        log.take_frame(second * SECOND)
+        if second in told:
+            names.append(log.tell(*told[second], said_by="Ada"))
+    current = log.current()
+    log.finish()
+    for track_id, time_s in enumerate((30, 120, 200, 400), start=1):
+        store.add(at(track_id, time_s))
+    store.close()
+    assert names == ["north", "north", "1"]
+    assert current is not None
+    assert current.name == "1"
+    found = read_stored_fish(store.path)
+    assert [one.haul for one in found] == ["", "north", "north", "1"]
+    efforts = {one.haul: one for one in read_effort(store.path, found)}
+    assert efforts["north"].hours_watched == pytest.approx(180 / 3600)
+    assert efforts["1"].hours_watched == pytest.approx(300 / 3600)
+    assert efforts[""].hours_watched == pytest.approx(120 / 3600)
+    assert [efforts[name].num_fish for name in ("north", "1", "")] == [2, 1, 1]
+    assert efforts["north"].share_measured == 1.0
+    assert efforts[""].share_measured == 1.0
+
+
+def test_a_haul_that_is_begun_again_has_only_its_own_times(tmp_path: Path):
+    store = LengthStore(tmp_path, FACTS)
+    log = HaulLog(store, HaulsSettings())
+    told = {100: ("start", "7"), 200: ("start", "8"), 400: ("start", "7"), 500: ("end", "")}
+    for second in range(0, 601, 5):
+        log.take_frame(second * SECOND)
+        if second in told:
+            log.tell(*told[second], said_by="Ada")
+    log.finish()
+    store.close()
+    efforts = {one.haul: one for one in read_effort(store.path, [])}
+    hours = {name: 3600 * effort.hours_watched for name, effort in efforts.items()}
+    assert hours == pytest.approx({"7": 200, "8": 200, "": 200})
+    assert (efforts["7"].began_ns, efforts["7"].ended_ns) == (100 * SECOND, 500 * SECOND)
+
+
+def test_fish_are_counted_by_fate_with_each_haul(tmp_path: Path):
+    store = LengthStore(tmp_path, replace(FACTS, haul="7"))
+    fates = ["landed", "unknown", "cut off", "landed", None]
+    for track_id, fate in enumerate(fates, start=1):
+        store.add(at(track_id, 10.0 * track_id), catch=CatchFacts(fate=fate))
+    store.close()
+    found = read_stored_fish(store.path)
+    (effort,) = read_effort(store.path, found)
+    row = haul_row(effort, utc_zero_ns=None)
+    assert [row[f"num_{zone}"] for zone in ("landed", "dropped", "cut_off")] == ["2", "0", "1"]
+    (effort,) = read_effort(store.path, found[4:])
+    row = haul_row(effort, utc_zero_ns=None)
+    assert [row[f"num_{zone}"] for zone in ("landed", "dropped", "cut_off")] == ["", "", ""]
+
+
+def test_frames_that_were_lost_lower_the_share(tmp_path: Path):
+    store = LengthStore(tmp_path, FACTS)
+    lost = iter(range(0, 200, 1))
+    log = HaulLog(store, HaulsSettings(), frames_lost=lambda: next(lost))
+    for second in range(100):
+        log.take_frame(second * SECOND)
+    log.finish()
+    store.close()
+    (effort,) = read_effort(store.path, [])
+    assert effort.share_measured == pytest.approx(100 / 199, abs=0.01)
+
+
+def test_a_pause_of_the_camera_is_not_watched(tmp_path: Path):
+    store = LengthStore(tmp_path, FACTS)
+    log = HaulLog(store, HaulsSettings())
+    for second in (*range(0, 61), *range(1000, 1061)):
+        log.take_frame(second * SECOND)
+    log.finish()
+    store.close()
+    (effort,) = read_effort(store.path, [])
+    assert effort.hours_watched == pytest.approx(120 / 3600)
+
+
+def test_hauls_by_rule(tmp_path: Path):
+    store = LengthStore(tmp_path, FACTS)
+    log = HaulLog(store, HaulsSettings(pause_min=5.0, end_speed_knots=6.0))
+    fish_at = [100.0, 300.0, 1000.0, 1100.0, 2000.0]
+    number = 0
+    for second in range(0, 2400, 10):
+        log.take_frame(second * SECOND)
+        knots = 9.0 if second >= 2100 else 2.0
+        log.take_position(_position(second, knots))
+        while number < len(fish_at) and fish_at[number] + 1 <= second:
+            number += 1
+            one = at(number, fish_at[number - 1])
+            log.take_fish(one)
+            store.add(one)
+        log.frame_done()
+    log.finish()
+    store.close()
+    assert [one.haul for one in read_stored_fish(store.path)] == ["1", "1", "2", "2", "3"]
+
+
+def test_a_rule_waits_for_the_fish_of_frames_before_a_pause(tmp_path: Path):
+    """Two fish in view together, and the camera's next frame an hour later is there before them."""
+    store = LengthStore(tmp_path, FACTS)
+    log = HaulLog(store, HaulsSettings(pause_min=5.0))
+    first, second = (fish(n, first_timestamp_ns=10 - n, last_timestamp_ns=20 + n) for n in (1, 2))
+    for time_ns in (10, 20, 60 * MINUTE):
+        log.take_frame(time_ns)
+    log.take_fish(replace(first, is_final=False))
+    log.take_fish(replace(second, is_final=False))
+    log.frame_done()
+    log.take_fish(first)
+    log.frame_done()
+    log.take_fish(second)
+    log.frame_done()
+    (haul,) = log.hauls()
+    log.finish()
+    store.close()
+    assert (haul.began_ns, haul.ended_ns) == (8, 23)
+
+
+def _position(second: int, knots: float) -> Position:
+    return Position(
+        frame_index=1,
+        timestamp_ns=second * SECOND,
+        utc_ns=None,
+        latitude=0.0,
+        longitude=0.0,
+        speed_knots=knots,
+        course_deg=None,
+    )
+
+
+def test_hauls_of_a_folder_afterwards(tmp_path: Path):
+    store = LengthStore(tmp_path, FACTS)
+    for track_id, time_s in enumerate((10, 20, 30), start=1):
+        store.add(at(track_id, time_s))
+    store.close()
+    with pytest.raises(UserError, match="say when, with --at"):
+        write_haul(tmp_path, "start", name="", at=None, said_by="Ada")
+    with pytest.raises(UserError, match="time of day"):
+        write_haul(tmp_path, "start", name="", at="2026-11-22T06:00:00Z", said_by="Ada")
+    write_haul(tmp_path, "start", name="A", at="15", said_by="Ada")
+    assert write_haul(tmp_path, "end", name="", at="25.5", said_by="Ada") == "A"
+    assert [one.haul for one in read_stored_fish(store.path)] == ["", "A", ""]
+    for nothing_to_end in ("14", "26"):
+        with pytest.raises(UserError, match="expected a haul that goes on"):
+            write_haul(tmp_path, "end", name="", at=nothing_to_end, said_by="Ada")
+    for no_time in ("inf", "1e30", "nan"):
+        with pytest.raises(UserError):
+            write_haul(tmp_path, "start", name="", at=no_time, said_by="Ada")
+    write_haul(tmp_path, "start", name="B", at="40", said_by="Ada")
+    assert write_haul(tmp_path, "end", name="", at="20", said_by="Ada") == "A"

@@ -1,0 +1,68 @@
+"""Which tracks become fish, and when."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from stream_dmr.camera import Camera
+from stream_dmr.messages import FishCrop
+from stream_dmr.tracking.confirmation import ConfirmationSettings, FishConfirmation
+from tests.support.given_masks import crop_of
+
+CAMERA = Camera.nominal(width=100, height=100)
+
+
+def crop_at(x: int, y: int, *, confidence: float | None = 1.0) -> FishCrop:
+    """A crop of a box of 20 px around (x, y)."""
+    mask = np.zeros((100, 100), bool)
+    mask[y - 10 : y + 10, x - 10 : x + 10] = True
+    crop = crop_of(mask, CAMERA, crop_size_px=32)
+    return replace(crop, quality=replace(crop.quality, mask_confidence=confidence))
+
+
+def confirmed(crops: Sequence[FishCrop], **settings: object) -> list[bool]:
+    """Frame by frame, whether one track is a fish."""
+    confirmation = FishConfirmation(ConfirmationSettings.model_validate(settings))
+    return [confirmation.update(1, crop) for crop in crops]
+
+
+def test_a_track_is_confirmed_after_enough_clear_frames():
+    unclear, clear = crop_at(50, 50, confidence=0.51), crop_at(50, 50, confidence=0.52)
+    crops = [clear, unclear, clear, unclear, unclear, clear, unclear]
+    assert confirmed(crops, min_track_frames=3) == [False] * 5 + [True] * 2
+
+
+def test_a_given_mask_is_clear():
+    assert confirmed([crop_at(50, 50, confidence=None)] * 2, min_track_frames=2) == [False, True]
+
+
+def test_a_track_is_confirmed_inside_the_zone_and_remains_a_fish_outside():
+    crops = [crop_at(x, 50) for x in (20, 40, 60, 80)]
+    zone = [0.5, 0.0, 0.7, 1.0]
+    assert confirmed(crops, min_track_frames=1, zone=zone) == [False, False, True, True]
+
+
+def test_a_fish_counts_while_it_is_seen():
+    empty, clear = crop_at(50, 50, confidence=0.0), crop_at(50, 50)
+    crops = [clear, *[empty] * 8, clear, *[empty] * 5, clear]
+    assert confirmed(crops, min_track_frames=1) == [True] * 6 + [False] * 3 + [True] * 7
+
+
+def test_tracks_are_counted_apart():
+    confirmation = FishConfirmation(ConfirmationSettings(min_track_frames=2))
+    crop = crop_at(50, 50)
+    assert [confirmation.update(number, crop) for number in (1, 2, 2, 1)] == [
+        False,
+        False,
+        True,
+        True,
+    ]
+
+
+@pytest.mark.parametrize("zone", [[0.5, 0.0, 0.5, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 1.1]])
+def test_a_zone_of_no_area_is_refused(zone: list[float]):
+    with pytest.raises(ValidationError):
+        ConfirmationSettings(zone=zone)

@@ -1,0 +1,76 @@
+"""A run without fish says what was seen, and which setting to change."""
+
+import numpy as np
+import pytest
+
+from stream_dmr.detection.motion_detector import MotionDetector, MotionSettings
+from stream_dmr.messages import Frame
+from stream_dmr.tracking.finder import Sightings, TrackedFish, TrackFishSettings, explain_no_fish
+
+LIMITS = {"min_frames": 4, "min_confidence": 0.8}
+
+
+@pytest.mark.parametrize(
+    ("seen", "refused", "words"),
+    [
+        (Sightings(frames=9), {}, "nothing moved or looked like a fish"),
+        (Sightings(frames=9), {"shorter than [detect_fish] motion_min_length": 14}, "all 14"),
+        (Sightings(frames=9, candidates=5, best_confidence=0.5), {}, "min_mask_confidence = 0.8"),
+        (
+            Sightings(frames=9, candidates=5, tracks=2, best_confidence=0.9),
+            {},
+            "none left its place",
+        ),
+        (
+            Sightings(frames=9, candidates=5, tracks=2, any_moved=True, best_confidence=0.9),
+            {},
+            "min_fish_like_frames = 0",
+        ),
+        (
+            Sightings(
+                frames=9,
+                candidates=5,
+                tracks=2,
+                any_moved=True,
+                any_fish_like=True,
+                best_confidence=0.9,
+            ),
+            {},
+            "min_track_frames",
+        ),
+    ],
+)
+def test_the_line_names_what_was_seen_and_the_setting(seen, refused, words):
+    line = explain_no_fish(seen, refused, **LIMITS)
+    assert line.startswith("no fish in 9 frames: ")
+    assert words in line
+    assert "\n" not in line
+
+
+def frame(index: int, *, spot_x: int | None) -> Frame:
+    image = np.full((240, 320, 3), 60, np.uint8)
+    if spot_x is not None:
+        image[100:106, spot_x : spot_x + 6] = 220
+    return Frame(frame_index=index, timestamp_ns=index, image=image, source="")
+
+
+def finder_after(spots: list[int | None]) -> TrackedFish:
+    finder = TrackedFish(MotionDetector(MotionSettings()), TrackFishSettings())
+    for index, spot_x in enumerate(spots, start=1):
+        assert not finder.detect(frame(index, spot_x=spot_x))
+        finder.confirm({})
+    return finder
+
+
+def test_small_things_that_move_are_said_to_be_too_short():
+    [line] = finder_after([None] * 6 + [40 + 8 * k for k in range(12)]).warnings
+    assert "motion_min_length" in line
+
+
+def test_a_still_picture_is_said_to_show_nothing():
+    [line] = finder_after([None] * 8).warnings
+    assert "nothing moved" in line
+
+
+def test_nothing_is_said_before_the_first_frame():
+    assert finder_after([]).warnings == []

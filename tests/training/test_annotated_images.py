@@ -1,0 +1,120 @@
+"""A user's masks in every format, and what does not match is refused."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from stream_dmr.errors import AnnotationError
+from stream_dmr.training.annotated_images import load_fish_cutouts, read_annotated_images
+from tests.support.frames import ellipse_mask
+
+
+def coco(vessel, segmentations):
+    images = [{"id": i, "file_name": f"haul-{i}.png"} for i in range(6)]
+    annotations = [
+        {"id": i, "image_id": i, "segmentation": one} for i, one in enumerate(segmentations)
+    ]
+    path = vessel / "coco.json"
+    path.write_text(json.dumps({"images": images, "annotations": annotations}))
+    return path
+
+
+def runs_of(mask):
+    values = mask.T.ravel()
+    edges = np.flatnonzero(np.diff(values)) + 1
+    runs = np.diff([0, *edges, values.size]).tolist()
+    return [0, *runs] if values[0] else runs
+
+
+def packed(runs):
+    """COCO's way to write run lengths as text; the reader's opposite."""
+    text = ""
+    for index, run in enumerate(runs):
+        value = run - (runs[index - 2] if index > 2 else 0)
+        while True:
+            bits = value & 31
+            value >>= 5
+            is_last = value == (-1 if bits & 16 else 0)
+            text += chr((bits if is_last else bits | 32) + 48)
+            if is_last:
+                break
+    return text
+
+
+@pytest.mark.parametrize("kind", ["runs", "packed", "polygon"])
+def test_coco_masks_are_the_ones_written(vessel, kind):
+    masks = [ellipse_mask(angle=30.0 * index) for index in range(6)]
+
+    def segmentation(mask):
+        if kind == "polygon":
+            [outline], _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+            return [(outline.reshape(-1) + 0.5).tolist()]
+        runs = runs_of(mask)
+        return {"size": list(mask.shape), "counts": packed(runs) if kind == "packed" else runs}
+
+    file = coco(vessel, [segmentation(mask) for mask in masks])
+    for annotated, mask in zip(read_annotated_images(vessel / "images", file), masks, strict=True):
+        np.testing.assert_array_equal(annotated.masks[0], mask > 0)
+
+
+def test_a_crowd_is_no_fish(vessel):
+    square = [[0, 0, 9, 0, 9, 9, 0, 9]]
+    file = coco(vessel, [square] * 6)
+    content = json.loads(file.read_text())
+    content["annotations"][2]["iscrowd"] = 1
+    file.write_text(json.dumps(content))
+    names = [one.path.name for one in read_annotated_images(vessel / "images", file)]
+    assert names == [f"haul-{i}.png" for i in (0, 1, 3, 4, 5)]
+
+
+@pytest.mark.parametrize("has_ids", [True, False])
+def test_what_is_unknown_beside_ids_is_no_fish(vessel, has_ids):
+    for path in (vessel / "masks").iterdir():
+        mask = ellipse_mask()
+        labels = np.where(mask > 0, 1 if has_ids and path.stem != "haul-0" else 255, 0)
+        labels[:5, :5] = 255
+        cv2.imwrite(str(path), labels.astype(np.uint8))
+    found = [len(one.masks) for one in read_annotated_images(vessel / "images", vessel / "masks")]
+    assert found == ([0, 1, 1, 1, 1, 1] if has_ids else [1] * 6)
+
+
+def refusal(images, masks):
+    with pytest.raises(AnnotationError) as caught:
+        load_fish_cutouts(images, masks)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_images_and_masks_that_do_not_match_are_refused(vessel):
+    images, masks = vessel / "images", vessel / "masks"
+    assert "found none there" in refusal(vessel / "nowhere", masks)
+    (vessel / "empty").mkdir()
+    assert "expected images" in refusal(vessel / "empty", masks)
+    assert "a folder of their own" in refusal(images, images)
+    assert "a folder of PNG masks or a COCO .json" in refusal(images, vessel / "masks.txt")
+    cv2.imwrite(str(masks / "haul-3.png"), np.zeros((10, 20), np.uint8))
+    assert "160x120 px, got 20x10 px" in refusal(images, masks)
+    cv2.imwrite(str(masks / "haul-3.png"), np.zeros((120, 160, 3), np.uint8))
+    assert "one channel" in refusal(images, masks)
+    (masks / "haul-3.png").unlink()
+    assert "none for 1, the first of them haul-3.png" in refusal(images, masks)
+    for path in masks.iterdir():
+        cv2.imwrite(str(path), np.zeros((120, 160), np.uint8))
+    cv2.imwrite(str(masks / "haul-3.png"), np.zeros((120, 160), np.uint8))
+    assert "0 fish to train on" in refusal(images, masks)
+
+
+def test_coco_files_of_another_kind_are_refused(vessel):
+    images, file = vessel / "images", vessel / "coco.json"
+    assert "expected a COCO .json" in refusal(images, file)
+    for text in ("{", "[]", '{"images": []}', '{"images": [{"id": 1}], "annotations": []}'):
+        file.write_text(text)
+        assert "COCO's JSON" in refusal(images, file)
+    coco(vessel, [{"size": [9, 9], "counts": [81]}])
+    assert "another size (annotation 0)" in refusal(images, file)
+    coco(vessel, ["nonsense"])
+    assert "polygons or run lengths" in refusal(images, file)
+    (images / "haul-0.png").unlink()
+    assert "expected haul-0.png among the images" in refusal(images, file)
