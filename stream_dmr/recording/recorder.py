@@ -24,7 +24,7 @@ from stream_dmr.recording.record import (
     make_record,
 )
 from stream_dmr.recording.rerun.live_view import LiveView
-from stream_dmr.recording.rerun.rrd_file import RrdSink
+from stream_dmr.recording.rerun.rrd_sink import RrdSink
 from stream_dmr.recording.topics import RecordingSettings
 
 STEM = "recording"

@@ -15,7 +15,7 @@ from stream_dmr.recording.reading import (
     require_selected,
 )
 from stream_dmr.recording.record import make_record
-from stream_dmr.recording.rerun.rrd_file import RrdSink
+from stream_dmr.recording.rerun.rrd_sink import RrdSink
 from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.recording.topics import TOPICS, RecordingSettings
 from tests.support.command import invoke, rows

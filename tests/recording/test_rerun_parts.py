@@ -16,12 +16,11 @@ from stream_dmr.recording.record import make_record
 from stream_dmr.recording.rerun.blueprint import middle_mm
 from stream_dmr.recording.rerun.rrd_file import (
     RrdRecording,
-    RrdSink,
     copy_readable_chunks,
     is_closed,
-    new_stream,
     rerun_program,
 )
+from stream_dmr.recording.rerun.rrd_sink import RrdSink, new_stream
 from stream_dmr.recording.rerun.scene_drawing import ColumnBuffer, SceneDrawing, payload_columns
 from stream_dmr.recording.topics import TOPICS, RecordingSettings
 from tests.support.recorded_run import calibration, header, run
@@ -143,7 +142,7 @@ def test_a_plane_behind_the_camera_has_its_origin_for_a_middle():
 
 def test_an_rrd_is_not_begun_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Rerun would wait for ever, and the run with it."""
-    monkeypatch.setattr("stream_dmr.recording.rerun.rrd_file.free_bytes", lambda folder: 1000)
+    monkeypatch.setattr("stream_dmr.recording.rerun.rrd_sink.free_bytes", lambda folder: 1000)
     with pytest.raises(OutputError, match="room to write to, got: No space left"):
         RrdSink(tmp_path / "a.rrd", header(), SETTINGS)
     assert not (tmp_path / "a.rrd").exists()

@@ -11,7 +11,7 @@ import rerun as rr
 from stream_dmr.errors import OutputError
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.record import Record
-from stream_dmr.recording.rerun.rrd_file import log_run, new_stream
+from stream_dmr.recording.rerun.rrd_sink import log_run, new_stream
 from stream_dmr.recording.rerun.scene_drawing import SceneDrawing
 from stream_dmr.recording.topics import RecordingSettings
 

@@ -27,7 +27,8 @@ from stream_dmr.recording.reading import (
     require_selected,
 )
 from stream_dmr.recording.record import Record
-from stream_dmr.recording.rerun.rrd_file import RrdSink, rerun_program
+from stream_dmr.recording.rerun.rrd_file import rerun_program
+from stream_dmr.recording.rerun.rrd_sink import RrdSink
 from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.recording.topics import TOPICS, RecordingSettings
 from stream_dmr.recording.view_geometry import MeshRebuilder
