@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test test-slow bench faults soak table1 check format golden config docs clean
+.PHONY: setup demo same test test-slow bench faults soak table1 check format golden config docs clean
 
 setup: $(STAMP)  ## compile the numeric loops, half a minute; without it the first run does
 	$(BIN)/stream-dmr setup
@@ -46,6 +46,9 @@ format: $(STAMP)
 
 golden: $(STAMP)  ## recordings/golden anew, after saying what moved
 	$(BIN)/python recordings/make_golden.py
+
+same: $(STAMP)  ## six runs by this checkout and by BASE, every output compared; ten minutes
+	$(BIN)/python -m tests.corpus --base $(or $(BASE),main)
 
 config: $(STAMP)  ## config.toml anew from the settings classes
 	$(BIN)/python -m stream_dmr.pipeline.config > config.toml.new
