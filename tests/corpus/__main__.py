@@ -14,6 +14,7 @@ from tests.corpus.shell import Shell
 
 ROOT = Path(__file__).parents[2]
 _CACHE = ROOT / "build" / "corpus"
+_RECIPE = ("recipe", "scenes", "shell")  # what a base that was made depends on, beside its commit
 
 
 def main() -> int:
@@ -24,7 +25,8 @@ def main() -> int:
     asked = parser.parse_args()
     names = asked.only or list(RUNS)
     commit = _git("rev-parse", "--verify", f"{asked.base}^{{commit}}")
-    recipe = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
+    here = Path(__file__).parent
+    recipe = b"".join((here / f"{name}.py").read_bytes() for name in _RECIPE)
     base = _CACHE / f"{commit[:12]}-{hashlib.sha256(recipe).hexdigest()[:8]}"
     _make_base(commit, base, names)
     print("this checkout", flush=True)
