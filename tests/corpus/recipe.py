@@ -102,7 +102,7 @@ def _trip(shell: Shell) -> None:
     shell.call("trip/run", "run", *given, "--out", "trip/out")
     start = ("haul", "start", "trip/out", "--name", "by hand", "--at", "2021-06-01T07:00:01Z")
     shell.call("trip/haul_start", *start)
-    shell.call("trip/haul_end", "haul", "end", "trip/out", "--at", "2021-06-01T07:00:09Z")
+    shell.call("trip/haul_end", "haul", "end", "trip/out", "--at", "2021-06-01T07:00:02Z")
     _check(shell, "trip", key="scenes/device.key.pub")
     for asked in _EXPORTS:
         name = "_".join(asked).replace("--", "")
@@ -178,8 +178,9 @@ def _commands(shell: Shell) -> None:
     mask = ("--side", "scenes/stills/masks/000002.png", "--out", "commands/one.ply")
     shell.call("commands/make_template", "make-template", *mask)
     manifest = shell.folder / "scenes" / "manifest.csv"
-    video = ("rail/video.mp4", "rail/calibration.yaml", "rail/boxes.txt", "A", "1", "2")
-    manifest.write_text("video,calibration,boxes,vessel,trip,haul\n" + ",".join(video) + "\n")
+    video = ("rail/video.mp4", "rail/calibration.yaml", "rail/boxes.txt", "", "A", "1", "2")
+    columns = "video,calibration,boxes,masks,vessel,trip,haul\n"
+    manifest.write_text(columns + ",".join(video) + "\n")
     batch = ("batch", "scenes/manifest.csv", "--workers", "1", "--out", "commands/batch")
     shell.call("commands/batch", *batch)
     shell.call("commands/batch_again", *batch)

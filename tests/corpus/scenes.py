@@ -20,6 +20,7 @@ PICTURE_S = 2  # from one picture of `pauses` to the next
 CODES = ("HAL", "COE")
 _SIDE_PX = 24  # of a picture that the classifier takes
 _FPS = 15.0  # of `simulate`
+_CUTS = (24, 34)  # frames at which the trip's video is cut: fish 3 is in all three clips
 _BOX = "{frame},{id},{x},{y},{w},{h},1,1,1\n"
 
 TRIP_CONFIG = f"""\
@@ -125,7 +126,7 @@ def _cut_clips(scene: Path, folder: Path) -> None:
     pictures = _pictures(scene / "video.mp4")
     folder.mkdir()
     at = START_UTC
-    for number, cut in enumerate(np.array_split(np.arange(len(pictures)), 3), start=1):
+    for number, cut in enumerate(np.split(np.arange(len(pictures)), _CUTS), start=1):
         path = folder / f"{number}.mp4"
         _write_video(path, [pictures[k] for k in cut])
         at += timedelta(seconds=len(cut) / _FPS)
