@@ -8,7 +8,13 @@ import pytest
 
 from benchmarks.segmentation import real_images
 from benchmarks.segmentation.mask_proposer import MaskProposer, ProposedMask
-from benchmarks.segmentation.real_images import READERS, Proposal, keep, put_before, window
+from benchmarks.segmentation.real_images import (
+    READERS,
+    Proposal,
+    keep,
+    put_before,
+    window,
+)
 
 MANIFEST = Path(real_images.__file__).parent / "real_sources.toml"
 OPEN = {"MIT", "CC BY 4.0", "Apache-2.0", "BSD-3-Clause", "CC0"}
@@ -31,11 +37,13 @@ def test_only_pictures_under_open_licences_are_trained_on(manifest):
     listed = [*manifest["sources"].values(), *manifest["frames"].values()]
     trained = [source for source in listed if source["role"] == "train"]
     assert len(trained) >= 6
-    assert {source["licence"] for source in [*trained, manifest["backgrounds"]]} <= OPEN
+    backgrounds = [manifest["backgrounds"], *manifest["more_backgrounds"].values()]
+    assert {source["licence"] for source in [*trained, *backgrounds]} <= OPEN
 
 
 def test_no_repository_is_used_that_is_kept_for_later_checks(manifest):
-    listed = [*manifest["sources"].values(), *manifest["frames"].values()]
+    tables = ("sources", "frames", "more_backgrounds")
+    listed = [source for table in tables for source in manifest[table].values()]
     used = {source["repository"] for source in listed}
     assert not used & KEPT_FOR_CHECKS
 

@@ -13,6 +13,7 @@ import argparse
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -222,6 +223,7 @@ def build(repositories: Path, saliency: Path, out: Path, *, only: list[str], she
     manifest = tomllib.loads(_MANIFEST.read_text(encoding="utf-8"))
     backgrounds = write_backgrounds(repositories, manifest["backgrounds"], out / "backgrounds")
     write_empty_squares(repositories, manifest, out / "backgrounds")
+    write_more_backgrounds(repositories, manifest["more_backgrounds"], out / "backgrounds")
     proposer = MaskProposer(saliency)
     rng = np.random.default_rng(5)
     for name in only or manifest["sources"]:
@@ -285,6 +287,17 @@ def write_empty_squares(repositories: Path, manifest: dict[str, Any], folder: Pa
             square = largest_empty_square(image, boxes)
             if square is not None and stem not in chosen["without"]:
                 cv2.imwrite(str(folder / f"{name}_{stem}.png"), square)
+
+
+def write_more_backgrounds(
+    repositories: Path, sources: dict[str, dict[str, Any]], folder: Path
+) -> None:
+    """Pictures without fish from other sources: every so many of them."""
+    for name, source in sources.items():
+        clone = Clone(repositories, source["repository"], source["commit"])
+        for proposal in islice(READERS[source["kind"]](clone, source), 0, None, source["every"]):
+            if proposal.name not in source.get("without", []):
+                cv2.imwrite(str(folder / f"{name}_{proposal.name}.png"), proposal.image)
 
 
 def _photograph(rng: np.random.Generator, paths: list[Path]) -> Image:

@@ -8,7 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Integer, UInt8
+from jaxtyping import Bool, Float32, Integer, UInt8
 
 from stream_dmr.errors import AnnotationError
 from stream_dmr.networks.unet_interface import box_coverage
@@ -17,6 +17,7 @@ from stream_dmr.training.image_degradation import add_weather, simulate_camera
 from stream_dmr.training.random_fish import PATCH_PX, RIM_PX
 from stream_dmr.training.samples import TrainingSample, crop_affine, draw_part_box, jitter_box
 from stream_dmr.training.surroundings import BACKGROUND_PX
+from stream_dmr.training.training_scene import FADED_SHARE, draw_fade
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -253,8 +254,10 @@ def draw_annotated_sample(
     crop_from_cutout = crop_from_rotated @ np.vstack([rotation, [0.0, 0.0, 1.0]])
     crop = cv2.warpAffine(cutout, crop_from_cutout, (size_px, size_px), flags=cv2.INTER_LINEAR)
     picture = crop[..., :3].astype(np.float32)
-    image = crop[..., :3]
-    if rng.random() < 0.7:
+    if is_faded := rng.random() < FADED_SHARE:
+        picture = fade_end(rng, picture, crop[..., 3] > 127)
+    image = picture.astype(np.uint8)
+    if is_faded or rng.random() < 0.7:
         image = simulate_camera(rng, add_weather(rng, picture) if rng.random() < 0.5 else picture)
     edges = box.reshape(2, 2) @ crop_from_rotated[:, :2].T + crop_from_rotated[:, 2] + 0.5
     return TrainingSample(
@@ -263,6 +266,31 @@ def draw_annotated_sample(
         in_box=box_coverage(edges.ravel(), size=size_px),
         ends_px=None,
     )
+
+
+def fade_end(
+    rng: np.random.Generator, picture: Float32[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]
+) -> Float32[np.ndarray, "S S 3"]:
+    """The picture with one end of the fish fading into what is around it."""
+    rows, columns = np.nonzero(mask)
+    if len(rows) < _MIN_AREA_PX:
+        return picture
+    points = np.column_stack([columns, rows]).astype(np.float64)
+    center = points.mean(axis=0)
+    _, axes = np.linalg.eigh(np.cov((points - center).T))
+    along = (points - center) @ axes[:, 1] * rng.choice([-1.0, 1.0])
+    place = (along - along.min()) / max(float(np.ptp(along)), 1.0)
+    seen = np.ones(mask.shape, np.float32)
+    seen[rows, columns] = draw_fade(rng).seen(place)
+    seen = cv2.GaussianBlur(seen, (0, 0), 1.0)[..., None]
+    # What is around, carried on smoothly below the fish, with the grain of another place.
+    around = 1 - cv2.dilate(mask.astype(np.float32), np.ones((5, 5), np.uint8))[..., None]
+    width = (0, 0), len(picture) / 16
+    weight = cv2.GaussianBlur(around, *width)[..., None]
+    ground = cv2.GaussianBlur(picture * around, *width) / np.maximum(weight, 1e-3)
+    grain = (picture - cv2.GaussianBlur(picture, *width)) * around
+    ground += np.roll(grain, tuple(rng.integers(len(picture), size=2)), axis=(0, 1))
+    return np.clip(seen * picture + (1 - seen) * ground, 0, 255).astype(np.float32)
 
 
 def cutout_patch(cutout: Cutout) -> UInt8[np.ndarray, "P P 4"]:

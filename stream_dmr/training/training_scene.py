@@ -5,6 +5,7 @@ docs/research/network-weights.md.
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ from stream_dmr.training.image_degradation import (
     motion_kernel,
     simulate_camera,
 )
-from stream_dmr.training.random_fish import PATCH_PX
+from stream_dmr.training.random_fish import PATCH_PX, RIM_PX
 from stream_dmr.training.surroundings import (
     Occluder,
     draw_into,
@@ -31,6 +32,24 @@ from stream_dmr.training.surroundings import (
 _BESIDE_SHARE = 0.12
 
 
+class Fade(NamedTuple):
+    """How a fish's end is lost in what is behind it, as dark, wet and translucent tails are."""
+
+    begin: float  # share of the fish's long axis from which on it fades
+    least: float  # share of the fish's own light at its very end
+    is_head: bool  # True: the left end of its patch
+
+    def seen(self, place: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
+        """The share of the fish's own light at places along its long axis, 0 to 1."""
+        along = 1 - place if self.is_head else place
+        return np.interp(along, [self.begin, 1.0], [1.0, self.least])
+
+
+def draw_fade(rng: np.random.Generator) -> Fade:
+    """A random fade, of the tail for three in four."""
+    return Fade(rng.uniform(0.6, 0.93), rng.uniform(0.08, 0.7), rng.random() < 0.25)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SceneFish:
     """One fish of a scene."""
@@ -39,6 +58,7 @@ class SceneFish:
     scene_from_patch: Float[np.ndarray, "2 3"]
     gain: Float[np.ndarray, "3"]  # factors on B, G, R
     tint: Float[np.ndarray, "4"]  # B, G, R of a colour, and the fraction of it that is mixed in
+    fade: "Fade | None" = None
 
     def to_scene(self, patch_px: Float[np.ndarray, "*N 2"]) -> Float[np.ndarray, "*N 2"]:
         """Points of the fish's patch, in px, as points of the scene."""
@@ -123,6 +143,7 @@ def _draw_fish(
         scene_from_patch=np.column_stack([linear, at - linear @ center]),
         gain=np.exp(rng.normal(0.0, 0.3) + rng.normal(0.0, 0.1, 3)),
         tint=tint,
+        fade=draw_fade(rng) if rng.random() < FADED_SHARE else None,
     )
 
 
@@ -138,6 +159,9 @@ def _draw_frame(rng: np.random.Generator) -> Float[np.ndarray, "4"]:
 # Share of the scenes in which fish cast shadows on what is behind them, chosen by hand: without any
 # the network took shadows on steel tables for fish.
 _SHADOW_SHARE = 0.35
+# Share of the fish whose end fades: without any the network cut translucent tails, and dark ones on
+# dark ground.
+FADED_SHARE = 0.25
 # Share of the scenes whose backdrop has a colour of the fish: without any the network left out
 # tails as dark as what is behind them.
 _ALIKE_SHARE = 0.15
@@ -169,6 +193,8 @@ def render_scene(
         mask *= 1 - layer[..., 3]
         if fish in targets:
             mask += layer[..., 3]
+        if fish.fade is not None:
+            layer = layer * _seen_share(fish.fade, fish, crop_from_scene, size_px)[..., None]
         layer = cv2.GaussianBlur(layer, (0, 0), blur_px) if blur_px else layer
         layer = layer if motion is None else cv2.filter2D(layer, -1, motion)
         picture = picture * (1 - layer[..., 3:]) + layer[..., :3]
@@ -181,6 +207,18 @@ def render_scene(
     inside = frame_coverage(scene.frame, crop_from_scene, size=size_px)
     pixels = simulate_camera(rng, add_weather(rng, picture))
     return (pixels * (inside[..., None] > 0.5)).astype(np.uint8), mask * inside
+
+
+def _seen_share(
+    fade: Fade, fish: SceneFish, crop_from_scene: Float[np.ndarray, "2 3"], size_px: int
+) -> Float32[np.ndarray, "S S"]:
+    """The share of the fish's own light at each pixel of the crop."""
+    linear = crop_from_scene[:, :2] @ fish.scene_from_patch[:, :2]
+    shift = crop_from_scene[:, :2] @ fish.scene_from_patch[:, 2] + crop_from_scene[:, 2]
+    to_patch_x = np.linalg.inv(linear)[0]
+    rows, columns = np.indices((size_px, size_px))
+    patch_x = to_patch_x[0] * (columns - shift[0]) + to_patch_x[1] * (rows - shift[1])
+    return fade.seen((patch_x - RIM_PX) / (PATCH_PX - 2 * RIM_PX)).astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 
 from stream_dmr.errors import AnnotationError
-from stream_dmr.training.annotated_images import load_fish_cutouts, read_annotated_images
+from stream_dmr.training.annotated_images import (
+    fade_end,
+    load_fish_cutouts,
+    read_annotated_images,
+)
 from tests.support.frames import ellipse_mask
 
 
@@ -78,6 +82,18 @@ def test_what_is_unknown_beside_ids_is_no_fish(vessel, has_ids):
         cv2.imwrite(str(path), labels.astype(np.uint8))
     found = [len(one.masks) for one in read_annotated_images(vessel / "images", vessel / "masks")]
     assert found == ([0, 1, 1, 1, 1, 1] if has_ids else [1] * 6)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_fading_end_goes_over_into_the_ground_and_the_rest_stays(seed):
+    mask = ellipse_mask(size=(128, 128), center=(64, 64), axes=(50, 15), angle=0.0) > 0
+    picture = np.where(mask[..., None], 200.0, 40.0).astype(np.float32).repeat(3, axis=2)[..., :3]
+    faded = fade_end(np.random.default_rng(seed), picture, mask)
+    np.testing.assert_allclose(faded[~mask], 40.0, atol=8)  # but for the rim
+    light = [faded[64, column].mean() for column in (16, 64, 112)]
+    assert light[1] == pytest.approx(200, abs=8)  # the middle keeps its own
+    assert sorted([light[0], light[2]])[0] < 170  # one end fades
+    assert max(light[0], light[2]) == pytest.approx(200, abs=8)
 
 
 def refusal(images, masks):
