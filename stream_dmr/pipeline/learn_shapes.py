@@ -40,11 +40,11 @@ from stream_dmr.fitting.shape.candidates import (
     CandidateShapes,
     LengthShift,
     are_like_mesh,
+    believable,
     describe,
     load_shapes,
     mesh_form,
     not_like_mesh,
-    why_implausible,
 )
 from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.fitting.shape.stocks import FRAMES_PER_FISH, MAX_FISH, GoodCrops, evenly, good_crops
@@ -240,7 +240,7 @@ def _learn_aloud(
     forms: CandidateShapes,
     observer: RunObserver,
 ) -> CandidateShapes:
-    """The stocks of all fish; the forms where none is seen whole, or a stock can't be of fish.
+    """The stocks of all fish; forms where no fish is seen whole, or stocks can't be of fish.
 
     The observer is told.
     """
@@ -250,12 +250,13 @@ def _learn_aloud(
     if stocks is None:
         observer.warn("no fish was seen whole: each is measured as the form it is most like")
         return forms
-    if (reason := why_implausible(forms, stocks)) is not None:
-        observer.warn(reason)
-        return forms
-    for line in describe(forms, stocks):
-        observer.notice(line)
-    return stocks
+    believed = believable(forms, stocks)
+    for doubt in believed.doubts:
+        observer.warn(doubt)
+    if (learnt := believed.shapes.stocks()) is not None:
+        for line in describe(forms, learnt):
+            observer.notice(line)
+    return believed.shapes
 
 
 def save_stocks(
@@ -413,11 +414,12 @@ def follow_shapes(
         nonlocal compared
         if not given.is_given_mesh:
             stocks = inputs.learn(crops, given, progress=progress)
-            reason = None if stocks is None else why_implausible(given, stocks)
-            if reason is None:
-                return stocks
-            observer.warn(reason)
-            return None
+            if stocks is None:
+                return None
+            believed = believable(given, stocks)
+            for doubt in believed.doubts:
+                observer.warn(doubt)
+            return believed.shapes.stocks()
         compared = compare_with_mesh(crops, inputs, progress=progress)
         if compared.stocks is None:
             observer.warn(compared.not_like_mesh)

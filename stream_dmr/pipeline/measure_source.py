@@ -257,10 +257,11 @@ def _compile_kernels_for(inputs: Inputs) -> None:
 
 def _save_learnt_meshes(inputs: Inputs) -> None:
     """Write the meshes of what the first pass learnt, if anything, into the run's folder."""
-    if inputs.candidates is not None and inputs.candidates.are_learnt:
+    stocks = None if inputs.candidates is None else inputs.candidates.stocks()
+    if stocks is not None:
         save_stocks(
             inputs.template,
-            inputs.candidates,
+            stocks,
             inputs.request.out / LEARNT,
             made_by=MADE_BY_RUN,
             source=inputs.source.name,

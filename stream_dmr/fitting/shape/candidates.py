@@ -19,6 +19,7 @@ from stream_dmr.fitting.shape.space import (
     THICKNESS,
     TRUNK,
     coefficients_of,
+    distance_from_form,
     form_precision,
     std_of,
 )
@@ -217,27 +218,68 @@ def _factor(log: float, more: str, less: str) -> str:
 _MAX_DISTANCE = float(chdtri(NUM_COEFFICIENTS, 1e-3))
 
 
-def why_implausible(forms: CandidateShapes, stocks: CandidateShapes) -> str | None:
-    """What to tell where a stock is like none of the forms; None where each is like one."""
-    lines = [
-        line
-        for stock, line in zip(stocks, describe(forms, stocks), strict=True)
-        if not is_plausible(forms, stock)
-    ]
-    if not lines:
-        return None
-    return (
-        f"the masks show a shape that fish don't have ({'; '.join(lines)}), so that each fish is "
-        "measured as the form it is most like: look whether the masks hold more than the fish, "
-        "such as its line; for fish that do look so give a mesh of them (--template)"
+# Of the fish; a smaller group is mostly one whose masks misled, and says little of its shape.
+_MIN_SHARE = 0.1
+_NEVER = 1.5  # times that distance: no fish at all; between the two it is doubted more and more
+
+
+class Believed(NamedTuple):
+    """The shapes that fish of a run may have, by what was learnt."""
+
+    shapes: CandidateShapes
+    doubts: list[str]  # about what was learnt, a line each
+
+
+def believable(forms: CandidateShapes, stocks: CandidateShapes) -> Believed:
+    """The stocks that can be of fish; doubtful ones less certain, none of those that can't be.
+
+    In the place of stocks that can't be of fish, or of too few, a fish may have any of the forms.
+    """
+    believed, doubts = list[CandidateShape](), list[str]()
+    for stock, line in zip(stocks, describe(forms, stocks), strict=True):
+        if stock.share < _MIN_SHARE:
+            continue
+        off, distance = _off_form(forms, stock)
+        doubt = max(0.0, (distance / _MAX_DISTANCE - 1) / (_NEVER - 1))
+        if doubt <= 1:
+            covariance = stock.covariance + doubt * np.outer(off, off)
+            believed.append(stock._replace(covariance=covariance))
+        if doubt > 0:
+            doubts.append(f"the masks show a shape that fish {_doubt(doubt)} ({line}){_REMEDY}")
+    if len(believed) == len(stocks):
+        return Believed(CandidateShapes.of(believed, are_learnt=True), doubts)
+    if not believed:
+        return Believed(forms, doubts)
+    kept = CandidateShapes.of(believed, are_learnt=True)
+    learnt = LearntShapes(
+        frame_index=0,
+        timestamp_ns=int(_ALWAYS) + 1,
+        names=kept.names,
+        coefficients=kept.coefficients,
+        covariances=kept.covariances,
+        shares=kept.shares,
     )
+    return Believed(forms.extended(learnt), doubts)
 
 
-def is_plausible(forms: CandidateShapes, stock: CandidateShape) -> bool:
-    """Whether a stock is as near to one of the forms as stocks are."""
-    off = stock.coefficients - forms.coefficients
-    distances = np.einsum("nv,nvw,nw->n", off, np.linalg.inv(forms.covariances), off)
-    return bool(distances.min() <= _MAX_DISTANCE)
+_REMEDY = (
+    ": look whether the masks hold more than the fish, such as its line; for fish that do look so "
+    "give a mesh of them (--template)"
+)
+
+
+def _doubt(doubt: float) -> str:
+    if doubt > 1:
+        return "don't have, so that these are measured as the form that each is most like"
+    return "hardly have, so that their lengths are less certain"
+
+
+def _off_form(
+    forms: CandidateShapes, stock: CandidateShape
+) -> tuple[Float[np.ndarray, "W"], float]:
+    """How a stock differs from the form that it is nearest to, and the squared distance."""
+    offs = [stock.coefficients - form.coefficients for form in forms]
+    return min(((off, distance_from_form(off)) for off in offs), key=lambda one: one[1])
 
 
 # Log factors between head and peduncle: on the mean breadth, beside one std, and on single places

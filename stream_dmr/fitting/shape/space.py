@@ -54,6 +54,7 @@ _CURVATURE_STD = 0.2  # of second differences along a side: outlines are smooth
 _SIDES_STD = 0.1  # of one side against the other
 _THICKNESS_STD, _THICKNESS_STEP_STD = 0.3, 0.15
 _LOBES_STD = 0.02  # body lengths
+_MAX_ONE_SIDED = 9.0  # three std
 # How far individuals are from their stock: the breadth by 5 % and the thickness by 10 %, as the
 # spread of condition factors says (weight goes with their product; Froese, J. Appl. Ichthyol. 22,
 # 241 (2006) finds 10 to 15 % in weight at a length), single places of the outline by 3 % more.
@@ -131,6 +132,26 @@ def coefficients_of(other: Template, template: Template) -> Float[np.ndarray, "W
 
 def form_precision() -> Float[np.ndarray, "W W"]:
     """Inverse covariance of a stock about the body form that it is most like."""
+    rows = _form_rows()
+    return rows.T @ rows
+
+
+def distance_from_form(off: Float[np.ndarray, "W"]) -> float:
+    """Squared distance of a shape from a body form in the std of stocks.
+
+    What one side alone has, such as a fin that is up in every mask, counts little: the body's two
+    sides are alike.
+    """
+    mean = (off[LEFT] + off[RIGHT]) / 2
+    both = off.copy()
+    both[LEFT] = both[RIGHT] = mean
+    rows = _form_rows()
+    one_sided = float(np.sum((rows @ (off - both)) ** 2))
+    return float(np.sum((rows @ both) ** 2)) + min(one_sided, _MAX_ONE_SIDED)
+
+
+def _form_rows() -> Float[np.ndarray, "R W"]:
+    """Rows whose products with a difference of shapes are independent, of std 1."""
     unit = np.eye(NUM_COEFFICIENTS)
     left, right = unit[LEFT], unit[RIGHT]
     parts = [
@@ -142,8 +163,7 @@ def form_precision() -> Float[np.ndarray, "W W"]:
         np.diff(unit[THICKNESS], axis=0) / _THICKNESS_STEP_STD,
         unit[LOBES:] / _LOBES_STD,
     ]
-    rows = np.concatenate(parts)
-    return rows.T @ rows
+    return np.concatenate(parts)
 
 
 def std_of(mean: Float[np.ndarray, "W"], covariance: Float[np.ndarray, "W W"]) -> float:
