@@ -72,6 +72,9 @@ class CropQuality:
     # The IoU with the truth that nine in ten masks like this one reach; None: given, not found
     mask_confidence: float | None = None
     glare: float | None = None  # share of the mask that is blown out; None: an older recording
+    # How much longer or shorter the fish was in a box that goes on beyond its ends, over its
+    # length; None: nobody looked.
+    length_doubt: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

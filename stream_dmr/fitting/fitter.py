@@ -242,14 +242,20 @@ class Fitter:
         return float(np.hypot(std, self._hidden_slant_std(parameters)))
 
     def _hidden_slant_std(self, parameters: Float[np.ndarray, "P"]) -> float:
-        """A flat fish would rather roll than slant, so it counts as far as the fish is round."""
+        """Std of the log length by a slant that a breadth not known exactly may hide.
+
+        A fish that shows its broad side would rather roll than slant, so this counts as far as it
+        can't roll: by the least breadth of its section over the one that it shows.
+        """
         if self._breadth_std == 0.0:
             return 0.0
-        axis = Rotation.from_rotvec(parameters[ROOT_ROTATION]).as_matrix()[:, 0]
-        breadth, thickness = self._half_section
-        roundness = min(thickness / breadth, 1.0)
+        R = Rotation.from_rotvec(parameters[ROOT_ROTATION]).as_matrix()
+        across = np.cross(self.plane_normal, R[:, 0])
+        across /= max(float(np.linalg.norm(across)), 1e-9)
+        shown = float(np.linalg.norm(self._half_section * (across @ R)[1:]))
+        roundness = min(float(self._half_section.min()) / max(shown, 1e-9), 1.0)
         return roundness * slant_std_ratio(
-            float(np.arcsin(np.clip(self.plane_normal @ axis, -1, 1))),
+            float(np.arcsin(np.clip(self.plane_normal @ R[:, 0], -1, 1))),
             slant_std_rad=self._settings.tilt_std_rad,
             breadth_std=self._breadth_std,
         )

@@ -42,7 +42,7 @@ class SmoothLengthSettings(Settings):
         default=0.005, gt=0, description="smallest std that a frame is given, over length"
     )
     frame_correlation: float = Field(
-        default=0.03,
+        default=0.3,
         ge=0,
         le=1,
         description="correlation of the errors of a fish's frames at any distance in time, 0 to 1",

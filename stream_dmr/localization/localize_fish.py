@@ -3,6 +3,7 @@
 The fit knows the fish's shape in the orientation of the camera, but not its scale. The scale comes
 from the reference plane: the center lies on it (eq. 9-11), head and tail lie on the rays through
 their pixels (eq. 6-8) and, seen from the center, in the directions of the fitted shape (eq. 12).
+Of a fish that lies on the plane, each keypoint is as high above it as such bodies rest.
 """
 
 from dataclasses import dataclass
@@ -18,6 +19,19 @@ from stream_dmr.reasons import Reason
 from stream_dmr.settings import Settings
 
 _MIN_ANGLE_RAD = 1e-3  # between two lines, for their intersection to mean anything
+# Heights of head, center and tail of a fish that lies on its side, over half its thickness at the
+# center. A stiff body holds all three at 1; a limp one lets the tail down to 0, and the snout to
+# its own half thickness. Neither is known of a fish, so the ends are halfway between.
+_LYING_HEIGHTS = np.array([0.5, 1.0, 0.25])
+_LYING_END_STD = 0.25  # of both ends' heights together: from stiff to limp is four stds
+# Of the thickness of a body form, relative: thickness over length differs so among specimens of one
+# species, by how full they are.
+_THICKNESS_STD = 0.3
+# Std of a fish's log length by its mask: where the mask is less sure, and by how much the length
+# changes in a longer box. All frames of a fish share it: a dark tail is dark in all of them. Fitted
+# to photographs that the segmenter never saw; see docs/research/real-pictures.md.
+_MASK_STD, _DOUBT_STD = 0.12, 0.35
+_HEIGHT_ROUNDS = 3  # the height goes with the length, which goes with the height
 
 
 class LocalizeSettings(Settings):
@@ -47,7 +61,7 @@ class LocalizeSettings(Settings):
     )
     rests_on_plane: bool = Field(
         default=False,
-        description="fish lie on the reference plane, their midline half a thickness above it",
+        description="fish lie on the reference plane, their ends lower than their middle",
     )
     plane_std_mm: float = Field(
         default=25.0, gt=0, description="std of the centers' distance from the plane, mm"
@@ -95,7 +109,8 @@ class Location:
     midline_mm: Float[np.ndarray, "M 3"]
     length_mm: float
     length_std_mm: float | None  # without the part below; None where the fit can't tell
-    # Of an error that all frames of the fish share: its own shape, and its distance from the plane.
+    # Of an error that all frames of the fish share: its own shape, its distance from the plane, and
+    # what its masks lack.
     shared_std_ratio: float
     slant_rad: float  # of the chord from the plane across the line of sight: 0 is broadside
     bow_ratio: float  # of the midline from its chord along the line of sight, over its length
@@ -170,7 +185,20 @@ def place_midline(
     return center_mm + scale * (midline - center)
 
 
-def locate(shape: FittedShape, calibration: Calibration, settings: LocalizeSettings) -> Location:
+def mask_std_ratio(quality: CropQuality) -> float:
+    """Std of the log length by what a found mask may lack or have too much at the ends."""
+    if quality.mask_confidence is None:
+        return 0.0
+    unsure = _MASK_STD * (1 - quality.mask_confidence)
+    return float(np.hypot(unsure, _DOUBT_STD * (quality.length_doubt or 0.0)))
+
+
+def locate(
+    shape: FittedShape,
+    quality: CropQuality,
+    calibration: Calibration,
+    settings: LocalizeSettings,
+) -> Location:
     """Where the fish is and how long, by eq. (13): |H'T'| times the bending ratio of the fit.
 
     Without `settings.bending` the length is |H'T'| alone. Raises Unlocatable.
@@ -181,11 +209,11 @@ def locate(shape: FittedShape, calibration: Calibration, settings: LocalizeSetti
     ratio = bend(shape)
     if ratio is None:
         raise Unlocatable(Reason.KEYPOINTS_COINCIDE)
-    keypoints_mm = locate_keypoints(shape.keypoints, shape.keypoints_px, calibration)
     if settings.rests_on_plane:
-        chord_mm = float(np.linalg.norm(keypoints_mm[0] - keypoints_mm[2]))
-        height_mm = (shape.height_ratio or 0.0) * chord_mm * ratio
-        keypoints_mm = raised(keypoints_mm, height_mm, calibration.plane)
+        keypoints_mm, height_std = lying_keypoints(shape, ratio, calibration)
+    else:
+        keypoints_mm = locate_keypoints(shape.keypoints, shape.keypoints_px, calibration)
+        height_std = 0.0
     chord_mm = float(np.linalg.norm(keypoints_mm[0] - keypoints_mm[2]))
     length_mm = chord_mm * ratio if settings.bending else chord_mm
     slant_rad = slant(keypoints_mm)
@@ -200,12 +228,13 @@ def locate(shape: FittedShape, calibration: Calibration, settings: LocalizeSetti
     ]
     std_mm = length_mm * float(np.linalg.norm(parts))
     plane_std = plane_std_ratio(calibration.plane, settings)
+    shared = [shape.shape_std_ratio or 0.0, plane_std, height_std, mask_std_ratio(quality)]
     return Location(
         keypoints_mm=keypoints_mm,
         midline_mm=place_midline(shape.midline, shape.keypoints[1], keypoints_mm),
         length_mm=length_mm,
         length_std_mm=std_mm if np.isfinite(std_mm) else None,
-        shared_std_ratio=float(np.hypot(shape.shape_std_ratio or 0.0, plane_std)),
+        shared_std_ratio=float(np.linalg.norm(shared)),
         slant_rad=slant_rad,
         bow_ratio=bow_ratio(shape.midline, keypoints_mm[1]),
         bending_ratio=ratio,
@@ -221,16 +250,26 @@ def bow_ratio(midline: Float[np.ndarray, "M 3"], toward: Float[np.ndarray, "3"])
     return float(np.abs(along).max() / arc[-1])
 
 
-def raised(
-    keypoints_mm: Float[np.ndarray, "3 3"], height_mm: float, plane: ReferencePlane
-) -> Float[np.ndarray, "3 3"]:
-    """The keypoints of a fish that rests on the plane, its center above it by its own height.
+def lying_keypoints(
+    shape: FittedShape, bending: float, calibration: Calibration
+) -> tuple[Float[np.ndarray, "3 3"], float]:
+    """H', C', T' in mm of a fish that lies on the plane, and the std of the log length by heights.
 
-    Along its rays a fish of height h grows with its distance from the camera; at distance D of the
-    plane it would be h high. Nearer by its own height, d = D - h d / D, so d / D = 1 / (1 + h / D).
+    Each keypoint is where its ray meets the plane of its own height: gravity says how such a fish
+    lies, so the fit's slants are not asked. A point at height h, with the camera at distance D
+    from the plane, is at 1 - h / D of its ray. Raises Unlocatable.
     """
-    distance_mm = abs(float(plane.rotation[:, 2] @ plane.translation_mm))
-    return keypoints_mm / (1.0 + height_mm / distance_mm)
+    rays = calibration.camera.back_project(shape.keypoints_px)
+    on_plane_mm = np.stack([center_on_plane(ray, calibration.plane) for ray in rays])
+    distance_mm = calibration.plane.distance_mm
+    keypoints_mm, half_thickness_mm = on_plane_mm, 0.0
+    for _ in range(_HEIGHT_ROUNDS):
+        chord_mm = float(np.linalg.norm(keypoints_mm[0] - keypoints_mm[2]))
+        half_thickness_mm = (shape.height_ratio or 0.0) * chord_mm * bending
+        nearer = np.clip(1 - _LYING_HEIGHTS * half_thickness_mm / distance_mm, 0.1, 1)
+        keypoints_mm = on_plane_mm * nearer[:, None]
+    end_std = np.hypot(_LYING_END_STD, _LYING_HEIGHTS[[0, 2]].mean() * _THICKNESS_STD)
+    return keypoints_mm, float(end_std * half_thickness_mm / distance_mm)
 
 
 def bend(shape: FittedShape) -> float | None:
@@ -248,8 +287,7 @@ def plane_std_ratio(plane: ReferencePlane, settings: LocalizeSettings) -> float:
     distance from the plane, along its normal: |R_3 . T|, which is the depth where the camera looks
     at it squarely.
     """
-    distance_mm = abs(float(plane.rotation[:, 2] @ plane.translation_mm))
-    return settings.plane_std_mm / distance_mm
+    return settings.plane_std_mm / plane.distance_mm
 
 
 def slant(keypoints_mm: Float[np.ndarray, "3 3"]) -> float:
@@ -288,7 +326,7 @@ def localize(
         return _message(mesh, Reason.NO_CALIBRATION)
     reason = quality_refusal(mesh.shape, mesh.quality, settings)
     try:
-        location = locate(mesh.shape, calibration, settings)
+        location = locate(mesh.shape, mesh.quality, calibration, settings)
         if location.slant_rad > settings.max_slant_rad:
             reason = reason or Reason.TURNED_AWAY
         is_bent = location.bending_ratio > settings.max_bending_ratio

@@ -362,3 +362,50 @@ def test_refusal_of_the_fit_is_passed_on():
     assert (fish.accepted, fish.reason, fish.iou) == (False, "no mask", None)
     assert (fish.frame_index, fish.timestamp_ns, fish.track_id) == (7, 280_000_000, 3)
     assert list(node.tick(1)) == list(node.close()) == []
+
+
+def test_a_mask_that_is_less_sure_or_longer_in_a_longer_box_gives_a_wider_length():
+    calibration = make_calibration()
+    stds = []
+    for confidence, doubt in ((None, None), (0.95, None), (0.7, None), (0.7, 0.0), (0.7, 0.1)):
+        quality = replace(GOOD, mask_confidence=confidence, length_doubt=doubt)
+        mesh = replace(straight_fish(calibration), quality=quality)
+        stds.append(localized(mesh, calibration).shared_std_ratio)
+    given, sure, unsure, looked_again, doubted = stds
+    assert given < sure < unsure == looked_again < doubted
+
+
+def lying_fish(calibration, *, length_mm, ends, half_thickness=0.05):
+    """A straight fish on the plane: heights of head and tail over half its thickness, `ends`."""
+    plane = calibration.plane
+    toward_camera = np.sign(-plane.rotation[:, 2] @ plane.translation_mm)
+    heights_mm = np.array([ends[0], 1.0, ends[1]]) * half_thickness * length_mm
+    along_mm = np.array([-0.5, 0.0, 0.5]) * length_mm
+    world_mm = np.column_stack([along_mm, np.full(3, 0.1 * length_mm), toward_camera * heights_mm])
+    points_mm = world_mm @ plane.rotation.T + plane.translation_mm
+    shape = make_shape(points_mm[[0, 2]], points_mm[1], calibration.camera)
+    return make_mesh(replace(shape, height_ratio=half_thickness))
+
+
+@pytest.mark.parametrize("distance_mm", [300.0, 2500.0])
+@pytest.mark.parametrize("tilt_rad", [0.0, 0.3])
+def test_ends_of_a_lying_fish_are_as_low_as_such_bodies_rest(distance_mm: float, tilt_rad: float):
+    calibration = make_calibration(tilt_rad=tilt_rad, depth_mm=distance_mm)
+    length_mm = 0.4 * distance_mm
+    mesh = lying_fish(calibration, length_mm=length_mm, ends=(0.5, 0.25))
+    fish = localized(mesh, calibration, rests_on_plane=True)
+    assert fish.length_mm == pytest.approx(length_mm, rel=2e-3)  # of the chord's slope
+
+
+@pytest.mark.parametrize("ends", [(1.0, 1.0), (0.3, 0.0)])
+def test_stiff_and_limp_fish_are_within_the_std_of_a_lying_fish(ends: tuple[float, float]):
+    calibration = make_calibration(depth_mm=400.0)
+    mesh = lying_fish(calibration, length_mm=250.0, ends=ends)
+    fish = localized(mesh, calibration, rests_on_plane=True, plane_std_mm=1e-6)
+    assert fish.length_mm is not None
+    assert fish.shared_std_ratio is not None
+    assert abs(np.log(fish.length_mm / 250.0)) < 2.6 * fish.shared_std_ratio
+    far = make_calibration(depth_mm=4000.0)
+    mesh = lying_fish(far, length_mm=250.0, ends=ends)
+    from_far = localized(mesh, far, rests_on_plane=True, plane_std_mm=1e-6)
+    assert from_far.shared_std_ratio == pytest.approx(fish.shared_std_ratio / 10, rel=0.1)

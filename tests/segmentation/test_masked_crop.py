@@ -252,6 +252,34 @@ def test_a_second_look_finds_the_tail_that_a_box_lacks(second_look):
     assert crop.quality.mask_area_px == pytest.approx(length_px * 100, rel=0.05)
     # Whether it is a fish says the first look.
     assert crop.quality.mask_confidence == pytest.approx(0.9**2.85, abs=0.02)
+    assert (crop.quality.length_doubt is None) == (not second_look)
+
+
+class Believer(Painter):
+    """Finds what is inside of the box, as sure as ever."""
+
+    def segment(self, image, bbox_xyxy_px):
+        x0, y0, x1, y1 = np.round(bbox_xyxy_px).astype(int)
+        inside = np.zeros(image.shape[:2], bool)
+        inside[max(y0, 0) : y1, max(x0, 0) : x1] = True
+        found = ((image[..., 0] > 127) & inside).astype(np.float32)
+        return SegmentedFish(probability=np.float32(0.9) * found, ends=None)
+
+
+@pytest.mark.parametrize("lost_px", [0, 30])
+def test_an_end_that_only_a_longer_box_shows_is_taken_and_doubted(lost_px):
+    camera = Camera.nominal(width=640, height=480)
+    picture = np.zeros((480, 640), np.uint8)
+    picture[200:320, 200:500] = 255
+    box = np.array([200.0, 200.0, 500.0 - lost_px, 320.0])
+    detection = Detection(
+        source_id=1, bbox_xyxy_px=box, mask=None, visible_fraction=1.0, may_be_no_fish=True
+    )
+    frame = frame_of(np.repeat(picture[..., None], 3, axis=2))
+    knobs = CropFishSettings(second_look=True)
+    crop = crop_fish(frame, detection, frame_camera=camera, settings=knobs, segmenter=Believer())
+    assert crop.quality.mask_area_px == pytest.approx(300 * 120, rel=0.07)
+    assert crop.quality.length_doubt == pytest.approx(lost_px / (300 - lost_px), abs=0.03)
 
 
 def test_a_part_of_something_larger_is_doubted():

@@ -1,10 +1,11 @@
 """How well do several pictures of one live fish agree? Juvenile Chinook before a grid.
 
-    python -m benchmarks.accuracy.chinook PICTURES --u2net u2net.onnx [--pose lying]
+    python -m benchmarks.accuracy.chinook PICTURES --u2net u2net.onnx [--pose lying] [--own-masks]
 
 PICTURES: the photographs FishID*.jpg of briancknight/HandsFreeFishing (MIT). No length is known:
 what is compared are lengths of one fish in cells of the grid. Masks and grids are drawn into
-OUT/overlays, to be looked at.
+OUT/overlays, to be looked at. With --own-masks the product finds its own in boxes drawn by hand, as
+a user's run does; the others are of U2-Net, mended by hand.
 """
 
 import argparse
@@ -17,7 +18,13 @@ from benchmarks.accuracy.chinook.overlays import draw_overlay
 from benchmarks.accuracy.chinook.photographs import read_photographs, unusable
 from benchmarks.accuracy.chinook.product_lengths import measure_photographs
 from benchmarks.accuracy.chinook.simple_lengths import by_hand, largest_diameter, midline
-from benchmarks.accuracy.chinook.tables import beyond_hand, fish_table, honesty, summary
+from benchmarks.accuracy.chinook.tables import (
+    against_marks,
+    beyond_hand,
+    fish_table,
+    honesty,
+    summary,
+)
 
 BY_HAND = "snout to fork by hand"
 
@@ -30,6 +37,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/chinook"))
     parser.add_argument("--template", default="auto")
     parser.add_argument("--pose", choices=("lying", "hanging"), default="lying")
+    parser.add_argument("--own-masks", action="store_true")
     arguments = parser.parse_args()
 
     photographs = read_photographs(arguments.pictures)
@@ -45,7 +53,7 @@ def main() -> None:
         draw_overlay(one, grids[one.name], masks[one.name], path)
     product = measure_photographs(
         photographs,
-        masks,
+        None if arguments.own_masks else masks,
         poses,
         camera,
         out=arguments.out / arguments.pose,
@@ -68,6 +76,7 @@ def main() -> None:
     print("\n".join(fish_table(photographs, product, columns)))
     print("\n".join(["", *summary(photographs, columns)]))
     print("\n" + beyond_hand(photographs, measured, columns[BY_HAND]))
+    print(against_marks(product, columns[BY_HAND]))
     print(honesty(photographs, product))
     print("\nnot measured:")
     print("\n".join(f"{name}: {why}" for name, why in unusable().items()))

@@ -15,7 +15,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 import stream_dmr
 from benchmarks.accuracy.chinook.cameras import CELL_MM, GridPose, facing_view
@@ -44,7 +44,7 @@ class ProductLength:
 
 def measure_photographs(
     photographs: Sequence[Photograph],
-    masks: Mapping[str, Bool[np.ndarray, "H W"]],
+    masks: Mapping[str, Bool[np.ndarray, "H W"]] | None,
     poses: Mapping[str, GridPose],
     camera: Camera,
     *,
@@ -52,7 +52,10 @@ def measure_photographs(
     template: str,
     pose: Literal["hanging", "lying"],
 ) -> dict[str, ProductLength]:
-    """Each picture's own length, by name; every one is another fish for the run."""
+    """Each picture's own length, by name; every one is another fish for the run.
+
+    Without `masks` the product finds its own in the boxes.
+    """
     shutil.rmtree(out, ignore_errors=True)
     distance_mm = float(np.median([pose.distance_mm for pose in poses.values()]))
     calibration = _write_inputs(photographs, masks, poses, camera, out=out, distance_mm=distance_mm)
@@ -60,7 +63,8 @@ def measure_photographs(
         out / "pictures",
         out=out / "run",
         calibration=calibration,
-        masks=out / "masks",
+        masks=None if masks is None else out / "masks",
+        boxes=out / "boxes.txt" if masks is None else None,
         stills=True,
         pose=pose,
         template=template,
@@ -82,28 +86,39 @@ def measure_photographs(
 
 def _write_inputs(
     photographs: Sequence[Photograph],
-    masks: Mapping[str, Bool[np.ndarray, "H W"]],
+    masks: Mapping[str, Bool[np.ndarray, "H W"]] | None,
     poses: Mapping[str, GridPose],
     camera: Camera,
     *,
     out: Path,
     distance_mm: float,
 ) -> Path:
-    """Pictures and masks of the turned views; the path of their calibration."""
+    """Pictures, boxes and masks of the turned views; the path of their calibration."""
     (out / "pictures").mkdir(parents=True)
     (out / "masks").mkdir()
-    width, height = _VIEW_SIZE
     K = camera.K.copy()
-    K[:2, 2] = (width - 1) / 2, (height - 1) / 2
-    view = Camera(width=width, height=height, K=K, distortion=np.zeros(5))
+    K[:2, 2] = (_VIEW_SIZE[0] - 1) / 2, (_VIEW_SIZE[1] - 1) / 2
+    view = Camera(width=_VIEW_SIZE[0], height=_VIEW_SIZE[1], K=K, distortion=np.zeros(5))
+    boxes = ""
     for number, photograph in enumerate(photographs, start=1):
         turned = facing_view(poses[photograph.name], camera, view)
         picture = cv2.warpPerspective(photograph.image, turned, _VIEW_SIZE)
-        soft = masks[photograph.name].astype(np.float32)
-        mask = cv2.warpPerspective(soft, turned, _VIEW_SIZE) > 0.5
         cv2.imwrite(str(out / "pictures" / f"{number:06d}.png"), picture)
-        cv2.imwrite(str(out / "masks" / f"{number:06d}.png"), (number * mask).astype(np.uint8))
+        corners = cv2.perspectiveTransform(_corners(photograph.box), turned)[0]
+        (x, y), (width, height) = corners.min(axis=0), np.ptp(corners, axis=0)
+        boxes += f"{number},{number},{x:.1f},{y:.1f},{width:.1f},{height:.1f},1,1,1\n"
+        if masks is not None:
+            soft = masks[photograph.name].astype(np.float32)
+            mask = cv2.warpPerspective(soft, turned, _VIEW_SIZE) > 0.5
+            cv2.imwrite(str(out / "masks" / f"{number:06d}.png"), (number * mask).astype(np.uint8))
+    (out / "boxes.txt").write_text(boxes)
     plane = ReferencePlane(rotation=np.eye(3), translation_mm=np.array([0.0, 0.0, distance_mm]))
     path = out / "calibration.yaml"
     save_calibration(path, Calibration(camera=view, plane=plane))
     return path
+
+
+def _corners(box: Float[np.ndarray, "4"]) -> Float[np.ndarray, "1 4 2"]:
+    left, top, right, bottom = box
+    corners = [[left, top], [right, top], [right, bottom], [left, bottom]]
+    return np.array([corners], np.float64)

@@ -71,6 +71,23 @@ def beyond_hand(
     )
 
 
+def against_marks(product: Mapping[str, ProductLength], by_hand: Mapping[str, float]) -> str:
+    """How the lengths differ from those between the marks of snout and fork, on the grid."""
+    errors, held = [], []
+    for name, marked in by_hand.items():
+        one = product[name]
+        assert one.length is not None
+        assert one.interval is not None
+        errors.append(one.length / marked - 1)
+        held.append(one.interval[0] <= marked <= one.interval[1])
+    off = np.array(errors)
+    return (
+        f"against the marks: {len(off)} of {len(product)} measured, {off.mean():+.1%} in the mean, "
+        f"mean error {np.abs(off).mean():.1%}, worst {off[np.abs(off).argmax()]:+.1%}, "
+        f"{np.mean(held):.0%} held"
+    )
+
+
 def honesty(photographs: Sequence[Photograph], product: Mapping[str, ProductLength]) -> str:
     """How often two pictures of one fish differ by less than 1.96 std of their difference."""
     overlaps, agrees, widths = [], [], []
