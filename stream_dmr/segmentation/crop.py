@@ -400,7 +400,7 @@ def _lengthened(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> Mask
     low, high = crop.extent[:2], crop.extent[2:]
     longer = _segment(view, np.concatenate([low, high]) + _beyond(low, high), segmenter)
     if longer.is_cut or agreement(crop, longer) < _MIN_SAME_FISH:
-        return crop
+        return replace(crop, length_doubt=_BEYOND_ENDS)  # it may go on as far as was looked
     before, after = _end_to_end_px(view, crop, longer)
     change = after / before - 1
     lost = (crop.confidence or 0.0) - (longer.confidence or 0.0)
