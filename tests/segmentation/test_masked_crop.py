@@ -282,6 +282,35 @@ def test_an_end_that_only_a_longer_box_shows_is_taken_and_doubted(lost_px):
     assert crop.quality.length_doubt == pytest.approx(lost_px / (300 - lost_px), abs=0.03)
 
 
+class Fickle(Painter):
+    """Finds the fish in a box around it, and nothing in a longer one."""
+
+    def segment(self, image, bbox_xyxy_px):
+        white = image[..., 0] > 127
+        is_longer = np.ptp(bbox_xyxy_px[::2]) > 1.15 * np.ptp(np.nonzero(white)[1])
+        return SegmentedFish(probability=(white & ~is_longer).astype(np.float32), ends=None)
+
+
+def test_a_fish_that_a_longer_box_does_not_show_keeps_its_mask_and_is_doubted():
+    picture = np.zeros((480, 640), np.uint8)
+    picture[200:320, 200:500] = 255
+    detection = Detection(
+        source_id=1,
+        bbox_xyxy_px=np.array([200.0, 200.0, 500.0, 320.0]),
+        mask=None,
+        visible_fraction=1.0,
+    )
+    crop = crop_fish(
+        frame_of(np.repeat(picture[..., None], 3, axis=2)),
+        detection,
+        frame_camera=Camera.nominal(width=640, height=480),
+        settings=CropFishSettings(second_look=True),
+        segmenter=Fickle(),
+    )
+    assert crop.quality.mask_area_px == pytest.approx(300 * 120, rel=0.07)
+    assert crop.quality.length_doubt == pytest.approx(0.15)
+
+
 def test_a_part_of_something_larger_is_doubted():
     camera = Camera.nominal(width=640, height=480)
     picture = np.zeros((480, 640), np.uint8)
