@@ -1,7 +1,5 @@
 """Zones of the picture, fates and conditions of fish.
 
-What a reviewer says of a fish beside its length: condition and fate, by codes.
-
 The condition codes are those of the regional observers of SPC and FFA, which WCPFC takes for
 discards; the fields of longline forms are compared in WCPFC-SC9-2013/EB-WP-04, Appendix 1. They
 were compared with the codes in public code that reads SPC's observer data, not with the paper.

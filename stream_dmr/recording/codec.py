@@ -1,11 +1,8 @@
-"""Parses `messages.proto` into protobuf classes, so that installing needs no protoc.
+"""Encode messages to bytes and back: one versioned encoding per type, exact to the last bit.
 
-It understands only what that file uses: flat messages of scalars, messages, `optional` and
-`repeated`.
-
-Encodes messages to bytes and back: one versioned encoding per type, exact to the last bit.
-
-The schema is `messages.proto`; a dataclass and its protobuf message have the same field names.
+The schema is `messages.proto`, parsed here so that installing needs no protoc: flat messages of
+scalars, messages, `optional` and `repeated`. A dataclass and its protobuf message have the same
+field names.
 """
 
 import re

@@ -1,11 +1,7 @@
 """The tables of lengths.db, opened for writing and for reading.
 
-The tables of lengths.db, opened for writing and for reading.
-
 The file is in SQLite's WAL mode while a run writes to it, so that others may read meanwhile.
 Reading never writes, since archives are kept on write-protected disks.
-
-What a lengths.db holds beside fish, events and runs, for sums and signatures.
 
 Marks, clips and scenes say where a run goes on and what it compares with; checks are of the scale.
 """

@@ -3,8 +3,6 @@
 The tracker follows whatever moves. Gaffs and waves are distinguished from fish by their masks,
 which are empty or of low confidence.
 
-What tells a fish from what only moves, and from what only looks like one.
-
 Plants sway and marks glitter in their places, rock passes by before a camera that moves; none of
 them looks like a fish. Letters and stones may, but stay where they are.
 """

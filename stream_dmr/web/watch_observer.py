@@ -1,8 +1,7 @@
 """Observe a run for its status page, its log in JSON and systemd.
 
-Tells systemd that the service is ready, and that it is alive.
-
-The protocol of sd_notify(3): a line to the datagram socket that NOTIFY_SOCKET names.
+Systemd learns by the protocol of sd_notify(3) that the service is ready and alive: a line to the
+datagram socket that NOTIFY_SOCKET names.
 """
 
 import json

@@ -1,7 +1,5 @@
 """Candidate shapes of a run: what they are, whether fish can have them, whether a mesh agrees.
 
-Whether shapes that were learnt can be those of fish.
-
 Masks that hold more than the fish teach its shape, too: where the line at the snout is in every
 mask, a long thin snout is learnt, and fish are measured from the end of the line.
 """

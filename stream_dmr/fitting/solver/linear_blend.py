@@ -5,8 +5,6 @@ Rotation vectors, their matrices and slopes: compiled loops.
 The derivative of a rotated vector is d(R v) = R ((J_r d_omega) x v), with J_r the right Jacobian of
 the rotation vector omega (Sola et al., "A micro Lie theory", 2018, eq. (143)).
 
-What both deformations share: the joints' weights, scales and blends, and the root.
-
 Skinning weights are a softmax of e_j, so that a blend X = sum_j W_j X_j has
 dX/de_j = W_j (X_j - X). The layout of the parameters stands in `stream_dmr.fitting.body`.
 """
