@@ -21,11 +21,11 @@ from jaxtyping import Bool, Float, UInt8
 from stream_dmr.camera import Camera
 from stream_dmr.localization.localize_fish import mask_std_ratio
 from stream_dmr.messages import Frame
+from stream_dmr.networks.unet_interface import SIZES_PX
 from stream_dmr.segmentation.crop import CropFishSettings, Detection, crop_fish
 from stream_dmr.segmentation.unet_segmenter import SHIPPED, UNetSegmenter
 from stream_dmr.training.annotated_images import read_annotated_images
 
-_SIZES_PX = [128, 192, 256]  # as `run --stills`
 _SPREAD = 0.02  # of a box's edges, over its sides
 _LOST = (0.08, 0.2)  # of a box's longer side
 _MIN_AREA_PX = 400
@@ -53,7 +53,7 @@ def measure(
         Frame(frame_index=1, timestamp_ns=0, image=image, source=""),
         Detection(source_id=1, bbox_xyxy_px=box, mask=None, visible_fraction=1.0),
         frame_camera=(camera := Camera.nominal(width=width, height=height)),
-        settings=CropFishSettings(segmenter_sizes_px=_SIZES_PX, second_look=second_look),
+        settings=CropFishSettings(segmenter_sizes_px=list(SIZES_PX), second_look=second_look),
         segmenter=segmenter,
     )
     to_frame = camera.K @ np.linalg.inv(crop.crop_camera.K)

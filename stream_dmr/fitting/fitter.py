@@ -252,7 +252,7 @@ class Fitter:
         R = Rotation.from_rotvec(parameters[ROOT_ROTATION]).as_matrix()
         across = np.cross(self.plane_normal, R[:, 0])
         across /= max(float(np.linalg.norm(across)), 1e-9)
-        shown = float(np.linalg.norm(self._half_section * (across @ R)[1:]))
+        shown = self._reach(R, across)
         roundness = min(float(self._half_section.min()) / max(shown, 1e-9), 1.0)
         return roundness * slant_std_ratio(
             float(np.arcsin(np.clip(self.plane_normal @ R[:, 0], -1, 1))),
@@ -263,7 +263,11 @@ class Fitter:
     def _height_ratio(self, parameters: Float[np.ndarray, "P"]) -> float:
         """How far the elliptic section at the center reaches along the plane's normal."""
         R = Rotation.from_rotvec(parameters[ROOT_ROTATION]).as_matrix()
-        return float(np.linalg.norm(self._half_section * (self.plane_normal @ R)[1:]))
+        return self._reach(R, self.plane_normal)
+
+    def _reach(self, R: Float[np.ndarray, "3 3"], direction: Float[np.ndarray, "3"]) -> float:
+        """How far the section at the center of a body rotated by R reaches in a direction."""
+        return float(np.linalg.norm(self._half_section * (direction @ R)[1:]))
 
     def _problem(self, body: Body, target: Target) -> Problem:
         return Problem.from_settings(self._settings, body, target, with_smoothness=True)

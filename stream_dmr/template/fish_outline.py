@@ -259,7 +259,6 @@ def _measured(
 
 # Chosen. The bundled forms have an elongation from 2.4 (bream) to 14 (eel), and a volume from 0.002
 # (eel) to 0.022 (bream) of the length cubed; a sphere has 1 and 0.52.
-_MIN_MESH_ELONGATION = 1.3
 _MIN_VOLUME, _MAX_VOLUME = 3e-4, 0.1
 _MESH_LENGTH_PX = 1200  # of the side view in which snout and fork are found
 _ENDS = (0.05, 0.10, 0.15)  # of the length: sections that distinguish a head from a tail fin
@@ -309,7 +308,7 @@ def _fish_axes(mesh: trimesh.Trimesh) -> Float[np.ndarray, "3 3"]:
 def _require_fish(fish: trimesh.Trimesh, *, name: str) -> None:
     length = fish.extents[0]
     elongation, volume = length / fish.extents[1:].max(), fish.volume / length**3
-    if elongation < _MIN_MESH_ELONGATION or not _MIN_VOLUME <= volume <= _MAX_VOLUME:
+    if elongation < _MIN_ELONGATION or not _MIN_VOLUME <= volume <= _MAX_VOLUME:
         raise TemplateError(
             f"template {name}: expected a fish, {_MIN_ELONGATION:g} times as long as broad or more "
             f"and of {_MIN_VOLUME:g} to {_MAX_VOLUME:g} of its length cubed in volume, got "

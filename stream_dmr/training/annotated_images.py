@@ -8,7 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Integer, UInt8
+from jaxtyping import Bool, Float, Float32, Integer, UInt8
 
 from stream_dmr.errors import AnnotationError
 from stream_dmr.networks.unet_interface import box_coverage
@@ -272,16 +272,13 @@ def fade_end(
     rng: np.random.Generator, picture: Float32[np.ndarray, "S S 3"], mask: Bool[np.ndarray, "S S"]
 ) -> Float32[np.ndarray, "S S 3"]:
     """The picture with one end of the fish fading into what is around it."""
-    rows, columns = np.nonzero(mask)
-    if len(rows) < _MIN_AREA_PX:
+    if np.count_nonzero(mask) < _MIN_AREA_PX:
         return picture
-    points = np.column_stack([columns, rows]).astype(np.float64)
-    center = points.mean(axis=0)
-    _, axes = np.linalg.eigh(np.cov((points - center).T))
+    points, center, axes = _points_and_axes(mask)
     along = (points - center) @ axes[:, 1] * rng.choice([-1.0, 1.0])
     place = (along - along.min()) / max(float(np.ptp(along)), 1.0)
     seen = np.ones(mask.shape, np.float32)
-    seen[rows, columns] = draw_fade(rng).seen(place)
+    seen[mask] = draw_fade(rng).seen(place)
     seen = cv2.GaussianBlur(seen, (0, 0), 1.0)[..., None]
     # What is around, carried on smoothly below the fish, with the grain of another place.
     around = 1 - cv2.dilate(mask.astype(np.float32), np.ones((5, 5), np.uint8))[..., None]
@@ -293,13 +290,20 @@ def fade_end(
     return np.clip(seen * picture + (1 - seen) * ground, 0, 255).astype(np.float32)
 
 
+def _points_and_axes(
+    mask: Bool[np.ndarray, "H W"],
+) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
+    """The pixels of a mask (x, y), their middle, and its short and long axis as columns."""
+    rows, columns = np.nonzero(mask)
+    points = np.column_stack([columns, rows]).astype(np.float64)
+    center = points.mean(axis=0)
+    return points, center, np.linalg.eigh(np.cov((points - center).T))[1]
+
+
 def cutout_patch(cutout: Cutout) -> UInt8[np.ndarray, "P P 4"]:
     """The fish alone, its long axis horizontal, filling a patch: BGR times coverage, coverage."""
     fish = cutout[..., 3] > 0
-    rows, columns = np.nonzero(fish)
-    points = np.column_stack([columns, rows]).astype(np.float64)
-    center = points.mean(axis=0)
-    _, axes = np.linalg.eigh(np.cov((points - center).T))
+    points, _, axes = _points_and_axes(fish)
     turn = np.stack([axes[:, 1], axes[::-1, 1] * [-1, 1]])  # long axis to x, without mirroring
     turned = points @ turn.T
     low, high = turned.min(axis=0), turned.max(axis=0)

@@ -64,6 +64,13 @@ class SceneFish:
         """Points of the fish's patch, in px, as points of the scene."""
         return patch_px @ self.scene_from_patch[:, :2].T + self.scene_from_patch[:, 2]
 
+    def to_crop(
+        self, crop_from_scene: Float[np.ndarray, "2 3"]
+    ) -> tuple[Float[np.ndarray, "2 2"], Float[np.ndarray, "2"]]:
+        """The linear part and the shift of the map from the patch's pixels to a crop's."""
+        linear = crop_from_scene[:, :2] @ self.scene_from_patch[:, :2]
+        return linear, crop_from_scene[:, :2] @ self.scene_from_patch[:, 2] + crop_from_scene[:, 2]
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainingScene:
@@ -213,8 +220,7 @@ def _seen_share(
     fade: Fade, fish: SceneFish, crop_from_scene: Float[np.ndarray, "2 3"], size_px: int
 ) -> Float32[np.ndarray, "S S"]:
     """The share of the fish's own light at each pixel of the crop."""
-    linear = crop_from_scene[:, :2] @ fish.scene_from_patch[:, :2]
-    shift = crop_from_scene[:, :2] @ fish.scene_from_patch[:, 2] + crop_from_scene[:, 2]
+    linear, shift = fish.to_crop(crop_from_scene)
     to_patch_x = np.linalg.inv(linear)[0]
     rows, columns = np.indices((size_px, size_px))
     patch_x = to_patch_x[0] * (columns - shift[0]) + to_patch_x[1] * (rows - shift[1])
@@ -256,8 +262,7 @@ def warp_fish(
     bank: PatchBank, fish: SceneFish, crop_from_scene: Float[np.ndarray, "2 3"], *, size: int
 ) -> Float32[np.ndarray, "S S 4"]:
     """A fish in the crop: BGR times coverage (0 to 255), and coverage (0 to 1)."""
-    linear = crop_from_scene[:, :2] @ fish.scene_from_patch[:, :2]
-    shift = crop_from_scene[:, :2] @ fish.scene_from_patch[:, 2] + crop_from_scene[:, 2]
+    linear, shift = fish.to_crop(crop_from_scene)
     patch = bank.fish[fish.patch]
     if abs(np.linalg.det(linear)) < _MIN_AREA_SCALE:  # halve the patch by averaging first
         patch = cv2.resize(patch, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)

@@ -96,15 +96,24 @@ class CandidateShapes:
 
     def extended(self, learnt: LearntShapes) -> "CandidateShapes":
         """With what a camera has learnt; the others keep their indices."""
-        since_ns = np.full(len(self), _ALWAYS) if self.since_ns is None else self.since_ns
-        new_since_ns = np.full(len(learnt.shares), learnt.timestamp_ns)
+        return self._joined(learnt, since_ns=learnt.timestamp_ns)
+
+    def with_stocks(self, stocks: "CandidateShapes") -> "CandidateShapes":
+        """With stocks that leave some of the shares to these, from the first fish on."""
+        return self._joined(stocks, since_ns=int(_ALWAYS) + 1)
+
+    def _joined(
+        self, learnt: "LearntShapes | CandidateShapes", *, since_ns: int
+    ) -> "CandidateShapes":
+        old_since_ns = np.full(len(self), _ALWAYS) if self.since_ns is None else self.since_ns
+        new_since_ns = np.full(len(learnt.shares), since_ns)
         return CandidateShapes(
             names=f"{self.names},{learnt.names}",
             coefficients=np.concatenate([self.coefficients, learnt.coefficients]),
             covariances=np.concatenate([self.covariances, learnt.covariances]),
             shares=np.concatenate([self.shares, learnt.shares]),
             are_learnt=self.are_learnt,
-            since_ns=np.concatenate([since_ns, new_since_ns]),
+            since_ns=np.concatenate([old_since_ns, new_since_ns]),
         )
 
     def stocks(self) -> "CandidateShapes | None":
@@ -244,20 +253,10 @@ def believable(forms: CandidateShapes, stocks: CandidateShapes) -> Believed:
             believed.append(stock._replace(covariance=covariance))
         if doubt > 0:
             doubts.append(f"the masks show a shape that fish {_doubt(doubt)} ({line}){_REMEDY}")
-    if len(believed) == len(stocks):
-        return Believed(CandidateShapes.of(believed, are_learnt=True), doubts)
     if not believed:
         return Believed(forms, doubts)
     kept = CandidateShapes.of(believed, are_learnt=True)
-    learnt = LearntShapes(
-        frame_index=0,
-        timestamp_ns=int(_ALWAYS) + 1,
-        names=kept.names,
-        coefficients=kept.coefficients,
-        covariances=kept.covariances,
-        shares=kept.shares,
-    )
-    return Believed(forms.extended(learnt), doubts)
+    return Believed(kept if len(kept) == len(stocks) else forms.with_stocks(kept), doubts)
 
 
 _REMEDY = (

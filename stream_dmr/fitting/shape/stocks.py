@@ -49,8 +49,6 @@ MAX_FISH = 60  # a stock's mean is known to an eighth of its individuals' spread
 _MIN_VISIBLE = 0.99
 _MIN_CONFIDENCE = 0.52  # of a mask that was found
 
-T = TypeVar("T")
-
 
 @dataclass(eq=False)
 class Sample:
