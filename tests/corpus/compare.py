@@ -17,8 +17,7 @@ from tests.corpus.recipe import MADE
 
 # Wall-clock time, what is hashed or signed over it, and how long work took.
 _MASKED_FIELDS = {
-    *("elapsedNs", "started_ns", "ended_ns", "written_ns", "wall_ns", "timestamp_wall_ns"),
-    *("signature", "sha256", "previous", "hash", "previous_sha256", "command", "made_ns"),
+    *("elapsedNs", "started_ns", "ended_ns", "written_ns", "signature", "sha256", "previous"),
 }
 _TIMED_TABLES = {"added_frames"}  # encoded messages, with the time that the fit took
 _MASKS = [
