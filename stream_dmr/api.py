@@ -16,7 +16,13 @@ from stream_dmr.messages import Message
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.replay_recording import replay as replay_recordings
 from stream_dmr.pipeline.run_observer import RunObserver
-from stream_dmr.pipeline.run_options import ReplayRequest, RunRequest, command_of, default_out
+from stream_dmr.pipeline.run_options import (
+    ReplayRequest,
+    RunRequest,
+    Stage,
+    command_of,
+    default_out,
+)
 from stream_dmr.recording.reading import decoded_messages, open_recordings
 from stream_dmr.recording.selection import Selection
 from stream_dmr.tables import rotated_files
@@ -120,7 +126,6 @@ def _row(kind: type[Row], texts: Mapping[str, str | None], where: str) -> Row:
 
 
 Location = str | PathLike[str]
-Stage = Literal["crop", "fit", "localize", "smooth"]
 Pose = Literal["hanging", "lying"]
 
 

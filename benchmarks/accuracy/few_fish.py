@@ -31,7 +31,7 @@ from stream_dmr.fitting.shape.space import TRUNK, reshaped, std_of
 from stream_dmr.fitting.shape.stocks import learn_shapes
 from stream_dmr.messages import FishCrop, LearntShapes
 from stream_dmr.pipeline.config import Config
-from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.simulation.rail_scene import PRESETS, make_scene
 from stream_dmr.simulation.simulated_fish import SPECIES
 from stream_dmr.template.template import Template
@@ -140,9 +140,14 @@ def _measured(
     template: Template,
     candidates: CandidateShapes,
 ) -> Iterator[MeasuredFish]:
-    nodes = later_nodes(
-        Config(), template=template, candidates=candidates, calibration=filmed.calibration
-    )
+    nodes = Session(
+        Setup(
+            config=Config(),
+            template=template,
+            candidates=candidates,
+            calibration=filmed.calibration,
+        )
+    ).nodes
     for length in judge(through_all(crops, nodes), filmed.truth_mm):
         yield MeasuredFish(
             way=task.way,

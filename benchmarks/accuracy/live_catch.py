@@ -41,7 +41,7 @@ from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.pipeline.config import Config
-from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.simulation.rail_scene import FPS
 from stream_dmr.simulation.simulated_fish import SPECIES
 from stream_dmr.tracking.finder import open_finder
@@ -114,12 +114,14 @@ class _Camera:
         assert self._forms is not None
         self._known: CandidateShapes = self._forms
         self._learnt_from = [0] * len(self._forms)
-        nodes = later_nodes(
-            self._config,
-            template=self._template,
-            candidates=self._forms,
-            calibration=filmed.calibration,
-        )
+        nodes = Session(
+            Setup(
+                config=self._config,
+                template=self._template,
+                candidates=self._forms,
+                calibration=filmed.calibration,
+            )
+        ).nodes
         self._fit, self._later = nodes[0], nodes[1:]
         assert isinstance(self._fit, FitMesh)
         self._crops: dict[int, GoodCrops] = {}

@@ -28,7 +28,7 @@ from stream_dmr.camera import Calibration, ReferencePlane
 from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
 from stream_dmr.fitting.shape.stocks import learn_shapes
 from stream_dmr.pipeline.config import Config, lying, stills
-from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.simulation.rail_scene import PRESETS, RailScene, Visit, draw_calibration
 from stream_dmr.simulation.simulated_fish import (
     SPECIES,
@@ -121,9 +121,9 @@ def _measured(filmed: FilmedScene) -> list[JudgedLength]:
     template, forms = load_shapes(AUTO)
     assert forms is not None
     stocks = learn_shapes(crops, template, forms, config.fit_mesh, calibration=filmed.calibration)
-    nodes = later_nodes(
-        config, template=template, candidates=stocks, calibration=filmed.calibration
-    )
+    nodes = Session(
+        Setup(config=config, template=template, candidates=stocks, calibration=filmed.calibration)
+    ).nodes
     return judge(through_all(crops, nodes), filmed.truth_mm)
 
 

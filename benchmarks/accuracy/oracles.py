@@ -29,7 +29,7 @@ from benchmarks.table1.filmed_scene import (
 from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish
 from stream_dmr.nodes.smooth_length import SmoothLength
 from stream_dmr.pipeline.config import Config
-from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.simulation.rail_scene import PRESETS, RailScene, make_scene
 from stream_dmr.simulation.simulated_fish import HALIBUT, SimulatedBody, pose_fish
 from stream_dmr.template.template import Template
@@ -103,7 +103,9 @@ def _errors(
 ) -> list[float]:
     errors = []
     for track_id, crops in tracks_of(filmed).items():
-        nodes = later_nodes(config, template=template_of(track_id), calibration=filmed.calibration)
+        nodes = Session(
+            Setup(config=config, template=template_of(track_id), calibration=filmed.calibration)
+        ).nodes
         final = [
             m for m in through_all(crops, nodes) if isinstance(m, LengthEstimate) and m.is_final
         ]

@@ -29,7 +29,7 @@ from stream_dmr.messages import FishCrop
 from stream_dmr.pipeline.config import Config
 from stream_dmr.pipeline.learn_shapes import learnt_from
 from stream_dmr.pipeline.run_observer import RunObserver
-from stream_dmr.pipeline.session import MeasuringSetup, later_nodes
+from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.simulation.simulated_fish import SPECIES, find_species
 from stream_dmr.template.template_file import bundled_names
 
@@ -56,7 +56,7 @@ def measure(task: tuple[str, int, Sequence[str]]) -> dict[str, list[JudgedLength
             template, shapes = body_template(find_species(name.removesuffix(_MESH))[0]), None
         else:
             template, shapes = load_shapes(name)
-        setup = MeasuringSetup(
+        setup = Setup(
             config=Config(), template=template, candidates=shapes, calibration=filmed.calibration
         )
         setup = learnt_from(crops, setup, RunObserver())
@@ -67,14 +67,9 @@ def measure(task: tuple[str, int, Sequence[str]]) -> dict[str, list[JudgedLength
 def _lengths(
     crops: Sequence[FishCrop],
     truth_mm: dict[int, float],
-    setup: MeasuringSetup,
+    setup: Setup,
 ) -> list[JudgedLength]:
-    nodes = later_nodes(
-        setup.config,
-        template=setup.template,
-        candidates=setup.candidates,
-        calibration=setup.calibration,
-    )
+    nodes = Session(setup, first="fit").nodes
     return judge(through_all(crops, nodes), truth_mm)
 
 

@@ -13,7 +13,7 @@ from benchmarks.table1.dmr import through_all
 from benchmarks.table1.filmed_scene import film_passages
 from stream_dmr.messages import LocalizedFish
 from stream_dmr.pipeline.config import Config
-from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.simulation.rail_scene import FPS, PRESETS
 
 _NUM_FRAMES = 600  # of a scene: some 48 of each fish
@@ -29,9 +29,9 @@ VIEWS = {
 def errors_of(task: tuple[str, int]) -> dict[str, list[tuple[float, float]]]:
     """Relative errors and relative stds of the fish of one scene, by what was seen of them."""
     filmed = film_passages(scene_of(task, num_frames=_NUM_FRAMES), with_second=False)
-    fit, localize, _ = later_nodes(
-        CONFIG, template=species_template(), calibration=filmed.calibration
-    )
+    fit, localize, _ = Session(
+        Setup(config=CONFIG, template=species_template(), calibration=filmed.calibration)
+    ).nodes
     found: dict[str, list[tuple[float, float]]] = {view: [] for view in VIEWS}
     for track_id, crops in tracks_of(filmed).items():
         placed = [m for m in through_all(crops, [fit, localize]) if isinstance(m, LocalizedFish)]

@@ -21,7 +21,7 @@ from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.pipeline.chain import run_chain
 from stream_dmr.pipeline.config import load_config
-from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.template.template_file import load_template
 from stream_dmr.tracking.finder import open_finder
 from stream_dmr.web.views import crop_outlines, draw_outlines
@@ -37,7 +37,7 @@ def fit_video(video: str, *, template: str, path: Path | None) -> list[Pair]:
     config = load_config(path)
     finder = open_finder(boxes=None, masks=None, detect=config.detect_fish, track=config.track_fish)
     node = CropFish(config.crop_fish, camera=None, finder=finder)
-    later = later_nodes(config, template=load_template(template), calibration=None)
+    later = Session(Setup(config=config, template=load_template(template), calibration=None)).nodes
     crops: dict[tuple[int, int], FishCrop] = {}
     pairs: list[Pair] = []
 

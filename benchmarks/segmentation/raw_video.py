@@ -30,7 +30,7 @@ from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.pipeline.chain import run_chain
 from stream_dmr.pipeline.config import load_config
-from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.segmentation.crop_geometry import frame_from_crop_map
 from stream_dmr.simulation.rail_scene import PRESETS
 from stream_dmr.simulation.write_scene import simulate
@@ -91,7 +91,9 @@ def chain(scene: Path, path: Path | None, template: str, *, given: bool) -> Chai
         track=config.track_fish,
     )
     crop_fish = CropFish(config.crop_fish, camera=calibration.camera, finder=finder)
-    later = later_nodes(config, template=load_template(template), calibration=calibration)
+    later = Session(
+        Setup(config=config, template=load_template(template), calibration=calibration)
+    ).nodes
     ran = ChainResult([], [])
 
     def note(message: Message) -> Message:

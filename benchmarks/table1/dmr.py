@@ -10,7 +10,7 @@ from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish, Message
 from stream_dmr.pipeline.chain import Node
 from stream_dmr.pipeline.config import Config
-from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.template.template import Template
 
 ROWS = ("dmr", "dmr-flat")
@@ -81,11 +81,13 @@ def _fit_once(
 ) -> tuple[list[Message], list[Message]]:
     """Everything that the nodes say after the fit, with bending and without."""
     bent, flat = (
-        later_nodes(
-            Config.model_validate(changes | {"localize": {"bending": bending}}),
-            template=template,
-            calibration=filmed.calibration,
-        )
+        Session(
+            Setup(
+                config=Config.model_validate(changes | {"localize": {"bending": bending}}),
+                template=template,
+                calibration=filmed.calibration,
+            )
+        ).nodes
         for bending in (True, False)
     )
     meshes = _through(crops, bent[0])

@@ -17,7 +17,7 @@ from benchmarks.table1.filmed_scene import chain_crops, table_scene
 from benchmarks.table1.tables import worst_fish
 from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
 from stream_dmr.pipeline.config import Config
-from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.simulation.film import film
 from stream_dmr.web.views import crop_outlines, draw_outlines
 
@@ -28,7 +28,9 @@ OUT = Path(__file__).parents[2] / "docs" / "images" / "table1_worst.jpg"
 def row(fish: cached_results.Fish) -> np.ndarray:
     """Frames spread over the passage of one fish."""
     scene, template = table_scene(fish.scene), species_template()
-    fit, localize, _ = later_nodes(Config(), template=template, calibration=scene.calibration)
+    fit, localize, _ = Session(
+        Setup(config=Config(), template=template, calibration=scene.calibration)
+    ).nodes
     seen: list[tuple[FishCrop, FittedMesh, LocalizedFish]] = []
     for shot in film(scene):
         for track_id, crop in chain_crops(shot, scene.calibration):

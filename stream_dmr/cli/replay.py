@@ -1,7 +1,7 @@
 """`stream-dmr replay`: recomputes a recording from one stage on."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -13,8 +13,7 @@ from stream_dmr.cli.shared_options import (
     parse_selection,
     stop_on_signals,
 )
-
-Stage = Literal["crop", "fit", "localize", "smooth"]
+from stream_dmr.pipeline.run_options import Stage
 
 
 def replay(

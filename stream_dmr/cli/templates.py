@@ -84,7 +84,7 @@ def learn_template(
     from stream_dmr.evidence.own_files import require_writable
     from stream_dmr.fitting.shape.candidates import describe, load_shapes, mesh_form
     from stream_dmr.pipeline.learn_shapes import save_stocks, stock_paths
-    from stream_dmr.pipeline.session import MeasuringSetup
+    from stream_dmr.pipeline.session import Setup
     from stream_dmr.recording.reading import open_recordings
 
     if out.suffix != ".ply":
@@ -94,7 +94,7 @@ def learn_template(
     header = opened[0].header
     mesh, forms = load_shapes(template, on_notice=lambda line: warn([line]))
     forms = forms or mesh_form(mesh)
-    setup = MeasuringSetup(
+    setup = Setup(
         config=settings_of(config, header.config_toml, recordings[0]),
         template=mesh,
         candidates=forms,

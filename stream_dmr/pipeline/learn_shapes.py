@@ -52,12 +52,11 @@ from stream_dmr.messages import FishCrop, Frame, LearntShapes, LengthEstimate, M
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.nodes.read_frames import ReadFrames
-from stream_dmr.pipeline.chain import Node
 from stream_dmr.pipeline.run_folder import require_folder
 from stream_dmr.pipeline.run_inputs import Inputs
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.run_outputs import Outputs
-from stream_dmr.pipeline.session import MeasuringSetup, keep_crops, later_nodes
+from stream_dmr.pipeline.session import Session, Setup, keep_crops
 from stream_dmr.store.open_results import (
     LEARNT,
     MADE_BY_RUN,
@@ -98,7 +97,7 @@ class MeshComparison:
 
 def compare_with_mesh(
     crops: Sequence[FishCrop],
-    setup: MeasuringSetup,
+    setup: Setup,
     *,
     progress: Callable[[str], None] = lambda step: None,
 ) -> MeshComparison:
@@ -133,21 +132,13 @@ def compare_with_mesh(
 
 
 def _lengths(
-    crops: Sequence[FishCrop], setup: MeasuringSetup, candidates: CandidateShapes | None
+    crops: Sequence[FishCrop], setup: Setup, candidates: CandidateShapes | None
 ) -> Lengths:
     """The fish's lengths by these frames; empty without a calibration."""
-    messages: Sequence[Message] = crops
-    nodes = later_nodes(
-        setup.config,
-        template=setup.template,
-        candidates=candidates,
-        calibration=setup.calibration,
-    )
-    for node in nodes:
-        messages = [*chain.from_iterable(map(node.step, messages)), *node.close()]
+    session = Session(replace(setup, candidates=candidates), first="fit")
     return {
         one.track_id: (float(np.log(one.length_mm)), one.length_std_mm / one.length_mm)
-        for one in messages
+        for one in session.messages(crops, setup.config.recording)
         if isinstance(one, LengthEstimate)
         and one.is_final
         and one.length_mm is not None
@@ -167,7 +158,7 @@ def _shift(by_mesh: Lengths, by_stocks: Lengths) -> LengthShift:
     )
 
 
-S = TypeVar("S", bound=MeasuringSetup)
+S = TypeVar("S", bound=Setup)
 
 
 def with_learnt_shapes(
@@ -212,7 +203,7 @@ def learnt_from(crops: Iterable[FishCrop], setup: S, observer: RunObserver) -> S
     return replace(setup, candidates=_learn_aloud(seen_whole, setup, forms, observer))
 
 
-def is_mesh_theirs(crops: Sequence[FishCrop], setup: MeasuringSetup, observer: RunObserver) -> bool:
+def is_mesh_theirs(crops: Sequence[FishCrop], setup: Setup, observer: RunObserver) -> bool:
     """Whether the fish of these good crops are like a mesh that was given for them.
 
     True where there are none. The observer is told.
@@ -236,7 +227,7 @@ def is_mesh_theirs(crops: Sequence[FishCrop], setup: MeasuringSetup, observer: R
 
 def _learn_aloud(
     crops: Iterable[FishCrop],
-    setup: MeasuringSetup,
+    setup: Setup,
     forms: CandidateShapes,
     observer: RunObserver,
 ) -> CandidateShapes:
@@ -390,21 +381,21 @@ class LiveShapes:
 def follow_shapes(
     inputs: Inputs,
     outputs: Outputs,
-    fit_mesh: Node,
+    session: Session,
     seen: SeenFish,
     *,
     write: Callable[[LearntShapes], object],
     observer: RunObserver,
 ) -> LiveShapes | None:
-    """Let `fit_mesh` know what earlier runs have learnt, and what this one learns.
+    """Let FitMesh know what earlier runs have learnt, and what this one learns.
 
     None where there is nothing to learn: the settings say so, or the source has an end, whose fish
-    were looked at before (`shape_pass.py`).
+    were looked at before (`with_learnt_shapes`).
     """
     given = inputs.candidates
     if given is None or not inputs.is_endless or not inputs.config.fit_mesh.are_shapes_learnt:
         return None
-    assert isinstance(fit_mesh, FitMesh)
+    [fit_mesh] = [node for node in session.nodes if isinstance(node, FitMesh)]
     known, compared = given, None
     for learnt in outputs.learnt:
         known = known.extended(learnt)

@@ -14,8 +14,7 @@ from stream_dmr.errors import OutputError, UserError
 from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.fitting.shape.candidates import AUTO
 from stream_dmr.messages import Frame, LengthEstimate, Message, Position
-from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.pipeline.chain import ErrorPolicy, Node, StageCounters, run_chain
+from stream_dmr.pipeline.chain import ErrorPolicy, StageCounters, run_chain
 from stream_dmr.pipeline.drift import DriftAlarms
 from stream_dmr.pipeline.learn_shapes import (
     SeenFish,
@@ -30,7 +29,7 @@ from stream_dmr.pipeline.run_inputs import Inputs, checked_inputs, start_notices
 from stream_dmr.pipeline.run_observer import RunObserver, RunTotals
 from stream_dmr.pipeline.run_options import RunRequest
 from stream_dmr.pipeline.run_outputs import Outputs, ResultWriter, open_outputs, resume_source
-from stream_dmr.pipeline.session import continue_tracks, later_nodes, records_covariance
+from stream_dmr.pipeline.session import Session
 from stream_dmr.sources.positions import PositionSource
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.open_results import LEARNT, MADE_BY_RUN
@@ -77,7 +76,7 @@ class MessageFlow:
     def __init__(
         self,
         inputs: Inputs,
-        nodes: Sequence[Node],
+        session: Session,
         outputs: Outputs,
         seen: SeenFish,
         observer: RunObserver,
@@ -90,7 +89,7 @@ class MessageFlow:
         _begin_positions(inputs, outputs, observer)
         self._positions = PositionFeed(inputs.positions, self._take_position)
         self._shapes = follow_shapes(
-            inputs, outputs, nodes[1], seen, write=self._writer.write, observer=observer
+            inputs, outputs, session, seen, write=self._writer.write, observer=observer
         )
 
     def take(self, message: Message) -> Message:
@@ -200,30 +199,22 @@ def _measure(
     unused: list[str] = []
     try:
         prepare_kernels(observer.stage, stop=stop)
-        crop_fish = _crop_fish(inputs)
+        crop_fish = inputs.crop_fish(inputs.finder)
         began = time.perf_counter()
         inputs = with_learnt_shapes(inputs, crop_fish, stop=stop, observer=observer)
         shapes_s = time.perf_counter() - began
-        nodes = [
-            inputs.crops or crop_fish,
-            *later_nodes(
-                inputs.config,
-                template=inputs.template,
-                candidates=inputs.candidates,
-                calibration=inputs.calibration,
-            ),
-        ]
+        session = Session(inputs, given=[inputs.crops or crop_fish])
         if inputs.is_endless:  # no frame of a camera shall wait for a compiler
             _compile_kernels_for(inputs)
         with open_outputs(inputs, observer) as outputs:
             crop_fish.number_after(outputs.store.before.track_id)
-            continue_tracks(nodes, outputs.interrupted)
+            session.continue_tracks(outputs.interrupted)
             _save_learnt_meshes(inputs)
             _report_start(inputs, outputs, observer)
             observer.begin(inputs.source.num_frames)
             seen = SeenFish()
             summary = _run_chain(
-                inputs, nodes, outputs, seen, observer, shapes_s=shapes_s, stop=stop
+                inputs, session, outputs, seen, observer, shapes_s=shapes_s, stop=stop
             )
         if stop.is_set():
             return summary
@@ -250,7 +241,7 @@ def _compile_kernels_for(inputs: Inputs) -> None:
     fitter = Fitter(
         inputs.template,
         inputs.config.fit_mesh,
-        with_covariance=records_covariance(inputs.config),
+        with_covariance=inputs.has_covariance,
     )
     compile_kernels(fitter)
 
@@ -279,19 +270,9 @@ def _report_start(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> No
         observer.warn(line)
 
 
-def _crop_fish(inputs: Inputs) -> CropFish:
-    camera = None if inputs.calibration is None else inputs.calibration.camera
-    return CropFish(
-        inputs.config.crop_fish,
-        camera=camera,
-        finder=inputs.finder,
-        species_model=inputs.config.species.model,
-    )
-
-
 def _run_chain(
     inputs: Inputs,
-    nodes: Sequence[Node],
+    session: Session,
     outputs: Outputs,
     seen: SeenFish,
     observer: RunObserver,
@@ -301,12 +282,12 @@ def _run_chain(
 ) -> RunSummary:
     began = time.perf_counter()
     outputs.store.count_frames(inputs.source.num_frames)
-    flow = MessageFlow(inputs, nodes, outputs, seen, observer)
+    flow = MessageFlow(inputs, session, outputs, seen, observer)
     try:
         with _noting_the_end(inputs, outputs.store, stop):
             counters = run_chain(
                 inputs.reader,
-                nodes,
+                session.nodes,
                 on_message=flow.take,
                 on_frame=flow.frame_done,
                 on_start=observer.attach,

@@ -21,7 +21,7 @@ from stream_dmr.pipeline.config import (
 from stream_dmr.pipeline.learn_shapes import learnt_from
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.run_options import ReplayRequest
-from stream_dmr.pipeline.session import STAGES, MeasuringSetup
+from stream_dmr.pipeline.session import STAGES, Setup
 from stream_dmr.recording.codec import stored_picture
 from stream_dmr.recording.header import InputFile, RunHeader, RunInputs
 from stream_dmr.recording.reading import Recording, known_shapes, messages_of
@@ -177,7 +177,7 @@ def _complaint(file: InputFile, option: str) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayInputs(MeasuringSetup):
+class ReplayInputs(Setup):
     """What the nodes of a replay are made of."""
 
     files: CropFiles | None  # None where no crop is cut again

@@ -12,10 +12,10 @@ from stream_dmr.errors import OutputError, UserError
 from stream_dmr.evidence.seal import SignedFiles, sealed
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish, Message, Position
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.pipeline.chain import Node, StageCounters, run_chain
+from stream_dmr.pipeline.chain import StageCounters, run_chain
 from stream_dmr.pipeline.comparator import MessageComparator, Mismatch
 from stream_dmr.pipeline.learn_shapes import save_stocks
-from stream_dmr.pipeline.replay_inputs import CropFiles, ReplayInputs, new_header, read_inputs
+from stream_dmr.pipeline.replay_inputs import ReplayInputs, new_header, read_inputs
 from stream_dmr.pipeline.run_folder import prepare_folder
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.run_options import ReplayRequest
@@ -25,9 +25,9 @@ from stream_dmr.pipeline.session import (
     CropFishOfRuns,
     PlaybackNode,
     RecordedMessages,
-    continue_tracks,
-    later_nodes,
-    stages_from,
+    Session,
+    messages_before,
+    messages_from,
 )
 from stream_dmr.recording.frame_images import open_pictures
 from stream_dmr.recording.header import REPRODUCIBLE_BY, RunHeader, RunStart
@@ -270,8 +270,8 @@ def replay(
     recorded = RecordedMessages(recording, request.selection)
     carried_over = _carried_over(request, recorded)
     with ExitStack() as stack:
-        frames, nodes = _open_chain(request, recorded, inputs, recording.header.runs, stack)
-        continue_tracks(nodes, carried_over)
+        frames, session = _open_chain(request, recorded, inputs, recording.header.runs, stack)
+        session.continue_tracks(carried_over)
         outputs = None
         if request.out is not None:
             opening = _open_outputs(request, request.out, recording, inputs, stop, observer)
@@ -279,7 +279,7 @@ def replay(
         comparator = _open_comparator(request, recorded, {fish.track_id for fish in carried_over})
         writer = ReplayWriter(
             recorded,
-            recomputed=stages_from(request.first),
+            recomputed=messages_from(request.first),
             settings=inputs.config.recording,
             outputs=outputs,
             comparator=comparator,
@@ -293,7 +293,7 @@ def replay(
         began = time.perf_counter()
         counters = run_chain(
             frames,
-            nodes,
+            session.nodes,
             on_message=writer.write,
             on_frame=on_frame,
             stop=stop,
@@ -321,7 +321,7 @@ def replay(
 
 def _is_light(request: ReplayRequest) -> bool:
     """True where no stage computes outside of Python for long."""
-    return FittedMesh not in stages_from(request.first)
+    return FittedMesh not in messages_from(request.first)
 
 
 def _open_outputs(
@@ -423,8 +423,8 @@ def _open_comparator(
     if not request.check:
         return None
     # The first fit of a track that was carried over starts from another one than in the run.
-    leave_out = carried_over if FittedMesh in stages_from(request.first) else ()
-    return MessageComparator(recorded, stages_from(request.first), leave_out=leave_out)
+    leave_out = carried_over if FittedMesh in messages_from(request.first) else ()
+    return MessageComparator(recorded, messages_from(request.first), leave_out=leave_out)
 
 
 def _open_chain(
@@ -433,42 +433,29 @@ def _open_chain(
     inputs: ReplayInputs,
     runs: Sequence[RunStart],
     stack: ExitStack,
-) -> tuple[Iterable[Frame], list[Node]]:
+) -> tuple[Iterable[Frame], Session]:
     """The frames and the nodes; playback nodes that only a new recording needs only with `out`."""
-    first, config = [*STAGES].index(request.first), inputs.config
-    computed = later_nodes(
-        config,
-        template=inputs.template,
-        candidates=inputs.candidates,
-        calibration=inputs.calibration,
-    )
-    if inputs.files is None:
-        played = [*STAGES.values()][:first]
-        if request.out is None:
-            played = played[-1:]
+    files, config = inputs.files, inputs.config
+    if files is None:
+        played = messages_before(request.first)[0 if request.out is not None else -1 :]
         playback = [PlaybackNode(recorded, kind) for kind in played]
-        return recorded.of_type(Frame), [*playback, *computed[first - 1 :]]
-    files, restorer = inputs.files, None
+        return recorded.of_type(Frame), Session(inputs, given=playback, first=request.first)
+    restorer = None
     if files.source is not None:
         restorer = stack.enter_context(open_pictures(files.source, config.read_frames))
     frames = recorded.frames_with_images(
         restorer, exact=request.check, missing_source=files.missing_source
     )
-    crop_fish = CropFishOfRuns(partial(_open_crop_fish, inputs, files), runs)
-    return frames, [crop_fish, *computed]
 
+    def open_crop_fish() -> CropFish:
+        return inputs.crop_fish(
+            open_finder(
+                boxes=files.boxes,
+                masks=files.masks,
+                detect=config.detect_fish,
+                track=config.track_fish,
+                pictures=None if files.source is None else Path(files.source),
+            )
+        )
 
-def _open_crop_fish(inputs: ReplayInputs, files: CropFiles) -> CropFish:
-    config = inputs.config
-    return CropFish(
-        config.crop_fish,
-        camera=None if inputs.calibration is None else inputs.calibration.camera,
-        finder=open_finder(
-            boxes=files.boxes,
-            masks=files.masks,
-            detect=config.detect_fish,
-            track=config.track_fish,
-            pictures=None if files.source is None else Path(files.source),
-        ),
-        species_model=config.species.model,
-    )
+    return frames, Session(inputs, given=[CropFishOfRuns(open_crop_fish, runs)])

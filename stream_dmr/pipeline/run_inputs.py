@@ -19,7 +19,7 @@ from stream_dmr.pipeline.config import (
     to_toml,
 )
 from stream_dmr.pipeline.run_options import RunRequest, without_password
-from stream_dmr.pipeline.session import KeptCrops, MeasuringSetup
+from stream_dmr.pipeline.session import KeptCrops, Setup
 from stream_dmr.recording.header import InputFile, RunHeader, RunInputs
 from stream_dmr.sources.open_source import open_positions
 from stream_dmr.sources.positions import PositionSource
@@ -68,7 +68,7 @@ def _nearest(name: str, known: Iterable[str]) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Inputs(MeasuringSetup):
+class Inputs(Setup):
     """A request with its files read and checked, and the open source."""
 
     request: RunRequest

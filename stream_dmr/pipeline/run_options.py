@@ -9,6 +9,9 @@ from typing import Literal
 
 from stream_dmr.recording.selection import EVERYTHING, Selection
 
+Stage = Literal["crop", "fit", "localize", "smooth"]
+"""A stage that a replay may begin with; see `STAGES` of session.py."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunRequest:
@@ -65,7 +68,7 @@ class ReplayRequest:
     """What to replay; None: as it was recorded."""
 
     recordings: Sequence[Path]  # files or folders, in order
-    first: str = "fit"  # the first of STAGES that is recomputed
+    first: Stage = "fit"  # the first that is recomputed
     config: Path | None = None
     calibration: Path | None = None
     template: str | None = None

@@ -1,13 +1,14 @@
 """The nodes of a chain over one setup, fed live, from a recording, or from both."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from tempfile import SpooledTemporaryFile
 from threading import Event
 from typing import IO, TypeVar
 
-from stream_dmr.camera import Calibration
+from stream_dmr.camera import Calibration, Camera
 from stream_dmr.errors import RecordingError
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.shape.stocks import learn_shapes
@@ -19,76 +20,36 @@ from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.nodes.smooth_length import SmoothLength
 from stream_dmr.pipeline.chain import Node, run_chain
 from stream_dmr.pipeline.config import Config
+from stream_dmr.pipeline.run_options import Stage
 from stream_dmr.recording.codec import decode, encode
 from stream_dmr.recording.frame_images import FrameRestorer, RecordedPictures, has_original_pixels
 from stream_dmr.recording.header import RunStart
 from stream_dmr.recording.reading import Recording
-from stream_dmr.recording.record import make_record
+from stream_dmr.recording.record import as_recorded, make_record
 from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.recording.topics import RecordingSettings
 from stream_dmr.template.template import Template
-
-STAGES: dict[str, type[Message]] = {
-    "crop": FishCrop,
-    "fit": FittedMesh,
-    "localize": LocalizedFish,
-    "smooth": LengthEstimate,
-}
-
-
-def stages_from(first: str) -> Sequence[type[Message]]:
-    """The messages of a stage and of those after it."""
-    return [*STAGES.values()][[*STAGES].index(first) :]
-
-
-def later_nodes(
-    config: Config,
-    *,
-    template: Template,
-    calibration: Calibration | None,
-    candidates: CandidateShapes | None = None,
-) -> list[Node]:
-    """The nodes after CropFish: fit, localization, length."""
-    camera = None if calibration is None else calibration.camera
-    frame_size = None if camera is None else (camera.width, camera.height)
-    return [
-        FitMesh(
-            config.fit_mesh,
-            template=template,
-            candidates=candidates,
-            calibration=calibration,
-            with_covariance=records_covariance(config),
-            species=config.species,
-        ),
-        Localize(config.localize, calibration=calibration),
-        SmoothLength(
-            config.smooth_length,
-            zones=config.zones,
-            species=config.species,
-            frame_size=frame_size,
-        ),
-    ]
-
-
-def records_covariance(config: Config) -> bool:
-    """Whether fits carry the covariance of their parameters, which is recorded with vertices."""
-    return config.recording.meshes == "vertices"
-
-
-def continue_tracks(nodes: Sequence[Node], interrupted: Iterable[LocalizedFish]) -> None:
-    """Give a chain's last node the frames of fish that an earlier recording has."""
-    for fish in interrupted:
-        nodes[-1].step(fish)
+from stream_dmr.tracking.finder import FishFinder
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeasuringSetup:
-    """What fish are measured by."""
+class Setup:
+    """Config, template, shapes and calibration: all that determines a length."""
 
     config: Config
     template: Template
-    candidates: CandidateShapes | None  # the shapes that the fish may have; None: the template's
+    candidates: CandidateShapes | None = None  # shapes that the fish may have; None: the template's
     calibration: Calibration | None
+
+    @property
+    def camera(self) -> Camera | None:
+        """The calibrated camera."""
+        return None if self.calibration is None else self.calibration.camera
+
+    @property
+    def has_covariance(self) -> bool:
+        """True if fits carry the covariance of their parameters, recorded with vertices."""
+        return self.config.recording.meshes == "vertices"
 
     def learn(
         self,
@@ -109,6 +70,108 @@ class MeasuringSetup:
             suffices=suffices,
             progress=progress,
         )
+
+    def crop_fish(self, finder: FishFinder) -> CropFish:
+        """A new CropFish. Raises ModelError if a model of the settings cannot be used."""
+        return CropFish(
+            self.config.crop_fish,
+            camera=self.camera,
+            finder=finder,
+            species_model=self.config.species.model,
+        )
+
+
+@dataclass(frozen=True)
+class StageNode:
+    """The message that the node of a stage returns, and how the node is made."""
+
+    message: type[Message]
+    make: Callable[[Setup], Node] | None
+
+
+STAGES: Mapping[Stage, StageNode] = {
+    "crop": StageNode(FishCrop, None),  # it needs a finder of fish too, see `Setup.crop_fish`
+    "fit": StageNode(
+        FittedMesh,
+        lambda setup: FitMesh(
+            setup.config.fit_mesh,
+            template=setup.template,
+            candidates=setup.candidates,
+            calibration=setup.calibration,
+            with_covariance=setup.has_covariance,
+            species=setup.config.species,
+        ),
+    ),
+    "localize": StageNode(
+        LocalizedFish,
+        lambda setup: Localize(setup.config.localize, calibration=setup.calibration),
+    ),
+    "smooth": StageNode(
+        LengthEstimate,
+        lambda setup: SmoothLength(
+            setup.config.smooth_length,
+            zones=setup.config.zones,
+            species=setup.config.species,
+            frame_size=setup.camera and (setup.camera.width, setup.camera.height),
+        ),
+    ),
+}
+
+
+def messages_before(stage: Stage) -> list[type[Message]]:
+    """The messages of the stages before this one."""
+    return [one.message for one in STAGES.values()][: _number(stage)]
+
+
+def messages_from(stage: Stage) -> list[type[Message]]:
+    """The messages of this stage and of those after it."""
+    return [one.message for one in STAGES.values()][_number(stage) :]
+
+
+def _number(stage: Stage) -> int:
+    return [*STAGES].index(stage)
+
+
+class Session:
+    """The nodes of a chain over one setup: given ones, then those of the stages to compute."""
+
+    def __init__(
+        self,
+        setup: Setup,
+        *,
+        given: Sequence[Node] = (),
+        first: Stage = "crop",
+        last: Stage = "smooth",
+    ) -> None:
+        """`given`: a CropFish, the crops of a first pass, or the playback of a recording."""
+        stages = [*STAGES.values()][_number(first) : _number(last) + 1]
+        self.nodes = [*given, *(one.make(setup) for one in stages if one.make is not None)]
+
+    def continue_tracks(self, interrupted: Iterable[LocalizedFish]) -> None:
+        """Give the last node the frames of fish that an earlier recording has."""
+        for fish in interrupted:
+            self.nodes[-1].step(fish)
+
+    def messages(self, inputs: Iterable[Message], settings: RecordingSettings) -> Iterator[Message]:
+        """What all nodes return, each as a recording with these settings gives it to the next.
+
+        Computed in this thread; tracks end with `inputs` alone.
+        """
+        for message in inputs:
+            yield from _through(self.nodes, [message], settings)
+        for stage, node in enumerate(self.nodes, start=1):
+            left = [as_recorded(message, settings) for message in node.close()]
+            yield from left
+            yield from _through(self.nodes[stage:], left, settings)
+
+
+def _through(
+    nodes: Sequence[Node], messages: Sequence[Message], settings: RecordingSettings
+) -> Iterator[Message]:
+    for node in nodes:
+        made = chain.from_iterable(map(node.step, messages))
+        messages = [as_recorded(message, settings) for message in made]
+        yield from messages
 
 
 _IN_MEMORY = 1 << 26  # bytes of crops: some 100,000 masks; more are kept on the disk

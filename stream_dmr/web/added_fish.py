@@ -1,7 +1,7 @@
 """Fish that a reviewer adds, splits and merges; added ones are measured."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,15 +13,14 @@ from stream_dmr.detection.box_files import AnnotatedBox
 from stream_dmr.detection.given_fish import AnnotatedFish
 from stream_dmr.errors import UserError
 from stream_dmr.files import is_locked
-from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
+from stream_dmr.messages import LocalizedFish
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.pipeline.config import Config
-from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.recording.codec import encode
 from stream_dmr.recording.frame_images import FoundFrame, FrameLookup
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.reading import known_shapes
-from stream_dmr.recording.record import as_recorded
 from stream_dmr.store.edits import TrackPart, edited_row, frames_of_parts, frames_of_tracks
 from stream_dmr.store.fish import read_measured_fish
 from stream_dmr.store.verdicts import AddedFrame, Verdict, frames_sha256, next_track_id
@@ -72,57 +71,36 @@ def measure_boxes(
             "verdict: expected pictures to measure the fish in, but neither the recording nor its "
             "source has them; give --source"
         )
-    chain = list(_chain(pictures, boxes, track_id=track_id, header=header, config=config))
-    return MeasuredBoxes(
-        frames=[
-            AddedFrame(
-                track_id=track_id,
-                frame_index=fish.frame_index,
-                crop=encode(crop),
-                fit=encode(fit),
-                fish=encode(fish),
-            )
-            for crop, fit, fish in chain
-        ],
-        fish=[fish for _, _, fish in chain],
-        is_original=all(one.is_original for one in pictures),
-    )
-
-
-def _chain(
-    pictures: Sequence[FoundFrame],
-    boxes: Boxes,
-    *,
-    track_id: int,
-    header: RunHeader,
-    config: Config,
-) -> Iterator[tuple[FishCrop, FittedMesh, LocalizedFish]]:
-    """The messages of the nodes, each as the recording would give it to the next node."""
     annotated = {
         index: [AnnotatedBox(track_id=track_id, bbox_xyxy_px=box, visibility=1.0)]
         for index, box in boxes.items()
     }
-    crop_fish = CropFish(
-        config.crop_fish,
-        camera=None if header.calibration is None else header.calibration.camera,
-        finder=AnnotatedFish(boxes=annotated, masks=None),
-    )
-    fit_mesh, localize, _ = later_nodes(
-        config,
+    setup = Setup(
+        config=config,
         template=header.template,
         candidates=header.candidates,
         calibration=header.calibration,
     )
-    settings = config.recording
-    for one in pictures:
-        for cut in crop_fish.step(one.frame):
-            crop = as_recorded(cut, settings)
-            fit = as_recorded(fit_mesh.step(crop)[0], settings)
-            fish = as_recorded(localize.step(fit)[0], settings)
-            assert isinstance(crop, FishCrop)
-            assert isinstance(fit, FittedMesh)
-            assert isinstance(fish, LocalizedFish)
-            yield crop, fit, fish
+    crop_fish = CropFish(  # without the run's classifier of species: its file may be gone
+        config.crop_fish, camera=setup.camera, finder=AnnotatedFish(boxes=annotated, masks=None)
+    )
+    session = Session(setup, given=[crop_fish], last="localize")
+    messages = session.messages((one.frame for one in pictures), config.recording)
+    frames, fish = list[AddedFrame](), list[LocalizedFish]()
+    for crop, fit, localized in zip(messages, messages, messages, strict=True):  # of each frame
+        assert isinstance(localized, LocalizedFish)
+        fish.append(localized)
+        frames.append(
+            AddedFrame(
+                track_id=track_id,
+                frame_index=localized.frame_index,
+                crop=encode(crop),
+                fit=encode(fit),
+                fish=encode(localized),
+            )
+        )
+    is_original = all(one.is_original for one in pictures)
+    return MeasuredBoxes(frames=frames, fish=fish, is_original=is_original)
 
 
 ADDED = "added by a reviewer"

@@ -11,7 +11,7 @@ from stream_dmr.fitting.shape.space import BREADTH
 from stream_dmr.messages import FishCrop
 from stream_dmr.pipeline.config import Config
 from stream_dmr.pipeline.learn_shapes import Lengths, MeshComparison, compare_with_mesh
-from stream_dmr.pipeline.session import MeasuringSetup
+from stream_dmr.pipeline.session import Setup
 from stream_dmr.template.template_file import load_template
 
 MESH = mesh_form(load_template("cod"))
@@ -19,7 +19,7 @@ STD = 0.03  # of every length
 
 
 @dataclass(frozen=True, kw_only=True)
-class Learnt(MeasuringSetup):
+class Learnt(Setup):
     """A setup that learns what a test says: at first, then by a new search for poses."""
 
     stages: tuple[CandidateShapes, CandidateShapes]
@@ -55,7 +55,7 @@ def compare(monkeypatch: pytest.MonkeyPatch) -> Callable[..., MeshComparison]:
         longer = {id(shapes[0]): stages[0][1], id(shapes[1]): stages[-1][1]}
 
         def lengths(
-            crops: list[FishCrop], setup: MeasuringSetup, candidates: CandidateShapes | None
+            crops: list[FishCrop], setup: Setup, candidates: CandidateShapes | None
         ) -> Lengths:
             assert candidates not in measured_by  # no shape is measured by twice
             measured_by.append(candidates)

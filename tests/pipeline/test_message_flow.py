@@ -4,14 +4,13 @@ import threading
 from pathlib import Path
 
 from stream_dmr.messages import FishCrop, Message
-from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.pipeline.chain import run_chain
 from stream_dmr.pipeline.learn_shapes import SeenFish
 from stream_dmr.pipeline.measure_source import MessageFlow
 from stream_dmr.pipeline.run_inputs import checked_inputs
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.run_outputs import open_outputs
-from stream_dmr.pipeline.session import later_nodes
+from stream_dmr.pipeline.session import Session
 from tests.support.fish_run import FISH, request
 from tests.support.tiny_clip import write_clip
 
@@ -31,22 +30,10 @@ def test_everyone_takes_what_the_next_stage_gets(tmp_path: Path):
     """A crop without its picture, as the recording has it: a replay reads the same."""
     write_clip(tmp_path / "clip", fish=FISH)
     inputs = checked_inputs(request(tmp_path / "clip", tmp_path / "out"))
-    assert inputs.calibration is not None
     observer, passed_on = Keeping(), list[Message]()
-    crop_fish = CropFish(
-        inputs.config.crop_fish, camera=inputs.calibration.camera, finder=inputs.finder
-    )
-    nodes = [
-        crop_fish,
-        *later_nodes(
-            inputs.config,
-            template=inputs.template,
-            candidates=inputs.candidates,
-            calibration=inputs.calibration,
-        ),
-    ]
+    session = Session(inputs, given=[inputs.crop_fish(inputs.finder)])
     with open_outputs(inputs, observer) as outputs:
-        flow = MessageFlow(inputs, nodes, outputs, SeenFish(), observer)
+        flow = MessageFlow(inputs, session, outputs, SeenFish(), observer)
 
         def on_message(message: Message) -> Message:
             passed_on.append(taken := flow.take(message))
@@ -54,7 +41,7 @@ def test_everyone_takes_what_the_next_stage_gets(tmp_path: Path):
 
         run_chain(
             inputs.reader,
-            nodes,
+            session.nodes,
             on_message=on_message,
             on_frame=flow.frame_done,
             stop=threading.Event(),

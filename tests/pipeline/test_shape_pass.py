@@ -23,7 +23,7 @@ from stream_dmr.pipeline.replay_recording import ReplayRequest, replay
 from stream_dmr.pipeline.run_inputs import Inputs, checked_inputs
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.run_options import RunRequest
-from stream_dmr.pipeline.session import MeasuringSetup
+from stream_dmr.pipeline.session import Setup
 from stream_dmr.store.open_results import LEARNT, learnt_files
 from stream_dmr.template.template_file import load_template
 from tests.support.command import rows
@@ -295,11 +295,11 @@ def test_a_stop_while_fish_are_looked_for_leaves_an_empty_valid_result(clip: Pat
 def test_a_shape_that_no_fish_has_is_not_believed(monkeypatch: pytest.MonkeyPatch):
     template, forms = load_shapes(AUTO)
     assert forms is not None
-    setup = MeasuringSetup(config=Config(), template=template, candidates=forms, calibration=None)
+    setup = Setup(config=Config(), template=template, candidates=forms, calibration=None)
     needle = next(iter(forms))
     far = needle._replace(coefficients=needle.coefficients - 5.0, share=1.0)
     stocks = CandidateShapes.of([far], are_learnt=True)
-    monkeypatch.setattr(MeasuringSetup, "learn", lambda *_, **__: stocks)
+    monkeypatch.setattr(Setup, "learn", lambda *_, **__: stocks)
     observer = Listener()
     assert learnt_from([], setup, observer).candidates is forms
     assert len(observer.warnings) == 1
