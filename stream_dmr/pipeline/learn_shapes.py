@@ -183,7 +183,7 @@ def with_learnt_shapes(
     inputs = replace(inputs, reader=reader, crops=crops)
     if stop.is_set():
         return inputs
-    return replace(inputs, candidates=_learn_aloud(crops, inputs, forms, observer))
+    return replace(inputs, candidates=_learn_and_report(crops, inputs, forms, observer))
 
 
 def learnt_from(crops: Iterable[FishCrop], setup: S, observer: RunObserver) -> S:
@@ -195,19 +195,16 @@ def learnt_from(crops: Iterable[FishCrop], setup: S, observer: RunObserver) -> S
     seen_whole = [*itertools.chain.from_iterable(good_crops(crops))]
     forms = setup.candidates
     if forms is None:
-        if is_mesh_theirs(seen_whole, setup, observer):
+        if mesh_fits_fish(seen_whole, setup, observer):
             return setup
         template, forms = load_shapes(AUTO)
         assert forms is not None
         setup = replace(setup, template=template)
-    return replace(setup, candidates=_learn_aloud(seen_whole, setup, forms, observer))
+    return replace(setup, candidates=_learn_and_report(seen_whole, setup, forms, observer))
 
 
-def is_mesh_theirs(crops: Sequence[FishCrop], setup: Setup, observer: RunObserver) -> bool:
-    """Whether the fish of these good crops are like a mesh that was given for them.
-
-    True where there are none. The observer is told.
-    """
+def mesh_fits_fish(crops: Sequence[FishCrop], setup: Setup, observer: RunObserver) -> bool:
+    """True if the mesh fits the fish of these good crops, or there are none. Reports the result."""
     name = setup.template.name
     if not crops:
         observer.warn(f"no fish was seen whole: whether they are like {name} is not known")
@@ -225,16 +222,13 @@ def is_mesh_theirs(crops: Sequence[FishCrop], setup: Setup, observer: RunObserve
     return False
 
 
-def _learn_aloud(
+def _learn_and_report(
     crops: Iterable[FishCrop],
     setup: Setup,
     forms: CandidateShapes,
     observer: RunObserver,
 ) -> CandidateShapes:
-    """The stocks of all fish; forms where no fish is seen whole, or stocks can't be of fish.
-
-    The observer is told.
-    """
+    """The stocks of all fish; forms if no fish is seen whole, or stocks can't be of fish."""
     stocks = setup.learn(
         crops, forms, progress=lambda step: observer.stage(f"learning their shapes: {step}")
     )

@@ -19,7 +19,7 @@ from stream_dmr.pipeline.drift import DriftAlarms
 from stream_dmr.pipeline.learn_shapes import (
     SeenFish,
     follow_shapes,
-    is_mesh_theirs,
+    mesh_fits_fish,
     save_stocks,
     with_learnt_shapes,
 )
@@ -183,18 +183,17 @@ def measure_source(
     observer = observer or RunObserver()
     # The stages run side by side, so that OpenCV's own threads only add a sixth to the work.
     cv2.setNumThreads(1)
-    summary = _measure(request, stop=stop, observer=observer)
-    if summary is None:
+    summary, mesh_fits = _measure(request, stop=stop, observer=observer)
+    if not mesh_fits:
         auto = replace(request, template=AUTO, overwrite=True)
-        summary = _measure(auto, stop=stop, observer=observer)
-    assert summary is not None
+        summary, _ = _measure(auto, stop=stop, observer=observer)
     return summary
 
 
 def _measure(
     request: RunRequest, *, stop: threading.Event, observer: RunObserver
-) -> RunSummary | None:
-    """Measure the fish of a source; None where the mesh that was given is not theirs."""
+) -> tuple[RunSummary, bool]:
+    """Measure the fish of a source; False if a mesh was given that does not fit them."""
     inputs = checked_inputs(request)
     unused: list[str] = []
     try:
@@ -217,24 +216,18 @@ def _measure(
                 inputs, session, outputs, seen, observer, shapes_s=shapes_s, stop=stop
             )
         if stop.is_set():
-            return summary
+            return summary, True
         unused = inputs.finder.unused  # only now is it known what the source has no frames for
         began = time.perf_counter()
-        if not _has_the_right_mesh(inputs, seen, observer):
-            return None
-        return replace(summary, shapes_s=shapes_s + time.perf_counter() - began)
+        is_given = inputs.candidates is None and inputs.config.fit_mesh.are_shapes_learnt
+        mesh_fits = not is_given or mesh_fits_fish(seen.crops(), inputs, observer)
+        return replace(summary, shapes_s=shapes_s + time.perf_counter() - began), mesh_fits
     finally:
         inputs.reader.close()
         if inputs.positions is not None:
             inputs.positions.close()
         for line in (*inputs.source.warnings, *inputs.finder.warnings, *unused):
             observer.warn(line)
-
-
-def _has_the_right_mesh(inputs: Inputs, seen: SeenFish, observer: RunObserver) -> bool:
-    """False where a mesh was given that is not that of the fish."""
-    is_given = inputs.candidates is None and inputs.config.fit_mesh.are_shapes_learnt
-    return not is_given or is_mesh_theirs(seen.crops(), inputs, observer)
 
 
 def _compile_kernels_for(inputs: Inputs) -> None:
