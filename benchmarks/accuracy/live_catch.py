@@ -48,7 +48,7 @@ from stream_dmr.tracking.finder import open_finder
 
 FIRST_SEED = 9400
 SPECIES_PER_CATCH = 3
-LEARNT_AT = (3, 6, 12)  # fish that have left; as `live_shapes.py` does
+LEARNT_AT = (3, 6, 12)  # fish that have left; as `ShapeLearner` does
 _TIMEOUT_S = 0.25  # fish follow each other in fractions of a second here, hardly ever unseen
 
 

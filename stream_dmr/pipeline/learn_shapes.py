@@ -1,20 +1,14 @@
 """Learn the shapes of fish: before a run, during it, and against a given mesh.
 
-Compares a mesh that was given for fish with the fish themselves.
+With `--template auto` a first pass over a source that has an end learns the shapes of all its fish
+before any of them is measured. The shapes of a camera's fish are learnt while they are measured,
+for those that come after: a length once given stays as it is, with the interval that was honest
+then; `replay --template auto` ashore measures all fish anew by what all of them show.
 
-Their shape is learnt beginning at the mesh. Where that stays near it, some of the fish are measured
-by both: a mesh of the right breadth may still be broader or slimmer enough at head and tail to make
-them longer or shorter.
-
-A first pass over a source, for the shapes of its fish, before any of them is measured.
-
-For `--template auto`, and only for sources with an end: the last fish are learnt from before the
-first one is measured. A mesh that was given is compared with the fish once they are measured.
-
-Learns the shapes of a camera's fish while they are measured, for those that come after.
-
-A length once given stays as it is, with the interval that was honest then; `replay --template auto`
-ashore measures all fish anew by what all of them show.
+A mesh that was given is compared with the fish once they are measured. Their shape is learnt
+beginning at the mesh. If it stays near the mesh, some of the fish are measured by both: a mesh of
+the right breadth may still be broader or slimmer enough at head and tail to make them longer or
+shorter.
 """
 
 import itertools
@@ -55,7 +49,6 @@ from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.pipeline.run_folder import require_folder
 from stream_dmr.pipeline.run_inputs import Inputs
 from stream_dmr.pipeline.run_observer import RunObserver
-from stream_dmr.pipeline.run_outputs import Outputs
 from stream_dmr.pipeline.session import Session, Setup, keep_crops
 from stream_dmr.store.open_results import (
     LEARNT,
@@ -319,30 +312,40 @@ class SeenFish:
 _FIRST, _AFTER_RESTART = 3, 48
 _NICENESS = 10  # frames come first
 
-Learn = Callable[[Sequence[FishCrop], Callable[[str], None]], CandidateShapes | None]
-"""Crops, and what is called at each step of the work, which may raise -> the stocks, if any."""
 
+class ShapeLearner:
+    """Learns from the fish that a camera saw, in a thread of its own, for those that come after.
 
-class LiveShapes:
-    """Learns from the fish that were seen, in a thread of its own."""
+    Used where no first pass has looked at the fish: the source has no end.
+    """
 
     def __init__(
         self,
+        inputs: Inputs,
+        session: Session,
         seen: SeenFish,
-        learn: Learn,
-        on_learnt: Callable[[LearntShapes], object],
         *,
-        knows_shapes: bool,
+        learnt: Sequence[LearntShapes],
+        write: Callable[[LearntShapes], object],
+        observer: RunObserver,
     ) -> None:
-        """`on_learnt` gets what fish may be that are first seen in the frame at hand, or later.
+        """`learnt` by earlier runs: FitMesh knows it at once. `write` records what this one learns.
 
-        `knows_shapes`: an earlier run has learnt some.
+        `inputs` have candidates.
         """
-        self._seen, self._learn, self._on_learnt = seen, learn, on_learnt
+        assert inputs.candidates is not None
+        self._inputs, self._seen, self._write, self._observer = inputs, seen, write, observer
+        self._given = self._known = inputs.candidates
+        [self._fit_mesh] = [node for node in session.nodes if isinstance(node, FitMesh)]
+        for one in learnt:
+            self._known = self._known.extended(one)
+        self._fit_mesh.learn(self._known)
+        self._compared: MeshComparison | None = None  # the last one with a given mesh
         self._stop = threading.Event()
-        self._next_at = _AFTER_RESTART if knows_shapes else _FIRST
+        self._next_at = _AFTER_RESTART if learnt else _FIRST
         self._worker = ThreadPoolExecutor(1, "shapes", initializer=_be_nice)
-        self._work: Future[tuple[CandidateShapes | None, int]] | None = None
+        self._work: Future[CandidateShapes | None] | None = None
+        self._num_fish = 0  # that this work learns from
 
     def take(self, frame: Frame) -> None:
         """Learn if there are fish enough, and pass on what was learnt by this frame."""
@@ -350,88 +353,60 @@ class LiveShapes:
             num_fish = self._seen.num
             if num_fish >= self._next_at:
                 self._next_at = 2 * num_fish
-                self._work = self._worker.submit(self._learn_from, self._seen.crops(), num_fish)
+                self._num_fish = min(num_fish, MAX_FISH)
+                self._work = self._worker.submit(self.learn, self._seen.crops())
         elif self._work.done():
             work, self._work = self._work, None
-            stocks, num_fish = work.result()
+            stocks = work.result()
             if stocks is not None:
-                self._on_learnt(_message(stocks, num_fish, frame))
+                self.pass_on(_message(stocks, self._num_fish, frame))
 
     def close(self) -> None:
         """End the work, whose result is lost. Idempotent."""
         self._stop.set()
         self._worker.shutdown()
 
-    def _learn_from(
-        self, crops: Sequence[FishCrop], num_fish: int
-    ) -> tuple[CandidateShapes | None, int]:
-        return self._learn(crops, self._go_on), min(num_fish, MAX_FISH)
+    def learn(self, crops: Sequence[FishCrop]) -> CandidateShapes | None:
+        """The stocks of these fish; None if there are none, or a given mesh fits the fish."""
+        if self._given.is_given_mesh:
+            found = compare_with_mesh(crops, self._inputs, progress=self.raise_if_stopped)
+            self._compared = found
+            if found.stocks is None:
+                self._observer.warn(found.not_like_mesh)
+            return None if found.is_like_mesh else found.stocks
+        stocks = self._inputs.learn(crops, self._given, progress=self.raise_if_stopped)
+        if stocks is None:
+            return None
+        believed = believable(self._given, stocks)
+        for doubt in believed.doubts:
+            self._observer.warn(doubt)
+        return believed.shapes.stocks()
 
-    def _go_on(self, step: str) -> None:
+    def raise_if_stopped(self, step: str) -> None:
+        """End the work at this step if the run has ended. Raises InterruptedError."""
         if self._stop.is_set():
             raise InterruptedError("the run has ended")
 
-
-def follow_shapes(
-    inputs: Inputs,
-    outputs: Outputs,
-    session: Session,
-    seen: SeenFish,
-    *,
-    write: Callable[[LearntShapes], object],
-    observer: RunObserver,
-) -> LiveShapes | None:
-    """Let FitMesh know what earlier runs have learnt, and what this one learns.
-
-    None where there is nothing to learn: the settings say so, or the source has an end, whose fish
-    were looked at before (`with_learnt_shapes`).
-    """
-    given = inputs.candidates
-    if given is None or not inputs.is_endless or not inputs.config.fit_mesh.are_shapes_learnt:
-        return None
-    [fit_mesh] = [node for node in session.nodes if isinstance(node, FitMesh)]
-    known, compared = given, None
-    for learnt in outputs.learnt:
-        known = known.extended(learnt)
-    fit_mesh.learn(known)
-
-    def learn(crops: Sequence[FishCrop], progress: Callable[[str], None]) -> CandidateShapes | None:
-        nonlocal compared
-        if not given.is_given_mesh:
-            stocks = inputs.learn(crops, given, progress=progress)
-            if stocks is None:
-                return None
-            believed = believable(given, stocks)
-            for doubt in believed.doubts:
-                observer.warn(doubt)
-            return believed.shapes.stocks()
-        compared = compare_with_mesh(crops, inputs, progress=progress)
-        if compared.stocks is None:
-            observer.warn(compared.not_like_mesh)
-        return None if compared.is_like_mesh else compared.stocks
-
-    def on_learnt(learnt: LearntShapes) -> None:
-        nonlocal known
-        more = known.extended(learnt)
+    def pass_on(self, learnt: LearntShapes) -> None:
+        """Let the fish of this frame and of later ones have what was learnt."""
+        more = self._known.extended(learnt)
         stocks = more.stocks()
         assert stocks is not None
-        known = more
-        write(learnt)
-        fit_mesh.learn(known)
-        if compared is not None:
-            observer.warn(
-                f"{compared.not_like_mesh}; fish to come may have the shape learnt from "
+        self._known = more
+        self._write(learnt)
+        self._fit_mesh.learn(more)
+        if self._compared is not None:
+            self._observer.warn(
+                f"{self._compared.not_like_mesh}; fish to come may have the shape learnt from "
                 "these; measure those so far anew: stream-dmr replay --from fit --template auto"
             )
         else:
-            for line in describe(given, stocks):
-                observer.notice(f"learnt from the fish so far: {line}")
+            for line in describe(self._given, stocks):
+                self._observer.notice(f"learnt from the fish so far: {line}")
         try:
-            _save_meshes(inputs, stocks)
+            _save_meshes(self._inputs, stocks)
         except OutputError as error:
-            observer.warn(str(error))
-
-    return LiveShapes(seen, learn, on_learnt, knows_shapes=bool(outputs.learnt))
+            self._observer.warn(str(error))
 
 
 def _save_meshes(inputs: Inputs, stocks: CandidateShapes) -> None:

@@ -18,7 +18,7 @@ from stream_dmr.pipeline.chain import ErrorPolicy, StageCounters, run_chain
 from stream_dmr.pipeline.drift import DriftAlarms
 from stream_dmr.pipeline.learn_shapes import (
     SeenFish,
-    follow_shapes,
+    ShapeLearner,
     mesh_fits_fish,
     save_stocks,
     with_learnt_shapes,
@@ -88,9 +88,17 @@ class MessageFlow:
         self._writer = _result_writer(inputs, outputs, on_notice=observer.warn)
         _begin_positions(inputs, outputs, observer)
         self._positions = PositionFeed(inputs.positions, self._take_position)
-        self._shapes = follow_shapes(
-            inputs, outputs, session, seen, write=self._writer.write, observer=observer
-        )
+        self._shapes = None
+        are_learnt = inputs.is_endless and inputs.config.fit_mesh.are_shapes_learnt
+        if are_learnt and inputs.candidates is not None:
+            self._shapes = ShapeLearner(
+                inputs,
+                session,
+                seen,
+                learnt=outputs.learnt,
+                write=self._writer.write,
+                observer=observer,
+            )
 
     def take(self, message: Message) -> Message:
         """Take any message of the chain; return what the next stage gets."""
@@ -204,7 +212,10 @@ def _measure(
         shapes_s = time.perf_counter() - began
         session = Session(inputs, given=[inputs.crops or crop_fish])
         if inputs.is_endless:  # no frame of a camera shall wait for a compiler
-            _compile_kernels_for(inputs)
+            settings = inputs.config.fit_mesh
+            compile_kernels(
+                Fitter(inputs.template, settings, with_covariance=inputs.has_covariance)
+            )
         with open_outputs(inputs, observer) as outputs:
             crop_fish.number_after(outputs.store.before.track_id)
             session.continue_tracks(outputs.interrupted)
@@ -228,15 +239,6 @@ def _measure(
             inputs.positions.close()
         for line in (*inputs.source.warnings, *inputs.finder.warnings, *unused):
             observer.warn(line)
-
-
-def _compile_kernels_for(inputs: Inputs) -> None:
-    fitter = Fitter(
-        inputs.template,
-        inputs.config.fit_mesh,
-        with_covariance=inputs.has_covariance,
-    )
-    compile_kernels(fitter)
 
 
 def _save_learnt_meshes(inputs: Inputs) -> None:

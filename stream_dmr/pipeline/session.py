@@ -25,7 +25,7 @@ from stream_dmr.recording.codec import decode, encode
 from stream_dmr.recording.frame_images import FrameRestorer, RecordedPictures, has_original_pixels
 from stream_dmr.recording.header import RunStart
 from stream_dmr.recording.reading import Recording
-from stream_dmr.recording.record import as_recorded, make_record
+from stream_dmr.recording.record import as_recorded
 from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.recording.topics import RecordingSettings
 from stream_dmr.template.template import Template
@@ -228,7 +228,7 @@ def keep_crops(
     kept = KeptCrops()
 
     def take(message: Message) -> Message:
-        message = make_record(message, settings).message  # from decoded pixels, as in the run
+        message = as_recorded(message, settings)  # from decoded pixels, as in the run
         if isinstance(message, FishCrop):
             kept.keep(message)
         return message

@@ -2,7 +2,7 @@
 
 import shutil
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
@@ -16,11 +16,12 @@ from hypothesis import strategies as st
 from stream_dmr.camera import Camera
 from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
 from stream_dmr.messages import FishCrop, FittedMesh, LearntShapes
-from stream_dmr.pipeline.learn_shapes import LiveShapes, SeenFish
+from stream_dmr.pipeline.learn_shapes import SeenFish, ShapeLearner
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.replay_recording import ReplayRequest, replay
-from stream_dmr.pipeline.run_inputs import Inputs
+from stream_dmr.pipeline.run_inputs import Inputs, checked_inputs
 from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.pipeline.session import Session
 from stream_dmr.recording.codec import decode, encode
 from stream_dmr.recording.reading import (
     decoded_messages,
@@ -203,43 +204,71 @@ def crop(track_id: int) -> FishCrop:
     return replace(crop_of(draw_mask(1, [1]) > 0, CAMERA), track_id=track_id)
 
 
-def see(seen: SeenFish, live: LiveShapes, track_id: int) -> None:
-    seen.take(crop(track_id))
-    seen.take(finished(track_id))
-    for _ in range(2):
-        live.take(frame_of(np.zeros((4, 4, 3), np.uint8), track_id))
+class Learner(ShapeLearner):
+    """Learns as a test says, and keeps what it would pass on."""
+
+    def __init__(self, inputs: Inputs, learn: Callable[..., CandidateShapes | None]) -> None:
+        self.seen, self.passed_on, self.learn_by = SeenFish(), list[LearntShapes](), learn
+        super().__init__(
+            inputs,
+            Session(inputs),
+            self.seen,
+            learnt=[],
+            write=self.passed_on.append,
+            observer=RunObserver(),
+        )
+
+    def learn(self, crops: Sequence[FishCrop]) -> CandidateShapes | None:
+        return self.learn_by(crops, self.raise_if_stopped)
+
+    def pass_on(self, learnt: LearntShapes) -> None:
+        self.passed_on.append(learnt)
+
+    def see(self, track_id: int) -> None:
+        self.seen.take(crop(track_id))
+        self.seen.take(finished(track_id))
+        for _ in range(2):
+            self.take(frame_of(np.zeros((4, 4, 3), np.uint8), track_id))
 
 
-def test_shapes_are_learnt_after_three_fish_and_twice_as_many():
+@pytest.fixture
+def inputs(runs: list[Path], tmp_path: Path) -> Iterator[Inputs]:
+    found = checked_inputs(request(runs[0].parent / "clip", tmp_path, template="auto"))
+    yield found
+    found.reader.close()
+
+
+def test_shapes_are_learnt_after_three_fish_and_twice_as_many(
+    inputs: Inputs, monkeypatch: pytest.MonkeyPatch
+):
     assert FORMS is not None
-    seen, learnt_from, passed_on = SeenFish(), list[int](), list[LearntShapes]()
+    learnt_from = list[int]()
 
     def learn(crops: Sequence[FishCrop], progress: Callable[[str], None]) -> CandidateShapes:
         learnt_from.append(len({crop.track_id for crop in crops}))
         return replace(FORMS, are_learnt=True)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("stream_dmr.pipeline.learn_shapes.ThreadPoolExecutor", Immediate)
-        live = LiveShapes(seen, learn, passed_on.append, knows_shapes=False)
+    monkeypatch.setattr("stream_dmr.pipeline.learn_shapes.ThreadPoolExecutor", Immediate)
+    learner = Learner(inputs, learn)
     for track_id in range(1, 14):
-        see(seen, live, track_id)
-    live.close()
+        learner.see(track_id)
+    learner.close()
     assert learnt_from == [3, 6, 12]
-    assert [one.timestamp_ns for one in passed_on] == [3, 6, 12]
-    assert passed_on[0].shares.sum() == pytest.approx(3 / 4)
+    assert [one.timestamp_ns for one in learner.passed_on] == [3, 6, 12]
+    assert learner.passed_on[0].shares.sum() == pytest.approx(3 / 4)
 
 
-def test_the_end_of_a_run_ends_the_work():
-    seen, began = SeenFish(), threading.Event()
+def test_the_end_of_a_run_ends_the_work(inputs: Inputs):
+    began = threading.Event()
 
     def learn(crops: Sequence[FishCrop], progress: Callable[[str], None]) -> None:
         while True:
             progress("another fish")
             began.set()
 
-    live = LiveShapes(seen, learn, lambda learnt: None, knows_shapes=False)
+    learner = Learner(inputs, learn)
     for track_id in (1, 2, 3):
-        see(seen, live, track_id)
+        learner.see(track_id)
     assert began.wait(10)
-    live.close()
+    learner.close()
     assert not any(thread.name.startswith("shapes") for thread in threading.enumerate())
