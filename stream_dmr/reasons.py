@@ -68,7 +68,8 @@ class Reason(StrEnum):
     KEYPOINTS_COINCIDE = (
         "keypoints coincide",
         _PLACE,
-        "head, center and tail of the fit lie in one place",
+        "head, center and tail of the fit lie in one place, or nearer together than fish "
+        "are broad: the mask's area is above the square of their distance",
         "look at the mask",
     )
     SEEN_END_ON = (

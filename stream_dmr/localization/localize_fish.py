@@ -13,7 +13,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from stream_dmr.camera import Calibration, ReferencePlane
-from stream_dmr.geometry import arc_lengths, bending_ratio
+from stream_dmr.geometry import arc_length, arc_lengths, bending_ratio
 from stream_dmr.messages import CropQuality, FittedMesh, FittedShape, LocalizedFish
 from stream_dmr.reasons import Reason
 from stream_dmr.settings import Settings
@@ -332,6 +332,8 @@ def localize(
         is_bent = location.bending_ratio > settings.max_bending_ratio
         if is_bent or location.bow_ratio > settings.max_bow_ratio:
             reason = reason or Reason.BENT_TOO_FAR
+        if mesh.quality.mask_area_px > arc_length(mesh.shape.keypoints_px) ** 2:
+            reason = reason or Reason.KEYPOINTS_COINCIDE
         return _message(mesh, reason, location)
     except Unlocatable as problem:
         return _message(mesh, reason or problem.reason)

@@ -112,7 +112,7 @@ class MaskedCrop:
     is_cut: bool  # the mask reaches the crop's edge, so the fish may go on in the frame
     confidence: float | None  # see `mask_confidence`; None for a given mask
     ends: FishEnds | None
-    unknown: Bool[np.ndarray, "S S"] | None = None  # hidden by something in front
+    unknown: Bool[np.ndarray, "S S"] | None = None  # hidden by something in front, or no fish
     pixel_px: float = 1.0  # frame pixels along a pixel of the mask that `extent` is of
     length_doubt: float | None = None  # see `CropQuality`
 
@@ -207,6 +207,10 @@ def _segment(
     areas = _pixel_areas(x, y)
     min_area_px = math.ceil(view.settings.min_mask_area_px / float(areas.mean()))
     mask = clean_mask(probability > 0.5, min_area_px=min_area_px)
+    ends = looks[-1].ends
+    unknown = None if ends is None else beyond_head(mask, ends)
+    if unknown is not None:
+        mask = clean_mask(mask & ~unknown, min_area_px=min_area_px)
     return MaskedCrop(
         image=resize(pictures[-1], crop_camera.width),
         crop_camera=crop_camera,
@@ -215,9 +219,41 @@ def _segment(
         extent=_extent(x[mask], y[mask]),
         is_cut=bool(mask[[0, -1]].any() or mask[:, [0, -1]].any()),
         confidence=mask_confidence(probability, mask),
-        ends=looks[-1].ends,
+        ends=ends,
+        unknown=unknown,
         pixel_px=math.sqrt(float(areas.mean())),
     )
+
+
+# A snout is where the network sees it, to 1 % of the length; a mask may go on beyond it along a
+# line, a shadow or the seam of a table. Chosen on photographs that the network never saw.
+_SURE_HEAD = 0.9  # least confidence of which end is the head
+_HEAD_REACH = 0.3  # of the length: how far around the snout it is looked for
+_LEAST_BEYOND, _KEPT_BEYOND = 0.05, 0.02  # of the length: where it counts, and what is left
+
+
+def beyond_head(mask: Bool[np.ndarray, "S S"], ends: FishEnds) -> Bool[np.ndarray, "S S"] | None:
+    """Where a mask goes on beyond the snout: what it holds there is unknown. None if it doesn't.
+
+    Outwards is from the middle of the mask around the snout to the snout.
+    """
+    length_px = float(np.linalg.norm(ends.head_px - ends.tail_px))
+    if ends.confidence < _SURE_HEAD or length_px == 0:
+        return None
+    rows, columns = np.nonzero(mask)
+    offset = np.column_stack([columns, rows]) - ends.head_px
+    near = np.linalg.norm(offset, axis=1) < _HEAD_REACH * length_px
+    behind = near & (offset @ (ends.tail_px - ends.head_px) > 0)
+    if not behind.any():
+        return None
+    outwards = -offset[behind].mean(axis=0)
+    beyond = offset @ outwards / np.linalg.norm(outwards)
+    if not (beyond[near] > _LEAST_BEYOND * length_px).any():
+        return None
+    is_beyond = near & (beyond > _KEPT_BEYOND * length_px)
+    unknown = np.zeros_like(mask)
+    unknown[rows[is_beyond], columns[is_beyond]] = True
+    return unknown
 
 
 def _looks(

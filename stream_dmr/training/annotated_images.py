@@ -1,10 +1,10 @@
-"""Training examples from a user's own pictures and masks."""
+"""Training examples from a user's own pictures, masks, and marks of head and tail."""
 
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ from stream_dmr.errors import AnnotationError
 from stream_dmr.networks.unet_interface import box_coverage
 from stream_dmr.pictures import MAX_PIXELS, PICTURE_SUFFIXES, size_if_huge
 from stream_dmr.training.image_degradation import add_weather, simulate_camera
-from stream_dmr.training.random_fish import PATCH_PX, RIM_PX
+from stream_dmr.training.random_fish import PATCH_PX, RIM_PX, FishPatch
 from stream_dmr.training.samples import TrainingSample, crop_affine, draw_part_box, jitter_box
 from stream_dmr.training.surroundings import BACKGROUND_PX
 from stream_dmr.training.training_scene import FADED_SHARE, draw_fade
@@ -27,13 +27,15 @@ class AnnotatedImage:
     path: Path
     image: UInt8[np.ndarray, "H W 3"]  # BGR
     masks: list[Bool[np.ndarray, "H W"]]
+    ends_px: list[Float[np.ndarray, "2 2"]]  # head and tail (x, y) of each fish; NaN: not marked
 
 
 def read_annotated_images(images: Path, masks: Path) -> Iterator[AnnotatedImage]:
     """The annotated images, ordered by name.
 
     `masks` is a folder with STEM.png for each image, whose pixel values are fish ids and 0 is
-    background, or a COCO file. Beside ids the largest value of the type is unknown, as in a run.
+    background, or a COCO file, whose keypoints are head and tail. Beside ids the largest value of
+    the type is unknown, as in a run.
     Raises AnnotationError where images and masks do not match.
     """
     paths = list_images(images)
@@ -76,7 +78,8 @@ def _read_folder(paths: dict[str, Path], masks: Path) -> Iterator[AnnotatedImage
         _check_size(mask, labels.shape, image)
         labels = _ids(labels) if have_ids else labels
         ids = np.unique(labels[labels > 0]).tolist()
-        yield AnnotatedImage(path=path, image=image, masks=[labels == one for one in ids])
+        masks_of_it, unmarked = [labels == one for one in ids], [_ends({})] * len(ids)
+        yield AnnotatedImage(path=path, image=image, masks=masks_of_it, ends_px=unmarked)
 
 
 def _read_labels(mask: Path) -> Integer[np.ndarray, "H W"]:
@@ -104,7 +107,17 @@ def _read_coco(paths: dict[str, Path], file: Path) -> Iterator[AnnotatedImage]:
             raise AnnotationError(f"{file}: expected {name} among the images, found it not there")
         image = read_image(paths[name])
         masks = [_decode(one, file, image.shape[:2]) for one in found]
-        yield AnnotatedImage(path=paths[name], image=image, masks=masks)
+        ends = [_ends(one) for one in found]
+        yield AnnotatedImage(path=paths[name], image=image, masks=masks, ends_px=ends)
+
+
+def _ends(annotation: dict[str, Any]) -> Float[np.ndarray, "2 2"]:
+    """Head and tail of COCO's keypoints x, y, v, where v = 0 is "not marked"."""
+    try:
+        found = np.array(annotation["keypoints"], np.float64).reshape(2, 3)
+    except (KeyError, TypeError, ValueError):
+        return np.full((2, 2), np.nan)
+    return np.where(found[:, 2:] > 0, found[:, :2] - 0.5, np.nan)
 
 
 def _parse_coco(file: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
@@ -206,7 +219,11 @@ _PART_SHARE = 0.055  # of the crops, whose box is around a part of the fish
 _VALIDATION_EVERY = 5  # images, of which one is kept for validation
 
 
-Cutout = UInt8[np.ndarray, "C C 4"]  # one fish with its surroundings: BGR, and mask (0 or 255)
+class Cutout(NamedTuple):
+    """One fish with its surroundings."""
+
+    pixels: UInt8[np.ndarray, "C C 4"]  # BGR, and mask (0 or 255)
+    ends_px: Float[np.ndarray, "2 2"]  # head and tail (x, y); NaN: unknown
 
 
 def load_fish_cutouts(images: Path, masks: Path) -> tuple[list[Cutout], list[Cutout]]:
@@ -218,8 +235,8 @@ def load_fish_cutouts(images: Path, masks: Path) -> tuple[list[Cutout], list[Cut
     validation: list[Cutout] = []
     for index, annotated in enumerate(read_annotated_images(images, masks)):
         fish = [
-            _cut_out(annotated.image, mask)
-            for mask in annotated.masks
+            _cut_out(annotated.image, mask, ends)
+            for mask, ends in zip(annotated.masks, annotated.ends_px, strict=True)
             if np.count_nonzero(mask) >= _MIN_AREA_PX
         ]
         (validation if index % _VALIDATION_EVERY == _VALIDATION_EVERY - 1 else training).extend(
@@ -243,7 +260,7 @@ def draw_annotated_sample(
     rotation = cv2.getRotationMatrix2D((center, center), angle_deg, 1.0)
     if rng.random() < 0.5:
         rotation = rotation @ np.array([[-1.0, 0.0, 2 * center], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    rows, columns = np.nonzero(cutout[..., 3])
+    rows, columns = np.nonzero(cutout.pixels[..., 3])
     points = np.column_stack([columns, rows]) @ rotation[:, :2].T + rotation[:, 2]
     box = np.concatenate([points.min(axis=0) - 0.5, points.max(axis=0) + 0.5])
     if rng.random() < _PART_SHARE:
@@ -252,7 +269,9 @@ def draw_annotated_sample(
     box = jitter_box(rng, box, limits=everywhere)
     crop_from_rotated = crop_affine(box, margin=rng.uniform(0.08, 0.22), size=size_px)
     crop_from_cutout = crop_from_rotated @ np.vstack([rotation, [0.0, 0.0, 1.0]])
-    crop = cv2.warpAffine(cutout, crop_from_cutout, (size_px, size_px), flags=cv2.INTER_LINEAR)
+    crop = cv2.warpAffine(
+        cutout.pixels, crop_from_cutout, (size_px, size_px), flags=cv2.INTER_LINEAR
+    )
     picture = crop[..., :3].astype(np.float32)
     if is_faded := rng.random() < FADED_SHARE:
         picture = fade_end(rng, picture, crop[..., 3] > 127)
@@ -264,8 +283,14 @@ def draw_annotated_sample(
         image=np.ascontiguousarray(image),
         mask=crop[..., 3].astype(np.float32) / 255,
         in_box=box_coverage(edges.ravel(), size=size_px),
-        ends_px=None,
+        ends_px=_moved(cutout.ends_px, crop_from_cutout),
     )
+
+
+def _moved(
+    points: Float[np.ndarray, "N 2"], affine: Float[np.ndarray, "2 3"]
+) -> Float32[np.ndarray, "N 2"]:
+    return (points @ affine[:, :2].T + affine[:, 2]).astype(np.float32)
 
 
 def fade_end(
@@ -300,9 +325,9 @@ def _points_and_axes(
     return points, center, np.linalg.eigh(np.cov((points - center).T))[1]
 
 
-def cutout_patch(cutout: Cutout) -> UInt8[np.ndarray, "P P 4"]:
-    """The fish alone, its long axis horizontal, filling a patch: BGR times coverage, coverage."""
-    fish = cutout[..., 3] > 0
+def cutout_patch(cutout: Cutout) -> FishPatch:
+    """The fish alone, its long axis horizontal, filling a patch."""
+    fish = cutout.pixels[..., 3] > 0
     points, _, axes = _points_and_axes(fish)
     turn = np.stack([axes[:, 1], axes[::-1, 1] * [-1, 1]])  # long axis to x, without mirroring
     turned = points @ turn.T
@@ -312,9 +337,10 @@ def cutout_patch(cutout: Cutout) -> UInt8[np.ndarray, "P P 4"]:
     # The outermost pixels are partly background, so they are left out.
     inner = cv2.erode(fish.astype(np.float32), np.ones((3, 3), np.uint8))
     coverage = cv2.GaussianBlur(inner, (0, 0), 0.6)[..., None]
-    layer = np.dstack([cutout[..., :3] * coverage, 255 * coverage])
+    layer = np.dstack([cutout.pixels[..., :3] * coverage, 255 * coverage])
     patch = cv2.warpAffine(layer, affine, (PATCH_PX, PATCH_PX), flags=cv2.INTER_LINEAR)
-    return np.clip(np.round(patch), 0, 255).astype(np.uint8)
+    bgra = np.clip(np.round(patch), 0, 255).astype(np.uint8)
+    return FishPatch(bgra=bgra, ends_px=_moved(cutout.ends_px, affine))
 
 
 def load_backgrounds(folder: Path) -> list[UInt8[np.ndarray, "B B 3"]]:
@@ -329,7 +355,11 @@ def load_backgrounds(folder: Path) -> list[UInt8[np.ndarray, "B B 3"]]:
     return squares
 
 
-def _cut_out(image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]) -> Cutout:
+def _cut_out(
+    image: UInt8[np.ndarray, "H W 3"],
+    mask: Bool[np.ndarray, "H W"],
+    ends_px: Float[np.ndarray, "2 2"],
+) -> Cutout:
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
     edges = np.array([x, y, x + width, y + height]) - 0.5
     cutout_from_image = crop_affine(edges, margin=_MARGIN, size=_CUTOUT_PX)
@@ -341,4 +371,4 @@ def _cut_out(image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]) -
         layers, cutout_from_image, (_CUTOUT_PX, _CUTOUT_PX), flags=cv2.INTER_LINEAR
     )
     cutout[..., 3] = np.where(cutout[..., 3] > 127, 255, 0)
-    return cutout
+    return Cutout(cutout, _moved(ends_px, cutout_from_image))

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from stream_dmr.training.random_fish import PATCH_PX, draw_fish_patch
+from stream_dmr.training.random_fish import PATCH_PX, FishPatch, draw_fish_patch
 from stream_dmr.training.surroundings import BACKGROUND_PX, draw_background
 
 Picture = Float32[np.ndarray, "S S 3"]  # BGR, 0 to 255
@@ -149,7 +149,7 @@ class PatchBank:
 
     # BGR times coverage, and coverage; simulated heads are to the left
     fish: UInt8[np.ndarray, "F P P 4"]
-    # snout and fork of the tail, x, y in the fish's patch; NaN: unknown, as of photographed fish
+    # snout and fork of the tail, x, y in the fish's patch; NaN: not marked
     ends_px: Float32[np.ndarray, "F 2 2"]
     backgrounds: UInt8[np.ndarray, "G B B 3"]
     num_photographed_fish: int = 0
@@ -165,13 +165,14 @@ class PatchBank:
         return self.backgrounds[index]
 
     def with_photographs(
-        self, fish: list[UInt8[np.ndarray, "P P 4"]], backgrounds: list[UInt8[np.ndarray, "B B 3"]]
+        self, fish: list[FishPatch], backgrounds: list[UInt8[np.ndarray, "B B 3"]]
     ) -> "PatchBank":
         """The bank with these besides; either list may be empty."""
-        unknown = np.full((len(fish), 2, 2), np.nan, np.float32)
         return PatchBank(
-            fish=np.concatenate([self.fish, *(one[None] for one in fish)]),
-            ends_px=np.concatenate([self.ends_px, unknown]),
+            fish=np.concatenate([self.fish, *(one.bgra[None] for one in fish)]),
+            ends_px=np.concatenate(
+                [self.ends_px, *(one.ends_px[None] for one in fish)], dtype=np.float32
+            ),
             backgrounds=np.concatenate([self.backgrounds, *(one[None] for one in backgrounds)]),
             num_photographed_fish=self.num_photographed_fish + len(fish),
             num_photographed_backgrounds=self.num_photographed_backgrounds + len(backgrounds),

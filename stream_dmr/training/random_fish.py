@@ -353,7 +353,7 @@ class FishPatch:
     """One fish on a transparent background."""
 
     bgra: UInt8[np.ndarray, "P P 4"]  # colour times coverage, and coverage
-    ends_px: Float[np.ndarray, "2 2"]  # snout and fork of the tail, x, y
+    ends_px: Float[np.ndarray, "2 2"]  # snout and fork of the tail, x, y; NaN: unknown
 
 
 def draw_fish_patch(rng: np.random.Generator) -> FishPatch:

@@ -19,7 +19,8 @@ from stream_dmr.messages import CropQuality, FittedMesh, FittedShape, LossTerms
 from stream_dmr.nodes.localize import Localize
 from stream_dmr.reasons import Reason
 
-GOOD = CropQuality(touches_border=False, visible_fraction=1.0, sharpness=9.0, mask_area_px=1e4)
+# The area is that of no fish here: smaller than any.
+GOOD = CropQuality(touches_border=False, visible_fraction=1.0, sharpness=9.0, mask_area_px=1.0)
 
 
 def make_calibration(*, tilt_rad=0.0, depth_mm=2500.0, distortion=(0, 0, 0, 0, 0)):
@@ -231,7 +232,7 @@ def test_a_fit_that_is_not_finite_is_refused(field):
 
 def quality(**changes):
     facts = {"touches_border": False, "visible_fraction": 1.0, "sharpness": 9.0}
-    return CropQuality(mask_area_px=1e4, **(facts | changes))
+    return CropQuality(**({"mask_area_px": 1e4} | facts | changes))
 
 
 @pytest.mark.parametrize(
@@ -247,6 +248,8 @@ def quality(**changes):
         ({}, {"iou": np.nan}, Reason.POOR_FIT),
         ({}, {"std_ratio": 0.21}, Reason.UNCERTAIN),
         ({"touches_border": True}, {"iou": 0.1}, Reason.TOUCHES_BORDER),
+        # Shorter in the picture than it is broad: head and tail are not where the fish ends.
+        ({"mask_area_px": 1e7}, {}, Reason.KEYPOINTS_COINCIDE),
     ],
 )
 def test_gates_name_the_first_reason_and_keep_the_millimetres(changes, shape_changes, reason):

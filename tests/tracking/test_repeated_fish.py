@@ -2,14 +2,17 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stream_dmr.camera import Camera
+from stream_dmr.detection.detector import Candidate
 from stream_dmr.messages import FishCrop
-from stream_dmr.tracking.finder import share_inside, without_repeats
+from stream_dmr.tracking.finder import share_inside, with_large_fish, without_repeats
+from tests.support.frames import frame_of
 from tests.support.given_masks import crop_of
 
 CAMERA = Camera.nominal(width=640, height=480)
@@ -53,3 +56,34 @@ def test_an_empty_mask_lies_nowhere():
     empty = crop_with(100, 300)
     empty = replace(empty, mask=np.zeros_like(empty.mask))
     assert share_inside(empty, crop_with(100, 300)) == share_inside(crop_with(1, 9), empty) == 0
+
+
+class _Shortsighted:
+    """Boxes of white rectangles, of those that are longer than 0.7 of the picture only a part."""
+
+    @property
+    def refused(self):
+        return {}
+
+    def find(self, frame):
+        grey = frame.image[..., 0]
+        _, _, stats, _ = cv2.connectedComponentsWithStats((grey > 200).astype(np.uint8))
+        boxes = np.array([[x, y, x + w, y + h] for x, y, w, h, _ in stats[1:]], np.float64)
+        for box in boxes:
+            if (box[2:] - box[:2]).max() > 0.7 * max(grey.shape):
+                box[2:] = box[:2] + 0.7 * (box[2:] - box[:2])  # its tail is missing
+        return [Candidate(bbox_xyxy_px=box, score=0.8) for box in boxes]
+
+
+@given(st.integers(1, 60), st.integers(100, 310), st.booleans())
+def test_a_fish_that_fills_the_picture_is_seen_whole(left, length, has_neighbour):
+    picture = np.zeros((200, 320, 3), np.uint8)
+    right = min(left + length, 318)
+    picture[80:120, left:right] = 255
+    if has_neighbour:
+        picture[150:160, 10:40] = 255
+    frame = frame_of(picture)
+    found = with_large_fish(_Shortsighted().find(frame), _Shortsighted(), frame)
+    boxes = sorted(one.bbox_xyxy_px.tolist() for one in found)
+    expected = [[left, 80, right, 120]] + [[10, 150, 40, 160]] * has_neighbour
+    np.testing.assert_allclose(boxes, sorted(expected))

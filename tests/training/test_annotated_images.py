@@ -63,6 +63,19 @@ def test_coco_masks_are_the_ones_written(vessel, kind):
         np.testing.assert_array_equal(annotated.masks[0], mask > 0)
 
 
+def test_cocos_keypoints_are_head_and_tail(vessel):
+    file = coco(vessel, [[[0, 0, 9, 0, 9, 9, 0, 9]]] * 6)
+    content = json.loads(file.read_text())
+    content["annotations"][1]["keypoints"] = [10, 20, 2, 30.5, 40, 1]
+    content["annotations"][2]["keypoints"] = [10, 20, 2, 0, 0, 0]
+    content["annotations"][3]["keypoints"] = "elsewhere"
+    file.write_text(json.dumps(content))
+    ends = [one.ends_px[0] for one in read_annotated_images(vessel / "images", file)]
+    np.testing.assert_array_equal(ends[1], [[9.5, 19.5], [30.0, 39.5]])  # pixels, not corners
+    np.testing.assert_array_equal(ends[2], [[9.5, 19.5], [np.nan, np.nan]])
+    assert np.isnan([ends[0], ends[3], ends[4]]).all()
+
+
 def test_a_crowd_is_no_fish(vessel):
     square = [[0, 0, 9, 0, 9, 9, 0, 9]]
     file = coco(vessel, [square] * 6)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from stream_dmr.training.image_degradation import PatchBank, load_or_make_bank, make_bank
+from stream_dmr.training.random_fish import FishPatch
 
 
 def test_a_bank_is_drawn_once_and_kept(tmp_path):
@@ -22,14 +23,15 @@ def simulated() -> PatchBank:
 
 
 def test_photographs_are_two_of_five(simulated):
-    fish = [np.full_like(simulated.fish[0], 7)]
+    marks = np.array([[3.0, 80.0], [150.0, 82.0]])
+    fish = [FishPatch(bgra=np.full_like(simulated.fish[0], 7), ends_px=marks)]
     backgrounds = [np.full_like(simulated.backgrounds[0], 9)] * 2
     bank = simulated.with_photographs(fish, backgrounds)
     rng = np.random.default_rng(0)
     assert np.mean([bank.draw_fish(rng) == 3 for _ in range(400)]) == pytest.approx(0.4, abs=0.1)
     drawn = [bool((bank.draw_background(rng) == 9).all()) for _ in range(400)]
     assert np.mean(drawn) == pytest.approx(0.4, abs=0.1)
-    assert np.isnan(bank.ends_px[3]).all()
+    np.testing.assert_array_equal(bank.ends_px[3], marks)
     assert np.isfinite(bank.ends_px[:3]).all()
 
 

@@ -423,16 +423,15 @@ class StockFitter:
             )
             frame.pose = square_pose(problem, frame.pose)
             H, g = shape_equations(problem, frame.pose, slopes)
-            parts = _without_pose(H, g, len(frame.pose))
-            fish.setdefault(frame.fish, []).append(parts)
+            if parts := _without_pose(H, g, len(frame.pose)):
+                fish.setdefault(frame.fish, []).append(parts)
         A, b = np.zeros((NUM_COEFFICIENTS, NUM_COEFFICIENTS)), np.zeros(NUM_COEFFICIENTS)
         for parts in fish.values():
             H = np.mean([part[0] for part in parts], axis=0) / self._nat
             g = np.mean([part[1] for part in parts], axis=0) / self._nat
-            # With the individual's deviation d ~ N(0, C) integrated out, H - H (H + C^-1)^-1 H.
-            shrink = np.eye(len(H)) - H @ np.linalg.inv(H + self._individual)
-            A += shrink @ H
-            b -= shrink @ g
+            information, slope = _without_deviation(H, g, self._individual)
+            A += information
+            b -= slope
         return A, b
 
     def _follow(self, body: Body, frame: PosedTarget) -> float:
@@ -465,11 +464,29 @@ def _limited(step: Float[np.ndarray, "W"]) -> Float[np.ndarray, "W"]:
     return step / max(1.0, float(np.abs(step[:LOBES]).max()) / _MAX_STEP)
 
 
+def _without_deviation(
+    H: Float[np.ndarray, "W W"], g: Float[np.ndarray, "W"], precision: Float[np.ndarray, "W W"]
+) -> tuple[Float[np.ndarray, "W W"], Float[np.ndarray, "W"]]:
+    """Curvature and slope in the stock's shape, an individual's deviation from it integrated out.
+
+    (H^-1 + C)^-1 = H - H (H + C^-1)^-1 H for a deviation N(0, C) of precision C^-1, written so that
+    the H of a mask unlike any fish, which reaches 1e11, cancels nothing.
+    """
+    shrink = np.linalg.solve(H + precision, precision).T
+    return precision - shrink @ precision, shrink @ g
+
+
 def _without_pose(
     H: Float[np.ndarray, "Z Z"], g: Float[np.ndarray, "Z"], num_pose: int
-) -> tuple[Float[np.ndarray, "W W"], Float[np.ndarray, "W"]]:
-    """The Schur complement: curvature and slope of the loss in the shape, the pose at its best."""
+) -> tuple[Float[np.ndarray, "W W"], Float[np.ndarray, "W"]] | None:
+    """The Schur complement: curvature and slope of the loss in the shape, the pose at its best.
+
+    None if a mask unlike any fish leaves a pose without a minimum: it tells no shape.
+    """
     pose, shape = slice(0, num_pose), slice(num_pose, None)
-    factor = cho_factor(H[pose, pose] + 1e-9 * np.eye(num_pose))
+    try:
+        factor = cho_factor(H[pose, pose] + 1e-9 * np.eye(num_pose))
+    except np.linalg.LinAlgError:
+        return None
     gain = cho_solve(factor, H[pose, shape])
     return H[shape, shape] - H[shape, pose] @ gain, g[shape] - gain.T @ g[pose]
