@@ -4,6 +4,8 @@ Motion finds what a network has never seen, with an outline, and also plants tha
 what hangs still, of a fish that fills the picture it sees parts, and of one behind a gaff two
 pieces. Looks find fish that don't move, and also marks that look like fish. What either finds is
 followed; what counts is said by `tracking.fish_evidence`.
+
+Most of a film is water, in which neither has to look at every picture: see `passes_over`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,11 +14,14 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import Field
 
 from stream_dmr.detection.detector import Candidate, Detector
 from stream_dmr.detection.motion_detector import MotionDetector
+from stream_dmr.detection.still_water import StillWater
 from stream_dmr.geometry import box_iou, fraction_inside, whole_pixels
 from stream_dmr.messages import Frame
+from stream_dmr.settings import Settings
 
 _MIN_IOU = 0.3  # of what moves with the box that says how much it looks like a fish
 # A box that has so much surely shows one whole fish, one with so much shows something of its own.
@@ -27,18 +32,53 @@ _MIN_WHOLE_IOU = 0.5  # of all pieces together with that box
 _SURROUNDINGS, _MIN_SURROUNDINGS_PX = 4.0, 208
 
 
+class LookSettings(Settings):
+    """The part of `[detect_fish]` that says how often the detector "motion" looks at water."""
+
+    look_every_s: float = Field(
+        default=0.5,
+        ge=0,
+        le=60,
+        description="where nothing changes and nothing is followed, a picture is looked at every "
+        "so many seconds, so that a fish that hangs still is seen; 0: every picture",
+    )
+
+
 class FusedDetector:
     """A `Detector` of what moves, and of what looks like fish."""
 
-    def __init__(self, motion: MotionDetector, looks: Detector) -> None:
+    def __init__(
+        self, motion: MotionDetector, looks: Detector, settings: LookSettings | None = None
+    ) -> None:
         self._motion = motion
         self._looks = looks
+        self._every_ns = round(1e9 * (settings or LookSettings()).look_every_s)
+        self._water = StillWater()
+        self._looked_ns = -self._every_ns  # capture time of the last frame that was looked at
+        self._passed: Frame | None = None  # the last frame, where it was not looked at
         self._beside = ThreadPoolExecutor(1, "looks")  # both take as long as each other
 
     @property
     def refused(self) -> Mapping[str, int]:
         """The moving shapes of all frames that were no candidates, by reason."""
         return self._motion.refused
+
+    def passes_over(self, frame: Frame, *, is_followed: bool) -> bool:
+        """Whether the next frame need not be looked at, since nothing happens in it.
+
+        `is_followed`: something found before is.
+        """
+        if not self._every_ns:
+            return False
+        is_changed = self._water.changes(frame.image, is_empty=not is_followed)
+        is_due = not 0 <= frame.timestamp_ns - self._looked_ns < self._every_ns
+        if not (is_changed or is_followed or is_due):
+            self._passed = frame
+            return True
+        if is_changed and self._passed is not None:
+            self._motion.find(self._passed)  # what moves is told from the picture before
+        self._looked_ns, self._passed = frame.timestamp_ns, None
+        return False
 
     def find(self, frame: Frame) -> list[Candidate]:
         """The candidates of one frame."""

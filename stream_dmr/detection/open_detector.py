@@ -5,7 +5,7 @@ from pathlib import Path
 from pydantic import Field
 
 from stream_dmr.detection.detector import FISH_LIKE, Detector
-from stream_dmr.detection.fused_detector import FusedDetector
+from stream_dmr.detection.fused_detector import FusedDetector, LookSettings
 from stream_dmr.detection.motion_detector import MotionDetector, MotionSettings
 from stream_dmr.detection.network_detectors import OnnxDetector, OnnxSettings, UNetDetector
 from stream_dmr.errors import ModelError
@@ -36,7 +36,9 @@ class UNetDetectorSettings(Settings):
     )
 
 
-class DetectFishSettings(OnnxSettings, UNetDetectorSettings, MotionSettings, DetectorSettings):
+class DetectFishSettings(
+    OnnxSettings, UNetDetectorSettings, MotionSettings, LookSettings, DetectorSettings
+):
     """`[detect_fish]`: how fish are found in a video that comes without boxes and masks."""
 
 
@@ -47,7 +49,7 @@ def open_detector(settings: DetectFishSettings) -> Detector:
     cannot be used.
     """
     if settings.detector == "motion":
-        return FusedDetector(MotionDetector(settings), _open_looks())
+        return FusedDetector(MotionDetector(settings), _open_looks(), settings)
     if settings.detector == "looks":
         return _open_looks()
     suffix = Path(settings.detector).suffix.lower()

@@ -177,7 +177,7 @@ class TrackedFish:
 
     def detect(self, frame: Frame) -> list[Detection]:
         """All tracks seen in a frame, by track number. Frames must come in order."""
-        candidates = self._detector.find(frame)
+        candidates = [] if self._passes_over(frame) else self._detector.find(frame)
         if self._are_stills:
             candidates = with_large_fish(candidates, self._detector, frame)
         tracked = self._tracker.step(frame, candidates)
@@ -194,6 +194,14 @@ class TrackedFish:
             replace(one, may_be_no_fish=not self._is_surely_fish(one.source_id))
             for one in self._corrector.correct(boxes, visible, frame)
         ]
+
+    def _passes_over(self, frame: Frame) -> bool:
+        """Whether nothing happens in a frame of a film."""
+        return (
+            self._settings.across_frames
+            and isinstance(self._detector, FusedDetector)
+            and self._detector.passes_over(frame, is_followed=self._tracker.is_following)
+        )
 
     def _look_closer(self, frame: Frame, boxes: Mapping[int, Float[np.ndarray, "4"]]) -> None:
         """Look at one of those that move and, small as they are, look like no fish from afar."""

@@ -64,6 +64,11 @@ class Tracker:
         self._hidden: list[Track] = []  # lost for longer, but may come out from behind something
         self._num_started = 0
 
+    @property
+    def is_following(self) -> bool:
+        """True while anything is seen, or was seen often enough that it may come again."""
+        return any(track.lost_frames == 0 or track.may_be_hidden for track in self._tracks)
+
     def step(self, frame: Frame, candidates: Sequence[Candidate]) -> list[TrackedCandidate]:
         """The tracks seen in a frame. Frames must come in order; some may be missing."""
         observations = [
