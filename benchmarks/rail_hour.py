@@ -1,11 +1,11 @@
 """What a film of mostly water costs: CPU seconds of decoding it, of measuring it.
 
-    python -m benchmarks.rail_hour [--minutes 2] [--template halibut] [--folder build/rail_hour]
+    python -m benchmarks.rail_hour [--minutes 2] [--template auto] [--every-picture]
 
 A made minute of a rail in H.264, again and again: one, two, then three fish at once, in view for a
 tenth of the time; a swaying camera, spray, light that changes. Beside it as much of it without a
-fish. Of each: decoding alone, and a run of the command from the video alone, recordings on, whose
-start (a run of the first frames) is taken off. Figures: docs/measure.md.
+fish. Of each: decoding alone, and a run of the command from the video alone, recordings on, by the
+mesh of the species or by another template; the start (a run of a few frames) is taken off.
 """
 
 import argparse
@@ -31,6 +31,7 @@ from stream_dmr.simulation.rail_scene import (
     find_preset,
 )
 from stream_dmr.simulation.simulated_fish import draw_fish
+from stream_dmr.simulation.write_scene import write_species
 
 _MINUTE = 60 * FPS  # frames
 _VISIT = _MINUTE // 30  # frames of one fish
@@ -39,6 +40,7 @@ _SWAY_PX, _SWAY_S = 3.0, 6.0
 _LIGHT, _LIGHT_S = 0.12, 20.0  # of the brightness
 _SPRAY_S = 10.0  # between bursts of spray, which last for 0.4 s
 _START_FRAMES = 30
+_FOLDER = Path("build/rail_hour")
 # A process's peak memory begins with that of its parent, so the parent must be small.
 _LAUNCHER = """
 import resource, subprocess, sys
@@ -65,7 +67,7 @@ class Cost(NamedTuple):
 
 def make_minute(path: Path, *, with_fish: bool, repeats: int, frames: int = _MINUTE) -> None:
     """Write the minute (or its first frames) so many times; its end fits its beginning."""
-    stored = [encoded for encoded in map(_jpeg, _pictures(with_fish, frames))]
+    stored = [_jpeg(image) for image in _pictures(with_fish, frames)]
     with av.open(str(path), "w") as video:
         stream = video.add_stream("libx264", FPS, options={"preset": "veryfast", "crf": "23"})
         stream.width, stream.height, stream.pix_fmt = 1280, 960, "yuv420p"
@@ -123,53 +125,53 @@ def _pictures(with_fish: bool, frames: int) -> Iterator[np.ndarray]:
         yield cv2.convertScaleAbs(image, alpha=light)
 
 
-def cost_of(*command: str) -> tuple[Cost, str]:
-    """Run a command; what it cost, and what it printed before."""
+def cost_of(*command: str) -> Cost:
+    """Run a command of Python."""
     launched = [sys.executable, "-c", _LAUNCHER, sys.executable, *command]
-    done = subprocess.run(launched, check=True, text=True, stdout=subprocess.PIPE)
-    *printed, last = done.stdout.splitlines()
-    return Cost(*map(float, last.split())), "\n".join(printed)
+    done = subprocess.run(launched, check=True, text=True, capture_output=True)
+    return Cost(*map(float, done.stdout.splitlines()[-1].split()))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=int, default=2)
-    parser.add_argument("--template", default="halibut")
-    parser.add_argument("--folder", type=Path, default=Path("build/rail_hour"))
+    parser.add_argument("--template", default=str(_FOLDER / "species.ply"))
+    parser.add_argument("--every-picture", action="store_true", help="look at all pictures")
     given = parser.parse_args(arguments)
-    given.folder.mkdir(parents=True, exist_ok=True)
-    calibration = given.folder / "calibration.yaml"
-    save_calibration(calibration, _scene(with_fish=True, frames=1).calibration)
+    _FOLDER.mkdir(parents=True, exist_ok=True)
+    write_species(_FOLDER / "species.ply")
+    save_calibration(_FOLDER / "calibration.yaml", _scene(with_fish=True, frames=1).calibration)
+    every_s = 0.0 if given.every_picture else 0.5
+    (_FOLDER / "config.toml").write_text(f"[detect_fish]\nlook_every_s = {every_s}\n")
+    options = ["run", "--overwrite", f"--template={given.template}"]
+    options += [f"--calibration={_FOLDER}/calibration.yaml", f"--config={_FOLDER}/config.toml"]
 
     def run(video: Path) -> Cost:
-        out = given.folder / video.stem
-        options = ["--template", given.template, "--calibration", str(calibration)]
-        options += ["--out", str(out), "--overwrite", "--source", str(video)]
-        return cost_of("-m", "stream_dmr.cli.main", "run", *options)[0]
+        of_video = (f"--source={video}", f"--out={video.with_suffix('')}")
+        return cost_of("-m", "stream_dmr.cli.main", *options, *of_video)
 
-    start = given.folder / "start.mp4"
+    start = _FOLDER / "start.mp4"
     if not start.exists():
         make_minute(start, with_fish=False, repeats=1, frames=_START_FRAMES)
-    began = run(start)
-    num = given.minutes * _MINUTE
-    print(f"{num} frames; the start {began.cpu_s:.1f} s of CPU")
-    print("| | CPU s | ms a frame | times decoding | peak MB | fish |\n|---|---|---|---|---|---|")
+    run(start)  # may compile
+    start_s, num = run(start).cpu_s, given.minutes * _MINUTE
+    print(f"{num} frames; the start {start_s:.1f} s of CPU\n")
+    print("| | CPU s | ms a frame | times decoding | peak MB | fish | their mean mm |")
+    print("|---|---|---|---|---|---|---|")
     for name, with_fish in (("water", False), ("rail", True)):
-        video = given.folder / f"{name}-{given.minutes}.mp4"
+        video = _FOLDER / f"{name}-{given.minutes}.mp4"
         if not video.exists():
             make_minute(video, with_fish=with_fish, repeats=given.minutes)
-        decoding, _ = cost_of("-c", _DECODE, str(video))
-        measuring = run(video)
-        with (given.folder / video.stem / "lengths.csv").open() as file:
-            fish = sum(1 for _ in csv.DictReader(file))
-        spent = measuring.cpu_s - began.cpu_s
-        print(
-            f"| decoding {name} | {decoding.cpu_s:.1f} | {1e3 * decoding.cpu_s / num:.1f} | 1 | | |"
-        )
-        print(
-            f"| measuring {name} | {spent:.1f} | {1e3 * spent / num:.1f} | "
-            f"{spent / decoding.cpu_s:.1f} | {measuring.peak_mb:.0f} | {fish} |"
-        )
+        decoding_s = cost_of("-c", _DECODE, str(video)).cpu_s
+        print(f"| decoding {name} | {decoding_s:.1f} | {1e3 * decoding_s / num:.1f} | 1 | | | |")
+        cost = run(video)
+        with (video.with_suffix("") / "lengths.csv").open() as file:
+            lengths = [float(row["length_mm"]) for row in csv.DictReader(file) if row["length_mm"]]
+        spent = cost.cpu_s - start_s
+        shown = [f"{spent:.1f}", f"{1e3 * spent / num:.1f}", f"{spent / decoding_s:.1f}"]
+        shown += [f"{cost.peak_mb:.0f}", f"{len(lengths)}"]
+        shown += [f"{np.mean(lengths):.1f}" if lengths else ""]
+        print(f"| measuring {name} | {' | '.join(shown)} |", flush=True)
 
 
 if __name__ == "__main__":

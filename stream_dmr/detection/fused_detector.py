@@ -54,8 +54,9 @@ class FusedDetector:
         self._looks = looks
         self._every_ns = round(1e9 * (settings or LookSettings()).look_every_s)
         self._water = StillWater()
-        self._looked_ns = -self._every_ns  # capture time of the last frame that was looked at
+        self._looked_ns = -self._every_ns  # capture time of the last that the network looked at
         self._passed: Frame | None = None  # the last frame, where it was not looked at
+        self._must_look = True  # at the next frame, whether or not anything moves in it
         self._beside = ThreadPoolExecutor(1, "looks")  # both take as long as each other
 
     @property
@@ -75,15 +76,23 @@ class FusedDetector:
         if not (is_changed or is_followed or is_due):
             self._passed = frame
             return True
-        if is_changed and self._passed is not None:
+        self._must_look = is_followed or is_due or self._water.is_new
+        if is_changed and self._passed is not None:  # something begins
+            self._must_look = True
             self._motion.find(self._passed)  # what moves is told from the picture before
-        self._looked_ns, self._passed = frame.timestamp_ns, None
+        self._passed = None
         return False
 
     def find(self, frame: Frame) -> list[Candidate]:
         """The candidates of one frame."""
-        looking = self._beside.submit(self._looks.find, frame)
-        moving, seen = self._motion.find(frame), looking.result()
+        if self._must_look:
+            looking = self._beside.submit(self._looks.find, frame)
+            moving, seen = self._motion.find(frame), looking.result()
+        else:  # spray and waves go on for a while, but nothing of a fish's size moves
+            moving = self._motion.find(frame)
+            seen = self._looks.find(frame) if moving else []
+        if self._must_look or moving:
+            self._looked_ns = frame.timestamp_ns
         return [
             replace(one, place_px=self._place(one, frame), looks=_looks(one.bbox_xyxy_px, seen))
             for one in fuse(moving, seen)

@@ -30,6 +30,11 @@ class StillWater:
         self._usual = 1.0  # largest change of a picture, over those of the cells
         self._num = 0
 
+    @property
+    def is_new(self) -> bool:
+        """Whether it is not known yet what is usual."""
+        return self._num <= _FIRST_PICTURES
+
     def changes(self, image: UInt8[np.ndarray, "H W 3"], *, is_empty: bool) -> bool:
         """Whether something happens in the next picture (BGR).
 
@@ -47,13 +52,12 @@ class StillWater:
         largest = float(cv2.blur(ratios, (_FISH_CELLS, _FISH_CELLS)).max())
         self._mean += np.float32(_MEAN_RATE) * difference
         self._change += np.float32(_CHANGE_RATE) * (change - self._change)
-        is_new = self._num <= _FIRST_PICTURES
         is_changed = largest > _RATIO * self._usual
-        if is_new:
+        if self.is_new:
             self._usual += (largest - self._usual) / (self._num - 1)  # their mean
         elif is_empty:
             self._usual *= _UP if largest > self._usual else _DOWN
-        return is_new or is_changed
+        return is_changed or self.is_new
 
 
 def _small_grey(image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "h w"]:

@@ -95,9 +95,9 @@ def seen_in(pictures: list[np.ndarray], every_s: float) -> tuple[list[np.ndarray
 
 
 def test_a_fish_that_hangs_still_is_seen_within_the_time_that_is_set(monkeypatch):
-    monkeypatch.setattr(  # as where it comes so slowly that it is no change
-        StillWater, "changes", lambda self, image, is_empty: False
-    )
+    # As where it comes so slowly that it is no change.
+    monkeypatch.setattr(StillWater, "changes", lambda self, image, is_empty: False)
+    monkeypatch.setattr(StillWater, "is_new", False)
     came = 43
     pictures = [*water(70)]
     pictures[came:] = [draw_fish(one, (160, 120)) for one in pictures[came:]]
