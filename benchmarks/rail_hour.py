@@ -73,7 +73,7 @@ def make_minute(path: Path, *, with_fish: bool, repeats: int, frames: int = _MIN
         stream.width, stream.height, stream.pix_fmt = 1280, 960, "yuv420p"
         for _ in range(repeats):
             for encoded in stored:
-                picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+                picture = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), np.uint8)
                 video.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
         video.mux(stream.encode(None))
 
