@@ -65,7 +65,7 @@ class FusedDetector:
         return self._motion.refused
 
     def passes_over(self, frame: Frame, *, is_followed: bool) -> bool:
-        """Whether the next frame need not be looked at, since nothing happens in it.
+        """True if the next frame need not be looked at, since nothing happens in it.
 
         `is_followed`: something found before is.
         """

@@ -1,4 +1,4 @@
-"""Whether anything happens in a picture, told from a small grey one.
+"""Tell from a small grey picture whether anything happens in it.
 
 Water moves all the time, more under wind, spray or a camera that sways. What counts as a change is
 therefore measured twice against the scene itself: each cell of the picture against how much that
@@ -22,7 +22,7 @@ _FIRST_PICTURES = 30  # all are looked at, until it is known what is usual
 
 
 class StillWater:
-    """Knows what usually changes in the pictures of a source."""
+    """Keeps what usually changes in the pictures of a source."""
 
     def __init__(self) -> None:
         self._mean: Float32[np.ndarray, "h w"] | None = None  # of each cell, grey levels
@@ -32,11 +32,11 @@ class StillWater:
 
     @property
     def is_new(self) -> bool:
-        """Whether it is not known yet what is usual."""
+        """True until it is known what is usual."""
         return self._num <= _FIRST_PICTURES
 
     def changes(self, image: UInt8[np.ndarray, "H W 3"], *, is_empty: bool) -> bool:
-        """Whether something happens in the next picture (BGR).
+        """True if something happens in the next picture (BGR).
 
         `is_empty`: nothing is followed in it, so that it may be told from it what is usual.
         """

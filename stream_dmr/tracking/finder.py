@@ -196,7 +196,7 @@ class TrackedFish:
         ]
 
     def _passes_over(self, frame: Frame) -> bool:
-        """Whether nothing happens in a frame of a film."""
+        """True if nothing happens in a frame of a video."""
         return (
             self._settings.across_frames
             and isinstance(self._detector, FusedDetector)
