@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from stream_dmr.camera import Camera
 from stream_dmr.detection.detector import Candidate
 from stream_dmr.messages import FishCrop
-from stream_dmr.tracking.finder import share_inside, with_large_fish, without_repeats
+from stream_dmr.tracking.finder import find_in_still, share_inside, without_repeats
 from tests.support.frames import frame_of
 from tests.support.given_masks import crop_of
 
@@ -58,8 +58,11 @@ def test_an_empty_mask_lies_nowhere():
     assert share_inside(empty, crop_with(100, 300)) == share_inside(crop_with(1, 9), empty) == 0
 
 
-class _Shortsighted:
-    """Boxes of white rectangles, of those that are longer than 0.7 of the picture only a part."""
+class _Nearsighted:
+    """Boxes of white rectangles; of long ones only a part, of short ones none.
+
+    Long and short: beside the picture that it is shown.
+    """
 
     @property
     def refused(self):
@@ -68,22 +71,23 @@ class _Shortsighted:
     def find(self, frame):
         grey = frame.image[..., 0]
         _, _, stats, _ = cv2.connectedComponentsWithStats((grey > 200).astype(np.uint8))
-        boxes = np.array([[x, y, x + w, y + h] for x, y, w, h, _ in stats[1:]], np.float64)
-        for box in boxes:
-            if (box[2:] - box[:2]).max() > 0.7 * max(grey.shape):
-                box[2:] = box[:2] + 0.7 * (box[2:] - box[:2])  # its tail is missing
-        return [Candidate(bbox_xyxy_px=box, score=0.8) for box in boxes]
+        found = []
+        for x, y, w, h, _ in stats[1:]:
+            share = max(w, h) / max(grey.shape)
+            seen = 0.7 if share > 0.7 else 1.0  # its tail is missing
+            box = np.array([x, y, x + seen * w, y + seen * h], np.float64)
+            if share > 0.12:
+                found.append(Candidate(bbox_xyxy_px=box, score=0.8))
+        return found
 
 
-@given(st.integers(1, 60), st.integers(100, 310), st.booleans())
-def test_a_fish_that_fills_the_picture_is_seen_whole(left, length, has_neighbour):
+@given(st.integers(1, 60), st.integers(100, 310), st.sampled_from([0, 30, 60]))
+def test_large_and_small_fish_of_a_still_are_found_whole_and_once(left, length, neighbour):
     picture = np.zeros((200, 320, 3), np.uint8)
     right = min(left + length, 318)
     picture[80:120, left:right] = 255
-    if has_neighbour:
-        picture[150:160, 10:40] = 255
-    frame = frame_of(picture)
-    found = with_large_fish(_Shortsighted().find(frame), _Shortsighted(), frame)
+    picture[150:160, 10 : 10 + neighbour] = 255
+    found = find_in_still(_Nearsighted(), frame_of(picture))
     boxes = sorted(one.bbox_xyxy_px.tolist() for one in found)
-    expected = [[left, 80, right, 120]] + [[10, 150, 40, 160]] * has_neighbour
+    expected = [[left, 80, right, 120]] + [[10, 150, 10 + neighbour, 160]] * (neighbour > 0)
     np.testing.assert_allclose(boxes, sorted(expected))

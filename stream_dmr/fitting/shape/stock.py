@@ -423,13 +423,13 @@ class StockFitter:
             )
             frame.pose = square_pose(problem, frame.pose)
             H, g = shape_equations(problem, frame.pose, slopes)
-            if parts := _without_pose(H, g, len(frame.pose)):
+            if parts := without_pose(H, g, len(frame.pose)):
                 fish.setdefault(frame.fish, []).append(parts)
         A, b = np.zeros((NUM_COEFFICIENTS, NUM_COEFFICIENTS)), np.zeros(NUM_COEFFICIENTS)
         for parts in fish.values():
             H = np.mean([part[0] for part in parts], axis=0) / self._nat
             g = np.mean([part[1] for part in parts], axis=0) / self._nat
-            information, slope = _without_deviation(H, g, self._individual)
+            information, slope = without_deviation(H, g, self._individual)
             A += information
             b -= slope
         return A, b
@@ -464,7 +464,7 @@ def _limited(step: Float[np.ndarray, "W"]) -> Float[np.ndarray, "W"]:
     return step / max(1.0, float(np.abs(step[:LOBES]).max()) / _MAX_STEP)
 
 
-def _without_deviation(
+def without_deviation(
     H: Float[np.ndarray, "W W"], g: Float[np.ndarray, "W"], precision: Float[np.ndarray, "W W"]
 ) -> tuple[Float[np.ndarray, "W W"], Float[np.ndarray, "W"]]:
     """Curvature and slope in the stock's shape, an individual's deviation from it integrated out.
@@ -476,7 +476,7 @@ def _without_deviation(
     return precision - shrink @ precision, shrink @ g
 
 
-def _without_pose(
+def without_pose(
     H: Float[np.ndarray, "Z Z"], g: Float[np.ndarray, "Z"], num_pose: int
 ) -> tuple[Float[np.ndarray, "W W"], Float[np.ndarray, "W"]] | None:
     """The Schur complement: curvature and slope of the loss in the shape, the pose at its best.

@@ -15,7 +15,7 @@ from stream_dmr.fitting.shape.space import (
     individual_covariance,
     reshaped,
 )
-from stream_dmr.fitting.shape.stock import _without_deviation, _without_pose, shape_equations
+from stream_dmr.fitting.shape.stock import shape_equations, without_deviation, without_pose
 from stream_dmr.fitting.solver.contour_solver import loss_of
 from stream_dmr.fitting.solver.descent import evaluate, normal_equations
 from stream_dmr.fitting.solver.problem import Problem
@@ -100,7 +100,7 @@ def test_an_individuals_deviation_leaves_what_its_covariance_lets_pass(largest):
     axes = np.linalg.qr(rng.normal(size=(6, 6)))[0]
     H = axes @ np.diag(np.geomspace(1, largest, 6)) @ axes.T
     C = np.diag(np.geomspace(1e-4, 1e-1, 6))
-    information, slope = _without_deviation(H, (g := rng.normal(size=6)), np.linalg.inv(C))
+    information, slope = without_deviation(H, (g := rng.normal(size=6)), np.linalg.inv(C))
     assert np.linalg.eigvalsh((information + information.T) / 2)[0] > 0
     np.testing.assert_allclose(information, np.linalg.inv(np.linalg.inv(H) + C), rtol=1e-3)
     np.testing.assert_allclose(slope, np.linalg.inv(np.eye(6) + H @ C) @ g, rtol=1e-3, atol=1e-6)
@@ -108,6 +108,6 @@ def test_an_individuals_deviation_leaves_what_its_covariance_lets_pass(largest):
 
 def test_a_pose_without_a_minimum_tells_no_shape():
     H = np.diag([1.0, -2.0, 5.0, 6.0])
-    assert _without_pose(H, np.ones(4), 2) is None
-    curvature, _ = _without_pose(np.abs(H) + 0.1, np.ones(4), 2)
+    assert without_pose(H, np.ones(4), 2) is None
+    curvature, _ = without_pose(np.abs(H) + 0.1, np.ones(4), 2)
     np.testing.assert_allclose(np.linalg.inv(curvature), np.linalg.inv(np.abs(H) + 0.1)[2:, 2:])
