@@ -127,6 +127,18 @@ class Reason(StrEnum):
         "`[localize] max_bow_ratio`, `max_bending_ratio`",
         "look at mask and template; usually a wrong mask",
     )
+    SEEN_BY_ONE = (
+        "seen by one camera",
+        _FRAME,
+        "`combine`: the other camera saw the fish, but not at this moment",
+        "nothing; other frames count",
+    )
+    CAMERAS_DISAGREE = (
+        "cameras disagree",
+        _FRAME,
+        "`combine`: no fish is where both cameras see this one",
+        "look at the masks of both; was a camera moved?",
+    )
     OUTLIER = (
         "outlier",
         _FRAME,

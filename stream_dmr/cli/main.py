@@ -15,7 +15,7 @@ import typer
 from stream_dmr.cli.batch import batch
 from stream_dmr.cli.calibrate import calibrate, check
 from stream_dmr.cli.export import export
-from stream_dmr.cli.replay import replay
+from stream_dmr.cli.replay import combine, replay
 from stream_dmr.cli.review import agreement, review
 from stream_dmr.cli.run import demo, recover, run, setup
 from stream_dmr.cli.shared_options import OverwriteOption
@@ -36,7 +36,7 @@ app = typer.Typer(
     rich_markup_mode=None,  # else it takes [tables] of settings for markup, and they vanish
 )
 for command in (
-    *(demo, run, calibrate, check, replay, recover, view, convert, export),
+    *(demo, run, calibrate, check, replay, combine, recover, view, convert, export),
     *(report, review, agreement, verify, haul, keygen, batch, fleet, evaluate, train),
     *(learn_template, make_template, setup),
 ):
@@ -135,16 +135,32 @@ def simulate_command(
     species: Annotated[
         str, typer.Option(help="Body of the fish; several, joined by commas, take turns.")
     ] = "halibut",
+    second: Annotated[
+        float | None,
+        typer.Option(
+            help="Film the same fish by another camera too, from so many degrees beside it."
+        ),
+    ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make a scene of hooked fish with known lengths: video, boxes, masks, calibration, truth."""
     from stream_dmr.evidence.own_files import require_writable
-    from stream_dmr.simulation import scene_files, simulate
+    from stream_dmr.simulation import SECOND, scene_files, simulate
 
     names = scene_files(species)
-    require_writable(*(out / name for name in names), overwrite=overwrite)
-    simulate(out, num_fish=fish, num_frames=frames, preset=preset, seed=seed, species=species)
-    print(f"scene in {out}: {', '.join(names)}")
+    folders = [out] if second is None else [out, out / SECOND]
+    files = [folder / name for folder in folders for name in names]
+    require_writable(*files, overwrite=overwrite)
+    simulate(
+        out,
+        num_fish=fish,
+        num_frames=frames,
+        preset=preset,
+        seed=seed,
+        species=species,
+        second_deg=second,
+    )
+    print(f"scene in {' and '.join(map(str, folders))}: {', '.join(names)}")
 
 
 if __name__ == "__main__":

@@ -87,3 +87,39 @@ def replay(
         print_check(summary)
         if not summary.is_as_recorded:
             raise typer.Exit(1)
+
+
+def combine(
+    first: Annotated[
+        Path, typer.Argument(help="Folder or recording of one camera's run.", metavar="LEFT")
+    ],
+    second: Annotated[
+        Path, typer.Argument(help="That of the other camera, of the same fish.", metavar="RIGHT")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the recording and tables of both.")],
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the results of an earlier run in --out.")
+    ] = False,
+    key: KeyOption = None,
+) -> None:
+    """Measure fish that two calibrated cameras saw: one length from both.
+
+    Both calibrations are of the same reference plane. Ids and pictures are those of LEFT.
+    """
+    from stream_dmr.cli.terminal import RunDisplay, print_replay
+    from stream_dmr.pipeline.replay_recording import replay as replay_recording
+    from stream_dmr.pipeline.run_options import ReplayRequest
+
+    request = ReplayRequest(
+        recordings=[first],
+        first="localize",
+        second=second,
+        out=out,
+        overwrite=overwrite,
+        key=key,
+        command=command_line(),
+    )
+    with stop_on_signals() as stop, RunDisplay() as display:
+        summary = replay_recording(request, stop=stop, observer=display)
+    print_replay(summary, out, timings=False)
+    stop.exit()

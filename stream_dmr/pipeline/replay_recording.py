@@ -12,7 +12,8 @@ from stream_dmr.errors import OutputError, UserError
 from stream_dmr.evidence.seal import SignedFiles, sealed
 from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish, Message, Position
 from stream_dmr.nodes.crop_fish import CropFish
-from stream_dmr.pipeline.chain import StageCounters, run_chain
+from stream_dmr.pipeline.chain import Node, StageCounters, run_chain
+from stream_dmr.pipeline.combine import open_second
 from stream_dmr.pipeline.comparator import MessageComparator, Mismatch
 from stream_dmr.pipeline.learn_shapes import save_stocks
 from stream_dmr.pipeline.replay_inputs import ReplayInputs, new_header, read_inputs
@@ -30,7 +31,7 @@ from stream_dmr.pipeline.session import (
     messages_from,
 )
 from stream_dmr.recording.frame_images import open_pictures
-from stream_dmr.recording.header import REPRODUCIBLE_BY, RunHeader, RunStart
+from stream_dmr.recording.header import REPRODUCIBLE_BY, RunHeader
 from stream_dmr.recording.reading import (
     Recording,
     open_recordings,
@@ -270,7 +271,7 @@ def replay(
     recorded = RecordedMessages(recording, request.selection)
     carried_over = _carried_over(request, recorded)
     with ExitStack() as stack:
-        frames, session = _open_chain(request, recorded, inputs, recording.header.runs, stack)
+        frames, session = _open_chain(request, recorded, inputs, recording, observer, stack)
         session.continue_tracks(carried_over)
         outputs = None
         if request.out is not None:
@@ -431,14 +432,19 @@ def _open_chain(
     request: ReplayRequest,
     recorded: RecordedMessages,
     inputs: ReplayInputs,
-    runs: Sequence[RunStart],
+    recording: Recording,
+    observer: RunObserver,
     stack: ExitStack,
 ) -> tuple[Iterable[Frame], Session]:
     """The frames and the nodes; playback nodes that only a new recording needs only with `out`."""
     files, config = inputs.files, inputs.config
     if files is None:
         played = messages_before(request.first)[0 if request.out is not None else -1 :]
-        playback = [PlaybackNode(recorded, kind) for kind in played]
+        playback: list[Node] = [PlaybackNode(recorded, kind) for kind in played]
+        if request.second is not None:
+            second = open_recordings([request.second])
+            playback.append(open_second(recording, second, inputs, observer))
+            return recorded.of_type(Frame), Session(inputs, given=playback, first="smooth")
         return recorded.of_type(Frame), Session(inputs, given=playback, first=request.first)
     restorer = None
     if files.source is not None:
@@ -458,4 +464,4 @@ def _open_chain(
             )
         )
 
-    return frames, Session(inputs, given=[CropFishOfRuns(open_crop_fish, runs)])
+    return frames, Session(inputs, given=[CropFishOfRuns(open_crop_fish, recording.header.runs)])

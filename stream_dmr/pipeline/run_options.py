@@ -69,6 +69,7 @@ class ReplayRequest:
 
     recordings: Sequence[Path]  # files or folders, in order
     first: Stage = "fit"  # the first that is recomputed
+    second: Path | None = None  # another camera's run of the same fish, for `localize`
     config: Path | None = None
     calibration: Path | None = None
     template: str | None = None

@@ -278,6 +278,18 @@ def draw_calibration(rng: np.random.Generator) -> Calibration:
     )
 
 
+def second_camera(calibration: Calibration, *, degrees: float) -> Calibration:
+    """The same camera, carried round the upright line through the fish before it by an angle."""
+    plane = calibration.plane
+    # Where the camera looks at the plane, in the plane's coordinates.
+    middle_mm = plane.depth_mm(np.array([[0.0, 0.0, 1.0]]))[0] * np.array([0.0, 0.0, 1.0])
+    pivot_mm = plane.rotation.T @ (middle_mm - plane.translation_mm)
+    turn, _ = cv2.Rodrigues(np.radians(degrees) * np.array([0.0, 1.0, 0.0]))
+    rotation = plane.rotation @ turn
+    turned = ReferencePlane(rotation=rotation, translation_mm=middle_mm - rotation @ pivot_mm)
+    return Calibration(camera=calibration.camera, plane=turned)
+
+
 def _draw_visit(
     index: int,
     *,

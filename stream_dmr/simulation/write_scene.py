@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ from jaxtyping import UInt16
 from stream_dmr.calibration.calibration_file import save_calibration
 from stream_dmr.errors import OutputError, UserError, reason_of
 from stream_dmr.simulation.film import VisibleBox, film
-from stream_dmr.simulation.rail_scene import FPS, RailScene, make_scene
+from stream_dmr.simulation.rail_scene import FPS, RailScene, make_scene, second_camera
 from stream_dmr.simulation.simulated_fish import (
     JOINT_ARCS,
     SPECIES,
@@ -22,6 +23,8 @@ from stream_dmr.simulation.simulated_fish import (
 )
 from stream_dmr.tables import write_table
 
+SECOND = "second"  # folder of the other camera
+_MOST_TURNED_DEG = 90
 _MAX_FISH = 65535  # the largest id of a 16-bit mask
 
 _SCENE_FILES = (
@@ -52,7 +55,14 @@ def scene_files(species: str) -> tuple[str, ...]:
 
 
 def simulate(
-    out: Path, *, num_fish: int, num_frames: int, preset: str, seed: int, species: str = "halibut"
+    out: Path,
+    *,
+    num_fish: int,
+    num_frames: int,
+    preset: str,
+    seed: int,
+    species: str = "halibut",
+    second_deg: float | None = None,
 ) -> None:
     """Write a clip of hooked fish with known lengths into the folder `out`.
 
@@ -60,18 +70,27 @@ def simulate(
     `truth_frames.csv` (per fish and frame: keypoints in the camera frame in mm and in frame
     pixels with lens distortion, arc, bending), and `species.ply` with `species.toml`, the mean
     body as a template. Of several `species`, names joined by commas, which take turns, there is a
-    mesh of each, and `species.csv` says which fish is which. Equal arguments write equal masks and
-    truth to the last bit.
+    mesh of each, and `species.csv` says which fish is which. With `second_deg` the folder `second`
+    has the same fish, filmed at the same moments by a camera carried round them by that angle.
+    Equal arguments write equal masks and truth to the last bit.
 
     Raises UserError for counts, a preset, a species or a seed out of range, OutputError where `out`
     can't be written to.
     """
     _check(num_fish=num_fish, num_frames=num_frames, seed=seed)
+    if second_deg is not None and not abs(second_deg) <= _MOST_TURNED_DEG:
+        raise UserError(
+            f"--second: expected at most {_MOST_TURNED_DEG} degrees to either side, got "
+            f"{second_deg:g}"
+        )
     bodies = find_species(species)
     scene = make_scene(
         num_fish=num_fish, num_frames=num_frames, preset=preset, seed=seed, species=bodies
     )
     write_scene(out, scene, species=species)
+    if second_deg is not None:
+        other = second_camera(scene.calibration, degrees=second_deg)
+        write_scene(out / SECOND, replace(scene, calibration=other), species=species)
 
 
 def write_scene(out: Path, scene: RailScene, *, species: str = "halibut") -> None:

@@ -1,0 +1,257 @@
+"""Two runs of the same fish by two cameras as one: which fish are the same, and how late.
+
+The first camera's recording is replayed from its fits on. A fish that the second camera saw at the
+same moment is placed by both, and the rest as one camera places it.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.optimize import linear_sum_assignment
+
+from stream_dmr.camera import Calibration
+from stream_dmr.errors import UserError
+from stream_dmr.localization.localize_fish import LocalizeSettings, localize, mask_std_ratio
+from stream_dmr.localization.two_views import View, place_between, rays_apart, second_from_first
+from stream_dmr.messages import FittedMesh, LocalizedFish
+from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.pipeline.session import Setup
+from stream_dmr.reasons import Reason
+from stream_dmr.recording.reading import Recording, messages_of
+
+_MOST_APART_S = 0.25  # between two pictures of a fish, for what it is between them to be known
+_MOST_OFFSET_S = 10.0  # of the two cameras' clocks, if nothing says better
+_FRAMES = 12  # of a track that are compared
+_FEWEST = 3  # frames that two tracks must share to be one fish
+# Of the distance of the two cameras' rays to head and tail, over the fish's length: more is
+# another fish. Chosen on simulated pairs: the same fish have 0.01, others 0.1 and more.
+_MOST_RAYS_APART = 0.06
+# What one camera refuses since it sees no depth, and two need not.
+_BY_ONE_CAMERA = ("", Reason.TURNED_AWAY, Reason.BENT_TOO_FAR)
+# Of both pictures' residuals, in their stds: more is another fish, or a camera that was moved.
+_MOST_MISFIT = 4.0
+_LEAST_APART_DEG = 3  # between the cameras, seen from the fish: less tells little of depth
+# Of the rays' distance over the length: what is usual on simulated pairs, and what is worth a word.
+_RAYS_USUAL, _RAYS_WARN = 0.01, 0.03
+_SHARED_STD = 0.004  # of the log length, of errors that all frames share: both masks' ends
+
+
+class Track(NamedTuple):
+    """What one camera saw of a fish."""
+
+    times_ns: Int[np.ndarray, "T"]
+    midlines_px: Float[np.ndarray, "T M 2"]
+    length_mm: float
+
+    def at(self, time_ns: int) -> Float[np.ndarray, "M 2"] | None:
+        """The midline at a time, between the frames around it; None too far from them."""
+        after = int(np.searchsorted(self.times_ns, time_ns))
+        before = (
+            after - 1 if after == len(self.times_ns) or self.times_ns[after] > time_ns else after
+        )
+        before, after = max(before, 0), min(after, len(self.times_ns) - 1)
+        t0, t1 = self.times_ns[before], self.times_ns[after]
+        if max(t1 - t0, t0 - time_ns, time_ns - t1) > _MOST_APART_S * 1e9:
+            return None
+        share = 0.0 if t1 == t0 else (time_ns - t0) / (t1 - t0)
+        return (1 - share) * self.midlines_px[before] + share * self.midlines_px[after]
+
+
+def tracks_of(fish: Iterable[LocalizedFish], calibration: Calibration) -> dict[int, Track]:
+    """The tracks of a run by their ids, of the frames that count."""
+    seen: dict[int, list[LocalizedFish]] = {}
+    for one in fish:
+        if one.accepted and one.midline_mm is not None:
+            seen.setdefault(one.track_id, []).append(one)
+    return {
+        track_id: Track(
+            times_ns=np.array([one.timestamp_ns for one in frames]),
+            midlines_px=np.stack([calibration.camera.project(f.midline_mm) for f in frames]),
+            length_mm=float(np.median([one.length_mm for one in frames])),
+        )
+        for track_id, frames in seen.items()
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pairing:
+    """Which fish of two runs are the same."""
+
+    offset_s: float  # the second camera's clock minus the first's
+    ids: Mapping[int, int]  # of the second run, by those of the first
+    apart: float  # of the rays to a fish's ends, over its length: median of all pairs
+
+
+def pair_up(
+    first: Mapping[int, Track],
+    second: Mapping[int, Track],
+    calibrations: tuple[Calibration, Calibration],
+    *,
+    frame_s: float,
+) -> Pairing:
+    """Pair the fish, at the offset of the clocks at which most rays meet.
+
+    Every offset up to 10 s is tried in steps of half a frame, then finer around the best.
+    """
+    steps = np.arange(-_MOST_OFFSET_S, _MOST_OFFSET_S + 1e-9, frame_s / 2)
+    candidates = sorted(steps.tolist(), key=abs)  # equally good ones: the clocks agree
+    best = min(candidates, key=lambda offset: _cost(_apart(first, second, calibrations, offset)))
+    for step in (frame_s / 4, frame_s / 10):
+        finer = sorted(
+            (best + step * n for n in range(-4, 5)), key=lambda offset: abs(offset - best)
+        )
+        best = min(finer, key=lambda offset: _cost(_apart(first, second, calibrations, offset)))
+    apart = _apart(first, second, calibrations, best)
+    rows, columns = linear_sum_assignment(apart)
+    ids, others = [*first], [*second]
+    pairs = {
+        ids[r]: others[c]
+        for r, c in zip(rows.tolist(), columns.tolist(), strict=True)
+        if apart[r, c] < _MOST_RAYS_APART
+    }
+    found = [apart[ids.index(a), others.index(b)] for a, b in pairs.items()]
+    return Pairing(offset_s=best, ids=pairs, apart=float(np.median(found)) if found else np.nan)
+
+
+def _cost(apart: Float[np.ndarray, "A B"]) -> float:
+    rows, columns = linear_sum_assignment(apart)
+    return float(apart[rows, columns].sum())
+
+
+def _apart(
+    first: Mapping[int, Track],
+    second: Mapping[int, Track],
+    calibrations: tuple[Calibration, Calibration],
+    offset_s: float,
+) -> Float[np.ndarray, "A B"]:
+    """How far apart the rays to the ends of each pair of tracks pass, over the fish's length.
+
+    At most `_MOST_RAYS_APART`, as of tracks that were not in view at the same time.
+    """
+    R, t = second_from_first(*calibrations)
+    center_mm = -R.T @ t
+    apart = np.full((len(first), len(second)), _MOST_RAYS_APART)
+    for row, one in enumerate(first.values()):
+        chosen = np.unique(np.linspace(0, len(one.times_ns) - 1, _FRAMES).round().astype(int))
+        for column, other in enumerate(second.values()):
+            times = one.times_ns[chosen] + round(offset_s * 1e9)
+            in_view = (times > other.times_ns[0] - 1e9) & (times < other.times_ns[-1] + 1e9)
+            pairs = [
+                (one.midlines_px[n, [0, -1]], seen[[0, -1]])
+                for n, time_ns in zip(chosen[in_view], times[in_view].tolist(), strict=True)
+                if (seen := other.at(time_ns)) is not None
+            ]
+            if len(pairs) < _FEWEST:
+                continue
+            ends, others = (np.concatenate(part) for part in zip(*pairs, strict=True))
+            rays = calibrations[0].camera.back_project(ends)
+            other_rays = calibrations[1].camera.back_project(others) @ R
+            distances = rays_apart(rays, other_rays, center_mm) / one.length_mm
+            apart[row, column] = min(float(np.median(distances)), _MOST_RAYS_APART)
+    return apart
+
+
+def open_second(
+    first: Recording,
+    second: Recording,
+    setup: Setup,
+    observer: RunObserver,
+) -> "LocalizeByTwo":
+    """The node that places the fish of two runs. Raises UserError if they saw no fish together."""
+    calibration, other = setup.calibration, second.header.calibration
+    if calibration is None or other is None:
+        raise UserError(
+            "expected two runs with --calibration, of the same reference plane; found one without"
+        )
+    R, t = second_from_first(calibration, other)
+    base_mm = float(np.linalg.norm(R.T @ t))  # from camera to camera
+    apart_deg = float(np.degrees(np.arctan2(base_mm, calibration.plane.distance_mm)))
+    if apart_deg < _LEAST_APART_DEG:
+        raise UserError(
+            f"expected two cameras at least {_LEAST_APART_DEG} degrees apart, as seen from the "
+            f"fish, got {apart_deg:.1f} degrees"
+        )
+    tracks = tracks_of(messages_of(first, LocalizedFish), calibration)
+    others = tracks_of(messages_of(second, LocalizedFish), other)
+    steps_ns = np.concatenate([[], *(np.diff(one.times_ns) for one in tracks.values())])
+    pairing = None
+    if len(steps_ns) and others:
+        frame_s = float(np.median(steps_ns)) / 1e9
+        pairing = pair_up(tracks, others, (calibration, other), frame_s=frame_s)
+    if pairing is None or not pairing.ids:
+        raise UserError(
+            f"expected fish that both cameras saw within {_MOST_OFFSET_S:g} s; found none among "
+            f"{len(tracks)} and {len(others)} with good frames. Are both calibrations of the same "
+            "reference plane, with its zero and its axes?"
+        )
+    observer.notice(
+        f"{len(pairing.ids)} of {len(tracks)} fish were seen by both cameras; the second clock is "
+        f"{pairing.offset_s:+.2f} s off, and the rays to a fish's ends pass {pairing.apart:.1%} of "
+        "its length apart"
+    )
+    if pairing.apart > _RAYS_WARN:
+        observer.warn(
+            f"the rays to a fish's ends pass {pairing.apart:.1%} of its length apart, usually "
+            f"{_RAYS_USUAL:.1%}: has a camera been moved since its calibration?"
+        )
+    return LocalizeByTwo(setup.config.localize, calibration, others, other, pairing)
+
+
+class LocalizeByTwo:
+    """A node in the place of Localize: places fish by two cameras where both saw them.
+
+    Of a fish that both saw, only frames that both saw count.
+    """
+
+    def __init__(
+        self,
+        settings: LocalizeSettings,
+        calibration: Calibration,
+        second: Mapping[int, Track],
+        second_calibration: Calibration,
+        pairing: Pairing,
+    ) -> None:
+        self._settings = settings
+        self._calibration, self._second_calibration = calibration, second_calibration
+        self._second, self._pairing = second, pairing
+
+    def step(self, mesh: FittedMesh, /) -> Sequence[LocalizedFish]:
+        """Return the fish of a fit."""
+        alone = localize(mesh, settings=self._settings, calibration=self._calibration)
+        track = self._second.get(self._pairing.ids.get(mesh.track_id, -1))
+        if track is None or alone.midline_mm is None or alone.reason not in _BY_ONE_CAMERA:
+            return [alone]
+        seen_px = track.at(mesh.timestamp_ns + round(self._pairing.offset_s * 1e9))
+        if seen_px is None:
+            return [replace(alone, accepted=False, reason=Reason.SEEN_BY_ONE)]
+        px = self._calibration.camera.project(alone.midline_mm)
+        views = View(px, self._calibration), View(seen_px, self._second_calibration)
+        placed = place_between(views, alone.midline_mm)
+        line = placed.midline_mm
+        part = np.linalg.norm(alone.midline_mm - alone.keypoints_mm[1], axis=1).argmin()
+        chord_mm = float(np.linalg.norm(line[0] - line[-1]))
+        disagree = placed.misfit > _MOST_MISFIT or not np.isfinite(placed.length_std_mm)
+        return [
+            replace(
+                alone,
+                keypoints_mm=line[[0, part, -1]],
+                midline_mm=line,
+                bending_ratio=placed.length_mm / chord_mm,
+                length_mm=placed.length_mm,
+                length_std_mm=placed.length_std_mm,
+                shared_std_ratio=float(np.hypot(_SHARED_STD, mask_std_ratio(mesh.quality))),
+                accepted=not disagree,
+                reason=Reason.CAMERAS_DISAGREE if disagree else "",
+            )
+        ]
+
+    def tick(self, timestamp_ns: int, /) -> Sequence[LocalizedFish]:
+        """Nothing ends here."""
+        return []
+
+    def close(self) -> Sequence[LocalizedFish]:
+        """Nothing is left."""
+        return []

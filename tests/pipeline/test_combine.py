@@ -1,0 +1,135 @@
+"""Two runs of the same fish become one: paired by time and place, placed by both cameras."""
+
+import threading
+
+import numpy as np
+import pytest
+
+import stream_dmr as sd
+from stream_dmr.errors import UserError
+from stream_dmr.localization.two_views import second_from_first
+from stream_dmr.messages import LocalizedFish
+from stream_dmr.pipeline.combine import Track, pair_up
+from stream_dmr.pipeline.replay_recording import replay
+from stream_dmr.pipeline.run_options import ReplayRequest
+from stream_dmr.reasons import Reason
+from stream_dmr.recording.reading import messages_of, open_recordings
+from stream_dmr.simulation import SECOND, simulate
+from stream_dmr.simulation.rail_scene import FPS, second_camera
+from tests.localization.test_two_views import FIRST
+from tests.support.command import invoke, rows
+
+FRAME_S = 1 / FPS
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Three fish, seen by two cameras 35 degrees apart, each run by itself."""
+    folder = tmp_path_factory.mktemp("two")
+    simulate(folder, num_fish=3, num_frames=30, preset="realistic", seed=21, second_deg=35.0)
+    for place in (folder, folder / SECOND):
+        sd.measure(
+            place / "video.mp4",
+            out=place / "run",
+            calibration=place / "calibration.yaml",
+            masks=place / "masks",
+            template=folder / "species.ply",
+        )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def combined(scene):
+    result = invoke(f"combine {scene / 'run'} {scene / SECOND / 'run'} --out {scene / 'both'}")
+    assert result.code == 0, result.err
+    return result
+
+
+def errors(scene, run):
+    true = {row["track_id"]: float(row["length_mm"]) for row in rows(scene / "truth.csv")}
+    return [
+        float(row["length_mm"]) / true[row["track_id"]] - 1
+        for row in rows(scene / run / "lengths.csv")
+        if row["length_mm"]
+    ]
+
+
+def test_fish_that_both_see_are_within_two_percent(scene, combined):
+    """The third fish has too few frames that are good for both: it is measured by the first."""
+    assert "2 of 3 fish were seen by both cameras" in combined.err
+    single, both = errors(scene, "run"), errors(scene, "both")
+    changed = [new for old, new in zip(single, both, strict=True) if old != new]
+    assert len(changed) == 2
+    assert np.abs(changed).max() < 0.02
+
+
+def test_the_recording_holds_the_fish_where_both_see_them(scene, combined):
+    recording = open_recordings([scene / "both"])
+    fish = [one for one in messages_of(recording, LocalizedFish) if one.accepted]
+    assert len(fish) > 20
+    for one in fish:
+        steps = np.linalg.norm(np.diff(one.midline_mm, axis=0), axis=1)
+        assert steps.sum() == pytest.approx(one.length_mm)
+    checked = invoke(f"replay {scene / 'both'} --from smooth --check")
+    assert checked.code == 0, checked.out
+    single = [one for one in messages_of(open_recordings([scene / "run"]), LocalizedFish)]
+    again = [one for one in messages_of(recording, LocalizedFish)]
+    assert [(one.frame_index, one.track_id) for one in single] == [
+        (one.frame_index, one.track_id) for one in again
+    ]
+    assert {one.reason for one in again} <= {"", *map(str, Reason)}
+
+
+def test_runs_that_share_no_fish_or_no_calibration_are_refused(scene, tmp_path):
+    result = invoke(f"combine {scene / 'run'} {scene / 'run'} --out {tmp_path / 'same'}")
+    assert "two cameras at least 3 degrees apart" in result.error
+    sd.measure(
+        scene / "video.mp4", out=tmp_path / "bare", masks=scene / "masks", template="halibut"
+    )
+    request = ReplayRequest(
+        recordings=[scene / "run"],
+        first="localize",
+        second=tmp_path / "bare",
+        out=tmp_path / "both",
+    )
+    with pytest.raises(UserError, match="with --calibration"):
+        replay(request, stop=threading.Event())
+
+
+def tracks(rng, degrees, offset_s):
+    """Six fish that swim about; both cameras see the first four, and each one more."""
+    second = second_camera(FIRST, degrees=degrees)
+    R, t = second_from_first(FIRST, second)
+    first_tracks, second_tracks = {}, {}
+    for fish in range(1, 7):
+        times_s = rng.uniform(0, 8) + np.arange(14) * FRAME_S
+        place = rng.uniform([-500, -300, 4600], [500, 300, 5300])
+        speed = rng.uniform(-300, 300, 3)
+        upright = np.linspace(-350, 350, 9)[:, None] * [0.1, 1.0, 0.05]
+
+        def midline(time_s, place=place, speed=speed, upright=upright, begin=times_s[0]):
+            return place + speed * (time_s - begin) + upright
+
+        views = ((FIRST, np.eye(3), np.zeros(3), 0.0, first_tracks, 5),)
+        views += ((second, R, t, 0.4 * FRAME_S, second_tracks, 6),)
+        for camera, turn, shift, late_s, found, leaves_out in views:
+            if fish == leaves_out:
+                continue
+            moments = times_s + late_s
+            lines = [midline(moment) @ turn.T + shift for moment in moments]
+            clock_s = moments + (offset_s if found is second_tracks else 0.0)
+            found[fish if found is first_tracks else fish + 10] = Track(
+                times_ns=np.round(clock_s * 1e9).astype(np.int64),
+                midlines_px=np.stack([camera.camera.project(line) for line in lines]),
+                length_mm=700.0,
+            )
+    return first_tracks, second_tracks, (FIRST, second)
+
+
+@pytest.mark.parametrize("offset_s", [0.0, 2.34, -7.77])
+def test_fish_are_paired_and_the_clocks_difference_is_found(offset_s):
+    first, second, calibrations = tracks(np.random.default_rng(4), 35.0, offset_s)
+    pairing = pair_up(first, second, calibrations, frame_s=FRAME_S)
+    assert pairing.ids == {fish: fish + 10 for fish in (1, 2, 3, 4)}
+    assert pairing.offset_s == pytest.approx(offset_s, abs=0.02)
+    assert pairing.apart < 0.005
