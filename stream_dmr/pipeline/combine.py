@@ -25,6 +25,7 @@ from stream_dmr.recording.reading import Recording, messages_of
 _MOST_APART_S = 0.25  # between two pictures of a fish, for what it is between them to be known
 _MOST_OFFSET_S = 10.0  # of the two cameras' clocks, if nothing says better
 _FRAMES = 12  # of a track that are compared
+_COMPARED = 24  # tracks by which the clocks are compared
 _FEWEST = 3  # frames that two tracks must share to be one fish
 # Of the distance of the two cameras' rays to head and tail, over the fish's length: more is
 # another fish. Chosen on simulated pairs: the same fish have 0.01, others 0.1 and more.
@@ -39,8 +40,8 @@ _RAYS_USUAL, _RAYS_WARN = 0.01, 0.03
 _SHARED_STD = 0.004  # of the log length, of errors that all frames share: both masks' ends
 
 
-class Track(NamedTuple):
-    """What one camera saw of a fish."""
+class FishSightings(NamedTuple):
+    """The frames of a fish that one camera saw well."""
 
     times_ns: Int[np.ndarray, "T"]
     midlines_px: Float[np.ndarray, "T M 2"]
@@ -60,14 +61,14 @@ class Track(NamedTuple):
         return (1 - share) * self.midlines_px[before] + share * self.midlines_px[after]
 
 
-def tracks_of(fish: Iterable[LocalizedFish], calibration: Calibration) -> dict[int, Track]:
+def tracks_of(fish: Iterable[LocalizedFish], calibration: Calibration) -> dict[int, FishSightings]:
     """The tracks of a run by their ids, of the frames that count."""
     seen: dict[int, list[LocalizedFish]] = {}
     for one in fish:
         if one.accepted and one.midline_mm is not None:
             seen.setdefault(one.track_id, []).append(one)
     return {
-        track_id: Track(
+        track_id: FishSightings(
             times_ns=np.array([one.timestamp_ns for one in frames]),
             midlines_px=np.stack([calibration.camera.project(f.midline_mm) for f in frames]),
             length_mm=float(np.median([one.length_mm for one in frames])),
@@ -86,8 +87,8 @@ class Pairing:
 
 
 def pair_up(
-    first: Mapping[int, Track],
-    second: Mapping[int, Track],
+    first: Mapping[int, FishSightings],
+    second: Mapping[int, FishSightings],
     calibrations: tuple[Calibration, Calibration],
     *,
     frame_s: float,
@@ -96,34 +97,33 @@ def pair_up(
 
     Every offset up to 10 s is tried in steps of half a frame, then finer around the best.
     """
+    chosen = np.unique(np.linspace(0, len(first) - 1, _COMPARED).round().astype(int))
+    some = {fish: first[fish] for fish in np.array([*first])[chosen].tolist()}
+
+    def cost(offset_s: float) -> float:
+        apart = _apart(some, second, calibrations, offset_s)
+        return float(apart[linear_sum_assignment(apart)].sum())
+
     steps = np.arange(-_MOST_OFFSET_S, _MOST_OFFSET_S + 1e-9, frame_s / 2)
-    candidates = sorted(steps.tolist(), key=abs)  # equally good ones: the clocks agree
-    best = min(candidates, key=lambda offset: _cost(_apart(first, second, calibrations, offset)))
+    best = min(sorted(steps.tolist(), key=abs), key=cost)  # of equals: the clocks agree
     for step in (frame_s / 4, frame_s / 10):
-        finer = sorted(
-            (best + step * n for n in range(-4, 5)), key=lambda offset: abs(offset - best)
-        )
-        best = min(finer, key=lambda offset: _cost(_apart(first, second, calibrations, offset)))
+        finer = [best + step * n for n in sorted(range(-4, 5), key=abs)]
+        best = min(finer, key=cost)
     apart = _apart(first, second, calibrations, best)
     rows, columns = linear_sum_assignment(apart)
-    ids, others = [*first], [*second]
+    ids, other_ids = [*first], [*second]
     pairs = {
-        ids[r]: others[c]
+        ids[r]: other_ids[c]
         for r, c in zip(rows.tolist(), columns.tolist(), strict=True)
         if apart[r, c] < _MOST_RAYS_APART
     }
-    found = [apart[ids.index(a), others.index(b)] for a, b in pairs.items()]
+    found = [apart[ids.index(a), other_ids.index(b)] for a, b in pairs.items()]
     return Pairing(offset_s=best, ids=pairs, apart=float(np.median(found)) if found else np.nan)
 
 
-def _cost(apart: Float[np.ndarray, "A B"]) -> float:
-    rows, columns = linear_sum_assignment(apart)
-    return float(apart[rows, columns].sum())
-
-
 def _apart(
-    first: Mapping[int, Track],
-    second: Mapping[int, Track],
+    first: Mapping[int, FishSightings],
+    second: Mapping[int, FishSightings],
     calibrations: tuple[Calibration, Calibration],
     offset_s: float,
 ) -> Float[np.ndarray, "A B"]:
@@ -134,22 +134,24 @@ def _apart(
     R, t = second_from_first(*calibrations)
     center_mm = -R.T @ t
     apart = np.full((len(first), len(second)), _MOST_RAYS_APART)
+    others = [*second.values()]
+    begins, ends = (np.array([one.times_ns[n] for one in others]) for n in (0, -1))
     for row, one in enumerate(first.values()):
         chosen = np.unique(np.linspace(0, len(one.times_ns) - 1, _FRAMES).round().astype(int))
-        for column, other in enumerate(second.values()):
-            times = one.times_ns[chosen] + round(offset_s * 1e9)
-            in_view = (times > other.times_ns[0] - 1e9) & (times < other.times_ns[-1] + 1e9)
+        times = one.times_ns[chosen] + round(offset_s * 1e9)
+        for column in np.flatnonzero((begins <= times[-1]) & (ends >= times[0])).tolist():
             pairs = [
                 (one.midlines_px[n, [0, -1]], seen[[0, -1]])
-                for n, time_ns in zip(chosen[in_view], times[in_view].tolist(), strict=True)
-                if (seen := other.at(time_ns)) is not None
+                for n, time_ns in zip(chosen, times.tolist(), strict=True)
+                if (seen := others[column].at(time_ns)) is not None
             ]
             if len(pairs) < _FEWEST:
                 continue
-            ends, others = (np.concatenate(part) for part in zip(*pairs, strict=True))
-            rays = calibrations[0].camera.back_project(ends)
-            other_rays = calibrations[1].camera.back_project(others) @ R
-            distances = rays_apart(rays, other_rays, center_mm) / one.length_mm
+            rays, other_rays = (
+                calibration.camera.back_project(np.concatenate(part))
+                for calibration, part in zip(calibrations, zip(*pairs, strict=True), strict=True)
+            )
+            distances = rays_apart(rays, other_rays @ R, center_mm) / one.length_mm
             apart[row, column] = min(float(np.median(distances)), _MOST_RAYS_APART)
     return apart
 
@@ -210,7 +212,7 @@ class LocalizeByTwo:
         self,
         settings: LocalizeSettings,
         calibration: Calibration,
-        second: Mapping[int, Track],
+        second: Mapping[int, FishSightings],
         second_calibration: Calibration,
         pairing: Pairing,
     ) -> None:

@@ -9,7 +9,7 @@ import stream_dmr as sd
 from stream_dmr.errors import UserError
 from stream_dmr.localization.two_views import second_from_first
 from stream_dmr.messages import LocalizedFish
-from stream_dmr.pipeline.combine import Track, pair_up
+from stream_dmr.pipeline.combine import FishSightings, pair_up
 from stream_dmr.pipeline.replay_recording import replay
 from stream_dmr.pipeline.run_options import ReplayRequest
 from stream_dmr.reasons import Reason
@@ -118,7 +118,7 @@ def tracks(rng, degrees, offset_s):
             moments = times_s + late_s
             lines = [midline(moment) @ turn.T + shift for moment in moments]
             clock_s = moments + (offset_s if found is second_tracks else 0.0)
-            found[fish if found is first_tracks else fish + 10] = Track(
+            found[fish if found is first_tracks else fish + 10] = FishSightings(
                 times_ns=np.round(clock_s * 1e9).astype(np.int64),
                 midlines_px=np.stack([camera.camera.project(line) for line in lines]),
                 length_mm=700.0,
