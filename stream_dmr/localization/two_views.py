@@ -87,10 +87,11 @@ def place_between(views: tuple[View, View], start_mm: Float[np.ndarray, "M 3"]) 
     ) -> Float[np.ndarray, "R C"]:
         return np.stack([(of(x + d) - of(x - d)) / (2 * _STEP * scale) for d in shifts], axis=-1)
 
+    J = slopes(residuals, coefficients)
     for _ in range(_ROUNDS):
-        J = slopes(residuals, coefficients)
         step = np.linalg.solve(J.T @ J, J.T @ residuals(coefficients))
         coefficients = coefficients - step
+        J = slopes(residuals, coefficients)
         if np.abs(step).max() < _SETTLED * scale:
             break
     dense = np.polynomial.legendre.legvander(np.linspace(-1, 1, len(start_mm)), _DEGREE)

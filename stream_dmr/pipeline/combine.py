@@ -63,17 +63,22 @@ class FishSightings(NamedTuple):
 
 def tracks_of(fish: Iterable[LocalizedFish], calibration: Calibration) -> dict[int, FishSightings]:
     """The tracks of a run by their ids, of the frames that count."""
-    seen: dict[int, list[LocalizedFish]] = {}
+    times: dict[int, list[int]] = {}
+    midlines: dict[int, list[Float[np.ndarray, "M 2"]]] = {}
+    lengths: dict[int, list[float]] = {}
     for one in fish:
-        if one.accepted and one.midline_mm is not None:
-            seen.setdefault(one.track_id, []).append(one)
+        if one.accepted and one.midline_mm is not None and one.length_mm is not None:
+            midline_px = calibration.camera.project(one.midline_mm)
+            times.setdefault(one.track_id, []).append(one.timestamp_ns)
+            midlines.setdefault(one.track_id, []).append(midline_px)
+            lengths.setdefault(one.track_id, []).append(one.length_mm)
     return {
         track_id: FishSightings(
-            times_ns=np.array([one.timestamp_ns for one in frames]),
-            midlines_px=np.stack([calibration.camera.project(f.midline_mm) for f in frames]),
-            length_mm=float(np.median([one.length_mm for one in frames])),
+            times_ns=np.array(times[track_id]),
+            midlines_px=np.stack(midlines[track_id]),
+            length_mm=float(np.median(lengths[track_id])),
         )
-        for track_id, frames in seen.items()
+        for track_id in times
     }
 
 
@@ -224,7 +229,9 @@ class LocalizeByTwo:
         """Return the fish of a fit."""
         alone = localize(mesh, settings=self._settings, calibration=self._calibration)
         track = self._second.get(self._pairing.ids.get(mesh.track_id, -1))
-        if track is None or alone.midline_mm is None or alone.reason not in _BY_ONE_CAMERA:
+        if track is None or alone.midline_mm is None or alone.keypoints_mm is None:
+            return [alone]
+        if alone.reason not in _BY_ONE_CAMERA:
             return [alone]
         seen_px = track.at(mesh.timestamp_ns + round(self._pairing.offset_s * 1e9))
         if seen_px is None:

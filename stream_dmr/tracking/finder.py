@@ -117,7 +117,7 @@ def find_in_still(detector: Detector, frame: Frame) -> list[Candidate]:
     """The candidates of a picture: large ones from afar, with a rim, small ones from near."""
     height, width = frame.image.shape[:2]
     rim_px = round(_RIM * max(height, width))
-    afar = cv2.copyMakeBorder(frame.image, *[rim_px] * 4, cv2.BORDER_REPLICATE)
+    afar = cv2.copyMakeBorder(frame.image, rim_px, rim_px, rim_px, rim_px, cv2.BORDER_REPLICATE)
     large = [
         one
         for one in _seen_in(detector, frame, afar, (-rim_px, -rim_px))
