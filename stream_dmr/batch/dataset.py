@@ -1,6 +1,6 @@
 """The results of a batch as one Parquet data set, partitioned by vessel and trip.
 
-`DIR/dataset/fish` has one row a fish, `DIR/dataset/frames` one row a fish and frame; both are
+`DIR/dataset/fish` has one row per fish, `DIR/dataset/frames` one row per fish and frame; both are
 partitioned as by Hive, with one file a video: `vessel=.../trip=.../VIDEO.parquet`.
 """
 

@@ -58,7 +58,7 @@ def batch(
     """Measure every video of a manifest, each as `run` does; call it again to go on.
 
     Writes --out/videos/NAME (as `run` does), videos.csv (what became of each) and dataset (Parquet:
-    a row a fish, a row a fish and frame). A video that can't be measured fails alone.
+    a row per fish, a row per fish and frame). A video that can't be measured fails alone.
     """
     with stop_on_signals() as stop:
         from stream_dmr.batch.driver import run_batch

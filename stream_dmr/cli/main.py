@@ -2,23 +2,22 @@
 
 import sys
 import traceback
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
-from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from stream_dmr.cli.batch import batch
 from stream_dmr.cli.calibrate import calibrate, check
 from stream_dmr.cli.export import export
 from stream_dmr.cli.replay import combine, replay
 from stream_dmr.cli.review import agreement, review
-from stream_dmr.cli.run import demo, recover, run, setup
-from stream_dmr.cli.shared_options import OverwriteOption
+from stream_dmr.cli.run import demo, recover, run, setup, simulate
 from stream_dmr.cli.templates import learn_template, make_template
 from stream_dmr.cli.train import evaluate, train
 from stream_dmr.cli.verify import keygen, report, verify
@@ -27,20 +26,69 @@ from stream_dmr.cli.view import convert, view
 from stream_dmr.errors import UserError
 from stream_dmr.version import __version__
 
+# In the order and groups of --help, each with what it says there.
+_GROUPS: dict[str, dict[Callable[..., None], str]] = {
+    "Measure": {
+        demo: "Measure the fish of the embedded scene.",
+        run: "Measure the fish of a video, a folder or a camera.",
+        combine: "Measure fish that two cameras saw: one length of both.",
+        batch: "Measure every video of a manifest.",
+        replay: "Recompute a recording from one stage on.",
+        evaluate: "Compare measured lengths with known ones.",
+    },
+    "Look": {
+        view: "Look at a recording in the viewer.",
+        convert: "Write the .rrd of a recording, or of a part of it.",
+        report: "Write results as one page that opens offline.",
+        export: "Write meshes, masks, keypoints and tables.",
+    },
+    "Review": {
+        review: "Review fish in the browser.",
+        agreement: "Compare the review with blind readings.",
+        verify: "Check that results are what their run measured.",
+    },
+    "At sea and ashore": {
+        haul: "Begin or end a haul.",
+        recover: "Repair recordings after a crash or a power cut.",
+        keygen: "Make a device key, which signs results.",
+        fleet: "Write one page about all boxes of a fleet.",
+    },
+    "Set up": {
+        setup: "Compile the numeric loops before the first run.",
+        calibrate: "Calibrate a camera and its reference plane.",
+        check: "Check a calibration by a board or a rod.",
+        make_template: "Make a template from one mask of a straight fish.",
+        learn_template: "Learn a mean shape from the masks of fish.",
+        train: "Train the network that finds masks.",
+        simulate: "Make a scene of hooked fish with known lengths.",
+    },
+}
+_NAMES = {f: f.__name__.replace("_", "-") for group in _GROUPS.values() for f in group}
+
+
+class _GroupedHelp(TyperGroup):
+    """Lists the commands by what they are for."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write a list of commands for each group."""
+        for title, commands in _GROUPS.items():
+            names = [_NAMES[command] for command in commands]
+            rows = [(name, self.commands[name].short_help or "") for name in names]
+            with formatter.section(title):
+                formatter.write_dl(rows)
+
+
 app = typer.Typer(
     name="stream-dmr",
+    cls=_GroupedHelp,
     help="Lengths of hooked, bent fish from one calibrated camera, with every stage recorded.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # else it takes [tables] of settings for markup, and they vanish
 )
-for command in (
-    *(demo, run, calibrate, check, replay, combine, recover, view, convert, export),
-    *(report, review, agreement, verify, haul, keygen, batch, fleet, evaluate, train),
-    *(learn_template, make_template, setup),
-):
-    app.command()(command)
+for _group in _GROUPS.values():
+    for _command, _summary in _group.items():
+        app.command(short_help=_summary)(_command)
 
 
 def main() -> None:
@@ -123,44 +171,6 @@ def _options(
     ] = False,
 ) -> None:
     pass
-
-
-@app.command("simulate")
-def simulate_command(
-    out: Annotated[Path, typer.Option(help="Folder for the scene.")],
-    fish: Annotated[int, typer.Option(help="Number of fish.")] = 3,
-    frames: Annotated[int, typer.Option(help="Number of frames.")] = 60,
-    preset: Annotated[str, typer.Option(help="clean, realistic or severe.")] = "realistic",
-    seed: Annotated[int, typer.Option(help="Equal seeds give equal scenes.")] = 0,
-    species: Annotated[
-        str, typer.Option(help="Body of the fish; several, joined by commas, take turns.")
-    ] = "halibut",
-    second: Annotated[
-        float | None,
-        typer.Option(
-            help="Film the same fish by another camera too, from so many degrees beside it."
-        ),
-    ] = None,
-    overwrite: OverwriteOption = False,
-) -> None:
-    """Make a scene of hooked fish with known lengths: video, boxes, masks, calibration, truth."""
-    from stream_dmr.evidence.own_files import require_writable
-    from stream_dmr.simulation import SECOND, scene_files, simulate
-
-    names = scene_files(species)
-    folders = [out] if second is None else [out, out / SECOND]
-    files = [folder / name for folder in folders for name in names]
-    require_writable(*files, overwrite=overwrite)
-    simulate(
-        out,
-        num_fish=fish,
-        num_frames=frames,
-        preset=preset,
-        seed=seed,
-        species=species,
-        second_deg=second,
-    )
-    print(f"scene in {' and '.join(map(str, folders))}: {', '.join(names)}")
 
 
 if __name__ == "__main__":

@@ -253,3 +253,41 @@ def recover(
         count += 1
     if not count:
         print(f"{folder}: nothing to repair")
+
+
+def simulate(
+    out: Annotated[Path, typer.Option(help="Folder for the scene.")],
+    fish: Annotated[int, typer.Option(help="Number of fish.")] = 3,
+    frames: Annotated[int, typer.Option(help="Number of frames.")] = 60,
+    preset: Annotated[str, typer.Option(help="clean, realistic or severe.")] = "realistic",
+    seed: Annotated[int, typer.Option(help="Equal seeds give equal scenes.")] = 0,
+    species: Annotated[
+        str, typer.Option(help="Body of the fish; several, joined by commas, take turns.")
+    ] = "halibut",
+    second: Annotated[
+        float | None,
+        typer.Option(
+            help="Film the same fish by another camera too, from so many degrees beside it."
+        ),
+    ] = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Make a scene of hooked fish with known lengths: video, boxes, masks, calibration, truth."""
+    from stream_dmr.evidence.own_files import require_writable
+    from stream_dmr.simulation import SECOND, scene_files
+    from stream_dmr.simulation import simulate as write
+
+    names = scene_files(species)
+    folders = [out] if second is None else [out, out / SECOND]
+    files = [folder / name for folder in folders for name in names]
+    require_writable(*files, overwrite=overwrite)
+    write(
+        out,
+        num_fish=fish,
+        num_frames=frames,
+        preset=preset,
+        seed=seed,
+        species=species,
+        second_deg=second,
+    )
+    print(f"scene in {' and '.join(map(str, folders))}: {', '.join(names)}")

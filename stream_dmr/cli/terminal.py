@@ -213,10 +213,8 @@ def _table(*titles: str) -> Table:
 
 
 def length_text(estimate: LengthEstimate) -> str:
-    """Length ± std in mm, or a dash."""
-    if estimate.length_mm is None or estimate.length_std_mm is None:
-        return "-"
-    return f"{estimate.length_mm:.1f} ± {estimate.length_std_mm:.1f}"
+    """Length in mm, or a dash."""
+    return "-" if estimate.length_mm is None else f"{estimate.length_mm:.1f}"
 
 
 def interval_text(estimate: LengthEstimate) -> str:

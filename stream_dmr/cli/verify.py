@@ -63,7 +63,10 @@ def report(
         Path,
         typer.Argument(help="The --out of a run or of a batch, or a recording.", metavar="DIR|REC"),
     ],
-    out: Annotated[Path, typer.Option(help="The page to write.")] = Path("report.html"),
+    out: Annotated[
+        Path | None,
+        typer.Option(help="The page to write.", show_default="report.html in the folder"),
+    ] = None,
     source: _Source = None,
     config: _Config = None,
     coast: Annotated[
@@ -77,6 +80,8 @@ def report(
     from stream_dmr.web.open_reports import is_batch, open_batch, open_report, write_report
     from stream_dmr.web.trip_map import load_coast
 
+    if out is None:
+        out = (path if path.is_dir() else path.parent) / "report.html"
     require_writable(out, overwrite=overwrite, is_own=is_made_by("report"))
     shores = [] if coast is None else load_coast(coast)
     failed = list[str]()

@@ -118,7 +118,7 @@ def fleet(
     ] = 0.0,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Write one page with health, fish an hour, alarms, disk and last contact of each box.
+    """Write one page with health, fish per hour, alarms, disk and last contact of each box.
 
     A box that does not answer is shown with what it said last, which is kept in a .json of the
     page's name. The page needs no server; with --every, Ctrl-C ends it.
@@ -176,4 +176,4 @@ def _figures(state: "BoxState") -> str:
         return "never answered"
     if state.error:
         return f"last contact {minute_text(state.contact_ns)}"
-    return f"{state.reading.fish_per_hour:.0f} fish an hour, {disk_text(state.reading)} free"
+    return f"{state.reading.fish_per_hour:.0f} fish per hour, {disk_text(state.reading)} free"

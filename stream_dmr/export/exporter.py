@@ -135,7 +135,7 @@ class Export:
         return len(coco["annotations"])
 
     def tables(self, out: Path, *, format: TableFormat) -> list[Path]:
-        """Write lengths and frames (keypoints, one row a fish and frame) into `out`, as `run`.
+        """Write lengths and frames (keypoints, one row per fish and frame) into `out`, as `run`.
 
         Fish that reviewers added, split or merged have the frames that they have since. Lengths
         are those of lengths.db, where there is one: of a camera, old segments may be deleted.

@@ -1,4 +1,4 @@
-"""fish.csv (or .parquet): one row a fish with all that fisheries and auditors need of it."""
+"""fish.csv (or .parquet): one row per fish with all that fisheries and auditors need of it."""
 
 import json
 from collections.abc import Callable, Sequence

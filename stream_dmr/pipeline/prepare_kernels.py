@@ -141,7 +141,7 @@ def _takes(lock: IO[str]) -> bool:
 def _progress(folder: Path, began: float) -> str:
     count = sum(1 for _ in folder.rglob("*.nbc"))
     return (
-        f"compiling the numeric loops, once on this machine: {count} of about {_ABOUT}, "
+        f"compiling the numeric loops, once on this machine: {count} of {max(count, _ABOUT)}, "
         f"{time.monotonic() - began:.0f} s"
     )
 

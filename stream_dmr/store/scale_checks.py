@@ -51,8 +51,10 @@ class ScaleCheck:
         if abs(self.error_percent) <= self.limit_percent:
             return ""
         return (
-            f"a known length of {self.known_mm:.1f} mm was measured {self.error_percent:+.2f} % "
-            f"off, more than {self.limit_percent:g} %: lengths of this calibration are as wrong"
+            f"a known length of {self.known_mm:.1f} mm was measured "
+            f"{abs(self.error_percent):.2f} % too {'long' if self.error_percent > 0 else 'short'}, "
+            f"more than {self.limit_percent:g} %: all lengths with this calibration have the same "
+            "error"
         )
 
 

@@ -268,12 +268,12 @@ def fleet_page(states: Sequence[BoxState], *, title: str, every_s: float, now_ns
 
 
 def fleet_summary(states: Sequence[BoxState]) -> str:
-    """One line: how many boxes are in which state, and their fish an hour together."""
+    """One line: how many boxes are in which state, and their fish per hour together."""
     counts = Counter(state.kind for state in states)
     parts = [f"{counts[kind]} {words}" for kind, words in _SUMMARY.items() if counts[kind]]
     hourly = sum(s.reading.fish_per_hour for s in states if s.reading and not s.error)
     boxes = "1 box" if len(states) == 1 else f"{len(states)} boxes"
-    return f"{boxes}: {', '.join(parts)}; {hourly:.0f} fish an hour"
+    return f"{boxes}: {', '.join(parts)}; {hourly:.0f} fish per hour"
 
 
 def state_text(state: BoxState) -> str:

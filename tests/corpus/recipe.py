@@ -159,8 +159,8 @@ def _review(review: Review, scene: Path, folder: Path) -> None:
 
 def _commands(shell: Shell) -> None:
     """Texts of help, wrong values, and commands that need no run."""
-    listed = shell.call("commands/help", "--help").partition("Commands:")[2]
-    for name in re.findall(r"^  ([a-z-]+) ", listed, re.MULTILINE):
+    listed = shell.call("commands/help", "--help")
+    for name in re.findall(r"^  ([a-z][a-z-]*)  ", listed, re.MULTILINE):
         shell.call(f"commands/help_{name}", name, "--help")
     wrong = {
         "no_source": ("run", "--source", "missing.mp4"),

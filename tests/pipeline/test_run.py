@@ -69,7 +69,7 @@ def test_several_fish_come_and_go_and_every_stage_is_recorded(tmp_path: Path):
     for row in lengths:
         low, length, high = (float(row[f]) for f in ("ci95_low_mm", "length_mm", "ci95_high_mm"))
         assert low < length < high
-        assert f"{length:.1f} ±" in outcome.out
+        assert f" {length:.1f} " in outcome.out
 
     counts = kinds(out / "recording.mcap")
     assert counts[Frame] == 8

@@ -1,4 +1,4 @@
-"""frames.csv: one row a fish and frame, with the final verdict, on the disk as it comes."""
+"""frames.csv: one row per fish and frame, with the final verdict, on the disk as it comes."""
 
 import csv
 from dataclasses import replace

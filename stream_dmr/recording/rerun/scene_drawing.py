@@ -347,4 +347,7 @@ def _fish_result(estimate: LengthEstimate) -> str:
     frames = f"{estimate.frames_used} of {estimate.frames_seen} frames used"
     if estimate.length_mm is None:
         return f"no length ({estimate.status}), {frames}"
-    return f"{estimate.length_mm:.1f} ± {estimate.length_std_mm or 0:.1f} mm, {frames}"
+    interval = ""
+    if estimate.ci95_mm is not None:
+        interval = " (95 %: {:.1f} to {:.1f})".format(*estimate.ci95_mm)
+    return f"{estimate.length_mm:.1f} mm{interval}, {frames}"
