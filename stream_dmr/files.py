@@ -6,6 +6,7 @@ import io
 import itertools
 import os
 import re
+import stat
 import weakref
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager, suppress
@@ -130,8 +131,16 @@ def read_text(path: Path, *, encoding: str = "utf-8", max_bytes: int = MAX_TEXT_
 
 
 def read_small(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
-    """The content of a file that should be small. Raises OSError as `read_text` does."""
-    with path.open("rb") as file:
+    """The content of a file that should be small. Raises OSError as `read_text` does.
+
+    A pipe or a device is refused: reading it may never end.
+    """
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+        mode = os.fstat(file.fileno()).st_mode
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        if not stat.S_ISREG(mode):
+            raise OSError(errno.EINVAL, "no file but a pipe or a device")
         data = file.read(max_bytes + 1)
     if len(data) > max_bytes:
         raise OSError(errno.EFBIG, f"more than {max_bytes // 1000} kB")

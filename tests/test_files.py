@@ -12,6 +12,7 @@ from stream_dmr.files import (
     TransactionalFile,
     make_folder,
     natural_order,
+    read_small,
     rename_durably,
     replacing,
     sha256_of_files,
@@ -116,3 +117,20 @@ def test_the_hash_of_files_is_that_of_sha256sum(tmp_path: Path):
         ["sha256sum", "a", "b"], cwd=tmp_path, capture_output=True, check=True
     ).stdout
     assert sha256_of_files(tmp_path.iterdir()) == hashlib.sha256(printed).hexdigest()
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "large", "folder"])
+def test_what_may_never_end_is_not_read(tmp_path: Path, kind: str):
+    path = tmp_path / kind
+    if kind == "pipe":
+        os.mkfifo(path)  # without a writer, which would be waited for
+    elif kind == "device":
+        path = Path("/dev/zero")
+    elif kind == "large":
+        path.write_bytes(bytes(101))
+    else:
+        path.mkdir()
+    with pytest.raises(OSError, match=r"pipe|more than|directory"):
+        read_small(path, max_bytes=100)
+    (tmp_path / "small").write_bytes(b"text")
+    assert read_small(tmp_path / "small", max_bytes=4) == b"text"

@@ -1,6 +1,7 @@
 """The manifest of a batch: one row a video, with its annotations and its vessel, trip and haul."""
 
 import csv
+import io
 import json
 import re
 from collections import Counter
@@ -11,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from stream_dmr.errors import UserError, reason_of
+from stream_dmr.files import read_text
 from stream_dmr.version import __version__
 
 COLUMNS = ("video", "calibration", "boxes", "masks", "vessel", "trip", "haul")
 MORE_COLUMNS = ("nmea", "start_utc")  # that a manifest may have as well
+_MAX_BYTES = 100_000_000  # of a manifest: a million videos
 _FILES = (*COLUMNS[:4], "nmea")
 
 
@@ -99,9 +102,9 @@ def repeated_videos(jobs: Sequence[Job]) -> list[str]:
 
 def _rows(path: Path) -> list[dict[str | None, str | None]]:
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            rows, columns = list(reader), reader.fieldnames or []
+        text = read_text(path, encoding="utf-8-sig", max_bytes=_MAX_BYTES)
+        reader = csv.DictReader(io.StringIO(text, newline=""))
+        rows, columns = list(reader), reader.fieldnames or []
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(
             f"{path}: expected a manifest as CSV in UTF-8, got: {reason_of(error)}"

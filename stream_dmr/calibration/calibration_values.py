@@ -106,11 +106,19 @@ def _numbers(node: cv2.FileNode) -> list[float] | None:
     return [number.real() for number in numbers]
 
 
+def _parsed_yaml(text: str) -> object:
+    """YAML without aliases, of which a few lines can stand for all of the memory."""
+    events = yaml.parse(text, Loader=yaml.CSafeLoader)
+    if any(isinstance(event, yaml.AliasEvent) for event in events):
+        raise ValueError("aliases")
+    return yaml.load(text, Loader=yaml.CSafeLoader)
+
+
 def _parsed(text: str, path: Path) -> Values:
     """JSON, or YAML without OpenCV's head."""
     try:
         is_json = text.lstrip().startswith("{")
-        values = json.loads(text) if is_json else yaml.load(text, Loader=yaml.CSafeLoader)
+        values = json.loads(text) if is_json else _parsed_yaml(text)
     except (ValueError, TypeError, yaml.YAMLError, RecursionError) as error:
         raise _no_calibration(path, f"a file that begins with {text[:20]!r}") from error
     if not isinstance(values, dict):

@@ -113,6 +113,8 @@ class MaskFolder:
         try:
             with Image.open(path) as file:
                 _check_labels(file, path, size=(width, height))
+                file.verify()  # the checksums, which decoding leaves out; then it must be reopened
+            with Image.open(path) as file:
                 # A 1-bit picture is decoded as bool, every other mode as unsigned integers.
                 labels = np.asarray(file)
         except FileNotFoundError:

@@ -20,6 +20,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 from stream_dmr.errors import OutputError, UserError
+from stream_dmr.files import read_small
 from stream_dmr.store.schema import Statement, has_table, insertion, rows_of
 
 # Of an entry. A file that was "found" lay there when a run started, after a crash or renamed.
@@ -128,7 +129,7 @@ def make_key(path: Path) -> Path:
 def load_public_key(path: Path) -> Ed25519PublicKey:
     """The public key of a device. Raises UserError where it is none."""
     try:
-        key = serialization.load_pem_public_key(path.read_bytes())
+        key = serialization.load_pem_public_key(read_small(path))
     except (OSError, ValueError) as error:
         raise _no_key(path, "public", error) from error
     if not isinstance(key, Ed25519PublicKey):
@@ -139,7 +140,7 @@ def load_public_key(path: Path) -> Ed25519PublicKey:
 def _load_private_key(path: Path) -> Ed25519PrivateKey:
     try:
         mode = path.stat().st_mode
-        key = serialization.load_pem_private_key(path.read_bytes(), password=None)
+        key = serialization.load_pem_private_key(read_small(path), password=None)
     except (OSError, ValueError, TypeError) as error:
         raise _no_key(path, "private", error) from error
     if not isinstance(key, Ed25519PrivateKey):

@@ -215,13 +215,13 @@ class _ReviewHandler(TokenHandler):
 
     def answer_post(self, path: str) -> None:
         """Take a verdict. Only this page's own scripts can send JSON with the cookie."""
-        length = self.headers.get("Content-Length", "")
         if path != "/verdict" or self.headers.get_content_type() != "application/json":
             return self.answer_json(HTTPStatus.NOT_FOUND, {"error": "expected a verdict as JSON"})
-        if not length.isdecimal() or int(length) > _MAX_VERDICT_BYTES:
+        body = self.body(max_bytes=_MAX_VERDICT_BYTES)
+        if body is None:
             return self.answer_json(HTTPStatus.BAD_REQUEST, {"error": "expected a short verdict"})
         try:
-            rows = self.server.queue.record(self.rfile.read(int(length)))
+            rows = self.server.queue.record(body)
         except UserError as error:
             return self.answer_json(HTTPStatus.BAD_REQUEST, {"error": str(error)})
         self.answer_json(HTTPStatus.OK, rows)

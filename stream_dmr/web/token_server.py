@@ -119,7 +119,10 @@ class TokenHandler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Refuse, keep the token as a cookie, or answer."""
-        url = urlsplit(self.path)
+        try:
+            url = urlsplit(self.path)
+        except ValueError:  # such as http://[::1
+            return self.answer(HTTPStatus.BAD_REQUEST, "text/plain", b"expected an address\n")
         token = parse_qs(url.query).get("token", [""])[0]
         if not self._is_own_page():
             self._refuse_site()
@@ -203,6 +206,12 @@ class TokenHandler(BaseHTTPRequestHandler):
 
     def _is_valid(self, token: str) -> bool:
         return hmac.compare_digest(token.encode(), self.server.token.encode())
+
+    def body(self, *, max_bytes: int) -> bytes | None:
+        """What a POST brings; None if it does not say how long it is, or is too long."""
+        length = self.headers.get("Content-Length", "")
+        is_short = length.isdecimal() and len(length) < 10 and int(length) <= max_bytes
+        return self.rfile.read(int(length)) if is_short else None
 
     def answer_json(self, code: HTTPStatus, content: object) -> None:
         """Answer with JSON."""

@@ -156,13 +156,13 @@ class _WatchHandler(TokenHandler):
 
     def answer_post(self, path: str) -> None:
         """Begin or end a haul. Only this page's own scripts can send JSON with the cookie."""
-        length, hauls = self.headers.get("Content-Length", ""), self.server.state.hauls
-        is_json = self.headers.get_content_type() == "application/json"
-        is_short = length.isdecimal() and int(length) <= _MAX_HAUL_BYTES
-        if path != "/haul" or hauls is None or not is_json or not is_short:
+        hauls, body = self.server.state.hauls, None
+        if path == "/haul" and self.headers.get_content_type() == "application/json":
+            body = self.body(max_bytes=_MAX_HAUL_BYTES)
+        if hauls is None or body is None:
             return self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"expected a haul as JSON\n")
         try:
-            told = _parse_haul(self.rfile.read(int(length)))
+            told = _parse_haul(body)
             what, name, said_by = (str(told.get(key) or "") for key in ("what", "name", "said_by"))
             name = hauls.tell(what, name, said_by=said_by)
         except UserError as error:

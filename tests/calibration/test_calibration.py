@@ -180,3 +180,10 @@ def test_pictures_of_another_size_are_refused(tmp_path):
 def test_shared_calibrations_load(scenes):
     for path in scenes.glob("*/calibration.yaml"):
         assert load_calibration(path).camera.width > 0
+
+
+def test_aliases_are_refused_before_they_fill_the_memory(tmp_path):
+    path = tmp_path / "calibration.yaml"
+    path.write_text("camera_matrix: &x [*x, *x, *x]\nimage_width: 640\n")
+    with pytest.raises(CalibrationError, match="file that begins with"):
+        load_calibration(path)

@@ -102,7 +102,7 @@ def test_the_command_keeps_it_and_raises_an_alarm(files: dict[str, Path], tmp_pa
         assert ("alarm" in outcome.out) is (name == "wrong")
     checks = last_checks(out / "lengths.db")
     assert len(checks) == 2
-    assert [line for line in run_notes(out) if "+5.0" in line]
+    assert [line for line in run_notes(out) if "too long" in line]
 
 
 def test_exports_have_the_last_check(files: dict[str, Path], tmp_path: Path):

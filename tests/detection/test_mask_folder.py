@@ -196,3 +196,15 @@ def test_masks_with_soft_edges_are_refused(tmp_path, white):
     cv2.imwrite(str(tmp_path / "000001.png"), cv2.GaussianBlur(fish, (0, 0), 2))
     with pytest.raises(AnnotationError, match=r"000001.png: .* values in thin bands.*the value 1"):
         MaskFolder(tmp_path).labels(1, **SIZE)
+
+
+def test_a_mask_with_a_wrong_checksum_is_refused(tmp_path):
+    """Decoders forgive it, and the fish gets another length."""
+    path = tmp_path / "000001.png"
+    cv2.imwrite(str(path), labels_of(id1=(0, 0, 2, 2), id3=(4, 1, 7, 5)))
+    content = bytearray(path.read_bytes())
+    begin = content.index(b"IDAT")
+    content[begin + 4 + int.from_bytes(content[begin - 4 : begin], "big")] ^= 1  # behind the data
+    path.write_bytes(content)
+    with pytest.raises(AnnotationError, match="can't be decoded"):
+        MaskFolder(tmp_path).labels(1, **LABELS_SIZE)

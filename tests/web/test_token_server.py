@@ -27,7 +27,8 @@ class Hello(TokenHandler):
         self.answer(HTTPStatus.OK, "text/plain", b"hello" * (1 << 22 if path == "/large" else 1))
 
     def answer_post(self, path: str) -> None:
-        self.answer(HTTPStatus.OK, "text/plain", b"taken")
+        body = self.body(max_bytes=20)
+        self.answer(HTTPStatus.OK, "text/plain", b"too long" if body is None else body)
 
 
 @pytest.fixture
@@ -137,3 +138,24 @@ def test_a_server_for_others_answers_to_every_name_with_the_token():
 )
 def test_loopback_is_what_only_this_machine_reaches(host: str, expected: bool):
     assert is_loopback(host) == expected
+
+
+def answer_to(server: TokenServer, request: bytes) -> bytes:
+    with socket.create_connection(("127.0.0.1", server.server_address[1]), timeout=10) as reader:
+        reader.sendall(request)
+        return b"".join(iter(lambda: reader.recv(4096), b""))
+
+
+def test_an_address_that_is_none_is_a_bad_request_and_no_traceback(server: TokenServer, capsys):
+    assert b" 400 " in answer_to(server, b"GET http://[::1 HTTP/1.0\r\n\r\n")
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("length", "answer"),
+    [("5", b"hello"), ("21", b"too long"), ("9" * 5000, b"too long"), ("-1", b"too long")],
+)
+def test_a_body_is_read_if_it_says_that_it_is_short(server: TokenServer, length, answer, capsys):
+    head = f"POST / HTTP/1.0\r\nContent-Length: {length}\r\n\r\n".encode()
+    assert answer_to(server, head + b"hello").endswith(answer)
+    assert capsys.readouterr().err == ""

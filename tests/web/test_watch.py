@@ -176,7 +176,7 @@ def test_a_known_length_that_is_measured_wrong_is_a_problem(tmp_path: Path, stat
         assert watched.problems() == []
         add_check(store.path, wrong)
         (problem,) = watched.problems()
-        assert "+5.00 % off" in problem
+        assert "5.00 % too long" in problem
         server = WatchServer(watched, WatchSettings(port=free_port()))
         with closing(server):
             assert get(f"{server.address}health")[0] == 503
