@@ -1,6 +1,5 @@
 """The commands `report`, `verify` and `keygen`."""
 
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -28,9 +27,8 @@ def verify(
     ] = None,
 ) -> None:
     """Check that results are still what their run measured; exit 1 and say what was changed."""
-    from stream_dmr.errors import OutputError
     from stream_dmr.evidence.verify_batch import verify_all
-    from stream_dmr.evidence.verify_folder import Change, check_signatures
+    from stream_dmr.evidence.verify_folder import Change, check_signatures, summary
     from stream_dmr.store.fish import run_notes
     from stream_dmr.store.ledger import load_public_key
     from stream_dmr.store.schema import NAME
@@ -50,9 +48,12 @@ def verify(
     for note in notes:
         print(note)
     for database in databases:
-        with suppress(OutputError):  # damaged, which is said above
-            for line in run_notes(database.parent):
-                print(f"{database}: {line}")
+        try:
+            lines = [*summary(database), *run_notes(database.parent)]
+        except Exception as error:  # a row that is no row of ours is a change, named above
+            lines = [f"its runs can't be told: {type(error).__name__}"]
+        for line in lines:
+            print(f"{database}: {line}")
     if changes:
         raise typer.Exit(1)
     print(f"{folder}: {num_files} files, nothing was changed")

@@ -280,7 +280,10 @@ def read_provenance(folder: Path) -> dict[str, Any] | None:
     path = folder / NAME
     if not path.is_file():
         return None
-    made = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        made = json.loads(path.read_text(encoding="utf-8"))
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
     if not isinstance(made, dict) or not all(
         isinstance(made.get(key), dict) for key in ("runs", "fish_sha256", "files")
     ):

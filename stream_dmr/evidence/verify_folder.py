@@ -7,16 +7,20 @@ elsewhere.
 
 import csv
 import io
+import json
+import math
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
+import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from stream_dmr.errors import OutputError, RecordingError, UserError
@@ -31,25 +35,22 @@ from stream_dmr.evidence.seal import (
     verdict_lines,
 )
 from stream_dmr.files import is_locked, sha256_of
-from stream_dmr.messages import LengthEstimate, LocalizedFish
-from stream_dmr.recording.reading import decoded_messages, open_recordings
-from stream_dmr.recording.selection import EVERYTHING
+from stream_dmr.localization.localize_fish import LocalizeSettings
+from stream_dmr.messages import FittedMesh, LengthEstimate, LocalizedFish
+from stream_dmr.recording.reading import decoded_messages, open_recordings, recorded_settings
+from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.store.edits import (
+    ReviewedMessages,
     TrackEdits,
+    corrected_fish,
+    corrected_length,
     edited_row,
     edits_of,
     frames_of_parts,
     frames_of_tracks,
     settings_of,
 )
-from stream_dmr.store.fish import (
-    FishResult,
-    database_of,
-    read_measured_fish,
-    read_runs,
-    rows_by_run,
-    run_times,
-)
+from stream_dmr.store.fish import database_of, read_runs, rows_by_run, run_times
 from stream_dmr.store.ledger import (
     CHECKS,
     END,
@@ -61,38 +62,119 @@ from stream_dmr.store.ledger import (
     RUN,
     STATE,
     ChainEntry,
+    chain_rows,
     content_sha256,
+    is_entry,
     lines_sha256,
-    read_chain,
 )
-from stream_dmr.store.run_facts import END_COLUMNS, NOT_ENDED, RunFacts, run_facts
+from stream_dmr.store.run_facts import END_COLUMNS, NOT_ENDED, CatchFacts, RunFacts, run_facts
 from stream_dmr.store.run_tables import FRAMES_COLUMNS, LENGTHS_COLUMNS, frames_row, lengths_row
-from stream_dmr.store.schema import NAME as DATABASE
 from stream_dmr.store.schema import (
+    MAY_COUNT_TWICE,
     AddedTable,
     added_rows,
     check_lines,
+    estimate_of,
     open_for_reading,
     read_state,
     rows_of,
 )
+from stream_dmr.store.schema import NAME as DATABASE
 from stream_dmr.store.trip import HAULS, POSITIONS, WATCHED
-from stream_dmr.store.verdicts import Verdict, frames_sha256, read_added_frames, read_verdicts
+from stream_dmr.store.verdicts import (
+    NOT_REVIEWED,
+    Verdict,
+    blind_readings,
+    frames_sha256,
+    read_added_frames,
+    read_verdicts,
+    reviews_of,
+    standing,
+)
 from stream_dmr.tables import rotated_files
 
+_Row = Mapping[str, Any]
 _NOT_COMPUTED = ("flags",)
 
 
-def changed_edits(database: Path, measured: Sequence[FishResult]) -> Iterator[str]:
-    """What is not as reviewers made it, one line each. Raises OutputError."""
+T = TypeVar("T")
+
+
+def _guarded(check: Iterable[T], finding: Callable[[str], T]) -> Iterator[T]:
+    """The findings of a check, and `finding` where what it reads is too broken to go on."""
+    try:
+        yield from check
+    except Exception as error:  # rows and JSON that others wrote may hold anything
+        is_ours = isinstance(error, UserError)
+        why = str(error) if is_ours else f"{type(error).__name__}: {error}"
+        yield finding(" ".join(why.split()))
+
+
+def changed_edits(database: Path, last_frames: Mapping[int, int]) -> Iterator[str]:
+    """What is not as reviewers made it, one line each. Raises OutputError.
+
+    `last_frames` by recorded track.
+    """
     verdicts = read_verdicts(database)
     yield from _added_frames(database, verdicts)
     edits = edits_of(verdicts)
     if edits.fish:
+        yield from _guarded(
+            _lengths(database, edits, last_frames),
+            lambda why: f"fish that reviewers made can't be checked: {why}",
+        )
+    corrections = [(n, v) for n, v in enumerate(verdicts, start=1) if v.kind == "correct"]
+    if corrections:
+        yield from _guarded(
+            _corrections(database, verdicts, corrections),
+            lambda why: f"lengths that reviewers corrected can't be checked: {why}",
+        )
+
+
+def _corrections(
+    database: Path, verdicts: Sequence[Verdict], corrections: Sequence[tuple[int, Verdict]]
+) -> Iterator[str]:
+    """Compute each corrected length again, from all points of its fish that were set until then."""
+    recording = open_recordings([database.parent])
+    fish = Selection(tracks=frozenset(verdict.track_id for _, verdict in corrections))
+    wanted = {(verdict.track_id, verdict.frame_index) for _, verdict in corrections}
+    fits = {
+        (fit.track_id, fit.frame_index): fit
+        for fit in ReviewedMessages(recording, database, fish).of([FittedMesh])
+        if isinstance(fit, FittedMesh) and (fit.track_id, fit.frame_index) in wanted
+    }
+    localizing = recorded_settings(recording, "localize", LocalizeSettings)
+    for number, verdict in corrections:
+        said, name = verdicts[:number], f"verdict {number}: fish {verdict.track_id}"
+        of_reader = blind_readings(said).get(verdict.reviewer, [])
+        counted = standing(said) if verdict.reading is None else of_reader
+        of_fish = [one for one in counted if one.track_id == verdict.track_id]
+        review = reviews_of(of_fish).get(verdict.track_id, NOT_REVIEWED)
+        moved = {**review.moved, **verdict.moved}
+        missing = [frame for frame in moved if (verdict.track_id, frame) not in fits]
+        if missing and any(database.parent.glob("recording-*")):
+            continue  # as in `_lengths`
+        if missing or not verdict.moved:
+            yield f"{name} is corrected to {verdict.length_mm} mm by no points in its frames"
+            continue
         try:
-            yield from _lengths(database, edits, measured)
-        except RecordingError as error:
-            yield f"fish that reviewers made can't be checked: {error}"
+            frames = {
+                frame: corrected_fish(
+                    fits[verdict.track_id, frame],
+                    np.array(points, float),
+                    settings=localizing,
+                    calibration=recording.header.calibration,
+                )
+                for frame, points in moved.items()
+            }
+        except UserError as error:
+            yield f"{name}: {error}"
+            continue
+        length = corrected_length(frames, settings_of(recording))
+        for column in ("length_mm", "length_std_mm"):
+            now, was = getattr(verdict, column), getattr(length, column)
+            if now is None or was is None or not math.isclose(now, was, rel_tol=1e-9):
+                yield f"{name}: {column} is {now}, its points give {was}"
 
 
 def _added_frames(database: Path, verdicts: Sequence[Verdict]) -> Iterator[str]:
@@ -103,13 +185,12 @@ def _added_frames(database: Path, verdicts: Sequence[Verdict]) -> Iterator[str]:
             yield f"fish {track_id}: its frames are not those that a reviewer added"
 
 
-def _lengths(database: Path, edits: TrackEdits, measured: Sequence[FishResult]) -> Iterator[str]:
+def _lengths(database: Path, edits: TrackEdits, last_frames: Mapping[int, int]) -> Iterator[str]:
     """Compare each fish with what its frames give, where the recording still has them all."""
     recording = open_recordings([database.parent])
     settings = settings_of(recording)
     tracks = {part.track_id for one in edits.fish.values() for part in one.parts}
-    last = {one.estimate.track_id: one.estimate.last_frame for one in measured}
-    frames = frames_of_tracks(recording, database, tracks, last)
+    frames = frames_of_tracks(recording, database, tracks, last_frames)
     for track_id, edited in edits.fish.items():
         try:
             chosen = frames_of_parts(frames, edited.parts, fish=track_id)
@@ -211,39 +292,83 @@ def verify(folder: Path, others: Checks = MappingProxyType({})) -> tuple[list[Ch
 
 
 def _changes(folder: Path, others: Checks) -> Iterator[Change]:
-    yield from _against_provenance(folder)
+    """The walk over one folder: each check is of its own, and none stops the next."""
+    for path in sorted(folder.iterdir()):
+        if not path.is_file() and not path.is_dir():
+            yield Change(path, "is no file: a pipe, a device or a link to nothing")
+    yield from _broken(folder / PROVENANCE, _against_provenance(folder))
     for name, check in others.items():
         if (folder / name).is_file():
-            yield from (Change(*finding) for finding in check(folder))
+            findings = (Change(*finding) for finding in check(folder))
+            yield from _broken(folder / name, findings)
     database = database_of(folder)
     if database is None:
         return
-    try:
-        runs = read_runs(database)
-        fish = {one.estimate.track_id: one for one in read_measured_fish(database)}
-    except OutputError as error:
-        yield Change(database, f"damaged: {error}")
-        return
-    yield from (Change(database, line) for line in changed_edits(database, list(fish.values())))
-    lengths = {
-        str(track_id): lengths_row(one.estimate, may_count_twice=one.may_count_twice)
-        for track_id, one in fish.items()
-    }
-    yield from _csv(folder / "lengths.csv", LENGTHS_COLUMNS, lengths, witness=DATABASE, whole=True)
+    runs: dict[str, RunFacts] = {}
+    fish: dict[int, _Row] = {}
+    lengths: dict[str, list[str]] = {}
+    yield from _broken(database, _stored(database, runs, fish, lengths))
+    last_frames = {track_id: row["last_frame"] for track_id, row in fish.items()}
+    edits = (Change(database, line) for line in changed_edits(database, last_frames))
+    yield from _broken(database, edits)
+    if runs:
+        path = folder / "lengths.csv"
+        yield from _csv(path, LENGTHS_COLUMNS, lengths, witness=DATABASE, whole=True)
     frames: dict[str, list[str]] = {}
     for recording in _recordings(folder):
-        yield from _recording(recording, runs, fish, frames)
+        yield from _broken(recording, _recording(recording, runs, fish, frames))
     if frames:
         yield from _csv(
             folder / "frames.csv", FRAMES_COLUMNS, frames, witness="the recording", whole=False
         )
 
 
+def _broken(path: Path, check: Iterable[Change]) -> Iterator[Change]:
+    return _guarded(check, lambda why: Change(path, f"damaged: {why.removeprefix(f'{path}: ')}"))
+
+
+def _stored(
+    database: Path, runs: dict[str, RunFacts], fish: dict[int, _Row], lengths: dict[str, list[str]]
+) -> Iterator[Change]:
+    """Read `runs`, the rows of `fish`, and theirs of lengths.csv; each broken row is a finding."""
+    runs |= read_runs(database)
+    with closing(open_for_reading(database)) as connection:
+        rows = list(rows_of(connection, "SELECT * FROM fish ORDER BY number"))
+    for row in rows:
+        track_id = row["track_id"]
+        fish[track_id] = row
+        try:
+            twice = any(MAY_COUNT_TWICE in flag for flag in json.loads(row["flags"]))
+            lengths[str(track_id)] = lengths_row(estimate_of(row), may_count_twice=twice)
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
+            yield Change(database, f"fish {track_id}: its row is damaged: {error!r}")
+
+
+def summary(database: Path) -> Iterator[str]:
+    """A line for each run: vessel, source, time and number of fish. Raises OutputError."""
+    times, fish = run_times(database), rows_by_run(database, "fish")
+    for run_id, facts in read_runs(database).items():
+        begun, ended = (_utc(ns) for ns in times[run_id])
+        yield (
+            f"run {run_id}: vessel {facts.vessel!r}, source {facts.source!r}, {begun} to {ended}, "
+            f"{len(fish.get(run_id, []))} fish"
+        )
+
+
+def _utc(time_ns: int | None) -> str:
+    """UTC to the second; "?" where it is unknown or no time."""
+    try:
+        return datetime.fromtimestamp(int(time_ns or "") / 1e9, UTC).isoformat(timespec="seconds")
+    except (ValueError, OverflowError, OSError, TypeError):
+        return "?"
+
+
 def _recordings(folder: Path) -> list[Path]:
     """Those to be read: every .mcap, and an .rrd, which is slow to read, where nothing knows it."""
     known = known_files(folder)
     rrd = [path for path in folder.glob("*.rrd") if path.name not in known]
-    return sorted([*folder.glob("*.mcap"), *folder.glob("*.mcap.part"), *rrd])
+    found = [*folder.glob("*.mcap"), *folder.glob("*.mcap.part"), *rrd]
+    return sorted(path for path in found if path.is_file())
 
 
 def _against_provenance(folder: Path) -> Iterator[Change]:
@@ -262,9 +387,14 @@ def _against_provenance(folder: Path) -> Iterator[Change]:
         elif sha256_of(path) != expected:
             yield Change(path, f"was changed: its SHA-256 is not that in {PROVENANCE}")
     database = database_of(folder)
-    if database is not None:
-        yield from _surplus_tables(folder, made["files"])
-        yield from _database(database, made)
+    if database is None:
+        return
+    yield from _surplus_tables(folder, made["files"])
+    for check in (_fish_and_runs, unsealed_rows, _verdicts, _state):
+        lines = _guarded(
+            check(database, made), lambda why: f"can't be compared with {PROVENANCE}: {why}"
+        )
+        yield from (Change(database, line) for line in lines)
 
 
 def _surplus_tables(folder: Path, known: Collection[str]) -> Iterator[Change]:
@@ -276,38 +406,30 @@ def _surplus_tables(folder: Path, known: Collection[str]) -> Iterator[Change]:
         yield Change(path, "is no table of this run")
 
 
-def _database(database: Path, made: dict[str, Any]) -> Iterator[Change]:
+def _fish_and_runs(database: Path, made: dict[str, Any]) -> Iterator[str]:
     """The fish and the runs against provenance.json."""
-    try:
-        stored, runs = rows_by_run(database, "fish"), read_runs(database)
-        events, times = rows_by_run(database, "events"), run_times(database)
-        said = verdict_lines(database)
-    except OutputError:
-        return  # `_changes` says so
+    stored = rows_by_run(database, "fish")
     for run_id, expected in made["fish_sha256"].items():
         if lines_sha256(stored.get(run_id, [])) != expected:
-            yield Change(database, f"the fish of run {run_id} are not those that were measured")
+            yield f"the fish of run {run_id} are not those that were measured"
+    runs, events, times = read_runs(database), rows_by_run(database, "events"), run_times(database)
     for run_id, known in made.get("run_times_ns", {}).items():  # older ones have neither of these
         if times.get(run_id) != known:
-            yield Change(database, f"run {run_id}: its times are not those of its run")
+            yield f"run {run_id}: its times are not those of its run"
         expected = made["events_sha256"].get(run_id)
         if events.get(run_id) and expected is None:
-            yield Change(database, f"run {run_id}: events were put in")
+            yield f"run {run_id}: events were put in"
         elif expected is not None and lines_sha256(events.get(run_id, [])) != expected:
-            yield Change(database, f"the events of run {run_id} are not those that were noted")
-    for what in unsealed_rows(database, made):
-        yield Change(database, what)
+            yield f"the events of run {run_id} are not those that were noted"
     for run_id, facts in made["runs"].items():
         for column in fields(RunFacts):
             now = getattr(runs.get(run_id), column.name, "missing")
             was = facts.get(column.name, column.default)  # older ones have fewer
             if now != was:
-                yield Change(database, f"run {run_id}: {column.name} is {now!r}, was {was!r}")
-    yield from _verdicts(database, said, made.get("verdicts") or log_sum([]))
-    yield from _state(database, made, is_of_last_run=set(runs) == set(made["runs"]))
+                yield f"run {run_id}: {column.name} is {now!r}, was {was!r}"
 
 
-def _state(database: Path, made: dict[str, Any], *, is_of_last_run: bool) -> Iterator[Change]:
+def _state(database: Path, made: dict[str, Any]) -> Iterator[str]:
     """The other tables against provenance.json, which older ones don't sum up."""
     known = made.get("checks")
     if known is None:
@@ -315,33 +437,35 @@ def _state(database: Path, made: dict[str, Any], *, is_of_last_run: bool) -> Ite
     with closing(open_for_reading(database)) as connection:
         state, checks = content_sha256(read_state(connection)), check_lines(connection)
     if not begins_as(checks, known):
-        yield Change(database, "the checks of the scale are not those that were made")
-    if is_of_last_run and state != made["state_sha256"]:
-        yield Change(database, "its marks, clips or scenes are not as its last run left them")
+        yield "the checks of the scale are not those that were made"
+    if set(read_runs(database)) == set(made["runs"]) and state != made["state_sha256"]:
+        yield "its marks, clips or scenes are not as its last run left them"
 
 
-def _verdicts(database: Path, said: Sequence[str], known: dict[str, Any]) -> Iterator[Change]:
+def _verdicts(database: Path, made: dict[str, Any]) -> Iterator[str]:
     """The verdicts against provenance.json: rows are only added."""
+    said, known = verdict_lines(database), made.get("verdicts") or log_sum([])
     if not begins_as(said, known):
-        yield Change(database, "the verdicts are not those that reviewers gave")
+        yield "the verdicts are not those that reviewers gave"
     elif len(said) > known["count"]:
-        yield Change(database, f"verdicts that no `review` took: {len(said) - known['count']}")
+        yield f"verdicts that no `review` took: {len(said) - known['count']}"
 
 
 def _recording(
     path: Path,
     runs: dict[str, RunFacts],
-    fish: dict[int, FishResult],
+    fish: Mapping[int, _Row],
     frames: dict[str, list[str]],
 ) -> Iterator[Change]:
     """Compare a recording with the database; its rows of frames.csv are added to `frames`."""
     try:
         recording = open_recordings([path])
         made = run_facts(recording.header)
-        if not any(all(getattr(r, n) == getattr(made, n) for n in _MADE_BY) for r in runs.values()):
-            of_run = next(iter(runs.values()), None)
+        made_by = [all(getattr(r, n) == getattr(made, n) for n in _MADE_BY) for r in runs.values()]
+        if runs and not any(made_by):
+            of_run = next(iter(runs.values()))
             for name in _MADE_BY:
-                if getattr(of_run, name, None) != getattr(made, name):
+                if getattr(of_run, name) != getattr(made, name):
                     yield Change(path, f"{name} is {getattr(made, name)}, no run in {DATABASE} has")
         waiting: dict[tuple[int, int], LocalizedFish] = {}
         for message, _ in decoded_messages(recording, [LocalizedFish, LengthEstimate], EVERYTHING):
@@ -352,7 +476,7 @@ def _recording(
                 if (seen := waiting.pop(key, None)) is not None:
                     row = frames_row(seen, message.is_frame_used, message.frame_reason)
                     frames[f"{key[0]},{key[1]}"] = row
-                if message.is_final:
+                if message.is_final and runs:  # else the database can't be read
                     yield from _estimate(path, message, fish.get(message.track_id))
         for line in recording.warnings:
             yield Change(path, line.removeprefix(f"{path}: "))
@@ -360,14 +484,13 @@ def _recording(
         yield Change(path, f"damaged: {str(error).removeprefix(f'{path}: ')}")
 
 
-def _estimate(path: Path, recorded: LengthEstimate, fish: FishResult | None) -> Iterator[Change]:
+def _estimate(path: Path, recorded: LengthEstimate, fish: _Row | None) -> Iterator[Change]:
     database = path.parent / DATABASE
     if fish is None:
         yield Change(database, f"fish {recorded.track_id} is missing; {path.name} has it")
         return
-    compared = [(name, getattr(fish.estimate, name)) for name in _COMPARED]
-    for name, stored in [*compared, *asdict(fish.catch).items()]:
-        measured = getattr(recorded, name)
+    for name in (*_COMPARED, *(one.name for one in fields(CatchFacts))):
+        stored, measured = fish.get(name), getattr(recorded, name)
         if stored != measured:
             what = f"fish {recorded.track_id}: {name} is {stored}, {path.name} says {measured}"
             yield Change(database, what)
@@ -386,7 +509,8 @@ def _csv(
         yield Change(path, "is missing")
         return
     found: dict[str, list[str]] = {}
-    for table in (older := rotated_files(path)) + [path]:
+    older = [table for table in rotated_files(path) if table.is_file()]
+    for table in [*older, path]:
         rows = _rows(table, columns)
         if rows is None:
             yield Change(table, "its columns are not those of stream-dmr")
@@ -419,9 +543,6 @@ def _rows(path: Path, columns: Sequence[str]) -> dict[str, list[str]] | None:
     return {f"{row[0]},{row[fish]}" if fish else row[0]: row for row in whole}
 
 
-_Row = Mapping[str, Any]
-
-
 @dataclass(frozen=True, kw_only=True)
 class SignatureCheck:
     """What was found in one folder."""
@@ -434,40 +555,84 @@ def check_signatures(folder: Path, key: Ed25519PublicKey) -> SignatureCheck:
     """Check the chain of a folder's lengths.db, and everything in the folder against it."""
     check = SignatureCheck()
     try:
-        with closing(open_for_reading(folder / DATABASE)) as database:
-            entries = read_chain(database)
-            added = {table: added_rows(database, table) for table in (POSITIONS, WATCHED, HAULS)}
-            tables = {name: _signed_rows(database, name) for name in ("runs", "fish", "events")}
-            state, checks = content_sha256(read_state(database)), check_lines(database)
-    except (sqlite3.Error, OutputError, TypeError) as error:
+        database = open_for_reading(folder / DATABASE)
+    except OutputError as error:
         check.changes.append(f"its signatures can't be read: {error}")
         return check
-    if not entries:
-        check.changes.append("nothing in it is signed")
-        return check
-    check.changes.extend(_broken_links(entries, key))
-    check.changes.extend(_rows_by_name(entries, FISH, tables["fish"], "track_id"))
-    check.changes.extend(_events(entries, tables["events"]))
-    for table, rows in added.items():
-        told = unsigned_rows(entries, table, rows) if table is HAULS else 0
-        if told:  # people may add hauls to a folder
-            check.notes.append(f"{told} events of hauls are not signed by the device")
-        check.changes.extend(added_changes(entries, table, rows, may_be_added=table is HAULS))
-    check.changes.extend(_runs(entries, tables["runs"], is_going_on=is_locked(folder)))
-    check.changes.extend(_files(entries, folder))
-    check.changes.extend(_signature_state(entries, state))
-    check.changes.extend(_checks(entries, checks))
-    check.notes.extend(_found(entries))
-    check.notes.extend(_later_checks(entries, checks))
+    with closing(database):
+        entries = list[ChainEntry]()
+        _extend(check.changes, "its chain", _whole_entries(database, entries))
+        if not entries:
+            check.changes.append("nothing in it is signed")
+            return check
+        changed = {
+            "its chain": _broken_links(entries, key),
+            "its fish": _fish(entries, database),
+            "its events": _events(entries, database),
+            "its runs": _runs(entries, database, is_going_on=is_locked(folder)),
+            "its files": _files(entries, folder),
+            "its marks, clips or scenes": _signature_state(entries, database),
+            "its checks of the scale": _checks(entries, database),
+        }
+        for table in (POSITIONS, WATCHED, HAULS):
+            changed[f"its {table.name}"] = _added(entries, database, table)
+        noted = {
+            "its events of hauls": _hauls_of_people(entries, database),
+            "its files": chain(_found(entries), _unsigned_files(entries, folder)),
+            "its checks of the scale": _later_checks(entries, database),
+            "its verdicts": _unsigned_verdicts(folder / DATABASE),
+        }
+        for name, lines in changed.items():
+            _extend(check.changes, name, lines)
+        for name, lines in noted.items():
+            _extend(check.notes, name, lines)
     last = entries[-1]
-    when = datetime.fromtimestamp(last.time_ns / 1e9, UTC).isoformat(timespec="seconds")
-    check.notes.append(f"{len(entries)} signed entries, the last of {when}: {last.sha256[:16]}")
+    count = f"{len(entries)} signed entries, the last of {_utc(last.time_ns)}"
+    check.notes.append(f"{count}: {last.sha256[:16]}")
     return check
+
+
+def _extend(found: list[str], name: str, lines: Iterable[str]) -> None:
+    found.extend(_guarded(lines, lambda why: f"{name} can't be checked: {why}"))
+
+
+def _whole_entries(database: sqlite3.Connection, entries: list[ChainEntry]) -> Iterator[str]:
+    """Add the entries to `entries`; those that are damaged are findings instead."""
+    for row in chain_rows(database):
+        if is_entry(row):
+            entries.append(ChainEntry(**row))
+        else:
+            yield "signed entry {number!r} ({kind!r} {name!r}) is damaged".format(**row)
 
 
 def _signed_rows(database: sqlite3.Connection, table: str) -> list[_Row]:
     order = "started_ns" if table == "runs" else "number"
     return list(rows_of(database, f"SELECT * FROM {table} ORDER BY {order}"))
+
+
+def _fish(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
+    yield from _rows_by_name(entries, FISH, _signed_rows(database, "fish"), "track_id")
+
+
+def _added(
+    entries: Sequence[ChainEntry], database: sqlite3.Connection, table: AddedTable
+) -> Iterator[str]:
+    rows = added_rows(database, table)
+    yield from added_changes(entries, table, rows, may_be_added=table is HAULS)
+
+
+def _hauls_of_people(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
+    """People may add hauls to a folder."""
+    if told := unsigned_rows(entries, HAULS, added_rows(database, HAULS)):
+        yield f"{told} events of hauls are not signed by the device"
+
+
+def _unsigned_verdicts(database: Path) -> Iterator[str]:
+    """Each verdict: reviewers have no keys, so anybody who can write to the file can add one."""
+    for number, one in enumerate(read_verdicts(database), start=1):
+        length = "" if one.length_mm is None else f" to {one.length_mm} mm"
+        what = f"{one.kind} fish {one.track_id}{length}"
+        yield f"verdict {number} of {_utc(one.written_ns)} by {one.reviewer!r}: {what}; not signed"
 
 
 def _broken_links(entries: Sequence[ChainEntry], key: Ed25519PublicKey) -> Iterator[str]:
@@ -488,6 +653,8 @@ def _rows_by_name(
     """Rows that were changed, removed, put in or moved."""
     signed = {entry.name: entry.content_sha256 for entry in entries if entry.kind == kind}
     found = {str(row[column]): _content(row) for row in rows}
+    if len(found) < len(rows):
+        yield f"{len(rows) - len(found)} {kind} are there twice"
     for name, sha256 in signed.items():
         if name not in found:
             yield f"{kind} {name} is missing, and was signed"
@@ -499,7 +666,8 @@ def _rows_by_name(
         yield f"the order of the {kind} is not as it was signed"
 
 
-def _events(entries: Sequence[ChainEntry], rows: Sequence[_Row]) -> Iterator[str]:
+def _events(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
+    rows = _signed_rows(database, "events")
     signed = [entry.content_sha256 for entry in entries if entry.kind == EVENT]
     found = [_content(row) for row in rows]
     for row, sha256 in zip(rows, found, strict=True):
@@ -514,8 +682,9 @@ def _events(entries: Sequence[ChainEntry], rows: Sequence[_Row]) -> Iterator[str
 
 
 def _runs(
-    entries: Sequence[ChainEntry], rows: Sequence[_Row], *, is_going_on: bool
+    entries: Sequence[ChainEntry], database: sqlite3.Connection, *, is_going_on: bool
 ) -> Iterator[str]:
+    rows = _signed_rows(database, "runs")
     begun = [{k: v for k, v in row.items() if k not in END_COLUMNS} for row in rows]
     yield from _rows_by_name(entries, RUN, begun, "run_id")
     ends = {entry.name: entry.content_sha256 for entry in entries if entry.kind == END}
@@ -532,24 +701,26 @@ def _runs(
             yield f"run {name} has no end: it crashed, or what came last was removed"
 
 
-def _signature_state(entries: Sequence[ChainEntry], state: str) -> Iterator[str]:
+def _signature_state(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
     """Marks, clips and scenes as the last run left them, where it came to its end."""
+    state = content_sha256(read_state(database))
     last = [entry for entry in entries if entry.kind in (RUN, STATE)]
     if last and last[-1].kind == STATE and last[-1].content_sha256 != state:
         yield "its marks, clips or scenes are not as they were signed"
 
 
-def _checks(entries: Sequence[ChainEntry], checks: Sequence[str]) -> Iterator[str]:
+def _checks(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
     """The checks of the scale: each run signs those that were there at its end."""
+    checks = check_lines(database)
     for entry in entries:
         if entry.kind == CHECKS and lines_sha256(checks[: int(entry.name)]) != entry.content_sha256:
             yield "the checks of the scale are not as they were signed"
             return
 
 
-def _later_checks(entries: Sequence[ChainEntry], checks: Sequence[str]) -> Iterator[str]:
+def _later_checks(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
     signed = max((int(entry.name) for entry in entries if entry.kind == CHECKS), default=0)
-    if more := len(checks) - signed:
+    if (more := len(check_lines(database)) - signed) > 0:
         yield f"checks of the scale that are not signed yet: {more}"
 
 
@@ -566,6 +737,20 @@ def _files(entries: Sequence[ChainEntry], folder: Path) -> Iterator[str]:
         for path in sorted(folder.glob(pattern)):
             if path.name not in signed:
                 yield f"{path.name} is not signed"
+
+
+def _unsigned_files(entries: Sequence[ChainEntry], folder: Path) -> Iterator[str]:
+    """Recordings that are not signed are a change, see `_files`; others may be exports."""
+    signed = {entry.name for entry in entries if entry.kind in FILE_KINDS}
+    named = {path for pattern in RECORDINGS for path in folder.glob(pattern)}
+    own = (*folder.glob(f"{DATABASE}*"), folder / PROVENANCE)
+    names = sorted(
+        path.name
+        for path in folder.iterdir()
+        if path.is_file() and path.name not in signed and path not in named and path not in own
+    )
+    if names:
+        yield f"not signed by the device: {', '.join(map(repr, names))}"
 
 
 def _found(entries: Sequence[ChainEntry]) -> Iterator[str]:

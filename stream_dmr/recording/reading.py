@@ -63,6 +63,9 @@ def open_recordings(paths: Sequence[Path]) -> Recording:
     Raises RecordingError where one can't be read, or where they are not of the same run.
     """
     files = [file for path in paths for file in files_of(path)]
+    for file in files:
+        if file.exists() and not file.is_file():
+            raise RecordingError(f"{file}: expected a recording, got a pipe or a device")
     segments = [RrdRecording(f) if f.suffix == ".rrd" else McapRecording(f) for f in files]
     return segments[0] if len(segments) == 1 else _Segments(files, segments)
 

@@ -5,6 +5,7 @@ tracks; its length is that of the frames in them, filtered as in a run (`edited_
 """
 
 import json
+import math
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,9 +14,14 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
+from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
 from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.lengths.track_record import TrackLength
+from stream_dmr.localization.localize_fish import LocalizeSettings, localize
 from stream_dmr.messages import (
     FishCrop,
     FishMessage,
@@ -208,6 +214,44 @@ def length_of_frames(
     """The running estimate after each frame, and the final one at the end."""
     track = TrackLength(frames[0], settings)
     return [*(track.add(fish) for fish in frames), track.finish()]
+
+
+def corrected_fish(
+    fit: FittedMesh,
+    points_px: Float[np.ndarray, "2 2"],
+    *,
+    settings: LocalizeSettings,
+    calibration: Calibration | None,
+) -> LocalizedFish:
+    """Localize a frame of a fish again with its head and tail at `points_px`, in frame pixels.
+
+    Shape, center and bend stay those of the fit. The gates of quality are left out, since the
+    reviewer has looked; UserError where these points give no length.
+    """
+    shape = fit.shape
+    if shape is None:
+        raise UserError(f"frame {fit.frame_index} has no fit to correct: {fit.refusal}")
+    keypoints_px = np.stack([points_px[0], shape.keypoints_px[1], points_px[1]])
+    moved = replace(fit, shape=replace(shape, keypoints_px=keypoints_px))
+    fish = localize(moved, settings=settings, calibration=calibration)
+    if fish.length_mm is None or fish.length_std_mm is None:
+        raise UserError(
+            f"frame {fit.frame_index}: these points give no length ({fish.reason}); set them on "
+            "the ends of the fish"
+        )
+    return replace(fish, accepted=True, reason="")
+
+
+def corrected_length(
+    frames: Mapping[int, LocalizedFish], settings: SmoothLengthSettings
+) -> LengthEstimate:
+    """The length from the corrected frames alone, filtered as in a run."""
+    of_points = settings.model_copy(update={"min_frames": 1, "max_std_ratio": math.inf})
+    ordered = [frames[index] for index in sorted(frames)]
+    track = TrackLength(ordered[0], of_points)
+    for fish in ordered:
+        track.add(fish)
+    return track.finish()
 
 
 def edited_row(

@@ -273,7 +273,7 @@ def rows_by_run(
             added = {name: row.pop(name, None) for name in _CATCH_NAMES}
             facts = {name: value for name, value in added.items() if value is not None}
             line = [*row.values(), *([facts] if facts else [])]
-            lines.setdefault(row["run_id"], []).append(json.dumps(line))
+            lines.setdefault(row["run_id"], []).append(json.dumps(line, default=repr))
     return lines
 
 

@@ -14,6 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import serialization
@@ -162,7 +163,8 @@ def _no_key(path: Path, kind: str, error: object) -> UserError:
 
 
 def _canonical(values: Mapping[str, object]) -> bytes:
-    return json.dumps(values, sort_keys=True, separators=(",", ":")).encode()
+    # Bytes, which no row of ours has, are signed nowhere.
+    return json.dumps(values, sort_keys=True, separators=(",", ":"), default=repr).encode()
 
 
 _NAMES = ", ".join(field.name for field in fields(ChainEntry))
@@ -208,7 +210,18 @@ class ChainWriter:
 
 def read_chain(database: sqlite3.Connection) -> Sequence[ChainEntry]:
     """All entries in their order; none where nothing was signed."""
+    return [ChainEntry(**row) for row in chain_rows(database)]
+
+
+def chain_rows(database: sqlite3.Connection) -> Sequence[Mapping[str, Any]]:
+    """The rows of `chain` in their order, unchecked."""
     if not has_table(database, "chain"):
         return []
-    query = f"SELECT {_NAMES} FROM chain ORDER BY number"
-    return [ChainEntry(**row) for row in rows_of(database, query)]
+    return list(rows_of(database, f"SELECT {_NAMES} FROM chain ORDER BY number"))
+
+
+def is_entry(row: Mapping[str, Any]) -> bool:
+    """True for a row of `chain` whose values are of the types of `ChainEntry`."""
+    numbers = {"number", "time_ns"}
+    typed = (isinstance(row[name], int if name in numbers else str) for name in row)
+    return all(typed) and (row["kind"] != CHECKS or row["name"].isdecimal())

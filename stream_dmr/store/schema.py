@@ -13,6 +13,7 @@ import sqlite3
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import MISSING, dataclass, fields
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -222,6 +223,8 @@ def _opened(address: str, path: Path, *, make_tables: bool = False) -> sqlite3.C
         isolation_level=None,
         check_same_thread=False,
     )
+    # Text that is no UTF-8 is read as other text, not an end to all reading.
+    database.text_factory = partial(str, encoding="utf-8", errors="backslashreplace")
     try:
         _check(database, path)
         if make_tables:
@@ -278,6 +281,13 @@ def _check(database: sqlite3.Connection, path: Path) -> None:
     (problem,) = database.execute("PRAGMA quick_check(1)").fetchone()
     if problem != "ok":
         raise sqlite3.DatabaseError(problem)
+    # A view in place of a table, or a trigger, would change what a reader gets.
+    others = database.execute(
+        "SELECT type, name FROM sqlite_master WHERE type IN ('view', 'trigger') "
+        "OR sql LIKE 'CREATE VIRTUAL%'"
+    ).fetchone()
+    if others is not None:
+        raise sqlite3.DatabaseError("tables alone, not the {} {!r}".format(*others))
     if version > VERSION:
         raise OutputError(
             f"{path}: expected a database of version {VERSION} or before, got version {version}, "

@@ -1,6 +1,5 @@
 """Check what a reviewer submits and write it as verdicts, edits and corrected lengths."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,16 +9,13 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from stream_dmr.camera import Calibration, frame_from_crop
+from stream_dmr.camera import frame_from_crop
 from stream_dmr.errors import UserError
 from stream_dmr.evidence.seal import seal_verdicts
-from stream_dmr.lengths.track_record import TrackLength
-from stream_dmr.localization.localize_fish import localize
-from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate, LocalizedFish
-from stream_dmr.pipeline.config import Config
+from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate
 from stream_dmr.recording.codec import decode
 from stream_dmr.recording.frame_images import FrameLookup
-from stream_dmr.store.edits import changed_fish, edits_of
+from stream_dmr.store.edits import changed_fish, corrected_fish, corrected_length, edits_of
 from stream_dmr.store.fish import database_of
 from stream_dmr.store.verdicts import (
     BLIND,
@@ -105,42 +101,6 @@ def drawn_boxes(
             raise UserError(f"verdict: expected a box in frame {box.frame_index}, got a point")
     times = [int(box.timestamp_ns) for box in boxes]
     return {box.frame_index: box.corners for box in boxes}, (min(times), max(times))
-
-
-def corrected_fish(
-    fit: FittedMesh,
-    points_px: Float[np.ndarray, "2 2"],
-    *,
-    config: Config,
-    calibration: Calibration | None,
-) -> LocalizedFish:
-    """Localize a frame of a fish again with its head and tail at `points_px`, in frame pixels.
-
-    Shape, center and bend stay those of the fit. The gates of quality are left out, since the
-    reviewer has looked; UserError where these points give no length.
-    """
-    shape = fit.shape
-    if shape is None:
-        raise UserError(f"frame {fit.frame_index} has no fit to correct: {fit.refusal}")
-    keypoints_px = np.stack([points_px[0], shape.keypoints_px[1], points_px[1]])
-    moved = replace(fit, shape=replace(shape, keypoints_px=keypoints_px))
-    fish = localize(moved, settings=config.localize, calibration=calibration)
-    if fish.length_mm is None or fish.length_std_mm is None:
-        raise UserError(
-            f"frame {fit.frame_index}: these points give no length ({fish.reason}); set them on "
-            "the ends of the fish"
-        )
-    return replace(fish, accepted=True, reason="")
-
-
-def corrected_length(frames: Mapping[int, LocalizedFish], config: Config) -> LengthEstimate:
-    """The length from the corrected frames alone, filtered as in a run."""
-    settings = config.smooth_length.model_copy(update={"min_frames": 1, "max_std_ratio": math.inf})
-    ordered = [frames[index] for index in sorted(frames)]
-    track = TrackLength(ordered[0], settings)
-    for fish in ordered:
-        track.add(fish)
-    return track.finish()
 
 
 class VerdictRecorder:
@@ -312,12 +272,12 @@ class VerdictRecorder:
             frame_index: corrected_fish(
                 decode(FittedMesh, self._view(track_id, frame_index).fit),
                 np.array(points, float),
-                config=report.config,
+                settings=report.config.localize,
                 calibration=report.recording.header.calibration,
             )
             for frame_index, points in moved.items()
         }
-        return corrected_length(frames, report.config)
+        return corrected_length(frames, report.config.smooth_length)
 
     def _view(self, track_id: int, frame_index: int) -> RecordedView:
         track = self._report.tracks.get(track_id)

@@ -236,7 +236,7 @@ def test_verify_finds_a_length_that_its_frames_do_not_give(queue: ReviewQueue, o
         edited.execute("UPDATE verdicts SET fish = ? WHERE kind = 'split'", (json.dumps(made),))
         edited.execute("UPDATE added_frames SET frame_index = 77 WHERE frame_index = 5")
         edited.commit()
-    found = list(changed_edits(database, read_measured_fish(database)))
+    found = list(changed_edits(database, {}))
     assert any("fish 1: frames_used" in line for line in found)
     assert any("fish 4: its frames are not those" in line for line in found)
 

@@ -19,12 +19,12 @@ from stream_dmr.errors import OutputError, UserError
 from stream_dmr.evidence.verify_folder import verify
 from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.recording.codec import decode
+from stream_dmr.store.edits import corrected_fish, corrected_length
 from stream_dmr.store.fish import read_stored_fish
 from stream_dmr.store.verdicts import read_verdicts
 from stream_dmr.web.open_reports import open_report
 from stream_dmr.web.report_page import RunReport, render_page
 from stream_dmr.web.review_queue import ReviewQueue, ReviewServer
-from stream_dmr.web.verdict_recorder import corrected_fish, corrected_length
 from tests.support.browser import Tab
 from tests.support.command import rows
 from tests.support.fish_run import measure
@@ -103,11 +103,11 @@ def test_two_corrected_frames_are_put_together_as_a_run_does(judge: ReviewQueue,
         ).tolist()
         header = report.recording.header
         frames[fit.frame_index] = corrected_fish(
-            fit, points, config=report.config, calibration=header.calibration
+            fit, points, settings=report.config.localize, calibration=header.calibration
         )
         said = {"frame_index": fit.frame_index, "head": head, "tail": tail}
         row = submit(judge, track_id=1, kind="correct", **said)
-    together = corrected_length(frames, report.config)
+    together = corrected_length(frames, report.config.smooth_length)
     assert row["corrected_length_mm"] == pytest.approx(together.length_mm, rel=1e-6)
     assert together.frames_used == 2
     submit(judge, track_id=1, kind="withdraw")
@@ -154,7 +154,7 @@ def test_head_and_tail_on_one_spot_give_no_length(judge: ReviewQueue, report: Ru
         corrected_fish(
             fit,
             fit.shape.keypoints_px[[2, 0]],  # the wrong way round
-            config=report.config,
+            settings=report.config.localize,
             calibration=report.recording.header.calibration,
         )
 
