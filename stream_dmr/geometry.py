@@ -1,4 +1,4 @@
-"""Polylines, boxes and connected components."""
+"""Polylines, affine maps, boxes and connected components."""
 
 import cv2
 import numpy as np
@@ -25,6 +25,13 @@ def bending_ratio(midline: Float[np.ndarray, "M 3"]) -> float:
     if chord == 0.0:
         raise ValueError("expected a midline with two distinct ends, got a closed one")
     return arc_length(midline) / chord
+
+
+def transformed(
+    points: Float[np.ndarray, "*N 2"], affine: Float[np.ndarray, "2 3"]
+) -> Float[np.ndarray, "*N 2"]:
+    """Points (x, y) mapped as `cv2.warpAffine` maps pixels."""
+    return points @ affine[:, :2].T + affine[:, 2]
 
 
 def components(

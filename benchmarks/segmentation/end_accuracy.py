@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from stream_dmr.camera import Camera
 from stream_dmr.localization.localize_fish import mask_std_ratio
-from stream_dmr.messages import Frame
+from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.networks.unet_interface import SIZES_PX
 from stream_dmr.segmentation.crop import CropFishSettings, Detection, crop_fish
 from stream_dmr.segmentation.unet_segmenter import SHIPPED, UNetSegmenter
@@ -39,6 +39,24 @@ class Cut(NamedTuple):
     std: float
 
 
+def cut_out(
+    image: UInt8[np.ndarray, "H W 3"],
+    box: Float[np.ndarray, "4"],
+    segmenter: UNetSegmenter,
+    *,
+    second_look: bool = False,
+) -> FishCrop:
+    """Cut a fish out of a picture by its box, as of a still."""
+    height, width = image.shape[:2]
+    return crop_fish(
+        Frame(frame_index=1, timestamp_ns=0, image=image, source=""),
+        Detection(source_id=1, bbox_xyxy_px=box, mask=None, visible_fraction=1.0),
+        frame_camera=Camera.nominal(width=width, height=height),
+        settings=CropFishSettings(segmenter_sizes_px=list(SIZES_PX), second_look=second_look),
+        segmenter=segmenter,
+    )
+
+
 def measure(
     image: UInt8[np.ndarray, "H W 3"],
     truth: Bool[np.ndarray, "H W"],
@@ -49,14 +67,8 @@ def measure(
 ) -> Cut:
     """Cut a fish out by a box, and compare its mask with the true one."""
     height, width = truth.shape
-    crop = crop_fish(
-        Frame(frame_index=1, timestamp_ns=0, image=image, source=""),
-        Detection(source_id=1, bbox_xyxy_px=box, mask=None, visible_fraction=1.0),
-        frame_camera=(camera := Camera.nominal(width=width, height=height)),
-        settings=CropFishSettings(segmenter_sizes_px=list(SIZES_PX), second_look=second_look),
-        segmenter=segmenter,
-    )
-    to_frame = camera.K @ np.linalg.inv(crop.crop_camera.K)
+    crop = cut_out(image, box, segmenter, second_look=second_look)
+    to_frame = crop.frame_camera.K @ np.linalg.inv(crop.crop_camera.K)
     layer = crop.mask.view(np.uint8) * np.uint8(255)
     mask = cv2.warpAffine(layer, to_frame[:2], (width, height)) > 127
     iou = np.count_nonzero(mask & truth) / max(np.count_nonzero(mask | truth), 1)

@@ -18,10 +18,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from stream_dmr.camera import Camera
-from stream_dmr.messages import Frame
-from stream_dmr.networks.unet_interface import SIZES_PX
-from stream_dmr.segmentation.crop import CropFishSettings, Detection, crop_fish
+from benchmarks.segmentation.end_accuracy import cut_out
+from stream_dmr.export.coco_masks import run_lengths
 from stream_dmr.segmentation.unet_segmenter import SHIPPED, UNetSegmenter
 from stream_dmr.training.annotated_images import read_annotated_images
 
@@ -108,20 +106,9 @@ def _direction(
     found = []
     for sign in (1, -1):
         picture, fish = image[:, ::sign], mask[:, ::sign]
-        height, width = mask.shape
         x, y, w, h = cv2.boundingRect(fish.astype(np.uint8))
-        crop = crop_fish(
-            Frame(frame_index=1, timestamp_ns=0, image=np.ascontiguousarray(picture), source=""),
-            Detection(
-                source_id=1,
-                bbox_xyxy_px=np.array([x, y, x + w, y + h], float),
-                mask=None,
-                visible_fraction=1.0,
-            ),
-            frame_camera=Camera.nominal(width=width, height=height),
-            settings=CropFishSettings(segmenter_sizes_px=list(SIZES_PX)),
-            segmenter=segmenter,
-        )
+        box = np.array([x, y, x + w, y + h], np.float64)
+        crop = cut_out(np.ascontiguousarray(picture), box, segmenter)
         if crop.ends is None or crop.ends.confidence < _SURE:
             return None
         forward = (crop.ends.tail_px - crop.ends.head_px) * [sign, 1]
@@ -164,9 +151,7 @@ def main() -> None:
         images.append({"id": len(images) + 1, "file_name": annotated.path.name})
         height, width = annotated.image.shape[:2]
         for mask in annotated.masks:
-            changes = np.flatnonzero(np.diff(mask.T.ravel(), prepend=False))
-            counts = np.diff(np.concatenate([[0], changes, [mask.size]])).tolist()
-            found: dict[str, Any] = {"counts": counts, "size": [height, width]}
+            found: dict[str, Any] = {"counts": run_lengths(mask), "size": [height, width]}
             one = {"id": len(annotations) + 1, "image_id": len(images), "segmentation": found}
             name = f"{annotated.path.stem}:{one['id']}"
             direction = None if name in wrong else _direction(annotated.image, mask, segmenter)

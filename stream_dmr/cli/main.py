@@ -63,7 +63,6 @@ _GROUPS: dict[str, dict[Callable[..., None], str]] = {
         simulate: "Make a scene of hooked fish with known lengths.",
     },
 }
-_NAMES = {f: f.__name__.replace("_", "-") for group in _GROUPS.values() for f in group}
 
 
 class _GroupedHelp(TyperGroup):
@@ -72,7 +71,7 @@ class _GroupedHelp(TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write a list of commands for each group."""
         for title, commands in _GROUPS.items():
-            names = [_NAMES[command] for command in commands]
+            names = [command.__name__.replace("_", "-") for command in commands]
             rows = [(name, self.commands[name].short_help or "") for name in names]
             with formatter.section(title):
                 formatter.write_dl(rows)

@@ -1,7 +1,7 @@
 """`stream-dmr replay`: recomputes a recording from one stage on."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,6 +14,10 @@ from stream_dmr.cli.shared_options import (
     stop_on_signals,
 )
 from stream_dmr.pipeline.run_options import Stage
+
+if TYPE_CHECKING:
+    from stream_dmr.pipeline.replay_recording import ReplaySummary
+    from stream_dmr.pipeline.run_options import ReplayRequest
 
 
 def replay(
@@ -59,8 +63,7 @@ def replay(
     ] = False,
 ) -> None:
     """Recompute a recording from one stage on, with its own inputs or with others."""
-    from stream_dmr.cli.terminal import RunDisplay, print_check, print_replay
-    from stream_dmr.pipeline.replay_recording import replay as replay_recording
+    from stream_dmr.cli.terminal import print_check
     from stream_dmr.pipeline.run_options import ReplayRequest
 
     request = ReplayRequest(
@@ -79,10 +82,7 @@ def replay(
         check=check,
         command=command_line(),
     )
-    with stop_on_signals() as stop, RunDisplay() as display:
-        summary = replay_recording(request, stop=stop, observer=display)
-    print_replay(summary, out, timings=timings)
-    stop.exit()
+    summary = _replay_and_print(request, timings=timings)
     if check:
         print_check(summary)
         if not summary.is_as_recorded:
@@ -106,8 +106,6 @@ def combine(
 
     Both calibrations are of the same reference plane. Ids and pictures are those of LEFT.
     """
-    from stream_dmr.cli.terminal import RunDisplay, print_replay
-    from stream_dmr.pipeline.replay_recording import replay as replay_recording
     from stream_dmr.pipeline.run_options import ReplayRequest
 
     request = ReplayRequest(
@@ -119,7 +117,16 @@ def combine(
         key=key,
         command=command_line(),
     )
+    _replay_and_print(request, timings=False)
+
+
+def _replay_and_print(request: "ReplayRequest", *, timings: bool) -> "ReplaySummary":
+    """Replay, with the fish and the speed printed; exits if a signal stopped it."""
+    from stream_dmr.cli.terminal import RunDisplay, print_replay
+    from stream_dmr.pipeline.replay_recording import replay as replay_recording
+
     with stop_on_signals() as stop, RunDisplay() as display:
         summary = replay_recording(request, stop=stop, observer=display)
-    print_replay(summary, out, timings=False)
+    print_replay(summary, request.out, timings=timings)
     stop.exit()
+    return summary

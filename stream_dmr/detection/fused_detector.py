@@ -18,6 +18,7 @@ from pydantic import Field
 
 from stream_dmr.detection.detector import Candidate, Detector
 from stream_dmr.detection.motion_detector import MotionDetector
+from stream_dmr.detection.picture_views import find_in_view
 from stream_dmr.detection.still_water import StillWater
 from stream_dmr.geometry import box_iou, fraction_inside, whole_pixels
 from stream_dmr.messages import Frame
@@ -108,9 +109,10 @@ class FusedDetector:
         middle = (bbox_xyxy_px[:2] + bbox_xyxy_px[2:]) / 2
         limits = np.array(frame.image.shape[1::-1])
         low = np.round(middle - side / 2).clip(0, np.maximum(limits - side, 0)).astype(int)
-        high = np.minimum(low + round(side), limits)
-        part = np.ascontiguousarray(frame.image[low[1] : high[1], low[0] : high[0]])
-        return _looks(bbox_xyxy_px - np.tile(low, 2), self._looks.find(replace(frame, image=part)))
+        left, top = low.tolist()
+        right, bottom = np.minimum(low + round(side), limits).tolist()
+        part = frame.image[top:bottom, left:right]
+        return _looks(bbox_xyxy_px, [*find_in_view(self._looks, frame, part, (left, top))])
 
     def _place(self, one: Candidate, frame: Frame) -> Float[np.ndarray, "2"]:
         middle = (one.bbox_xyxy_px[:2] + one.bbox_xyxy_px[2:]) / 2

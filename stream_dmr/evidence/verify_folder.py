@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
-from stream_dmr.errors import OutputError, RecordingError, UserError
+from stream_dmr.errors import OutputError, UserError
 from stream_dmr.evidence.seal import NAME as PROVENANCE
 from stream_dmr.evidence.seal import (
     RECORDINGS,
@@ -458,30 +458,27 @@ def _recording(
     frames: dict[str, list[str]],
 ) -> Iterator[Change]:
     """Compare a recording with the database; its rows of frames.csv are added to `frames`."""
-    try:
-        recording = open_recordings([path])
-        made = run_facts(recording.header)
-        made_by = [all(getattr(r, n) == getattr(made, n) for n in _MADE_BY) for r in runs.values()]
-        if runs and not any(made_by):
-            of_run = next(iter(runs.values()))
-            for name in _MADE_BY:
-                if getattr(of_run, name) != getattr(made, name):
-                    yield Change(path, f"{name} is {getattr(made, name)}, no run in {DATABASE} has")
-        waiting: dict[tuple[int, int], LocalizedFish] = {}
-        for message, _ in decoded_messages(recording, [LocalizedFish, LengthEstimate], EVERYTHING):
-            key = message.frame_index, getattr(message, "track_id", 0)
-            if isinstance(message, LocalizedFish):
-                waiting[key] = message
-            elif isinstance(message, LengthEstimate):
-                if (seen := waiting.pop(key, None)) is not None:
-                    row = frames_row(seen, message.is_frame_used, message.frame_reason)
-                    frames[f"{key[0]},{key[1]}"] = row
-                if message.is_final and runs:  # else the database can't be read
-                    yield from _estimate(path, message, fish.get(message.track_id))
-        for line in recording.warnings:
-            yield Change(path, line.removeprefix(f"{path}: "))
-    except RecordingError as error:
-        yield Change(path, f"damaged: {str(error).removeprefix(f'{path}: ')}")
+    recording = open_recordings([path])
+    made = run_facts(recording.header)
+    made_by = [all(getattr(r, n) == getattr(made, n) for n in _MADE_BY) for r in runs.values()]
+    if runs and not any(made_by):
+        of_run = next(iter(runs.values()))
+        for name in _MADE_BY:
+            if getattr(of_run, name) != getattr(made, name):
+                yield Change(path, f"{name} is {getattr(made, name)}, no run in {DATABASE} has")
+    waiting: dict[tuple[int, int], LocalizedFish] = {}
+    for message, _ in decoded_messages(recording, [LocalizedFish, LengthEstimate], EVERYTHING):
+        key = message.frame_index, getattr(message, "track_id", 0)
+        if isinstance(message, LocalizedFish):
+            waiting[key] = message
+        elif isinstance(message, LengthEstimate):
+            if (seen := waiting.pop(key, None)) is not None:
+                row = frames_row(seen, message.is_frame_used, message.frame_reason)
+                frames[f"{key[0]},{key[1]}"] = row
+            if message.is_final and runs:  # else the database can't be read
+                yield from _estimate(path, message, fish.get(message.track_id))
+    for line in recording.warnings:
+        yield Change(path, line.removeprefix(f"{path}: "))
 
 
 def _estimate(path: Path, recorded: LengthEstimate, fish: _Row | None) -> Iterator[Change]:

@@ -49,11 +49,8 @@ class FishSightings(NamedTuple):
 
     def at(self, time_ns: int) -> Float[np.ndarray, "M 2"] | None:
         """The midline at a time, between the frames around it; None too far from them."""
-        after = int(np.searchsorted(self.times_ns, time_ns))
-        before = (
-            after - 1 if after == len(self.times_ns) or self.times_ns[after] > time_ns else after
-        )
-        before, after = max(before, 0), min(after, len(self.times_ns) - 1)
+        before = max(int(np.searchsorted(self.times_ns, time_ns, side="right")) - 1, 0)
+        after = min(int(np.searchsorted(self.times_ns, time_ns)), len(self.times_ns) - 1)
         t0, t1 = self.times_ns[before], self.times_ns[after]
         if max(t1 - t0, t0 - time_ns, time_ns - t1) > _MOST_APART_S * 1e9:
             return None
@@ -144,19 +141,16 @@ def _apart(
     for row, one in enumerate(first.values()):
         chosen = np.unique(np.linspace(0, len(one.times_ns) - 1, _FRAMES).round().astype(int))
         times = one.times_ns[chosen] + round(offset_s * 1e9)
+        ends_px = one.midlines_px[chosen][:, [0, -1]].reshape(-1, 2)
+        rays = calibrations[0].camera.back_project(ends_px).reshape(-1, 2, 3)
         for column in np.flatnonzero((begins <= times[-1]) & (ends >= times[0])).tolist():
-            pairs = [
-                (one.midlines_px[n, [0, -1]], seen[[0, -1]])
-                for n, time_ns in zip(chosen, times.tolist(), strict=True)
-                if (seen := others[column].at(time_ns)) is not None
-            ]
-            if len(pairs) < _FEWEST:
+            seen = {n: others[column].at(time_ns) for n, time_ns in enumerate(times.tolist())}
+            both = {n: midline[[0, -1]] for n, midline in seen.items() if midline is not None}
+            if len(both) < _FEWEST:
                 continue
-            rays, other_rays = (
-                calibration.camera.back_project(np.concatenate(part))
-                for calibration, part in zip(calibrations, zip(*pairs, strict=True), strict=True)
-            )
-            distances = rays_apart(rays, other_rays @ R, center_mm) / one.length_mm
+            other_rays = calibrations[1].camera.back_project(np.concatenate([*both.values()])) @ R
+            own_rays = rays[[*both]].reshape(-1, 3)
+            distances = rays_apart(own_rays, other_rays, center_mm) / one.length_mm
             apart[row, column] = min(float(np.median(distances)), _MOST_RAYS_APART)
     return apart
 
@@ -229,9 +223,8 @@ class LocalizeByTwo:
         """Return the fish of a fit."""
         alone = localize(mesh, settings=self._settings, calibration=self._calibration)
         track = self._second.get(self._pairing.ids.get(mesh.track_id, -1))
-        if track is None or alone.midline_mm is None or alone.keypoints_mm is None:
-            return [alone]
-        if alone.reason not in _BY_ONE_CAMERA:
+        is_refused = alone.reason not in _BY_ONE_CAMERA
+        if track is None or is_refused or alone.midline_mm is None or alone.keypoints_mm is None:
             return [alone]
         seen_px = track.at(mesh.timestamp_ns + round(self._pairing.offset_s * 1e9))
         if seen_px is None:

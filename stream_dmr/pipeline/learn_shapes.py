@@ -228,12 +228,20 @@ def _learn_and_report(
     if stocks is None:
         observer.warn("no fish was seen whole: each is measured as the form it is most like")
         return forms
+    shapes = _believed(forms, stocks, observer)
+    if (learnt := shapes.stocks()) is not None:
+        for line in describe(forms, learnt):
+            observer.notice(line)
+    return shapes
+
+
+def _believed(
+    forms: CandidateShapes, stocks: CandidateShapes, observer: RunObserver
+) -> CandidateShapes:
+    """What can be believed of learnt stocks; the observer is warned of the rest."""
     believed = believable(forms, stocks)
     for doubt in believed.doubts:
         observer.warn(doubt)
-    if (learnt := believed.shapes.stocks()) is not None:
-        for line in describe(forms, learnt):
-            observer.notice(line)
     return believed.shapes
 
 
@@ -377,10 +385,7 @@ class ShapeLearner:
         stocks = self._inputs.learn(crops, self._given, progress=self.raise_if_stopped)
         if stocks is None:
             return None
-        believed = believable(self._given, stocks)
-        for doubt in believed.doubts:
-            self._observer.warn(doubt)
-        return believed.shapes.stocks()
+        return _believed(self._given, stocks, self._observer).stocks()
 
     def raise_if_stopped(self, step: str) -> None:
         """End the work at this step if the run has ended. Raises InterruptedError."""

@@ -6,17 +6,17 @@ A box with a fish's tail and one without it, or a fish and its fin, overlap too 
 box. Their masks tell: fish share no pixels.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from stream_dmr.detection.box_files import UNKNOWN_ID, load_boxes
-from stream_dmr.detection.detector import Candidate, Detector
+from stream_dmr.detection.detector import Detector
 from stream_dmr.detection.fused_detector import FusedDetector
 from stream_dmr.detection.given_fish import (
     AnnotatedFish,
@@ -27,7 +27,7 @@ from stream_dmr.detection.given_fish import (
 )
 from stream_dmr.detection.mask_folder import MaskFolder
 from stream_dmr.detection.open_detector import DetectFishSettings, open_detector
-from stream_dmr.geometry import box_iou, fraction_inside
+from stream_dmr.detection.picture_views import find_in_still
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.crop import Detection
 from stream_dmr.tracking.box_correction import BoxCorrector
@@ -101,79 +101,6 @@ def _commonest(refused: Mapping[str, int]) -> list[tuple[str, int]]:
 # Of a mask that lies inside another one. In 70 stills, repeats and fins had 0.85 and more of theirs
 # in the fish's, neighbours at most 0.14; see docs/research/real-lengths.md.
 _SAME = 0.5
-
-
-# A detector misses small fish, and fish that fill the picture or their tails. Chosen on photographs
-# that it never saw; see docs/research/real-pictures.md.
-_RIM = 0.25  # of the picture's longer side, around it
-_LARGE = 0.4  # of the picture's longer side: fish that are taken from the picture with the rim
-_TILE_SHARE = 0.625  # of the picture's sides: two by two overlap by a quarter of the picture
-_EDGE_PX = 3  # from a tile's edge: what a box there may lack
-_SURE_NEAR = 0.5  # least score in a tile, where parts of other things look like fish
-_SAME_FISH, _INSIDE = 0.45, 0.9  # IoU of two boxes of a fish; share of a part in the fish's box
-
-
-def find_in_still(detector: Detector, frame: Frame) -> list[Candidate]:
-    """The candidates of a picture: large ones from afar, with a rim, small ones from near."""
-    height, width = frame.image.shape[:2]
-    rim_px = round(_RIM * max(height, width))
-    afar = cv2.copyMakeBorder(frame.image, rim_px, rim_px, rim_px, rim_px, cv2.BORDER_REPLICATE)
-    large = [
-        one
-        for one in _seen_in(detector, frame, afar, (-rim_px, -rim_px))
-        if _longer_px(one) > _LARGE * max(height, width)
-    ]
-    whole, others = [*detector.find(frame)], list[Candidate]()
-    rows, columns = round(_TILE_SHARE * height), round(_TILE_SHARE * width)
-    for top in (0, height - rows):
-        for left in (0, width - columns):
-            tile = frame.image[top : top + rows, left : left + columns]
-            near = _seen_in(detector, frame, tile, (left, top))
-            others += [
-                one
-                for one in near
-                if one.score >= _SURE_NEAR
-                and not _is_cut(one, frame, tile, (left, top))
-                and not any(_is_part(one, fish) for fish in [*large, *whole])
-            ]
-    kept = [*large]
-    for one in sorted([*whole, *others], key=lambda one: -one.score):
-        if not any(_are_same(one, fish) for fish in kept):
-            kept.append(one)
-    return kept
-
-
-def _is_part(one: Candidate, fish: Candidate) -> bool:
-    is_inside = fraction_inside(one.bbox_xyxy_px, fish.bbox_xyxy_px) > _INSIDE
-    return is_inside and not _are_same(one, fish)
-
-
-def _are_same(one: Candidate, fish: Candidate) -> bool:
-    return box_iou(one.bbox_xyxy_px, fish.bbox_xyxy_px) >= _SAME_FISH
-
-
-def _seen_in(
-    detector: Detector, frame: Frame, view: UInt8[np.ndarray, "h w 3"], corner: tuple[int, int]
-) -> Iterator[Candidate]:
-    """The candidates in a view, whose corner is at a pixel of the frame, in the frame's pixels."""
-    limits = np.tile(np.array(frame.image.shape[1::-1], np.float64), 2)
-    for one in detector.find(replace(frame, image=np.ascontiguousarray(view))):
-        yield replace(one, bbox_xyxy_px=(one.bbox_xyxy_px + np.tile(corner, 2)).clip(0, limits))
-
-
-def _is_cut(
-    one: Candidate, frame: Frame, tile: UInt8[np.ndarray, "h w 3"], corner: tuple[int, int]
-) -> bool:
-    """True if a box reaches an edge of a tile that is none of the picture."""
-    low = np.array(corner)
-    high = low + tile.shape[1::-1]
-    at_low = (one.bbox_xyxy_px[:2] < low + _EDGE_PX) & (low > 0)
-    at_high = (one.bbox_xyxy_px[2:] > high - _EDGE_PX) & (high < frame.image.shape[1::-1])
-    return bool(at_low.any() or at_high.any())
-
-
-def _longer_px(one: Candidate) -> float:
-    return float((one.bbox_xyxy_px[2:] - one.bbox_xyxy_px[:2]).max())
 
 
 def without_repeats(crops: Mapping[int, FishCrop], scores: Mapping[int, float]) -> list[int]:

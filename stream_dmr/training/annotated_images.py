@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Integer, UInt8
 
 from stream_dmr.errors import AnnotationError
+from stream_dmr.geometry import transformed
 from stream_dmr.networks.unet_interface import box_coverage
 from stream_dmr.pictures import MAX_PIXELS, PICTURE_SUFFIXES, size_if_huge
 from stream_dmr.training.image_degradation import add_weather, simulate_camera
@@ -261,7 +262,7 @@ def draw_annotated_sample(
     if rng.random() < 0.5:
         rotation = rotation @ np.array([[-1.0, 0.0, 2 * center], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     rows, columns = np.nonzero(cutout.pixels[..., 3])
-    points = np.column_stack([columns, rows]) @ rotation[:, :2].T + rotation[:, 2]
+    points = transformed(np.column_stack([columns, rows]).astype(np.float64), rotation)
     box = np.concatenate([points.min(axis=0) - 0.5, points.max(axis=0) + 0.5])
     if rng.random() < _PART_SHARE:
         box = draw_part_box(rng, box, points)
@@ -278,19 +279,13 @@ def draw_annotated_sample(
     image = picture.astype(np.uint8)
     if is_faded or rng.random() < 0.7:
         image = simulate_camera(rng, add_weather(rng, picture) if rng.random() < 0.5 else picture)
-    edges = box.reshape(2, 2) @ crop_from_rotated[:, :2].T + crop_from_rotated[:, 2] + 0.5
+    edges = transformed(box.reshape(2, 2), crop_from_rotated) + 0.5
     return TrainingSample(
         image=np.ascontiguousarray(image),
         mask=crop[..., 3].astype(np.float32) / 255,
         in_box=box_coverage(edges.ravel(), size=size_px),
-        ends_px=_moved(cutout.ends_px, crop_from_cutout),
+        ends_px=transformed(cutout.ends_px, crop_from_cutout).astype(np.float32),
     )
-
-
-def _moved(
-    points: Float[np.ndarray, "N 2"], affine: Float[np.ndarray, "2 3"]
-) -> Float32[np.ndarray, "N 2"]:
-    return (points @ affine[:, :2].T + affine[:, 2]).astype(np.float32)
 
 
 def fade_end(
@@ -340,7 +335,7 @@ def cutout_patch(cutout: Cutout) -> FishPatch:
     layer = np.dstack([cutout.pixels[..., :3] * coverage, 255 * coverage])
     patch = cv2.warpAffine(layer, affine, (PATCH_PX, PATCH_PX), flags=cv2.INTER_LINEAR)
     bgra = np.clip(np.round(patch), 0, 255).astype(np.uint8)
-    return FishPatch(bgra=bgra, ends_px=_moved(cutout.ends_px, affine))
+    return FishPatch(bgra=bgra, ends_px=transformed(cutout.ends_px, affine))
 
 
 def load_backgrounds(folder: Path) -> list[UInt8[np.ndarray, "B B 3"]]:
@@ -371,4 +366,4 @@ def _cut_out(
         layers, cutout_from_image, (_CUTOUT_PX, _CUTOUT_PX), flags=cv2.INTER_LINEAR
     )
     cutout[..., 3] = np.where(cutout[..., 3] > 127, 255, 0)
-    return Cutout(cutout, _moved(ends_px, cutout_from_image))
+    return Cutout(cutout, transformed(ends_px, cutout_from_image))

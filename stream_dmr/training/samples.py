@@ -16,6 +16,7 @@ from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from stream_dmr.geometry import transformed
 from stream_dmr.networks.unet_interface import SIZES_PX, box_coverage
 from stream_dmr.training.image_degradation import PatchBank, add_weather, simulate_camera
 from stream_dmr.training.surroundings import draw_into
@@ -168,7 +169,7 @@ def draw_spot_sample(
         background, affine, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
     )
     image = simulate_camera(rng, add_weather(rng, crop.astype(np.float32)))
-    low, high = box.reshape(2, 2) @ affine[:, :2].T + affine[:, 2]
+    low, high = transformed(box.reshape(2, 2), affine)
     return TrainingSample(
         image=np.ascontiguousarray(image),
         mask=np.zeros(size, np.float32),
@@ -234,7 +235,7 @@ def draw_sample(rng: np.random.Generator, bank: PatchBank, *, size_px: int) -> T
     picture, mask = render_scene(
         rng, bank, scene, crop_from_scene, targets=targets, size_px=size_px
     )
-    low, high = box.reshape(2, 2) @ crop_from_scene[:, :2].T + crop_from_scene[:, 2]
+    low, high = transformed(box.reshape(2, 2), crop_from_scene)
     in_box = box_coverage(np.concatenate([low, high]) + 0.5, size=size_px)
     has_ends = is_boxed and not is_empty
     return TrainingSample(
@@ -308,4 +309,4 @@ def _ends_px(
 ) -> Float32[np.ndarray, "2 2"]:
     """Head and tail in the crop, x, y."""
     ends = fish.to_scene(bank.ends_px[fish.patch].astype(np.float64))
-    return (ends @ crop_from_scene[:, :2].T + crop_from_scene[:, 2]).astype(np.float32)
+    return transformed(ends, crop_from_scene).astype(np.float32)

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+from stream_dmr.geometry import transformed
 from stream_dmr.simulation.simulated_fish import noise
 
 BACKGROUND_PX = 256  # width and height; so that each crop of 128 px is another piece
@@ -284,7 +285,7 @@ def draw_into(
     covered = np.zeros((size, size), np.float32)
     tones = np.ones((size, size), np.float32)
     for polygon, tone in zip(occluder.polygons, occluder.tones, strict=True):
-        points = polygon @ crop_from_scene[:, :2].T + crop_from_scene[:, 2]
+        points = transformed(polygon, crop_from_scene)
         fixed = np.round(np.clip(points, -2000, 2000) * (1 << _SUBPIXEL_BITS)).astype(np.int32)
         canvas = np.zeros((size, size), np.uint8)
         cv2.fillPoly(canvas, [fixed], 255, cv2.LINE_AA, _SUBPIXEL_BITS)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+from stream_dmr.geometry import transformed
 from stream_dmr.networks.unet_interface import box_coverage
 from stream_dmr.training.image_degradation import (
     PatchBank,
@@ -62,7 +63,7 @@ class SceneFish:
 
     def to_scene(self, patch_px: Float[np.ndarray, "*N 2"]) -> Float[np.ndarray, "*N 2"]:
         """Points of the fish's patch, in px, as points of the scene."""
-        return patch_px @ self.scene_from_patch[:, :2].T + self.scene_from_patch[:, 2]
+        return transformed(patch_px, self.scene_from_patch)
 
     def to_crop(
         self, crop_from_scene: Float[np.ndarray, "2 3"]

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from stream_dmr.camera import Camera
 from stream_dmr.detection.detector import Candidate
+from stream_dmr.detection.picture_views import find_in_still
 from stream_dmr.messages import FishCrop
-from stream_dmr.tracking.finder import find_in_still, share_inside, without_repeats
+from stream_dmr.tracking.finder import share_inside, without_repeats
 from tests.support.frames import frame_of
 from tests.support.given_masks import crop_of
 

@@ -1,0 +1,84 @@
+"""Fish found in a part of a picture, or in a wider one, in the pixels of the picture itself."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from stream_dmr.detection.detector import Candidate, Detector
+from stream_dmr.geometry import box_iou, fraction_inside
+from stream_dmr.messages import Frame
+
+# A detector misses small fish, and fish that fill the picture or their tails. Chosen on photographs
+# that it never saw; see docs/research/real-pictures.md.
+_RIM = 0.25  # of the picture's longer side, around it
+_LARGE = 0.4  # of the picture's longer side: fish that are taken from the picture with the rim
+_TILE_SHARE = 0.625  # of the picture's sides: two by two overlap by a quarter of the picture
+_EDGE_PX = 3  # from a tile's edge: what a box there may lack
+_SURE_NEAR = 0.5  # least score in a tile, where parts of other things look like fish
+_SAME_FISH, _INSIDE = 0.45, 0.9  # IoU of two boxes of a fish; share of a part in the fish's box
+
+
+def find_in_view(
+    detector: Detector, frame: Frame, view: UInt8[np.ndarray, "h w 3"], corner: tuple[int, int]
+) -> Iterator[Candidate]:
+    """The candidates in a view, whose corner is at a pixel of the frame, in the frame's pixels."""
+    limits = np.tile(np.array(frame.image.shape[1::-1], np.float64), 2)
+    for one in detector.find(replace(frame, image=np.ascontiguousarray(view))):
+        yield replace(one, bbox_xyxy_px=(one.bbox_xyxy_px + np.tile(corner, 2)).clip(0, limits))
+
+
+def find_in_still(detector: Detector, frame: Frame) -> list[Candidate]:
+    """The candidates of a picture: large ones from afar, with a rim, small ones from near."""
+    height, width = frame.image.shape[:2]
+    rim_px = round(_RIM * max(height, width))
+    afar = cv2.copyMakeBorder(frame.image, rim_px, rim_px, rim_px, rim_px, cv2.BORDER_REPLICATE)
+    large = [
+        one
+        for one in find_in_view(detector, frame, afar, (-rim_px, -rim_px))
+        if _longer_px(one) > _LARGE * max(height, width)
+    ]
+    whole, others = [*detector.find(frame)], list[Candidate]()
+    rows, columns = round(_TILE_SHARE * height), round(_TILE_SHARE * width)
+    for top in (0, height - rows):
+        for left in (0, width - columns):
+            tile = frame.image[top : top + rows, left : left + columns]
+            near = find_in_view(detector, frame, tile, (left, top))
+            others += [
+                one
+                for one in near
+                if one.score >= _SURE_NEAR
+                and not _is_cut(one, frame, tile, (left, top))
+                and not any(_is_part(one, fish) for fish in [*large, *whole])
+            ]
+    kept = [*large]
+    for one in sorted([*whole, *others], key=lambda one: -one.score):
+        if not any(_are_same(one, fish) for fish in kept):
+            kept.append(one)
+    return kept
+
+
+def _is_part(one: Candidate, fish: Candidate) -> bool:
+    is_inside = fraction_inside(one.bbox_xyxy_px, fish.bbox_xyxy_px) > _INSIDE
+    return is_inside and not _are_same(one, fish)
+
+
+def _are_same(one: Candidate, fish: Candidate) -> bool:
+    return box_iou(one.bbox_xyxy_px, fish.bbox_xyxy_px) >= _SAME_FISH
+
+
+def _is_cut(
+    one: Candidate, frame: Frame, tile: UInt8[np.ndarray, "h w 3"], corner: tuple[int, int]
+) -> bool:
+    """True if a box reaches an edge of a tile that is none of the picture."""
+    low = np.array(corner)
+    high = low + tile.shape[1::-1]
+    at_low = (one.bbox_xyxy_px[:2] < low + _EDGE_PX) & (low > 0)
+    at_high = (one.bbox_xyxy_px[2:] > high - _EDGE_PX) & (high < frame.image.shape[1::-1])
+    return bool(at_low.any() or at_high.any())
+
+
+def _longer_px(one: Candidate) -> float:
+    return float((one.bbox_xyxy_px[2:] - one.bbox_xyxy_px[:2]).max())
