@@ -60,6 +60,10 @@ class TransactionalFile:
         self._size = os.lseek(self._fd, size, os.SEEK_SET)
         self._has_partial_write = False
 
+    def is_at(self, path: Path) -> bool:
+        """True while this file has the name `path`: not renamed, deleted or replaced."""
+        return _is_open_at(self._fd, path)
+
     def tell(self) -> int:
         """Bytes written so far."""
         return self._size
@@ -76,6 +80,13 @@ class TransactionalFile:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
+
+
+def _is_open_at(descriptor: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except OSError:
+        return False
 
 
 class Snapshot:
@@ -247,6 +258,7 @@ class FolderLock:
 
     def __init__(self, folder: Path) -> None:
         """Raises OutputError where another process holds the folder."""
+        self._folder = folder
         self._descriptor = os.open(folder, os.O_RDONLY)
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -261,6 +273,11 @@ class FolderLock:
     def is_held(self) -> bool:
         """False after `release`."""
         return self._descriptor >= 0
+
+    @property
+    def is_in_place(self) -> bool:
+        """False where the folder was renamed, deleted or replaced since."""
+        return _is_open_at(self._descriptor, self._folder)
 
     def release(self) -> None:
         """Unlock the folder. Idempotent."""

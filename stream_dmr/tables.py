@@ -1,6 +1,7 @@
 """CSV files and their cells."""
 
 import csv
+import errno
 import io
 import os
 from collections.abc import Iterable
@@ -46,6 +47,8 @@ class CsvFile:
         """Append a row. Raises OutputError where the disk refuses it; nothing of it stays then."""
         try:
             file = self._file or self._open(resume=True)
+            if not file.is_at(self._path):
+                raise OSError(errno.ESTALE, "another file or none has its name now")
             if self._max_bytes is not None and file.tell() >= self._max_bytes:
                 file = self._rotate()
             file.write(_line(row))

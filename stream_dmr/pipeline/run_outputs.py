@@ -108,7 +108,10 @@ class ResultWriter:
             case _:
                 pass
         states = self._recorder.states
-        states.report(self._store.path.name, self._store.trouble)
+        lost = self._store.lost
+        states.report(self._store.path.name, self._store.trouble or lost)
+        if lost:
+            self._on_notice(f"{self._store.path}: {lost}")
         if self._store.trouble:
             self._on_notice(f"{self._store.path}: {self._store.trouble}; lengths wait in memory")
 

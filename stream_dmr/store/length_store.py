@@ -4,6 +4,7 @@ The database also holds what a restart must not use again: track ids, frame numb
 times.
 """
 
+import os
 import sqlite3
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -78,6 +79,7 @@ class WaitingRows:
         self.pending: list[Statement] = []
         self.trouble = ""  # why the last row could not be written; "" when all are
         self.database, self.is_reached = self._open(waits_for_disk=waits_for_disk)
+        self._opened = path.stat() if self.is_reached else None
         self._is_stand_in = not self.is_reached
         self._written = _num_written(self.database)
 
@@ -96,6 +98,16 @@ class WaitingRows:
             self.is_reached = False
             if not is_last:
                 self._reserve.release()
+
+    @property
+    def is_in_place(self) -> bool:
+        """False where the file that is open was renamed, deleted or replaced."""
+        if self._opened is None or not self.is_reached:
+            return True
+        try:
+            return os.path.samestat(self._opened, self._path.stat())
+        except OSError:
+            return False
 
     def close(self) -> None:
         """Close the file; what still waits is lost."""
@@ -138,6 +150,7 @@ class WaitingRows:
             raise
         self.database.close()
         self.database, self.is_reached, self._is_stand_in = fresh, True, False
+        self._opened = self._path.stat()
         written = _num_written(fresh)
         del self.pending[: max(0, written - self._written)]
         self._written = written
@@ -149,6 +162,7 @@ def _num_written(database: sqlite3.Connection) -> int:
 
 
 _MARK_EVERY_NS = 5_000_000_000  # capture times that a crash may leave unmarked; chosen
+_BEGIN_ANEW = "what is measured will not be found here: end the run and begin it anew"
 _FRAMES_AHEAD = 1000  # frame numbers that are marked as used at a time; a crash skips the rest
 _COUNTS = "UPDATE runs SET frames_done = ?, frames_promised = ? WHERE run_id = ?"
 _END = f"UPDATE runs SET {' = ?, '.join(END_COLUMNS)} = ? WHERE run_id = ?"
@@ -209,6 +223,17 @@ class LengthStore:
     def trouble(self) -> str:
         """Why the last row could not be written; "" when all are."""
         return self._rows.trouble
+
+    @property
+    def lost(self) -> str:
+        """Why what is written will not be found in the folder; "" while it will."""
+        if not self._lock_of_folder.is_held:
+            return ""
+        if not self._lock_of_folder.is_in_place:
+            return f"its folder was renamed, deleted or replaced; {_BEGIN_ANEW}"
+        if not self._rows.is_in_place:
+            return f"the file was renamed, deleted or replaced; {_BEGIN_ANEW}"
+        return ""
 
     def add(
         self,
@@ -361,10 +386,11 @@ class LengthStore:
     def close(self) -> None:
         """End the run and leave one file. Idempotent.
 
-        Raises OutputError where rows could not be written.
+        Raises OutputError where rows could not be written, or are not where they should be.
         """
         if not self._lock_of_folder.is_held:
             return
+        lost = self.lost
         values = {"ended_ns": time.time_ns()}
         values |= {name: getattr(self._facts, name) for name in END_COLUMNS if name not in values}
         with self._lock:
@@ -374,6 +400,8 @@ class LengthStore:
         self._rows.close()
         self._reserve.release()
         self._lock_of_folder.release()
+        if lost:
+            raise OutputError(f"{self.path}: expected the results of this run, but {lost}")
         if self.trouble:
             raise OutputError(
                 f"{self.path}: expected room for {len(self._rows.pending)} more rows, got: "

@@ -68,7 +68,8 @@ class LengthsTable:
         self._export()
 
     def _export(self) -> None:
-        if self._store.trouble:  # its file lacks fish; the next run exports them
+        # Its file lacks fish, which the next run exports, or is elsewhere.
+        if self._store.trouble or self._store.lost:
             return
         try:
             store = self._store

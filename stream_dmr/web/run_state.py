@@ -68,10 +68,12 @@ class RunState:
         positions: PositionSource | None = None,
         hauls: HaulLog | None = None,
         scale_alarm: Callable[[], str] = str,
+        store: LengthStore | None = None,
     ) -> None:
         """A camera that is silent for `silence_s` and a frame that takes `stuck_s` are problems.
 
-        So is a line of `scale_alarm`, that a known length was measured wrong.
+        So are a line of `scale_alarm`, that a known length was measured wrong, and a `store` whose
+        file or folder is not where it was, also while no frame comes.
         """
         self.source = source
         self.positions, self.hauls = positions, hauls
@@ -87,7 +89,7 @@ class RunState:
         self._out_dir = out_dir
         self._silence_s = silence_s
         self._stuck_s = stuck_s
-        self._scale_alarm = scale_alarm
+        self._scale_alarm, self._store = scale_alarm, store
         self._began_s = time.monotonic()
         self._lock = threading.Lock()
         self._frames: deque[Frame] = deque(maxlen=_MAX_FRAMES)
@@ -202,6 +204,8 @@ class RunState:
             problems += self.positions.problems()
         if alarm := self._scale_alarm():
             problems.append(alarm)
+        if self._store is not None and (lost := self._store.lost):
+            self.sinks.report(self._store.path.name, lost)
         return problems + self.sinks.problems()
 
     def is_stuck(self) -> bool:

@@ -181,6 +181,7 @@ class WatchObserver(RunObserver):
             positions=run.positions,
             hauls=run.hauls,
             scale_alarm=ScaleAlarm(run.store.path, run.store.calibration_sha256).line,
+            store=run.store,
         )
         state.continue_after(run.store)
         if settings.port:
