@@ -13,7 +13,7 @@ from pathlib import Path
 
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.replay_recording import replay
-from stream_dmr.pipeline.run_options import ReplayRequest, RunRequest
+from stream_dmr.pipeline.run_options import ReplayOptions, RunOptions
 from stream_dmr.simulation import DEMO_SCENE
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -26,7 +26,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         # From a copy, since a recording says where its inputs lay.
         scene = Path(shutil.copytree(DEMO_SCENE, Path(folder) / "scene"))
-        request = RunRequest(
+        request = RunOptions(
             source=str(scene / "video.mp4"),
             boxes=scene / "boxes.txt",
             masks=scene / "masks",
@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def _print_moved() -> None:
-    request = ReplayRequest(recordings=[GOLDEN / "recording.mcap"], check=True)
+    request = ReplayOptions(recordings=[GOLDEN / "recording.mcap"], check=True)
     moved = replay(request, stop=threading.Event()).mismatches
     kinds = sorted({item.kind for item in moved})
     print(f"{len(moved)} fields moved: {', '.join(kinds) or 'none'}", file=sys.stderr)

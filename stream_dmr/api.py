@@ -17,11 +17,11 @@ from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.replay_recording import replay as replay_recordings
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.run_options import (
-    ReplayRequest,
-    RunRequest,
+    ReplayOptions,
+    RunOptions,
     Stage,
     command_of,
-    default_out,
+    options_of,
 )
 from stream_dmr.recording.reading import decoded_messages, open_recordings
 from stream_dmr.recording.selection import Selection
@@ -126,7 +126,6 @@ def _row(kind: type[Row], texts: Mapping[str, str | None], where: str) -> Row:
 
 
 Location = str | PathLike[str]
-Pose = Literal["hanging", "lying"]
 
 
 @dataclass(frozen=True)
@@ -192,8 +191,8 @@ def measure(
     calibration: Location | None = None,
     boxes: Location | None = None,
     masks: Location | None = None,
-    template: Location = RunRequest.template,
-    pose: Pose = "hanging",
+    template: Location = "auto",
+    pose: Literal["hanging", "lying"] = "hanging",
     stills: bool = False,
     config: Location | None = None,
     overwrite: bool = False,
@@ -214,26 +213,7 @@ def measure(
     Warnings are logged (logger "stream_dmr"), or passed to `observer`. Raises a UserError, in one
     line, where an input is wrong.
     """
-    _require_choice("pose", pose, get_args(Pose))
-    request = RunRequest(
-        source=str(source),
-        out=default_out(str(source)) if out is None else Path(out),
-        calibration=_path(calibration),
-        boxes=_path(boxes),
-        masks=_path(masks),
-        template=str(template),
-        pose=pose,
-        stills=stills,
-        config=_path(config),
-        overwrite=overwrite,
-        live=live,
-        vessel=vessel,
-        trip=trip,
-        haul=haul,
-        nmea=None if nmea is None else str(nmea),
-        start_utc=start_utc,
-        key=_path(key),
-    )
+    request = options_of(RunOptions, locals())
     measure_source(
         command_of(request),
         stop=stop or threading.Event(),
@@ -263,18 +243,8 @@ def replay(
     recorded; `tracks` and `time_s` (from, to, capture time) take a part of it. Raises a UserError
     where an input is wrong.
     """
-    _require_choice("first", first, get_args(Stage))
-    request = ReplayRequest(
-        recordings=_paths(recordings),
-        first=first,
-        config=_path(config),
-        calibration=_path(calibration),
-        template=None if template is None else str(template),
-        selection=_selection(time_s, tracks),
-        out=Path(out),
-        overwrite=overwrite,
-        key=_path(key),
-    )
+    parts = {"recordings": _paths(recordings), "selection": _selection(time_s, tracks)}
+    request = options_of(ReplayOptions, locals() | parts)
     replay_recordings(
         request, stop=stop or threading.Event(), observer=observer or LoggingObserver()
     )
@@ -326,12 +296,6 @@ class LoggingObserver(RunObserver):
         _LOGGER.info("watch it with: %s", address)
 
 
-def _require_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Raise UserError for a value that is none of the choices."""
-    if value not in choices:
-        raise UserError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
-
-
 def _selection(time_s: tuple[float, float] | None, tracks: Collection[int]) -> Selection:
     """The selected part; UserError for a time that ends before it begins."""
     if time_s is not None and not time_s[0] < time_s[1]:
@@ -340,10 +304,6 @@ def _selection(time_s: tuple[float, float] | None, tracks: Collection[int]) -> S
             "must be less"
         )
     return Selection.from_seconds(time_s, frozenset(tracks) or None)
-
-
-def _path(location: Location | None) -> Path | None:
-    return None if location is None else Path(location)
 
 
 def _paths(locations: Location | Sequence[Location]) -> list[Path]:

@@ -96,10 +96,13 @@ def times_of(setup, pair):
 
 def test_backlog_has_as_many_frames_raw_as_with_masks(tmp_path):
     with_masks, whole = batch_speed.backlogs(tmp_path, videos=2)
-    assert [job.trip for job in with_masks.jobs] == ["0", "1"]
-    lengths = [cv2.VideoCapture(job.video).get(cv2.CAP_PROP_FRAME_COUNT) for job in with_masks.jobs]
+    assert [job.options.trip for job in with_masks.jobs] == ["0", "1"]
+    lengths = [
+        cv2.VideoCapture(job.options.source).get(cv2.CAP_PROP_FRAME_COUNT)
+        for job in with_masks.jobs
+    ]
     (raw,) = whole.jobs
-    assert cv2.VideoCapture(raw.video).get(cv2.CAP_PROP_FRAME_COUNT) == sum(lengths)
+    assert cv2.VideoCapture(raw.options.source).get(cv2.CAP_PROP_FRAME_COUNT) == sum(lengths)
     assert with_masks.num_frames == whole.num_frames == sum(lengths)
 
 

@@ -12,7 +12,7 @@ import pytest
 
 import stream_dmr as sd
 from stream_dmr.api import read_rows
-from stream_dmr.pipeline.run_options import RunRequest, command_of
+from stream_dmr.pipeline.run_options import RunOptions, command_of
 from stream_dmr.store.run_tables import FRAMES_COLUMNS, LENGTHS_COLUMNS
 from tests.support.command import invoke, rows
 from tests.support.fish_run import FISH
@@ -82,12 +82,14 @@ def test_measure_gives_what_the_command_gives(run: sd.Run, tmp_path: Path):
 
 
 def test_measure_takes_all_that_a_run_can_be_asked():
-    parameters = set(inspect.signature(sd.measure).parameters)
-    assert parameters - {"observer", "stop"} == {f.name for f in fields(RunRequest)} - {"command"}
+    taken = {p.name: p.default for p in inspect.signature(sd.measure).parameters.values()}
+    options = {f.name: f.default for f in fields(RunOptions)} | {"source": inspect.Parameter.empty}
+    del options["command"]
+    assert taken == options | {"observer": None, "stop": None}
 
 
 def test_a_request_is_recorded_as_the_command_that_does_the_same():
-    request = RunRequest(source="rtsp://me:secret@rail/1", out=Path("a b"), stills=True)
+    request = RunOptions(source="rtsp://me:secret@rail/1", out=Path("a b"), stills=True)
     command = "stream-dmr run --source rtsp://rail/1 --out 'a b' --stills"
     assert command_of(request).command == command
 

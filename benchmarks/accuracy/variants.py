@@ -15,7 +15,7 @@ from pathlib import Path
 from stream_dmr.evaluation.compare import Evaluation, evaluate
 from stream_dmr.pipeline.config import Config, to_toml
 from stream_dmr.pipeline.measure_source import measure_source
-from stream_dmr.pipeline.run_options import RunRequest
+from stream_dmr.pipeline.run_options import RunOptions
 
 _QUIET = {"mcap": False, "rrd": False}
 _PAPER = {"deformation": "linear-blend", "solver": "adam"}
@@ -33,7 +33,7 @@ def measure(scene: Path, template: str, changes: dict) -> tuple[Evaluation, floa
     with tempfile.TemporaryDirectory() as folder:
         config = Path(folder) / "config.toml"
         config.write_text(to_toml(Config.model_validate({"recording": _QUIET, **changes})))
-        request = RunRequest(
+        request = RunOptions(
             source=str(scene / "video.mp4"),
             calibration=scene / "calibration.yaml",
             boxes=scene / "boxes.txt",

@@ -13,7 +13,7 @@ import numpy as np
 from stream_dmr.calibration.calibration_file import load_calibration, save_calibration
 from stream_dmr.pipeline.config import Config, to_toml
 from stream_dmr.pipeline.measure_source import measure_source
-from stream_dmr.pipeline.run_options import RunRequest
+from stream_dmr.pipeline.run_options import RunOptions
 from stream_dmr.simulation.film import FilmedFrame, film
 from stream_dmr.simulation.rail_scene import HEIGHT, WIDTH, make_scene
 from stream_dmr.simulation.write_scene import encode_mask, write_species
@@ -78,7 +78,7 @@ def measure(clip: Path, task: Task) -> Rate:
         _resize(clip, folder, task.size)
         config = folder / "config.toml"
         config.write_text(to_toml(Config.model_validate({"recording": task.recording})))
-        request = RunRequest(
+        request = RunOptions(
             source=str(folder / "video.mp4"),
             calibration=folder / "calibration.yaml",
             masks=clip / "masks" if task.has_masks else None,

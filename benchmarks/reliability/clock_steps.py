@@ -57,7 +57,7 @@ def measure(folder: Path, address: str, steps_ns: list[int]) -> list[str]:
     """A run with the clock off by each of these for some seconds; what was said of the clock."""
     from stream_dmr.pipeline.measure_source import measure_source
     from stream_dmr.pipeline.run_observer import RunObserver
-    from stream_dmr.pipeline.run_options import RunRequest
+    from stream_dmr.pipeline.run_options import RunOptions
 
     library, stop, has_begun = ctypes.CDLL(None), threading.Event(), threading.Event()
     library.disturb_clock.argtypes = [ctypes.c_longlong]
@@ -80,7 +80,7 @@ def measure(folder: Path, address: str, steps_ns: list[int]) -> list[str]:
 
     stepping = threading.Thread(target=step)
     stepping.start()
-    request = RunRequest(
+    request = RunOptions(
         source=address,
         out=folder / "out",
         calibration=folder / "scene" / "calibration.yaml",

@@ -17,7 +17,7 @@ from stream_dmr.errors import OutputError
 from stream_dmr.messages import Frame
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.run_observer import RunObserver
-from stream_dmr.pipeline.run_options import RunRequest
+from stream_dmr.pipeline.run_options import RunOptions
 from stream_dmr.recording.repair import repair_recordings
 
 _FPS = 5  # of capture time: a new segment is tried again 5 s after one that failed
@@ -72,7 +72,7 @@ def measure(case: Case) -> dict:
     out, scene = _FOLDER / "out", _FOLDER / "scene"
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir()
-    request = RunRequest(
+    request = RunOptions(
         source=str(_FOLDER / "clips"),
         out=out,
         calibration=scene / "calibration.yaml",

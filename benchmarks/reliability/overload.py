@@ -12,7 +12,7 @@ from benchmarks.reliability.soak import metrics_of
 from stream_dmr.messages import LocalizedFish, Message
 from stream_dmr.pipeline.measure_source import RunSummary, measure_source
 from stream_dmr.pipeline.run_observer import RunObserver
-from stream_dmr.pipeline.run_options import RunRequest
+from stream_dmr.pipeline.run_options import RunOptions
 from stream_dmr.web.watch_observer import WatchObserver
 from tests.support.camera import Camera, free_port
 
@@ -90,7 +90,7 @@ def measured(
     stop: threading.Event | None = None,
 ) -> RunSummary:
     """A run over a source, into a folder of its own."""
-    request = RunRequest(
+    request = RunOptions(
         source=source,
         out=folder / name,
         calibration=scene / "calibration.yaml",

@@ -48,10 +48,10 @@ def write_tables(folder: Path, job: Job) -> None:
 
     Its recording may be gone: lengths.db, frames.csv and the job have all that is needed.
     """
-    recording = open_results(folder, template=job.template)
-    settings = load_config(job.config or None).fisheries
+    recording = open_results(folder, template=job.options.template)
+    settings = load_config(job.options.config).fisheries
     fish = read_fish(folder, recording)
-    of_video = {"video": job.name, "haul": job.haul}
+    of_video = {"video": job.name, "haul": job.options.haul}
     records = fish_records(fish, recording.header.template, settings, database=folder / DATABASE)
     _write(folder / "fish.parquet", [one | of_video for one in records], _FISH_SCHEMA)
     _write(folder / "frames.parquet", _frame_records(folder, fish, of_video), _FRAMES_SCHEMA)
@@ -99,7 +99,7 @@ def withdraw_others(jobs: Iterable[Job], out: Path) -> None:
 
 
 def _target(out: Path, kind: str, job: Job) -> Path:
-    return dataset_file(out, kind, vessel=job.vessel, trip=job.trip, name=job.name)
+    return dataset_file(out, kind, vessel=job.options.vessel, trip=job.options.trip, name=job.name)
 
 
 def _written_ns(folder: Path, kind: str) -> int:

@@ -139,7 +139,8 @@ class _BatchResults:
 
 
 def _cells(job: Job, outcome: Outcome | None) -> tuple[object, ...]:
-    of_job = (job.name, job.video, job.vessel, job.trip, job.haul)
+    options = job.options
+    of_job = (job.name, options.source, options.vessel, options.trip, options.haul)
     if outcome is None:
         return (*of_job, WAITING, *[""] * (len(OUTCOME_COLUMNS) - 1))
     return (*of_job, *(getattr(outcome, name) for name in OUTCOME_COLUMNS.values()))

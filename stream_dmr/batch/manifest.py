@@ -5,16 +5,18 @@ import io
 import json
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 from stream_dmr.errors import UserError, reason_of
 from stream_dmr.files import read_text
+from stream_dmr.pipeline.run_options import RunOptions, options_of
 from stream_dmr.version import __version__
 
+# Options of `run` by their names; `video` is --source.
 COLUMNS = ("video", "calibration", "boxes", "masks", "vessel", "trip", "haul")
 MORE_COLUMNS = ("nmea", "start_utc")  # that a manifest may have as well
 _MAX_BYTES = 100_000_000  # of a manifest: a million videos
@@ -23,21 +25,15 @@ _FILES = (*COLUMNS[:4], "nmea")
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One video of a batch; workers get it as JSON. Paths are absolute, "" where there is none."""
+    """One video of a batch; workers get it as JSON."""
 
     name: str  # of its folder; unique in the manifest
-    video: str
-    calibration: str = ""
-    boxes: str = ""
-    masks: str = ""
-    vessel: str = ""
-    trip: str = ""
-    haul: str = ""
-    nmea: str = ""  # positions: a file
-    start_utc: str = ""  # when the video began
-    config: str = ""
-    template: str = "auto"
-    device_key: str = ""  # signs the results
+    given: Mapping[str, str]  # options of its run by name, where there are any; paths are absolute
+
+    @cached_property
+    def options(self) -> RunOptions:
+        """The options of its run, with the default of all that is not given."""
+        return options_of(RunOptions, self.given)
 
     @property
     def key(self) -> str:
@@ -45,21 +41,18 @@ class Job:
 
         Videos and masks count by size and time of change, since reading them takes too long.
         """
-        stamps = [_size_and_time(path) for path in (self.video, self.masks)]
-        hashes = [_content_hash(path) for path in self._small_files]
-        mesh = Path(self.template)
-        hashes += [_content_hash(str(path)) for path in (mesh, mesh.with_suffix(".toml"))]
+        stamps = [_size_and_time(self.given.get(name, "")) for name in ("source", "masks")]
+        mesh = Path(self.options.template)
+        small = [self.given.get(name, "") for name in ("calibration", "boxes", "nmea", "config")]
+        small += [str(mesh), str(mesh.with_suffix(".toml"))]
+        hashes = [_content_hash(path) for path in small]
         inputs = [__version__, asdict(self), stamps, hashes]
         return sha256(json.dumps(inputs).encode()).hexdigest()
 
     @property
-    def _small_files(self) -> tuple[str, ...]:
-        return self.calibration, self.boxes, self.nmea, self.config
-
-    @property
     def num_bytes(self) -> int:
         """Size of the video, from which the time left is estimated; 0 where it is no file."""
-        path = Path(self.video)
+        path = Path(self.options.source)
         return path.stat().st_size if path.is_file() else 0
 
 
@@ -74,8 +67,8 @@ def read_manifest(
     rows = _rows(path)
     names = _names([row["video"] or "" for row in rows])
     mesh = template if not Path(template).is_file() else str(Path(template).resolve())
-    given = {"config": config, "device_key": key}
-    shared = {name: str(file.resolve()) for name, file in given.items() if file is not None}
+    files = {"config": config, "key": key}
+    shared = {name: str(file.resolve()) for name, file in files.items() if file is not None}
     shared["template"] = mesh
     jobs, home = [], path.resolve().parent
     for number, (row, name) in enumerate(zip(rows, names, strict=True), start=2):
@@ -85,14 +78,15 @@ def read_manifest(
             )
         cells = {key: (row.get(key) or "").strip() for key in (*COLUMNS, *MORE_COLUMNS)}
         files = {key: str(home / cells[key]) for key in _FILES if cells[key]}
-        values: dict[str, Any] = cells | files | shared
-        jobs.append(Job(name=name, **values))
+        given = {key: value for key, value in (cells | files).items() if value}
+        given["source"] = given.pop("video", "")
+        jobs.append(Job(name=name, given=given | shared))
     return jobs
 
 
 def repeated_videos(jobs: Sequence[Job]) -> list[str]:
     """A line for each video that several rows name: its fish count once for each of them."""
-    counts = Counter(str(Path(job.video).resolve()) for job in jobs)
+    counts = Counter(str(Path(job.options.source).resolve()) for job in jobs)
     return [
         f"{video}: in {count} rows of the manifest, so its fish count {count} times"
         for video, count in counts.items()

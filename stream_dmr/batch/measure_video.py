@@ -17,7 +17,7 @@ from stream_dmr.evidence.seal import add_files
 from stream_dmr.files import rename_durably
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.run_observer import RunObserver
-from stream_dmr.pipeline.run_options import RunRequest, command_of
+from stream_dmr.pipeline.run_options import RunOptions, command_of
 from stream_dmr.store.batch_folder import (
     DONE,
     FAILED,
@@ -173,28 +173,10 @@ def _write_outcome(path: Path, outcome: Outcome) -> None:
     add_files(path.parent, [path])
 
 
-def request_of(job: Job, out: Path) -> RunRequest:
+def request_of(job: Job, out: Path) -> RunOptions:
     """The run that measures a video of the batch in `out`, with its command as a user types it."""
-    request = RunRequest(
-        source=job.video,
-        out=results_folder(job.name, out),
-        calibration=_path(job.calibration),
-        boxes=_path(job.boxes),
-        masks=_path(job.masks),
-        template=job.template,
-        config=_path(job.config),
-        key=_path(job.device_key),
-        vessel=job.vessel,
-        trip=job.trip,
-        haul=job.haul,
-        nmea=job.nmea or None,
-        start_utc=job.start_utc,
-    )
-    return replace(command_of(request), out=unfinished_folder(job.name, out))
-
-
-def _path(text: str) -> Path | None:
-    return Path(text) if text else None
+    request = command_of(replace(job.options, out=results_folder(job.name, out)))
+    return replace(request, out=unfinished_folder(job.name, out))
 
 
 class _ProgressObserver(RunObserver):

@@ -10,13 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from stream_dmr.cli.shared_options import (
-    ConfigOption,
-    KeyOption,
-    TemplateOption,
-    stop_on_signals,
-    warn,
-)
+from stream_dmr.batch.manifest import COLUMNS, MORE_COLUMNS
+from stream_dmr.cli.shared_options import stop_on_signals, warn
+from stream_dmr.pipeline.run_options import ConfigOption, KeyOption, TemplateOption
 
 if TYPE_CHECKING:
     from stream_dmr.batch.driver import Engine
@@ -28,7 +24,7 @@ def batch(
     manifest: Annotated[
         Path,
         typer.Argument(
-            help="CSV with video,calibration,boxes,masks,vessel,trip,haul, perhaps nmea,start_utc.",
+            help=f"CSV with {','.join(COLUMNS)}, perhaps {','.join(MORE_COLUMNS)}.",
             metavar="MANIFEST.csv",
         ),
     ],

@@ -18,6 +18,7 @@ from stream_dmr.cli.export import export
 from stream_dmr.cli.replay import combine, replay
 from stream_dmr.cli.review import agreement, review
 from stream_dmr.cli.run import demo, recover, run, setup, simulate
+from stream_dmr.cli.shared_options import typer_command
 from stream_dmr.cli.templates import learn_template, make_template
 from stream_dmr.cli.train import evaluate, train
 from stream_dmr.cli.verify import keygen, report, verify
@@ -87,7 +88,7 @@ app = typer.Typer(
 )
 for _group in _GROUPS.values():
     for _command, _summary in _group.items():
-        app.command(short_help=_summary)(_command)
+        app.command(short_help=_summary)(typer_command(_command))
 
 
 def main() -> None:

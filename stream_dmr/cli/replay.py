@@ -1,23 +1,22 @@
 """`stream-dmr replay`: recomputes a recording from one stage on."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stream_dmr.cli.shared_options import (
-    KeyOption,
     TimeOption,
     TrackOption,
     command_line,
     parse_selection,
     stop_on_signals,
 )
-from stream_dmr.pipeline.run_options import Stage
+from stream_dmr.pipeline.run_options import KeyOption, ReplayOptions, Stage
 
 if TYPE_CHECKING:
     from stream_dmr.pipeline.replay_recording import ReplaySummary
-    from stream_dmr.pipeline.run_options import ReplayRequest
 
 
 def replay(
@@ -29,61 +28,24 @@ def replay(
         ),
     ],
     first: Annotated[Stage, typer.Option("--from", help="The first stage to recompute.")] = "fit",
-    check: Annotated[
-        bool, typer.Option("--check", help="Compare with what was recorded; exit 1 if it differs.")
-    ] = False,
-    config: Annotated[
-        Path | None, typer.Option(help="Settings instead of the recorded ones.")
-    ] = None,
-    calibration: Annotated[
-        Path | None, typer.Option(help="A calibration instead of the recorded one.")
-    ] = None,
-    template: Annotated[
-        str | None, typer.Option(help="A template instead of the recorded one: its name or mesh.")
-    ] = None,
-    source: Annotated[
-        str | None,
-        typer.Option(
-            help="The recorded clip, for --from crop.", show_default="the run's, if it is unchanged"
-        ),
-    ] = None,
-    boxes: Annotated[Path | None, typer.Option(help="As in the run, for --from crop.")] = None,
-    masks: Annotated[Path | None, typer.Option(help="As in the run, for --from crop.")] = None,
+    *,
+    options: ReplayOptions,
     time: TimeOption = None,
     track: TrackOption = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for a new recording and new tables.")
-    ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the results of an earlier run in --out.")
-    ] = False,
-    key: KeyOption = None,
-    timings: Annotated[
-        bool, typer.Option("--timings", help="At the end, show the time that each stage took.")
-    ] = False,
+    timings: Annotated[bool, "At the end, show the time that each stage took."] = False,
 ) -> None:
     """Recompute a recording from one stage on, with its own inputs or with others."""
     from stream_dmr.cli.terminal import print_check
-    from stream_dmr.pipeline.run_options import ReplayRequest
 
-    request = ReplayRequest(
+    request = replace(
+        options,
         recordings=recordings,
         first=first,
-        config=config,
-        calibration=calibration,
-        template=template,
-        source=source,
-        boxes=boxes,
-        masks=masks,
         selection=parse_selection(time, track),
-        out=out,
-        overwrite=overwrite,
-        key=key,
-        check=check,
         command=command_line(),
     )
     summary = _replay_and_print(request, timings=timings)
-    if check:
+    if request.check:
         print_check(summary)
         if not summary.is_as_recorded:
             raise typer.Exit(1)
@@ -97,18 +59,15 @@ def combine(
         Path, typer.Argument(help="That of the other camera, of the same fish.", metavar="RIGHT")
     ],
     out: Annotated[Path, typer.Option(help="Folder for the recording and tables of both.")],
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the results of an earlier run in --out.")
-    ] = False,
+    overwrite: Annotated[bool, "Replace the results of an earlier run in --out."] = False,
     key: KeyOption = None,
 ) -> None:
     """Measure fish that two calibrated cameras saw: one length from both.
 
     Both calibrations are of the same reference plane. Ids and pictures are those of LEFT.
     """
-    from stream_dmr.pipeline.run_options import ReplayRequest
 
-    request = ReplayRequest(
+    request = ReplayOptions(
         recordings=[first],
         first="localize",
         second=second,
@@ -120,7 +79,7 @@ def combine(
     _replay_and_print(request, timings=False)
 
 
-def _replay_and_print(request: "ReplayRequest", *, timings: bool) -> "ReplaySummary":
+def _replay_and_print(request: ReplayOptions, *, timings: bool) -> "ReplaySummary":
     """Replay, with the fish and the speed printed; exits if a signal stopped it."""
     from stream_dmr.cli.terminal import RunDisplay, print_replay
     from stream_dmr.pipeline.replay_recording import replay as replay_recording

@@ -8,9 +8,12 @@ import sys
 import threading
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
+from dataclasses import MISSING, fields, is_dataclass
+from functools import wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -23,17 +26,6 @@ if TYPE_CHECKING:
     from stream_dmr.pipeline.config import Config
     from stream_dmr.recording.selection import Selection
 
-TemplateOption = Annotated[
-    str,
-    typer.Option(
-        help="auto: the shape of the fish themselves. Or the body form that they probably have "
-        "(halibut, cod, salmon, bream, tuna, pike, eel), or a mesh of the species with its TOML "
-        "beside it."
-    ),
-]
-ConfigOption = Annotated[
-    Path | None, typer.Option(help="A config.toml; left-out settings keep their defaults.")
-]
 TimeOption = Annotated[
     str | None, typer.Option("--time", help="Only this time of capture, in s.", metavar="FROM:TO")
 ]
@@ -53,10 +45,54 @@ MarkerOption = Annotated[
     float | None, typer.Option(help="Side of a ChArUco board's markers in mm.")
 ]
 
-KeyOption = Annotated[
-    Path | None, typer.Option(help="Device key of `keygen`; signs all that is written.")
-]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
+OverwriteOption = Annotated[bool, "Replace existing files."]
+
+
+_KIND = Parameter.KEYWORD_ONLY
+
+
+def typer_command(function: Callable[..., None]) -> Callable[..., None]:
+    """The function for Typer: texts in `Annotated` become options with this help.
+
+    An argument of a dataclass is replaced by an option for each of its fields that has a text.
+    """
+    groups, parameters = dict[str, tuple[type, list[str]]](), list[Parameter]()
+    for parameter in signature(function).parameters.values():
+        kind: type = parameter.annotation
+        if not is_dataclass(kind):
+            parameters.append(parameter)
+            continue
+        hints = get_type_hints(kind, include_extras=True)
+        options = [field for field in fields(kind) if get_origin(hints[field.name]) is Annotated]
+        groups[parameter.name] = kind, [field.name for field in options]
+        for field in options:
+            default = Parameter.empty if field.default is MISSING else field.default
+            parameters.append(
+                parameter.replace(name=field.name, annotation=hints[field.name], default=default)
+            )
+
+    @wraps(function)
+    def command(**values: Any) -> None:
+        for name, (kind, names) in groups.items():
+            values[name] = kind(**{name: values.pop(name) for name in names})
+        function(**values)
+
+    shown = [
+        parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=_typer_option(parameter))
+        for parameter in parameters
+    ]
+    command.__signature__ = Signature(shown)  # type: ignore[attr-defined]
+    return command
+
+
+def _typer_option(parameter: Parameter) -> Any:
+    """Its annotation, with an option of Typer in the place of the texts."""
+    kind, *texts = get_args(parameter.annotation) or (parameter.annotation,)
+    if not texts or not isinstance(texts[0], str):
+        return parameter.annotation
+    names = [f"--{parameter.name.replace('_', '-')}"] if kind is bool else []  # no --no-...
+    default = texts[1] if len(texts) > 1 else True
+    return Annotated[kind, typer.Option(*names, help=texts[0], show_default=default)]
 
 
 def parse_ends(ends: str) -> "np.ndarray":

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stream_dmr.cli.shared_options import ConfigOption, OverwriteOption, settings_of, warn
+from stream_dmr.cli.shared_options import OverwriteOption, settings_of, warn
+from stream_dmr.pipeline.run_options import ConfigOption
 
 
 def make_template(

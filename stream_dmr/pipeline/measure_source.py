@@ -27,7 +27,7 @@ from stream_dmr.pipeline.prepare_kernels import compile_kernels, prepare_kernels
 from stream_dmr.pipeline.run_folder import result_names
 from stream_dmr.pipeline.run_inputs import Inputs, checked_inputs, start_notices
 from stream_dmr.pipeline.run_observer import RunObserver, RunTotals
-from stream_dmr.pipeline.run_options import RunRequest
+from stream_dmr.pipeline.run_options import RunOptions
 from stream_dmr.pipeline.run_outputs import Outputs, ResultWriter, open_outputs, resume_source
 from stream_dmr.pipeline.session import Session
 from stream_dmr.sources.positions import PositionSource
@@ -177,7 +177,7 @@ class RunSummary:
 
 
 def measure_source(
-    request: RunRequest, *, stop: threading.Event, observer: RunObserver | None = None
+    request: RunOptions, *, stop: threading.Event, observer: RunObserver | None = None
 ) -> RunSummary:
     """Measure the fish of a source, with every stage recorded in `request.out`.
 
@@ -199,7 +199,7 @@ def measure_source(
 
 
 def _measure(
-    request: RunRequest, *, stop: threading.Event, observer: RunObserver
+    request: RunOptions, *, stop: threading.Event, observer: RunObserver
 ) -> tuple[RunSummary, bool]:
     """Measure the fish of a source; False if a mesh was given that does not fit them."""
     inputs = checked_inputs(request)

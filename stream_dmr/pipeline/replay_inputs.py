@@ -20,7 +20,7 @@ from stream_dmr.pipeline.config import (
 )
 from stream_dmr.pipeline.learn_shapes import learnt_from
 from stream_dmr.pipeline.run_observer import RunObserver
-from stream_dmr.pipeline.run_options import ReplayRequest
+from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.pipeline.session import STAGES, Setup
 from stream_dmr.recording.codec import stored_picture
 from stream_dmr.recording.header import InputFile, RunHeader, RunInputs
@@ -184,7 +184,7 @@ class ReplayInputs(Setup):
 
 
 def read_inputs(
-    request: ReplayRequest, recording: Recording, observer: RunObserver
+    request: ReplayOptions, recording: Recording, observer: RunObserver
 ) -> ReplayInputs:
     """Read the given inputs and take the others from the recording. Raises a UserError.
 
@@ -226,7 +226,7 @@ def read_inputs(
     return learnt_from(messages_of(recording, FishCrop), inputs, observer)
 
 
-def new_header(request: ReplayRequest, recorded: RunHeader, inputs: ReplayInputs) -> RunHeader:
+def new_header(request: ReplayOptions, recorded: RunHeader, inputs: ReplayInputs) -> RunHeader:
     """The header of the recording that the replay writes."""
     calibration, is_cut_anew = request.calibration, inputs.files is not None
     calibration_file = recorded.calibration_file

@@ -19,7 +19,7 @@ from stream_dmr.pipeline.learn_shapes import save_stocks
 from stream_dmr.pipeline.replay_inputs import ReplayInputs, new_header, read_inputs
 from stream_dmr.pipeline.run_folder import prepare_folder
 from stream_dmr.pipeline.run_observer import RunObserver
-from stream_dmr.pipeline.run_options import ReplayRequest
+from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.pipeline.run_outputs import ResultWriter
 from stream_dmr.pipeline.session import (
     STAGES,
@@ -86,7 +86,7 @@ class ReplayOutputs:
 
 @contextmanager
 def open_replay_outputs(
-    request: ReplayRequest,
+    request: ReplayOptions,
     out: Path,
     header: RunHeader,
     inputs: ReplayInputs,
@@ -146,7 +146,7 @@ def open_replay_outputs(
         store.end(STOPPED if stop.is_set() else _end_of(request, known))
 
 
-def _end_of(request: ReplayRequest, recorded: RunFacts | None) -> str:
+def _end_of(request: ReplayOptions, recorded: RunFacts | None) -> str:
     """What ended a replay that nobody stopped."""
     if not request.selection.is_everything:
         return "the end of the selected part of a recording"
@@ -257,7 +257,7 @@ class ReplaySummary:
 
 
 def replay(
-    request: ReplayRequest, *, stop: threading.Event, observer: RunObserver | None = None
+    request: ReplayOptions, *, stop: threading.Event, observer: RunObserver | None = None
 ) -> ReplaySummary:
     """Recompute a recording from one stage on; with `check`, compare with what was recorded.
 
@@ -320,13 +320,13 @@ def replay(
     )
 
 
-def _is_light(request: ReplayRequest) -> bool:
+def _is_light(request: ReplayOptions) -> bool:
     """True where no stage computes outside of Python for long."""
     return FittedMesh not in messages_from(request.first)
 
 
 def _open_outputs(
-    request: ReplayRequest,
+    request: ReplayOptions,
     out: Path,
     recording: Recording,
     inputs: ReplayInputs,
@@ -351,7 +351,7 @@ def _other_versions(recording: Recording) -> list[str]:
 
 
 def _recorded_run(
-    request: ReplayRequest, recording: Recording, observer: RunObserver
+    request: ReplayOptions, recording: Recording, observer: RunObserver
 ) -> OriginalRun:
     try:
         return read_recorded_run(request.recordings, recording.header)
@@ -360,7 +360,7 @@ def _recorded_run(
         return OriginalRun()
 
 
-def _refuse_impossible(request: ReplayRequest, recording: Recording) -> None:
+def _refuse_impossible(request: ReplayOptions, recording: Recording) -> None:
     folders = {(path if path.is_dir() else path.parent).resolve() for path in request.recordings}
     if request.out is not None and request.out.resolve() in folders:
         raise UserError(
@@ -384,7 +384,7 @@ def _refuse_impossible(request: ReplayRequest, recording: Recording) -> None:
         raise UserError("--track with --from crop: crops are made of whole frames; use --from fit")
 
 
-def _refuse_unused(request: ReplayRequest) -> None:
+def _refuse_unused(request: ReplayOptions) -> None:
     """Raise UserError for an input of a stage that is not recomputed."""
     given = (
         ("--template", "a template matters to the fit", request.template, "fit"),
@@ -401,7 +401,7 @@ def _refuse_unused(request: ReplayRequest) -> None:
             )
 
 
-def _carried_over(request: ReplayRequest, recorded: RecordedMessages) -> list[LocalizedFish]:
+def _carried_over(request: ReplayOptions, recorded: RecordedMessages) -> list[LocalizedFish]:
     """The frames from before the recording that count towards a length; notes say which don't."""
     carried_over = recorded.carried_over()
     if not carried_over or request.first == "smooth":
@@ -419,7 +419,7 @@ def _carried_over(request: ReplayRequest, recorded: RecordedMessages) -> list[Lo
 
 
 def _open_comparator(
-    request: ReplayRequest, recorded: RecordedMessages, carried_over: Collection[int]
+    request: ReplayOptions, recorded: RecordedMessages, carried_over: Collection[int]
 ) -> MessageComparator | None:
     if not request.check:
         return None
@@ -429,7 +429,7 @@ def _open_comparator(
 
 
 def _open_chain(
-    request: ReplayRequest,
+    request: ReplayOptions,
     recorded: RecordedMessages,
     inputs: ReplayInputs,
     recording: Recording,

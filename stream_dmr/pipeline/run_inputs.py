@@ -18,7 +18,7 @@ from stream_dmr.pipeline.config import (
     stills,
     to_toml,
 )
-from stream_dmr.pipeline.run_options import RunRequest, without_password
+from stream_dmr.pipeline.run_options import RunOptions, without_password
 from stream_dmr.pipeline.session import KeptCrops, Setup
 from stream_dmr.recording.header import InputFile, RunHeader, RunInputs
 from stream_dmr.sources.open_source import open_positions
@@ -71,7 +71,7 @@ def _nearest(name: str, known: Iterable[str]) -> str:
 class Inputs(Setup):
     """A request with its files read and checked, and the open source."""
 
-    request: RunRequest
+    request: RunOptions
     notices: Sequence[str]  # what was repaired or found when the template was read
     finder: FishFinder
     reader: ReadFrames
@@ -140,7 +140,7 @@ class Inputs(Setup):
         )
 
 
-def checked_inputs(request: RunRequest) -> Inputs:
+def checked_inputs(request: RunOptions) -> Inputs:
     """Read and check the files of a request; the caller closes the reader.
 
     Raises a UserError where one of them is wrong.
@@ -189,7 +189,7 @@ def checked_inputs(request: RunRequest) -> Inputs:
     return inputs
 
 
-def _config(request: RunRequest) -> Config:
+def _config(request: RunOptions) -> Config:
     """The settings, with what the request's options change of them."""
     config = load_config(request.config)
     if request.calibration is not None:
@@ -203,7 +203,7 @@ def _config(request: RunRequest) -> Config:
     return config
 
 
-def _keep_template(request: RunRequest) -> None:
+def _keep_template(request: RunOptions) -> None:
     """Raise a UserError where the given mesh is of the results that are replaced."""
     mesh = Path(request.template).resolve()
     if mesh in {path.resolve() for path in learnt_files(request.out)}:

@@ -1,40 +1,76 @@
-"""The options of a run and of a replay."""
+"""The options of a run and of a replay, each declared once with its type, default and help."""
 
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Literal
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
+from stream_dmr.errors import UserError
 from stream_dmr.recording.selection import EVERYTHING, Selection
 
 Stage = Literal["crop", "fit", "localize", "smooth"]
 """A stage that a replay may begin with; see `STAGES` of session.py."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunRequest:
-    """The options of `stream-dmr run`."""
+TemplateOption = Annotated[
+    str,
+    "auto: the shape of the fish themselves. Or the body form that they probably have (halibut, "
+    "cod, salmon, bream, tuna, pike, eel), or a mesh of the species with its TOML beside it.",
+]
+ConfigOption = Annotated[Path | None, "A config.toml; left-out settings keep their defaults."]
+KeyOption = Annotated[Path | None, "Device key of `keygen`; signs all that is written."]
 
-    source: str  # path, address or camera index
-    out: Path
-    calibration: Path | None = None
-    boxes: Path | None = None
-    masks: Path | None = None
-    template: str = "auto"  # or the name of a body form, or a path
-    pose: Literal["hanging", "lying"] = "hanging"  # lying: flat on the reference plane
-    stills: bool = False  # pictures are independent of each other
-    config: Path | None = None
-    overwrite: bool = False  # replace the results of an earlier run in `out`
-    live: bool = False  # serve the view while measuring
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """The options of a run, of `api.measure` and of a video in a batch.
+
+    A field with a text is an option of `stream-dmr run`, which shows the text in --help, and the
+    second text in the place of the default.
+    """
+
+    source: Annotated[str, "A video, a folder of pictures, rtsp://... or a camera's index."]
+    out: Annotated[
+        Path,
+        "Folder for the results. With those of an earlier run in it a video is refused, a camera "
+        "or a folder of clips goes on.",
+        "runs/<name of the source>",
+    ] = None  # type: ignore[assignment]  # __post_init__ replaces it
+    calibration: Annotated[
+        Path | None, "Calibration file. Without one: relative shapes, no millimetres."
+    ] = None
+    boxes: Annotated[Path | None, "Boxes as MOT Challenge text, frames from 1."] = None
+    masks: Annotated[
+        Path | None, "Folder of PNGs of ids: 000001.png ..., or named like the pictures."
+    ] = None
+    template: TemplateOption = "auto"
+    pose: Annotated[
+        Literal["hanging", "lying"], "lying: the fish lie flat on the reference plane."
+    ] = "hanging"
+    stills: Annotated[bool, "Pictures are independent; one good picture gives a length."] = False
+    config: ConfigOption = None
+    overwrite: Annotated[bool, "Replace the results of an earlier run in --out."] = False
+    live: Annotated[bool, "Serve the view on this machine while measuring."] = False
+    vessel: Annotated[str, "Name of the vessel, for the exports."] = ""
+    trip: Annotated[str, "Name of the trip, for the exports."] = ""
+    haul: Annotated[str, "Name of the haul, for the exports."] = ""
+    nmea: Annotated[
+        str | None,
+        "Positions as NMEA 0183: a file (or CSV), tcp://HOST:PORT, udp://HOST:PORT or a serial "
+        "device.",
+    ] = None
+    start_utc: Annotated[
+        str, "When the video began, such as 2026-11-22T06:00:00Z.", "[sensors] start_utc"
+    ] = ""
+    key: KeyOption = None
     command: str = ""  # as typed, for the recording
-    vessel: str = ""  # vessel, trip and haul, for the exports
-    trip: str = ""
-    haul: str = ""
-    nmea: str | None = None  # positions: a file, tcp://..., udp://... or a serial device
-    start_utc: str = ""  # when a video began, in the place of [sensors] start_utc
-    key: Path | None = None  # of the device, to sign with
+
+    def __post_init__(self) -> None:
+        """Set the default of `out`, which follows from the source."""
+        object.__setattr__(self, "out", self.out or default_out(self.source))
 
 
 def default_out(source: str) -> Path:
@@ -52,7 +88,7 @@ def without_password(text: str) -> str:
     return re.sub(r"(?<=://)[^/\s]*@", "", text)
 
 
-def command_of(request: RunRequest) -> RunRequest:
+def command_of(request: RunOptions) -> RunOptions:
     """The request with the command that would do the same."""
     arguments = ["stream-dmr", "run"]
     for field in fields(request):
@@ -64,21 +100,45 @@ def command_of(request: RunRequest) -> RunRequest:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayRequest:
-    """What to replay; None: as it was recorded."""
+class ReplayOptions:
+    """What to replay; None: as it was recorded. A field with a text is an option of `replay`."""
 
-    recordings: Sequence[Path]  # files or folders, in order
+    recordings: Sequence[Path] = ()  # files or folders, in order
     first: Stage = "fit"  # the first that is recomputed
     second: Path | None = None  # another camera's run of the same fish, for `localize`
-    config: Path | None = None
-    calibration: Path | None = None
-    template: str | None = None
-    source: str | None = None  # for `crop`
-    boxes: Path | None = None  # for `crop`; boxes or masks stand for both of the run
-    masks: Path | None = None  # for `crop`
+    check: Annotated[bool, "Compare with what was recorded; exit 1 if it differs."] = False
+    config: Annotated[Path | None, "Settings instead of the recorded ones."] = None
+    calibration: Annotated[Path | None, "A calibration instead of the recorded one."] = None
+    template: Annotated[str | None, "A template instead of the recorded one: its name or mesh."] = (
+        None
+    )
+    source: Annotated[
+        str | None, "The recorded clip, for --from crop.", "the run's, if it is unchanged"
+    ] = None
+    boxes: Annotated[Path | None, "As in the run, for --from crop."] = None  # for both of the run
+    masks: Annotated[Path | None, "As in the run, for --from crop."] = None
     selection: Selection = EVERYTHING
-    out: Path | None = None  # None: nothing is written
-    overwrite: bool = False
-    key: Path | None = None  # of the device, to sign what is written
-    check: bool = False  # compare with what was recorded
+    out: Annotated[Path | None, "Folder for a new recording and new tables."] = None
+    overwrite: Annotated[bool, "Replace the results of an earlier run in --out."] = False
+    key: KeyOption = None
     command: str = ""  # as typed, for the new recording
+
+
+Options = TypeVar("Options", RunOptions, ReplayOptions)
+
+
+def options_of(kind: type[Options], given: Mapping[str, Any]) -> Options:
+    """The options among values by name, with paths and texts as their fields have them.
+
+    Raises UserError for a value that is none of the choices.
+    """
+    types, values = get_type_hints(kind), dict[str, Any]()
+    for name in types.keys() & given.keys():
+        declared, value = types[name], given[name]
+        parts = get_args(declared) if isinstance(declared, UnionType) else (declared,)
+        if get_origin(declared) is Literal and value not in get_args(declared):
+            expected = ", ".join(get_args(declared))
+            raise UserError(f"{name}: expected one of {expected}, got {value!r}")
+        convert = next((kind for kind in (Path, str) if kind in parts), None)
+        values[name] = value if value is None or convert is None else convert(value)
+    return kind(**values)

@@ -163,8 +163,8 @@ def test_the_data_set_holds_every_fish_and_every_frame(season: Path, tmp_path: P
             assert f"{one['length_mm']:.6f}" == line["length_mm"]
             assert (one["vessel"], str(one["trip"]), one["haul"]) == (
                 "Sea/Bird",
-                job.trip,
-                job.haul,
+                job.options.trip,
+                job.options.haul,
             )
             assert one["run_id"]
             assert len(one["config_sha256"]) == 64

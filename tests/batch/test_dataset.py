@@ -14,12 +14,13 @@ from stream_dmr.store.verdicts import Verdict, add_verdict
 from tests.support.command import rows
 from tests.support.fish_run import measure
 
-JOB = Job(name="clip", video="/videos/clip.mp4", vessel="Sea/Bird", trip="7", haul="2")
+OPTIONS = {"source": "/videos/clip.mp4", "vessel": "Sea/Bird", "trip": "7", "haul": "2"}
+JOB = Job(name="clip", given=OPTIONS)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = measure(tmp_path_factory.mktemp("dataset"), haul=JOB.haul)
+    out = measure(tmp_path_factory.mktemp("dataset"), haul=JOB.options.haul)
     write_tables(out, JOB)
     return out
 
@@ -61,7 +62,7 @@ def test_without_its_recording_a_video_still_takes_verdicts(folder: Path, tmp_pa
     verdict = Verdict(track_id=2, kind="reject", reason="a glove", reviewer="Ada")
     add_verdict(left / "lengths.db", verdict)
     mesh = str(folder.parent / "clip" / "tiny.ply")
-    publish(left, replace(JOB, template=mesh), tmp_path)
+    publish(left, replace(JOB, given=OPTIONS | {"template": mesh}), tmp_path)
     after = parquet.read_table(left / "fish.parquet").to_pylist()
     assert [one["verdict"] for one in after] == [None, "reject"]
     of_review = ("verdict", "verdict_reason", "reviewer", "reviewed_utc", "reviewed_ns")
@@ -72,7 +73,7 @@ def test_without_its_recording_a_video_still_takes_verdicts(folder: Path, tmp_pa
 
 
 def test_files_of_videos_that_are_not_finished_go(folder: Path, tmp_path: Path):
-    other = Job(name="other", video="/videos/other.mp4")
+    other = Job(name="other", given={"source": "/videos/other.mp4"})
     publish(folder, JOB, tmp_path)
     publish(folder, other, tmp_path)
     withdraw_others([other], tmp_path)

@@ -40,9 +40,10 @@ def test_a_wrong_manifest_is_refused(tmp_path: Path, text: str, match: str):
 
 def test_relative_paths_start_from_the_manifest(tmp_path: Path):
     (job,) = read(tmp_path / "m.csv", f"{HEADER}a.mp4,b.yaml,,/masks,v,t,h\n")
-    assert (job.video, job.calibration) == (str(tmp_path / "a.mp4"), str(tmp_path / "b.yaml"))
-    assert (job.boxes, job.masks) == ("", "/masks")
-    assert (job.vessel, job.trip, job.haul) == ("v", "t", "h")
+    run = job.options
+    assert (run.source, run.calibration) == (str(tmp_path / "a.mp4"), tmp_path / "b.yaml")
+    assert (run.boxes, run.masks) == (None, Path("/masks"))
+    assert (run.vessel, run.trip, run.haul) == ("v", "t", "h")
 
 
 def test_positions_and_the_start_of_a_video_may_be_given(tmp_path: Path):
@@ -50,8 +51,9 @@ def test_positions_and_the_start_of_a_video_may_be_given(tmp_path: Path):
     first, second = read(
         tmp_path / "m.csv", f"{header}a.mp4,,,,,,,2026-11-22T06:00:00Z,way.nmea\nb.mp4,,,,,,,,\n"
     )
-    assert (first.nmea, first.start_utc) == (str(tmp_path / "way.nmea"), "2026-11-22T06:00:00Z")
-    assert (second.nmea, second.start_utc) == ("", "")
+    assert first.options.nmea == str(tmp_path / "way.nmea")
+    assert first.options.start_utc == "2026-11-22T06:00:00Z"
+    assert (second.options.nmea, second.options.start_utc) == (None, "")
     key = first.key
     (tmp_path / "way.nmea").write_text("$GPRMC,1")
     assert first.key != key
@@ -76,15 +78,9 @@ def job(tmp_path: Path) -> Job:
     names = ("video.mp4", "calibration.yaml", "boxes.txt", "config.toml", "tiny.ply", "tiny.toml")
     for name in names:
         (tmp_path / name).write_text(name)
-    video, calibration, boxes, config, template, _ = (str(tmp_path / name) for name in names)
-    return Job(
-        name="video",
-        video=video,
-        calibration=calibration,
-        boxes=boxes,
-        config=config,
-        template=template,
-    )
+    options = ("source", "calibration", "boxes", "config", "template")
+    files = (str(tmp_path / name) for name in names[:5])
+    return Job(name="video", given=dict(zip(options, files, strict=True)))
 
 
 def test_a_key_is_unchanged_while_all_inputs_are(job: Job):
@@ -105,4 +101,4 @@ def test_a_changed_file_changes_the_key(
 
 @pytest.mark.parametrize("field", ["vessel", "trip", "haul", "masks"])
 def test_a_changed_row_changes_the_key(job: Job, field: str):
-    assert replace(job, **{field: "another"}).key != job.key
+    assert replace(job, given=job.given | {field: "another"}).key != job.key

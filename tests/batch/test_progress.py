@@ -14,7 +14,7 @@ def jobs(tmp_path: Path) -> list[Job]:
     """Two videos, the second of which is three times as large."""
     for name, size in (("a", 100), ("b", 300)):
         (tmp_path / name).write_bytes(bytes(size))
-    return [Job(name=name, video=str(tmp_path / name)) for name in ("a", "b")]
+    return [Job(name=name, given={"source": str(tmp_path / name)}) for name in ("a", "b")]
 
 
 def test_time_left_follows_the_share_of_bytes(jobs: list[Job]):

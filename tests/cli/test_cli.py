@@ -2,14 +2,19 @@
 
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import pytest
+from typer import Typer
+from typer.testing import CliRunner
 
 from stream_dmr import __version__
 from stream_dmr.cli.main import one_line
+from stream_dmr.cli.shared_options import typer_command
 from stream_dmr.errors import UserError
-from stream_dmr.pipeline.run_options import default_out
+from stream_dmr.pipeline.run_options import RunOptions, command_of, default_out
 from tests.support.command import invoke, rows
 
 HEAVY = ["cv2", "torch", "rerun", "mcap", "numpy", "scipy", "trimesh", "numba", "pydantic"]
@@ -58,6 +63,31 @@ def test_a_usage_error_is_one_line_with_what_to_read(command: str, expected: str
     outcome = invoke(command)
     assert outcome.code == 2
     assert outcome.error.endswith(expected)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MoreOptions(RunOptions):
+    deep: Annotated[bool, "The fish hang deep."] = False
+    depth_mm: Annotated[float, "Depth of the water.", "[sensors] depth"] = 0.0
+
+
+def test_an_option_is_declared_once():
+    """A field is a flag, its help, and a part of the recorded command."""
+    taken = list[MoreOptions]()
+
+    def measure(options: MoreOptions, often: Annotated[int, "How often."] = 1) -> None:
+        taken.append(options)
+
+    app = Typer()
+    app.command()(typer_command(measure))
+    shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "200"}).output
+    for text in ("--deep", "The fish hang deep.", "[sensors] depth", "--often", "How often."):
+        assert text in shown
+    assert "--no-deep" not in shown
+    CliRunner().invoke(app, ["--source", "a.mp4", "--deep", "--depth-mm", "3"])
+    assert taken == [MoreOptions(source="a.mp4", deep=True, depth_mm=3.0)]
+    command = "stream-dmr run --source a.mp4 --out runs/a --deep --depth-mm 3.0"
+    assert command_of(taken[0]).command == command
 
 
 def test_without_a_command_there_is_help():

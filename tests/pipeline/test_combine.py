@@ -11,7 +11,7 @@ from stream_dmr.localization.two_views import second_from_first
 from stream_dmr.messages import LocalizedFish
 from stream_dmr.pipeline.combine import FishSightings, pair_up
 from stream_dmr.pipeline.replay_recording import replay
-from stream_dmr.pipeline.run_options import ReplayRequest
+from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.reasons import Reason
 from stream_dmr.recording.reading import messages_of, open_recordings
 from stream_dmr.simulation import SECOND, simulate
@@ -86,7 +86,7 @@ def test_runs_that_share_no_fish_or_no_calibration_are_refused(scene, tmp_path):
     sd.measure(
         scene / "video.mp4", out=tmp_path / "bare", masks=scene / "masks", template="halibut"
     )
-    request = ReplayRequest(
+    request = ReplayOptions(
         recordings=[scene / "run"],
         first="localize",
         second=tmp_path / "bare",

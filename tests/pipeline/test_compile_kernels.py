@@ -16,7 +16,7 @@ from stream_dmr.fitting.fitter import Fitter
 from stream_dmr.pipeline.prepare_kernels import compile_kernels
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.pipeline.replay_recording import replay
-from stream_dmr.pipeline.run_options import ReplayRequest
+from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.fitting.paper.torch_body import Rig
 from stream_dmr.template.template_file import load_template
 
@@ -34,7 +34,7 @@ for seed in (1, 1, 2):
     node.step(crop_of(pose(np.random.default_rng(seed), in_plane_rad=1.0), rig))
 assert compiled() == before, (compiled(), before)
 golden = Path("recordings/golden/recording.mcap")
-replay(ReplayRequest(recordings=[golden], first="fit"), stop=threading.Event())
+replay(ReplayOptions(recordings=[golden], first="fit"), stop=threading.Event())
 assert compiled() == before, (compiled(), before)
 """
 

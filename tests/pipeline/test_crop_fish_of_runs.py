@@ -11,7 +11,7 @@ from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.pipeline.replay_inputs import read_inputs
 from stream_dmr.pipeline.run_observer import RunObserver
-from stream_dmr.pipeline.run_options import ReplayRequest
+from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.pipeline.session import CropFishOfRuns
 from stream_dmr.recording.header import RunHeader, RunStart, joined_runs
 from stream_dmr.recording.mcap.mcap_sink import McapSink
@@ -86,7 +86,7 @@ def test_runs_whose_beginnings_are_not_known_are_said(
     recorded = replace(header(), runs=(FIRST, second))
     McapSink(tmp_path / "x.mcap", recorded, flush_s=1.0).close()
     observer, path = Listener(), tmp_path / "x.mcap"
-    read_inputs(ReplayRequest(recordings=[path], first="crop"), open_recordings([path]), observer)
+    read_inputs(ReplayOptions(recordings=[path], first="crop"), open_recordings([path]), observer)
     assert any("do not record at which frame" in line for line in observer.warned) is is_said
 
 

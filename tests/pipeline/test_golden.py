@@ -10,7 +10,7 @@ import pytest
 
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.pipeline.replay_recording import LENGTH_TOLERANCE, replay
-from stream_dmr.pipeline.run_options import ReplayRequest
+from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.recording.codec import decode
 from stream_dmr.recording.reading import Recording, open_recordings
 
@@ -22,7 +22,7 @@ ELSEWHERE = {"fit": LENGTH_TOLERANCE, "localize": 1e-9, "smooth": 1e-9}
 
 @pytest.mark.parametrize("first", ELSEWHERE)
 def test_golden_recording_is_computed_again(first):
-    request = ReplayRequest(recordings=[GOLDEN], first=first, check=True)
+    request = ReplayOptions(recordings=[GOLDEN], first=first, check=True)
     summary = replay(request, stop=threading.Event())
     recording = open_recordings([GOLDEN])
     if _is_made_here(recording):

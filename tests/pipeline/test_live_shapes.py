@@ -18,7 +18,7 @@ from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
 from stream_dmr.messages import FishCrop, FittedMesh, LearntShapes
 from stream_dmr.pipeline.learn_shapes import SeenFish, ShapeLearner
 from stream_dmr.pipeline.measure_source import measure_source
-from stream_dmr.pipeline.replay_recording import ReplayRequest, replay
+from stream_dmr.pipeline.replay_recording import ReplayOptions, replay
 from stream_dmr.pipeline.run_inputs import Inputs, checked_inputs
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.session import Session
@@ -150,7 +150,7 @@ def test_a_given_mesh_is_compared_with_the_first_fish(
     assert (out / LEARNT).exists() != is_believed
     [recording] = out.glob("recording-*.mcap")
     again = replay(
-        ReplayRequest(recordings=[recording], first="fit", check=True), stop=threading.Event()
+        ReplayOptions(recordings=[recording], first="fit", check=True), stop=threading.Event()
     )
     assert again.num_compared > 0
     assert again.mismatches == []
@@ -159,7 +159,7 @@ def test_a_given_mesh_is_compared_with_the_first_fish(
 @pytest.mark.parametrize("kind", ["mcap", "rrd"])
 def test_a_replay_gives_the_same_bits(runs: list[Path], kind: str):
     for recording in sorted(runs[1].glob(f"recording-*.{kind}")):
-        asked = ReplayRequest(recordings=[recording], first="fit", check=True)
+        asked = ReplayOptions(recordings=[recording], first="fit", check=True)
         summary = replay(asked, stop=threading.Event())
         assert summary.num_compared > 0
         assert summary.mismatches == []

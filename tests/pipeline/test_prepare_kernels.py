@@ -14,12 +14,12 @@ import sys, threading
 from pathlib import Path
 from stream_dmr.pipeline import prepare_kernels as module
 from stream_dmr.pipeline.measure_source import measure_source
-from stream_dmr.pipeline.run_options import RunRequest
+from stream_dmr.pipeline.run_options import RunOptions
 
 module.prepare_kernels(print, stop=threading.Event())
 cache, scene = Path(sys.argv[1]), Path("stream_dmr/simulation/demo_scene")
 before = {path.name for path in cache.rglob("*.nbc")}
-request = RunRequest(
+request = RunOptions(
     source=str(scene / "video.mp4"), calibration=scene / "calibration.yaml", out=Path(sys.argv[2]),
 )
 measure_source(request, stop=threading.Event())

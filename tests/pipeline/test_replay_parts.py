@@ -14,7 +14,7 @@ from stream_dmr.pipeline.comparator import MessageComparator
 from stream_dmr.pipeline.replay_inputs import new_header, read_inputs
 from stream_dmr.pipeline.replay_recording import ReplayWriter, read_recorded_run
 from stream_dmr.pipeline.run_observer import RunObserver
-from stream_dmr.pipeline.run_options import ReplayRequest
+from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.pipeline.session import RecordedMessages
 from stream_dmr.recording.mcap.mcap_sink import McapSink
 from stream_dmr.recording.reading import Recording, open_recordings
@@ -51,7 +51,7 @@ def of_kinds(recorded: RecordedMessages, kinds: list[type[Message]]) -> Iterator
 
 
 def test_what_is_not_given_is_as_it_was_recorded(recording: Recording, folder: Path):
-    inputs = read_inputs(ReplayRequest(recordings=[folder]), recording, RunObserver())
+    inputs = read_inputs(ReplayOptions(recordings=[folder]), recording, RunObserver())
     assert_same(inputs.template, recording.header.template)
     assert_same(inputs.calibration, recording.header.calibration)
     assert inputs.files is None
@@ -64,7 +64,7 @@ def test_a_given_calibration_replaces_the_recorded_one(
     given = replace(calibration(), plane=nearer)
     path = tmp_path / "other.yaml"
     save_calibration(path, given)
-    request = ReplayRequest(recordings=[folder], calibration=path, command="stream-dmr replay")
+    request = ReplayOptions(recordings=[folder], calibration=path, command="stream-dmr replay")
     inputs = read_inputs(request, recording, RunObserver())
     assert inputs.calibration is not None
     np.testing.assert_array_equal(inputs.calibration.plane.translation_mm, [0, 0, 1200])
@@ -79,7 +79,7 @@ def test_no_shapes_are_learnt_where_the_settings_have_none(
 ):
     config = tmp_path / "paper.toml"
     config.write_text('[fit_mesh]\ndeformation = "linear-blend"\n')
-    request = ReplayRequest(recordings=[folder], template="auto", config=config)
+    request = ReplayOptions(recordings=[folder], template="auto", config=config)
     inputs = read_inputs(request, recording, RunObserver())
     assert inputs.candidates is not None
     assert not inputs.candidates.are_learnt

@@ -12,7 +12,7 @@ from stream_dmr.evidence.verify_folder import verify
 from stream_dmr.messages import Position
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.replay_recording import replay
-from stream_dmr.pipeline.run_options import ReplayRequest
+from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.recording.reading import decoded_messages, open_recordings
 from stream_dmr.store.fish import read_fish, read_stored_fish
 from stream_dmr.store.trip import read_positions
@@ -67,7 +67,7 @@ def test_each_fish_has_its_place_and_time(folder: Path):
 
 def test_a_replay_has_the_positions_of_the_recording(folder: Path):
     (folder / "way.nmea").rename(folder / "gone.nmea")
-    asked = ReplayRequest(recordings=[folder / "out"], first="fit", out=folder / "again")
+    asked = ReplayOptions(recordings=[folder / "out"], first="fit", out=folder / "again")
     replay(asked, stop=threading.Event())
     (folder / "gone.nmea").rename(folder / "way.nmea")
     before, after = (read_positions(folder / name / "lengths.db") for name in ("out", "again"))

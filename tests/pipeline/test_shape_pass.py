@@ -19,10 +19,10 @@ from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.pipeline.config import Config
 from stream_dmr.pipeline.learn_shapes import learnt_from, with_learnt_shapes
 from stream_dmr.pipeline.measure_source import measure_source
-from stream_dmr.pipeline.replay_recording import ReplayRequest, replay
+from stream_dmr.pipeline.replay_recording import ReplayOptions, replay
 from stream_dmr.pipeline.run_inputs import Inputs, checked_inputs
 from stream_dmr.pipeline.run_observer import RunObserver
-from stream_dmr.pipeline.run_options import RunRequest
+from stream_dmr.pipeline.run_options import RunOptions
 from stream_dmr.pipeline.session import Setup
 from stream_dmr.store.open_results import LEARNT, learnt_files
 from stream_dmr.template.template_file import load_template
@@ -62,7 +62,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def measured(clip: Path, out: Path, observer: Listener, **other: object) -> RunRequest:
+def measured(clip: Path, out: Path, observer: Listener, **other: object) -> RunOptions:
     asked = request(clip, out, **{"template": "auto"} | other)
     measure_source(asked, stop=observer.stop, observer=observer)
     return asked
@@ -172,7 +172,7 @@ def test_overwrite_does_not_remove_the_mesh_to_measure_with(
 
 
 def test_it_replays_to_the_last_bit(learnt: tuple[Path, Listener]):
-    asked = ReplayRequest(recordings=[learnt[0] / "recording.mcap"], first="fit", check=True)
+    asked = ReplayOptions(recordings=[learnt[0] / "recording.mcap"], first="fit", check=True)
     assert not replay(asked, stop=threading.Event()).mismatches
 
 
@@ -189,7 +189,7 @@ def test_a_live_run_s_recording_learns_its_shapes_ashore(
     assert not header.candidates.are_learnt
     assert not (named / LEARNT).exists()
     ashore, observer = tmp_path / "ashore", Listener()
-    asked = ReplayRequest(
+    asked = ReplayOptions(
         recordings=[named / "recording.mcap"], first="fit", template="auto", out=ashore
     )
     replay(asked, stop=threading.Event(), observer=observer)
@@ -197,7 +197,7 @@ def test_a_live_run_s_recording_learns_its_shapes_ashore(
 
 
 def test_a_replay_writes_what_its_run_learnt(learnt: tuple[Path, Listener], tmp_path: Path):
-    asked = ReplayRequest(recordings=[learnt[0]], first="smooth", out=tmp_path / "again")
+    asked = ReplayOptions(recordings=[learnt[0]], first="smooth", out=tmp_path / "again")
     replay(asked, stop=threading.Event())
     for name in (LEARNT, Path(LEARNT).with_suffix(".toml").name):
         assert (tmp_path / "again" / name).read_bytes() == (learnt[0] / name).read_bytes()
@@ -207,7 +207,7 @@ def test_a_replay_does_not_write_over_a_mesh_of_the_user(
     learnt: tuple[Path, Listener], tmp_path: Path
 ):
     (tmp_path / LEARNT).write_text("mine")
-    asked = ReplayRequest(recordings=[learnt[0]], first="smooth", out=tmp_path)
+    asked = ReplayOptions(recordings=[learnt[0]], first="smooth", out=tmp_path)
     with pytest.raises(OutputError, match="expected a name that is free"):
         replay(asked, stop=threading.Event())
     assert [path.name for path in tmp_path.iterdir()] == [LEARNT]
@@ -274,7 +274,7 @@ def test_a_mesh_that_fits_no_mask_is_not_believed(
 
 def test_a_replay_does_not_believe_it_either(learnt: tuple[Path, Listener], tmp_path: Path):
     slim = str(learnt[0].parent / "clip" / "slim.ply")
-    asked = ReplayRequest(
+    asked = ReplayOptions(
         recordings=[learnt[0]], first="fit", template=slim, out=tmp_path / "again"
     )
     observer = Listener()

@@ -4,13 +4,13 @@ import threading
 from pathlib import Path
 
 from stream_dmr.pipeline.measure_source import measure_source
-from stream_dmr.pipeline.run_options import RunRequest
+from stream_dmr.pipeline.run_options import RunOptions
 from tests.support.tiny_clip import write_clip
 
 FISH = [[1], [1, 2], [1, 2], [1, 2], [1, 2], [2]]
 
 
-def request(clip: Path, out: Path, **other: object) -> RunRequest:
+def request(clip: Path, out: Path, **other: object) -> RunOptions:
     given: dict[str, object] = {
         "source": str(clip / "video.mp4"),
         "out": out,
@@ -20,7 +20,7 @@ def request(clip: Path, out: Path, **other: object) -> RunRequest:
         "config": clip / "quick.toml",
         "command": f"stream-dmr run --source {clip / 'video.mp4'}",
     }
-    return RunRequest(**given | other)  # type: ignore[arg-type]
+    return RunOptions(**given | other)  # type: ignore[arg-type]
 
 
 def measure(folder: Path, **other: object) -> Path:
