@@ -28,15 +28,12 @@ def batch(
             metavar="MANIFEST.csv",
         ),
     ],
-    out: Annotated[
-        Path, typer.Option(help="Folder for the results; an interrupted batch continues there.")
-    ],
+    out: Annotated[Path, "Folder for the results; an interrupted batch continues there."],
     engine: Annotated[
-        Engines, typer.Option(help="Where to measure: processes of this machine, or a Ray cluster.")
+        Engines, "Where to measure: processes of this machine, or a Ray cluster."
     ] = "local",
     address: Annotated[
-        str | None,
-        typer.Option(help="Address of a Ray cluster; auto: this machine's; default: start one."),
+        str | None, "Address of a Ray cluster; auto: this machine's; default: start one."
     ] = None,
     gpus: Annotated[
         float, typer.Option(help="GPUs per video on Ray; fractions are allowed.", min=0)

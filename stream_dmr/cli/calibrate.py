@@ -28,10 +28,7 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    plane: Annotated[
-        Path,
-        typer.Option(help="Photograph of the board lying in the reference plane, or of --ends."),
-    ],
+    plane: Annotated[Path, "Photograph of the board lying in the reference plane, or of --ends."],
     images: Annotated[
         list[Path] | None,
         typer.Argument(help="Photographs of the board, tilted to all sides; none with --lens."),
@@ -41,21 +38,15 @@ def calibrate(
     marker_mm: MarkerOption = None,
     model: Annotated[
         str,
-        typer.Option(
-            help="pinhole, or fisheye for very wide lenses and domes; auto takes the fisheye where "
-            "the pinhole fits badly and the fisheye does not."
-        ),
+        "pinhole, or fisheye for very wide lenses and domes; auto takes the fisheye where "
+        "the pinhole fits badly and the fisheye does not.",
     ] = "auto",
     lens: Annotated[
         Path | None,
-        typer.Option(
-            help="A calibration of this camera, also of another program: only the plane is "
-            "measured, from --plane."
-        ),
+        "A calibration of this camera, also of another program: only the plane is "
+        "measured, from --plane.",
     ] = None,
-    camera: Annotated[
-        str | None, typer.Option(help="Which camera of --lens: left, right, cam0, ...")
-    ] = None,
+    camera: Annotated[str | None, "Which camera of --lens: left, right, cam0, ..."] = None,
     ends: Annotated[
         str | None,
         typer.Option(
@@ -63,20 +54,14 @@ def calibrate(
             metavar="U,V,U,V",
         ),
     ] = None,
-    length_mm: Annotated[float | None, typer.Option(help="Distance of the --ends in mm.")] = None,
+    length_mm: Annotated[float | None, "Distance of the --ends in mm."] = None,
     focal_35mm: Annotated[
         float | None,
-        typer.Option(
-            help="With --ends and no --lens: the focal length as on 35 mm film; phones have 24 to "
-            "28 mm."
-        ),
+        "With --ends and no --lens: the focal length as on 35 mm film; phones have 24 to 28 mm.",
     ] = None,
-    out: Annotated[Path, typer.Option(help="Calibration file to write.")] = Path(
-        "calibration.yaml"
-    ),
+    out: Annotated[Path, "Calibration file to write."] = Path("calibration.yaml"),
     corners: Annotated[
-        Path | None,
-        typer.Option(help="Folder for pictures of the corners found; default: beside --out."),
+        Path | None, "Folder for pictures of the corners found; default: beside --out."
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -268,7 +253,7 @@ def check(
     source: Annotated[
         str, typer.Argument(help="A picture, a video, rtsp://... or a camera's index.")
     ],
-    calibration: Annotated[Path, typer.Option(help="The calibration that is checked.")],
+    calibration: Annotated[Path, "The calibration that is checked."],
     board: BoardOption = "9x6",
     square_mm: SquareOption = 25.0,
     marker_mm: MarkerOption = None,
@@ -276,13 +261,11 @@ def check(
         str | None,
         typer.Option(help="Ends of a rod, px, instead of a board.", metavar="U,V,U,V"),
     ] = None,
-    length_mm: Annotated[float | None, typer.Option(help="Length of the rod in mm.")] = None,
+    length_mm: Annotated[float | None, "Length of the rod in mm."] = None,
     limit: Annotated[
         float, typer.Option(help="Per cent off that raise an alarm and exit code 1.", min=0)
     ] = 1.0,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder of a run; the check is kept in its lengths.db.")
-    ] = None,
+    out: Annotated[Path | None, "Folder of a run; the check is kept in its lengths.db."] = None,
 ) -> None:
     """Measure a board, or a rod of known length, that lies in the reference plane.
 

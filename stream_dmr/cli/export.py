@@ -22,27 +22,17 @@ def export(
     recording: Annotated[
         Path, typer.Argument(help="An .mcap or .rrd, or the folder of a run.", metavar="REC")
     ],
-    out: Annotated[Path, typer.Option(help="Folder to write to.")],
+    out: Annotated[Path, "Folder to write to."],
     meshes: Annotated[
-        MeshFormat | None,
-        typer.Option(help="A mesh per fish and frame, in mm, in the camera frame."),
+        MeshFormat | None, "A mesh per fish and frame, in mm, in the camera frame."
     ] = None,
-    masks: Annotated[
-        bool, typer.Option("--masks", help="masks.json: every mask as COCO run lengths.")
-    ] = False,
-    tables: Annotated[
-        TableFormat | None, typer.Option(help="lengths, and frames with the keypoints.")
-    ] = None,
+    masks: Annotated[bool, "masks.json: every mask as COCO run lengths."] = False,
+    tables: Annotated[TableFormat | None, "lengths, and frames with the keypoints."] = None,
     fish: Annotated[
         TableFormat | None,
-        typer.Option(
-            help="Table for fisheries: total and fork length, whole cm, weight, legal size."
-        ),
+        "Table for fisheries: total and fork length, whole cm, weight, legal size.",
     ] = None,
-    viame: Annotated[
-        bool,
-        typer.Option("--viame", help="tracks.viame.csv: boxes, outlines and ends, for DIVE."),
-    ] = False,
+    viame: Annotated[bool, "tracks.viame.csv: boxes, outlines and ends, for DIVE."] = False,
     agency: Annotated[
         list[Agency] | None,
         typer.Option(
@@ -51,12 +41,9 @@ def export(
             metavar="<wcpfc|rdbes>",
         ),
     ] = None,
-    hauls: Annotated[
-        bool, typer.Option("--hauls", help="hauls.csv: hours watched and fish of each haul.")
-    ] = False,
+    hauls: Annotated[bool, "hauls.csv: hours watched and fish of each haul."] = False,
     config: Annotated[
-        Path | None,
-        typer.Option(help="A config.toml; its [fisheries] replaces the run's, for --fish."),
+        Path | None, "A config.toml; its [fisheries] replaces the run's, for --fish."
     ] = None,
     time: TimeOption = None,
     track: TrackOption = None,

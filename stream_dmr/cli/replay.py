@@ -58,7 +58,7 @@ def combine(
     second: Annotated[
         Path, typer.Argument(help="That of the other camera, of the same fish.", metavar="RIGHT")
     ],
-    out: Annotated[Path, typer.Option(help="Folder for the recording and tables of both.")],
+    out: Annotated[Path, "Folder for the recording and tables of both."],
     overwrite: Annotated[bool, "Replace the results of an earlier run in --out."] = False,
     key: KeyOption = None,
 ) -> None:

@@ -15,32 +15,22 @@ _Folders = Annotated[
 
 def review(
     folders: _Folders,
-    reviewer: Annotated[
-        str, typer.Option(help="Your name, for the verdicts.", show_default="who is logged in")
-    ] = "",
+    reviewer: Annotated[str, "Your name, for the verdicts.", "who is logged in"] = "",
     port: Annotated[
         int, typer.Option(help="Port on this machine; 0: any free one.", min=0, max=65535)
     ] = 0,
     source: Annotated[
         str | None,
-        typer.Option(
-            help="The recorded clip, for pictures of the fish.",
-            show_default="the one that was measured, if it is still there",
-        ),
+        "The recorded clip, for pictures of the fish.",
+        "the one that was measured, if it is still there",
     ] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="A config.toml; its [fisheries] replaces the run's.")
-    ] = None,
+    config: Annotated[Path | None, "A config.toml; its [fisheries] replaces the run's."] = None,
     sample: Annotated[
         int | None, typer.Option(help="Review so many fish, drawn at random, for an audit.", min=1)
     ] = None,
     seed: Annotated[int, typer.Option(help="Of --sample; equal seeds draw equal fish.", min=0)] = 0,
     blind: Annotated[
-        bool,
-        typer.Option(
-            "--blind",
-            help="A second reading: earlier verdicts are hidden, and yours are only compared.",
-        ),
+        bool, "A second reading: earlier verdicts are hidden, and yours are only compared."
     ] = False,
 ) -> None:
     """Serve the page of `report` on this machine and take verdicts into lengths.db.

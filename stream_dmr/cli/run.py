@@ -67,9 +67,9 @@ def _print_summary(summary: "RunSummary", out: Path, *, timings: bool) -> None:
 
 
 def demo(
-    out: Annotated[
-        Path, typer.Option(help="Folder for the results; those of an earlier demo are replaced.")
-    ] = Path("runs/demo"),
+    out: Annotated[Path, "Folder for the results; those of an earlier demo are replaced."] = Path(
+        "runs/demo"
+    ),
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure the fish of the embedded scene from its video, and print the true lengths beside.
@@ -170,19 +170,14 @@ def recover(
 
 
 def simulate(
-    out: Annotated[Path, typer.Option(help="Folder for the scene.")],
-    fish: Annotated[int, typer.Option(help="Number of fish.")] = 3,
-    frames: Annotated[int, typer.Option(help="Number of frames.")] = 60,
-    preset: Annotated[str, typer.Option(help="clean, realistic or severe.")] = "realistic",
-    seed: Annotated[int, typer.Option(help="Equal seeds give equal scenes.")] = 0,
-    species: Annotated[
-        str, typer.Option(help="Body of the fish; several, joined by commas, take turns.")
-    ] = "halibut",
+    out: Annotated[Path, "Folder for the scene."],
+    fish: Annotated[int, "Number of fish."] = 3,
+    frames: Annotated[int, "Number of frames."] = 60,
+    preset: Annotated[str, "clean, realistic or severe."] = "realistic",
+    seed: Annotated[int, "Equal seeds give equal scenes."] = 0,
+    species: Annotated[str, "Body of the fish; several, joined by commas, take turns."] = "halibut",
     second: Annotated[
-        float | None,
-        typer.Option(
-            help="Film the same fish by another camera too, from so many degrees beside it."
-        ),
+        float | None, "Film the same fish by another camera too, from so many degrees beside it."
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:

@@ -35,15 +35,11 @@ TrackOption = Annotated[
 
 BoardOption = Annotated[
     str,
-    typer.Option(
-        help="A chessboard's inner corners per row and column; 10x7 squares have 9x6. Or a ChArUco "
-        "board by its squares, such as charuco:7x5, of which a part in view is enough."
-    ),
+    "A chessboard's inner corners per row and column; 10x7 squares have 9x6. Or a ChArUco "
+    "board by its squares, such as charuco:7x5, of which a part in view is enough.",
 ]
-SquareOption = Annotated[float, typer.Option(help="Side of one square in mm.")]
-MarkerOption = Annotated[
-    float | None, typer.Option(help="Side of a ChArUco board's markers in mm.")
-]
+SquareOption = Annotated[float, "Side of one square in mm."]
+MarkerOption = Annotated[float | None, "Side of a ChArUco board's markers in mm."]
 
 OverwriteOption = Annotated[bool, "Replace existing files."]
 
@@ -74,7 +70,8 @@ def typer_command(function: Callable[..., None]) -> Callable[..., None]:
     @wraps(function)
     def command(**values: Any) -> None:
         for name, (kind, names) in groups.items():
-            values[name] = kind(**{name: values.pop(name) for name in names})
+            given = {name: values.pop(name) for name in names}
+            values[name] = kind(**{n: value for n, value in given.items() if value is not None})
         function(**values)
 
     shown = [

@@ -12,20 +12,13 @@ from stream_dmr.pipeline.run_options import ConfigOption
 
 
 def make_template(
-    side: Annotated[
-        Path,
-        typer.Option(help="Mask of a straight fish seen from the side; pixels above 0 are fish."),
-    ],
-    out: Annotated[Path, typer.Option(help="The mesh to write, .ply; a .toml comes beside it.")],
-    top: Annotated[
-        Path | None, typer.Option(help="Mask of the same fish, or its like, seen from above.")
-    ] = None,
+    side: Annotated[Path, "Mask of a straight fish seen from the side; pixels above 0 are fish."],
+    out: Annotated[Path, "The mesh to write, .ply; a .toml comes beside it."],
+    top: Annotated[Path | None, "Mask of the same fish, or its like, seen from above."] = None,
     thickness: Annotated[
         float | None,
-        typer.Option(
-            help="Largest thickness over largest breadth, where there is no --top.",
-            show_default="that of the bundled body form nearest in outline",
-        ),
+        "Largest thickness over largest breadth, where there is no --top.",
+        "that of the bundled body form nearest in outline",
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -67,9 +60,9 @@ def learn_template(
     recordings: Annotated[
         list[Path], typer.Argument(help="Recordings, or folders of runs.", metavar="RECORDINGS...")
     ],
-    out: Annotated[Path, typer.Option(help="The mesh to write, .ply; a .toml comes beside it.")],
+    out: Annotated[Path, "The mesh to write, .ply; a .toml comes beside it."],
     template: Annotated[
-        str, typer.Option(help="What to start from: auto, a body form, or a mesh with its TOML.")
+        str, "What to start from: auto, a body form, or a mesh with its TOML."
     ] = "auto",
     config: ConfigOption = None,
     overwrite: OverwriteOption = False,

@@ -4,8 +4,6 @@ import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
-
 from stream_dmr.cli.shared_options import OverwriteOption, command_line, stop_on_signals, warn
 from stream_dmr.errors import UserError
 
@@ -13,31 +11,22 @@ Device = Literal["cpu", "cuda"]
 
 
 def train(
-    out: Annotated[Path, typer.Option(help="Folder for weights, scores and pictures.")] = Path(
-        "runs/train"
-    ),
+    out: Annotated[Path, "Folder for weights, scores and pictures."] = Path("runs/train"),
     images: Annotated[
-        Path | None,
-        typer.Option(help="Folder of your own images; without them all pictures are simulated."),
+        Path | None, "Folder of your own images; without them all pictures are simulated."
     ] = None,
     masks: Annotated[
-        Path | None,
-        typer.Option(help="Folder of a .png per image, values are fish ids; or a COCO .json."),
+        Path | None, "Folder of a .png per image, values are fish ids; or a COCO .json."
     ] = None,
     backgrounds: Annotated[
-        Path | None,
-        typer.Option(help="Folder of photographs without fish, to put your own fish before."),
+        Path | None, "Folder of photographs without fish, to put your own fish before."
     ] = None,
     init: Annotated[
-        Path | None,
-        typer.Option(help="Weights to start from; with --images the shipped ones by themselves."),
+        Path | None, "Weights to start from; with --images the shipped ones by themselves."
     ] = None,
-    config: Annotated[Path | None, typer.Option(help="A config.toml; its [train] is used.")] = None,
-    device: Annotated[Device, typer.Option(help="Where to compute.")] = "cpu",
-    resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Continue the training in --out after its last epoch."),
-    ] = False,
+    config: Annotated[Path | None, "A config.toml; its [train] is used."] = None,
+    device: Annotated[Device, "Where to compute."] = "cpu",
+    resume: Annotated[bool, "Continue the training in --out after its last epoch."] = False,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Train the network that finds masks, on simulated pictures or on your own as well.
@@ -84,23 +73,15 @@ _NOT_THE_SAME_IDS = (
 
 
 def evaluate(
-    lengths: Annotated[Path, typer.Option(help="lengths.csv of a run.")],
+    lengths: Annotated[Path, "lengths.csv of a run."],
     truth: Annotated[
         Path,
-        typer.Option(
-            help="truth.csv with track_id,length_mm; or a histogram with bin_low_mm,bin_high_mm "
-            "and count or share."
-        ),
+        "truth.csv with track_id,length_mm; or a histogram with bin_low_mm,bin_high_mm "
+        "and count or share.",
     ],
-    config: Annotated[
-        Path | None, typer.Option(help="A config.toml; its [evaluate] has the bins.")
-    ] = None,
+    config: Annotated[Path | None, "A config.toml; its [evaluate] has the bins."] = None,
     plot: Annotated[
-        Path | None,
-        typer.Option(
-            help="Where to draw both histograms.",
-            show_default="lengths_histogram.png beside lengths",
-        ),
+        Path | None, "Where to draw both histograms.", "lengths_histogram.png beside lengths"
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:

@@ -9,21 +9,16 @@ from stream_dmr.cli.shared_options import OverwriteOption, warn
 
 _Source = Annotated[
     str | None,
-    typer.Option(
-        help="The recorded clip, for pictures of the fish.",
-        show_default="the one that was measured, if it is still there",
-    ),
+    "The recorded clip, for pictures of the fish.",
+    "the one that was measured, if it is still there",
 ]
-_Config = Annotated[
-    Path | None, typer.Option(help="A config.toml; its [fisheries] replaces the run's.")
-]
+_Config = Annotated[Path | None, "A config.toml; its [fisheries] replaces the run's."]
 
 
 def verify(
     folder: Annotated[Path, typer.Argument(help="The --out of runs or of exports.", metavar="DIR")],
     key: Annotated[
-        Path | None,
-        typer.Option(help="The device's FILE.pub: all that it signed is checked by it as well."),
+        Path | None, "The device's FILE.pub: all that it signed is checked by it as well."
     ] = None,
 ) -> None:
     """Check that results are still what their run measured; exit 1 and say what was changed."""
@@ -64,15 +59,10 @@ def report(
         Path,
         typer.Argument(help="The --out of a run or of a batch, or a recording.", metavar="DIR|REC"),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option(help="The page to write.", show_default="report.html in the folder"),
-    ] = None,
+    out: Annotated[Path | None, "The page to write.", "report.html in the folder"] = None,
     source: _Source = None,
     config: _Config = None,
-    coast: Annotated[
-        Path | None, typer.Option(help="Coastlines for the map, as GeoJSON in degrees.")
-    ] = None,
+    coast: Annotated[Path | None, "Coastlines for the map, as GeoJSON in degrees."] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Write results as one page that opens offline: plots, a table of fish, their best frames."""

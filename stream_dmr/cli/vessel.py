@@ -24,18 +24,11 @@ def haul(
             help="Address of a run's status page, or the --out of a run.", metavar="URL|DIR"
         ),
     ],
-    name: Annotated[
-        str, typer.Option(help="Name of the haul.", show_default="the next number")
-    ] = "",
+    name: Annotated[str, "Name of the haul.", "the next number"] = "",
     at: Annotated[
-        str | None,
-        typer.Option(
-            help="When: UTC as 2026-11-22T06:00:00Z, or seconds as in lengths.csv; for a DIR.",
-        ),
+        str | None, "When: UTC as 2026-11-22T06:00:00Z, or seconds as in lengths.csv; for a DIR."
     ] = None,
-    token_file: Annotated[
-        Path | None, typer.Option(help="The access token of the status page.")
-    ] = None,
+    token_file: Annotated[Path | None, "The access token of the status page."] = None,
 ) -> None:
     """Begin or end a haul; its fish are those whose middle frame lies in it."""
     from stream_dmr.errors import UserError
@@ -111,7 +104,7 @@ def fleet(
             metavar="URL|FILE...",
         ),
     ],
-    out: Annotated[Path, typer.Option(help="The page to write.")] = Path("fleet.html"),
+    out: Annotated[Path, "The page to write."] = Path("fleet.html"),
     every: Annotated[
         float,
         typer.Option(help="Ask again and write it again every so many seconds; 0: once.", min=0),

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _Source = Annotated[
     str | None,
-    typer.Option(help="The clip that was recorded, for pictures recorded by reference."),
+    "The clip that was recorded, for pictures recorded by reference.",
 ]
 
 
@@ -38,18 +38,12 @@ def view(
     source: _Source = None,
     time: TimeOption = None,
     track: TrackOption = None,
-    web: Annotated[
-        bool, typer.Option("--web", help="For a browser on this machine, in bounded memory.")
-    ] = False,
+    web: Annotated[bool, "For a browser on this machine, in bounded memory."] = False,
     port: Annotated[
         int, typer.Option(help="Port of --web; 0: any free one.", min=0, max=65535)
     ] = 0,
-    screenshot: Annotated[
-        Path | None, typer.Option(help="Save a picture (.png) instead; needs no screen.")
-    ] = None,
-    frame: Annotated[
-        int | None, typer.Option(help="The frame of --screenshot.", show_default="1")
-    ] = None,
+    screenshot: Annotated[Path | None, "Save a picture (.png) instead; needs no screen."] = None,
+    frame: Annotated[int | None, "The frame of --screenshot.", "1"] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Look at a recording, or a part of it: frame, 3D scene, lengths, IoU, timings and events."""
@@ -89,16 +83,11 @@ def convert(
     recording: Annotated[
         Path, typer.Argument(help="A recording, or the folder of a run.", metavar="REC")
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option(help="The .rrd to write.", show_default="REC with .rrd for .mcap"),
-    ] = None,
+    out: Annotated[Path | None, "The .rrd to write.", "REC with .rrd for .mcap"] = None,
     source: _Source = None,
     time: TimeOption = None,
     track: TrackOption = None,
-    full_size: Annotated[
-        bool, typer.Option("--full-size", help="Pictures as large as the source's.")
-    ] = False,
+    full_size: Annotated[bool, "Pictures as large as the source's."] = False,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Write the .rrd of a recording, or of a part of it, again, with every frame drawn."""

@@ -130,15 +130,17 @@ Options = TypeVar("Options", RunOptions, ReplayOptions)
 def options_of(kind: type[Options], given: Mapping[str, Any]) -> Options:
     """The options among values by name, with paths and texts as their fields have them.
 
-    Raises UserError for a value that is none of the choices.
+    None leaves the default. Raises UserError for a value that is none of the choices.
     """
     types, values = get_type_hints(kind), dict[str, Any]()
     for name in types.keys() & given.keys():
         declared, value = types[name], given[name]
+        if value is None:
+            continue
         parts = get_args(declared) if isinstance(declared, UnionType) else (declared,)
         if get_origin(declared) is Literal and value not in get_args(declared):
             expected = ", ".join(get_args(declared))
             raise UserError(f"{name}: expected one of {expected}, got {value!r}")
         convert = next((kind for kind in (Path, str) if kind in parts), None)
-        values[name] = value if value is None or convert is None else convert(value)
+        values[name] = convert(value) if convert else value
     return kind(**values)

@@ -325,9 +325,10 @@ def test_the_command_writes_the_file_and_the_drawings(folder, views, result, tmp
     import typer
 
     from stream_dmr.cli.calibrate import calibrate as command
+    from stream_dmr.cli.shared_options import typer_command
 
     app = typer.Typer()
-    app.command()(command)
+    app.command()(typer_command(command))
     out = tmp_path / "calibration.yaml"
     arguments = ["--plane", folder / "plane.png", *views, folder / "none.png", "--out", out]
     outcome = CliRunner().invoke(app, [str(argument) for argument in arguments])
