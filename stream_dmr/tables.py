@@ -4,14 +4,12 @@ import csv
 import errno
 import io
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any, TypeVar, get_args, get_type_hints
 
-import numpy as np
-from jaxtyping import Float
-
-from stream_dmr.errors import OutputError
+from stream_dmr.errors import OutputError, UserError
 from stream_dmr.files import TransactionalFile, natural_order
 
 _BLOCK_BYTES = 1 << 16  # read at once when searching for the last line, backwards
@@ -164,11 +162,80 @@ def utc_text(utc_ns: int | None) -> str | None:
     return f"{moment:%Y-%m-%dT%H:%M:%S}.{rest_ns // 1_000_000:03d}Z"
 
 
-def number(value: float | None) -> str:
-    """A number with six decimals; blank for None."""
-    return "" if value is None else f"{value:.6f}"
+def cell(value: object) -> str:
+    """A value as the text of a cell: blank for None, numbers with six decimals, true or false."""
+    match value:
+        case None:
+            return ""
+        case bool():
+            return str(value).lower()
+        case float():
+            return f"{value:.6f}"
+        case _:
+            return str(value)
 
 
-def numbers(values: Float[np.ndarray, "..."] | None, count: int) -> list[str]:
-    """The cells of an array of `count` numbers in C order; blanks for None."""
-    return [""] * count if values is None else [number(float(value)) for value in values.flat]
+def cells(row: type, message: object, **others: object) -> list[str]:
+    """The cells of a row class: attributes of the message of these names, but for `others`."""
+    names = get_type_hints(row)
+    return [cell(others[name] if name in others else getattr(message, name)) for name in names]
+
+
+def column_kinds(row: type) -> dict[str, type]:
+    """Name and kind of every column of a row class; each may have blank cells."""
+    hints = get_type_hints(row).items()
+    return {name: kind if isinstance(kind, type) else get_args(kind)[0] for name, kind in hints}
+
+
+_PARSERS: Mapping[object, tuple[Callable[[str], object], str]] = {
+    int: (int, "a whole number"),
+    float: (float, "a number"),
+    float | None: (lambda text: float(text) if text else None, "a number or nothing"),
+    bool: ({"true": True, "false": False}.__getitem__, "true or false"),
+    str: (str, "text"),
+}
+Row = TypeVar("Row")
+
+
+def read_rows(path: Path, row: type[Row]) -> list[Row]:
+    """All rows of a table; columns that `row` does not have are left out.
+
+    UserError where the file can't be read, or a column or a value is not what it should be.
+    """
+    return [row(**values) for values in read_records(path, row)]
+
+
+def read_records(path: Path, row: type) -> list[dict[str, Any]]:
+    """As `read_rows`, with the values of each row by their names."""
+    kinds = get_type_hints(row)
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            missing = kinds.keys() - set(reader.fieldnames or ())
+            if missing:
+                raise UserError(
+                    f"{path}: expected the column {min(missing)}, found {reader.fieldnames}; "
+                    "give the folder of a run"
+                )
+            return [_parsed(kinds, texts, f"{path}, line {reader.line_num}") for texts in reader]
+    except OSError as error:
+        raise UserError(
+            f"{path}: expected a table of a run, got: {error.strerror}; give the folder of a run"
+        ) from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"{path}: expected a table of a run, got: {error}") from error
+
+
+def _parsed(
+    kinds: Mapping[str, object], texts: Mapping[str, str | None], where: str
+) -> dict[str, object]:
+    values: dict[str, object] = {}
+    for name, kind in kinds.items():
+        parse, expected = _PARSERS[kind]
+        try:
+            values[name] = parse(texts[name] or "")
+        except (ValueError, KeyError) as error:
+            raise UserError(
+                f"{where}: expected {expected} for {name}, got {texts[name]!r}"
+            ) from error
+    return values

@@ -13,7 +13,7 @@ import pytest
 import stream_dmr as sd
 from stream_dmr.api import read_rows
 from stream_dmr.pipeline.run_options import RunOptions, command_of
-from stream_dmr.store.run_tables import FRAMES_COLUMNS, LENGTHS_COLUMNS
+from stream_dmr.store.run_tables import LENGTHS_COLUMNS
 from tests.support.command import invoke, rows
 from tests.support.fish_run import FISH
 from tests.support.tiny_clip import options, write_clip
@@ -92,11 +92,6 @@ def test_a_request_is_recorded_as_the_command_that_does_the_same():
     request = RunOptions(source="rtsp://me:secret@rail/1", out=Path("a b"), stills=True)
     command = "stream-dmr run --source rtsp://rail/1 --out 'a b' --stills"
     assert command_of(request).command == command
-
-
-def test_rows_have_the_columns_of_the_tables():
-    assert [field.name for field in fields(sd.FishRow)] == LENGTHS_COLUMNS
-    assert [field.name for field in fields(sd.FrameRow)] == FRAMES_COLUMNS
 
 
 def test_rows_are_typed_and_ready_for_pandas(run: sd.Run):

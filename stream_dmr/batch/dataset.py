@@ -4,7 +4,6 @@
 partitioned as by Hive, with one file a video: `vessel=.../trip=.../VIDEO.parquet`.
 """
 
-import csv
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
@@ -22,23 +21,20 @@ from stream_dmr.pipeline.config import load_config
 from stream_dmr.store.batch_folder import TABLE_KINDS, dataset_file
 from stream_dmr.store.fish import FishResult, read_fish
 from stream_dmr.store.open_results import open_results
-from stream_dmr.store.run_tables import FRAMES_COLUMNS
+from stream_dmr.store.run_tables import FrameRow
 from stream_dmr.store.scale_checks import last_checks
 from stream_dmr.store.schema import NAME as DATABASE
 from stream_dmr.store.verdicts import read_verdicts
+from stream_dmr.tables import column_kinds, read_records
 
 _PARTITIONS = ("vessel", "trip")
 _TABLE_SUFFIXES = (".parquet", ".part")  # whole, and while it is written
-_INTEGER_COLUMNS = ("frame_index", "timestamp_ns", "track_id")
 _RUN_COLUMNS = ("run_id", "software_version", "config_sha256")
 _VIDEO_COLUMNS = {"video": str, "haul": str}
 _FISH_SCHEMA = _VIDEO_COLUMNS | {k: v for k, v in FISH_TABLE.items() if k not in _PARTITIONS}
 _FRAMES_SCHEMA: dict[str, type] = {
     **_VIDEO_COLUMNS,
-    **dict.fromkeys(FRAMES_COLUMNS, float),
-    **dict.fromkeys(_INTEGER_COLUMNS, int),
-    "accepted": bool,
-    "reason": str,
+    **column_kinds(FrameRow),
     **dict.fromkeys(_RUN_COLUMNS, str),
 }
 
@@ -62,12 +58,8 @@ def _frame_records(
     folder: Path, fish: Sequence[FishResult], of_video: dict[str, str]
 ) -> list[dict[str, Any]]:
     by_track = {one.estimate.track_id: {"run_id": one.run_id} | asdict(one.facts) for one in fish}
-    frames = list[dict[str, Any]]()
-    with (folder / "frames.csv").open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            record = {name: _value(row[name], _FRAMES_SCHEMA[name]) for name in FRAMES_COLUMNS}
-            frames.append(record | of_video | by_track.get(record["track_id"], {}))
-    return frames
+    frames = read_records(folder / "frames.csv", FrameRow)
+    return [frame | of_video | by_track.get(frame["track_id"], {}) for frame in frames]
 
 
 def publish(folder: Path, job: Job, out: Path) -> None:
@@ -122,9 +114,3 @@ def _last_addition_ns(folder: Path) -> int:
 def _write(path: Path, records: list[dict[str, Any]], schema: dict[str, type]) -> None:
     rows = [{name: record.get(name) for name in schema} for record in records]
     parquet.write_table(Table.from_pylist(rows, arrow_schema(schema)), path)
-
-
-def _value(text: str, kind: type) -> Any:
-    if kind is bool:
-        return text == "true"
-    return kind(text) if text or kind is str else None

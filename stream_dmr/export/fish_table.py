@@ -12,7 +12,7 @@ from stream_dmr.species import CODE
 from stream_dmr.store.fish import FishResult, code_of, is_same_species, species_of
 from stream_dmr.store.fisheries import Derived, FisheriesSettings, derive
 from stream_dmr.store.scale_checks import ScaleCheck, last_checks
-from stream_dmr.tables import seconds, utc_text, write_table
+from stream_dmr.tables import cell, seconds, utc_text, write_table
 from stream_dmr.template.template import Template
 
 
@@ -165,7 +165,7 @@ def _length_from(fish: FishResult) -> str | None:
 def write_csv(path: Path, records: Sequence[dict[str, Any]]) -> Path:
     """Write records of FISH_TABLE as `path`.csv; lengths are rounded as in lengths.csv."""
     target = path.with_suffix(".csv")
-    rows = ([_text(record[name]) for name in FISH_TABLE] for record in records)
+    rows = ([cell(record[name]) for name in FISH_TABLE] for record in records)
     with writing_to(target):
         write_table(target, FISH_TABLE, rows)
     return target
@@ -187,15 +187,3 @@ def arrow_schema(columns: dict[str, type]) -> Any:
 
     kinds = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
     return pa.schema([(name, kinds[kind]) for name, kind in columns.items()])
-
-
-def _text(value: object) -> str:
-    match value:
-        case None:
-            return ""
-        case bool():
-            return str(value).lower()
-        case float():
-            return f"{value:.6f}"
-        case _:
-            return str(value)

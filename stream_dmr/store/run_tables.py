@@ -1,9 +1,12 @@
 """Write lengths.csv and frames.csv."""
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from stream_dmr.errors import OutputError
 from stream_dmr.files import replacing
@@ -11,13 +14,33 @@ from stream_dmr.messages import LengthEstimate, LocalizedFish
 from stream_dmr.recording.record import Record
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.schema import MAY_COUNT_TWICE
-from stream_dmr.tables import CsvFile, number, numbers, seconds
+from stream_dmr.tables import CsvFile, cells, column_kinds, seconds
 
-LENGTHS_COLUMNS = [
-    *("track_id", "length_mm", "length_std_mm", "ci95_low_mm", "ci95_high_mm"),
-    *("frames_seen", "frames_used", "first_frame", "last_frame", "first_time", "last_time"),
-    "status",
-]
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FishRow:
+    """One fish: a row of lengths.csv. `pandas.DataFrame(run.fish)` makes a table of many.
+
+    The fields are the columns, in their order; the comments stand in docs/files.md.
+    """
+
+    track_id: int  # number of the fish, never used twice
+    length_mm: float | None  # snout to tail keypoint along the body; empty where `status` says why
+    length_std_mm: float | None  # its standard deviation
+    ci95_low_mm: float | None  # its 95 % interval
+    ci95_high_mm: float | None
+    frames_seen: int  # frames with this fish; those that counted
+    frames_used: int
+    first_frame: int  # of the fish
+    last_frame: int
+    first_time: float  # capture times, s (cameras: since 1970), exact to the nanosecond
+    last_time: float
+    # `measured`, or [why there is no length](troubleshooting.md#reasons); with `; may count twice`
+    # for a fish that was in view at a crash
+    status: str
+
+
+LENGTHS_COLUMNS = list(column_kinds(FishRow))
 
 
 class LengthsTable:
@@ -101,29 +124,55 @@ def write_lengths(
 
 def lengths_row(estimate: LengthEstimate, *, may_count_twice: bool = False) -> list[str]:
     """The cells of a final estimate; times in seconds, exact to the nanosecond."""
-    return [
-        str(estimate.track_id),
-        number(estimate.length_mm),
-        number(estimate.length_std_mm),
-        *numbers(estimate.ci95_mm, 2),
-        str(estimate.frames_seen),
-        str(estimate.frames_used),
-        str(estimate.first_frame),
-        str(estimate.last_frame),
-        seconds(estimate.first_timestamp_ns),
-        seconds(estimate.last_timestamp_ns),
-        f"{estimate.status}; {MAY_COUNT_TWICE}" if may_count_twice else estimate.status,
-    ]
+    low, high = (None, None) if estimate.ci95_mm is None else estimate.ci95_mm.tolist()
+    return cells(
+        FishRow,
+        estimate,
+        ci95_low_mm=low,
+        ci95_high_mm=high,
+        first_time=seconds(estimate.first_timestamp_ns),
+        last_time=seconds(estimate.last_timestamp_ns),
+        status=f"{estimate.status}; {MAY_COUNT_TWICE}" if may_count_twice else estimate.status,
+    )
 
 
-FRAMES_COLUMNS = [
-    *("frame_index", "timestamp_ns", "track_id"),
-    *("head_u", "head_v", "center_u", "center_v", "tail_u", "tail_v"),
-    *("head_x_mm", "head_y_mm", "head_z_mm"),
-    *("center_x_mm", "center_y_mm", "center_z_mm"),
-    *("tail_x_mm", "tail_y_mm", "tail_z_mm"),
-    *("bending_ratio", "length_mm", "length_std_mm", "iou", "accepted", "reason"),
-]
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FrameRow:
+    """One fish in one frame: a row of frames.csv. None where there is no value."""
+
+    frame_index: int  # the frame; its capture time
+    timestamp_ns: int
+    track_id: int  # the fish
+    head_u: float | None  # keypoints in the frame, px
+    head_v: float | None
+    center_u: float | None
+    center_v: float | None
+    tail_u: float | None
+    tail_v: float | None
+    head_x_mm: float | None  # the same in the camera frame (x right, y down, z forward)
+    head_y_mm: float | None
+    head_z_mm: float | None
+    center_x_mm: float | None
+    center_y_mm: float | None
+    center_z_mm: float | None
+    tail_x_mm: float | None
+    tail_y_mm: float | None
+    tail_z_mm: float | None
+    # length along the body over the straight distance from head to tail
+    bending_ratio: float | None
+    # what this frame says of the length, and its std without what all frames of the fish share:
+    # its shape, its distance from the plane
+    length_mm: float | None
+    length_std_mm: float | None
+    iou: float | None  # overlap of the fitted mesh with the mask, 0 to 1
+    accepted: bool  # `true` where the frame counted
+    reason: str  # [why it did not](troubleshooting.md#reasons)
+
+
+FRAMES_COLUMNS = list(column_kinds(FrameRow))
+_POINTS = ("head", "center", "tail")
+_POINTS_PX = [f"{point}_{axis}" for point in _POINTS for axis in "uv"]
+_POINTS_MM = [f"{point}_{axis}_mm" for point in _POINTS for axis in "xyz"]
 _MAX_BYTES = 64 << 20  # of one file of an endless run: some hours of two fish
 
 
@@ -174,16 +223,11 @@ class FramesTable:
 
 def frames_row(fish: LocalizedFish, accepted: bool, reason: str) -> list[str]:
     """The cells of one fish in one frame, with the final verdict on the frame."""
-    return [
-        str(fish.frame_index),
-        str(fish.timestamp_ns),
-        str(fish.track_id),
-        *numbers(fish.keypoints_px, 6),
-        *numbers(fish.keypoints_mm, 9),
-        number(fish.bending_ratio),
-        number(fish.length_mm),
-        number(fish.length_std_mm),
-        number(fish.iou),
-        "true" if accepted else "false",
-        reason,
-    ]
+    points = _named(_POINTS_PX, fish.keypoints_px) | _named(_POINTS_MM, fish.keypoints_mm)
+    return cells(FrameRow, fish, **points, accepted=accepted, reason=reason)
+
+
+def _named(names: Sequence[str], values: np.ndarray | None) -> dict[str, float | None]:
+    if values is None:
+        return dict.fromkeys(names)
+    return dict(zip(names, values.ravel().tolist(), strict=True))

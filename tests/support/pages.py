@@ -4,8 +4,10 @@ A generated file is written whole; a generated table stands between two marks of
 """
 
 import ast
+import inspect
 import json
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from stream_dmr import messages
 from stream_dmr.pipeline.config import Config
 from stream_dmr.reasons import Reason
 from stream_dmr.recording.topics import topics_table
+from stream_dmr.store.run_tables import FishRow, FrameRow
 from tests.support.plan import draw_plan, read_plan
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -88,6 +91,17 @@ def _comment(lines: list[str], field: ast.AnnAssign) -> str:
     return " ".join(line.strip(" #") for line in lines[before : field.lineno - 1])
 
 
+def columns_table(row: type) -> str:
+    """The columns of a row class; those without a comment share that of the one before."""
+    source = inspect.getsource(row)
+    (kind,), rows = ast.parse(source).body, list[tuple[str, str]]()
+    for field in kind.body if isinstance(kind, ast.ClassDef) else ():
+        if isinstance(field, ast.AnnAssign):
+            name, text = f"`{ast.unparse(field.target)}`", _comment(source.splitlines(), field)
+            rows.append((name, text) if text else (f"{rows[-1][0]}, {name}", rows.pop()[1]))
+    return _markdown(["column", "meaning"], iter(rows))
+
+
 def reasons_table() -> str:
     """One row for each reason, below what it refuses."""
     rows = list[tuple[str, ...]]()
@@ -108,10 +122,11 @@ def _markdown(head: list[str], rows: Iterator[tuple[str, ...]]) -> str:
 
 
 WHOLE: dict[str, Callable[[], str]] = {"images/plan.svg": lambda: draw_plan(read_plan())}
-TABLES: dict[str, Callable[[], str]] = {
-    "settings.md": settings_tables,
-    "files.md": files_tables,
-    "troubleshooting.md": reasons_table,
+# In the order of the marks of each page.
+TABLES: dict[str, list[Callable[[], str]]] = {
+    "settings.md": [settings_tables],
+    "files.md": [partial(columns_table, FishRow), partial(columns_table, FrameRow), files_tables],
+    "troubleshooting.md": [reasons_table],
 }
 
 
@@ -119,11 +134,14 @@ def pages() -> Iterator[tuple[Path, str]]:
     """Every page with a generated part, and its text as it should be."""
     for name, make in WHOLE.items():
         yield DOCS / name, make()
-    for name, make in TABLES.items():
-        before, _, rest = (DOCS / name).read_text(encoding="utf-8").partition(BEGIN)
-        _, end, after = rest.partition(END)
-        assert end, f"docs/{name}: expected the lines {BEGIN!r} and {END!r}, got none"
-        yield DOCS / name, f"{before}{BEGIN}\n{make()}\n{END}{after}"
+    for name, makers in TABLES.items():
+        text, *parts = (DOCS / name).read_text(encoding="utf-8").split(BEGIN)
+        assert len(parts) == len(makers), f"docs/{name}: expected {len(makers)} lines {BEGIN!r}"
+        for make, part in zip(makers, parts, strict=True):
+            _, end, after = part.partition(END)
+            assert end, f"docs/{name}: expected a line {END!r} after {BEGIN!r}, got none"
+            text += f"{BEGIN}\n{make()}\n{END}{after}"
+        yield DOCS / name, text
 
 
 if __name__ == "__main__":
