@@ -66,7 +66,6 @@ def combine(
 
     Both calibrations are of the same reference plane. Ids and pictures are those of LEFT.
     """
-
     request = ReplayOptions(
         recordings=[first],
         first="localize",
