@@ -1,5 +1,6 @@
 """Inputs that never end, nest without end or fill the memory: refused in one line, and soon."""
 
+import os
 import struct
 import subprocess
 import sys
@@ -51,12 +52,28 @@ ENDLESS: dict[str, tuple[Callable[[Path], object], type[UserError]]] = {
 }
 
 
+@pytest.fixture
+def large_file(tmp_path: Path) -> Path:
+    """A sparse file of 2 GB, which takes no room on the disk."""
+    path = tmp_path / "large"
+    path.touch()
+    os.truncate(path, 2 * 10**9)
+    return path
+
+
 @pytest.mark.parametrize("kind", ENDLESS)
 @pytest.mark.parametrize("device", ["/dev/zero", "/dev/urandom"])
 def test_a_device_that_never_ends_is_refused(kind: str, device: str):
     load, error = ENDLESS[kind]
-    with pytest.raises(error, match="more than 1000 kB"):
+    with pytest.raises(error, match="a pipe or a device"):
         load(Path(device))
+
+
+@pytest.mark.parametrize("kind", ENDLESS)
+def test_a_file_that_is_too_large_is_refused(kind: str, large_file: Path):
+    load, error = ENDLESS[kind]
+    with pytest.raises(error, match="more than 1000 kB"):
+        load(large_file)
 
 
 def test_a_template_beside_an_endless_toml_is_refused(tmp_path: Path):
@@ -66,10 +83,12 @@ def test_a_template_beside_an_endless_toml_is_refused(tmp_path: Path):
         load_template(str(tmp_path / "fish.ply"))
 
 
-def test_boxes_that_never_end_are_refused(monkeypatch: pytest.MonkeyPatch):
+def test_boxes_that_never_end_are_refused(monkeypatch: pytest.MonkeyPatch, large_file: Path):
     monkeypatch.setattr("stream_dmr.detection.box_files._MAX_BYTES", 10**6)
-    with pytest.raises(UserError, match="more than 1000 kB"):
+    with pytest.raises(UserError, match="a pipe or a device"):
         load_boxes(Path("/dev/zero"))
+    with pytest.raises(UserError, match="more than 1000 kB"):
+        load_boxes(large_file)
 
 
 def huge_png(path: Path) -> Path:
