@@ -158,6 +158,11 @@ class ReferencePlane:
         """From the camera, at a right angle to the plane."""
         return float(abs(self.rotation[:, 2] @ self.translation_mm))
 
+    @property
+    def lean_rad(self) -> float:
+        """Angle between the plane and one that faces the camera, 0 to pi / 2."""
+        return float(np.arccos(min(abs(self.rotation[2, 2]), 1.0)))
+
     def homography(self, K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
         """H = K [R1 R2 T] of eq. (9): from (X, Y, 1) mm on the plane to undistorted pixels."""
         return K @ np.column_stack([self.rotation[:, 0], self.rotation[:, 1], self.translation_mm])

@@ -5,6 +5,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from stream_dmr.calibration.calibration_file import load_calibration, require_size
 from stream_dmr.errors import ConfigError, UserError
 from stream_dmr.fitting.shape.candidates import given_mesh, load_shapes
@@ -224,6 +226,7 @@ def _nmea_input(address: str) -> InputFile:
 
 
 _USUAL_M = (0.5, 20.0)  # chosen: from cameras to the plane of hanging fish
+_LARGEST_LEAN_RAD = np.radians(20)  # chosen: cameras are aimed at the fish, within this
 
 
 def start_notices(inputs: Inputs) -> Iterator[str]:
@@ -238,6 +241,13 @@ def start_notices(inputs: Inputs) -> Iterator[str]:
             yield (
                 f"the calibration's reference plane is {distance_m:.2f} m from the camera; if it "
                 "is not, every length is wrong: tvec must be in mm"
+            )
+        lean_rad = inputs.calibration.plane.lean_rad
+        if lean_rad > _LARGEST_LEAN_RAD:
+            yield (
+                f"the calibration's reference plane leans {np.degrees(lean_rad):.0f} degrees from "
+                "facing the camera; fish that hang facing it are measured up to "
+                f"{1 / np.cos(lean_rad) - 1:.0%} too long: photograph the board held as fish hang"
             )
     if inputs.source.is_live and inputs.config.recording.frames == "reference":
         yield (

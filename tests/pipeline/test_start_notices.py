@@ -3,6 +3,9 @@
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+from scipy.spatial.transform import Rotation
+
 from stream_dmr.pipeline.run_inputs import Inputs, checked_inputs, start_notices
 from tests.support.fish_run import request
 from tests.support.tiny_clip import write_clip
@@ -24,6 +27,20 @@ def test_a_plane_that_is_too_near_for_a_rail_is_named_unless_fish_lie(tmp_path: 
     assert [line for line in start_notices(inputs) if "tvec must be in mm" in line]
     lying = replace(inputs, request=replace(inputs.request, pose="lying"))
     assert not [line for line in start_notices(lying) if "tvec must be in mm" in line]
+
+
+@pytest.mark.parametrize(("lean_deg", "is_named"), [(10.0, False), (35.0, True)])
+def test_a_plane_that_leans_from_the_camera_is_named(
+    tmp_path: Path, lean_deg: float, is_named: bool
+):
+    inputs = opened(tmp_path)
+    assert inputs.calibration is not None
+    rotation = Rotation.from_euler("xz", [lean_deg, 40.0], degrees=True).as_matrix()
+    plane = replace(inputs.calibration.plane, rotation=rotation)
+    inputs = replace(inputs, calibration=replace(inputs.calibration, plane=plane))
+    named = [line for line in start_notices(inputs) if "held as fish hang" in line]
+    assert bool(named) == is_named
+    assert all("leans 35 degrees" in line and "22% too long" in line for line in named)
 
 
 def opened(folder: Path) -> Inputs:
