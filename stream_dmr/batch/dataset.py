@@ -19,7 +19,7 @@ from stream_dmr.export.fish_table import FISH_TABLE, arrow_schema, fish_records
 from stream_dmr.files import replacing
 from stream_dmr.pipeline.config import load_config
 from stream_dmr.store.batch_folder import TABLE_KINDS, dataset_file
-from stream_dmr.store.fish import FishResult, read_fish
+from stream_dmr.store.fish import Fish, read_fish
 from stream_dmr.store.open_results import open_results
 from stream_dmr.store.run_tables import FrameRow
 from stream_dmr.store.scale_checks import last_checks
@@ -55,7 +55,7 @@ def write_tables(folder: Path, job: Job) -> None:
 
 
 def _frame_records(
-    folder: Path, fish: Sequence[FishResult], of_video: dict[str, str]
+    folder: Path, fish: Sequence[Fish], of_video: dict[str, str]
 ) -> list[dict[str, Any]]:
     by_track = {one.estimate.track_id: {"run_id": one.run_id} | asdict(one.facts) for one in fish}
     frames = read_records(folder / "frames.csv", FrameRow)

@@ -24,15 +24,19 @@ from stream_dmr.store.ledger import (
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.open_results import learnt_files
 from stream_dmr.store.run_facts import RunFacts
-from stream_dmr.store.schema import NAME as DATABASE
 from stream_dmr.store.schema import (
+    EVENTS,
+    FISH,
+    HAULS,
+    POSITIONS,
+    WATCHED,
     check_lines,
-    open_for_reading,
     open_for_writing,
-    read_added,
+    read_rows,
     read_state,
+    reading,
 )
-from stream_dmr.store.trip import HAULS
+from stream_dmr.store.schema import NAME as DATABASE
 from stream_dmr.store.verdicts import read_verdicts, verdict_line
 from stream_dmr.version import __version__
 
@@ -147,10 +151,10 @@ def seal_run(folder: Path, *, with_recordings: bool) -> None:
     files = [path for kind in kinds for path in folder.glob(kind)]
     files += learnt_files(folder)
     sums = {
-        f"{table}_sha256": {
+        f"{table.name}_sha256": {
             run_id: lines_sha256(lines) for run_id, lines in rows_by_run(database, table).items()
         }
-        for table in ("fish", "events", "positions", "watched")
+        for table in (FISH, EVENTS, POSITIONS, WATCHED)
     }
     _write(
         folder,
@@ -164,7 +168,7 @@ def seal_run(folder: Path, *, with_recordings: bool) -> None:
 
 
 def _state_sums(database: Path) -> dict[str, Any]:
-    with closing(open_for_reading(database)) as connection:
+    with reading(database) as connection:
         checks = check_lines(connection)
         state = content_sha256(read_state(connection))
     return {"state_sha256": state, "checks": log_sum(checks)}
@@ -177,7 +181,8 @@ def verdict_lines(database: Path) -> list[str]:
 
 def haul_lines(database: Path) -> list[str]:
     """The events of hauls as lines of JSON, for sums. Raises OutputError."""
-    return [json.dumps(dict(row)) for row in read_added(database, HAULS)]
+    told = ({k: v for k, v in row.items() if k != "number"} for row in read_rows(database, HAULS))
+    return [json.dumps(row) for row in told]
 
 
 def seal_files(

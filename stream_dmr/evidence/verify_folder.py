@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
@@ -52,35 +52,39 @@ from stream_dmr.store.edits import (
 )
 from stream_dmr.store.fish import database_of, read_runs, rows_by_run, run_times
 from stream_dmr.store.ledger import (
-    CHECKS,
     END,
-    EVENT,
     FILE_KINDS,
-    FISH,
     FOUND,
     REMOVED,
-    RUN,
     STATE,
     ChainEntry,
-    chain_rows,
     content_sha256,
     is_entry,
     lines_sha256,
 )
-from stream_dmr.store.run_facts import END_COLUMNS, NOT_ENDED, CatchFacts, RunFacts, run_facts
+from stream_dmr.store.run_facts import END_COLUMNS, NOT_ENDED, RunFacts, run_facts
 from stream_dmr.store.run_tables import FRAMES_COLUMNS, LENGTHS_COLUMNS, frames_row, lengths_row
 from stream_dmr.store.schema import (
+    CATCH_COLUMNS,
+    CHECKS,
+    EVENTS,
+    FISH,
+    HAULS,
+    LEDGER,
     MAY_COUNT_TWICE,
-    AddedTable,
-    added_rows,
+    POSITIONS,
+    RUNS,
+    WATCHED,
+    Table,
     check_lines,
     estimate_of,
     open_for_reading,
+    read_rows,
     read_state,
-    rows_of,
+    reading,
+    rows,
 )
 from stream_dmr.store.schema import NAME as DATABASE
-from stream_dmr.store.trip import HAULS, POSITIONS, WATCHED
 from stream_dmr.store.verdicts import (
     NOT_REVIEWED,
     Verdict,
@@ -205,29 +209,24 @@ def _lengths(database: Path, edits: TrackEdits, last_frames: Mapping[int, int]) 
                 yield f"fish {track_id}: {name} is {now}, its frames give {expected.get(name)}"
 
 
-def added_changes(
-    entries: Sequence[ChainEntry],
-    table: AddedTable,
-    rows: Sequence[Mapping[str, Any]],
-    *,
-    may_be_added: bool = False,
+def _added(
+    entries: Sequence[ChainEntry], database: sqlite3.Connection, table: Table
 ) -> Iterator[str]:
-    """What was changed, removed or, unless it `may_be_added`, put in; a line each kind."""
-    signed = Counter(entry.content_sha256 for entry in entries if entry.kind == table.kind)
-    found = Counter(content_sha256(row) for row in rows)
-    if missing := (signed - found).total():
+    """What was changed, removed or put in, a line each kind; people may add hauls to a folder."""
+    missing, surplus = _unmatched(entries, database, table)
+    if missing:
         yield f"{missing} of its {table.name} are missing, or not as they were signed"
-    surplus = 0 if may_be_added else unsigned_rows(entries, table, rows)
-    if surplus:
+    if surplus and table is not HAULS:
         yield f"{surplus} of its {table.name} were put in, or are not as they were signed"
 
 
-def unsigned_rows(
-    entries: Sequence[ChainEntry], table: AddedTable, rows: Sequence[Mapping[str, Any]]
-) -> int:
-    """The number of rows that the device did not sign."""
+def _unmatched(
+    entries: Sequence[ChainEntry], database: sqlite3.Connection, table: Table
+) -> tuple[int, int]:
+    """The number of rows that were signed and are not there, and that are there and not signed."""
     signed = Counter(entry.content_sha256 for entry in entries if entry.kind == table.kind)
-    return (Counter(content_sha256(row) for row in rows) - signed).total()
+    found = Counter(map(_content, rows(database, table)))
+    return (signed - found).total(), (found - signed).total()
 
 
 def unsealed_rows(database: Path, made: Mapping[str, Any]) -> Iterator[str]:
@@ -235,15 +234,14 @@ def unsealed_rows(database: Path, made: Mapping[str, Any]) -> Iterator[str]:
 
     An older one knows none of them. Raises OutputError.
     """
-    tables: tuple[Literal["positions", "watched"], ...] = ("positions", "watched")
-    for table in tables:
-        sealed: dict[str, str] | None = made.get(f"{table}_sha256")
+    for table in (POSITIONS, WATCHED):
+        sealed: dict[str, str] | None = made.get(f"{table.name}_sha256")
         if sealed is None:
             continue
         found = rows_by_run(database, table)
         for run_id in {**sealed, **found}:
             if lines_sha256(found.get(run_id, [])) != sealed.get(run_id, lines_sha256([])):
-                yield f"the rows of {table} of run {run_id} are not those that it wrote"
+                yield f"the rows of {table.name} of run {run_id} are not those that it wrote"
     known: dict[str, Any] | None = made.get("hauls")
     lines = haul_lines(database)
     if known is not None and not begins_as(lines, known):
@@ -332,9 +330,7 @@ def _stored(
 ) -> Iterator[Change]:
     """Read `runs`, the rows of `fish`, and theirs of lengths.csv; each broken row is a finding."""
     runs |= read_runs(database)
-    with closing(open_for_reading(database)) as connection:
-        rows = list(rows_of(connection, "SELECT * FROM fish ORDER BY number"))
-    for row in rows:
+    for row in read_rows(database, FISH):
         track_id = row["track_id"]
         fish[track_id] = row
         try:
@@ -346,7 +342,7 @@ def _stored(
 
 def summary(database: Path) -> Iterator[str]:
     """A line for each run: vessel, source, time and number of fish. Raises OutputError."""
-    times, fish = run_times(database), rows_by_run(database, "fish")
+    times, fish = run_times(database), rows_by_run(database, FISH)
     for run_id, facts in read_runs(database).items():
         begun, ended = (_utc(ns) for ns in times[run_id])
         yield (
@@ -408,11 +404,11 @@ def _surplus_tables(folder: Path, known: Collection[str]) -> Iterator[Change]:
 
 def _fish_and_runs(database: Path, made: dict[str, Any]) -> Iterator[str]:
     """The fish and the runs against provenance.json."""
-    stored = rows_by_run(database, "fish")
+    stored = rows_by_run(database, FISH)
     for run_id, expected in made["fish_sha256"].items():
         if lines_sha256(stored.get(run_id, [])) != expected:
             yield f"the fish of run {run_id} are not those that were measured"
-    runs, events, times = read_runs(database), rows_by_run(database, "events"), run_times(database)
+    runs, events, times = read_runs(database), rows_by_run(database, EVENTS), run_times(database)
     for run_id, known in made.get("run_times_ns", {}).items():  # older ones have neither of these
         if times.get(run_id) != known:
             yield f"run {run_id}: its times are not those of its run"
@@ -434,7 +430,7 @@ def _state(database: Path, made: dict[str, Any]) -> Iterator[str]:
     known = made.get("checks")
     if known is None:
         return
-    with closing(open_for_reading(database)) as connection:
+    with reading(database) as connection:
         state, checks = content_sha256(read_state(connection)), check_lines(connection)
     if not begins_as(checks, known):
         yield "the checks of the scale are not those that were made"
@@ -486,7 +482,7 @@ def _estimate(path: Path, recorded: LengthEstimate, fish: _Row | None) -> Iterat
     if fish is None:
         yield Change(database, f"fish {recorded.track_id} is missing; {path.name} has it")
         return
-    for name in (*_COMPARED, *(one.name for one in fields(CatchFacts))):
+    for name in (*_COMPARED, *CATCH_COLUMNS):
         stored, measured = fish.get(name), getattr(recorded, name)
         if stored != measured:
             what = f"fish {recorded.track_id}: {name} is {stored}, {path.name} says {measured}"
@@ -508,11 +504,11 @@ def _csv(
     found: dict[str, list[str]] = {}
     older = [table for table in rotated_files(path) if table.is_file()]
     for table in [*older, path]:
-        rows = _rows(table, columns)
-        if rows is None:
+        found_rows = _rows(table, columns)
+        if found_rows is None:
             yield Change(table, "its columns are not those of stream-dmr")
             return
-        found |= rows
+        found |= found_rows
     # Where room was short the oldest tables went, maybe with some rows of the first frame left.
     first = min((int(row[0]) for row in found.values()), default=0) if older else 0
     for name, row in expected.items():
@@ -532,11 +528,11 @@ def _csv(
 
 def _rows(path: Path, columns: Sequence[str]) -> dict[str, list[str]] | None:
     """Rows by their fish, or by frame and fish; None where the columns are others."""
-    rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8", errors="replace"))))
-    if not rows or rows[0] != list(columns):
+    table = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8", errors="replace"))))
+    if not table or table[0] != list(columns):
         return None
     fish = columns.index("track_id")
-    whole = [row for row in rows[1:] if len(row) == len(columns)]
+    whole = [row for row in table[1:] if len(row) == len(columns)]
     return {f"{row[0]},{row[fish]}" if fish else row[0]: row for row in whole}
 
 
@@ -564,7 +560,7 @@ def check_signatures(folder: Path, key: Ed25519PublicKey) -> SignatureCheck:
             return check
         changed = {
             "its chain": _broken_links(entries, key),
-            "its fish": _fish(entries, database),
+            "its fish": _rows_by_name(entries, FISH, rows(database, FISH), "track_id"),
             "its events": _events(entries, database),
             "its runs": _runs(entries, database, is_going_on=is_locked(folder)),
             "its files": _files(entries, folder),
@@ -595,33 +591,17 @@ def _extend(found: list[str], name: str, lines: Iterable[str]) -> None:
 
 def _whole_entries(database: sqlite3.Connection, entries: list[ChainEntry]) -> Iterator[str]:
     """Add the entries to `entries`; those that are damaged are findings instead."""
-    for row in chain_rows(database):
+    for row in rows(database, LEDGER):
         if is_entry(row):
             entries.append(ChainEntry(**row))
         else:
             yield "signed entry {number!r} ({kind!r} {name!r}) is damaged".format(**row)
 
 
-def _signed_rows(database: sqlite3.Connection, table: str) -> list[_Row]:
-    order = "started_ns" if table == "runs" else "number"
-    return list(rows_of(database, f"SELECT * FROM {table} ORDER BY {order}"))
-
-
-def _fish(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
-    yield from _rows_by_name(entries, FISH, _signed_rows(database, "fish"), "track_id")
-
-
-def _added(
-    entries: Sequence[ChainEntry], database: sqlite3.Connection, table: AddedTable
-) -> Iterator[str]:
-    rows = added_rows(database, table)
-    yield from added_changes(entries, table, rows, may_be_added=table is HAULS)
-
-
 def _hauls_of_people(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
-    """People may add hauls to a folder."""
-    if told := unsigned_rows(entries, HAULS, added_rows(database, HAULS)):
-        yield f"{told} events of hauls are not signed by the device"
+    _, surplus = _unmatched(entries, database, HAULS)
+    if surplus:
+        yield f"{surplus} events of hauls are not signed by the device"
 
 
 def _unsigned_verdicts(database: Path) -> Iterator[str]:
@@ -645,13 +625,14 @@ def _broken_links(entries: Sequence[ChainEntry], key: Ed25519PublicKey) -> Itera
 
 
 def _rows_by_name(
-    entries: Sequence[ChainEntry], kind: str, rows: Sequence[_Row], column: str
+    entries: Sequence[ChainEntry], table: Table, stored: Iterable[_Row], column: str
 ) -> Iterator[str]:
     """Rows that were changed, removed, put in or moved."""
+    kind, contents = table.kind, [(str(row[column]), _content(row)) for row in stored]
     signed = {entry.name: entry.content_sha256 for entry in entries if entry.kind == kind}
-    found = {str(row[column]): _content(row) for row in rows}
-    if len(found) < len(rows):
-        yield f"{len(rows) - len(found)} {kind} are there twice"
+    found = dict(contents)
+    if len(found) < len(contents):
+        yield f"{len(contents) - len(found)} {kind} are there twice"
     for name, sha256 in signed.items():
         if name not in found:
             yield f"{kind} {name} is missing, and was signed"
@@ -664,10 +645,10 @@ def _rows_by_name(
 
 
 def _events(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
-    rows = _signed_rows(database, "events")
-    signed = [entry.content_sha256 for entry in entries if entry.kind == EVENT]
-    found = [_content(row) for row in rows]
-    for row, sha256 in zip(rows, found, strict=True):
+    stored = list(rows(database, EVENTS))
+    signed = [entry.content_sha256 for entry in entries if entry.kind == EVENTS.kind]
+    found = [_content(row) for row in stored]
+    for row, sha256 in zip(stored, found, strict=True):
         if sha256 not in signed:
             yield f"the event {row['text']!r} was put in, or is not as it was signed"
     if missing := len([sha256 for sha256 in signed if sha256 not in found]):
@@ -681,12 +662,12 @@ def _events(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iter
 def _runs(
     entries: Sequence[ChainEntry], database: sqlite3.Connection, *, is_going_on: bool
 ) -> Iterator[str]:
-    rows = _signed_rows(database, "runs")
-    begun = [{k: v for k, v in row.items() if k not in END_COLUMNS} for row in rows]
-    yield from _rows_by_name(entries, RUN, begun, "run_id")
+    stored = list(rows(database, RUNS))
+    begun = ({k: v for k, v in row.items() if k not in END_COLUMNS} for row in stored)
+    yield from _rows_by_name(entries, RUNS, begun, "run_id")
     ends = {entry.name: entry.content_sha256 for entry in entries if entry.kind == END}
-    runs = [entry.name for entry in entries if entry.kind == RUN]
-    for row in rows:
+    runs = [entry.name for entry in entries if entry.kind == RUNS.kind]
+    for row in stored:
         name = str(row["run_id"])
         if name in ends:
             end = {column: row.get(column) for column in END_COLUMNS}
@@ -701,7 +682,7 @@ def _runs(
 def _signature_state(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
     """Marks, clips and scenes as the last run left them, where it came to its end."""
     state = content_sha256(read_state(database))
-    last = [entry for entry in entries if entry.kind in (RUN, STATE)]
+    last = [entry for entry in entries if entry.kind in (RUNS.kind, STATE)]
     if last and last[-1].kind == STATE and last[-1].content_sha256 != state:
         yield "its marks, clips or scenes are not as they were signed"
 
@@ -710,13 +691,16 @@ def _checks(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iter
     """The checks of the scale: each run signs those that were there at its end."""
     checks = check_lines(database)
     for entry in entries:
-        if entry.kind == CHECKS and lines_sha256(checks[: int(entry.name)]) != entry.content_sha256:
+        if (
+            entry.kind == CHECKS.kind
+            and lines_sha256(checks[: int(entry.name)]) != entry.content_sha256
+        ):
             yield "the checks of the scale are not as they were signed"
             return
 
 
 def _later_checks(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
-    signed = max((int(entry.name) for entry in entries if entry.kind == CHECKS), default=0)
+    signed = max((int(entry.name) for entry in entries if entry.kind == CHECKS.kind), default=0)
     if (more := len(check_lines(database)) - signed) > 0:
         yield f"checks of the scale that are not signed yet: {more}"
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from stream_dmr.files import writing_to
 from stream_dmr.lengths.fate import FATE_OF_ZONE
 from stream_dmr.store.effort import HaulEffort
-from stream_dmr.store.fish import FishResult, sure_code
+from stream_dmr.store.fish import Fish
 from stream_dmr.tables import utc_text, write_table
 from stream_dmr.template.template import Template
 
@@ -38,7 +38,7 @@ _WCPFC_LENGTHS = {"fork": "UF", "total": "TL"}  # upper jaw to fork; tip of snou
 ICES_LENGTHS = {"fork": "LengthFork", "total": "LengthTotal"}
 
 
-def wcpfc_row(fish: FishResult, template: Template) -> Row:
+def wcpfc_row(fish: Fish, template: Template) -> Row:
     """The catch line of one fish."""
     date, _, time = (utc_text(fish.utc_ns) or "").partition("T")
     length_mm, where = fish.length_mm, fish.where
@@ -54,7 +54,7 @@ def wcpfc_row(fish: FishResult, template: Template) -> Row:
         "catch_time_utc": time[:8],
         "latitude": _degrees(where.latitude, "NS", digits=2),
         "longitude": _degrees(where.longitude, "EW", digits=3),
-        "species_code": sure_code(fish),
+        "species_code": fish.sure_code,
         "length_cm": "" if length_mm is None else str(int(length_mm // 10)),
         "length_code": ""
         if length_mm is None
@@ -63,7 +63,7 @@ def wcpfc_row(fish: FishResult, template: Template) -> Row:
     }
 
 
-def rdbes_row(fish: FishResult, template: Template) -> Row:
+def rdbes_row(fish: Fish, template: Template) -> Row:
     """One measured length, as a biological variable with the sample's and the haul's keys."""
     kind, length_mm = ICES_LENGTHS.get(template.tail_gives or "", ""), fish.length_mm
     is_measured = length_mm is not None
@@ -72,7 +72,7 @@ def rdbes_row(fish: FishResult, template: Template) -> Row:
         "FOstationNumber": fish.haul,
         "FOlatitude": "" if place[0] is None else f"{place[0]:.5f}",
         "FOlongitude": "" if place[1] is None else f"{place[1]:.5f}",
-        "SAspeciesCodeFAO": sure_code(fish),
+        "SAspeciesCodeFAO": fish.sure_code,
         "BVrecordType": "BV",
         "BVnationalUniqueFishId": f"{fish.run_id[:8]}-{fish.estimate.track_id}",
         "BVtypeMeasured": kind if is_measured else "",

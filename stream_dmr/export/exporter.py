@@ -41,7 +41,7 @@ from stream_dmr.recording.topics import RecordingSettings
 from stream_dmr.recording.view_geometry import MeshRebuilder, place_fit
 from stream_dmr.store.edits import ReviewedMessages
 from stream_dmr.store.effort import read_effort
-from stream_dmr.store.fish import FishResult, database_of, read_fish, read_runs, sure_code
+from stream_dmr.store.fish import Fish, database_of, read_fish, read_runs
 from stream_dmr.store.fisheries import FisheriesSettings
 from stream_dmr.store.open_results import open_results, require_recording
 from stream_dmr.store.run_facts import run_facts
@@ -129,7 +129,7 @@ class Export:
                 for crop in self._messages(FishCrop)
                 if isinstance(crop, FishCrop) and crop.track_id not in left_out
             ),
-            {one.estimate.track_id: sure_code(one) for one in self._all_fish() if one.counts},
+            {one.estimate.track_id: one.sure_code for one in self._all_fish() if one.counts},
         )
         self._write_text(path, json.dumps(coco))
         return len(coco["annotations"])
@@ -252,7 +252,7 @@ class Export:
         steps = np.diff(np.array([frame.timestamp_ns for frame in frames], np.int64))
         return round(1e9 / float(np.median(steps)), 3) if len(steps) else None
 
-    def _all_fish(self) -> list[FishResult]:
+    def _all_fish(self) -> list[Fish]:
         return read_fish(self._path, self._recording, self._selection)
 
     def _left_out(self) -> set[int]:

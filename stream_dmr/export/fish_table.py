@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from stream_dmr.export.agency_tables import ICES_LENGTHS
 from stream_dmr.files import writing_to
 from stream_dmr.species import CODE
-from stream_dmr.store.fish import FishResult, code_of, is_same_species, species_of
+from stream_dmr.store.fish import Fish, is_same_species
 from stream_dmr.store.fisheries import Derived, FisheriesSettings, derive
 from stream_dmr.store.scale_checks import ScaleCheck, last_checks
 from stream_dmr.tables import cell, seconds, utc_text, write_table
@@ -19,7 +19,7 @@ from stream_dmr.template.template import Template
 class _Row(NamedTuple):
     """What the columns of one fish are made of."""
 
-    fish: FishResult
+    fish: Fish
     template: Template
     settings: FisheriesSettings
     species: str  # "": neither a reviewer nor a classifier said it
@@ -43,17 +43,16 @@ _COLUMNS: dict[str, _Column] = {
     **_same(str, "fish", "origin"),
     "template": (str, lambda row: row.template.name),
     "species": (str, lambda row: row.species or row.template.name),
-    "species_code": (str, lambda row: code_of(row.fish)),
-    **_same(str, "fish", "fate"),
+    **_same(str, "fish", "species_code", "fate"),
     **_same(str, "fish.estimate", "status"),
     # What a reviewer says has no share.
     "species_share": (
         float,
-        lambda row: None if row.fish.review.species else row.fish.catch.species_share,
+        lambda row: None if row.fish.review.species else row.fish.estimate.species_share,
     ),
     "fate_share": (
         float,
-        lambda row: row.fish.catch.fate_share if row.fish.review.fate is None else None,
+        lambda row: row.fish.estimate.fate_share if row.fish.review.fate is None else None,
     ),
     **_same(str, "fish.review", "condition"),
     **_same(float, "fish.estimate", "length_mm", "length_std_mm"),
@@ -105,7 +104,7 @@ FISH_TABLE: dict[str, type] = {name: kind for name, (kind, _) in _COLUMNS.items(
 
 
 def fish_record(
-    fish: FishResult,
+    fish: Fish,
     template: Template,
     settings: FisheriesSettings,
     *,
@@ -115,7 +114,7 @@ def fish_record(
 
     `check`: the last one with the calibration of the fish's run.
     """
-    found = species_of(fish)
+    found = fish.species
     named = "" if CODE.fullmatch(fish.review.species) else fish.review.species
     species = named or (found.english_name if found else "") or fish.review.species
     derived = derive(fish.length_mm, template, settings, species=species)
@@ -124,7 +123,7 @@ def fish_record(
 
 
 def fish_records(
-    fish: Sequence[FishResult],
+    fish: Sequence[Fish],
     template: Template,
     settings: FisheriesSettings,
     *,
@@ -156,7 +155,7 @@ def _ci95_mm(row: _Row, end: int) -> float | None:
     return None if ci95_mm is None else float(ci95_mm[end])
 
 
-def _length_from(fish: FishResult) -> str | None:
+def _length_from(fish: Fish) -> str | None:
     if fish.length_mm is None:
         return None
     return "measurement" if fish.review.length_mm is None else "review"

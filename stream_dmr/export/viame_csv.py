@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from stream_dmr.store.fish import FishResult, sure_code
+from stream_dmr.store.fish import Fish
 
 _HEADER = (
     "# 1: Detection or Track-id,2: Video or Image Identifier,3: Unique Frame Identifier,"
@@ -26,9 +26,9 @@ NO_LENGTH = -1
 class ViameTracks:
     """The rows of one recording, in the order of its frames."""
 
-    def __init__(self, fish: Iterable[FishResult], *, fps: float | None) -> None:
+    def __init__(self, fish: Iterable[Fish], *, fps: float | None) -> None:
         """`fps` of the frames; None: not known."""
-        self._fish: Mapping[int, FishResult] = {one.estimate.track_id: one for one in fish}
+        self._fish: Mapping[int, Fish] = {one.estimate.track_id: one for one in fish}
         self._head = f"{_HEADER}\n# metadata{'' if fps is None else f',fps: {fps:g}'}\n"
         self._rows = StringIO()
         self._writer = csv.writer(self._rows, lineterminator="\n")
@@ -69,14 +69,14 @@ class ViameTracks:
         return self._head + self._rows.getvalue()
 
 
-def _species(fish: FishResult | None) -> tuple[str, float]:
+def _species(fish: Fish | None) -> tuple[str, float]:
     """What it is, and how sure that is; "fish" where nobody knows more."""
     if fish is None:
         return "fish", 1.0
     if fish.review.species:
         return fish.review.species, 1.0
-    code = sure_code(fish)
-    return (code, fish.catch.species_share or 1.0) if code else ("fish", 1.0)
+    code = fish.sure_code
+    return (code, fish.estimate.species_share or 1.0) if code else ("fish", 1.0)
 
 
 def _time(timestamp_ns: int) -> str:

@@ -15,14 +15,11 @@ from stream_dmr.pipeline.config import HaulsSettings
 from stream_dmr.sources.sensors_settings import utc_ns_of
 from stream_dmr.store.fish import database_of, read_runs
 from stream_dmr.store.length_store import LengthStore
-from stream_dmr.store.schema import read_added
+from stream_dmr.store.schema import HAULS, WATCHED, add_row, read_rows
 from stream_dmr.store.trip import (
     END,
-    HAULS,
     START,
-    WATCHED,
     Haul,
-    add_haul,
     haul_at,
     haul_values,
     hauls_of,
@@ -64,7 +61,7 @@ class HaulLog:
     def hauls(self) -> list[Haul]:
         """All hauls of the folder so far; those that others wrote into it as well."""
         with self._lock, suppress(OutputError):
-            self._known = hauls_of(read_added(self._store.path, HAULS))
+            self._known = hauls_of(read_rows(self._store.path, HAULS))
         return self._known
 
     def current(self) -> Haul | None:
@@ -178,7 +175,7 @@ def write_haul(folder: Path, what: str, *, name: str, at: str | None, said_by: s
         raise UserError(
             f"{folder}: expected the --out of a run, found no lengths.db; check the path"
         )
-    hauls = hauls_of(read_added(database, HAULS))
+    hauls = hauls_of(read_rows(database, HAULS))
     timestamp_ns = _timestamp_ns(folder, database, at)
     if what == END:
         name = haul_at(hauls, timestamp_ns)
@@ -187,7 +184,8 @@ def write_haul(folder: Path, what: str, *, name: str, at: str | None, said_by: s
                 f"{folder}: expected a haul that goes on at that time, got none; begin one first"
             )
     name = name.strip() or next_name(hauls)
-    add_haul(database, haul_values(what, name, timestamp_ns, said_by))
+    row = haul_values(what, name, timestamp_ns, said_by)
+    add_row(database, HAULS, {"run_id": "", **row, "written_ns": time.time_ns()})
     if not is_locked(folder):
         seal_hauls(folder)
     return name

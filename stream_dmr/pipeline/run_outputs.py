@@ -38,10 +38,10 @@ from stream_dmr.sources.source import ResumePoint, Source
 from stream_dmr.store.fish import flagged_fish
 from stream_dmr.store.ledger import Signer
 from stream_dmr.store.length_store import LengthStore
-from stream_dmr.store.run_facts import CatchFacts, run_facts
+from stream_dmr.store.run_facts import run_facts
 from stream_dmr.store.run_tables import FramesTable, LengthsTable
-from stream_dmr.store.schema import INTERRUPTED
-from stream_dmr.store.trip import POSITIONS, KeptPosition, PositionThinner, position_values
+from stream_dmr.store.schema import INTERRUPTED, POSITIONS
+from stream_dmr.store.trip import KeptPosition, PositionThinner, position_values
 
 _SENSORS = SensorsSettings()
 
@@ -176,7 +176,7 @@ class ResultWriter:
         if estimate.track_id in self._interrupted:
             flags.append(INTERRUPTED)
         self._take_fish(estimate)
-        self._store.add(estimate, iou=iou, flags=flags, catch=CatchFacts.of(estimate))
+        self._store.add(estimate, iou=iou, flags=flags)
 
     def _take_fish(self, estimate: LengthEstimate) -> None:
         if self._hauls is not None:

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from stream_dmr.store.fish import FishResult, read_runs
-from stream_dmr.store.schema import read_added
-from stream_dmr.store.trip import HAULS, WATCHED, Haul, hauls_of
+from stream_dmr.store.fish import Fish, read_runs
+from stream_dmr.store.schema import HAULS, WATCHED, read_rows
+from stream_dmr.store.trip import Haul, hauls_of
 
 _HOUR_NS = 3_600_000_000_000
 
@@ -27,10 +27,10 @@ class HaulEffort:
     fates: Mapping[str, int] | None = None  # number of fish; None: nobody looked for any's fate
 
 
-def read_effort(database: Path, fish: Sequence[FishResult]) -> list[HaulEffort]:
+def read_effort(database: Path, fish: Sequence[Fish]) -> list[HaulEffort]:
     """The effort of each haul of a folder, and of what is outside of them. Raises OutputError."""
-    hauls = hauls_of(read_added(database, HAULS))
-    watched = read_added(database, WATCHED)
+    hauls = hauls_of(read_rows(database, HAULS))
+    watched = read_rows(database, WATCHED)
     if hauls:
         efforts = [_effort_of_hauls(named, watched, fish) for named in _by_name(hauls)]
         shares = [1.0 - _overlap(row, hauls) for row in watched]
@@ -53,7 +53,7 @@ def _by_name(hauls: Sequence[Haul]) -> list[list[Haul]]:
 
 
 def _effort_of_hauls(
-    hauls: Sequence[Haul], watched: Sequence[Mapping[str, Any]], fish: Sequence[FishResult]
+    hauls: Sequence[Haul], watched: Sequence[Mapping[str, Any]], fish: Sequence[Fish]
 ) -> HaulEffort:
     """Of hauls of one name; from the first start to the last end, without what lies between."""
     effort = _effort(hauls[0].name, watched, [_overlap(row, hauls) for row in watched], fish)
@@ -64,7 +64,7 @@ def _effort(
     name: str,
     watched: Sequence[Mapping[str, Any]],
     shares: Sequence[float],
-    fish: Sequence[FishResult],
+    fish: Sequence[Fish],
 ) -> HaulEffort:
     """`shares` (one a row of `watched`, 0 to 1): what of each watched time belongs to it."""
     parts = list(zip(watched, shares, strict=True))

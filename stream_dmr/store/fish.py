@@ -3,11 +3,10 @@
 import json
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate, Position
@@ -17,22 +16,23 @@ from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.sources.sensors_settings import SensorsSettings
 from stream_dmr.species import CODE, UNSURE, Species, find_species, load_species
 from stream_dmr.store.edits import TrackPart, edits_of
-from stream_dmr.store.run_facts import UNKNOWN_CATCH, CatchFacts, RunFacts, cut_short, run_facts
+from stream_dmr.store.run_facts import RunFacts, cut_short, run_facts
 from stream_dmr.store.scale_checks import last_checks
 from stream_dmr.store.schema import (
+    CATCH_COLUMNS,
+    FISH,
+    HAULS,
     MAY_COUNT_TWICE,
     NAME,
-    added_rows,
+    RUNS,
+    Table,
     estimate_of,
-    has_table,
-    open_for_reading,
-    read_estimates,
-    rows_of,
+    read_rows,
+    reading,
+    rows,
 )
 from stream_dmr.store.trip import (
-    HAULS,
     NOWHERE,
-    POSITIONS,
     VesselTrack,
     Whereabouts,
     haul_at,
@@ -50,19 +50,19 @@ from stream_dmr.store.verdicts import (
 )
 from stream_dmr.template.template import load_body_forms
 
-_CATCH_NAMES = [field.name for field in fields(CatchFacts)]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FishResult:
-    """One finished fish."""
+class Fish:
+    """A finished fish as measured and reviewed: the reviewer's word comes before the measurement.
+
+    Length and species as measured are those of `estimate`.
+    """
 
     estimate: LengthEstimate
     facts: RunFacts
     run_id: str  # "": of a recording without its database
     iou: float | None = None
     flags: Sequence[str] = ()
-    catch: CatchFacts = UNKNOWN_CATCH
     haul: str = ""
     where: Whereabouts = NOWHERE  # at `middle_ns`
     review: Review = NOT_REVIEWED
@@ -87,13 +87,13 @@ class FishResult:
 
     @property
     def may_count_twice(self) -> bool:
-        """True where it was in view at a crash, and maybe again after it."""
+        """True if it was in view at a crash, and maybe again after it."""
         return any(MAY_COUNT_TWICE in flag for flag in self.flags)
 
     @property
     def fate(self) -> str | None:
         """The reviewer's, else that of the zones."""
-        return self.catch.fate if self.review.fate is None else self.review.fate
+        return self.estimate.fate if self.review.fate is None else self.review.fate
 
     @property
     def length_mm(self) -> float | None:
@@ -101,26 +101,27 @@ class FishResult:
         corrected = self.review.length_mm
         return self.estimate.length_mm if corrected is None else corrected
 
+    @property
+    def species(self) -> Species | None:
+        """The species of the bundled list; None if it is not in there, or unknown."""
+        return find_species(self.review.species or self.estimate.species_code or "", load_species())
 
-class _Folder:
-    """What the fish of a lengths.db have in common: runs, hauls and the vessel's track."""
+    @property
+    def species_code(self) -> str | None:
+        """FAO 3-alpha, in a review also one that the list lacks; a classifier's may be unsure.
 
-    def __init__(self, connection: sqlite3.Connection) -> None:
-        self.runs = dict(_runs(connection))
-        self._hauls = hauls_of(added_rows(connection, HAULS))
-        self._track = VesselTrack(positions_of(added_rows(connection, POSITIONS)))
+        None if nobody looked, and for a name without a code.
+        """
+        named = self.review.species.strip()
+        if not named:
+            return self.estimate.species_code
+        return self.species.code if self.species else named if CODE.fullmatch(named) else None
 
-    def fish(self, estimate: LengthEstimate, run_id: str, **values: Any) -> FishResult:
-        """A fish of a run, with its haul and its place."""
-        facts, moment_ns = self.runs[run_id], middle_ns(estimate)
-        return FishResult(
-            estimate=estimate,
-            facts=facts,
-            run_id=run_id,
-            haul=haul_at(self._hauls, moment_ns) if self._hauls else facts.haul,
-            where=self._track.at(moment_ns),
-            **values,
-        )
+    @property
+    def sure_code(self) -> str:
+        """`species_code`, but "" if it is not known or unsure."""
+        code = self.species_code
+        return "" if code is None or code == UNSURE else code
 
 
 def middle_ns(estimate: LengthEstimate) -> int:
@@ -134,9 +135,7 @@ def database_of(path: Path) -> Path | None:
     return database if path.is_dir() and database.is_file() else None
 
 
-def read_fish(
-    path: Path, recording: Recording, selection: Selection = EVERYTHING
-) -> list[FishResult]:
+def read_fish(path: Path, recording: Recording, selection: Selection = EVERYTHING) -> list[Fish]:
     """The fish of a folder from its lengths.db, or from the recording where it has none.
 
     Raises OutputError or RecordingError where they can't be read.
@@ -152,11 +151,10 @@ def read_fish(
         ]
     facts, track = run_facts(recording.header), recorded_track(recording)
     return [
-        FishResult(
+        Fish(
             estimate=estimate,
             facts=facts,
             run_id="",
-            catch=CatchFacts.of(estimate),
             where=track.at(middle_ns(estimate)),
         )
         for estimate in messages_of(recording, LengthEstimate, selection)
@@ -171,60 +169,77 @@ def recorded_track(recording: Recording) -> VesselTrack:
     return VesselTrack(kept_of(positions, keep_s=settings.keep_s, max_gap_s=settings.max_gap_s))
 
 
-def read_stored_fish(database: Path) -> list[FishResult]:
+def read_stored_fish(database: Path) -> list[Fish]:
     """All fish of a lengths.db as reviewed: with those that were added, split and merged.
 
-    A fish that was merged into another stays, with that decision. Raises OutputError where the
-    file is damaged.
+    A fish that was merged into another stays, with that decision. Raises OutputError if the file
+    is damaged.
     """
-    verdicts = read_verdicts(database)
-    return _with_edits(database, _stored_fish(database, reviews_of(verdicts)), verdicts)
+    return _stored_fish(database, read_verdicts(database))
 
 
-def read_measured_fish(database: Path) -> list[FishResult]:
+def read_measured_fish(database: Path) -> list[Fish]:
     """All fish of a lengths.db as they were measured, without any review. OutputError likewise."""
-    return _stored_fish(database, {})
+    return _stored_fish(database, ())
 
 
-def _with_edits(
-    database: Path, measured: Sequence[FishResult], verdicts: Sequence[Verdict]
-) -> list[FishResult]:
-    """The fish with those that reviewers made; each is of the run of its first frames."""
-    edits, reviews = edits_of(verdicts), reviews_of(verdicts)
-    if not edits.fish:
-        return list(measured)
-    with closing(open_for_reading(database)) as connection:
-        folder = _Folder(connection)
-    tracks = {one.estimate.track_id: one for one in measured}
-    fish = dict(tracks)
-    for track_id, edited in edits.fish.items():
-        parts = sorted(edited.parts, key=lambda part: (part.last_frame, part.first_frame))
-        runs = [tracks[part.track_id].run_id for part in parts if part.track_id in tracks]
-        fish[track_id] = folder.fish(
-            estimate_of(edited.row),
-            runs[0] if runs else list(folder.runs)[-1],
-            iou=edited.row["iou"],
-            flags=json.loads(edited.row["flags"]),
-            catch=_catch_of(parts, tracks),
-            review=reviews.get(track_id, NOT_REVIEWED),
-            origin=edited.kind,
-        )
-    return list(fish.values())
+def _stored_fish(database: Path, verdicts: Sequence[Verdict]) -> list[Fish]:
+    reviews, edits = reviews_of(verdicts), edits_of(verdicts).fish
+    try:
+        with reading(database) as connection:
+            runs, stored = dict(_runs(connection)), list(rows(connection, FISH))
+            hauls = hauls_of(rows(connection, HAULS))
+            vessel = VesselTrack(positions_of(connection))
+
+        def fish(row: Mapping[str, Any], estimate: LengthEstimate, run_id: str, **of: str) -> Fish:
+            moment_ns = middle_ns(estimate)
+            return Fish(
+                estimate=estimate,
+                facts=runs[run_id],
+                run_id=run_id,
+                iou=row["iou"],
+                flags=json.loads(row["flags"]),
+                haul=haul_at(hauls, moment_ns) if hauls else runs[run_id].haul,
+                where=vessel.at(moment_ns),
+                review=reviews.get(estimate.track_id, NOT_REVIEWED),
+                **of,
+            )
+
+        tracks = {row["track_id"]: fish(row, estimate_of(row), row["run_id"]) for row in stored}
+        made = dict[int, Fish]()
+        for track_id, edited in edits.items():
+            parts = sorted(edited.parts, key=lambda part: (part.last_frame, part.first_frame))
+            known = [tracks[part.track_id] for part in parts if part.track_id in tracks]
+            estimate = _with_catch(estimate_of(edited.row), parts, known)
+            run_id = known[0].run_id if known else list(runs)[-1]  # that of its first frames
+            made[track_id] = fish(edited.row, estimate, run_id, origin=edited.kind)
+    except (ValueError, KeyError) as error:
+        raise OutputError(
+            f"{database}: expected the fish of its runs, got: {error!r}; the file is damaged"
+        ) from error
+    return list((tracks | made).values())
 
 
-def _catch_of(parts: Sequence[TrackPart], tracks: Mapping[int, FishResult]) -> CatchFacts:
-    """Of a fish of several parts of tracks: its fate is that of the track that it ends with."""
-    known = [tracks[part.track_id] for part in parts if part.track_id in tracks]
+def _with_catch(
+    estimate: LengthEstimate, parts: Sequence[TrackPart], known: Sequence[Fish]
+) -> LengthEstimate:
+    """With the species of the first track, and the fate of the last one unless that goes on."""
     if not known:
-        return UNKNOWN_CATCH
-    is_cut = parts[-1].last_frame < known[-1].estimate.last_frame
-    last = UNKNOWN_CATCH if is_cut else known[-1].catch
-    return replace(known[0].catch, fate=last.fate, fate_share=last.fate_share)
+        return estimate
+    first, last = known[0].estimate, known[-1].estimate
+    is_whole = parts[-1].last_frame >= last.last_frame
+    return replace(
+        estimate,
+        species_code=first.species_code,
+        species_share=first.species_share,
+        fate=last.fate if is_whole else None,
+        fate_share=last.fate_share if is_whole else None,
+    )
 
 
 def read_runs(database: Path) -> dict[str, RunFacts]:
     """The facts of the runs by run id, in their order. Raises OutputError."""
-    with closing(open_for_reading(database)) as connection:
+    with reading(database) as connection:
         return dict(_runs(connection))
 
 
@@ -253,94 +268,35 @@ def numbers_its_own(folder: Path) -> bool:
 
 def run_times(database: Path) -> dict[str, list[int | None]]:
     """When each run began and ended, ns of the wall clock."""
-    with closing(open_for_reading(database)) as connection:
-        rows = connection.execute("SELECT run_id, started_ns, ended_ns FROM runs")
-        return {run_id: [started, ended] for run_id, started, ended in rows}
+    runs = read_rows(database, RUNS)
+    return {run["run_id"]: [run["started_ns"], run["ended_ns"]] for run in runs}
 
 
-def rows_by_run(
-    database: Path, table: Literal["fish", "events", "positions", "watched"]
-) -> dict[str, list[str]]:
+def rows_by_run(database: Path, table: Table) -> dict[str, list[str]]:
     """Every stored value of the rows of each run, as lines of JSON, for checksums.
 
-    `CatchFacts` only where they have a value, by name: older databases lack their columns.
+    CATCH_COLUMNS are there by name if they have a value, since older databases lack them.
     """
     lines: dict[str, list[str]] = {}
-    with closing(open_for_reading(database)) as connection:
-        if not has_table(connection, table):
-            return {}
-        for row in rows_of(connection, f"SELECT * FROM {table} ORDER BY number"):
-            added = {name: row.pop(name, None) for name in _CATCH_NAMES}
-            facts = {name: value for name, value in added.items() if value is not None}
-            line = [*row.values(), *([facts] if facts else [])]
-            lines.setdefault(row["run_id"], []).append(json.dumps(line, default=repr))
+    for row in read_rows(database, table):
+        added = {name: row.pop(name, None) for name in CATCH_COLUMNS}
+        facts = {name: value for name, value in added.items() if value is not None}
+        line = [*row.values(), *([facts] if facts else [])]
+        lines.setdefault(row["run_id"], []).append(json.dumps(line, default=repr))
     return lines
 
 
 def flagged_fish(out_dir: Path) -> set[int]:
-    """The ids of fish whose length has a flag. Raises OutputError where they can't be read."""
+    """The ids of fish whose length has a flag. Raises OutputError if they can't be read."""
     path = out_dir / NAME
-    if not path.exists():
-        return set()
-    try:
-        with closing(open_for_reading(path)) as connection:
-            rows = connection.execute("SELECT track_id FROM fish WHERE flags != '[]'")
-            return {track_id for (track_id,) in rows}
-    except sqlite3.Error as error:
-        raise OutputError(f"{path}: expected the flags of its fish, got: {error}") from error
+    stored = read_rows(path, FISH) if path.exists() else []
+    return {row["track_id"] for row in stored if row["flags"] != "[]"}
 
 
 def _runs(connection: sqlite3.Connection) -> Iterator[tuple[str, RunFacts]]:
-    for row in rows_of(connection, "SELECT * FROM runs ORDER BY started_ns"):
-        # An older database has fewer columns.
-        known = {f.name: row[f.name] for f in fields(RunFacts) if row.get(f.name) is not None}
+    for row in rows(connection, RUNS):
+        known = {f.name: row[f.name] for f in fields(RunFacts) if row[f.name] is not None}
         yield row["run_id"], RunFacts(**known)
-
-
-def _stored_fish(database: Path, reviews: dict[int, Review]) -> list[FishResult]:
-    try:
-        with closing(open_for_reading(database)) as connection:
-            folder = _Folder(connection)
-            estimates = read_estimates(connection)
-            others = rows_of(connection, "SELECT * FROM fish ORDER BY number")
-            return [
-                folder.fish(
-                    estimate,
-                    other["run_id"],
-                    iou=other["iou"],
-                    flags=json.loads(other["flags"]),
-                    catch=CatchFacts(**{name: other.get(name) for name in _CATCH_NAMES}),
-                    review=reviews.get(estimate.track_id, NOT_REVIEWED),
-                )
-                for estimate, other in zip(estimates, others, strict=True)
-            ]
-    except (sqlite3.Error, ValueError, KeyError) as error:
-        raise OutputError(
-            f"{database}: expected the fish of its runs, got: {error!r}; the file is damaged"
-        ) from error
-
-
-def species_of(fish: FishResult) -> Species | None:
-    """That of the bundled list; None where it is not in there, or nobody knows."""
-    return find_species(fish.review.species or fish.catch.species_code or "", load_species())
-
-
-def code_of(fish: FishResult) -> str | None:
-    """FAO 3-alpha: a reviewer may also type one that the list lacks. A classifier's may be unsure.
-
-    None where nobody looked, and for a name without a code.
-    """
-    named = fish.review.species.strip()
-    if not named:
-        return fish.catch.species_code
-    found = species_of(fish)
-    return found.code if found else named if CODE.fullmatch(named) else None
-
-
-def sure_code(fish: FishResult) -> str:
-    """As `code_of`; "" where it is not known or unsure."""
-    code = code_of(fish)
-    return "" if code is None or code == UNSURE else code
 
 
 def is_same_species(one: str, other: str) -> bool:

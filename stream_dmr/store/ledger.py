@@ -11,7 +11,7 @@ import stat
 import time
 from base64 import b64decode, b64encode
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -22,13 +22,11 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.files import read_small
-from stream_dmr.store.schema import Statement, has_table, insertion, rows_of
+from stream_dmr.store.schema import CHECKS, LEDGER, Statement, insertion, records
 
-# Of an entry. A file that was "found" lay there when a run started, after a crash or renamed.
-FISH, EVENT, RUN, END, FILE, FOUND, REMOVED = (
-    *("fish", "event", "run", "end", "file", "found", "removed"),
-)
-STATE, CHECKS = "state", "checks"  # at the end of a run: what `store_state` reads
+# Kinds of entries beside those of tables: END and STATE (see `read_state`) at the end of a run. A
+# file that was FOUND lay there when a run started, after a crash or renamed.
+END, STATE, FILE, FOUND, REMOVED = "end", "state", "file", "found", "removed"
 FILE_KINDS = (FILE, FOUND, REMOVED)
 
 
@@ -167,20 +165,6 @@ def _canonical(values: Mapping[str, object]) -> bytes:
     return json.dumps(values, sort_keys=True, separators=(",", ":"), default=repr).encode()
 
 
-_NAMES = ", ".join(field.name for field in fields(ChainEntry))
-_TABLE = """
-CREATE TABLE IF NOT EXISTS chain (
-    number INTEGER PRIMARY KEY, -- from 1, without gaps
-    previous TEXT NOT NULL, -- SHA-256 of the entry before it
-    -- of what: fish, event, run, end, file, found, removed, state, checks
-    kind TEXT NOT NULL, name TEXT NOT NULL,
-    content_sha256 TEXT NOT NULL,
-    time_ns INTEGER NOT NULL, -- wall clock
-    signature TEXT NOT NULL -- Ed25519, base64
-) STRICT
-"""
-
-
 class ChainWriter:
     """Gives the statements that sign what a store writes, for the same transaction.
 
@@ -189,7 +173,6 @@ class ChainWriter:
 
     def __init__(self, signer: Signer | None, database: sqlite3.Connection) -> None:
         self._signer = signer
-        self._is_begun = False
         if signer is not None:
             entries = read_chain(database)
             signer.continue_after(entries[-1] if entries else None)
@@ -202,26 +185,16 @@ class ChainWriter:
         """Sign anything by its hash."""
         if self._signer is None:
             return []
-        begin: list[Statement] = [] if self._is_begun else [(_TABLE, ())]
-        self._is_begun = True
-        entry = self._signer.sign(kind, name, sha256)
-        return [*begin, insertion("chain", asdict(entry))]
+        return [insertion(LEDGER, asdict(self._signer.sign(kind, name, sha256)))]
 
 
 def read_chain(database: sqlite3.Connection) -> Sequence[ChainEntry]:
     """All entries in their order; none where nothing was signed."""
-    return [ChainEntry(**row) for row in chain_rows(database)]
-
-
-def chain_rows(database: sqlite3.Connection) -> Sequence[Mapping[str, Any]]:
-    """The rows of `chain` in their order, unchecked."""
-    if not has_table(database, "chain"):
-        return []
-    return list(rows_of(database, f"SELECT {_NAMES} FROM chain ORDER BY number"))
+    return records(database, LEDGER, ChainEntry)
 
 
 def is_entry(row: Mapping[str, Any]) -> bool:
     """True for a row of `chain` whose values are of the types of `ChainEntry`."""
     numbers = {"number", "time_ns"}
     typed = (isinstance(row[name], int if name in numbers else str) for name in row)
-    return all(typed) and (row["kind"] != CHECKS or row["name"].isdecimal())
+    return all(typed) and (row["kind"] != CHECKS.kind or row["name"].isdecimal())

@@ -9,7 +9,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from threading import RLock
 from typing import Literal
@@ -19,26 +19,30 @@ from stream_dmr.errors import OutputError
 from stream_dmr.files import FolderLock, ReservedSpace
 from stream_dmr.messages import LengthEstimate
 from stream_dmr.store.ledger import (
-    CHECKS,
     END,
-    EVENT,
     FILE_KINDS,
-    FISH,
-    RUN,
     STATE,
     ChainWriter,
     Signer,
     lines_sha256,
     read_chain,
 )
-from stream_dmr.store.run_facts import END_COLUMNS, NOT_ENDED, UNKNOWN_CATCH, CatchFacts, RunFacts
+from stream_dmr.store.run_facts import END_COLUMNS, NOT_ENDED, RunFacts
 from stream_dmr.store.schema import (
+    CATCH_COLUMNS,
+    CHECKS,
+    CLIPS,
+    EVENTS,
+    FISH,
+    MARK,
     MAY_COUNT_TWICE,
     NAME,
     REVIEWED_ID,
-    AddedTable,
+    RUNS,
+    WRITTEN,
     DiskRefusal,
     Statement,
+    Table,
     check_lines,
     copy_in_memory,
     fish_row,
@@ -46,12 +50,10 @@ from stream_dmr.store.schema import (
     open_for_writing,
     read_estimates,
     read_state,
+    rows,
     transaction,
 )
 
-MARK = "INSERT INTO marks VALUES (?1, ?2) ON CONFLICT (name) DO UPDATE SET value = ?2"
-WRITTEN = "written"
-"""The mark of how many statements were committed: a commit that failed may have been one."""
 _GET_WRITTEN = "SELECT value FROM marks WHERE name = ?"
 
 
@@ -236,22 +238,15 @@ class LengthStore:
         return ""
 
     def add(
-        self,
-        estimate: LengthEstimate,
-        *,
-        iou: float | None = None,
-        flags: Sequence[str] = (),
-        catch: CatchFacts = UNKNOWN_CATCH,
+        self, estimate: LengthEstimate, *, iou: float | None = None, flags: Sequence[str] = ()
     ) -> None:
         """Write a final estimate durably; `flags`: what a reader of this length must know.
 
         `iou`: median over its accepted frames, of mesh and mask.
         """
-        values = fish_row(estimate, flags) | {"iou": iou, "run_id": self.run_id} | asdict(catch)
-        values["written_ns"] = time.time_ns()
-        with self._lock:
-            signature = self._chain.row(FISH, str(estimate.track_id), values)
-            self._write(insertion("fish", values), *signature)
+        catch = {name: getattr(estimate, name) for name in CATCH_COLUMNS}
+        row = fish_row(estimate, flags) | {"iou": iou} | catch
+        self.append(FISH, str(estimate.track_id), row)
 
     def reserve_track(self, track_id: int) -> None:
         """Mark an id as used, durably: no later run in this folder uses it again."""
@@ -291,11 +286,9 @@ class LengthStore:
 
     def clips_before(self) -> tuple[set[str], dict[str, int]]:
         """The clips that earlier runs have finished, and the frames done of others."""
-        rows = self._rows.database.execute(
-            "SELECT name, frames_done, is_done FROM clips"
-        ).fetchall()
-        done = {name for name, _, is_done in rows if is_done}
-        return done, {name: frames for name, frames, is_done in rows if not is_done}
+        clips = list(rows(self._rows.database, CLIPS))
+        done = {clip["name"] for clip in clips if clip["is_done"]}
+        return done, {c["name"]: c["frames_done"] for c in clips if not c["is_done"]}
 
     def resume_after_ns(self) -> int:
         """The capture time after which a live source goes on, whatever the clock was set to."""
@@ -329,14 +322,10 @@ class LengthStore:
 
     def note(self, kind: str, text: str, *, timestamp_ns: int) -> None:
         """Write an event that readers of the lengths must know."""
-        values = {"run_id": self.run_id, "kind": kind, "text": text}
-        values |= {"timestamp_ns": timestamp_ns, "written_ns": time.time_ns()}
-        with self._lock:
-            signature = self._chain.row(EVENT, kind, values)
-            self._write(insertion("events", values), *signature)
+        self.append(EVENTS, kind, {"kind": kind, "text": text, "timestamp_ns": timestamp_ns})
 
     def append(
-        self, table: AddedTable, name: str, values: Mapping[str, object], *, is_urgent: bool = True
+        self, table: Table, name: str, values: Mapping[str, object], *, is_urgent: bool = True
     ) -> None:
         """Add a row of this run to a table, signed by `name`.
 
@@ -345,7 +334,7 @@ class LengthStore:
         row = {"run_id": self.run_id, **values, "written_ns": time.time_ns()}
         with self._lock:
             signature = self._chain.row(table.kind, name, row)
-            self._rows.pending += [(table.statement, ()), insertion(table.name, row), *signature]
+            self._rows.pending += [insertion(table, row), *signature]
             if is_urgent:
                 self._rows.write()
 
@@ -360,11 +349,11 @@ class LengthStore:
             entries = read_chain(self._rows.database)
         return {entry.name for entry in entries if entry.kind in FILE_KINDS}
 
-    def estimates(self, *, last: int | None = None) -> list[LengthEstimate]:
-        """The finished fish of this folder, in the order in which tracks ended; the `last` few."""
+    def estimates(self) -> list[LengthEstimate]:
+        """The finished fish of this folder, in the order in which tracks ended."""
         with self._lock:
             try:
-                return list(read_estimates(self._rows.database, last=last))
+                return read_estimates(self._rows.database)
             except sqlite3.Error as error:
                 raise OutputError(
                     f"{self.path}: expected a database of lengths, got: {error}; make room, or "
@@ -416,15 +405,15 @@ class LengthStore:
         state, checks = read_state(self._rows.database), check_lines(self._rows.database)
         return [
             *self._chain.row(STATE, self.run_id, state),
-            *self._chain.content(CHECKS, str(len(checks)), lines_sha256(checks)),
+            *self._chain.content(CHECKS.kind, str(len(checks)), lines_sha256(checks)),
         ]
 
     def _begin_run(self, *, waits_for_disk: bool) -> None:
         values = {"run_id": self.run_id, "started_ns": time.time_ns()}
         values |= {field.name: getattr(self._facts, field.name) for field in fields(self._facts)}
         begun = {k: v for k, v in values.items() if k not in END_COLUMNS}
-        signature = self._chain.row(RUN, self.run_id, begun)
-        self._rows.pending += [insertion("runs", values), *signature]
+        signature = self._chain.row(RUNS.kind, self.run_id, begun)
+        self._rows.pending += [insertion(RUNS, values), *signature]
         if self._rows.is_reached:
             self._rows.write()
             if self.trouble and not waits_for_disk:

@@ -1,10 +1,9 @@
-"""Facts of a run and of a caught fish, as lengths.db and provenance.json hold them."""
+"""Facts of a run, as lengths.db and provenance.json hold them."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any
 
-from stream_dmr.messages import LengthEstimate
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.version import __version__
 
@@ -19,10 +18,7 @@ END_COLUMNS = ("ended_ns", "ended_by", "frames_done", "frames_promised")
 
 @dataclass(frozen=True, kw_only=True)
 class RunFacts:
-    """The facts of one run; hashes are SHA-256 in hex; "" where there is none.
-
-    Each field is a column of `runs`, which older databases get when they are next written to.
-    """
+    """The facts of one run, a column of `runs` each. Hashes are SHA-256 in hex; "" for none."""
 
     source: str
     command: str
@@ -81,25 +77,3 @@ def run_facts(header: RunHeader) -> RunFacts:
         "template_sha256": hashes["template.pb"],
     }
     return RunFacts(**facts)
-
-
-@dataclass(frozen=True, kw_only=True)
-class CatchFacts:
-    """What a run found out about a fish; None where it did not.
-
-    Each field is a column of `fish`, which older databases get when they are next written to. A
-    value of None stands in no checksum, so that these stay as they were sealed.
-    """
-
-    species_code: str | None = None  # FAO 3-alpha, or "unsure"
-    species_share: float | None = None  # posterior probability of the likeliest species
-    fate: str | None = None  # what became of it: "landed", ...
-    fate_share: float | None = None  # of its body in that zone when it was last seen
-
-    @classmethod
-    def of(cls, estimate: LengthEstimate) -> "CatchFacts":
-        """Those that a final estimate has."""
-        return cls(**{field.name: getattr(estimate, field.name) for field in fields(cls)})
-
-
-UNKNOWN_CATCH = CatchFacts()

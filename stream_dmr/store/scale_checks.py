@@ -1,33 +1,14 @@
-"""Checks of the scale by a known length: a table of its own in lengths.db, rows are only added."""
+"""Checks of the scale by a known length; rows are only added."""
 
-import sqlite3
 import time
-from contextlib import closing, suppress
-from dataclasses import asdict, dataclass, fields, replace
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from stream_dmr.errors import OutputError
-from stream_dmr.store.schema import (
-    has_table,
-    insertion,
-    open_for_reading,
-    open_for_writing,
-    rows_of,
-)
-
-_TABLE = """
-CREATE TABLE IF NOT EXISTS checks (
-    number INTEGER PRIMARY KEY,
-    time_ns INTEGER NOT NULL, -- wall clock
-    source TEXT NOT NULL,
-    calibration_sha256 TEXT NOT NULL,
-    known_mm REAL NOT NULL, error_mm REAL NOT NULL,
-    error_percent REAL NOT NULL, worst_percent REAL NOT NULL,
-    limit_percent REAL NOT NULL -- an alarm beyond it
-) STRICT
-"""
+from stream_dmr.store.schema import CHECKS, add_row, reading, records
 
 _READ_EVERY_S = 5.0  # chosen: /health may be asked several times a second
 
@@ -58,9 +39,6 @@ class ScaleCheck:
         )
 
 
-_NAMES = [field.name for field in fields(ScaleCheck)]
-
-
 class ScaleAlarm:
     """The alarm of the last check of a calibration, for a run that goes on beside `check`."""
 
@@ -83,23 +61,11 @@ class ScaleAlarm:
 
 def add_check(database: Path, check: ScaleCheck) -> None:
     """Write a check into a lengths.db, durably. Raises OutputError."""
-    row = asdict(replace(check, time_ns=time.time_ns()))
-    try:
-        with closing(open_for_writing(database)) as connection:
-            connection.execute(_TABLE)
-            connection.execute(*insertion("checks", row))
-    except sqlite3.Error as error:
-        raise OutputError(f"{database}: expected room for a check, got: {error}") from error
+    add_row(database, CHECKS, asdict(replace(check, time_ns=time.time_ns())))
 
 
 def last_checks(database: Path) -> dict[str, ScaleCheck]:
     """The last check by the SHA-256 of its calibration. Raises OutputError."""
-    try:
-        with closing(open_for_reading(database)) as connection:
-            if not has_table(connection, "checks"):
-                return {}
-            query = f"SELECT {', '.join(_NAMES)} FROM checks ORDER BY number"
-            checks = [ScaleCheck(**row) for row in rows_of(connection, query)]
-    except sqlite3.Error as error:
-        raise OutputError(f"{database}: expected checks of the scale, got: {error}") from error
+    with reading(database) as connection:
+        checks = records(connection, CHECKS, ScaleCheck)
     return {check.calibration_sha256: check for check in checks}

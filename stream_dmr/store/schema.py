@@ -12,83 +12,17 @@ import shutil
 import sqlite3
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
-from dataclasses import MISSING, dataclass, fields
-from functools import partial
+from dataclasses import dataclass, fields
+from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, get_args, get_type_hints
+from typing import Any, TypeVar
 
 import numpy as np
 
 from stream_dmr.errors import OutputError
 from stream_dmr.messages import LengthEstimate
-from stream_dmr.store.run_facts import CatchFacts, RunFacts
-
-_KINDS: dict[Any, str] = {str: "TEXT", int: "INTEGER", float: "REAL"}
-
-Statement = tuple[str, tuple[object, ...]]
-"""SQL, and the values of its marks."""
-
-
-@contextmanager
-def transaction(database: sqlite3.Connection) -> Generator[None]:
-    """All that is executed within is written, or nothing of it where any of it raises."""
-    database.execute("BEGIN IMMEDIATE")
-    try:
-        yield
-        database.execute("COMMIT")
-    except BaseException:
-        with suppress(sqlite3.Error):
-            database.execute("ROLLBACK")
-        raise
-
-
-def insertion(table: str, values: Mapping[str, object]) -> Statement:
-    """The statement that adds a row; `values` by column."""
-    marks = ", ".join("?" for _ in values)
-    return f"INSERT INTO {table} ({', '.join(values)}) VALUES ({marks})", tuple(values.values())
-
-
-def rows_of(
-    database: sqlite3.Connection, query: str, values: tuple[object, ...] = ()
-) -> Iterator[dict[str, Any]]:
-    """The rows that a query finds, by column."""
-    found = database.execute(query, values)
-    names = [column[0] for column in found.description]
-    return (dict(zip(names, row, strict=True)) for row in found)
-
-
-def has_table(database: sqlite3.Connection, name: str) -> bool:
-    """True where there is a table of this name."""
-    query = "SELECT 1 FROM sqlite_master WHERE name = ? AND type = 'table'"
-    return database.execute(query, (name,)).fetchone() is not None
-
-
-def add_columns(database: sqlite3.Connection, table: str, columns: Mapping[str, str]) -> None:
-    """Add the columns (name -> type) that a table of an earlier version lacks."""
-    present = columns_of(database, table)
-    for name, kind in columns.items():
-        if name not in present:
-            database.execute(f"ALTER TABLE {table} ADD COLUMN {name} {kind}")
-
-
-def optional_columns(facts: type) -> dict[str, str]:
-    """The columns (name -> type) for the fields with a default: of str, int, float, or None."""
-    hints = get_type_hints(facts)
-    names = [field.name for field in fields(facts) if field.default is not MISSING]
-    return {name: _KINDS[(get_args(hints[name]) or (hints[name],))[0]] for name in names}
-
-
-def declaration(columns: Mapping[str, str]) -> str:
-    """The columns as CREATE TABLE takes them."""
-    return ", ".join(f"{name} {kind}" for name, kind in columns.items())
-
-
-def columns_of(database: sqlite3.Connection, table: str) -> set[str]:
-    """The names of a table's columns; none where there is no such table."""
-    return {column[1] for column in database.execute(f"PRAGMA table_info({table})")}
-
 
 NAME = "lengths.db"
 VERSION = 1  # PRAGMA user_version
@@ -99,15 +33,40 @@ _DISK_ERRORS = {
     *(sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
 }
 
-FISH_COLUMNS = [
-    *("track_id", "length_mm", "length_std_mm", "frames_seen", "frames_used", "first_frame"),
-    *("last_frame", "first_timestamp_ns", "last_timestamp_ns", "status"),
-]
-# Older databases get those that they lack, NULL in the rows that are there. Older versions read and
-# write tables that have them, so they need no new VERSION.
-_OPTIONAL_COLUMNS = {"runs": optional_columns(RunFacts), "fish": optional_columns(CatchFacts)}
-_TABLES = f"""
-CREATE TABLE runs (
+T = TypeVar("T")
+Statement = tuple[str, tuple[object, ...]]
+"""SQL, and the values of its marks."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of lengths.db; columns that older databases lack are last, and may be NULL."""
+
+    name: str
+    columns: str  # as in CREATE TABLE; its comments stand in the file as well
+    order: str = "number"  # of its rows
+    kind: str = ""  # of its rows in the ledger
+
+    @property
+    def statement(self) -> str:
+        """The SQL that makes it."""
+        return f"CREATE TABLE {self.name} ({self.columns}) STRICT"
+
+    @cached_property
+    def declared(self) -> "_Columns":
+        """The columns as declared here, whatever a file has."""
+        with closing(sqlite3.connect(":memory:")) as empty:
+            empty.execute(self.statement)
+            return _columns(empty, self.name)
+
+
+_Columns = Mapping[str, tuple[str, bool]]
+"""Type of each column, and whether it may be missing."""
+
+# Text of `runs`, `fish` and `verdicts` from the empty line on: what older databases lack.
+RUNS = Table(
+    "runs",
+    """
     run_id TEXT PRIMARY KEY,
     started_ns INTEGER NOT NULL, -- wall clock, ns since 1970
     ended_ns INTEGER, -- NULL: still going, or ended by a crash
@@ -117,9 +76,18 @@ CREATE TABLE runs (
     config_sha256 TEXT NOT NULL,
     calibration_sha256 TEXT NOT NULL, -- '': no calibration
     template_sha256 TEXT NOT NULL,
-    {declaration(_OPTIONAL_COLUMNS["runs"])}
-) STRICT;
-CREATE TABLE fish (
+
+    source_path TEXT, source_sha256 TEXT, boxes_path TEXT, boxes_sha256 TEXT, masks_path TEXT,
+    masks_sha256 TEXT, calibration_path TEXT, nmea_path TEXT, nmea_sha256 TEXT,
+    species_model_path TEXT, species_model_sha256 TEXT, vessel TEXT, trip TEXT, haul TEXT,
+    ended_by TEXT, frames_done INTEGER, frames_promised INTEGER, utc_zero_ns INTEGER
+""",
+    order="started_ns",
+    kind="run",
+)
+FISH = Table(
+    "fish",
+    """
     number INTEGER PRIMARY KEY, -- in the order in which the tracks ended
     track_id INTEGER NOT NULL UNIQUE,
     run_id TEXT NOT NULL REFERENCES runs,
@@ -132,26 +100,234 @@ CREATE TABLE fish (
     iou REAL, -- median of the frames that were accepted: mesh and mask
     flags TEXT NOT NULL, -- JSON: what a reader of this length must know, such as a moved camera
     written_ns INTEGER NOT NULL, -- wall clock
-    {declaration(_OPTIONAL_COLUMNS["fish"])}
-) STRICT;
-CREATE TABLE marks (name TEXT PRIMARY KEY, value INTEGER NOT NULL) STRICT;
-CREATE TABLE clips (
-    name TEXT PRIMARY KEY,
-    frames_done INTEGER NOT NULL, -- from its start, that have left the chain
-    is_done INTEGER NOT NULL -- 1: the clip after it has begun
-) STRICT;
-CREATE TABLE scenes (
-    calibration_sha256 TEXT PRIMARY KEY,
-    data BLOB NOT NULL -- what the camera saw when the calibration was first used here
-) STRICT;
-CREATE TABLE events (
+
+    species_code TEXT, species_share REAL, fate TEXT, fate_share REAL
+""",
+    kind="fish",
+)
+CATCH_COLUMNS = ("species_code", "species_share", "fate", "fate_share")
+EVENTS = Table(
+    "events",
+    """
     number INTEGER PRIMARY KEY,
     run_id TEXT NOT NULL REFERENCES runs,
     kind TEXT NOT NULL, text TEXT NOT NULL,
     timestamp_ns INTEGER NOT NULL, -- capture time
     written_ns INTEGER NOT NULL
-) STRICT;
-"""
+""",
+    kind="event",
+)
+HAULS = Table(
+    "hauls",
+    """
+    number INTEGER PRIMARY KEY,
+    run_id TEXT NOT NULL, -- the run that was told; '': a folder, after its run
+    what TEXT NOT NULL, -- start, end
+    name TEXT NOT NULL, -- of the haul
+    timestamp_ns INTEGER NOT NULL, -- on the clock of the frames
+    said_by TEXT NOT NULL, -- who or what said so
+    written_ns INTEGER NOT NULL -- wall clock
+""",
+    kind="haul",
+)
+WATCHED = Table(
+    "watched",
+    """
+    number INTEGER PRIMARY KEY,
+    run_id TEXT NOT NULL REFERENCES runs,
+    first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, -- frames without a pause, capture times
+    frames INTEGER NOT NULL, -- that were measured
+    frames_lost INTEGER NOT NULL, -- that came from the camera and were not
+    written_ns INTEGER NOT NULL -- wall clock
+""",
+    kind="watched",
+)
+POSITIONS = Table(
+    "positions",
+    """
+    number INTEGER PRIMARY KEY,
+    run_id TEXT NOT NULL REFERENCES runs,
+    timestamp_ns INTEGER NOT NULL, -- on the clock of the frames
+    utc_ns INTEGER, -- the receiver's, since 1970; NULL: it gave no date
+    latitude REAL NOT NULL, longitude REAL NOT NULL, -- degrees, WGS 84
+    speed_knots REAL, course_deg REAL, -- over ground
+    is_joined INTEGER NOT NULL, -- 0: positions are missing between the row before and this one
+    written_ns INTEGER NOT NULL -- wall clock
+""",
+    kind="position",
+)
+CHECKS = Table(
+    "checks",
+    """
+    number INTEGER PRIMARY KEY,
+    time_ns INTEGER NOT NULL, -- wall clock
+    source TEXT NOT NULL,
+    calibration_sha256 TEXT NOT NULL,
+    known_mm REAL NOT NULL, error_mm REAL NOT NULL,
+    error_percent REAL NOT NULL, worst_percent REAL NOT NULL,
+    limit_percent REAL NOT NULL -- an alarm beyond it
+""",
+    kind="checks",
+)
+VERDICTS = Table(
+    "verdicts",
+    """
+    number INTEGER PRIMARY KEY,
+    track_id INTEGER NOT NULL,
+    kind TEXT NOT NULL,
+    reason TEXT NOT NULL, -- of a rejection
+    species TEXT NOT NULL,
+    duplicate_of INTEGER, -- track id
+    frame_index INTEGER, -- of a correction: where its points were set; of a split: the first after
+    head_u REAL, head_v REAL, tail_u REAL, tail_v REAL, -- of a correction, frame pixels
+    length_mm REAL, length_std_mm REAL, -- of all frames that are corrected so far
+    reviewer TEXT NOT NULL,
+    written_ns INTEGER NOT NULL, -- wall clock
+
+    undoes INTEGER, other_fish INTEGER, fish TEXT, frames_sha256 TEXT, reading TEXT, fate TEXT,
+    condition TEXT
+""",
+)
+ADDED_FRAMES = Table(
+    "added_frames",
+    """
+    track_id INTEGER NOT NULL, frame_index INTEGER NOT NULL,
+    crop BLOB NOT NULL, fit BLOB NOT NULL, fish BLOB NOT NULL, -- messages, encoded as recorded
+    PRIMARY KEY (track_id, frame_index)
+""",
+    order="track_id, frame_index",
+)
+LEDGER = Table(
+    "chain",
+    """
+    number INTEGER PRIMARY KEY, -- from 1, without gaps
+    previous TEXT NOT NULL, -- SHA-256 of the entry before it
+    -- of what: fish, event, run, end, file, found, removed, state, checks
+    kind TEXT NOT NULL, name TEXT NOT NULL,
+    content_sha256 TEXT NOT NULL,
+    time_ns INTEGER NOT NULL, -- wall clock
+    signature TEXT NOT NULL -- Ed25519, base64
+""",
+)
+MARKS = Table("marks", "name TEXT PRIMARY KEY, value INTEGER NOT NULL", order="name")
+CLIPS = Table(
+    "clips",
+    """
+    name TEXT PRIMARY KEY,
+    frames_done INTEGER NOT NULL, -- from its start, that have left the chain
+    is_done INTEGER NOT NULL -- 1: the clip after it has begun
+""",
+    order="name",
+)
+SCENES = Table(
+    "scenes",
+    """
+    calibration_sha256 TEXT PRIMARY KEY,
+    data BLOB NOT NULL -- what the camera saw when the calibration was first used here
+""",
+    order="calibration_sha256",
+)
+TABLES = (
+    *(RUNS, FISH, EVENTS, HAULS, WATCHED, POSITIONS, CHECKS, VERDICTS, ADDED_FRAMES, LEDGER),
+    *(MARKS, CLIPS, SCENES),
+)
+
+
+def ensure(database: sqlite3.Connection) -> None:
+    """Make the tables and columns that are missing, all of them or none.
+
+    Older programs read and write files that have more, so user_version stays.
+    """
+    if _missing(database):
+        with transaction(database):
+            for statement in _missing(database):
+                database.execute(statement)
+
+
+def _missing(database: sqlite3.Connection) -> list[str]:
+    (version,) = database.execute("PRAGMA user_version").fetchone()
+    if version == 0:  # new; or of another program, if such a table is there
+        marks = f"PRAGMA application_id = {APPLICATION_ID}", f"PRAGMA user_version = {VERSION}"
+        return [*(table.statement for table in TABLES), *marks]
+    statements = list[str]()
+    for table in TABLES:
+        if present := _columns(database, table.name):
+            columns = (f"{n} {k}" for n, (k, _) in table.declared.items() if n not in present)
+            statements += [f"ALTER TABLE {table.name} ADD COLUMN {column}" for column in columns]
+        else:
+            statements.append(table.statement)
+    return statements
+
+
+def _columns(database: sqlite3.Connection, table: str) -> _Columns:
+    found = database.execute(f"PRAGMA table_info({table})")
+    return {name: (kind, not (required or key)) for _, name, kind, required, _, key in found}
+
+
+def rows(database: sqlite3.Connection, table: Table) -> Iterator[dict[str, Any]]:
+    """The rows in their order, by column: None in columns that are missing.
+
+    There are none if the table is missing.
+    """
+    present = _columns(database, table.name)
+    names = [n for n, (_, is_optional) in table.declared.items() if n in present or not is_optional]
+    if present:
+        query = f"SELECT {', '.join(names)} FROM {table.name} ORDER BY {table.order}"
+        for row in database.execute(query):
+            yield dict.fromkeys(table.declared) | dict(zip(names, row, strict=True))
+
+
+def records(database: sqlite3.Connection, table: Table, kind: type[T]) -> list[T]:
+    """The rows as objects of a dataclass whose fields are columns."""
+    names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
+    return [kind(**{name: row[name] for name in names}) for row in rows(database, table)]
+
+
+@contextmanager
+def refusing(path: Path) -> Generator[None]:
+    """Raise an error of SQLite as OutputError."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise OutputError(f"{path}: expected a database of lengths, got: {error}") from error
+
+
+@contextmanager
+def reading(path: Path) -> Generator[sqlite3.Connection]:
+    """A lengths.db, open for reading. Raises OutputError, also if what is read is damaged."""
+    with refusing(path), closing(open_for_reading(path)) as database:
+        yield database
+
+
+def read_rows(path: Path, table: Table) -> list[dict[str, Any]]:
+    """The rows of a table. Raises OutputError."""
+    with reading(path) as database:
+        return list(rows(database, table))
+
+
+def add_row(path: Path, table: Table, values: Mapping[str, object]) -> None:
+    """Write a row into a lengths.db, durably. Raises OutputError."""
+    with refusing(path), closing(open_for_writing(path)) as database:
+        database.execute(*insertion(table, values))
+
+
+def insertion(table: Table, values: Mapping[str, object]) -> Statement:
+    """The statement that adds a row; `values` by column."""
+    marks = ", ".join("?" for _ in values)
+    return f"INSERT INTO {table.name} ({', '.join(values)}) VALUES ({marks})", (*values.values(),)
+
+
+@contextmanager
+def transaction(database: sqlite3.Connection) -> Generator[None]:
+    """Write all that is executed within, or nothing if any of it raises."""
+    database.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+        database.execute("COMMIT")
+    except BaseException:
+        with suppress(sqlite3.Error):
+            database.execute("ROLLBACK")
+        raise
 
 
 class DiskRefusal(OutputError):
@@ -229,7 +405,7 @@ def _opened(address: str, path: Path, *, make_tables: bool = False) -> sqlite3.C
         _check(database, path)
         if make_tables:
             _prepare(database)
-        elif not has_table(database, "fish"):
+        elif not _columns(database, FISH.name):
             raise sqlite3.DatabaseError("it has no tables: nothing could ever be written")
     except BaseException:
         database.close()
@@ -298,80 +474,34 @@ def _check(database: sqlite3.Connection, path: Path) -> None:
 def _prepare(database: sqlite3.Connection) -> None:
     database.execute("PRAGMA journal_mode = WAL")
     database.execute("PRAGMA synchronous = FULL")
-    (version,) = database.execute("PRAGMA user_version").fetchone()
-    if version == 0:
-        database.executescript(
-            f"BEGIN; {_TABLES} PRAGMA application_id = {APPLICATION_ID}; "
-            f"PRAGMA user_version = {VERSION}; COMMIT;"
-        )
-    for table, columns in _OPTIONAL_COLUMNS.items():
-        add_columns(database, table, columns)
+    ensure(database)
 
 
-@dataclass(frozen=True, kw_only=True)
-class AddedTable:
-    """One table; its first column is `number INTEGER PRIMARY KEY`."""
-
-    name: str
-    kind: str  # of its rows in the chain of signatures
-    columns: str  # SQL, after `number`
-
-    @property
-    def statement(self) -> str:
-        """The SQL that makes it."""
-        return (
-            f"CREATE TABLE IF NOT EXISTS {self.name} (number INTEGER PRIMARY KEY, {self.columns}) "
-            "STRICT"
-        )
-
-
-def read_added(database: Path, table: AddedTable) -> Sequence[Mapping[str, Any]]:
-    """The rows of a table in the order of writing, without their numbers; none where it is missing.
-
-    Raises OutputError.
-    """
-    try:
-        with closing(open_for_reading(database)) as connection:
-            return added_rows(connection, table)
-    except sqlite3.Error as error:
-        raise OutputError(f"{database}: expected its {table.name}, got: {error}") from error
-
-
-def added_rows(connection: sqlite3.Connection, table: AddedTable) -> list[dict[str, Any]]:
-    """As `read_added`, of an open database."""
-    if not has_table(connection, table.name):
-        return []
-    rows = list(rows_of(connection, f"SELECT * FROM {table.name} ORDER BY number"))
-    for row in rows:
-        del row["number"]
-    return rows
-
-
-# The mark of the last id that a reviewer gave to a fish. Verdicts are summed up by themselves.
-REVIEWED_ID = "reviewed_id"
-
-# "written" counts the statements of a store, also those that sign: no sum can hold it.
-_MARKS = (
-    f"SELECT name, value FROM marks WHERE name NOT IN ('written', '{REVIEWED_ID}') ORDER BY name"
-)
-_CLIPS = "SELECT name, frames_done, is_done FROM clips ORDER BY name"
-_SCENES = "SELECT calibration_sha256, data FROM scenes ORDER BY calibration_sha256"
+MARK = "INSERT INTO marks VALUES (?1, ?2) ON CONFLICT (name) DO UPDATE SET value = ?2"
+REVIEWED_ID = "reviewed_id"  # the mark of the last id that a reviewer gave to a fish
+WRITTEN = "written"
+"""The mark of how many statements were committed: a commit that failed may have been one."""
 
 
 def read_state(database: sqlite3.Connection) -> Mapping[str, object]:
-    """Marks, clips and scenes, these by their hashes; a run changes them as it goes on."""
+    """Marks, clips and scenes, these by their hashes; a run changes them as it goes on.
+
+    Without the marks of what is written (statements that sign are counted too) and reviewed.
+    """
+    marks = [[*row.values()] for row in rows(database, MARKS)]
     return {
-        "marks": [[*row] for row in database.execute(_MARKS)],
-        "clips": [[*row] for row in database.execute(_CLIPS)],
-        "scenes": [[key, sha256(data).hexdigest()] for key, data in database.execute(_SCENES)],
+        "marks": [mark for mark in marks if mark[0] not in (WRITTEN, REVIEWED_ID)],
+        "clips": [[*row.values()] for row in rows(database, CLIPS)],
+        "scenes": [
+            [row["calibration_sha256"], sha256(row["data"]).hexdigest()]
+            for row in rows(database, SCENES)
+        ],
     }
 
 
 def check_lines(database: sqlite3.Connection) -> Sequence[str]:
     """The checks of the scale in their order, each as a line of JSON; rows are only added."""
-    if not has_table(database, "checks"):
-        return []
-    return [json.dumps(row) for row in database.execute("SELECT * FROM checks ORDER BY number")]
+    return [json.dumps([*row.values()]) for row in rows(database, CHECKS)]
 
 
 MAY_COUNT_TWICE = "may count twice"
@@ -379,10 +509,16 @@ MAY_COUNT_TWICE = "may count twice"
 INTERRUPTED = f"{MAY_COUNT_TWICE}: interrupted by a restart, finished with what was recorded"
 
 
+_ESTIMATE_COLUMNS = [
+    *("track_id", "length_mm", "length_std_mm", "frames_seen", "frames_used", "first_frame"),
+    *("last_frame", "first_timestamp_ns", "last_timestamp_ns", "status"),
+]
+
+
 def fish_row(estimate: LengthEstimate, flags: Sequence[str]) -> dict[str, object]:
-    """The columns of a final estimate; `flags`: what a reader of its length must know."""
+    """The columns of a final estimate but CATCH_COLUMNS, which an edit of a fish has not."""
     low, high = (None, None) if estimate.ci95_mm is None else estimate.ci95_mm.tolist()
-    row: dict[str, object] = {name: getattr(estimate, name) for name in FISH_COLUMNS}
+    row: dict[str, object] = {name: getattr(estimate, name) for name in _ESTIMATE_COLUMNS}
     return row | {
         "ci95_low_mm": low,
         "ci95_high_mm": high,
@@ -391,24 +527,16 @@ def fish_row(estimate: LengthEstimate, flags: Sequence[str]) -> dict[str, object
     }
 
 
-def read_estimates(
-    database: sqlite3.Connection, *, last: int | None = None
-) -> Iterator[LengthEstimate]:
-    """The final estimates, or the `last` few; the recordings have their smoothed series."""
-    names = [*FISH_COLUMNS, "ci95_low_mm", "ci95_high_mm", "refused"]
-    known = columns_of(database, "fish")
-    names += [field.name for field in fields(CatchFacts) if field.name in known]
-    wanted = "" if last is None else "WHERE number > (SELECT MAX(number) FROM fish) - ?"
-    query = f"SELECT {', '.join(names)} FROM fish {wanted} ORDER BY number"
-    for row in rows_of(database, query, () if last is None else (last,)):
-        yield estimate_of(row)
+def read_estimates(database: sqlite3.Connection) -> list[LengthEstimate]:
+    """The final estimates; the recordings have their smoothed series."""
+    return [estimate_of(row) for row in rows(database, FISH)]
 
 
 def estimate_of(row: Mapping[str, Any]) -> LengthEstimate:
-    """The final estimate of a row that `fish_row` made, without its smoothed series."""
+    """The final estimate of a row of `fish`, without its smoothed series."""
     low, high = row["ci95_low_mm"], row["ci95_high_mm"]
-    values: dict[str, Any] = {name: row[name] for name in FISH_COLUMNS}
-    values |= {field.name: row.get(field.name) for field in fields(CatchFacts)}
+    values: dict[str, Any] = {name: row[name] for name in _ESTIMATE_COLUMNS}
+    values |= {name: row.get(name) for name in CATCH_COLUMNS}
     return LengthEstimate(
         **values,
         refused=json.loads(row["refused"]),

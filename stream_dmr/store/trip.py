@@ -1,41 +1,16 @@
 """Hauls, positions and the track of the vessel."""
 
-import time
+import sqlite3
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from stream_dmr.errors import OutputError
 from stream_dmr.messages import Position
-from stream_dmr.store.schema import AddedTable, insertion, open_for_writing, read_added
+from stream_dmr.store.schema import POSITIONS, reading, rows
 
 START, END = "start", "end"
-HAULS = AddedTable(
-    name="hauls",
-    kind="haul",
-    columns="""
-    run_id TEXT NOT NULL, -- the run that was told; '': a folder, after its run
-    what TEXT NOT NULL, -- start, end
-    name TEXT NOT NULL, -- of the haul
-    timestamp_ns INTEGER NOT NULL, -- on the clock of the frames
-    said_by TEXT NOT NULL, -- who or what said so
-    written_ns INTEGER NOT NULL -- wall clock
-""",
-)
-WATCHED = AddedTable(
-    name="watched",
-    kind="watched",
-    columns="""
-    run_id TEXT NOT NULL REFERENCES runs,
-    first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, -- frames without a pause, capture times
-    frames INTEGER NOT NULL, -- that were measured
-    frames_lost INTEGER NOT NULL, -- that came from the camera and were not
-    written_ns INTEGER NOT NULL -- wall clock
-""",
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +29,7 @@ class Haul:
 
 
 def hauls_of(rows: Iterable[Mapping[str, Any]]) -> list[Haul]:
-    """The hauls that events make, in their order.
+    """The hauls that rows of `hauls` make, in their order.
 
     A start ends the haul before it; an end without a start means nothing.
     """
@@ -82,32 +57,6 @@ def next_name(hauls: Iterable[Haul]) -> str:
 def haul_values(what: str, name: str, timestamp_ns: int, said_by: str) -> dict[str, Any]:
     """The columns of an event, without the run and the time of writing."""
     return {"what": what, "name": name, "timestamp_ns": timestamp_ns, "said_by": said_by}
-
-
-def add_haul(database: Path, values: Mapping[str, Any]) -> None:
-    """Write an event into a lengths.db, durably and not signed. Raises OutputError."""
-    row = {"run_id": "", **values, "written_ns": time.time_ns()}
-    try:
-        with closing(open_for_writing(database)) as connection:
-            connection.execute(HAULS.statement)
-            connection.execute(*insertion(HAULS.name, row))
-    except OSError as error:
-        raise OutputError(f"{database}: expected room for a haul, got: {error}") from error
-
-
-POSITIONS = AddedTable(
-    name="positions",
-    kind="position",
-    columns="""
-    run_id TEXT NOT NULL REFERENCES runs,
-    timestamp_ns INTEGER NOT NULL, -- on the clock of the frames
-    utc_ns INTEGER, -- the receiver's, since 1970; NULL: it gave no date
-    latitude REAL NOT NULL, longitude REAL NOT NULL, -- degrees, WGS 84
-    speed_knots REAL, course_deg REAL, -- over ground
-    is_joined INTEGER NOT NULL, -- 0: positions are missing between the row before and this one
-    written_ns INTEGER NOT NULL -- wall clock
-""",
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,17 +125,15 @@ def position_values(kept: KeptPosition) -> Mapping[str, object]:
 
 def read_positions(database: Path) -> list[KeptPosition]:
     """All positions of a lengths.db, in the order of writing. Raises OutputError."""
-    return positions_of(read_added(database, POSITIONS))
+    with reading(database) as connection:
+        return positions_of(connection)
 
 
-def positions_of(rows: Sequence[Mapping[str, Any]]) -> list[KeptPosition]:
-    """The rows of the table as positions."""
+def positions_of(database: sqlite3.Connection) -> list[KeptPosition]:
+    """The positions of an open lengths.db, in the order of writing."""
     return [
-        KeptPosition(
-            **{name: row[name] for name in _NAMES if name != "is_joined"},
-            is_joined=bool(row["is_joined"]),
-        )
-        for row in rows
+        KeptPosition(**{n: row[n] for n in _NAMES} | {"is_joined": bool(row["is_joined"])})
+        for row in rows(database, POSITIONS)
     ]
 
 

@@ -24,7 +24,7 @@ from stream_dmr.pipeline.config import Config
 from stream_dmr.recording.reading import Recording, known_shapes
 from stream_dmr.store.edits import NO_EDITS, TrackEdits
 from stream_dmr.store.effort import HaulEffort
-from stream_dmr.store.fish import FishResult, sure_code
+from stream_dmr.store.fish import Fish
 from stream_dmr.store.fisheries import FisheriesSettings
 from stream_dmr.store.trip import VesselTrack
 from stream_dmr.tables import utc_text
@@ -40,7 +40,7 @@ class RunReport:
 
     path: Path
     recording: Recording
-    fish: Sequence[FishResult]
+    fish: Sequence[Fish]
     tracks: Mapping[int, RecordedTrack]  # by track id
     views: DrawnViews
     config: Config  # of the run
@@ -90,7 +90,7 @@ def trip_section(
     return f"{title}{table}{drawn}"
 
 
-def _heading(fish: Sequence[FishResult]) -> str:
+def _heading(fish: Sequence[Fish]) -> str:
     """Vessel, trip and hauls, and the time from the first fish to the last."""
     parts = [
         _named("", {one.facts.vessel for one in fish}),
@@ -130,7 +130,7 @@ def _haul_rows(report: RunReport, *, many: bool) -> list[str]:
 
 
 def _haul_row(
-    effort: HaulEffort, counted: Sequence[FishResult], zero_ns: int | None, *, title: str
+    effort: HaulEffort, counted: Sequence[Fish], zero_ns: int | None, *, title: str
 ) -> str:
     fish = [one for one in counted if one.haul == effort.haul]
     row = haul_row(effort, utc_zero_ns=zero_ns)
@@ -152,9 +152,9 @@ def _haul_row(
     return f"<tr>{row_cells}</tr>"
 
 
-def _species(fish: FishResult) -> str:
+def _species(fish: Fish) -> str:
     """Its code; without one what was said of it."""
-    return sure_code(fish) or fish.review.species or fish.catch.species_code or ""
+    return fish.sure_code or fish.review.species or fish.estimate.species_code or ""
 
 
 def _hours(hours: float) -> str:
@@ -244,7 +244,7 @@ class PlacedReport:
         """The number of a fish in the page."""
         return self.run * _MAX_TRACKS + track_id
 
-    def row(self, fish: FishResult) -> dict[str, Any]:
+    def row(self, fish: Fish) -> dict[str, Any]:
         """The row of a fish in the table of the page; `id` is its number in the page."""
         row = summary_row(fish, self.report)
         if not self.is_one_of_many:
@@ -285,7 +285,7 @@ def _fill_template(title: str, data: str, scripts: Sequence[str], *, trip: str) 
     return "".join(parts[piece] if k % 2 else piece for k, piece in enumerate(pieces))
 
 
-def summary_row(fish: FishResult, report: RunReport) -> dict[str, Any]:
+def summary_row(fish: Fish, report: RunReport) -> dict[str, Any]:
     """The row of a fish in the table: that of fish.csv, and its best view, small."""
     record = fish_record(fish, report.recording.header.template, report.settings)
     of_run = asdict(fish.facts)
@@ -307,7 +307,7 @@ def summary_row(fish: FishResult, report: RunReport) -> dict[str, Any]:
     }
 
 
-def _moved_points(fish: FishResult, views: Sequence[DrawnView]) -> dict[int, Any]:
+def _moved_points(fish: Fish, views: Sequence[DrawnView]) -> dict[int, Any]:
     """Frame index -> the head and tail points that a reviewer has set, in pixels of the crop."""
     by_frame = {view.recorded.row.fish.frame_index: view for view in views}
     return {
@@ -322,7 +322,7 @@ def _moved_points(fish: FishResult, views: Sequence[DrawnView]) -> dict[int, Any
     }
 
 
-def fish_detail(fish: FishResult, report: RunReport) -> dict[str, Any]:
+def fish_detail(fish: Fish, report: RunReport) -> dict[str, Any]:
     """What a row opens: best views, every frame, the mesh."""
     views = report.views.get(fish.estimate.track_id, [])
     track = report.tracks.get(fish.estimate.track_id)

@@ -11,7 +11,7 @@ import numpy as np
 
 from stream_dmr.errors import ConfigError, OutputError, UserError
 from stream_dmr.species import load_species
-from stream_dmr.store.fish import FishResult, database_of, read_measured_fish
+from stream_dmr.store.fish import Fish, database_of, read_measured_fish
 from stream_dmr.store.verdicts import NOT_REVIEWED
 from stream_dmr.web.clip import fish_clip
 from stream_dmr.web.report_page import PlacedReport, RunReport, fish_detail, place, render_page
@@ -103,7 +103,7 @@ class ReviewQueue:
 
     def _fish(
         self, run: int, wanted: set[int] | None = None
-    ) -> Iterator[tuple[FishResult, dict[str, Any]]]:
+    ) -> Iterator[tuple[Fish, dict[str, Any]]]:
         """The fish of a run as this reader sees them, with their rows."""
         report, reviews, _ = self._recorder(run).said()
         placed = replace(self.placed[run], report=report)

@@ -105,7 +105,7 @@ class RunState:
             self.num_fish[without_counts(status)] += number
         self.species.update(store.counts("species_code"))
         self.fates.update(store.counts("fate"))
-        self.finished.extend(store.estimates(last=MAX_FINISHED))
+        self.finished.extend(store.estimates())
 
     def take(self, message: Message) -> None:
         """Keep what the page shows of a message; no picture is copied."""

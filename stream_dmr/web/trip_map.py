@@ -9,7 +9,7 @@ from typing import Any
 
 from stream_dmr.errors import UserError, reason_of
 from stream_dmr.files import read_text
-from stream_dmr.store.fish import FishResult, sure_code
+from stream_dmr.store.fish import Fish
 from stream_dmr.store.trip import VesselTrack
 
 Line = Sequence[tuple[float, float]]  # longitude and latitude of each point, degrees
@@ -73,7 +73,7 @@ _COLOURS = ("#1668a8", "#d55e00", "#16824a", "#8a4fa3", "#b8860b", "#b3372c")
 
 
 def draw_map(
-    tracks: Sequence[VesselTrack], fish: Sequence[FishResult], coast: Sequence[Line] = ()
+    tracks: Sequence[VesselTrack], fish: Sequence[Fish], coast: Sequence[Line] = ()
 ) -> str:
     """A figure of SVG with its key; "" without a position. Fish have a colour for each haul."""
     pieces = [
@@ -106,13 +106,13 @@ def draw_map(
     )
 
 
-def _dot(fish: FishResult, view: "_View", colour: str) -> str:
+def _dot(fish: Fish, view: "_View", colour: str) -> str:
     where = fish.where
     if where.latitude is None or where.longitude is None:
         return ""
     x, y = view.point((where.longitude, where.latitude)).split(",")
     length = "no length" if fish.length_mm is None else f"{fish.length_mm / 10:.1f} cm"
-    facts = (f"fish {fish.estimate.track_id}", length, sure_code(fish), fish.fate)
+    facts = (f"fish {fish.estimate.track_id}", length, fish.sure_code, fish.fate)
     title = escape(", ".join(fact for fact in facts if fact))
     return f'<circle cx="{x}" cy="{y}" r="4" fill="{colour}"><title>{title}</title></circle>'
 

@@ -11,8 +11,7 @@ import pytest
 
 from stream_dmr.export.agency_tables import RDBES_COLUMNS, WCPFC_COLUMNS, rdbes_row, wcpfc_row
 from stream_dmr.export.viame_csv import ViameTracks
-from stream_dmr.store.fish import FishResult, sure_code
-from stream_dmr.store.run_facts import CatchFacts
+from stream_dmr.store.fish import Fish
 from stream_dmr.store.trip import Whereabouts
 from stream_dmr.store.verdicts import Review, Verdict, add_verdict
 from stream_dmr.template.template_file import load_template
@@ -22,12 +21,12 @@ from tests.support.fish_run import measure
 from tests.support.nmea import START_NS
 
 TEMPLATE = load_template("halibut")
-HALIBUT = FishResult(
-    estimate=fish(7, length_mm=1234.5),
+SURE: dict[str, object] = {"species_code": "HAL", "species_share": 0.9}
+HALIBUT = Fish(
+    estimate=fish(7, length_mm=1234.5, **SURE, fate="landed", fate_share=1.0),
     facts=replace(FACTS, vessel="Sea Bird", trip="T1"),
     run_id="0123456789abcdef",
     haul="3",
-    catch=CatchFacts(species_code="HAL", species_share=0.9, fate="landed", fate_share=1.0),
     where=Whereabouts(utc_ns=START_NS, latitude=57.5, longitude=-152.25, speed_knots=3.0),
 )
 
@@ -47,9 +46,8 @@ def test_a_line_of_each_table():
 def test_what_is_not_known_stays_empty():
     unknown = replace(
         HALIBUT,
-        estimate=fish(7, length_mm=None),
+        estimate=fish(7, length_mm=None, species_code="unsure", species_share=0.4),
         where=Whereabouts(),
-        catch=CatchFacts(species_code="unsure", species_share=0.4),
     )
     for row in (wcpfc_row(unknown, TEMPLATE), rdbes_row(unknown, TEMPLATE)):
         known = {name for name, value in row.items() if value}
@@ -63,7 +61,7 @@ def test_what_is_not_known_stays_empty():
     ("reviewed", "expected"), [("", "HAL"), ("COD", "COD"), ("Albacore", "ALB"), ("sea hag", "")]
 )
 def test_the_reviewers_species_comes_first(reviewed: str, expected: str):
-    assert sure_code(replace(HALIBUT, review=Review(species=reviewed))) == expected
+    assert replace(HALIBUT, review=Review(species=reviewed)).sure_code == expected
 
 
 @pytest.mark.parametrize("decision", ["reject", "duplicate", "merge"])

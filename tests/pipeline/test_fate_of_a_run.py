@@ -43,7 +43,7 @@ def printed(clip: Path) -> str:
 
 def fates(folder: Path) -> dict[int, str | None]:
     return {
-        one.estimate.track_id: one.catch.fate for one in read_stored_fish(folder / "lengths.db")
+        one.estimate.track_id: one.estimate.fate for one in read_stored_fish(folder / "lengths.db")
     }
 
 
@@ -51,8 +51,8 @@ def test_a_run_stores_prints_exports_and_counts_fates(clip: Path, printed: str, 
     out = clip / "out"
     assert fates(out) == {1: "landed", 2: "unknown"}
     first, second = read_stored_fish(out / "lengths.db")
-    assert first.catch.fate_share == pytest.approx(1.0)
-    assert second.catch.fate_share is None
+    assert first.estimate.fate_share == pytest.approx(1.0)
+    assert second.estimate.fate_share is None
     assert "fate: 1 landed, 1 unknown" in printed
     assert invoke("export", {str(out): None, "--fish": "csv", "--out": str(tmp_path)}).code == 0
     assert [row["fate"] for row in rows(tmp_path / "fish.csv")] == ["landed", "unknown"]

@@ -56,8 +56,8 @@ def out(scene: Path, model: Path) -> Path:
 
 def test_every_fish_has_its_species(out: Path, scene: Path):
     fish = read_stored_fish(out / "lengths.db")
-    assert {one.estimate.track_id: one.catch.species_code for one in fish} == species_of(scene)
-    assert all(0.8 <= (one.catch.species_share or 0) <= 1 for one in fish)
+    assert {one.estimate.track_id: one.estimate.species_code for one in fish} == species_of(scene)
+    assert all(0.8 <= (one.estimate.species_share or 0) <= 1 for one in fish)
     assert "species: 2 HAP, 2 COE" in (scene / "printed.txt").read_text()
 
 
@@ -104,5 +104,5 @@ def test_a_higher_threshold_makes_fish_unsure(out: Path, tmp_path: Path):
     outcome = invoke(f"replay {out} --from smooth --config {config} --out {tmp_path / 'again'}")
     assert outcome.code == 0, outcome.err
     fish = read_stored_fish(tmp_path / "again" / "lengths.db")
-    assert {one.catch.species_code for one in fish} == {"unsure"}
-    assert all((one.catch.species_share or 0) > 0.8 for one in fish)
+    assert {one.estimate.species_code for one in fish} == {"unsure"}
+    assert all((one.estimate.species_share or 0) > 0.8 for one in fish)

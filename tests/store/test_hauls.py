@@ -16,7 +16,6 @@ from stream_dmr.pipeline.haul_log import HaulLog, write_haul
 from stream_dmr.store.effort import read_effort
 from stream_dmr.store.fish import read_stored_fish
 from stream_dmr.store.length_store import LengthStore
-from stream_dmr.store.run_facts import CatchFacts
 from stream_dmr.store.trip import haul_at, haul_values, hauls_of
 from tests.support.final_estimates import FACTS, fish
 
@@ -96,7 +95,7 @@ def test_fish_are_counted_by_fate_with_each_haul(tmp_path: Path):
     store = LengthStore(tmp_path, replace(FACTS, haul="7"))
     fates = ["landed", "unknown", "cut off", "landed", None]
     for track_id, fate in enumerate(fates, start=1):
-        store.add(at(track_id, 10.0 * track_id), catch=CatchFacts(fate=fate))
+        store.add(replace(at(track_id, 10.0 * track_id), fate=fate))
     store.close()
     found = read_stored_fish(store.path)
     (effort,) = read_effort(store.path, found)

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,33 @@ from hypothesis import strategies as st
 
 from stream_dmr.errors import OutputError
 from stream_dmr.evidence.seal import sealed
-from stream_dmr.store.fish import read_runs
+from stream_dmr.store.fish import read_runs, read_stored_fish
+from stream_dmr.store.ledger import ChainEntry
 from stream_dmr.store.length_store import LengthStore
+from stream_dmr.store.run_facts import RunFacts
 from stream_dmr.store.run_tables import lengths_row
-from stream_dmr.store.schema import open_for_reading, open_for_writing
+from stream_dmr.store.scale_checks import ScaleCheck
+from stream_dmr.store.schema import (
+    ADDED_FRAMES,
+    CHECKS,
+    CLIPS,
+    EVENTS,
+    FISH,
+    HAULS,
+    LEDGER,
+    MARKS,
+    POSITIONS,
+    RUNS,
+    SCENES,
+    TABLES,
+    VERDICTS,
+    Table,
+    open_for_reading,
+    open_for_writing,
+    read_rows,
+)
+from stream_dmr.store.trip import KeptPosition
+from stream_dmr.store.verdicts import AddedFrame, Verdict, add_verdict, read_verdicts
 from tests.support.final_estimates import FACTS, fish
 from tests.support.small_disk import fill, small_disk
 
@@ -105,6 +128,31 @@ def test_a_database_from_before_a_column_is_read_and_gone_on_with(store: LengthS
     again.end("a test")
     again.close()
     assert list(read_runs(store.path).values()) == [FACTS, replace(facts, ended_by="a test")]
+
+
+def test_a_database_of_the_first_tables_is_read_and_gone_on_with(store: LengthStore):
+    store.add(fish(1))
+    store.close()
+    first = {RUNS, FISH, EVENTS, MARKS, CLIPS, SCENES}
+    with closing(sqlite3.connect(store.path)) as database:
+        for table in set(TABLES) - first:
+            database.execute(f"DROP TABLE {table.name}")
+    (before,) = read_stored_fish(store.path)
+    assert (read_rows(store.path, HAULS), read_verdicts(store.path)) == ([], [])
+    add_verdict(store.path, Verdict(track_id=1, kind="reject", reviewer="Ada", reason="bent"))
+    (after,) = read_stored_fish(store.path)
+    assert (before.counts, after.counts) == (True, False)
+
+
+@pytest.mark.parametrize(
+    ("table", "kind"),
+    [
+        *((RUNS, RunFacts), (CHECKS, ScaleCheck), (VERDICTS, Verdict), (LEDGER, ChainEntry)),
+        *((ADDED_FRAMES, AddedFrame), (POSITIONS, KeptPosition)),
+    ],
+)
+def test_fields_are_columns(table: Table, kind: type):
+    assert {field.name for field in fields(kind)} <= table.declared.keys()
 
 
 def test_one_file_is_left(store: LengthStore):

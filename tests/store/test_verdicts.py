@@ -139,6 +139,7 @@ def test_a_blind_reading_changes_no_review():
 
 def test_a_table_of_an_older_version_is_read_and_written_on(database: Path):
     with closing(sqlite3.connect(database)) as older:
+        older.execute("DROP TABLE verdicts")
         older.execute(
             "CREATE TABLE verdicts (number INTEGER PRIMARY KEY, track_id INTEGER NOT NULL, kind "
             "TEXT NOT NULL, reason TEXT NOT NULL, species TEXT NOT NULL, duplicate_of INTEGER, "

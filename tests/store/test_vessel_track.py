@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from stream_dmr.messages import Position
 from stream_dmr.store.fish import read_stored_fish
 from stream_dmr.store.length_store import LengthStore
-from stream_dmr.store.schema import read_added
+from stream_dmr.store.schema import POSITIONS, read_rows
 from stream_dmr.store.trip import (
-    POSITIONS,
     KeptPosition,
     PositionThinner,
     VesselTrack,
@@ -95,7 +94,7 @@ def test_each_stored_fish_has_its_place(tmp_path: Path):
     for one in kept([0, 10, 20, 120, 130]):  # the positions after a fish may come later
         store.append(POSITIONS, "x", position_values(one), is_urgent=False)
     store.close()
-    assert len(read_added(store.path, POSITIONS)) == 5
+    assert len(read_rows(store.path, POSITIONS)) == 5
     assert read_positions(store.path) == kept([0, 10, 20, 120, 130])
     first, second, third = read_stored_fish(store.path)
     assert (first.where.latitude, first.utc_ns) == (57.0, START_NS + 12 * SECOND)

@@ -8,8 +8,8 @@ import pytest
 
 from stream_dmr.errors import OutputError
 from stream_dmr.files import ReservedSpace
-from stream_dmr.store.length_store import MARK, WaitingRows
-from stream_dmr.store.schema import NAME
+from stream_dmr.store.length_store import WaitingRows
+from stream_dmr.store.schema import MARK, NAME
 
 
 def mark(name: str, value: int) -> tuple[str, tuple[object, ...]]:
