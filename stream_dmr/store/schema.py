@@ -13,7 +13,7 @@ import sqlite3
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, fields
-from functools import cached_property, partial
+from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -38,56 +38,22 @@ Statement = tuple[str, tuple[object, ...]]
 """SQL, and the values of its marks."""
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table of lengths.db; columns that older databases lack are last, and may be NULL."""
-
-    name: str
-    columns: str  # as in CREATE TABLE; its comments stand in the file as well
-    order: str = "number"  # of its rows
-    kind: str = ""  # of its rows in the ledger
-
-    @property
-    def statement(self) -> str:
-        """The SQL that makes it."""
-        return f"CREATE TABLE {self.name} ({self.columns}) STRICT"
-
-    @cached_property
-    def declared(self) -> "_Columns":
-        """The columns as declared here, whatever a file has."""
-        with closing(sqlite3.connect(":memory:")) as empty:
-            empty.execute(self.statement)
-            return _columns(empty, self.name)
-
-
-_Columns = Mapping[str, tuple[str, bool]]
-"""Type of each column, and whether it may be missing."""
-
-# Text of `runs`, `fish` and `verdicts` from the empty line on: what older databases lack.
-RUNS = Table(
-    "runs",
-    """
+# Columns that older databases lack are the last of their table, and may be NULL.
+_SQL = """
+CREATE TABLE runs (
     run_id TEXT PRIMARY KEY,
     started_ns INTEGER NOT NULL, -- wall clock, ns since 1970
     ended_ns INTEGER, -- NULL: still going, or ended by a crash
-    source TEXT NOT NULL,
-    command TEXT NOT NULL,
-    software_version TEXT NOT NULL,
+    source TEXT NOT NULL, command TEXT NOT NULL, software_version TEXT NOT NULL,
     config_sha256 TEXT NOT NULL,
     calibration_sha256 TEXT NOT NULL, -- '': no calibration
     template_sha256 TEXT NOT NULL,
-
     source_path TEXT, source_sha256 TEXT, boxes_path TEXT, boxes_sha256 TEXT, masks_path TEXT,
     masks_sha256 TEXT, calibration_path TEXT, nmea_path TEXT, nmea_sha256 TEXT,
     species_model_path TEXT, species_model_sha256 TEXT, vessel TEXT, trip TEXT, haul TEXT,
     ended_by TEXT, frames_done INTEGER, frames_promised INTEGER, utc_zero_ns INTEGER
-""",
-    order="started_ns",
-    kind="run",
-)
-FISH = Table(
-    "fish",
-    """
+) STRICT;
+CREATE TABLE fish (
     number INTEGER PRIMARY KEY, -- in the order in which the tracks ended
     track_id INTEGER NOT NULL UNIQUE,
     run_id TEXT NOT NULL REFERENCES runs,
@@ -100,26 +66,16 @@ FISH = Table(
     iou REAL, -- median of the frames that were accepted: mesh and mask
     flags TEXT NOT NULL, -- JSON: what a reader of this length must know, such as a moved camera
     written_ns INTEGER NOT NULL, -- wall clock
-
     species_code TEXT, species_share REAL, fate TEXT, fate_share REAL
-""",
-    kind="fish",
-)
-CATCH_COLUMNS = ("species_code", "species_share", "fate", "fate_share")
-EVENTS = Table(
-    "events",
-    """
+) STRICT;
+CREATE TABLE events (
     number INTEGER PRIMARY KEY,
     run_id TEXT NOT NULL REFERENCES runs,
     kind TEXT NOT NULL, text TEXT NOT NULL,
     timestamp_ns INTEGER NOT NULL, -- capture time
     written_ns INTEGER NOT NULL
-""",
-    kind="event",
-)
-HAULS = Table(
-    "hauls",
-    """
+) STRICT;
+CREATE TABLE hauls (
     number INTEGER PRIMARY KEY,
     run_id TEXT NOT NULL, -- the run that was told; '': a folder, after its run
     what TEXT NOT NULL, -- start, end
@@ -127,24 +83,16 @@ HAULS = Table(
     timestamp_ns INTEGER NOT NULL, -- on the clock of the frames
     said_by TEXT NOT NULL, -- who or what said so
     written_ns INTEGER NOT NULL -- wall clock
-""",
-    kind="haul",
-)
-WATCHED = Table(
-    "watched",
-    """
+) STRICT;
+CREATE TABLE watched (
     number INTEGER PRIMARY KEY,
     run_id TEXT NOT NULL REFERENCES runs,
     first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, -- frames without a pause, capture times
     frames INTEGER NOT NULL, -- that were measured
     frames_lost INTEGER NOT NULL, -- that came from the camera and were not
     written_ns INTEGER NOT NULL -- wall clock
-""",
-    kind="watched",
-)
-POSITIONS = Table(
-    "positions",
-    """
+) STRICT;
+CREATE TABLE positions (
     number INTEGER PRIMARY KEY,
     run_id TEXT NOT NULL REFERENCES runs,
     timestamp_ns INTEGER NOT NULL, -- on the clock of the frames
@@ -153,12 +101,8 @@ POSITIONS = Table(
     speed_knots REAL, course_deg REAL, -- over ground
     is_joined INTEGER NOT NULL, -- 0: positions are missing between the row before and this one
     written_ns INTEGER NOT NULL -- wall clock
-""",
-    kind="position",
-)
-CHECKS = Table(
-    "checks",
-    """
+) STRICT;
+CREATE TABLE checks (
     number INTEGER PRIMARY KEY,
     time_ns INTEGER NOT NULL, -- wall clock
     source TEXT NOT NULL,
@@ -166,12 +110,8 @@ CHECKS = Table(
     known_mm REAL NOT NULL, error_mm REAL NOT NULL,
     error_percent REAL NOT NULL, worst_percent REAL NOT NULL,
     limit_percent REAL NOT NULL -- an alarm beyond it
-""",
-    kind="checks",
-)
-VERDICTS = Table(
-    "verdicts",
-    """
+) STRICT;
+CREATE TABLE verdicts (
     number INTEGER PRIMARY KEY,
     track_id INTEGER NOT NULL,
     kind TEXT NOT NULL,
@@ -183,23 +123,15 @@ VERDICTS = Table(
     length_mm REAL, length_std_mm REAL, -- of all frames that are corrected so far
     reviewer TEXT NOT NULL,
     written_ns INTEGER NOT NULL, -- wall clock
-
     undoes INTEGER, other_fish INTEGER, fish TEXT, frames_sha256 TEXT, reading TEXT, fate TEXT,
     condition TEXT
-""",
-)
-ADDED_FRAMES = Table(
-    "added_frames",
-    """
+) STRICT;
+CREATE TABLE added_frames (
     track_id INTEGER NOT NULL, frame_index INTEGER NOT NULL,
     crop BLOB NOT NULL, fit BLOB NOT NULL, fish BLOB NOT NULL, -- messages, encoded as recorded
     PRIMARY KEY (track_id, frame_index)
-""",
-    order="track_id, frame_index",
-)
-LEDGER = Table(
-    "chain",
-    """
+) STRICT;
+CREATE TABLE chain (
     number INTEGER PRIMARY KEY, -- from 1, without gaps
     previous TEXT NOT NULL, -- SHA-256 of the entry before it
     -- of what: fish, event, run, end, file, found, removed, state, checks
@@ -207,30 +139,60 @@ LEDGER = Table(
     content_sha256 TEXT NOT NULL,
     time_ns INTEGER NOT NULL, -- wall clock
     signature TEXT NOT NULL -- Ed25519, base64
-""",
-)
-MARKS = Table("marks", "name TEXT PRIMARY KEY, value INTEGER NOT NULL", order="name")
-CLIPS = Table(
-    "clips",
-    """
+) STRICT;
+CREATE TABLE clips (
     name TEXT PRIMARY KEY,
     frames_done INTEGER NOT NULL, -- from its start, that have left the chain
     is_done INTEGER NOT NULL -- 1: the clip after it has begun
-""",
-    order="name",
-)
-SCENES = Table(
-    "scenes",
-    """
+) STRICT;
+CREATE TABLE scenes (
     calibration_sha256 TEXT PRIMARY KEY,
     data BLOB NOT NULL -- what the camera saw when the calibration was first used here
-""",
-    order="calibration_sha256",
-)
-TABLES = (
-    *(RUNS, FISH, EVENTS, HAULS, WATCHED, POSITIONS, CHECKS, VERDICTS, ADDED_FRAMES, LEDGER),
-    *(MARKS, CLIPS, SCENES),
-)
+) STRICT;
+CREATE TABLE marks (name TEXT PRIMARY KEY, value INTEGER NOT NULL) STRICT;
+"""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of lengths.db."""
+
+    name: str
+    order: str = "number"  # of its rows
+    kind: str = ""  # of its rows in the ledger
+
+    @property
+    def columns(self) -> "_Columns":
+        """The columns as declared, whatever a file has."""
+        return _declared()[self.name][1]
+
+
+_Columns = Mapping[str, tuple[str, bool]]
+"""Type of each column, and whether it may be missing."""
+
+RUNS = Table("runs", order="started_ns", kind="run")
+FISH = Table("fish", kind="fish")
+EVENTS = Table("events", kind="event")
+HAULS = Table("hauls", kind="haul")
+WATCHED = Table("watched", kind="watched")
+POSITIONS = Table("positions", kind="position")
+CHECKS = Table("checks", kind="checks")
+VERDICTS = Table("verdicts")
+ADDED_FRAMES = Table("added_frames", order="track_id, frame_index")
+LEDGER = Table("chain")
+MARKS = Table("marks", order="name")
+CLIPS = Table("clips", order="name")
+SCENES = Table("scenes", order="calibration_sha256")
+CATCH_COLUMNS = ("species_code", "species_share", "fate", "fate_share")
+
+
+@cache
+def _declared() -> Mapping[str, tuple[str, _Columns]]:
+    """SQL and columns of each table."""
+    with closing(sqlite3.connect(":memory:")) as empty:
+        empty.executescript(_SQL)
+        made = empty.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'").fetchall()
+        return {name: (statement, _columns(empty, name)) for name, statement in made}
 
 
 def ensure(database: sqlite3.Connection) -> None:
@@ -246,16 +208,19 @@ def ensure(database: sqlite3.Connection) -> None:
 
 def _missing(database: sqlite3.Connection) -> list[str]:
     (version,) = database.execute("PRAGMA user_version").fetchone()
-    if version == 0:  # new; or of another program, if such a table is there
-        marks = f"PRAGMA application_id = {APPLICATION_ID}", f"PRAGMA user_version = {VERSION}"
-        return [*(table.statement for table in TABLES), *marks]
     statements = list[str]()
-    for table in TABLES:
-        if present := _columns(database, table.name):
-            columns = (f"{n} {k}" for n, (k, _) in table.declared.items() if n not in present)
-            statements += [f"ALTER TABLE {table.name} ADD COLUMN {column}" for column in columns]
-        else:
-            statements.append(table.statement)
+    if version == 0:  # new; or of another program, if such a table is there
+        statements += [
+            f"PRAGMA application_id = {APPLICATION_ID}",
+            f"PRAGMA user_version = {VERSION}",
+        ]
+    for table, (statement, columns) in _declared().items():
+        present = _columns(database, table) if version else {}
+        if not present:
+            statements.append(statement)
+            continue
+        missing = (f"{name} {kind}" for name, (kind, _) in columns.items() if name not in present)
+        statements += [f"ALTER TABLE {table} ADD COLUMN {column}" for column in missing]
     return statements
 
 
@@ -270,11 +235,11 @@ def rows(database: sqlite3.Connection, table: Table) -> Iterator[dict[str, Any]]
     There are none if the table is missing.
     """
     present = _columns(database, table.name)
-    names = [n for n, (_, is_optional) in table.declared.items() if n in present or not is_optional]
+    names = [n for n, (_, is_optional) in table.columns.items() if n in present or not is_optional]
     if present:
         query = f"SELECT {', '.join(names)} FROM {table.name} ORDER BY {table.order}"
         for row in database.execute(query):
-            yield dict.fromkeys(table.declared) | dict(zip(names, row, strict=True))
+            yield dict.fromkeys(table.columns) | dict(zip(names, row, strict=True))
 
 
 def records(database: sqlite3.Connection, table: Table, kind: type[T]) -> list[T]:
