@@ -67,6 +67,7 @@ from stream_dmr.store.run_tables import FRAMES_COLUMNS, LENGTHS_COLUMNS, frames_
 from stream_dmr.store.schema import (
     CATCH_COLUMNS,
     CHECKS,
+    ESTIMATE_COLUMNS,
     EVENTS,
     FISH,
     HAULS,
@@ -251,11 +252,6 @@ def unsealed_rows(database: Path, made: Mapping[str, Any]) -> Iterator[str]:
 
 
 _MADE_BY = ("config_sha256", "calibration_sha256", "template_sha256")
-_COMPARED = (
-    *("length_mm", "length_std_mm", "frames_seen", "frames_used", "first_frame", "last_frame"),
-    *("first_timestamp_ns", "last_timestamp_ns", "status"),
-)
-
 
 Checks = Mapping[str, Callable[[Path], Iterable[tuple[Path, str]]]]
 """By the file that a folder has: what is found there, each with the file that it concerns."""
@@ -482,7 +478,7 @@ def _estimate(path: Path, recorded: LengthEstimate, fish: _Row | None) -> Iterat
     if fish is None:
         yield Change(database, f"fish {recorded.track_id} is missing; {path.name} has it")
         return
-    for name in (*_COMPARED, *CATCH_COLUMNS):
+    for name in (*ESTIMATE_COLUMNS, *CATCH_COLUMNS):
         stored, measured = fish.get(name), getattr(recorded, name)
         if stored != measured:
             what = f"fish {recorded.track_id}: {name} is {stored}, {path.name} says {measured}"

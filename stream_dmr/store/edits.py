@@ -181,13 +181,8 @@ def frames_of_tracks(
             if last is None or fish.frame_index <= last:
                 frames[fish.track_id].append(fish)
     for track_id in wanted & added.keys():
-        frames[track_id] = [localized(frame) for frame in added[track_id]]
+        frames[track_id] = [decode(LocalizedFish, frame.fish) for frame in added[track_id]]
     return frames
-
-
-def localized(frame: AddedFrame) -> LocalizedFish:
-    """The last message of a frame that a reviewer added."""
-    return decode(LocalizedFish, frame.fish)
 
 
 def frames_of_parts(

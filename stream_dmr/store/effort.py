@@ -32,7 +32,12 @@ def read_effort(database: Path, fish: Sequence[Fish]) -> list[HaulEffort]:
     hauls = hauls_of(read_rows(database, HAULS))
     watched = read_rows(database, WATCHED)
     if hauls:
-        efforts = [_effort_of_hauls(named, watched, fish) for named in _by_name(hauls)]
+        efforts = list[HaulEffort]()
+        for name in dict.fromkeys(haul.name for haul in hauls):
+            named = [haul for haul in hauls if haul.name == name]  # it may begin again after others
+            effort = _effort(name, watched, [_overlap(row, named) for row in watched], fish)
+            ends = {"began_ns": named[0].began_ns, "ended_ns": named[-1].ended_ns}
+            efforts.append(replace(effort, **ends))
         shares = [1.0 - _overlap(row, hauls) for row in watched]
         outside = _effort("", watched, shares, fish)
         is_worth_a_row = outside.num_fish or outside.hours_watched > 1e-3
@@ -42,22 +47,6 @@ def read_effort(database: Path, fish: Sequence[Fish]) -> list[HaulEffort]:
         _effort(name, watched, [float(by_run.get(r["run_id"]) == name) for r in watched], fish)
         for name in dict.fromkeys(by_run.values())
     ]
-
-
-def _by_name(hauls: Sequence[Haul]) -> list[list[Haul]]:
-    """The hauls of each name: one may be begun, ended, and begun again after others."""
-    named: dict[str, list[Haul]] = {}
-    for haul in hauls:
-        named.setdefault(haul.name, []).append(haul)
-    return list(named.values())
-
-
-def _effort_of_hauls(
-    hauls: Sequence[Haul], watched: Sequence[Mapping[str, Any]], fish: Sequence[Fish]
-) -> HaulEffort:
-    """Of hauls of one name; from the first start to the last end, without what lies between."""
-    effort = _effort(hauls[0].name, watched, [_overlap(row, hauls) for row in watched], fish)
-    return replace(effort, began_ns=hauls[0].began_ns, ended_ns=hauls[-1].ended_ns)
 
 
 def _effort(

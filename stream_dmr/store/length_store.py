@@ -54,8 +54,6 @@ from stream_dmr.store.schema import (
     transaction,
 )
 
-_GET_WRITTEN = "SELECT value FROM marks WHERE name = ?"
-
 
 class WaitingRows:
     """Statements for a lengths.db, in order, and its connection. Not thread-safe.
@@ -159,8 +157,7 @@ class WaitingRows:
 
 
 def _num_written(database: sqlite3.Connection) -> int:
-    row = database.execute(_GET_WRITTEN, (WRITTEN,)).fetchone()
-    return 0 if row is None else row[0]
+    return dict(database.execute("SELECT name, value FROM marks")).get(WRITTEN, 0)
 
 
 _MARK_EVERY_NS = 5_000_000_000  # capture times that a crash may leave unmarked; chosen

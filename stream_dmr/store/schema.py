@@ -474,7 +474,7 @@ MAY_COUNT_TWICE = "may count twice"
 INTERRUPTED = f"{MAY_COUNT_TWICE}: interrupted by a restart, finished with what was recorded"
 
 
-_ESTIMATE_COLUMNS = [
+ESTIMATE_COLUMNS = [
     *("track_id", "length_mm", "length_std_mm", "frames_seen", "frames_used", "first_frame"),
     *("last_frame", "first_timestamp_ns", "last_timestamp_ns", "status"),
 ]
@@ -483,7 +483,7 @@ _ESTIMATE_COLUMNS = [
 def fish_row(estimate: LengthEstimate, flags: Sequence[str]) -> dict[str, object]:
     """The columns of a final estimate but CATCH_COLUMNS, which an edit of a fish has not."""
     low, high = (None, None) if estimate.ci95_mm is None else estimate.ci95_mm.tolist()
-    row: dict[str, object] = {name: getattr(estimate, name) for name in _ESTIMATE_COLUMNS}
+    row: dict[str, object] = {name: getattr(estimate, name) for name in ESTIMATE_COLUMNS}
     return row | {
         "ci95_low_mm": low,
         "ci95_high_mm": high,
@@ -500,7 +500,7 @@ def read_estimates(database: sqlite3.Connection) -> list[LengthEstimate]:
 def estimate_of(row: Mapping[str, Any]) -> LengthEstimate:
     """The final estimate of a row of `fish`, without its smoothed series."""
     low, high = row["ci95_low_mm"], row["ci95_high_mm"]
-    values: dict[str, Any] = {name: row[name] for name in _ESTIMATE_COLUMNS}
+    values: dict[str, Any] = {name: row[name] for name in ESTIMATE_COLUMNS}
     values |= {name: row.get(name) for name in CATCH_COLUMNS}
     return LengthEstimate(
         **values,

@@ -173,7 +173,9 @@ class VesselTrack:
         """Where the vessel was; linear between two positions, the short way round the earth."""
         index = bisect_left(self._times_ns, timestamp_ns)
         if index < len(self.positions) and self._times_ns[index] == timestamp_ns:
-            return _exactly(self.positions[index])
+            kept = self.positions[index]
+            place = {"latitude": kept.latitude, "longitude": kept.longitude}
+            return Whereabouts(utc_ns=kept.utc_ns, speed_knots=kept.speed_knots, **place)
         if not 0 < index < len(self.positions):
             return NOWHERE
         before, after = self.positions[index - 1], self.positions[index]
@@ -182,42 +184,25 @@ class VesselTrack:
             return Whereabouts(gap_s=span_ns / 1e9)
         share = (timestamp_ns - before.timestamp_ns) / span_ns
         turn = (after.longitude - before.longitude + 180) % 360 - 180
-        longitude = (before.longitude + share * turn + 180) % 360 - 180
+        utc_ns = speed_knots = None
+        if before.utc_ns is not None and after.utc_ns is not None:
+            # In integers: a double has no nanoseconds of the year.
+            passed_ns = timestamp_ns - before.timestamp_ns
+            utc_ns = before.utc_ns + (after.utc_ns - before.utc_ns) * passed_ns // span_ns
+        if before.speed_knots is not None and after.speed_knots is not None:
+            speed_knots = before.speed_knots + share * (after.speed_knots - before.speed_knots)
         return Whereabouts(
-            utc_ns=_utc_between(before, after, timestamp_ns),
+            utc_ns=utc_ns,
             latitude=before.latitude + share * (after.latitude - before.latitude),
-            longitude=longitude,
-            speed_knots=_between(before.speed_knots, after.speed_knots, share),
+            longitude=(before.longitude + share * turn + 180) % 360 - 180,
+            speed_knots=speed_knots,
         )
 
     def pieces(self) -> list[Sequence[KeptPosition]]:
         """The track, cut at its gaps."""
         pieces: list[list[KeptPosition]] = []
         for kept in self.positions:
-            if kept.is_joined and pieces:
-                pieces[-1].append(kept)
-            else:
-                pieces.append([kept])
+            if not (kept.is_joined and pieces):
+                pieces.append([])
+            pieces[-1].append(kept)
         return [*pieces]
-
-
-def _exactly(kept: KeptPosition) -> Whereabouts:
-    return Whereabouts(
-        utc_ns=kept.utc_ns,
-        latitude=kept.latitude,
-        longitude=kept.longitude,
-        speed_knots=kept.speed_knots,
-    )
-
-
-def _between(before: float | None, after: float | None, share: float) -> float | None:
-    return None if before is None or after is None else before + share * (after - before)
-
-
-def _utc_between(before: KeptPosition, after: KeptPosition, timestamp_ns: int) -> int | None:
-    """In integers: a double has no nanoseconds of the year."""
-    if before.utc_ns is None or after.utc_ns is None:
-        return None
-    span_ns = after.timestamp_ns - before.timestamp_ns
-    passed_ns = timestamp_ns - before.timestamp_ns
-    return before.utc_ns + (after.utc_ns - before.utc_ns) * passed_ns // span_ns
