@@ -150,6 +150,8 @@ def seal_run(folder: Path, *, with_recordings: bool) -> None:
     kinds = ("*.csv", "*.mcap", "*.rrd") if with_recordings else ("lengths.csv", "frames.csv")
     files = [path for kind in kinds for path in folder.glob(kind)]
     files += learnt_files(folder)
+    with reading(database) as connection:
+        state, checks = content_sha256(read_state(connection)), log_sum(check_lines(connection))
     sums = {
         f"{table.name}_sha256": {
             run_id: lines_sha256(lines) for run_id, lines in rows_by_run(database, table).items()
@@ -162,16 +164,8 @@ def seal_run(folder: Path, *, with_recordings: bool) -> None:
         | sums
         | {"run_times_ns": run_times(database), "files": _sums(folder, files)}
         | {"verdicts": log_sum(verdict_lines(database))}
-        | {"hauls": log_sum(haul_lines(database))}
-        | _state_sums(database),
+        | {"hauls": log_sum(haul_lines(database)), "state_sha256": state, "checks": checks},
     )
-
-
-def _state_sums(database: Path) -> dict[str, Any]:
-    with reading(database) as connection:
-        checks = check_lines(connection)
-        state = content_sha256(read_state(connection))
-    return {"state_sha256": state, "checks": log_sum(checks)}
 
 
 def verdict_lines(database: Path) -> list[str]:

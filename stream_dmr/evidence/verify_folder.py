@@ -230,7 +230,7 @@ def _unmatched(
     return (signed - found).total(), (found - signed).total()
 
 
-def unsealed_rows(database: Path, made: Mapping[str, Any]) -> Iterator[str]:
+def _unsealed_rows(database: Path, made: Mapping[str, Any]) -> Iterator[str]:
     """Positions, watched times and hauls that are not as provenance.json, `made`, knows them.
 
     An older one knows none of them. Raises OutputError.
@@ -382,7 +382,7 @@ def _against_provenance(folder: Path) -> Iterator[Change]:
     if database is None:
         return
     yield from _surplus_tables(folder, made["files"])
-    for check in (_fish_and_runs, unsealed_rows, _verdicts, _state):
+    for check in (_fish_and_runs, _unsealed_rows, _verdicts, _state):
         lines = _guarded(
             check(database, made), lambda why: f"can't be compared with {PROVENANCE}: {why}"
         )
@@ -595,8 +595,7 @@ def _whole_entries(database: sqlite3.Connection, entries: list[ChainEntry]) -> I
 
 
 def _hauls_of_people(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
-    _, surplus = _unmatched(entries, database, HAULS)
-    if surplus:
+    if surplus := _unmatched(entries, database, HAULS)[1]:
         yield f"{surplus} events of hauls are not signed by the device"
 
 

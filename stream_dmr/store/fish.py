@@ -1,8 +1,7 @@
 """Read finished fish with their run, haul, position, species and review."""
 
 import json
-import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from pathlib import Path
@@ -187,7 +186,8 @@ def _stored_fish(database: Path, verdicts: Sequence[Verdict]) -> list[Fish]:
     reviews, edits = reviews_of(verdicts), edits_of(verdicts).fish
     try:
         with reading(database) as connection:
-            runs, stored = dict(_runs(connection)), list(rows(connection, FISH))
+            runs = {row["run_id"]: _run_of(row) for row in rows(connection, RUNS)}
+            stored = list(rows(connection, FISH))
             hauls = hauls_of(rows(connection, HAULS))
             vessel = VesselTrack(positions_of(connection))
 
@@ -239,8 +239,7 @@ def _with_catch(
 
 def read_runs(database: Path) -> dict[str, RunFacts]:
     """The facts of the runs by run id, in their order. Raises OutputError."""
-    with reading(database) as connection:
-        return dict(_runs(connection))
+    return {row["run_id"]: _run_of(row) for row in read_rows(database, RUNS)}
 
 
 def run_notes(path: Path) -> list[str]:
@@ -293,10 +292,8 @@ def flagged_fish(out_dir: Path) -> set[int]:
     return {row["track_id"] for row in stored if row["flags"] != "[]"}
 
 
-def _runs(connection: sqlite3.Connection) -> Iterator[tuple[str, RunFacts]]:
-    for row in rows(connection, RUNS):
-        known = {f.name: row[f.name] for f in fields(RunFacts) if row[f.name] is not None}
-        yield row["run_id"], RunFacts(**known)
+def _run_of(row: Mapping[str, Any]) -> RunFacts:
+    return RunFacts(**{f.name: row[f.name] for f in fields(RunFacts) if row[f.name] is not None})
 
 
 def is_same_species(one: str, other: str) -> bool:
