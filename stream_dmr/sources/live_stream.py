@@ -233,6 +233,9 @@ class LiveStream(Source):
                 )
             self._counts.received += 1
             self._counts.last_arrival_ns = arrival.monotonic_ns
+            if self._closing.is_set():  # `close` may have emptied the queue already
+                self._counts.dropped += 1
+                return
             if len(self._queue) >= self._settings.live_queue:
                 self._queue.popleft()
                 self._counts.dropped += 1

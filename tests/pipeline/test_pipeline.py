@@ -161,15 +161,21 @@ def endless() -> Iterator[Frame]:
 
 
 def test_stop_drops_what_waits_before_the_slow_stage_and_finishes_what_came_after_it():
-    stop, recorded = threading.Event(), Recorded()
-    nodes = [Repeat("crop", copies=2), Repeat("fit", owes=True, delay_s=0.01), Repeat("last")]
-    nodes[2].owes = True
+    stop, recorded, chains = threading.Event(), Recorded(), list[Chain]()
 
-    def on_frame() -> None:
-        if len(recorded.of("last")) >= 6:
-            stop.set()
+    class Fit(Repeat):
+        def step(self, message: Message) -> Sequence[Message]:
+            while message.frame_index == 3 and not stop.is_set():
+                (chain,) = chains
+                # The queues before it are full, and none has been busy longer.
+                others = [chain.counters[stage].busy_s for stage in (0, 1, 3)]
+                if chain.waiting()[:2] == [2, 2] and chain.longest_busy_s() > max(others):
+                    stop.set()
+                time.sleep(0.001)
+            return super().step(message)
 
-    run_chain(endless(), nodes, on_message=recorded, on_frame=on_frame, stop=stop)
+    nodes = [Repeat("crop", copies=2), Fit("fit", owes=True), Repeat("last", owes=True)]
+    run_chain(endless(), nodes, on_message=recorded, on_start=chains.append, stop=stop)
     fitted = recorded.of("fit") + recorded.of("fit.tick") + recorded.of("fit.close")
     assert sorted(recorded.of("last")) == sorted(fitted)  # nothing fitted was lost
     assert len(recorded.of("fit")) < len(recorded.of("crop"))  # and what waited was dropped

@@ -23,6 +23,7 @@ from stream_dmr.sources.video_file import VideoFile
 from tests.support.camera import Camera, camera, require_server
 
 QUICK = ReadFramesSettings(silence_s=1.5, connect_s=20.0, retry_s=0.5)
+PATIENCE_S = 60.0  # for what comes within a second, unless the machine is busy
 NUM_PICTURES = 32
 BURST = 30  # on connecting, FFmpeg looks through a second of the stream, then hands it out at once
 
@@ -84,22 +85,32 @@ def test_h264_with_its_password_out_of_the_name():
 @pytest.mark.parametrize("loss", ["refused", "silent", "resized", "frozen"])
 def test_a_lost_camera_is_found_again(rail: Camera, pictures: Path, loss: str):
     notices: list[str] = []
+    is_lost, is_resized = threading.Event(), threading.Event()
+
+    def listen(line: str) -> None:
+        notices.append(line)
+        for said, event in (("is lost", is_lost), ("no longer are 64x48", is_resized)):
+            if said in line:
+                event.set()
+
     stream = LiveStream(rail.address, QUICK)
-    stream.listen(notices.append)
+    stream.listen(listen)
     frames = iter(stream)
     before = take(frames, 5)
     if loss == "frozen":
         rail.freeze()
-        threading.Timer(2.5, rail.thaw).start()
+        assert is_lost.wait(PATIENCE_S)
+        rail.thaw()
     else:
         rail.lose()
+        assert is_lost.wait(PATIENCE_S)
     if loss == "silent":
-        with rail.silent():
-            time.sleep(1.0)
+        with rail.silent() as server:
+            connection, _ = server.accept()
+            connection.close()
     if loss == "resized":
         rail.start("--size", "160x120")
-        while not any("no longer are 64x48" in line for line in notices):
-            time.sleep(0.1)
+        assert is_resized.wait(PATIENCE_S)
         rail.lose()
     if loss != "frozen":
         rail.start()
@@ -144,6 +155,7 @@ def test_closing_wakes_who_waits(rail: Camera):
     rail.lose()
     threading.Timer(0.3, stream.close).start()
     assert take(frames, 1000) is not None  # comes to an end
+    stream.close()  # waits until the other thread is through
     assert_every_frame_is_counted(stream)
 
 

@@ -67,10 +67,11 @@ class Camera:
         self._process.send_signal(number)
 
     @contextmanager
-    def silent(self) -> Iterator[None]:
+    def silent(self) -> Iterator[socket.socket]:
         """Where it was, connections are accepted and nothing ever comes."""
-        with socket.create_server(("127.0.0.1", self.port)):
-            yield
+        with socket.create_server(("127.0.0.1", self.port)) as server:
+            server.settimeout(60.0)
+            yield server
 
 
 @contextmanager
