@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import MCAP0_MAGIC
 
 from stream_dmr.calibration.calibration_file import load_calibration, save_calibration
 from stream_dmr.errors import RecordingError
@@ -215,12 +216,27 @@ class TestDamage:
     def test_a_flipped_byte_is_found(self, run, tmp_path_factory, seed):
         _check_flip(run[0] / "recording.mcap", tmp_path_factory.mktemp("flip"), seed)
 
+    def test_a_record_of_another_kind_is_found(self, run, tmp_path):
+        """A few bytes among many, which random flips seldom meet."""
+        whole = run[0] / "recording.mcap"
+        data, at, kinds = whole.read_bytes(), len(MCAP0_MAGIC), dict[int, int]()
+        while at < len(data) - len(MCAP0_MAGIC):
+            kinds.setdefault(data[at], at)
+            at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")  # opcode, length, content
+        assert len(kinds) > 10
+        for place in kinds.values():
+            for bit in range(8):
+                flipped = bytearray(data)
+                flipped[place] ^= 1 << bit
+                _check_damaged(whole, tmp_path, flipped)
+
     @settings(max_examples=30, deadline=None)
     @given(seed=st.integers(0, 2**32))
     def test_a_flipped_byte_is_found_or_not_read_by_a_read_of_a_part(
         self, run, tmp_path_factory, seed
     ):
-        path = _flipped(run[0] / "recording.mcap", tmp_path_factory.mktemp("flip"), seed)
+        path = tmp_path_factory.mktemp("flip") / "recording.mcap"
+        path.write_bytes(_flipped(run[0] / path.name, seed))
         selection = Selection(tracks=frozenset({2}))
         with suppress(RecordingError):
             recording = open_recordings([path])
@@ -278,18 +294,21 @@ class TestDamage:
         assert "torn" in outcome.err
 
 
-def _flipped(whole: Path, scratch: Path, seed: int) -> Path:
+def _flipped(whole: Path, seed: int) -> bytes:
     rng = np.random.default_rng(seed)
     data = bytearray(whole.read_bytes())
     data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
-    path = scratch / whole.name
-    path.write_bytes(data)
-    return path
+    return data
 
 
 def _check_flip(whole: Path, scratch: Path, seed: int) -> None:
+    _check_damaged(whole, scratch, _flipped(whole, seed))
+
+
+def _check_damaged(whole: Path, scratch: Path, data: bytes) -> None:
     """Every flip in a .mcap is reported; in an .rrd, no message changes unnoticed."""
-    path = _flipped(whole, scratch, seed)
+    path = scratch / whole.name
+    path.write_bytes(data)
     found = []
     with suppress(RecordingError):
         recording = open_recordings([path])

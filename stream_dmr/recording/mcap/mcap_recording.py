@@ -16,9 +16,9 @@ from typing import IO
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Chunk, Footer, Metadata
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Metadata
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
@@ -291,6 +291,17 @@ def _check_index(stream: IO[bytes], footer: Footer) -> None:
 
 def _records(stream: IO[bytes], *, emit_chunks: bool = False) -> Iterator[object]:
     reader = StreamReader(
-        stream, emit_chunks=emit_chunks, validate_crcs=True, record_size_limit=_MAX_RECORD_BYTES
+        stream, emit_chunks=True, validate_crcs=True, record_size_limit=_MAX_RECORD_BYTES
     )
-    return reader.records
+    is_data_checked = False
+    for record in reader.records:
+        # The kind of a record has no checksum that is compared before the record is given out.
+        if isinstance(record, McapMessage):
+            raise ValueError("a message lies outside of the chunks")
+        if isinstance(record, Footer) and not is_data_checked:
+            raise ValueError("the checksum of its data is missing")
+        is_data_checked |= isinstance(record, DataEnd)
+        if isinstance(record, Chunk) and not emit_chunks:
+            yield from breakup_chunk(record, validate_crc=True)
+        else:
+            yield record
