@@ -14,14 +14,12 @@ from stream_dmr.training.train_settings import TrainSettings
 from stream_dmr.training.train_unet import TrainObserver, TrainRequest, train_unet
 from tests.support.command import invoke
 
-TINY = TrainSettings(
-    epochs=2,
-    crops_per_epoch=32,
-    validation_crops=16,
-    batch_size=8,
-    bank_fish=8,
-    bank_backgrounds=8,
-    learning_rate=5e-3,
+# Smaller than a user may ask for.
+TINY = TrainSettings(epochs=2, learning_rate=5e-3).model_copy(
+    update={
+        **{"crops_per_epoch": 8, "validation_crops": 4, "batch_size": 4},
+        **{"bank_fish": 4, "bank_backgrounds": 4},
+    }
 )
 
 
