@@ -201,18 +201,18 @@ def test_recording_goes_on_when_there_is_room_again(disk: Path, messages: list[M
 
 
 def test_a_full_disk_does_not_stop_measuring(tmp_path: Path):
-    with small_disk(tmp_path / "disk", kilobytes=800) as disk:
-        options = write_clips(tmp_path / "clip", num_frames=80)
+    with small_disk(tmp_path / "disk", kilobytes=500) as disk:
+        options = write_clips(tmp_path / "clip", num_frames=40)
         options |= {"--out": str(disk / "out")}
         with_pictures(options)
         outcome = invoke("run", options)
         assert outcome.code == 0, outcome.err
         assert "nothing is recorded but lengths" in outcome.err
-        assert "80 frames" in outcome.out
+        assert "40 frames" in outcome.out
         with sqlite3.connect(disk / "out" / "lengths.db") as database:
             fish = database.execute("SELECT frames_seen FROM fish").fetchall()
         database.close()
-        assert sum(seen for (seen,) in fish) > 60
+        assert sum(seen for (seen,) in fish) > 25
 
 
 def with_pictures(options: dict[str, str]) -> None:
@@ -224,7 +224,7 @@ PICTURES = '[recording]\nframes = "jpeg"\njpeg_quality = 100\nkeep_free_gb = 0.0
 
 
 def test_masks_that_went_are_not_fitted_and_the_rest_is_what_was_recorded(tmp_path: Path):
-    options = write_clips(tmp_path / "clip", num_frames=60)
+    options = write_clips(tmp_path / "clip", num_frames=30)
     with_pictures(options)
     assert invoke("run", options).code == 0
     out = Path(options["--out"])

@@ -3,7 +3,10 @@
 import json
 import os
 import shutil
+import signal
 import sqlite3
+import subprocess
+import sys
 from collections import Counter
 from dataclasses import replace
 from fnmatch import fnmatch
@@ -33,7 +36,6 @@ from stream_dmr.store.ledger import load_public_key, make_key
 from stream_dmr.store.run_tables import FramesTable
 from stream_dmr.store.schema import INTERRUPTED, MAY_COUNT_TWICE
 from stream_dmr.web.views import frame_images, recorded_source
-from tests.pipeline.test_run_signals import start, wait_for_rows
 from tests.support.command import invoke, rows
 from tests.support.reading import read_header, read_messages
 from tests.support.recorded_run import assert_same, header, run
@@ -362,12 +364,13 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A measurement of clips, killed in the middle of a fish and started again."""
     folder = tmp_path_factory.mktemp("interrupted")
     make_key(folder / "key")
-    options = write_clips(folder, num_frames=110) | {"--key": str(folder / "key")}
+    options = write_clips(folder, num_frames=80) | {"--key": str(folder / "key")}
     out = Path(options["--out"])
-    killed = start(options)
-    wait_for_rows(out / "frames.csv", 45, killed)
-    killed.kill()
-    killed.communicate()
+    arguments = [part for item in options.items() for part in item]
+    killed = subprocess.run(
+        [sys.executable, "-c", KILLED, "run", *arguments], capture_output=True, text=True
+    )
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert any(name.endswith(".part") for name in names(out))
     outcome = invoke("run", options)
     assert outcome.code == 0, outcome.err
@@ -376,13 +379,32 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+# Kills itself: another process might be late, and find the run at its end.
+KILLED = """
+import os, signal
+from stream_dmr.cli.main import main
+from stream_dmr.store.run_tables import FramesTable
+
+write = FramesTable.write
+
+def write_until_killed(table, record):
+    write(table, record)
+    if record.message.frame_index == 28:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+FramesTable.write = write_until_killed
+main()
+"""
+
 CLIPS = """
+[detect_fish]
+look_every_s = 60
 [read_frames]
 clips_wait_s = 0.5
 [recording]
 rrd = false
 flush_s = 0.1
-segment_s = 4.0
+segment_s = 2.0
 """
 
 
@@ -455,10 +477,10 @@ def localized(path: Path) -> list[LocalizedFish]:
 
 def test_the_fish_of_a_folder_that_grew_are_found_again(tmp_path: Path):
     """Each run begins with nothing seen; also where a replay has made one recording of both."""
-    options = write_clips(tmp_path, num_frames=24)
+    options = write_clips(tmp_path, num_frames=16)
     again = {"--from": "crop", "--check": None}
     assert invoke("run", options).code == 0
-    write_swaying_fish(tmp_path / "clips" / "2.avi", num_frames=24)
+    write_swaying_fish(tmp_path / "clips" / "2.avi", num_frames=16)
     assert invoke("run", options).code == 0
     assert {fish.track_id for fish in localized(Path(options["--out"]))} == {1, 2}
     joined = tmp_path / "joined"
