@@ -144,8 +144,9 @@ def test_a_recording_that_nothing_sums_up_is_read(out: Path):
     (out / NAME).write_text(json.dumps(made))
     assert changed(out) == []
     sql(out, "UPDATE fish SET length_mm = 999.0 WHERE track_id = 2")
+    lines = changed(out)
     for name in ("recording.mcap", "recording.rrd"):
-        assert any(f"length_mm is 999.0, {name} says" in line for line in changed(out))
+        assert any(f"length_mm is 999.0, {name} says" in line for line in lines)
     with (out / "recording.rrd").open("r+b") as file:
         file.truncate(len((out / "recording.rrd").read_bytes()) // 2)
     assert any(line.startswith("recording.rrd: ") for line in changed(out))

@@ -18,6 +18,7 @@ from stream_dmr.simulation import SECOND, simulate
 from stream_dmr.simulation.rail_scene import FPS, second_camera
 from tests.localization.test_two_views import FIRST
 from tests.support.command import invoke, rows
+from tests.support.fish_run import measure
 
 FRAME_S = 1 / FPS
 
@@ -83,13 +84,11 @@ def test_the_recording_holds_the_fish_where_both_see_them(scene, combined):
 def test_runs_that_share_no_fish_or_no_calibration_are_refused(scene, tmp_path):
     result = invoke(f"combine {scene / 'run'} {scene / 'run'} --out {tmp_path / 'same'}")
     assert "two cameras at least 3 degrees apart" in result.error
-    sd.measure(
-        scene / "video.mp4", out=tmp_path / "bare", masks=scene / "masks", template="halibut"
-    )
+    bare = measure(tmp_path, calibration=None)
     request = ReplayOptions(
         recordings=[scene / "run"],
         first="localize",
-        second=tmp_path / "bare",
+        second=bare,
         out=tmp_path / "both",
     )
     with pytest.raises(UserError, match="with --calibration"):

@@ -477,10 +477,10 @@ def localized(path: Path) -> list[LocalizedFish]:
 
 def test_the_fish_of_a_folder_that_grew_are_found_again(tmp_path: Path):
     """Each run begins with nothing seen; also where a replay has made one recording of both."""
-    options = write_clips(tmp_path, num_frames=16)
+    options = write_clips(tmp_path, num_frames=10)
     again = {"--from": "crop", "--check": None}
     assert invoke("run", options).code == 0
-    write_swaying_fish(tmp_path / "clips" / "2.avi", num_frames=16)
+    write_swaying_fish(tmp_path / "clips" / "2.avi", num_frames=10)
     assert invoke("run", options).code == 0
     assert {fish.track_id for fish in localized(Path(options["--out"]))} == {1, 2}
     joined = tmp_path / "joined"
