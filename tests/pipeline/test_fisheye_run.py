@@ -9,12 +9,14 @@ import pytest
 import stream_dmr as sd
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.recording.reading import open_recordings
-from stream_dmr.simulation.rail_scene import HEIGHT, WIDTH, RailScene, make_scene
+from stream_dmr.simulation import rail_scene
+from stream_dmr.simulation.rail_scene import RailScene, make_scene
 from stream_dmr.simulation.write_scene import write_scene
 from tests.support.command import rows
 
-FOCAL_PX = 420.0  # the picture's corners are 62 degrees off the axis, for a pinhole
-K = np.array([[FOCAL_PX, 0, 633.0], [0, FOCAL_PX, 486.0], [0, 0, 1]])
+WIDTH, HEIGHT = rail_scene.WIDTH // 2, rail_scene.HEIGHT // 2
+FOCAL_PX = 210.0  # the picture's corners are 62 degrees off the axis, for a pinhole
+K = np.array([[FOCAL_PX, 0, 316.0], [0, FOCAL_PX, 243.0], [0, 0, 1]])
 LENSES = {
     "pinhole": Camera(width=WIDTH, height=HEIGHT, K=K, distortion=np.zeros(5)),
     "fisheye": Camera(

@@ -9,10 +9,11 @@ import pytest
 
 from stream_dmr.messages import FittedMesh
 from stream_dmr.recording.reading import decoded_messages, open_recordings
-from stream_dmr.simulation import simulate
+from stream_dmr.simulation.write_scene import write_scene
 from stream_dmr.store.fish import read_stored_fish
 from tests.support.command import invoke
 from tests.support.small_classifier import crops_of, train_classifier
+from tests.support.trip import NAMES, small_scene
 
 CODES = {"halibut": "HAP", "conger": "COE"}
 
@@ -26,7 +27,7 @@ def species_of(scene: Path) -> dict[int, str]:
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene = tmp_path_factory.mktemp("learnt")
-    simulate(scene, num_fish=12, num_frames=50, preset="realistic", seed=1, species=",".join(CODES))
+    write_scene(scene, small_scene(num_fish=8, num_frames=40, seed=1), species=NAMES)
     codes, pictures = species_of(scene), defaultdict[str, list[np.ndarray]](list)
     for crop in crops_of(scene):
         assert crop.image is not None
@@ -37,7 +38,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scene")
-    simulate(folder, num_fish=4, num_frames=24, preset="clean", seed=2, species=",".join(CODES))
+    write_scene(folder, small_scene(num_fish=4, num_frames=24, seed=5), species=NAMES)
     return folder
 
 
