@@ -17,7 +17,7 @@ from tests.support.command import invoke
 # Smaller than a user may ask for.
 TINY = TrainSettings(epochs=2, learning_rate=5e-3).model_copy(
     update={
-        **{"crops_per_epoch": 8, "validation_crops": 4, "batch_size": 4},
+        **{"crops_per_epoch": 4, "validation_crops": 2, "batch_size": 2},
         **{"bank_fish": 4, "bank_backgrounds": 4},
     }
 )
