@@ -1,23 +1,27 @@
-"""CropFish: every fish of a frame, cut out through an ideal camera of its own."""
+"""CropFish: every fish of a frame, cut out through an ideal camera of its own; then who is gone."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from stream_dmr.camera import Camera
-from stream_dmr.messages import FishCrop, Frame
+from stream_dmr.messages import FishCrop, Frame, TrackEnded
 from stream_dmr.segmentation.crop import CropFishSettings, crop_fish
 from stream_dmr.segmentation.open_segmenter import open_segmenter
 from stream_dmr.segmentation.species_classifier import SpeciesClassifier
 from stream_dmr.tracking.finder import FishFinder
+from stream_dmr.tracking.timeout import TrackTimeout
 from stream_dmr.tracking.tracker import TrackNumbering
 
 
 class CropFish:
-    """Frame -> FishCrop, one per fish. Without a calibrated camera a nominal one is assumed."""
+    """Frame -> FishCrop, one per fish, then TrackEnded of each that no later frame will show.
+
+    Without a calibrated camera a nominal one is assumed.
+    """
 
     def __init__(
         self,
@@ -26,27 +30,37 @@ class CropFish:
         camera: Camera | None,
         finder: FishFinder,
         species_model: str = "",
+        track_timeout_s: float = 10.0,
     ) -> None:
         """Raises ModelError where a model that the settings name cannot be used.
 
         The segmenter is not opened, and torch is not imported, where the finder gives all masks.
-        `species_model`: the file of a classifier; "": none.
+        `species_model`: the file of a classifier; "": none. Tracks of given ids end when they are
+        unseen for `track_timeout_s`.
         """
         self._finder = finder
-        self._numbering = TrackNumbering(keeps_source_ids=finder.knows_ids)
+        self._numbering = TrackNumbering(keeps_source_ids=finder.open_ids is None)
         self._segmenter = None if finder.gives_masks else open_segmenter(settings.segmenter)
         self._classifier = SpeciesClassifier(Path(species_model)) if species_model else None
         self._settings = settings
         self._camera = camera
+        self._timeout = TrackTimeout(track_timeout_s)
+        self._open: dict[int, int] = {}  # source ids by the track ids that were given
+        self._interrupted: list[int] = []  # track ids of an earlier run
+        self._last: Frame | None = None
         # Networks run side by side; given masks are cut out mostly by Python, which can't.
         workers = ThreadPoolExecutor(os.cpu_count(), "crop")
         self._map = map if self._segmenter is None else workers.map
 
-    def number_after(self, track_id: int) -> None:
-        """Number the fish on after those of earlier runs; call it before the first frame."""
-        self._numbering.resume_after(track_id)
+    def number_after(self, track_id: int, *, interrupted: Collection[int] = ()) -> None:
+        """Number the fish on after those of earlier runs; call it before the first frame.
 
-    def step(self, frame: Frame, /) -> list[FishCrop]:
+        Tracks that were open when an earlier run broke off end with the first frame.
+        """
+        self._numbering.resume_after(track_id)
+        self._interrupted = sorted(interrupted)
+
+    def step(self, frame: Frame, /) -> list[FishCrop | TrackEnded]:
         """The fish of one frame, by id. Raises AnnotationError for an unusable mask."""
         height, width = frame.image.shape[:2]
         camera = self._camera or Camera.nominal(width=width, height=height)
@@ -61,20 +75,34 @@ class CropFish:
         crops = {
             one.source_id: crop for one, crop in zip(found, self._map(cut, found), strict=True)
         }
-        fish = [
-            replace(
-                crops[source_id],
-                track_id=self._numbering.track_id(source_id),
-                species=self._classifier.classify(crops[source_id]) if self._classifier else {},
-            )
+        fish = {
+            self._numbering.track_id(source_id): source_id
             for source_id in self._finder.confirm(crops)
-        ]
-        return sorted(fish, key=lambda crop: crop.track_id)
+        }
+        self._open |= fish
+        self._last = frame
+        return [*self._crops(fish, crops), *self._ends(frame, fish)]
 
-    def tick(self, timestamp_ns: int, /) -> Sequence[FishCrop]:
-        """No output: crops do not wait for time to pass."""
-        return ()
+    def close(self) -> list[FishCrop | TrackEnded]:
+        """All open tracks end with the source."""
+        last, ended = self._last, [*self._open]
+        self._open.clear()
+        return [] if last is None else [TrackEnded.after(last, one, "end") for one in ended]
 
-    def close(self) -> Sequence[FishCrop]:
-        """No output at the end."""
-        return ()
+    def _crops(self, fish: Mapping[int, int], crops: Mapping[int, FishCrop]) -> Iterator[FishCrop]:
+        for track_id, source_id in sorted(fish.items()):
+            crop = crops[source_id]
+            species = self._classifier.classify(crop) if self._classifier else {}
+            yield replace(crop, track_id=track_id, species=species)
+
+    def _ends(self, frame: Frame, fish: Collection[int]) -> Iterator[TrackEnded]:
+        while self._interrupted:
+            yield TrackEnded.after(frame, self._interrupted.pop(0), "restart")
+        open_ids = self._finder.open_ids
+        if open_ids is None:
+            ended, cause = self._timeout.step(frame.timestamp_ns, fish), "timeout"
+        else:
+            ended, cause = [i for i, source in self._open.items() if source not in open_ids], "lost"
+        for track_id in ended:
+            del self._open[track_id]
+            yield TrackEnded.after(frame, track_id, cause)

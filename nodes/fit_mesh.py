@@ -10,7 +10,7 @@ from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.species import SpeciesSettings
 from stream_dmr.template.template import Template
 
-# Of capture time: a pose that old says nothing of the next one, and runs of weeks see many fish.
+# Capture time. An older pose is a poor start, and keeping all of them would fill the memory.
 _FORGET_NS = 60_000_000_000
 
 
@@ -46,12 +46,8 @@ class FitMesh:
 
     def step(self, crop: FishCrop, /) -> list[FittedMesh]:
         """Fit one crop; what can't be fitted is passed on with its reason."""
+        self._tracks.forget(before_ns=crop.timestamp_ns - _FORGET_NS)
         return [self._tracks.fit(crop)]
-
-    def tick(self, timestamp_ns: int, /) -> Sequence[FittedMesh]:
-        """Forget the tracks that have not been seen for a minute."""
-        self._tracks.forget(before_ns=timestamp_ns - _FORGET_NS)
-        return []
 
     def close(self) -> Sequence[FittedMesh]:
         """No output at the end."""

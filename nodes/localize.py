@@ -21,10 +21,6 @@ class Localize:
         """One LocalizedFish for every fit, refused ones included."""
         return [localize(message, settings=self._settings, calibration=self._calibration)]
 
-    def tick(self, timestamp_ns: int, /) -> Sequence[LocalizedFish]:
-        """No output: every fit was answered by `step`."""
-        return []
-
     def close(self) -> Sequence[LocalizedFish]:
         """No output: every fit was answered by `step`."""
         return []

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from stream_dmr.lengths.fate import FateTracker, ZonesSettings
 from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.lengths.track_record import TrackLength, late_estimate
-from stream_dmr.messages import LengthEstimate, LocalizedFish
+from stream_dmr.messages import LengthEstimate, LocalizedFish, TrackEnded
 from stream_dmr.species import UNSURE, SpeciesEvidence, SpeciesSettings
 
 
@@ -45,10 +45,11 @@ class SmoothLength:
         self._species = species or SpeciesSettings()
         self._open: dict[int, _Track] = {}
         self._ended: set[int] = set()
-        self._watched_ns: tuple[int, int] | None = None  # capture times of the first frame and last
+        self._last: LocalizedFish | None = None
 
     def step(self, message: LocalizedFish, /) -> Sequence[LengthEstimate]:
         """Return the running estimate of this fish after one more frame."""
+        self._last = message
         if message.track_id in self._ended:
             return [late_estimate(message)]
         if message.track_id not in self._open:
@@ -62,28 +63,32 @@ class SmoothLength:
         track.species.add(message.species)
         return [track.length.add(message)]
 
-    def tick(self, timestamp_ns: int, /) -> Sequence[LengthEstimate]:
-        """Finish the tracks unseen for `track_timeout_s` at this capture time."""
-        first_ns, _ = self._watched_ns or (timestamp_ns, timestamp_ns)
-        self._watched_ns = first_ns, timestamp_ns
-        earliest_ns = timestamp_ns - round(self._settings.track_timeout_s * 1e9)
-        overdue = [i for i, t in self._open.items() if t.length.last_timestamp_ns < earliest_ns]
-        return [self._finish(track_id) for track_id in overdue]
+    def end(self, ended: TrackEnded, /) -> Sequence[LengthEstimate]:
+        """Finish the track of a fish, if it has any frames."""
+        return [self._finish(ended)] if ended.track_id in self._open else []
 
     def close(self) -> Sequence[LengthEstimate]:
-        """Finish all tracks still open."""
-        return [self._finish(track_id) for track_id in list(self._open)]
+        """Finish the tracks whose end did not come here, since the chain was stopped."""
+        last = self._last
+        return (
+            []
+            if last is None
+            else [
+                self._finish(TrackEnded.after(last, track_id, "end")) for track_id in [*self._open]
+            ]
+        )
 
-    def _finish(self, track_id: int) -> LengthEstimate:
-        self._ended.add(track_id)
-        track = self._open.pop(track_id)
-        return self._with_species(self._with_fate(track.length.finish(), track), track)
+    def _finish(self, ended: TrackEnded) -> LengthEstimate:
+        self._ended.add(ended.track_id)
+        track = self._open.pop(ended.track_id)
+        return self._with_species(self._with_fate(track.length.finish(), track, ended), track)
 
-    def _with_fate(self, estimate: LengthEstimate, track: _Track) -> LengthEstimate:
+    def _with_fate(
+        self, estimate: LengthEstimate, track: _Track, ended: TrackEnded
+    ) -> LengthEstimate:
         if not any(self._zones.polygons()):
             return estimate
-        first_ns, last_ns = self._watched_ns or (0, 0)
-        fate = track.fate.finish(watched_from_ns=first_ns, watched_to_ns=last_ns)
+        fate = track.fate.finish(ended)
         return replace(estimate, fate=fate.name, fate_share=fate.share)
 
     def _with_species(self, estimate: LengthEstimate, track: _Track) -> LengthEstimate:

@@ -189,6 +189,25 @@ class LocalizedFish(FishMessage):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class TrackEnded(FishMessage):
+    """A fish that no later frame shows; frame and time are those after which it ended."""
+
+    # "lost": the tracker dropped it; "timeout": unseen for `track_timeout_s`; "end": of the source;
+    # "restart": in view when an earlier run broke off.
+    cause: str
+
+    @classmethod
+    def after(cls, last: "Frame | FishMessage", track_id: int, cause: str) -> "TrackEnded":
+        """The end of a track after the frame of this message."""
+        return cls(
+            frame_index=last.frame_index,
+            timestamp_ns=last.timestamp_ns,
+            track_id=track_id,
+            cause=cause,
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class LengthEstimate(FishMessage):
     """What is known of one fish's length so far; `is_final` once its track has ended.
 
@@ -245,4 +264,13 @@ class LearntShapes(_ReadOnly):
     shares: Float[np.ndarray, "N"]  # of the fish; what is left of 1 is for the body forms
 
 
-Message = Frame | FishCrop | FittedMesh | LocalizedFish | LengthEstimate | Position | LearntShapes
+Message = (
+    Frame
+    | FishCrop
+    | FittedMesh
+    | LocalizedFish
+    | TrackEnded
+    | LengthEstimate
+    | Position
+    | LearntShapes
+)

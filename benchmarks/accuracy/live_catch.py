@@ -17,7 +17,7 @@ import os
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 import multiprocessing
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from csv import DictReader
 from dataclasses import replace
 from pathlib import Path
@@ -36,19 +36,29 @@ from benchmarks.table1.filmed_scene import (
 from stream_dmr.calibration.calibration_file import load_calibration
 from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
 from stream_dmr.fitting.shape.stocks import GoodCrops, learn_shapes
-from stream_dmr.messages import FishCrop, FittedMesh, LearntShapes, LengthEstimate
+from stream_dmr.messages import (
+    FishCrop,
+    FittedMesh,
+    Frame,
+    LearntShapes,
+    LengthEstimate,
+    TrackEnded,
+)
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.nodes.read_frames import ReadFrames
+from stream_dmr.nodes.smooth_length import SmoothLength
 from stream_dmr.pipeline.config import Config
 from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.simulation.rail_scene import FPS
 from stream_dmr.simulation.simulated_fish import SPECIES
 from stream_dmr.tracking.finder import open_finder
+from stream_dmr.tracking.timeout import TrackTimeout
 
 FIRST_SEED = 9400
 SPECIES_PER_CATCH = 3
 LEARNT_AT = (3, 6, 12)  # fish that have left; as `ShapeLearner` does
+_NO_IMAGE = np.zeros((1, 1, 3), np.uint8)
 _TIMEOUT_S = 0.25  # fish follow each other in fractions of a second here, hardly ever unseen
 
 
@@ -109,7 +119,8 @@ class _Camera:
 
     def __init__(self, filmed: FilmedScene) -> None:
         self._filmed, self._now_ns = filmed, 0
-        self._config = Config.model_validate({"smooth_length": {"track_timeout_s": _TIMEOUT_S}})
+        self._timeout = TrackTimeout(_TIMEOUT_S)
+        self._config = Config()
         self._template, self._forms = load_shapes(AUTO)
         assert self._forms is not None
         self._known: CandidateShapes = self._forms
@@ -135,7 +146,8 @@ class _Camera:
             self._now_ns = _capture_ns(number)
             for sighting in sightings:
                 self._take(sighting.crop)
-            yield from self._finish(self._pass_time())
+            seen = [sighting.crop.track_id for sighting in sightings]
+            yield from self._finish(self._pass_time(seen))
         yield from self._finish(
             [one for node in self._later for one in node.close() if isinstance(one, LengthEstimate)]
         )
@@ -150,13 +162,13 @@ class _Camera:
         for node in self._later:
             messages = [out for message in messages for out in node.step(message)]
 
-    def _pass_time(self) -> list[LengthEstimate]:
-        return [
-            one
-            for node in self._later
-            for one in node.tick(self._now_ns)
-            if isinstance(one, LengthEstimate)
-        ]
+    def _pass_time(self, seen: Iterable[int]) -> list[LengthEstimate]:
+        smooth = self._later[-1]
+        assert isinstance(smooth, SmoothLength)
+        gone = self._timeout.step(self._now_ns, seen)
+        last = Frame(frame_index=0, timestamp_ns=self._now_ns, image=_NO_IMAGE, source="")
+        ends = [TrackEnded.after(last, track_id, "timeout") for track_id in gone]
+        return [one for ended in ends for one in smooth.end(ended)]
 
     def _finish(self, estimates: list[LengthEstimate]) -> Iterator[MeasuredFish]:
         for one in estimates:

@@ -108,9 +108,9 @@ class AnnotatedFish:
         ]
 
     @property
-    def knows_ids(self) -> bool:
-        """True: files say which fish is which."""
-        return True
+    def open_ids(self) -> None:
+        """None: a given id may come again at any time."""
+        return None
 
     def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:
         """All ids: every annotated object is a fish."""
@@ -239,9 +239,9 @@ class NamedPictures:
         return self._masks is not None
 
     @property
-    def knows_ids(self) -> bool:
-        """True: the file says which fish is which."""
-        return True
+    def open_ids(self) -> None:
+        """None: a given id may come again at any time."""
+        return None
 
     @property
     def warnings(self) -> list[str]:

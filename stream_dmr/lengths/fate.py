@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, field_validator
 
-from stream_dmr.messages import LocalizedFish
+from stream_dmr.messages import LocalizedFish, TrackEnded
 from stream_dmr.reasons import Reason
 from stream_dmr.settings import Settings
 
@@ -112,11 +112,10 @@ class FateTracker:
         if fish.keypoints_px is not None and np.isfinite(fish.keypoints_px).all():
             self._seen = fish
 
-    def finish(self, *, watched_from_ns: int, watched_to_ns: int) -> Fate:
-        """The fate, once the track has ended; frames were watched between these capture times.
+    def finish(self, ended: TrackEnded) -> Fate:
+        """The fate, once the track has ended.
 
-        Unknown where the end was not seen: the fish was hidden, was still in view at the last
-        frame, or was seen only before the first one, in a run that broke off.
+        Unknown if the end was not seen: the fish was hidden, or still in view at the last frame.
         """
         gap_ns = round(self._settings.max_gap_s * 1e9)
         seen = self._seen
@@ -125,8 +124,8 @@ class FateTracker:
             or seen.keypoints_px is None
             or self._is_hidden
             or self._last_ns - seen.timestamp_ns > gap_ns
-            or watched_to_ns - self._last_ns <= gap_ns
-            or self._last_ns < watched_from_ns
+            or ended.cause == "restart"
+            or (ended.cause == "end" and ended.timestamp_ns - self._last_ns <= gap_ns)
         ):
             return Fate(UNKNOWN_FATE, None)
         shares = shares_in(self._settings, self._in_frame(body_points(seen.keypoints_px)))

@@ -1,7 +1,8 @@
 """Runs the chain of nodes: one thread each, bounded queues between them, shutdown, counters.
 
-All messages of a frame travel together as one batch, and each stage's `tick` follows the batch. So
-every stage works in the order of the source, and a shutdown cuts between frames.
+All messages of a frame travel together as one batch, frames without fish as an empty one. So every
+stage works in the order of the source, and a shutdown cuts between frames. A TrackEnded travels
+down the whole chain, behind the last message of its fish.
 """
 
 import queue
@@ -14,7 +15,7 @@ from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 from stream_dmr.errors import OutputError, UserError
-from stream_dmr.messages import Frame, Message
+from stream_dmr.messages import Frame, Message, TrackEnded
 
 _QUEUE_FRAMES = 2  # between two stages; chosen: both stay busy, and a stop drops few frames
 _POLL_S = 0.1  # how soon a waiting stage notices that the chain stops
@@ -32,12 +33,17 @@ class Node(Protocol):
         """
         ...
 
-    def tick(self, timestamp_ns: int, /) -> Sequence[Message]:
-        """A frame has passed, with fish or without: return what times out by it."""
-        ...
-
     def close(self) -> Sequence[Message]:
         """The stream has ended: return what remains."""
+        ...
+
+
+@runtime_checkable
+class EndsTracks(Protocol):
+    """A node that has something left to return when a track ends."""
+
+    def end(self, ended: TrackEnded, /) -> Sequence[Message]:
+        """No later message of this fish will come: return what remains of it."""
         ...
 
 
@@ -209,18 +215,18 @@ class Chain:
         self._pass_on(stage, self._process(stage, node, ending, close=True))
 
     def _process(self, stage: int, node: Node, batch: _Batch, *, close: bool = False) -> _Batch:
-        """Step through a batch, then tick or close; messages made before an exception go on."""
+        """Step through a batch, then close; messages made before an exception go on."""
         made, is_done = _Batch(timestamp_ns=batch.timestamp_ns), True
         with self._busy(stage):
             for message in batch.messages:
                 if self._is_cut(stage):
                     break
-                self.counters[stage].messages_in += 1
-                is_done &= self._attempt(stage, partial(node.step, message), made)
+                self.counters[stage].messages_in += not isinstance(message, TrackEnded)
+                is_done &= self._attempt(stage, partial(_answer, node, message), made)
+                if isinstance(message, TrackEnded):
+                    made.messages.append(message)
             if batch.timestamp_ns is not None:
                 is_whole = not self._is_cut(stage)
-                if is_whole:
-                    is_done &= self._attempt(stage, partial(node.tick, batch.timestamp_ns), made)
                 outcome = "processed" if is_whole else "dropped"
                 self._count(stage, outcome if is_done else "failed")
                 if is_whole and stage == len(self._nodes):
@@ -261,7 +267,7 @@ class Chain:
     def _emit(self, stage: int, messages: Sequence[Message], made: _Batch) -> None:
         for message in messages:
             made.messages.append(self._on_message(message))
-            self.counters[stage].messages_out += 1
+            self.counters[stage].messages_out += not isinstance(message, TrackEnded)
 
     def _take(self, stage: int) -> _Batch | None:
         """Wait for the next batch of a stage; None once the stage drops what waits."""
@@ -318,6 +324,12 @@ class Chain:
             self._busy_since[stage] = None
             self.counters[stage].busy_s += time.perf_counter() - began
             self.counters[stage].cpu_s += time.thread_time() - cpu_began
+
+
+def _answer(node: Node, message: Message) -> Sequence[Message]:
+    if isinstance(message, TrackEnded):
+        return node.end(message) if isinstance(node, EndsTracks) else ()
+    return node.step(message)
 
 
 _MAX_CONSECUTIVE = 100  # failed frames (some 10 s): then it is the run that is broken. Chosen.

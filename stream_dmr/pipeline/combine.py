@@ -250,10 +250,6 @@ class LocalizeByTwo:
             )
         ]
 
-    def tick(self, timestamp_ns: int, /) -> Sequence[LocalizedFish]:
-        """Nothing ends here."""
-        return []
-
     def close(self) -> Sequence[LocalizedFish]:
         """Nothing is left."""
         return []

@@ -217,7 +217,10 @@ def _measure(
                 Fitter(inputs.template, settings, with_covariance=inputs.has_covariance)
             )
         with open_outputs(inputs, observer) as outputs:
-            crop_fish.number_after(outputs.store.before.track_id)
+            crop_fish.number_after(
+                outputs.store.before.track_id,
+                interrupted={fish.track_id for fish in outputs.interrupted},
+            )
             session.continue_tracks(outputs.interrupted)
             _save_learnt_meshes(inputs)
             _report_start(inputs, outputs, observer)

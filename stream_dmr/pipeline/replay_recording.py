@@ -10,7 +10,15 @@ from pathlib import Path
 
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.evidence.seal import SignedFiles, sealed
-from stream_dmr.messages import FittedMesh, Frame, LengthEstimate, LocalizedFish, Message, Position
+from stream_dmr.messages import (
+    FittedMesh,
+    Frame,
+    LengthEstimate,
+    LocalizedFish,
+    Message,
+    Position,
+    TrackEnded,
+)
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.pipeline.chain import Node, StageCounters, run_chain
 from stream_dmr.pipeline.combine import open_second
@@ -183,7 +191,7 @@ class ReplayWriter:
 
     def write(self, message: Message) -> Message:
         """Record, compare and count a message; returns it as the next node is to get it."""
-        if type(message) in self._recomputed:
+        if type(message) in self._recomputed or isinstance(message, TrackEnded):
             return self._write_recomputed(message)
         payload = self._recorded.payload(message)
         if isinstance(message, Frame):
@@ -220,7 +228,7 @@ class ReplayWriter:
             message = self._outputs.results.write(message)
         else:
             message = as_recorded(message, self._settings)
-        if self._comparator is not None:
+        if self._comparator is not None and not isinstance(message, TrackEnded):
             self._comparator.compare(message)
         if isinstance(message, LengthEstimate) and message.is_final:
             self.final.append(message)
@@ -440,7 +448,10 @@ def _open_chain(
     files, config = inputs.files, inputs.config
     if files is None:
         played = messages_before(request.first)[0 if request.out is not None else -1 :]
-        playback: list[Node] = [PlaybackNode(recorded, kind) for kind in played]
+        timeout_s = config.smooth_length.track_timeout_s
+        playback: list[Node] = [
+            PlaybackNode(recorded, kind, track_timeout_s=timeout_s) for kind in played
+        ]
         if request.second is not None:
             second = open_recordings([request.second])
             playback.append(open_second(recording, second, inputs, observer))

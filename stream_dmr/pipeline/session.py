@@ -12,7 +12,16 @@ from stream_dmr.camera import Calibration, Camera
 from stream_dmr.errors import RecordingError
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.shape.stocks import learn_shapes
-from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
+from stream_dmr.messages import (
+    FishCrop,
+    FishMessage,
+    FittedMesh,
+    Frame,
+    LengthEstimate,
+    LocalizedFish,
+    Message,
+    TrackEnded,
+)
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.nodes.localize import Localize
@@ -30,6 +39,7 @@ from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.recording.topics import RecordingSettings
 from stream_dmr.template.template import Template
 from stream_dmr.tracking.finder import FishFinder
+from stream_dmr.tracking.timeout import TrackTimeout
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +88,7 @@ class Setup:
             camera=self.camera,
             finder=finder,
             species_model=self.config.species.model,
+            track_timeout_s=self.config.smooth_length.track_timeout_s,
         )
 
 
@@ -160,7 +171,7 @@ class Session:
         for message in inputs:
             yield from _through(self.nodes, [message], settings)
         for stage, node in enumerate(self.nodes, start=1):
-            left = [as_recorded(message, settings) for message in node.close()]
+            left = _without_ends(node.close(), settings)
             yield from left
             yield from _through(self.nodes[stage:], left, settings)
 
@@ -169,9 +180,12 @@ def _through(
     nodes: Sequence[Node], messages: Sequence[Message], settings: RecordingSettings
 ) -> Iterator[Message]:
     for node in nodes:
-        made = chain.from_iterable(map(node.step, messages))
-        messages = [as_recorded(message, settings) for message in made]
+        messages = _without_ends(chain.from_iterable(map(node.step, messages)), settings)
         yield from messages
+
+
+def _without_ends(messages: Iterable[Message], settings: RecordingSettings) -> list[Message]:
+    return [as_recorded(one, settings) for one in messages if not isinstance(one, TrackEnded)]
 
 
 _IN_MEMORY = 1 << 26  # bytes of crops: some 100,000 masks; more are kept on the disk
@@ -184,24 +198,24 @@ class KeptCrops:
         """Beyond so many bytes they go to the disk."""
         self._file: IO[bytes] = SpooledTemporaryFile(in_memory)  # noqa: SIM115, see `close`
         self._places: dict[int, list[tuple[int, int]]] = {}  # of each frame: offsets and sizes
+        self._ended: dict[int, list[TrackEnded]] = {}
 
-    def keep(self, crop: FishCrop) -> None:
-        """Take one more crop."""
-        data = encode(crop)
-        self._places.setdefault(crop.frame_index, []).append((self._file.tell(), len(data)))
+    def keep(self, message: FishCrop | TrackEnded) -> None:
+        """Take one more message of CropFish."""
+        if isinstance(message, TrackEnded):
+            self._ended.setdefault(message.frame_index, []).append(message)
+            return
+        data = encode(message)
+        self._places.setdefault(message.frame_index, []).append((self._file.tell(), len(data)))
         self._file.write(data)
 
     def __iter__(self) -> Iterator[FishCrop]:
         """All crops, in the order in which they came."""
         return (crop for frame_index in self._places for crop in self._of(frame_index))
 
-    def step(self, frame: Frame, /) -> Sequence[FishCrop]:
-        """The crops of a frame."""
-        return self._of(frame.frame_index)
-
-    def tick(self, timestamp_ns: int, /) -> Sequence[FishCrop]:
-        """Nothing waits for time to pass."""
-        return ()
+    def step(self, frame: Frame, /) -> Sequence[FishCrop | TrackEnded]:
+        """The crops of a frame, and who is gone after it."""
+        return [*self._of(frame.frame_index), *self._ended.get(frame.frame_index, [])]
 
     def close(self) -> Sequence[FishCrop]:
         """Close the file; no output at the end."""
@@ -229,7 +243,7 @@ def keep_crops(
 
     def take(message: Message) -> Message:
         message = as_recorded(message, settings)  # from decoded pixels, as in the run
-        if isinstance(message, FishCrop):
+        if isinstance(message, FishCrop | TrackEnded):
             kept.keep(message)
         return message
 
@@ -246,17 +260,19 @@ class CropFishOfRuns:
         self._crop_fish, self._is_new = open_crop_fish(), True
         self._frames_before = -1  # of the run that goes on
 
-    def step(self, frame: Frame, /) -> list[FishCrop]:
+    def step(self, frame: Frame, /) -> list[FishCrop | TrackEnded]:
         """The fish of one frame, as the run had them that recorded it.
 
         Of runs that began at one frame, as those with given boxes say, the first goes on.
         """
+        ended = list[FishCrop | TrackEnded]()
         while self._runs and self._runs[0].frames_before < frame.frame_index:
             run = self._runs.popleft()
             if run.frames_before > self._frames_before:
+                ended += self._crop_fish.close()
                 self._begin(run)
         self._is_new = False
-        return self._crop_fish.step(frame)
+        return [*ended, *self._crop_fish.step(frame)]
 
     def _begin(self, run: RunStart) -> None:
         if not self._is_new:
@@ -264,13 +280,9 @@ class CropFishOfRuns:
         self._crop_fish.number_after(run.tracks_before)
         self._frames_before = run.frames_before
 
-    def tick(self, timestamp_ns: int, /) -> Sequence[FishCrop]:
-        """No output: crops do not wait for time to pass."""
-        return ()
-
-    def close(self) -> Sequence[FishCrop]:
-        """No output at the end."""
-        return ()
+    def close(self) -> Sequence[FishCrop | TrackEnded]:
+        """The tracks of the last run end."""
+        return self._crop_fish.close()
 
 
 M = TypeVar("M", bound=Message)
@@ -348,14 +360,38 @@ class RecordedMessages:
 
 
 class PlaybackNode:
-    """Takes the place of a node and returns the messages that the node returned in the run."""
+    """Takes the place of a node and returns the messages that the node returned in the run.
 
-    def __init__(self, recorded: RecordedMessages, kind: type[Message]) -> None:
+    The first node of a chain returns the ends of tracks as well. A recording of before 0.2 has
+    none: there a track ends when its fish is unseen for `track_timeout_s`.
+    """
+
+    def __init__(
+        self, recorded: RecordedMessages, kind: type[Message], *, track_timeout_s: float
+    ) -> None:
         self._messages = recorded.of_type(kind)
         self._next = next(self._messages, None)
+        self._ends = deque(recorded.of_type(TrackEnded, keep_payloads=False))
+        self._timeout = None if self._ends else TrackTimeout(track_timeout_s)
+        self._last: Frame | None = None
 
     def step(self, message: Frame | FishCrop | FittedMesh, /) -> Sequence[Message]:
-        """The recorded messages of a frame, or that of one fish in a frame."""
+        """The recorded messages of a frame and its ends, or that of one fish in a frame."""
+        recorded = self._recorded(message)
+        if not isinstance(message, Frame):
+            return recorded
+        self._last = message
+        return [*recorded, *self._ends_after(message, recorded)]
+
+    def _ends_after(self, frame: Frame, recorded: Sequence[Message]) -> Iterator[TrackEnded]:
+        if self._timeout is not None:
+            seen = [message.track_id for message in recorded if isinstance(message, FishMessage)]
+            for track_id in self._timeout.step(frame.timestamp_ns, seen):
+                yield TrackEnded.after(frame, track_id, "timeout")
+        while self._ends and self._ends[0].frame_index <= frame.frame_index:
+            yield self._ends.popleft()
+
+    def _recorded(self, message: Frame | FishCrop | FittedMesh) -> list[Message]:
         recorded: list[Message] = []
         while self._next is not None and self._next.frame_index <= message.frame_index:
             if self._next.frame_index == message.frame_index:
@@ -368,10 +404,8 @@ class PlaybackNode:
     def _track_id(self) -> int:
         return getattr(self._next, "track_id", 0)
 
-    def tick(self, timestamp_ns: int, /) -> Sequence[Message]:
-        """Nothing: `step` returns everything that was recorded."""
-        return ()
-
     def close(self) -> Sequence[Message]:
-        """Nothing: `step` returns everything that was recorded."""
-        return ()
+        """The ends of the tracks that are left, if none was recorded."""
+        if self._timeout is None or self._last is None:
+            return ()
+        return [TrackEnded.after(self._last, one, "end") for one in self._timeout.open_ids]

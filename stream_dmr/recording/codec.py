@@ -213,7 +213,7 @@ DATACLASSES: dict[str, type] = {
     for kind in (
         *(messages.Frame, messages.FishCrop, messages.FittedMesh),
         *(messages.LocalizedFish, messages.LengthEstimate, messages.Position),
-        messages.LearntShapes,
+        *(messages.LearntShapes, messages.TrackEnded),
         *(messages.CropQuality, messages.FishEnds, messages.FittedShape),
         *(messages.LossTerms, messages.SolverReport),
         *(Camera, ReferencePlane, Calibration),

@@ -14,6 +14,7 @@ from stream_dmr.messages import (
     LocalizedFish,
     Message,
     Position,
+    TrackEnded,
 )
 from stream_dmr.settings import Settings
 
@@ -68,6 +69,7 @@ TOPICS: dict[type[Message], Topic] = {
             topic="/localized",
             entities=(BOX, KEYPOINTS_2D, KEYPOINTS_3D, MIDLINE, FRAME_LENGTH, BENDING),
         ),
+        Topic(message=TrackEnded, topic="/ended", entities=()),
         Topic(message=LengthEstimate, topic="/length", entities=(LENGTH, REFUSALS, RESULTS)),
         Topic(message=Position, topic="/position", entities=(VESSEL,)),
         Topic(message=LearntShapes, topic="/shapes", entities=()),

@@ -6,7 +6,7 @@ A box with a fish's tail and one without it, or a fish and its fin, overlap too 
 box. Their masks tell: fish share no pixels.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -202,9 +202,9 @@ class TrackedFish:
         return evidence.has_moved and evidence.looks_like_a_fish(min_frames)
 
     @property
-    def knows_ids(self) -> bool:
-        """False: track numbers also count what turns out to be no fish."""
-        return False
+    def open_ids(self) -> Collection[int]:
+        """The track numbers that later frames may show."""
+        return self._tracker.open_numbers
 
     def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:
         """The track numbers of confirmed fish; `crops` are those of all detections of the frame."""
@@ -275,8 +275,8 @@ class FishFinder(Protocol):
         ...
 
     @property
-    def knows_ids(self) -> bool:
-        """True where `source_id` is the id that somebody gave the fish."""
+    def open_ids(self) -> Collection[int] | None:
+        """The ids that later frames may show; None if ids are given, so that nobody knows."""
         ...
 
     def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:

@@ -69,6 +69,11 @@ class Tracker:
         """True while anything is seen, or was seen often enough that it may come again."""
         return any(track.lost_frames == 0 or track.may_be_hidden for track in self._tracks)
 
+    @property
+    def open_numbers(self) -> set[int]:
+        """The numbers of the tracks that a later frame may show."""
+        return {track.number for track in (*self._tracks, *self._hidden)}
+
     def step(self, frame: Frame, candidates: Sequence[Candidate]) -> list[TrackedCandidate]:
         """The tracks seen in a frame. Frames must come in order; some may be missing."""
         observations = [

@@ -377,7 +377,7 @@ class TestRepeats:
         fitted = [message for crop in crops for message in node.step(crop)]
         assert [m.refusal for m in fitted] == ["", "no mask", ""]
         assert fitted[2].shape.iou >= 0.95
-        assert [*node.tick(0), *node.close()] == []
+        assert [*node.close()] == []
 
     @pytest.mark.parametrize(("later_s", "is_known"), [(59, True), (61, False)])
     def test_a_fish_not_seen_for_a_minute_is_forgotten(self, later_s, is_known):
@@ -385,6 +385,6 @@ class TestRepeats:
         node = FitMesh(FitMeshSettings(), template=TEMPLATE, calibration=None)
         first, second = (crop_of(true_pose(1), RIG, size=64, frame_index=k) for k in (1, 2))
         node.step(first)
-        node.tick(first.timestamp_ns + later_s * 1_000_000_000)
-        (fitted,) = node.step(second)
+        later_ns = first.timestamp_ns + later_s * 1_000_000_000
+        (fitted,) = node.step(replace(second, timestamp_ns=later_ns))
         assert fitted.report.cold_start != is_known

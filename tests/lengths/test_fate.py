@@ -15,7 +15,7 @@ from stream_dmr.lengths.fate import (
     shares_in,
 )
 from stream_dmr.lengths.kalman import SmoothLengthSettings
-from stream_dmr.messages import LengthEstimate, LocalizedFish
+from stream_dmr.messages import LengthEstimate, LocalizedFish, TrackEnded
 from stream_dmr.nodes.smooth_length import SmoothLength
 from stream_dmr.pipeline.config import Config, parse_config, to_toml
 from stream_dmr.reasons import Reason
@@ -47,11 +47,11 @@ def look(frame: int, *, x: float | None, y: float = 75.0, reason: str = "") -> L
     )
 
 
-def fate_of(*looks: LocalizedFish, first: int = 1, last: int = 100) -> Fate:
+def fate_of(*looks: LocalizedFish, cause: str = "lost", last: int = 100) -> Fate:
     tracker = FateTracker(ZONES)
     for one in looks:
         tracker.add(one)
-    return tracker.finish(watched_from_ns=first * FRAME_NS, watched_to_ns=last * FRAME_NS)
+    return tracker.finish(TrackEnded.after(look(last, x=None), 1, cause))
 
 
 @pytest.mark.parametrize(
@@ -83,14 +83,16 @@ def test_an_end_that_was_not_seen_is_unknown():
 
 
 def test_a_fish_in_view_at_the_end_or_before_a_crash_has_no_fate_yet():
-    assert fate_of(look(10, x=20.0), last=10) == Fate(UNKNOWN_FATE, None)
-    assert fate_of(look(10, x=20.0), first=11) == Fate(UNKNOWN_FATE, None)
+    assert fate_of(look(10, x=20.0), cause="end", last=10) == Fate(UNKNOWN_FATE, None)
+    assert fate_of(look(10, x=20.0), cause="end", last=50).name == "landed"
+    assert fate_of(look(10, x=20.0), cause="restart") == Fate(UNKNOWN_FATE, None)
+    assert fate_of(look(10, x=20.0), cause="lost", last=11).name == "landed"
 
 
 def test_what_reaches_out_of_the_picture_counts_at_its_edge():
     tracker = FateTracker(ZONES, frame_size=(200, 100))
     tracker.add(look(1, x=-35.0))  # most of it is beyond the left edge
-    assert tracker.finish(watched_from_ns=0, watched_to_ns=10**10) == Fate("landed", 1.0)
+    assert tracker.finish(TrackEnded.after(look(9, x=None), 1, "lost")) == Fate("landed", 1.0)
     assert fate_of(look(1, x=-35.0)).name == UNKNOWN_FATE
 
 
@@ -112,12 +114,11 @@ def test_shares_are_of_the_body_and_never_counted_twice(points: np.ndarray):
 def test_the_node_gives_final_estimates_their_fate():
     def through(zones: ZonesSettings | None) -> LengthEstimate:
         node = SmoothLength(SmoothLengthSettings(), zones=zones)
-        for i in range(1, 41):
-            if i <= 20:
-                (running,) = node.step(look(i, x=4.0 * i))
-                assert (running.fate, running.fate_share) == (None, None)
-            assert not node.tick(i * FRAME_NS)
-        (final,) = node.close()
+        for i in range(1, 21):
+            (running,) = node.step(look(i, x=4.0 * i))
+            assert (running.fate, running.fate_share) == (None, None)
+        (final,) = node.end(TrackEnded.after(look(40, x=None), 1, "lost"))
+        assert not node.close()
         return final
 
     assert through(ZONES).fate == "landed"

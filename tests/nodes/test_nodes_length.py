@@ -5,12 +5,11 @@ import pytest
 
 from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.localization.localize_fish import LocalizeSettings
+from stream_dmr.messages import TrackEnded
 from stream_dmr.nodes.localize import Localize
 from stream_dmr.nodes.smooth_length import SmoothLength
 from tests.lengths.test_lengths import frame
 from tests.localization.test_localization import make_calibration, make_mesh, straight_fish
-
-FRAME_NS = 40_000_000
 
 
 def test_fits_become_one_length():
@@ -36,34 +35,30 @@ def test_without_calibration_there_is_a_row_but_no_length():
     assert (final.status, final.length_mm, final.frames_seen) == ("no calibration", None, 5)
 
 
-def test_each_fish_ends_once_by_time_out_or_by_close():
-    node = SmoothLength(SmoothLengthSettings(track_timeout_s=1.0))
-    finals = []
-    for i in range(1, 101):
-        if i <= 10:
-            node.step(frame(i, 500.0 + i % 2, track_id=1))
-        if i >= 5:
-            node.step(frame(i, 800.0 + i % 2, track_id=2))
-        finals += [(i, estimate) for estimate in node.tick(i * FRAME_NS)]
-    finals += [(None, estimate) for estimate in node.close()]
-    assert [(i, e.track_id, e.is_final) for i, e in finals] == [(36, 1, True), (None, 2, True)]
-    np.testing.assert_allclose([e.length_mm for _, e in finals], [500, 800], atol=1)
+def test_each_fish_ends_once_when_it_is_gone_or_by_close():
+    node = SmoothLength(SmoothLengthSettings())
+    for i in range(1, 11):
+        node.step(frame(i, 500.0 + i % 2, track_id=1))
+        node.step(frame(i, 800.0 + i % 2, track_id=2))
+    gone = TrackEnded.after(frame(18, 0.0), 1, "lost")
+    finals = [*node.end(gone), *node.end(gone), *node.close()]
+    assert [(e.track_id, e.is_final) for e in finals] == [(1, True), (2, True)]
+    np.testing.assert_allclose([e.length_mm for e in finals], [500, 800], atol=1)
     assert list(node.close()) == []
 
 
-def test_a_short_absence_is_the_same_track():
-    node = SmoothLength(SmoothLengthSettings(track_timeout_s=1.0))
-    for i in (1, 2, 25, 26):
-        assert list(node.tick(i * FRAME_NS)) == []
-        (estimate,) = node.step(frame(i, 500.0))
-    assert (estimate.frames_seen, estimate.first_frame) == (4, 1)
+def test_the_end_of_a_fish_without_frames_is_passed_over():
+    node = SmoothLength(SmoothLengthSettings())
+    assert list(node.end(TrackEnded.after(frame(1, 0.0), 5, "lost"))) == []
+    (running,) = node.step(frame(2, 500.0, track_id=5))
+    assert running.is_frame_used
 
 
 def test_an_id_that_returns_after_its_end_gets_no_second_row():
-    node = SmoothLength(SmoothLengthSettings(track_timeout_s=1.0))
+    node = SmoothLength(SmoothLengthSettings())
     for i in range(1, 5):
         node.step(frame(i, 500.0))
-    (final,) = node.tick(1000 * FRAME_NS)
+    (final,) = node.end(TrackEnded.after(frame(1000, 0.0), frame(4, 0.0).track_id, "timeout"))
     assert final.is_final
     (late,) = node.step(frame(1001, 900.0))
     assert (late.is_frame_used, late.frame_reason, late.is_final) == (
@@ -71,7 +66,7 @@ def test_an_id_that_returns_after_its_end_gets_no_second_row():
         "track has ended",
         False,
     )
-    assert list(node.tick(2000 * FRAME_NS)) == list(node.close()) == []
+    assert list(node.close()) == []
 
 
 def test_the_same_frames_give_the_same_bits():

@@ -95,7 +95,7 @@ def test_messages_after_a_cut_are_no_mismatch():
 
 
 def test_playback_gives_each_frame_and_fish_its_recorded_messages():
-    node = PlaybackNode(MadeUpRecording(RECORDED), LocalizedFish)
+    node = PlaybackNode(MadeUpRecording(RECORDED), LocalizedFish, track_timeout_s=10.0)
     fits = [m for m in RECORDED if isinstance(m, FittedMesh)]
     given_back = [message for fit in fits for message in node.step(fit)]
     assert given_back == [m for m in RECORDED if isinstance(m, LocalizedFish)]

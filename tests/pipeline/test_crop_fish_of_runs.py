@@ -1,13 +1,13 @@
 """Each run of a recording begins with nothing seen, and numbers its fish after earlier ones."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from stream_dmr.messages import FishCrop, Frame
+from stream_dmr.messages import FishCrop, Frame, TrackEnded
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.pipeline.replay_inputs import read_inputs
 from stream_dmr.pipeline.run_observer import RunObserver
@@ -32,11 +32,14 @@ class CountedFrames(CropFish):
     def __init__(self) -> None:
         self.tracks_before, self.frames = 0, list[int]()
 
-    def number_after(self, track_id: int) -> None:
+    def number_after(self, track_id: int, *, interrupted: Collection[int] = ()) -> None:
         self.tracks_before = track_id
 
-    def step(self, frame: Frame, /) -> list[FishCrop]:
+    def step(self, frame: Frame, /) -> list[FishCrop | TrackEnded]:
         self.frames.append(frame.frame_index)
+        return []
+
+    def close(self) -> list[FishCrop | TrackEnded]:
         return []
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stream_dmr.messages import FishCrop
+from stream_dmr.messages import FishCrop, TrackEnded
 from stream_dmr.pipeline.session import KeptCrops
 from stream_dmr.recording.codec import encode
 from tests.support.recorded_run import run
@@ -25,5 +25,8 @@ def test_gives_back_what_it_took(in_memory):
     assert [encode(crop) for frame in frames for crop in kept.step(frame)] == expected
     later = replace(frames[0], frame_index=99, image=np.zeros((2, 2, 3), np.uint8))
     assert list(kept.step(later)) == []
-    assert list(kept.tick(0)) == []
+    gone = TrackEnded.after(crops[-1], 1, "lost")
+    kept.keep(gone)
+    assert kept.step(frames[-1])[-1] is gone
+    assert [encode(crop) for crop in kept] == expected
     assert list(kept.close()) == []

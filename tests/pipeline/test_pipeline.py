@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stream_dmr.messages import Frame, Message
+from stream_dmr.messages import Frame, Message, TrackEnded
 from stream_dmr.pipeline.chain import Chain, StageCounters, run_chain
 
 BLACK = np.zeros((2, 2, 3), np.uint8)
@@ -24,7 +24,7 @@ def frames(count: int) -> Iterator[Frame]:
 
 
 class Repeat:
-    """Passes every message on `copies` times; owes one message at every tick and at the end."""
+    """Passes every message on `copies` times; may owe one message at the end."""
 
     def __init__(self, name: str, *, copies: int = 1, owes: bool = False, delay_s: float = 0.0):
         self.name, self.copies, self.owes, self.delay_s = name, copies, owes, delay_s
@@ -33,9 +33,6 @@ class Repeat:
     def step(self, message: Message) -> Sequence[Message]:
         time.sleep(self.delay_s)
         return [frame(message.frame_index, source=self.name)] * self.copies
-
-    def tick(self, timestamp_ns: int) -> Sequence[Message]:
-        return [frame(timestamp_ns // 10, source=f"{self.name}.tick")] if self.owes else []
 
     def close(self) -> Sequence[Message]:
         self.closed += 1
@@ -69,12 +66,52 @@ def reference(count: int, nodes: Sequence[Repeat]) -> dict[str, list[tuple[str, 
         batch = record("test", [item])
         for node in nodes:
             made = [out for message in batch for out in node.step(message)]
-            batch = record(node.name, [*made, *node.tick(item.timestamp_ns)])
+            batch = record(node.name, made)
     batch = []
     for node in nodes:
         made = [out for message in batch for out in node.step(message)]
         batch = record(node.name, [*made, *node.close()])
     return seen
+
+
+class EndsEven:
+    """Ends a track after each even frame; answers an end with a frame of its own."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def step(self, message: Message) -> Sequence[Message]:
+        ended = TrackEnded.after(frame(message.frame_index), 7, "lost")
+        return [frame(message.frame_index, source=self.name), *[ended][message.frame_index % 2 :]]
+
+    def end(self, ended: TrackEnded) -> Sequence[Message]:
+        return [frame(ended.frame_index, source=f"{self.name}.end")]
+
+    def close(self) -> Sequence[Message]:
+        return []
+
+
+@pytest.mark.parametrize("in_one_thread", [False, True])
+def test_the_end_of_a_track_goes_down_the_chain_and_is_told_once(in_one_thread: bool):
+    ended, answers = list[int](), list[tuple[str, int]]()
+
+    def take(message: Message) -> Message:
+        if isinstance(message, TrackEnded):
+            ended.append(message.frame_index)
+        elif isinstance(message, Frame) and message.source.endswith("end"):
+            answers.append((message.source, message.frame_index))
+        return message
+
+    class Answers(EndsEven):
+        def step(self, message: Message) -> Sequence[Message]:
+            return [frame(message.frame_index, source=self.name)]
+
+    nodes = [EndsEven("first"), Repeat("without"), Answers("last")]
+    run_chain(
+        frames(6), nodes, on_message=take, stop=threading.Event(), in_one_thread=in_one_thread
+    )
+    assert ended == [2, 4, 6]
+    assert answers == [("last.end", 2), ("last.end", 4), ("last.end", 6)]
 
 
 @settings(max_examples=50, deadline=None)

@@ -77,9 +77,6 @@ class Again:
     def step(self, message: FittedMesh, /) -> list[FittedMesh]:
         return [message]
 
-    def tick(self, timestamp_ns: int, /) -> list[FittedMesh]:
-        return []
-
     def close(self) -> list[FittedMesh]:
         return []
 

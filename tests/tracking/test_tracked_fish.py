@@ -78,7 +78,7 @@ def follow(
     """The fish of each frame."""
     track_settings = TrackFishSettings.model_validate({"min_track_frames": 1, **settings})
     fish = TrackedFish(ScriptedDetector(frames), track_settings)
-    numbering = TrackNumbering(keeps_source_ids=fish.knows_ids)
+    numbering = TrackNumbering(keeps_source_ids=fish.open_ids is None)
     found = {}
     for i, spots in enumerate(frames, start=1):
         frame = spots_frame(spots, i)
@@ -99,6 +99,17 @@ def test_a_track_counts_once_it_is_long_enough():
     assert ids(follow(frames, min_track_frames=4)) == [[]] * 3 + [[1]] * 7
     flashes = [[climbing(i)] if i < 3 else [] for i in range(12)]
     assert not any(ids(follow(flashes * 3, min_track_frames=4)))
+
+
+def test_a_fish_is_open_until_the_tracker_drops_it():
+    frames = [[climbing(i)] if i < 6 else [] for i in range(16)]
+    fish = TrackedFish(ScriptedDetector(frames), TrackFishSettings(max_lost_frames=4))
+    is_open = []
+    for i, spots in enumerate(frames, start=1):
+        frame = spots_frame(spots, i)
+        fish.confirm(cut_out(frame, fish.detect(frame), WholeBox(1.0)))
+        is_open.append(bool(fish.open_ids))
+    assert is_open == [True] * 10 + [False] * 6
 
 
 def test_what_never_looks_like_a_fish_does_not_count():

@@ -23,6 +23,7 @@ from stream_dmr.messages import (
     LocalizedFish,
     Message,
     Position,
+    TrackEnded,
 )
 from stream_dmr.recording import topics
 from stream_dmr.recording.codec import color_labels, compress
@@ -175,7 +176,7 @@ class SceneDrawing:
                 self._length(estimate)
             case Position() as position:
                 self._position(position)
-            case LearntShapes():  # its fish are drawn by it
+            case LearntShapes() | TrackEnded():  # the fish show the first, lengths the second
                 pass
 
     def add_payload(self, record: Record) -> None:
