@@ -30,8 +30,8 @@ class SmoothLengthSettings(Settings):
     track_timeout_s: float = Field(
         default=10.0,
         gt=0,
-        description="a fish of given boxes or masks ends when unseen for so long, s of capture time; "
-        "a tracked one when the tracker drops it",
+        description="a fish of given boxes or masks ends when unseen for so long, s of capture "
+        "time; a tracked one when the tracker drops it",
     )
     process_std_mm: float = Field(
         default=0.1, ge=0, description="drift of the measured length from frame to frame, std, mm"
