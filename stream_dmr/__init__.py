@@ -42,7 +42,14 @@ from stream_dmr.version import __version__
 if TYPE_CHECKING:
     from stream_dmr.api import FishRow, FrameRow, RecordedRun, Run, measure, open, replay
     from stream_dmr.errors import UserError
-    from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish
+    from stream_dmr.messages import (
+        FishCrop,
+        FittedMesh,
+        Frame,
+        LengthEstimate,
+        LocalizedFish,
+        TrackEnded,
+    )
     from stream_dmr.simulation import DEMO_SCENE
 
 __all__ = [
@@ -56,6 +63,7 @@ __all__ = [
     "LocalizedFish",
     "RecordedRun",
     "Run",
+    "TrackEnded",
     "UserError",
     "__version__",
     "measure",
@@ -67,7 +75,8 @@ _MODULES = {
     **dict.fromkeys(("RecordedRun", "Run", "measure", "open", "replay"), "api"),
     **dict.fromkeys(("FishRow", "FrameRow"), "api"),
     **dict.fromkeys(
-        ("FishCrop", "FittedMesh", "Frame", "LengthEstimate", "LocalizedFish"), "messages"
+        ("FishCrop", "FittedMesh", "Frame", "LengthEstimate", "LocalizedFish", "TrackEnded"),
+        "messages",
     ),
     "UserError": "errors",
     "DEMO_SCENE": "simulation",

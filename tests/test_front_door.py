@@ -126,7 +126,8 @@ def test_open_gives_the_messages_again_and_again(run: sd.Run):
     recorded = sd.open(run.out)
     assert recorded.calibration is not None
     kinds = [type(message) for message in recorded]
-    assert {sd.Frame, sd.FishCrop, sd.FittedMesh, sd.LocalizedFish, sd.LengthEstimate} == {*kinds}
+    chain = {sd.Frame, sd.FishCrop, sd.FittedMesh, sd.LocalizedFish, sd.LengthEstimate}
+    assert {*chain, sd.TrackEnded} == {*kinds}
     assert [type(message) for message in recorded] == kinds
     localized = list(run.messages([sd.LocalizedFish], tracks=[2]))
     assert [fish.track_id for fish in localized] == [2] * 5
