@@ -188,15 +188,14 @@ class LoggingObserver(RunObserver):
     """Logs the warnings of a run, each once."""
 
     def __init__(self) -> None:
-        """Has logged nothing yet."""
         self._logged: set[str] = set()
 
-    def warn(self, line: str) -> None:  # noqa: D102
+    def warn(self, line: str) -> None:
         if line not in self._logged:
             self._logged.add(line)
             _LOGGER.warning(line)
 
-    def serving(self, address: str) -> None:  # noqa: D102
+    def serving(self, address: str) -> None:
         _LOGGER.info("watch it with: %s", address)
 
 

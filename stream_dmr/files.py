@@ -65,7 +65,6 @@ class TransactionalFile:
         return _is_open_at(self._fd, path)
 
     def tell(self) -> int:
-        """Bytes written so far."""
         return self._size
 
     def flush(self) -> None:
@@ -236,7 +235,6 @@ def make_folder(path: Path) -> Path:
 
 
 def sha256_of(path: Path) -> str:
-    """SHA-256 of a file, in hex."""
     with path.open("rb") as file:
         return file_digest(file, "sha256").hexdigest()
 
@@ -271,7 +269,6 @@ class FolderLock:
 
     @property
     def is_held(self) -> bool:
-        """False after `release`."""
         return self._descriptor >= 0
 
     @property

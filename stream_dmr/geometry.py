@@ -12,7 +12,6 @@ def arc_lengths(points: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "M"]:
 
 
 def arc_length(points: Float[np.ndarray, "M D"]) -> float:
-    """Length of a polyline, in the points' unit."""
     return float(arc_lengths(points)[-1])
 
 
@@ -61,7 +60,6 @@ def fraction_inside(box: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) 
 
 
 def box_iou(one: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> float:
-    """Intersection over union of two boxes."""
     sides = np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2])
     both = np.prod(np.maximum(sides, 0))
     return float(both / (np.prod(one[2:] - one[:2]) + np.prod(other[2:] - other[:2]) - both))

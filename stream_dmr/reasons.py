@@ -23,7 +23,6 @@ class Reason(StrEnum):
     remedy: str  # what a user can do
 
     def __new__(cls, text: str, subject: str, explanation: str, remedy: str) -> "Reason":
-        """A text with its explanation."""
         reason = str.__new__(cls, text)
         reason._value_ = text
         reason.subject, reason.explanation, reason.remedy = subject, explanation, remedy

@@ -57,10 +57,10 @@ class RestoringObserver(RunObserver):
         self.num_frames = 0
         self._frames_left = FAILING_FRAMES if case.mode == "for a while" else -1
 
-    def warn(self, line: str) -> None:  # noqa: D102
+    def warn(self, line: str) -> None:
         self.lines.append(line)
 
-    def frame_done(self) -> None:  # noqa: D102
+    def frame_done(self) -> None:
         self.num_frames += 1
         self._frames_left -= 1
         if self._frames_left == 0:

@@ -26,10 +26,10 @@ class Late(RunObserver):
     timer: threading.Timer  # of the end, from the first frame on
     late_s: list[float] = field(default_factory=list)
 
-    def begin(self, num_frames: int | None) -> None:  # noqa: D102
+    def begin(self, num_frames: int | None) -> None:
         self.timer.start()
 
-    def take(self, message: Message) -> None:  # noqa: D102
+    def take(self, message: Message) -> None:
         if isinstance(message, LocalizedFish):
             self.late_s.append((time.time_ns() - message.timestamp_ns) / 1e9)
 

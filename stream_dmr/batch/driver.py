@@ -99,7 +99,6 @@ class _BatchResults:
     """The outcomes of all videos: writes videos.csv, and the data set of the finished ones."""
 
     def __init__(self, jobs: Sequence[Job], out: Path, log: Callable[[str], None]) -> None:
-        """Begins with the videos that earlier calls have finished."""
         self._jobs, self._out, self._log = jobs, out, log
         known = {job.name: read_outcome(job, out) for job in jobs}
         self.outcomes = {name: one for name, one in known.items() if one and one.status == DONE}
@@ -111,7 +110,6 @@ class _BatchResults:
         self._write_table()
 
     def add(self, job: Job, outcome: Outcome) -> None:
-        """Record what became of a video."""
         self.outcomes[job.name] = outcome
         if outcome.status == DONE:
             publish(results_folder(job.name, self._out), job, self._out)

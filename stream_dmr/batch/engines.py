@@ -36,7 +36,6 @@ FINISHED = "finished"
 
 
 def main() -> None:
-    """Measure the jobs that come on stdin."""
     jobs = queue.Queue[str]()
     threading.Thread(target=_read_stdin, args=(jobs,), daemon=True).start()
     while True:
@@ -124,7 +123,6 @@ class _Worker:
     def work(
         self, jobs: queue.Queue[Job], finished: queue.Queue[Outcome], progress: BatchProgress
     ) -> None:
-        """Measure jobs until there are none."""
         with tempfile.TemporaryFile() as self._errors:
             try:
                 while not self._stop.is_set():
@@ -138,7 +136,6 @@ class _Worker:
                 self._end()
 
     def kill(self) -> None:
-        """End the process now."""
         if self._process is not None:
             self._process.kill()
 

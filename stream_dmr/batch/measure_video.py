@@ -53,13 +53,11 @@ class BatchProgress:
         return take
 
     def finish(self, name: str) -> None:
-        """Count a video as over, measured or failed."""
         self._finished.add(name)
         self._shares[name] = 1.0
         self._logged = -math.inf  # so that the next `update` says so
 
     def update(self) -> None:
-        """Log a line if one is due."""
         now = time.monotonic()
         if now - self._logged >= _LOG_EVERY_S:
             self._logged = now
@@ -97,7 +95,6 @@ class Outcome:
 
     @classmethod
     def failed(cls, job: Job, key: str, reason: str) -> "Outcome":
-        """Of a video that could not be measured."""
         return cls(name=job.name, key=key, status=FAILED, reason=reason)
 
 

@@ -81,7 +81,6 @@ class BoardView:
 
     @classmethod
     def measured(cls, path: Path, corners: BoardCorners, camera: Camera) -> "BoardView":
-        """The board's plane by its corners, and the errors of both."""
         plane, rms_px = find_plane(corners, camera)
         distances = _distance_errors(corners, camera, plane)
         return cls(path=path, corners=corners, plane=plane, rms_px=rms_px, distances=distances)
@@ -308,7 +307,6 @@ def require_views(boards: int, left_out: list[LeftOut]) -> None:
 
 
 def quality_warnings(fit: LensFit) -> Iterator[str]:
-    """What should be improved before the calibration is used."""
     camera = fit.camera
     if len(fit.views) < GOOD_VIEWS:
         yield f"only {len(fit.views)} views; {GOOD_VIEWS} to 20 determine the lens better"

@@ -92,7 +92,6 @@ for _group in _GROUPS.values():
 
 
 def main() -> None:
-    """The entry point of `stream-dmr`."""
     sys.meta_path.insert(0, _WithoutPandas())
     with exit_codes():
         sys.exit(app(prog_name=app.info.name, standalone_mode=False))
@@ -110,7 +109,6 @@ class _WithoutPandas(MetaPathFinder, Loader):
         return ModuleSpec(fullname, self) if fullname == "pandas" else None
 
     def exec_module(self, module: ModuleType) -> None:
-        """Raises ModuleNotFoundError."""
         raise ModuleNotFoundError("hidden: see stream_dmr.cli.main", name=module.__name__)
 
 
@@ -140,7 +138,6 @@ def exit_codes() -> Generator[None]:
 
 
 def one_line(error: UserError) -> str:
-    """The message of an error and its notes on one line."""
     parts = [str(error), *getattr(error, "__notes__", [])]
     return "; ".join(" ".join(part.splitlines()) for part in parts)
 

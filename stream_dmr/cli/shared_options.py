@@ -108,13 +108,11 @@ def command_line() -> str:
 
 
 def warn(lines: Iterable[str]) -> None:
-    """Print warnings to stderr."""
     for line in lines:
         print(f"warning: {line}", file=sys.stderr)
 
 
 def parse_selection(time: str | None, track: list[int] | None) -> "Selection":
-    """The part of a recording that --time and --track ask for."""
     from stream_dmr.recording.selection import Selection
 
     time_s = None if time is None else _parse_time(time)

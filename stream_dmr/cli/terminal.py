@@ -50,15 +50,15 @@ class RunDisplay(RunObserver):
     def __exit__(self, *error: object) -> None:
         self._progress.stop()
 
-    def warn(self, line: str) -> None:  # noqa: D102
+    def warn(self, line: str) -> None:
         if line not in self._warned:
             self._warned.add(line)
             self._console.print(f"warning: {line}", markup=False)
 
-    def notice(self, line: str) -> None:  # noqa: D102
+    def notice(self, line: str) -> None:
         self._console.print(line, markup=False)
 
-    def stage(self, line: str) -> None:  # noqa: D102
+    def stage(self, line: str) -> None:
         self._num_done, self._began = 0, time.monotonic()
         self._progress.reset(self._task, description=line, rate=0.0)
         self._progress.start()
@@ -66,17 +66,17 @@ class RunDisplay(RunObserver):
             self._last_line = time.monotonic()
             self._console.print(line, markup=False)
 
-    def serving(self, address: str) -> None:  # noqa: D102
+    def serving(self, address: str) -> None:
         self._console.print(f"watch it with: {address}", markup=False)
 
-    def begin(self, num_frames: int | None) -> None:  # noqa: D102
+    def begin(self, num_frames: int | None) -> None:
         self._num_frames = num_frames
         self._began = self._last_line = time.monotonic()
         self._num_done = 0
         self._progress.reset(self._task, description="measuring", total=num_frames)
         self._progress.start()
 
-    def frame_done(self) -> None:  # noqa: D102
+    def frame_done(self) -> None:
         self._num_done += 1
         now = time.monotonic()
         rate = self._num_done / max(now - self._began, 1e-9)
@@ -87,7 +87,7 @@ class RunDisplay(RunObserver):
             print_line = f"frame {self._num_done}{of}, {rate:.1f} frames/s, {len(self._fish)} fish"
             self._console.print(print_line)
 
-    def take(self, message: Message) -> None:  # noqa: D102
+    def take(self, message: Message) -> None:
         if isinstance(message, LengthEstimate):
             self._fish.add(message.track_id)
             self._progress.update(self._task, num_fish=len(self._fish))
@@ -191,7 +191,6 @@ def print_evaluation(evaluation: Evaluation) -> None:
 
 
 def print_distributions(distributions: Distributions) -> None:
-    """Print the measures of difference of two histograms to stdout."""
     _stdout().print(_figures(distribution_rows(distributions)))
 
 

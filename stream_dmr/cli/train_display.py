@@ -32,16 +32,16 @@ class TrainDisplay(TrainObserver):
     def __exit__(self, *error: object) -> None:
         self._progress.stop()
 
-    def patches_drawn(self, num_done: int, num_all: int) -> None:  # noqa: D102
+    def patches_drawn(self, num_done: int, num_all: int) -> None:
         is_unfinished = num_done < num_all
         self._progress.update(
             self._drawing, completed=num_done, total=num_all, visible=is_unfinished
         )
 
-    def crops_trained(self, num_crops: int) -> None:  # noqa: D102
+    def crops_trained(self, num_crops: int) -> None:
         self._progress.update(self._epoch, advance=num_crops)
 
-    def epoch_done(self, scores: EpochScores, *, is_best: bool) -> None:  # noqa: D102
+    def epoch_done(self, scores: EpochScores, *, is_best: bool) -> None:
         loss = "before training" if scores.loss is None else f"loss {scores.loss:.3f}"
         heads = "" if scores.ends_right is None else f", heads right {scores.ends_right:.2f}"
         self._console.print(

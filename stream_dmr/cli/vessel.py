@@ -152,7 +152,6 @@ class _Changes:
         self._told: dict[str, list[str]] = {}  # by address
 
     def show(self, states: "Iterable[BoxState]") -> None:
-        """Print what is new."""
         from stream_dmr.web.fleet_page import alarms_of, state_text
 
         for state in states:

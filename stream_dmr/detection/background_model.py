@@ -164,7 +164,6 @@ class BackgroundModel:
     """
 
     def __init__(self, picture: Float32[np.ndarray, "3 H W"], *, memory_frames: float) -> None:
-        """`memory_frames`: frames over which the mean is learnt."""
         height, width = picture.shape[1:]
         self._memory_frames = memory_frames
         self._size = (width, height)

@@ -62,7 +62,6 @@ class FusedDetector:
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """The moving shapes of all frames that were no candidates, by reason."""
         return self._motion.refused
 
     def passes_over(self, frame: Frame, *, is_followed: bool) -> bool:
@@ -85,7 +84,6 @@ class FusedDetector:
         return False
 
     def find(self, frame: Frame) -> list[Candidate]:
-        """The candidates of one frame."""
         if self._must_look:
             looking = self._beside.submit(self._looks.find, frame)
             moving, seen = self._motion.find(frame), looking.result()

@@ -180,7 +180,6 @@ class MotionDetector:
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """The moving shapes of all frames that were no candidates, by reason."""
         return self._refused
 
     def find(self, frame: Frame) -> list[Candidate]:

@@ -335,7 +335,6 @@ class UNetDetector:
         return {}
 
     def find(self, frame: Frame) -> list[Candidate]:
-        """The candidates of one frame."""
         height, width = frame.image.shape[:2]
         scale = self._longer_px / max(width, height)
         size = [

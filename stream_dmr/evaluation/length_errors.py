@@ -43,7 +43,6 @@ class Histogram:
 
     @property
     def centers_mm(self) -> Float[np.ndarray, "B"]:
-        """Middle of each bin."""
         return (self.edges_mm[:-1] + self.edges_mm[1:]) / 2
 
     @property
@@ -104,7 +103,6 @@ class DistributionErrors:
 def distribution_errors(
     predicted: Histogram, truth: Histogram, settings: EvaluateSettings
 ) -> DistributionErrors:
-    """Compare two histograms of the same bins."""
     return DistributionErrors(
         bias_mm=histogram_bias_mm(predicted, truth),
         emd_mm=histogram_emd_mm(predicted, truth),

@@ -40,7 +40,6 @@ class KnownHistogram:
 
 
 def is_histogram(path: Path) -> bool:
-    """Whether a CSV file is a histogram rather than one row per fish, by its columns."""
     columns, _ = _open(path)
     return "bin_low_mm" in columns
 
@@ -106,7 +105,6 @@ def _records(path: Path, *required: str) -> Iterator[tuple[str, _Record]]:
 
 
 def _open(path: Path) -> tuple[list[str], list[tuple[str, _Record]]]:
-    """Columns and rows of a CSV file."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file, strict=True)

@@ -109,7 +109,6 @@ def _matching(folder: Path, patterns: Iterable[str]) -> list[Path]:
 
 
 def log_sum(lines: Sequence[str]) -> dict[str, Any]:
-    """The sum of a log, given as a line for each row."""
     return {"count": len(lines), "sha256": lines_sha256(lines)}
 
 

@@ -39,7 +39,6 @@ ICES_LENGTHS = {"fork": "LengthFork", "total": "LengthTotal"}
 
 
 def wcpfc_row(fish: Fish, template: Template) -> Row:
-    """The catch line of one fish."""
     date, _, time = (utc_text(fish.utc_ns) or "").partition("T")
     length_mm, where = fish.length_mm, fish.where
     notes = [

@@ -70,12 +70,10 @@ class Export:
 
     @property
     def config_toml(self) -> str:
-        """The settings of the run."""
         return self._recording.header.config_toml
 
     @property
     def template(self) -> Template:
-        """The template of the run."""
         return self._recording.header.template
 
     @property
@@ -309,7 +307,6 @@ class Export:
 
 
 def _pairs(messages: Iterable[Message]) -> Iterator[tuple[FittedMesh, LocalizedFish]]:
-    """Each fit with the place of its fish."""
     waiting: dict[tuple[int, int], FittedMesh] = {}
     for message in messages:
         if isinstance(message, FittedMesh):

@@ -181,7 +181,6 @@ def write_parquet(path: Path, records: Sequence[dict[str, Any]]) -> Path:
 
 
 def arrow_schema(columns: dict[str, type]) -> Any:
-    """The schema of a table in Parquet."""
     import pyarrow as pa
 
     kinds = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}

@@ -65,7 +65,6 @@ class ViameTracks:
         )
 
     def text(self) -> str:
-        """The whole file."""
         return self._head + self._rows.getvalue()
 
 

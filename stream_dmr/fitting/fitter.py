@@ -109,7 +109,6 @@ class Fitter:
         return AdamSolver(self._template, self._settings)
 
     def target(self, crop: FishCrop) -> Target:
-        """The target of a crop."""
         return Target.from_crop(crop, plane_normal=self.plane_normal)
 
     def fit(self, crop: FishCrop, warm: Float[np.ndarray, "P"] | None) -> Fit:

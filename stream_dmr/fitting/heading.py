@@ -49,7 +49,6 @@ class HeadTracker:
     """Log odds along one track of which end is the head: a fish doesn't turn round in a frame."""
 
     def __init__(self) -> None:
-        """Nothing has been seen yet."""
         self._forward: np.ndarray | None = None  # tail to head of the last fit, 2 numbers
         self._log_odds = 0.0  # that this is right
 

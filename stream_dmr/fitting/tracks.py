@@ -108,7 +108,6 @@ class TrackFitter:
         return track.against + self._of_species(track)
 
     def forget(self, *, before_ns: int) -> None:
-        """Forget the tracks that have not been seen since a capture time."""
         for track_id, track in list(self._tracks.items()):
             if track.seen_ns < before_ns:
                 del self._tracks[track_id]

@@ -97,7 +97,6 @@ class Residual(nn.Module):
         self.second = nn.Conv2d(width, width, 3, padding=1)
 
     def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
-        """`x`, plus what the two convolutions make of it."""
         return torch.relu(x + self.second(self.first(x)))
 
 
@@ -201,21 +200,17 @@ class _Graph:
         return self.last
 
     def constant(self, value: np.ndarray) -> str:
-        """The name of a constant."""
         name = f"constant_{len(self._constants)}"
         self._constants.append(numpy_helper.from_array(value, name))
         return name
 
     def ints(self, *values: int) -> str:
-        """The name of a constant vector of integers."""
         return self.constant(np.array(values, np.int64))
 
     def floats(self, *values: float) -> str:
-        """The name of a constant vector."""
         return self.constant(np.array(values, np.float32))
 
     def convolve(self, x: str, layer: nn.Module) -> str:
-        """Append a convolution with bias."""
         assert isinstance(layer, nn.Conv2d)
         assert layer.bias is not None
         weights = [self.constant(one.detach().numpy()) for one in (layer.weight, layer.bias)]
@@ -223,7 +218,6 @@ class _Graph:
         return self.add("Conv", [x, *weights], pads=pads, strides=list(layer.stride))
 
     def convolve_relu(self, x: str, block: nn.Module) -> str:
-        """Append a convolution with batch normalisation and ReLU."""
         assert isinstance(block, nn.Sequential)
         convolution, normalisation, _ = block
         assert isinstance(convolution, nn.Conv2d)
@@ -237,7 +231,6 @@ class _Graph:
         return self.add("Relu", [self.add("Add", [x, second])])
 
     def model(self) -> onnx.ModelProto:
-        """The whole model with its inputs and outputs."""
         tensor = helper.make_tensor_value_info
         graph = helper.make_graph(
             self._nodes,
@@ -259,7 +252,6 @@ class _Graph:
 
 
 def _add_normalise(graph: _Graph) -> str:
-    """`unet.normalise` as nodes."""
     pixels = graph.add("Cast", [IMAGES_INPUT], to=TensorProto.FLOAT)
     centred = graph.add("Sub", [pixels, graph.add("ReduceMean", [pixels], axes=[1, 2])])
     squares = graph.add("Mul", [centred, centred])

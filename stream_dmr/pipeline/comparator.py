@@ -177,7 +177,6 @@ class _Lookahead:
         self.step()
 
     def step(self) -> None:
-        """Go to the next value."""
         self.value = next(self._values, None)
 
 

@@ -215,7 +215,6 @@ class DriftAlarms:
         self._alarms: tuple[str, ...] = ()
 
     def take_frame(self, frame: Frame) -> None:
-        """Monitor what the camera sees."""
         self._scene.take(frame.image, frame.timestamp_ns)
         if not self._is_reference_stored and self._scene.reference is not None:
             self._store.keep_scene(encode_scene(self._scene.reference))

@@ -65,7 +65,6 @@ class HaulLog:
         return self._known
 
     def current(self) -> Haul | None:
-        """The haul that goes on."""
         hauls = self.hauls()
         return hauls[-1] if hauls and hauls[-1].ended_ns is None else None
 
@@ -117,7 +116,6 @@ class HaulLog:
             del self._in_view[estimate.track_id]
 
     def take_position(self, position: Position) -> None:
-        """The vessel's speed may end a haul."""
         with self._lock:
             if position.speed_knots is None or position.speed_knots <= self._fast_knots:
                 self._fast_since_ns = None
@@ -127,7 +125,6 @@ class HaulLog:
                 self._end_ruled(self._fast_since_ns)
 
     def finish(self) -> None:
-        """The last frame has passed."""
         with self._lock:
             self._write_watched()
             if self._ruled is not None:

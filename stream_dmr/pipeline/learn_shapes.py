@@ -79,12 +79,10 @@ class MeshComparison:
 
     @property
     def is_like_mesh(self) -> bool:
-        """Whether the mesh can be believed."""
         return self.stocks is not None and self.shift is not None and self.shift.off <= 1
 
     @property
     def not_like_mesh(self) -> str:
-        """How the fish differ from it."""
         return not_like_mesh(self.mesh, self.stocks, self.shift)
 
 
@@ -286,7 +284,6 @@ class SeenFish:
         self._num = 0
 
     def take(self, message: Message) -> None:
-        """Take any message of the chain."""
         match message:
             case FishCrop(track_id=track_id):
                 with self._lock:
@@ -303,7 +300,6 @@ class SeenFish:
             return self._num
 
     def crops(self) -> list[FishCrop]:
-        """The crops that are kept, fish after fish."""
         with self._lock:
             return [*chain.from_iterable(self._fish)]
 

@@ -52,7 +52,6 @@ def compile_kernels(fitter: Fitter) -> None:
 
 
 def drawn_fish() -> FishCrop:
-    """The crop of an ellipse."""
     mask = np.zeros((_SIZE_PX, _SIZE_PX), np.uint8)
     middle = _SIZE_PX // 2
     cv2.ellipse(mask, (middle, middle), (_SIZE_PX // 3, _SIZE_PX // 8), 30, 0, 360, 1, cv2.FILLED)

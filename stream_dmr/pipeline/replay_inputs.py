@@ -227,7 +227,6 @@ def read_inputs(
 
 
 def new_header(request: ReplayOptions, recorded: RunHeader, inputs: ReplayInputs) -> RunHeader:
-    """The header of the recording that the replay writes."""
     calibration, is_cut_anew = request.calibration, inputs.files is not None
     calibration_file = recorded.calibration_file
     if calibration is not None:

@@ -82,12 +82,10 @@ class Inputs(Setup):
 
     @property
     def source(self) -> Source:
-        """The source of the frames."""
         return self.reader.source
 
     @property
     def is_endless(self) -> bool:
-        """True for cameras and growing folders, see `Source`."""
         return self.source.is_endless
 
     @property
@@ -108,7 +106,6 @@ class Inputs(Setup):
         return self.is_endless and not is_annotated
 
     def header(self) -> RunHeader:
-        """The header of this run's recording."""
         file = self.request.calibration
         return RunHeader(
             source=self.source.name,

@@ -72,11 +72,11 @@ class RunTotals(RunObserver):
         self.num_frames = 0
         self._fish: deque[LengthEstimate] = deque(maxlen=max_fish)
 
-    def take(self, message: Message) -> None:  # noqa: D102
+    def take(self, message: Message) -> None:
         if isinstance(message, LengthEstimate) and message.is_final:
             self._fish.append(message)
 
-    def frame_done(self) -> None:  # noqa: D102
+    def frame_done(self) -> None:
         self.num_frames += 1
 
     def fish(self) -> Sequence[LengthEstimate]:

@@ -69,7 +69,6 @@ class RunOptions:
     command: str = ""  # as typed, for the recording
 
     def __post_init__(self) -> None:
-        """Set the default of `out`, which follows from the source."""
         object.__setattr__(self, "out", self.out or default_out(self.source))
 
 
@@ -84,7 +83,6 @@ def default_out(source: str) -> Path:
 
 
 def without_password(text: str) -> str:
-    """An address without the password in it."""
     return re.sub(r"(?<=://)[^/\s]*@", "", text)
 
 

@@ -49,7 +49,6 @@ _FIELD = re.compile(r"(optional |repeated |)(\w+) (\w+) = (\d+);")
 
 
 def proto_class(name: str) -> type[Proto]:
-    """The protobuf class of a message of `messages.proto`, by its name there."""
     return _classes()[name]
 
 

@@ -95,7 +95,6 @@ class ClipPictures:
         )
 
     def close(self) -> None:
-        """Release the open clip."""
         if self._video is not None:
             self._video.close()
 
@@ -191,7 +190,6 @@ class FrameLookup:
         yield from self._of_source(missing)
 
     def close(self) -> None:
-        """Release the source."""
         if self._video is not None:
             self._video.close()
 

@@ -36,7 +36,6 @@ class InputFile:
         return cls(path=os.path.abspath(path), sha256=content_sha256(Path(path)))
 
     def exists(self) -> bool:
-        """True where there is a file or folder at that place."""
         return Path(self.path).exists()
 
     def is_unchanged(self) -> bool:
@@ -245,7 +244,6 @@ def _runs_text(runs: Sequence[RunStart]) -> str:
 
 
 def _runs_in(text: str) -> tuple[RunStart, ...]:
-    """The inverse of `_runs_text`."""
     pairs = [part.split() for part in text.split(",") if part]
     return tuple(RunStart(frames_before=int(f), tracks_before=int(t)) for f, t in pairs)
 

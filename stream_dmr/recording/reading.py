@@ -121,13 +121,11 @@ class _Segments:
 
     @property
     def warnings(self) -> Sequence[str]:
-        """What is lost of each segment."""
         return [line for segment in self._segments for line in segment.warnings]
 
     def payloads(
         self, kinds: MessageTypes, selection: Selection = EVERYTHING
     ) -> Iterator[tuple[type[Message], bytes]]:
-        """The payloads of each segment in turn."""
         for segment in self._segments:
             yield from segment.payloads(kinds, selection)
 
@@ -136,7 +134,6 @@ class _Segments:
         return self._segments[0].carried_over()
 
     def video(self, selection: Selection = EVERYTHING) -> Iterator[bytes]:
-        """The video of each segment in turn."""
         for segment in self._segments:
             yield from segment.video(selection)
 
@@ -188,7 +185,6 @@ def require_frame(recording: Recording, frame_index: int, selection: Selection) 
 
 
 def localized_tracks(recording: Recording, selection: Selection) -> set[int]:
-    """The ids of the selected fish that a recording has."""
     return {fish.track_id for fish in messages_of(recording, LocalizedFish, selection)}
 
 

@@ -36,7 +36,6 @@ class Record:
 
     @property
     def topic(self) -> Topic:
-        """Where the message lies in each kind of recording."""
         return TOPICS[type(self.message)]
 
 
@@ -172,7 +171,6 @@ class SinkStates:
             return list(self._states.values())
 
     def problems(self) -> list[str]:
-        """A line for each output that fails."""
         return [state.problem for state in self.all() if state.is_failing]
 
 

@@ -25,7 +25,6 @@ class Selection:
 
     @property
     def is_everything(self) -> bool:
-        """True where nothing is left out."""
         return self.time_ns is None and self.tracks is None
 
     @property
@@ -36,7 +35,6 @@ class Selection:
         return self.time_ns[0] - self.lead_ns, self.time_ns[1]
 
     def includes_time(self, timestamp_ns: int) -> bool:
-        """True for a capture time within the bounds."""
         first, last = self.bounds_ns
         return (first is None or first <= timestamp_ns) and (last is None or timestamp_ns < last)
 

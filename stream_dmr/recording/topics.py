@@ -170,7 +170,6 @@ class RecordingSettings(Settings):
 
     @property
     def keeps_crops(self) -> bool:
-        """True where the pictures of all crops are recorded."""
         return self.crops in ("jpeg", "png")
 
     def keeps_photographs(self, *, is_live: bool) -> bool:

@@ -42,7 +42,6 @@ class FrameThrottle:
         return True
 
     def has_shown(self, frame_index: int) -> bool:
-        """True where a recent frame was shown."""
         return frame_index in self._shown
 
 
@@ -59,7 +58,6 @@ class PendingItems(Generic[T]):
             del self._items[next(iter(self._items))]
 
     def take(self, fish: LocalizedFish) -> T | None:
-        """Remove and return the item of the same fish in the same frame, if there is one."""
         return self._items.pop((fish.track_id, fish.frame_index), None)
 
 

@@ -194,7 +194,6 @@ class Visit:
     is_gaffed: bool
 
     def pose_at(self, frame_index: int) -> HangingPose:
-        """The pose in a frame of the visit."""
         return self.poses[frame_index - self.first_frame]
 
     def progress(self, frame_index: int) -> float | None:
@@ -220,7 +219,6 @@ class RailScene:
         return [visit for visit in self.visits if visit.progress(frame_index) is not None]
 
     def pose(self, visit: Visit, frame_index: int) -> PosedFish:
-        """The body of a visiting fish in a frame."""
         pose = visit.pose_at(frame_index)
         return pose_fish(visit.fish, pose, calibration=self.calibration)
 

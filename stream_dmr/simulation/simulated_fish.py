@@ -64,7 +64,6 @@ class SimulatedBody:
         return (flesh**6 + tail**6) ** (1 / 6)  # a smooth maximum
 
     def half_thickness_at(self, s: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
-        """Half the thickness in the middle of the section at s."""
         flesh = self.half_thickness * _bump(s, peak=self.thickest_at, end=0.95, power=0.7)
         fin = self.fin_half_thickness * _smooth_step(s / 0.2)
         return (flesh**4 + fin**4) ** (1 / 4)
@@ -276,7 +275,6 @@ class HangingPose:
 
     @property
     def total_bend_rad(self) -> float:
-        """Total turning of the body's tangent from head to tail."""
         return total_bend_rad(self.bends)
 
 

@@ -230,7 +230,6 @@ class ClipFolder(Source):
 
     @property
     def has_clips(self) -> bool:
-        """True."""
         return True
 
     def resume(self, point: ResumePoint) -> None:

@@ -128,12 +128,10 @@ class LiveStream(Source):
 
     @property
     def is_live(self) -> bool:
-        """True: the pictures can't be read again."""
         return True
 
     @property
     def counts(self) -> CameraCounts:
-        """Frames received, passed on and lost since the iteration began."""
         return self._counts
 
     def listen(self, on_notice: Callable[[str], None]) -> None:

@@ -70,7 +70,6 @@ class PositionFile(PositionSource):
 
     @property
     def counts(self) -> PositionCounts:
-        """What was read so far."""
         return self._builder.counts
 
     def take(self, frame: Frame) -> Sequence[Position]:
@@ -92,7 +91,6 @@ class PositionFile(PositionSource):
         return [] if self._next is None else [self._message(self._next)]
 
     def close(self) -> None:
-        """Close the file. Idempotent."""
         self._file.close()
 
     def _message(self, timed: tuple[int, Fix]) -> Position:
@@ -310,7 +308,6 @@ class PositionReceiver(PositionSource):
 
     @property
     def counts(self) -> PositionCounts:
-        """What came so far."""
         with self._lock:
             return replace(self._builder.counts)
 
@@ -325,16 +322,13 @@ class PositionReceiver(PositionSource):
         )
 
     def take(self, frame: Frame) -> Sequence[Position]:
-        """The positions that came up to the time of a frame."""
         self._last_frame = frame.frame_index
         return self._taken(frame.timestamp_ns)
 
     def finish(self) -> Sequence[Position]:
-        """All that came since."""
         return self._taken(None)
 
     def problems(self) -> list[str]:
-        """Why no positions come."""
         counts, now_ns = self.counts, time.monotonic_ns()
         silent_s = (now_ns - (counts.last_arrival_ns or self._opened_ns)) / 1e9
         blind_s = (now_ns - (counts.last_position_ns or self._opened_ns)) / 1e9

@@ -52,7 +52,6 @@ class SensorsSettings(Settings):
 
     @property
     def offset_ns(self) -> int:
-        """`offset_s` in ns."""
         return round(self.offset_s * 1e9)
 
 

@@ -70,7 +70,6 @@ class VideoFile(Source):
         self.close()
 
     def close(self) -> None:
-        """Release the file; the iteration ends."""
         self._is_closed = True
         self._first = None
         self._decoder.close()
@@ -237,6 +236,5 @@ class SeekableVideo:
         return at_ms
 
     def close(self) -> None:
-        """Release the file."""
         with self._lock:
             self._capture.release()

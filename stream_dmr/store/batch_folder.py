@@ -25,12 +25,10 @@ DONE, FAILED, WAITING = "done", "failed", "waiting"
 
 
 def results_folder(name: str, out: Path) -> Path:
-    """The folder of a finished or failed video."""
     return out / VIDEO_FOLDERS / name
 
 
 def unfinished_folder(name: str, out: Path) -> Path:
-    """The folder of a video while it is measured."""
     return out / VIDEO_FOLDERS / f"{name}.part"
 
 

@@ -55,7 +55,6 @@ class TrackPart:
     last_frame: int = _LAST
 
     def has(self, track_id: int, frame_index: int) -> bool:
-        """True for a frame of this part."""
         return track_id == self.track_id and self.first_frame <= frame_index <= self.last_frame
 
     def before(self, frame_index: int) -> "TrackPart":
@@ -68,7 +67,6 @@ class TrackPart:
 
     @property
     def is_empty(self) -> bool:
-        """True where it has room for no frame."""
         return self.first_frame > self.last_frame
 
 
@@ -101,7 +99,6 @@ class TrackEdits:
         return track_id
 
     def after(self, verdict: Verdict) -> "TrackEdits":
-        """The fish after one more add, split or merge."""
         rows = {row["track_id"]: row for row in json.loads(verdict.fish or "[]")}
         fish, merged = dict(self.fish), dict(self.merged)
         parts: dict[int, tuple[TrackPart, ...]] = {}
@@ -139,7 +136,6 @@ NO_EDITS = TrackEdits()
 
 
 def edits_of(verdicts: Sequence[Verdict]) -> TrackEdits:
-    """The fish that the verdicts make."""
     edits = NO_EDITS
     for verdict in standing(verdicts):
         if verdict.kind in EDITS:
@@ -158,7 +154,6 @@ Frames = Mapping[int, Sequence[LocalizedFish]]  # by recorded or added track, in
 
 
 def settings_of(recording: Recording) -> SmoothLengthSettings:
-    """The filter's settings of the run that was recorded."""
     return recorded_settings(recording, "smooth_length", SmoothLengthSettings)
 
 

@@ -74,7 +74,6 @@ class Signer:
         self._last = last
 
     def sign(self, kind: str, name: str, content_sha256: str) -> ChainEntry:
-        """The next entry."""
         unsigned = ChainEntry(
             number=1 if self._last is None else self._last.number + 1,
             previous="" if self._last is None else self._last.sha256,
@@ -89,7 +88,6 @@ class Signer:
 
 
 def lines_sha256(lines: Iterable[str]) -> str:
-    """SHA-256 of the rows of a database, a line each."""
     return sha256("\n".join(lines).encode()).hexdigest()
 
 

@@ -304,7 +304,6 @@ class LengthStore:
         return None if row is None else row[0]
 
     def keep_scene(self, data: bytes) -> None:
-        """Write the static scene of this calibration, for this run and later ones."""
         key = self._facts.calibration_sha256
         self._write(("INSERT OR IGNORE INTO scenes VALUES (?, ?)", (key, data)))
 

@@ -70,15 +70,12 @@ class LostRecording:
     def payloads(
         self, kinds: MessageTypes, selection: Selection = EVERYTHING
     ) -> Iterator[tuple[type[Message], bytes]]:
-        """None."""
         return iter(())
 
     def carried_over(self) -> Iterator[bytes]:
-        """None."""
         return iter(())
 
     def video(self, selection: Selection = EVERYTHING) -> Iterator[bytes]:
-        """None."""
         return iter(())
 
 

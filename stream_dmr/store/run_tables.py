@@ -73,7 +73,6 @@ class LengthsTable:
         )
 
     def add(self, estimate: LengthEstimate) -> None:
-        """Append the row of a final estimate."""
         self._waiting.append(estimate)
         try:
             while self._waiting:

@@ -22,7 +22,6 @@ class Haul:
     ended_ns: int | None = None  # None: it goes on
 
     def includes(self, timestamp_ns: int) -> bool:
-        """True for a time within it."""
         return self.began_ns <= timestamp_ns and (
             self.ended_ns is None or timestamp_ns < self.ended_ns
         )
@@ -86,7 +85,6 @@ class PositionThinner:
         self.gap_s = 0.0  # before the last one that came, where that is a gap
 
     def take(self, position: Position) -> list[KeptPosition]:
-        """The positions to keep now, in their order."""
         last, self._last = self._last, position
         self.gap_s = 0.0
         if last is None or self._kept is None:
@@ -119,7 +117,6 @@ class PositionThinner:
 
 
 def position_values(kept: KeptPosition) -> Mapping[str, object]:
-    """The columns of a row."""
     return asdict(kept) | {"is_joined": int(kept.is_joined)}
 
 

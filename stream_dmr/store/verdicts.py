@@ -95,7 +95,6 @@ class Review:
     written_ns: int = 0
 
     def after(self, verdict: Verdict) -> "Review":
-        """The review after one more verdict."""
         before = Review() if verdict.kind == "withdraw" else self
         now = replace(before, reviewer=verdict.reviewer, written_ns=verdict.written_ns)
         match verdict.kind:

@@ -176,7 +176,6 @@ class BodyForm:
 
 
 def load_body_forms() -> dict[str, BodyForm]:
-    """All body forms, by name."""
     tables = tomllib.loads(_TABLES.read_text(encoding="utf-8"))
     rows = ("places", "half_depth", "half_thickness")
     return {

@@ -86,7 +86,6 @@ def save_template(template: Template, path: Path, *, comment: str) -> None:
 
 
 def bundled_names() -> list[str]:
-    """Names of the templates that come with the package."""
     return sorted(file.stem for file in BUNDLED.glob("*.ply"))
 
 

@@ -68,7 +68,6 @@ class FishConfirmation:
         self._num_empty_frames: Counter[int] = Counter()  # of confirmed ones, in a row
 
     def is_confirmed(self, number: int) -> bool:
-        """True for a track that counts as a fish."""
         return number in self._confirmed
 
     def update(self, number: int, crop: FishCrop, *, may_count: bool = True) -> bool:
@@ -128,7 +127,6 @@ class FishEvidence:
         self.add(candidate, size_px)
 
     def add(self, candidate: Candidate, size_px: float) -> None:
-        """Take the candidate of another frame into account."""
         edges_px = _edges_px(candidate)
         if edges_px is not None and self._first_edges_px is not None:
             is_outlined = candidate.foreground is not None

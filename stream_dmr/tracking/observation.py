@@ -136,7 +136,6 @@ class Observation:
         return self.box if self.whole is None else self.whole.bbox_xyxy_px
 
     def fraction_inside(self, box: Float[np.ndarray, "4"]) -> float:
-        """The fraction of this observation's box that lies inside `box`."""
         return fraction_inside(self.box, box)
 
 

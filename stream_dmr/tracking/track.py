@@ -121,7 +121,6 @@ class Track:
         self.make_uncertain()
 
     def update(self, observation: Observation) -> None:
-        """Take an observation for this fish."""
         self.observation, self.lost_frames, self._merged_frames = observation, 0, 0
         self.frames_seen += 1
         self._evidence.add(observation.candidate, self.size)
@@ -161,7 +160,6 @@ class Track:
         return self.snapshot
 
     def settle(self) -> None:
-        """Mark the identity as certain."""
         self.snapshot = None
         self._history.clear()
         self._history.append(self._current_snapshot())

@@ -84,7 +84,6 @@ def load_batches(samples: SampleDataset, *, workers: int) -> DataLoader[Training
 
 
 def collate_samples(samples: list[TrainingSample]) -> Batch:
-    """Several examples as one batch."""
     unknown = np.full((2, 2), np.nan, np.float32)
     return (
         torch.from_numpy(np.stack([sample.image for sample in samples])),

@@ -324,7 +324,6 @@ def _draw_glove(rng: np.random.Generator) -> Occluder:
 
 def _draw_rope(rng: np.random.Generator) -> Occluder:
     """A rope straight across the picture."""
-    """A rope straight across the picture."""
     center, half = rng.normal(0.0, 0.3, 2), 3.0 * _direction(rng.uniform(0.0, np.pi))
     bars, tones = _lit_bar(rng, center - half, center + half, rng.uniform(0.03, 0.08))
     return Occluder(polygons=bars, tones=tones, colour=_colour(rng), hides=True)

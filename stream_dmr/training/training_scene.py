@@ -90,7 +90,6 @@ class TrainingScene:
 
 
 def draw_scene(rng: np.random.Generator, bank: PatchBank) -> TrainingScene:
-    """A random scene of the bank's fish."""
     target = _draw_fish(rng, bank, at=np.zeros(2), size=1.0, angle_rad=_draw_angle(rng))
     behind: list[SceneFish] = []
     before: list[SceneFish] = []

@@ -136,7 +136,6 @@ class UNetTrainer:
         self.best = -math.inf
 
     def begin(self, network: UNet | None) -> None:
-        """Start from these weights, or from random ones."""
         if network is not None:
             self.network = network
         self.network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -171,7 +170,6 @@ class UNetTrainer:
 
     @property
     def _epoch(self) -> int:
-        """The last epoch done."""
         return self.history[-1].epoch if self.history else 0
 
     def check_start(self, validation: SampleDataset) -> EpochScores:

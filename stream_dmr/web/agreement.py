@@ -26,7 +26,6 @@ class LabelAgreement:
 
     @property
     def text(self) -> str:
-        """For people."""
         if self.count == 0:
             return "none in common"
         kappa = "not defined" if self.kappa is None else f"{self.kappa:.2f}"
@@ -43,7 +42,6 @@ class LengthAgreement:
 
     @property
     def text(self) -> str:
-        """For people."""
         if self.mean_mm is None:
             return "none in common"
         limits = ""
@@ -64,7 +62,6 @@ class Reading:
 
     @property
     def is_empty(self) -> bool:
-        """True where nothing was said."""
         return not (self.decisions or self.species or self.lengths_mm)
 
 

@@ -33,7 +33,6 @@ class Alert:
 
     @property
     def title(self) -> str:
-        """One line for a subject."""
         state = "is healthy again" if self.healthy else f"is unhealthy: {'; '.join(self.problems)}"
         return f"stream-dmr: {self.run} {state}"
 

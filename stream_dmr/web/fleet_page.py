@@ -147,7 +147,6 @@ def _ask(before: BoxState, *, timeout_s: float) -> BoxState:
 
 
 def _failure(failure: Exception) -> str:
-    """Why a box did not answer, for people."""
     if isinstance(failure, urllib.error.HTTPError):
         if failure.code == _UNAUTHORIZED:
             return "it asks for a token, or for another: ADDRESS?token=..."
@@ -277,7 +276,6 @@ def fleet_summary(states: Sequence[BoxState]) -> str:
 
 
 def state_text(state: BoxState) -> str:
-    """How a box is, in some words."""
     if state.reading is None:
         return "never answered"
     return _WORDS[state.kind]

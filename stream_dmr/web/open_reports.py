@@ -106,7 +106,6 @@ def reread_fish(report: RunReport, changed: frozenset[int], pictures: FrameLooku
 
 
 def is_batch(path: Path) -> bool:
-    """True for the --out of a batch."""
     return (path / VIDEOS).is_file()
 
 

@@ -53,7 +53,6 @@ class RunReport:
 
     @property
     def title(self) -> str:
-        """The name of the results' folder or file."""
         return self.path.resolve().name
 
     @property
@@ -258,7 +257,6 @@ class PlacedReport:
 
 
 def place(reports: Sequence[RunReport]) -> list[PlacedReport]:
-    """The reports of a page, with what tells their fish apart."""
     placed, end_s = list[PlacedReport](), -math.inf
     for run, report in enumerate(reports):
         first_s, last_s = report.span_s
@@ -270,7 +268,6 @@ def place(reports: Sequence[RunReport]) -> list[PlacedReport]:
 
 
 def _fill_template(title: str, data: str, scripts: Sequence[str], *, trip: str) -> str:
-    """page.html with its parts filled in."""
     folder = files("stream_dmr.web").joinpath("report")
     parts = {
         "TRIP": trip,

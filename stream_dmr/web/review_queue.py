@@ -50,7 +50,6 @@ class ReviewQueue:
             self._about["sample"] = {"size": sample.size, "seed": sample.seed}
 
     def page(self, title: str) -> str:
-        """The page as it is now."""
         reports = [
             replace(
                 recorder.report, fish=[fish for fish, row in self._fish(run) if self._is_shown(row)]
@@ -86,7 +85,6 @@ class ReviewQueue:
         return fish_clip(recorder.report, recorder.pictures, track_id, shift=shift)
 
     def close(self) -> None:
-        """Release the sources."""
         for recorder in self._recorders:
             recorder.pictures.close()
 
@@ -179,7 +177,6 @@ class ReviewServer:
         self._server.start()
 
     def close(self) -> None:
-        """Stop serving."""
         self._server.stop()
         self._queue.close()
 

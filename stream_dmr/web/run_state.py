@@ -127,12 +127,10 @@ class RunState:
                     pass
 
     def frame_done(self) -> None:
-        """Count a frame that has left the chain."""
         with self._lock:
             self._frames_done_s.append(time.monotonic())
 
     def warn(self, line: str) -> None:
-        """Keep a warning, or count it again."""
         with self._lock:
             before = self._warnings.pop(line, None)
             count = 1 if before is None else before.count + 1
@@ -228,7 +226,6 @@ class RunMetrics(Collector):
         self._state = state
 
     def collect(self) -> Iterator[Metric]:
-        """Give all metrics as they are now."""
         yield from self._stages()
         yield from self._camera()
         yield from self._positions()

@@ -55,7 +55,6 @@ class TokenServer(ThreadingHTTPServer):
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop serving."""
         self.shutdown()
         self.server_close()
         self._thread.join()
@@ -73,7 +72,6 @@ class TokenServer(ThreadingHTTPServer):
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Handle a connection to its end."""
         try:
             super().process_request_thread(request, client_address)
         finally:
@@ -113,12 +111,10 @@ class TokenHandler(BaseHTTPRequestHandler):
         return is_valid
 
     def finish(self) -> None:
-        """End the connection."""
         self._timer.cancel()
         super().finish()
 
     def do_GET(self) -> None:
-        """Refuse, keep the token as a cookie, or answer."""
         try:
             url = urlsplit(self.path)
         except ValueError:  # such as http://[::1
@@ -134,7 +130,6 @@ class TokenHandler(BaseHTTPRequestHandler):
             self._refuse_token()
 
     def do_POST(self) -> None:
-        """Refuse or answer."""
         if not self._is_own_page():
             self._refuse_site()
         elif self._is_authorized():
@@ -214,7 +209,6 @@ class TokenHandler(BaseHTTPRequestHandler):
         return self.rfile.read(int(length)) if is_short else None
 
     def answer_json(self, code: HTTPStatus, content: object) -> None:
-        """Answer with JSON."""
         self.answer(code, "application/json", json.dumps(content).encode())
 
     def answer(self, code: HTTPStatus, media_type: str, content: bytes) -> None:

@@ -129,7 +129,6 @@ class VerdictRecorder:
 
     @property
     def report(self) -> RunReport:
-        """The fish as they are now."""
         return self._report
 
     def record(self, submitted: SubmittedVerdict) -> list[int]:
@@ -198,7 +197,6 @@ class VerdictRecorder:
     def _checked(
         self, verdict: Verdict, submitted: SubmittedVerdict, said: Sequence[Verdict]
     ) -> TrackEdit:
-        """The verdict with what follows from it."""
         report = self._report
         if verdict.kind in EDITS and self._reading is not None:
             raise UserError(

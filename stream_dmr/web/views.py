@@ -146,7 +146,6 @@ def recorded_source(recording: Recording) -> str | None:
 
 
 def _resized(camera: Camera, size: int) -> Camera:
-    """The same camera with `size` by `size` pixels."""
     scale = size / camera.width
     K = camera.K.copy()
     K[:2] *= scale

@@ -31,7 +31,7 @@ _PROGRESS_INTERVAL_S = 60.0
 class JsonFormatter(logging.Formatter):
     """Formats a record as JSON: time, level, event, and its facts."""
 
-    def format(self, record: logging.LogRecord) -> str:  # noqa: D102
+    def format(self, record: logging.LogRecord) -> str:
         facts: dict[str, Any] = getattr(record, "facts", {})
         line = {"time": record.created, "level": record.levelname.lower(), "event": record.msg}
         return json.dumps(line | facts, ensure_ascii=False)
@@ -45,7 +45,7 @@ class RepeatFilter(logging.Filter):
         self._passed_s: dict[tuple[object, ...], float] = {}  # the longest silent first
         self._held_back: dict[tuple[object, ...], int] = {}
 
-    def filter(self, record: logging.LogRecord) -> bool:  # noqa: D102
+    def filter(self, record: logging.LogRecord) -> bool:
         facts: dict[str, Any] = getattr(record, "facts", {})
         kind = (record.msg, facts.get("text"), facts.get("track_id"))
         now_s = time.monotonic()
@@ -77,23 +77,23 @@ class JsonLog(RunObserver):
         self._num_frames = 0
         self._progress_s = time.monotonic()
 
-    def warn(self, line: str) -> None:  # noqa: D102
+    def warn(self, line: str) -> None:
         self._log_event(logging.WARNING, "warning", text=line)
 
-    def serving(self, address: str) -> None:  # noqa: D102
+    def serving(self, address: str) -> None:
         self._log_event(logging.INFO, "serving", text=address)
 
-    def begin(self, num_frames: int | None) -> None:  # noqa: D102
+    def begin(self, num_frames: int | None) -> None:
         self._log_event(logging.INFO, "begin", frames_promised=num_frames)
 
-    def frame_done(self) -> None:  # noqa: D102
+    def frame_done(self) -> None:
         self._num_frames += 1
         now_s = time.monotonic()
         if now_s - self._progress_s >= _PROGRESS_INTERVAL_S:
             self._progress_s = now_s
             self._log_event(logging.INFO, "progress", frames=self._num_frames)
 
-    def take(self, message: Message) -> None:  # noqa: D102
+    def take(self, message: Message) -> None:
         if isinstance(message, LengthEstimate) and message.is_final:
             self._log_fish(message)
 
@@ -197,7 +197,6 @@ class WatchObserver(RunObserver):
         self._state = state
 
     def attach(self, chain: Chain) -> None:
-        """Show this chain's counters."""
         if self._state is not None:
             self._state.chain = chain
         self._observer.attach(chain)
@@ -208,29 +207,29 @@ class WatchObserver(RunObserver):
         self.address = None
         self._observer.close()
 
-    def take(self, message: Message) -> None:  # noqa: D102
+    def take(self, message: Message) -> None:
         if self._state is not None:
             self._state.take(message)
         self._observer.take(message)
 
-    def warn(self, line: str) -> None:  # noqa: D102
+    def warn(self, line: str) -> None:
         if self._state is not None:
             self._state.warn(line)
         self._observer.warn(line)
 
-    def stage(self, line: str) -> None:  # noqa: D102
+    def stage(self, line: str) -> None:
         self._observer.stage(line)
 
-    def notice(self, line: str) -> None:  # noqa: D102
+    def notice(self, line: str) -> None:
         self._observer.notice(line)
 
-    def serving(self, address: str) -> None:  # noqa: D102
+    def serving(self, address: str) -> None:
         self._observer.serving(address)
 
-    def begin(self, num_frames: int | None) -> None:  # noqa: D102
+    def begin(self, num_frames: int | None) -> None:
         self._observer.begin(num_frames)
 
-    def frame_done(self) -> None:  # noqa: D102
+    def frame_done(self) -> None:
         if self._state is not None:
             self._state.frame_done()
         self._observer.frame_done()

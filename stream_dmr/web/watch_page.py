@@ -48,7 +48,6 @@ def draw_fish(measured: MeasuredFrame) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def encode_jpeg(image: UInt8[np.ndarray, "H W 3"]) -> bytes:
-    """The image as a JPEG file."""
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
 
 
@@ -80,7 +79,6 @@ class WatchServer:
         self._server.start()
 
     def close(self) -> None:
-        """Stop serving."""
         self._server.stop()
 
 
@@ -243,7 +241,6 @@ def haul_json(state: RunState) -> dict[str, Any] | None:
 
 
 def status_json(state: RunState) -> dict[str, Any]:
-    """What the status page shows, for JSON."""
     return {
         "problems": state.problems(),
         "num_fish": sum(state.num_fish.values()),

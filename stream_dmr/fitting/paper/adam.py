@@ -143,7 +143,6 @@ class AdamSolver:
         self._settings = settings
 
     def refine(self, target: Target, start: Float[np.ndarray, "P"]) -> Solution:
-        """From one start near the answer."""
         return self.descend(target, start[None], self._settings.adam_iterations, NEAR)[0]
 
     def search(self, target: Target, starts: Float[np.ndarray, "B P"]) -> Solution:

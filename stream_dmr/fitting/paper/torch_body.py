@@ -160,7 +160,6 @@ DEFORMATIONS: dict[str, Deformation] = {"spine": spine, "linear-blend": linear_b
 
 
 def deform(rig: Rig, vector: Float[Tensor, "B P"], deformation: Deformation) -> Deformed:
-    """Deform vertices, keypoints and midline of the template together."""
     points = deformation(rig, Parameters.from_vector(vector))
     v = rig.num_vertices
     return Deformed(points[:, :v], points[:, v : v + 3], points[:, v + 3 :])

@@ -62,14 +62,12 @@ class CandidateShapes:
     since_ns: Int[np.ndarray, "N"] | None = None
 
     def __iter__(self) -> Iterator[CandidateShape]:
-        """Iterate over the candidates."""
         rows = zip(
             self.names.split(","), self.coefficients, self.covariances, self.shares, strict=True
         )
         return (CandidateShape(*row[:3], float(row[3])) for row in rows)
 
     def __len__(self) -> int:
-        """Return their number."""
         return len(self.shares)
 
     @property
@@ -134,7 +132,6 @@ class CandidateShapes:
 
     @classmethod
     def of(cls, candidates: list[CandidateShape], *, are_learnt: bool) -> "CandidateShapes":
-        """Stack them."""
         return cls(
             names=",".join(candidate.name for candidate in candidates),
             coefficients=np.stack([candidate.coefficients for candidate in candidates]),
@@ -205,7 +202,6 @@ def describe(forms: CandidateShapes, stocks: CandidateShapes) -> Iterator[str]:
 
 
 def changes(form: CandidateShape, stock: CandidateShape) -> str:
-    """How a stock differs from its form."""
     change = stock.coefficients - form.coefficients
     std = std_of(TRUNK, stock.covariance)
     return (
@@ -311,7 +307,6 @@ def are_like_mesh(stocks: CandidateShapes) -> bool:
 
 
 def is_like_mesh(stock: CandidateShape) -> bool:
-    """The same of one stock."""
     breadth = abs(float(TRUNK @ stock.coefficients))
     is_as_broad = breadth <= _MAX_BREADTH + min(std_of(TRUNK, stock.covariance), _MAX_STD)
     return is_as_broad and _outline_off(stock) <= _MAX_OUTLINE

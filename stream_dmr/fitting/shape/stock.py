@@ -262,7 +262,6 @@ class FormOdds(NamedTuple):
 
     @classmethod
     def certain(cls, form: Float[np.ndarray, "W"]) -> "FormOdds":
-        """One form and no other."""
         return cls(form[None], np.ones(1))
 
 

@@ -132,7 +132,6 @@ class _Group:
 
     @property
     def num_fish(self) -> int:
-        """How many fish."""
         return len(self.stock.nats)
 
     @property

@@ -61,7 +61,6 @@ class FoxgloveTopics:
         self._shapes = PendingItems[FittedShape]()
 
     def draw(self, record: Record) -> Iterator[tuple[str, Any]]:
-        """The topics and protobuf messages that show a record."""
         message = record.whole
         if isinstance(message, Frame):
             if self._throttle.shows(message):

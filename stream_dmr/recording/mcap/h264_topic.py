@@ -39,7 +39,6 @@ class H264Topic:
         self._key_at_ns = 0
 
     def draw(self, record: Record) -> Iterator[tuple[str, Any]]:
-        """The CompressedVideo message of a frame."""
         frame = record.whole
         if isinstance(frame, Frame):
             video = CompressedVideo(data=self._encode(frame), format="h264", frame_id="camera")

@@ -77,7 +77,6 @@ class McapRecording:
         return {decode(LocalizedFish, payload).track_id for payload in fish}
 
     def carried_over(self) -> Iterator[bytes]:
-        """The encoded LocalizedFish from before this segment of tracks that were open then."""
         for _, message in self._messages([CARRIED_OVER], EVERYTHING) if self.is_segment else ():
             yield message.data
 
@@ -90,7 +89,6 @@ class McapRecording:
             yield topics[topic], message.data
 
     def video(self, selection: Selection = EVERYTHING) -> Iterator[bytes]:
-        """The encoded CompressedVideo messages of `frames = "h264"`."""
         for _, message in self._messages([VIDEO], selection):
             yield message.data
 
@@ -271,7 +269,6 @@ def _has_index(stream: IO[bytes]) -> bool:
 
 
 def _footer(stream: IO[bytes]) -> Footer:
-    """The footer at the stream's position."""
     opcode, _, *fields = struct.unpack("<BQQQI", stream.read(_FOOTER_BYTES))
     if opcode != Opcode.FOOTER:
         raise ValueError("it has no footer")

@@ -98,12 +98,10 @@ class McapSink:
 
     @property
     def name(self) -> str:
-        """The name of the file."""
         return self.path.name
 
     @property
     def size(self) -> int:
-        """Bytes written so far."""
         return self._file.tell()
 
     def write(self, record: Record) -> None:

@@ -31,7 +31,6 @@ from stream_dmr.recording.topics import END, TOPICS
 
 
 def rerun_program() -> str:
-    """Path of the program."""
     return str(files("rerun_cli").joinpath("rerun"))
 
 

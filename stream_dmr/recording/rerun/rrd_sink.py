@@ -74,7 +74,6 @@ class RrdSink:
 
     @property
     def name(self) -> str:
-        """The name of the file."""
         return self.path.name
 
     def write(self, record: Record) -> None:

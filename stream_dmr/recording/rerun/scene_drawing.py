@@ -76,7 +76,6 @@ class ColumnBuffer:
         self._moments[path, archetype].append(moment)
 
     def send(self) -> None:
-        """Send all rows to Rerun and forget them."""
         # Entities are cleared before something is drawn at the same moment.
         for key in sorted(self._rows, key=lambda key: key[1] is not rr.Clear):
             path, archetype = key
@@ -189,7 +188,6 @@ class SceneDrawing:
         )
 
     def send(self) -> None:
-        """Send what was drawn to Rerun."""
         self._draw_masks()
         self._columns.send()
 
