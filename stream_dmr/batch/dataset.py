@@ -10,12 +10,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from pyarrow import Table, parquet
-
 from stream_dmr.batch.manifest import Job
 from stream_dmr.errors import OutputError
 from stream_dmr.evidence.seal import add_files
-from stream_dmr.export.fish_table import FISH_TABLE, arrow_schema, fish_records
+from stream_dmr.export.fish_table import FISH_TABLE, fish_record, write_parquet
 from stream_dmr.files import replacing
 from stream_dmr.pipeline.config import load_config
 from stream_dmr.store.batch_folder import TABLE_KINDS, dataset_file
@@ -48,9 +46,11 @@ def write_tables(folder: Path, job: Job) -> None:
     settings = load_config(job.options.config).fisheries
     fish = read_fish(folder, recording)
     of_video = {"video": job.name, "haul": job.options.haul}
-    records = fish_records(fish, recording.header.template, settings, database=folder / DATABASE)
-    _write(folder / "fish.parquet", [one | of_video for one in records], _FISH_SCHEMA)
-    _write(folder / "frames.parquet", _frame_records(folder, fish, of_video), _FRAMES_SCHEMA)
+    template, checks = recording.header.template, last_checks(folder / DATABASE)
+    records = [fish_record(one, template, settings, checks) | of_video for one in fish]
+    write_parquet(folder / "fish.parquet", _FISH_SCHEMA, records)
+    frames = _frame_records(folder, fish, of_video)
+    write_parquet(folder / "frames.parquet", _FRAMES_SCHEMA, frames)
     add_files(folder, [folder / f"{kind}.parquet" for kind in TABLE_KINDS])
 
 
@@ -109,8 +109,3 @@ def _last_addition_ns(folder: Path) -> int:
         return 0
     times = [one.written_ns for one in verdicts] + [one.time_ns for one in checks]
     return max(times, default=0)
-
-
-def _write(path: Path, records: list[dict[str, Any]], schema: dict[str, type]) -> None:
-    rows = [{name: record.get(name) for name in schema} for record in records]
-    parquet.write_table(Table.from_pylist(rows, arrow_schema(schema)), path)

@@ -58,14 +58,14 @@ def export(
             "expected a choice of what to export, got none; give some of: "
             "--fish csv, --meshes ply, --masks, --tables csv, --viame, --hauls, --agency wcpfc"
         )
+    from stream_dmr.evidence.seal import NAME as PROVENANCE
     from stream_dmr.export.exporter import Export
     from stream_dmr.pipeline.run_inputs import species_notes
     from stream_dmr.store.fish import run_notes
 
     exported = Export(recording, parse_selection(time, track), overwrite=overwrite)
-    exported.claim(out)
     notes: list[str] = []
-    with exit_on_signals(), exported.kept_if_sealed():
+    with exit_on_signals(), exported.into(out):
         if meshes:
             print(f"{out / 'meshes'}: {exported.meshes(out / 'meshes', format=meshes)} meshes")
         if masks:
@@ -74,8 +74,8 @@ def export(
             for path in exported.tables(out, format=tables):
                 print(path)
         if fish:
-            settings = settings_of(config, exported.config_toml, recording)
-            notes = species_notes(settings, exported.template)
+            settings = settings_of(config, exported.header.config_toml, recording)
+            notes = species_notes(settings, exported.header.template)
             print(exported.fish(out, settings.fisheries, format=fish))
         if viame:
             path = out / "tracks.viame.csv"
@@ -84,5 +84,5 @@ def export(
             print(exported.agency(out, one))
         if hauls:
             print(exported.hauls(out))
-        print(exported.provenance(out))
-    warn([*run_notes(recording), *exported.warnings, *(notes or exported.notes)])
+    print(out / PROVENANCE)
+    warn([*run_notes(recording), *exported.recording.warnings, *(notes or exported.notes)])

@@ -5,14 +5,11 @@ What a camera can't know stays empty: nothing is guessed. Sources: draft longlin
 vocabularies TypeMeasured and ValueUnitOrScale.
 """
 
-from collections.abc import Sequence
-from pathlib import Path
-
-from stream_dmr.files import writing_to
+from stream_dmr.export.export_choices import Agency
 from stream_dmr.lengths.fate import FATE_OF_ZONE
 from stream_dmr.store.effort import HaulEffort
 from stream_dmr.store.fish import Fish
-from stream_dmr.tables import utc_text, write_table
+from stream_dmr.tables import utc_text
 from stream_dmr.template.template import Template
 
 Row = dict[str, str]
@@ -105,16 +102,12 @@ def haul_row(effort: HaulEffort, *, utc_zero_ns: int | None) -> Row:
     }
 
 
-def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> Path:
-    """Write a table as CSV; what a row lacks stays empty."""
-    with writing_to(path):
-        write_table(path, columns, ([row.get(name, "") for name in columns] for row in rows))
-    return path
-
-
 def _degrees(value: float | None, letters: str, *, digits: int) -> str:
     """Degrees and minutes with three decimals, such as 5701.234N."""
     if value is None:
         return ""
     whole, minutes = divmod(round(abs(value) * 60_000), 60_000)
     return f"{whole:0{digits}d}{minutes / 1000:06.3f}{letters[value < 0]}"
+
+
+AGENCIES = {Agency.WCPFC: (WCPFC_COLUMNS, wcpfc_row), Agency.RDBES: (RDBES_COLUMNS, rdbes_row)}

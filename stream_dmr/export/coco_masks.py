@@ -24,14 +24,25 @@ def coco_masks(
     Categories are the codes, and "fish" where there is none.
     """
     names = ["fish", *sorted({code for code in codes.values() if code})]
+    annotations = list[dict[str, Any]]()
+    for number, crop in enumerate(crops, start=1):
+        mask = mask_in_frame(crop)
+        x0, y0, x1, y1 = crop.bbox_xyxy_px.tolist()
+        annotations.append(
+            {
+                "id": number,
+                "image_id": crop.frame_index,
+                "category_id": 1 + names.index(codes.get(crop.track_id) or "fish"),
+                "track_id": crop.track_id,
+                "bbox": [x0, y0, x1 - x0, y1 - y0],
+                "area": int(mask.sum()),
+                "iscrowd": 0,
+                "segmentation": {"size": list(mask.shape), "counts": run_lengths(mask)},
+            }
+        )
     return {
         "images": [_image(*picture) for picture in pictures],
-        "annotations": [
-            _annotation(
-                crop, number=k, category=1 + names.index(codes.get(crop.track_id) or "fish")
-            )
-            for k, crop in enumerate(crops, start=1)
-        ],
+        "annotations": annotations,
         "categories": [
             {"id": k, "name": name, "supercategory": "fish"}
             for k, name in enumerate(names, start=1)
@@ -90,18 +101,3 @@ def _image(frame_index: int, source: str, picture: EncodedPicture) -> dict[str, 
     is_picture = "://" not in source and Path(source).suffix.lower() in PICTURE_SUFFIXES
     name = source if is_picture else f"{frame_index:06d}.png"
     return {"id": frame_index, "file_name": name, "width": picture.width, "height": picture.height}
-
-
-def _annotation(crop: FishCrop, *, number: int, category: int) -> dict[str, Any]:
-    mask = mask_in_frame(crop)
-    x0, y0, x1, y1 = crop.bbox_xyxy_px.tolist()
-    return {
-        "id": number,
-        "image_id": crop.frame_index,
-        "category_id": category,
-        "track_id": crop.track_id,
-        "bbox": [x0, y0, x1 - x0, y1 - y0],
-        "area": int(mask.sum()),
-        "iscrowd": 0,
-        "segmentation": {"size": list(mask.shape), "counts": run_lengths(mask)},
-    }

@@ -1,17 +1,16 @@
 """fish.csv (or .parquet): one row per fish with all that fisheries and auditors need of it."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from stream_dmr.export.agency_tables import ICES_LENGTHS
-from stream_dmr.files import writing_to
 from stream_dmr.species import CODE
 from stream_dmr.store.fish import Fish, is_same_species
 from stream_dmr.store.fisheries import Derived, FisheriesSettings, derive
-from stream_dmr.store.scale_checks import ScaleCheck, last_checks
+from stream_dmr.store.scale_checks import ScaleCheck
 from stream_dmr.tables import cell, seconds, utc_text, write_table
 from stream_dmr.template.template import Template
 
@@ -25,6 +24,17 @@ class _Row(NamedTuple):
     species: str  # "": neither a reviewer nor a classifier said it
     derived: Derived
     check: ScaleCheck | None  # the last one with the calibration of its run
+
+    @property
+    def ci95_mm(self) -> list[Any]:
+        ci95_mm = self.fish.estimate.ci95_mm
+        return [None, None] if ci95_mm is None else ci95_mm.tolist()
+
+    @property
+    def length_from(self) -> str | None:
+        if self.fish.length_mm is None:
+            return None
+        return "measurement" if self.fish.review.length_mm is None else "review"
 
 
 _Column = tuple[type, Callable[[_Row], Any]]
@@ -56,9 +66,9 @@ _COLUMNS: dict[str, _Column] = {
     ),
     **_same(str, "fish.review", "condition"),
     **_same(float, "fish.estimate", "length_mm", "length_std_mm"),
-    "ci95_low_mm": (float, lambda row: _ci95_mm(row, 0)),
-    "ci95_high_mm": (float, lambda row: _ci95_mm(row, 1)),
-    "length_from": (str, lambda row: _length_from(row.fish)),  # as are the five after it
+    "ci95_low_mm": (float, lambda row: row.ci95_mm[0]),
+    "ci95_high_mm": (float, lambda row: row.ci95_mm[1]),
+    "length_from": (str, attrgetter("length_from")),  # as are the five after it
     **_same(float, "derived", "fork_length_mm", "total_length_mm"),
     **_same(int, "derived", "length_cm"),
     **_same(float, "derived", "weight_kg"),
@@ -107,34 +117,19 @@ def fish_record(
     fish: Fish,
     template: Template,
     settings: FisheriesSettings,
-    *,
-    check: ScaleCheck | None = None,
+    checks: Mapping[str, ScaleCheck] | None = None,
 ) -> dict[str, Any]:
     """The values of FISH_TABLE; None where there is none.
 
-    `check`: the last one with the calibration of the fish's run.
+    `checks`: the last ones of the scale, by the SHA-256 of their calibration.
     """
     found = fish.species
     named = "" if CODE.fullmatch(fish.review.species) else fish.review.species
     species = named or (found.english_name if found else "") or fish.review.species
     derived = derive(fish.length_mm, template, settings, species=species)
+    check = (checks or {}).get(fish.facts.calibration_sha256)
     row = _Row(fish, template, settings, species, derived, check)
     return {name: value(row) for name, (_, value) in _COLUMNS.items()}
-
-
-def fish_records(
-    fish: Sequence[Fish],
-    template: Template,
-    settings: FisheriesSettings,
-    *,
-    database: Path | None,
-) -> list[dict[str, Any]]:
-    """`fish_record` of all, with the last check of the scale that their lengths.db knows."""
-    checks = {} if database is None else last_checks(database)
-    return [
-        fish_record(one, template, settings, check=checks.get(one.facts.calibration_sha256))
-        for one in fish
-    ]
 
 
 def unweighed_note(records: Sequence[dict[str, Any]], settings: FisheriesSettings) -> list[str]:
@@ -150,38 +145,16 @@ def unweighed_note(records: Sequence[dict[str, Any]], settings: FisheriesSetting
     ]
 
 
-def _ci95_mm(row: _Row, end: int) -> float | None:
-    ci95_mm = row.fish.estimate.ci95_mm
-    return None if ci95_mm is None else float(ci95_mm[end])
+def write_csv(path: Path, columns: Iterable[str], records: Iterable[Mapping[str, Any]]) -> None:
+    """Write a table; lengths are rounded as in lengths.csv, what a record lacks stays empty."""
+    write_table(path, columns, ([cell(one.get(name)) for name in columns] for one in records))
 
 
-def _length_from(fish: Fish) -> str | None:
-    if fish.length_mm is None:
-        return None
-    return "measurement" if fish.review.length_mm is None else "review"
-
-
-def write_csv(path: Path, records: Sequence[dict[str, Any]]) -> Path:
-    """Write records of FISH_TABLE as `path`.csv; lengths are rounded as in lengths.csv."""
-    target = path.with_suffix(".csv")
-    rows = ([cell(record[name]) for name in FISH_TABLE] for record in records)
-    with writing_to(target):
-        write_table(target, FISH_TABLE, rows)
-    return target
-
-
-def write_parquet(path: Path, records: Sequence[dict[str, Any]]) -> Path:
-    """Write records of FISH_TABLE as `path`.parquet, exact."""
-    from pyarrow import Table, parquet
-
-    target = path.with_suffix(".parquet")
-    with writing_to(target):
-        parquet.write_table(Table.from_pylist(list(records), arrow_schema(FISH_TABLE)), target)
-    return target
-
-
-def arrow_schema(columns: dict[str, type]) -> Any:
+def write_parquet(path: Path, columns: Mapping[str, type], records: list[dict[str, Any]]) -> None:
+    """Write a table, exact; what a record lacks is null."""
     import pyarrow as pa
+    from pyarrow import parquet
 
     kinds = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
-    return pa.schema([(name, kinds[kind]) for name, kind in columns.items()])
+    schema = pa.schema([(name, kinds[kind]) for name, kind in columns.items()])
+    parquet.write_table(pa.Table.from_pylist(records, schema), path)

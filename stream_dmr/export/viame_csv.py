@@ -7,12 +7,15 @@ time or picture, frame from 0, box, confidence, length or -1, species and its co
 
 import csv
 from collections.abc import Iterable, Iterator, Mapping
+from datetime import datetime, timedelta
 from io import StringIO
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
+from stream_dmr.export.coco_masks import mask_in_frame
+from stream_dmr.messages import FishCrop, LocalizedFish
 from stream_dmr.store.fish import Fish
 
 _HEADER = (
@@ -23,74 +26,33 @@ _HEADER = (
 NO_LENGTH = -1
 
 
-class ViameTracks:
-    """The rows of one recording, in the order of its frames."""
-
-    def __init__(self, fish: Iterable[Fish], *, fps: float | None) -> None:
-        """`fps` of the frames; None: not known."""
-        self._fish: Mapping[int, Fish] = {one.estimate.track_id: one for one in fish}
-        self._head = f"{_HEADER}\n# metadata{'' if fps is None else f',fps: {fps:g}'}\n"
-        self._rows = StringIO()
-        self._writer = csv.writer(self._rows, lineterminator="\n")
-        self.count = 0
-
-    def add(
-        self,
-        *,
-        track_id: int,
-        frame_index: int,
-        timestamp_ns: int,
-        bbox_xyxy_px: Float[np.ndarray, "4"],
-        mask: Bool[np.ndarray, "H W"],
-        keypoints_px: Float[np.ndarray, "3 2"] | None,
-    ) -> None:
-        """Add one fish in one frame; frames count from 1 here."""
-        self.count += 1
-        fish = self._fish.get(track_id)
-        length_mm = None if fish is None else fish.length_mm
-        species, share = _species(fish)
-        self._writer.writerow(
-            [
-                track_id,
-                _time(timestamp_ns),
-                frame_index - 1,
-                *(f"{value:.1f}" for value in bbox_xyxy_px.tolist()),
-                "1.0",
-                NO_LENGTH if length_mm is None else f"{length_mm:.1f}",
-                species,
-                f"{share:.3f}",
-                *_points(keypoints_px),
-                *_polygon(mask),
-            ]
-        )
-
-    def text(self) -> str:
-        return self._head + self._rows.getvalue()
+def viame_csv(
+    seen: Iterable[tuple[FishCrop, LocalizedFish]], fish: Mapping[int, Fish], *, fps: float | None
+) -> tuple[str, int]:
+    """The file and the number of its boxes; `fish` by track id, `fps` None where not known."""
+    rows = [[*_row(crop, located, fish.get(located.track_id))] for crop, located in seen]
+    text = StringIO()
+    text.write(f"{_HEADER}\n# metadata{'' if fps is None else f',fps: {fps:g}'}\n")
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue(), len(rows)
 
 
-def _species(fish: Fish | None) -> tuple[str, float]:
-    """What it is, and how sure that is; "fish" where nobody knows more."""
-    if fish is None:
-        return "fish", 1.0
-    if fish.review.species:
-        return fish.review.species, 1.0
-    code = fish.sure_code
-    return (code, fish.estimate.species_share or 1.0) if code else ("fish", 1.0)
-
-
-def _time(timestamp_ns: int) -> str:
-    """HH:MM:SS.ffffff, of a day."""
-    seconds, rest_ns = divmod(max(0, timestamp_ns), 1_000_000_000)
-    return (
-        f"{seconds // 3600 % 24:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
-        f".{rest_ns // 1000:06d}"
-    )
-
-
-def _points(keypoints_px: Float[np.ndarray, "3 2"] | None) -> Iterator[str]:
-    if keypoints_px is not None:
-        for name, (x, y) in (("head", keypoints_px[0]), ("tail", keypoints_px[2])):
+def _row(crop: FishCrop, located: LocalizedFish, fish: Fish | None) -> Iterator[object]:
+    yield located.track_id
+    since = timedelta(microseconds=max(0, located.timestamp_ns) // 1000)
+    yield (datetime(1970, 1, 1) + since).time().isoformat("microseconds")  # of a day
+    yield located.frame_index - 1
+    yield from (f"{value:.1f}" for value in crop.bbox_xyxy_px.tolist())
+    yield "1.0"
+    yield NO_LENGTH if fish is None or fish.length_mm is None else f"{fish.length_mm:.1f}"
+    # What it is, and how sure that is; "fish" where nobody knows more.
+    named, code = (fish.review.species, fish.sure_code) if fish else ("", "")
+    share = fish.estimate.species_share if fish and code and not named else None
+    yield from (named or code or "fish", f"{share or 1.0:.3f}")
+    if located.keypoints_px is not None:
+        for name, (x, y) in zip(("head", "tail"), located.keypoints_px[[0, 2]], strict=True):
             yield f"(kp) {name} {x:.1f} {y:.1f}"
+    yield from _polygon(mask_in_frame(crop))
 
 
 def _polygon(mask: Bool[np.ndarray, "H W"]) -> Iterator[str]:

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from stream_dmr.export.agency_tables import RDBES_COLUMNS, WCPFC_COLUMNS, rdbes_row, wcpfc_row
-from stream_dmr.export.viame_csv import ViameTracks
+from stream_dmr.export.viame_csv import viame_csv
+from stream_dmr.messages import LocalizedFish
 from stream_dmr.store.fish import Fish
 from stream_dmr.store.trip import Whereabouts
 from stream_dmr.store.verdicts import Review, Verdict, add_verdict
@@ -19,6 +20,7 @@ from tests.support.command import invoke
 from tests.support.final_estimates import FACTS, fish
 from tests.support.fish_run import measure
 from tests.support.nmea import START_NS
+from tests.support.shapes import crop_camera, crop_from_mask
 
 TEMPLATE = load_template("halibut")
 SURE: dict[str, object] = {"species_code": "HAL", "species_share": 0.9}
@@ -72,18 +74,28 @@ def test_what_a_reviewer_left_out_does_not_count(decision: str):
 
 
 def test_viame_rows_have_box_length_species_and_outline():
-    tracks = ViameTracks([HALIBUT], fps=10.0)
-    mask = np.zeros((40, 60), bool)
+    mask = np.zeros((60, 60), bool)
     mask[10:20, 5:50] = True
-    tracks.add(
-        track_id=7,
+    box = np.array([5.0, 10.0, 50.0, 20.0])
+    camera = crop_camera(size=60)
+    crop = replace(crop_from_mask(mask, track_id=7), bbox_xyxy_px=box, frame_camera=camera)
+    seen = LocalizedFish(
         frame_index=1,
         timestamp_ns=61_500_000_000,
-        bbox_xyxy_px=np.array([5.0, 10.0, 50.0, 20.0]),
-        mask=mask,
+        track_id=7,
         keypoints_px=np.array([[5.0, 15.0], [25.0, 15.0], [49.0, 15.0]]),
+        keypoints_mm=None,
+        midline_mm=None,
+        bending_ratio=None,
+        length_mm=None,
+        length_std_mm=None,
+        iou=None,
+        accepted=True,
+        reason="",
     )
-    head, fps, row = tracks.text().splitlines()
+    text, count = viame_csv([(crop, seen)], {7: HALIBUT}, fps=10.0)
+    assert count == 1
+    head, fps, row = text.splitlines()
     assert head.startswith("# 1: Detection or Track-id,")
     assert fps == "# metadata,fps: 10"
     cells = next(csv.reader([row]))

@@ -88,8 +88,8 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def exported(out: Path, folder: Path, **fisheries: object) -> list[dict[str, str]]:
     export = Export(out)
     settings = FisheriesSettings(**{"species": "tiny", **fisheries})  # type: ignore[arg-type]
-    path = export.fish(folder, settings, format="csv")
-    export.provenance(folder)
+    with export.into(folder):
+        path = export.fish(folder, settings, format="csv")
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
