@@ -16,7 +16,6 @@ from stream_dmr.store.ledger import (
     FILE,
     FOUND,
     REMOVED,
-    ChainWriter,
     Signer,
     content_sha256,
     lines_sha256,
@@ -84,7 +83,7 @@ class SignedFiles:
             self.changed(path)
 
     def _sign(self, path: Path, kind: str) -> None:
-        if self._store is None or not self._store.is_signing:
+        if self._store is None:
             return
         with suppress(OSError):  # it is not signed, which `verify` says
             if path.exists():
@@ -96,11 +95,10 @@ class SignedFiles:
 def sign_found(folder: Path, paths: Sequence[Path], signer: Signer) -> None:
     """Sign files that lie in a folder where no run is writing, as found; lengths.csv as it is."""
     with closing(open_for_writing(folder / DATABASE)) as database:
-        chain = ChainWriter(signer, database)
-        entries = [(FOUND, path) for path in paths if path.exists()]
-        entries += [(FILE, path) for path in _matching(folder, ["lengths.csv"])]
-        for kind, path in entries:
-            for statement, values in chain.content(kind, path.name, sha256_of(path)):
+        signer.continue_chain(database)
+        found = [(FOUND, path) for path in paths if path.exists()]
+        for kind, path in [*found, *((FILE, path) for path in folder.glob("lengths.csv"))]:
+            for statement, values in signer.content(kind, path.name, sha256_of(path)):
                 database.execute(statement, values)
 
 
@@ -149,22 +147,16 @@ def seal_run(folder: Path, *, with_recordings: bool) -> None:
     kinds = ("*.csv", "*.mcap", "*.rrd") if with_recordings else ("lengths.csv", "frames.csv")
     files = [path for kind in kinds for path in folder.glob(kind)]
     files += learnt_files(folder)
+    made = _new(read_runs(database))
+    for table in (FISH, EVENTS, POSITIONS, WATCHED):
+        by_run = rows_by_run(database, table).items()
+        made[f"{table.name}_sha256"] = {run_id: lines_sha256(lines) for run_id, lines in by_run}
+    made |= {"run_times_ns": run_times(database), "files": _sums(folder, files)}
+    made |= {"verdicts": log_sum(verdict_lines(database)), "hauls": log_sum(haul_lines(database))}
     with reading(database) as connection:
-        state, checks = content_sha256(read_state(connection)), log_sum(check_lines(connection))
-    sums = {
-        f"{table.name}_sha256": {
-            run_id: lines_sha256(lines) for run_id, lines in rows_by_run(database, table).items()
-        }
-        for table in (FISH, EVENTS, POSITIONS, WATCHED)
-    }
-    _write(
-        folder,
-        _new(read_runs(database))
-        | sums
-        | {"run_times_ns": run_times(database), "files": _sums(folder, files)}
-        | {"verdicts": log_sum(verdict_lines(database))}
-        | {"hauls": log_sum(haul_lines(database)), "state_sha256": state, "checks": checks},
-    )
+        made["state_sha256"] = content_sha256(read_state(connection))
+        made["checks"] = log_sum(check_lines(connection))
+    _write(folder, made)
 
 
 def verdict_lines(database: Path) -> list[str]:
@@ -202,7 +194,8 @@ def add_files(folder: Path, files: Iterable[Path]) -> None:
     What it says of others stays, whatever has become of them. One that is missing or damaged stays
     so: it is for `verify` to find.
     """
-    _add(folder, lambda made: {"files": made["files"] | _sums(folder, files)})
+    if (made := _if_readable(folder)) is not None:
+        _write(folder, made | {"files": made["files"] | _sums(folder, files)})
 
 
 def seal_verdicts(folder: Path) -> None:
@@ -219,16 +212,9 @@ def seal_hauls(folder: Path) -> None:
 
 
 def _seal_log(folder: Path, name: str, lines: Sequence[str]) -> None:
-    def more(made: dict[str, Any]) -> dict[str, Any]:
-        known = made.get(name) or log_sum([])
-        return {name: log_sum(lines)} if begins_as(lines, known) else {}
-
-    _add(folder, more)
-
-
-def _add(folder: Path, more: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
-    if (made := _if_readable(folder)) is not None:
-        _write(folder, made | more(made))
+    made = _if_readable(folder)
+    if made is not None and begins_as(lines, made.get(name) or log_sum([])):
+        _write(folder, made | {name: log_sum(lines)})
 
 
 def _new(runs: Mapping[str, RunFacts], origin: str = "") -> dict[str, Any]:

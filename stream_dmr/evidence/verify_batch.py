@@ -62,15 +62,11 @@ def _check_row(out: Path, row: Mapping[str, str]) -> Iterator[Finding]:
             yield out / VIDEOS, f"{is_now}, {name_of_outcome} says {was}"
     if row["status"] == DONE:
         for kind, path in zip(TABLE_KINDS, _tables(out, row), strict=True):
-            yield from _check_copy(path, folder / f"{kind}.parquet", out)
-
-
-def _check_copy(path: Path, origin: Path, out: Path) -> Iterator[Finding]:
-    """Compare a file of the data set with the video's own, whose absence `verify` reports."""
-    if not path.is_file():
-        yield path, "is missing"
-    elif origin.is_file() and sha256_of(path) != sha256_of(origin):
-        yield path, f"differs from {origin.relative_to(out)}"
+            origin = folder / f"{kind}.parquet"  # whose absence `verify` reports
+            if not path.is_file():
+                yield path, "is missing"
+            elif origin.is_file() and sha256_of(path) != sha256_of(origin):
+                yield path, f"differs from {origin.relative_to(out)}"
 
 
 def _tables(out: Path, row: Mapping[str, str]) -> list[Path]:

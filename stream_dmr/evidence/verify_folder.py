@@ -11,11 +11,11 @@ import json
 import math
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, fields
+from dataclasses import fields
 from datetime import UTC, datetime
-from itertools import chain
+from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
@@ -120,8 +120,11 @@ def changed_edits(database: Path, last_frames: Mapping[int, int]) -> Iterator[st
 
     `last_frames` by recorded track.
     """
-    verdicts = read_verdicts(database)
-    yield from _added_frames(database, verdicts)
+    verdicts, frames = read_verdicts(database), read_added_frames(database)
+    said = {one.track_id: one.frames_sha256 for one in verdicts if one.kind == "add"}
+    for track_id in sorted(frames.keys() | said.keys()):
+        if frames_sha256(frames.get(track_id, [])) != said.get(track_id):
+            yield f"fish {track_id}: its frames are not those that a reviewer added"
     edits = edits_of(verdicts)
     if edits.fish:
         yield from _guarded(
@@ -182,14 +185,6 @@ def _corrections(
                 yield f"{name}: {column} is {now}, its points give {was}"
 
 
-def _added_frames(database: Path, verdicts: Sequence[Verdict]) -> Iterator[str]:
-    frames = read_added_frames(database)
-    said = {one.track_id: one.frames_sha256 for one in verdicts if one.kind == "add"}
-    for track_id in sorted(frames.keys() | said.keys()):
-        if frames_sha256(frames.get(track_id, [])) != said.get(track_id):
-            yield f"fish {track_id}: its frames are not those that a reviewer added"
-
-
 def _lengths(database: Path, edits: TrackEdits, last_frames: Mapping[int, int]) -> Iterator[str]:
     """Compare each fish with what its frames give, where the recording still has them all."""
     recording = open_recordings([database.parent])
@@ -208,47 +203,6 @@ def _lengths(database: Path, edits: TrackEdits, last_frames: Mapping[int, int]) 
         for name, now in edited.row.items():
             if name not in _NOT_COMPUTED and now != expected.get(name):
                 yield f"fish {track_id}: {name} is {now}, its frames give {expected.get(name)}"
-
-
-def _added(
-    entries: Sequence[ChainEntry], database: sqlite3.Connection, table: Table
-) -> Iterator[str]:
-    """What was changed, removed or put in, a line each kind; people may add hauls to a folder."""
-    missing, surplus = _unmatched(entries, database, table)
-    if missing:
-        yield f"{missing} of its {table.name} are missing, or not as they were signed"
-    if surplus and table is not HAULS:
-        yield f"{surplus} of its {table.name} were put in, or are not as they were signed"
-
-
-def _unmatched(
-    entries: Sequence[ChainEntry], database: sqlite3.Connection, table: Table
-) -> tuple[int, int]:
-    """The number of rows that were signed and are not there, and that are there and not signed."""
-    signed = Counter(entry.content_sha256 for entry in entries if entry.kind == table.kind)
-    found = Counter(map(_content, rows(database, table)))
-    return (signed - found).total(), (found - signed).total()
-
-
-def _unsealed_rows(database: Path, made: Mapping[str, Any]) -> Iterator[str]:
-    """Positions, watched times and hauls that are not as provenance.json, `made`, knows them.
-
-    An older one knows none of them. Raises OutputError.
-    """
-    for table in (POSITIONS, WATCHED):
-        sealed: dict[str, str] | None = made.get(f"{table.name}_sha256")
-        if sealed is None:
-            continue
-        found = rows_by_run(database, table)
-        for run_id in {**sealed, **found}:
-            if lines_sha256(found.get(run_id, [])) != sealed.get(run_id, lines_sha256([])):
-                yield f"the rows of {table.name} of run {run_id} are not those that it wrote"
-    known: dict[str, Any] | None = made.get("hauls")
-    lines = haul_lines(database)
-    if known is not None and not begins_as(lines, known):
-        yield "the hauls are not those that were told"
-    elif known is not None and len(lines) > known["count"]:
-        yield f"hauls that no run and no `haul` took: {len(lines) - known['count']}"
 
 
 _MADE_BY = ("config_sha256", "calibration_sha256", "template_sha256")
@@ -303,18 +257,19 @@ def _changes(folder: Path, others: Checks) -> Iterator[Change]:
     lengths: dict[str, list[str]] = {}
     yield from _broken(database, _stored(database, runs, fish, lengths))
     last_frames = {track_id: row["last_frame"] for track_id, row in fish.items()}
-    edits = (Change(database, line) for line in changed_edits(database, last_frames))
-    yield from _broken(database, edits)
+    edited = changed_edits(database, last_frames)
+    yield from _broken(database, (Change(database, line) for line in edited))
     if runs:
-        path = folder / "lengths.csv"
-        yield from _csv(path, LENGTHS_COLUMNS, lengths, witness=DATABASE, whole=True)
+        yield from _csv(folder / "lengths.csv", LENGTHS_COLUMNS, lengths, witness=DATABASE)
     frames: dict[str, list[str]] = {}
-    for recording in _recordings(folder):
+    # Every .mcap, and an .rrd, which is slow to read, where nothing knows it.
+    known = known_files(folder)
+    found = [*folder.glob("*.mcap"), *folder.glob("*.mcap.part")]
+    found += [path for path in folder.glob("*.rrd") if path.name not in known]
+    for recording in sorted(path for path in found if path.is_file()):
         yield from _broken(recording, _recording(recording, runs, fish, frames))
     if frames:
-        yield from _csv(
-            folder / "frames.csv", FRAMES_COLUMNS, frames, witness="the recording", whole=False
-        )
+        yield from _csv(folder / "frames.csv", FRAMES_COLUMNS, frames, witness="the recording")
 
 
 def _broken(path: Path, check: Iterable[Change]) -> Iterator[Change]:
@@ -355,14 +310,6 @@ def _utc(time_ns: int | None) -> str:
         return "?"
 
 
-def _recordings(folder: Path) -> list[Path]:
-    """Those to be read: every .mcap, and an .rrd, which is slow to read, where nothing knows it."""
-    known = known_files(folder)
-    rrd = [path for path in folder.glob("*.rrd") if path.name not in known]
-    found = [*folder.glob("*.mcap"), *folder.glob("*.mcap.part"), *rrd]
-    return sorted(path for path in found if path.is_file())
-
-
 def _against_provenance(folder: Path) -> Iterator[Change]:
     try:
         made = read_provenance(folder)
@@ -381,21 +328,17 @@ def _against_provenance(folder: Path) -> Iterator[Change]:
     database = database_of(folder)
     if database is None:
         return
-    yield from _surplus_tables(folder, made["files"])
+    # Tables that nothing of stream-dmr wrote, though their names may look like it; a camera's
+    # frames.csv, whose recordings are not sealed, is rotated.
+    tables = {path for path in folder.glob("*.csv") if path.name not in made["files"]}
+    if not any(name.endswith((".mcap", ".rrd")) for name in made["files"]):
+        tables -= set(rotated_files(folder / "frames.csv"))
+    yield from (Change(path, "is no table of this run") for path in sorted(tables))
     for check in (_fish_and_runs, _unsealed_rows, _verdicts, _state):
         lines = _guarded(
             check(database, made), lambda why: f"can't be compared with {PROVENANCE}: {why}"
         )
         yield from (Change(database, line) for line in lines)
-
-
-def _surplus_tables(folder: Path, known: Collection[str]) -> Iterator[Change]:
-    """Tables that nothing of stream-dmr wrote, though their names may look like it."""
-    tables = {path for path in folder.glob("*.csv") if path.name not in known}
-    if not any(name.endswith((".mcap", ".rrd")) for name in known):  # a camera's are rotated
-        tables -= set(rotated_files(folder / "frames.csv"))
-    for path in sorted(tables):
-        yield Change(path, "is no table of this run")
 
 
 def _fish_and_runs(database: Path, made: dict[str, Any]) -> Iterator[str]:
@@ -434,13 +377,36 @@ def _state(database: Path, made: dict[str, Any]) -> Iterator[str]:
         yield "its marks, clips or scenes are not as its last run left them"
 
 
+def _unsealed_rows(database: Path, made: Mapping[str, Any]) -> Iterator[str]:
+    """Positions, watched times and hauls against provenance.json; an older one knows none."""
+    for table in (POSITIONS, WATCHED):
+        sealed: dict[str, str] | None = made.get(f"{table.name}_sha256")
+        if sealed is None:
+            continue
+        found = rows_by_run(database, table)
+        for run_id in {**sealed, **found}:
+            if lines_sha256(found.get(run_id, [])) != sealed.get(run_id, lines_sha256([])):
+                yield f"the rows of {table.name} of run {run_id} are not those that it wrote"
+    lines, known = haul_lines(database), made.get("hauls")
+    if known is not None:
+        changed, added = "the hauls are not those that were told", "hauls that no run and no `haul`"
+        yield from _log(lines, known, changed=changed, added=added)
+
+
 def _verdicts(database: Path, made: dict[str, Any]) -> Iterator[str]:
-    """The verdicts against provenance.json: rows are only added."""
-    said, known = verdict_lines(database), made.get("verdicts") or log_sum([])
-    if not begins_as(said, known):
-        yield "the verdicts are not those that reviewers gave"
-    elif len(said) > known["count"]:
-        yield f"verdicts that no `review` took: {len(said) - known['count']}"
+    lines, known = verdict_lines(database), made.get("verdicts") or log_sum([])
+    changed, added = "the verdicts are not those that reviewers gave", "verdicts that no `review`"
+    yield from _log(lines, known, changed=changed, added=added)
+
+
+def _log(
+    lines: Sequence[str], known: Mapping[str, Any], *, changed: str, added: str
+) -> Iterator[str]:
+    """A log against its sum in provenance.json: rows are only added, and the sum then renewed."""
+    if not begins_as(lines, known):
+        yield changed
+    elif len(lines) > known["count"]:
+        yield f"{added} took: {len(lines) - known['count']}"
 
 
 def _recording(
@@ -450,14 +416,13 @@ def _recording(
     frames: dict[str, list[str]],
 ) -> Iterator[Change]:
     """Compare a recording with the database; its rows of frames.csv are added to `frames`."""
-    recording = open_recordings([path])
-    made = run_facts(recording.header)
-    made_by = [all(getattr(r, n) == getattr(made, n) for n in _MADE_BY) for r in runs.values()]
-    if runs and not any(made_by):
-        of_run = next(iter(runs.values()))
-        for name in _MADE_BY:
-            if getattr(of_run, name) != getattr(made, name):
-                yield Change(path, f"{name} is {getattr(made, name)}, no run in {DATABASE} has")
+    recording, database = open_recordings([path]), path.parent / DATABASE
+    made_by = attrgetter(*_MADE_BY)
+    made, of_runs = made_by(run_facts(recording.header)), [made_by(one) for one in runs.values()]
+    if of_runs and made not in of_runs:
+        for name, now, was in zip(_MADE_BY, made, of_runs[0], strict=True):
+            if now != was:
+                yield Change(path, f"{name} is {now}, no run in {DATABASE} has")
     waiting: dict[tuple[int, int], LocalizedFish] = {}
     for message, _ in decoded_messages(recording, [LocalizedFish, LengthEstimate], EVERYTHING):
         key = message.frame_index, getattr(message, "track_id", 0)
@@ -467,33 +432,24 @@ def _recording(
             if (seen := waiting.pop(key, None)) is not None:
                 row = frames_row(seen, message.is_frame_used, message.frame_reason)
                 frames[f"{key[0]},{key[1]}"] = row
-            if message.is_final and runs:  # else the database can't be read
-                yield from _estimate(path, message, fish.get(message.track_id))
+            if not (message.is_final and runs):  # without runs the database can't be read
+                continue
+            stored, name = fish.get(message.track_id), f"fish {message.track_id}"
+            if stored is None:
+                yield Change(database, f"{name} is missing; {path.name} has it")
+                continue
+            for column in (*ESTIMATE_COLUMNS, *CATCH_COLUMNS):
+                now, was = stored.get(column), getattr(message, column)
+                if now != was:
+                    yield Change(database, f"{name}: {column} is {now}, {path.name} says {was}")
     for line in recording.warnings:
         yield Change(path, line.removeprefix(f"{path}: "))
 
 
-def _estimate(path: Path, recorded: LengthEstimate, fish: _Row | None) -> Iterator[Change]:
-    database = path.parent / DATABASE
-    if fish is None:
-        yield Change(database, f"fish {recorded.track_id} is missing; {path.name} has it")
-        return
-    for name in (*ESTIMATE_COLUMNS, *CATCH_COLUMNS):
-        stored, measured = fish.get(name), getattr(recorded, name)
-        if stored != measured:
-            what = f"fish {recorded.track_id}: {name} is {stored}, {path.name} says {measured}"
-            yield Change(database, what)
-
-
 def _csv(
-    path: Path,
-    columns: Sequence[str],
-    expected: dict[str, list[str]],
-    *,
-    witness: str,
-    whole: bool,
+    path: Path, columns: Sequence[str], expected: dict[str, list[str]], *, witness: str
 ) -> Iterator[Change]:
-    """Compare a table with rows of a witness; it may have more rows, unless it is `whole`."""
+    """Compare a table with rows of a witness; only frames.csv may have more rows."""
     if not path.is_file():
         yield Change(path, "is missing")
         return
@@ -518,7 +474,7 @@ def _csv(
             if now != was:
                 cell = f"{column} is {now or 'blank'}, {witness} says {was or 'blank'}"
                 yield Change(path, f"{label}: {cell}")
-    for name in sorted(found.keys() - expected.keys()) if whole else ():
+    for name in sorted(found.keys() - expected.keys()) if witness == DATABASE else ():
         yield Change(path, f"fish {name} is no fish of {witness}")
 
 
@@ -532,17 +488,16 @@ def _rows(path: Path, columns: Sequence[str]) -> dict[str, list[str]] | None:
     return {f"{row[0]},{row[fish]}" if fish else row[0]: row for row in whole}
 
 
-@dataclass(frozen=True, kw_only=True)
-class SignatureCheck:
+class SignatureCheck(NamedTuple):
     """What was found in one folder."""
 
-    changes: list[str] = field(default_factory=list[str])
-    notes: list[str] = field(default_factory=list[str])  # what a reader must know beside
+    changes: list[str]
+    notes: list[str]  # what a reader must know beside
 
 
 def check_signatures(folder: Path, key: Ed25519PublicKey) -> SignatureCheck:
     """Check the chain of a folder's lengths.db, and everything in the folder against it."""
-    check = SignatureCheck()
+    check = SignatureCheck([], [])
     try:
         database = open_for_reading(folder / DATABASE)
     except OutputError as error:
@@ -554,31 +509,44 @@ def check_signatures(folder: Path, key: Ed25519PublicKey) -> SignatureCheck:
         if not entries:
             check.changes.append("nothing in it is signed")
             return check
-        changed = {
-            "its chain": _broken_links(entries, key),
-            "its fish": _rows_by_name(entries, FISH, rows(database, FISH), "track_id"),
-            "its events": _events(entries, database),
-            "its runs": _runs(entries, database, is_going_on=is_locked(folder)),
-            "its files": _files(entries, folder),
-            "its marks, clips or scenes": _signature_state(entries, database),
-            "its checks of the scale": _checks(entries, database),
-        }
-        for table in (POSITIONS, WATCHED, HAULS):
-            changed[f"its {table.name}"] = _added(entries, database, table)
-        noted = {
-            "its events of hauls": _hauls_of_people(entries, database),
-            "its files": chain(_found(entries), _unsigned_files(entries, folder)),
-            "its checks of the scale": _later_checks(entries, database),
-            "its verdicts": _unsigned_verdicts(folder / DATABASE),
-        }
-        for name, lines in changed.items():
-            _extend(check.changes, name, lines)
-        for name, lines in noted.items():
-            _extend(check.notes, name, lines)
+        signed = _Signed(folder, database, entries)
+        for found, name, lines in (
+            (check.changes, "its chain", _broken_links(entries, key)),
+            (check.changes, "its fish", _rows_by_name(signed, FISH, rows(database, FISH))),
+            (check.changes, "its events", _events(signed)),
+            (check.changes, "its runs", _runs(signed, is_going_on=is_locked(folder))),
+            (check.changes, "its files", _files(signed)),
+            (check.changes, "its marks, clips or scenes", _signature_state(signed)),
+            (check.changes, "its checks of the scale", _checks(signed)),
+            *(
+                (check.changes, f"its {table.name}", _added(signed, table))
+                for table in (POSITIONS, WATCHED, HAULS)
+            ),
+            (check.notes, "its events of hauls", _hauls_of_people(signed)),
+            (check.notes, "its files", _noted_files(signed)),
+            (check.notes, "its checks of the scale", _later_checks(signed)),
+            (check.notes, "its verdicts", _unsigned_verdicts(folder / DATABASE)),
+        ):
+            _extend(found, name, lines)
     last = entries[-1]
     count = f"{len(entries)} signed entries, the last of {_utc(last.time_ns)}"
     check.notes.append(f"{count}: {last.sha256[:16]}")
     return check
+
+
+class _Signed(NamedTuple):
+    """The signed entries of a folder, and what is in the folder."""
+
+    folder: Path
+    database: sqlite3.Connection
+    entries: Sequence[ChainEntry]
+
+    def of(self, *kinds: str) -> list[ChainEntry]:
+        return [entry for entry in self.entries if entry.kind in kinds]
+
+    def hashes(self, kind: str) -> dict[str, str]:
+        """The last hash by name."""
+        return {entry.name: entry.content_sha256 for entry in self.of(kind)}
 
 
 def _extend(found: list[str], name: str, lines: Iterable[str]) -> None:
@@ -594,9 +562,25 @@ def _whole_entries(database: sqlite3.Connection, entries: list[ChainEntry]) -> I
             yield "signed entry {number!r} ({kind!r} {name!r}) is damaged".format(**row)
 
 
-def _hauls_of_people(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
-    if surplus := _unmatched(entries, database, HAULS)[1]:
+def _added(signed: _Signed, table: Table) -> Iterator[str]:
+    """What was changed, removed or put in, a line each kind; people may add hauls to a folder."""
+    missing, surplus = _unmatched(signed, table)
+    if missing:
+        yield f"{missing} of its {table.name} are missing, or not as they were signed"
+    if surplus and table is not HAULS:
+        yield f"{surplus} of its {table.name} were put in, or are not as they were signed"
+
+
+def _hauls_of_people(signed: _Signed) -> Iterator[str]:
+    if surplus := _unmatched(signed, HAULS)[1]:
         yield f"{surplus} events of hauls are not signed by the device"
+
+
+def _unmatched(signed: _Signed, table: Table) -> tuple[int, int]:
+    """The number of rows that were signed and are not there, and that are there and not signed."""
+    known = Counter(entry.content_sha256 for entry in signed.of(table.kind))
+    found = Counter(map(_content, rows(signed.database, table)))
+    return (known - found).total(), (found - known).total()
 
 
 def _unsigned_verdicts(database: Path) -> Iterator[str]:
@@ -619,49 +603,44 @@ def _broken_links(entries: Sequence[ChainEntry], key: Ed25519PublicKey) -> Itera
         previous, number = entry.sha256, entry.number
 
 
-def _rows_by_name(
-    entries: Sequence[ChainEntry], table: Table, stored: Iterable[_Row], column: str
-) -> Iterator[str]:
-    """Rows that were changed, removed, put in or moved."""
-    kind, contents = table.kind, [(str(row[column]), _content(row)) for row in stored]
-    signed = {entry.name: entry.content_sha256 for entry in entries if entry.kind == kind}
+def _rows_by_name(signed: _Signed, table: Table, stored: Iterable[_Row]) -> Iterator[str]:
+    """Rows that were changed, removed, put in or moved; their name is what the entries say."""
+    kind, hashes = table.kind, signed.hashes(table.kind)
+    column = "run_id" if table is RUNS else "track_id"
+    contents = [(str(row[column]), _content(row)) for row in stored]
     found = dict(contents)
     if len(found) < len(contents):
         yield f"{len(contents) - len(found)} {kind} are there twice"
-    for name, sha256 in signed.items():
+    for name, sha256 in hashes.items():
         if name not in found:
             yield f"{kind} {name} is missing, and was signed"
         elif found[name] != sha256:
             yield f"{kind} {name} is not as it was signed"
-    yield from (f"{kind} {name} is not signed" for name in found if name not in signed)
-    order = [name for name in found if name in signed]
-    if order != [name for name in signed if name in found]:
+    yield from (f"{kind} {name} is not signed" for name in found if name not in hashes)
+    if [name for name in found if name in hashes] != [name for name in hashes if name in found]:
         yield f"the order of the {kind} is not as it was signed"
 
 
-def _events(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
-    stored = list(rows(database, EVENTS))
-    signed = [entry.content_sha256 for entry in entries if entry.kind == EVENTS.kind]
+def _events(signed: _Signed) -> Iterator[str]:
+    stored = list(rows(signed.database, EVENTS))
+    known = [entry.content_sha256 for entry in signed.of(EVENTS.kind)]
     found = [_content(row) for row in stored]
     for row, sha256 in zip(stored, found, strict=True):
-        if sha256 not in signed:
+        if sha256 not in known:
             yield f"the event {row['text']!r} was put in, or is not as it was signed"
-    if missing := len([sha256 for sha256 in signed if sha256 not in found]):
+    if missing := len([sha256 for sha256 in known if sha256 not in found]):
         yield f"{missing} events are missing, or not as they were signed"
-    if not missing and sorted(found) == sorted(signed) and found != signed:
+    if not missing and sorted(found) == sorted(known) and found != known:
         yield "the order of the events is not as it was signed"
     if len(found) > len(set(found)):
         yield "an event is there twice"
 
 
-def _runs(
-    entries: Sequence[ChainEntry], database: sqlite3.Connection, *, is_going_on: bool
-) -> Iterator[str]:
-    stored = list(rows(database, RUNS))
+def _runs(signed: _Signed, *, is_going_on: bool) -> Iterator[str]:
+    stored = list(rows(signed.database, RUNS))
     begun = ({k: v for k, v in row.items() if k not in END_COLUMNS} for row in stored)
-    yield from _rows_by_name(entries, RUNS, begun, "run_id")
-    ends = {entry.name: entry.content_sha256 for entry in entries if entry.kind == END}
-    runs = [entry.name for entry in entries if entry.kind == RUNS.kind]
+    yield from _rows_by_name(signed, RUNS, begun)
+    ends, runs = signed.hashes(END), [entry.name for entry in signed.of(RUNS.kind)]
     for row in stored:
         name = str(row["run_id"])
         if name in ends:
@@ -674,65 +653,58 @@ def _runs(
             yield f"run {name} has no end: it crashed, or what came last was removed"
 
 
-def _signature_state(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
+def _signature_state(signed: _Signed) -> Iterator[str]:
     """Marks, clips and scenes as the last run left them, where it came to its end."""
-    state = content_sha256(read_state(database))
-    last = [entry for entry in entries if entry.kind in (RUNS.kind, STATE)]
+    state, last = content_sha256(read_state(signed.database)), signed.of(RUNS.kind, STATE)
     if last and last[-1].kind == STATE and last[-1].content_sha256 != state:
         yield "its marks, clips or scenes are not as they were signed"
 
 
-def _checks(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
+def _checks(signed: _Signed) -> Iterator[str]:
     """The checks of the scale: each run signs those that were there at its end."""
-    checks = check_lines(database)
-    for entry in entries:
-        if (
-            entry.kind == CHECKS.kind
-            and lines_sha256(checks[: int(entry.name)]) != entry.content_sha256
-        ):
-            yield "the checks of the scale are not as they were signed"
-            return
+    checks, known = check_lines(signed.database), signed.of(CHECKS.kind)
+    if any(lines_sha256(checks[: int(one.name)]) != one.content_sha256 for one in known):
+        yield "the checks of the scale are not as they were signed"
 
 
-def _later_checks(entries: Sequence[ChainEntry], database: sqlite3.Connection) -> Iterator[str]:
-    signed = max((int(entry.name) for entry in entries if entry.kind == CHECKS.kind), default=0)
-    if (more := len(check_lines(database)) - signed) > 0:
+def _later_checks(signed: _Signed) -> Iterator[str]:
+    known = max((int(entry.name) for entry in signed.of(CHECKS.kind)), default=0)
+    if (more := len(check_lines(signed.database)) - known) > 0:
         yield f"checks of the scale that are not signed yet: {more}"
 
 
-def _files(entries: Sequence[ChainEntry], folder: Path) -> Iterator[str]:
-    signed = {e.name: e for e in entries if e.kind in FILE_KINDS}
-    for name, entry in signed.items():
-        path = folder / Path(name).name
+def _files(signed: _Signed) -> Iterator[str]:
+    known = {entry.name: entry for entry in signed.of(*FILE_KINDS)}
+    for name, entry in known.items():
+        path = signed.folder / Path(name).name
         if not path.is_file():
             if entry.kind != REMOVED:
                 yield f"{name} is missing, and was signed"
         elif entry.kind == REMOVED or sha256_of(path) != entry.content_sha256:
             yield f"{name} is not as it was signed"
     for pattern in RECORDINGS:
-        for path in sorted(folder.glob(pattern)):
-            if path.name not in signed:
+        for path in sorted(signed.folder.glob(pattern)):
+            if path.name not in known:
                 yield f"{path.name} is not signed"
 
 
-def _unsigned_files(entries: Sequence[ChainEntry], folder: Path) -> Iterator[str]:
-    """Recordings that are not signed are a change, see `_files`; others may be exports."""
-    signed = {entry.name for entry in entries if entry.kind in FILE_KINDS}
-    named = {path for pattern in RECORDINGS for path in folder.glob(pattern)}
-    own = (*folder.glob(f"{DATABASE}*"), folder / PROVENANCE)
+def _noted_files(signed: _Signed) -> Iterator[str]:
+    """Files that were found, and others without a signature than recordings (see `_files`)."""
+    for entry in signed.of(FOUND):
+        yield f"{entry.name} was signed when a run found it, after a crash or renamed"
+    known = {entry.name for entry in signed.of(*FILE_KINDS)}
+    own = {
+        path
+        for pattern in (*RECORDINGS, f"{DATABASE}*", PROVENANCE)
+        for path in signed.folder.glob(pattern)
+    }
     names = sorted(
         path.name
-        for path in folder.iterdir()
-        if path.is_file() and path.name not in signed and path not in named and path not in own
+        for path in signed.folder.iterdir()
+        if path.is_file() and path.name not in known and path not in own
     )
-    if names:
+    if names:  # exports, maybe
         yield f"not signed by the device: {', '.join(map(repr, names))}"
-
-
-def _found(entries: Sequence[ChainEntry]) -> Iterator[str]:
-    for entry in entries:
-        if entry.kind == FOUND:
-            yield f"{entry.name} was signed when a run found it, after a crash or renamed"
 
 
 def _content(row: _Row) -> str:

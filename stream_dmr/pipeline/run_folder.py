@@ -142,7 +142,7 @@ def recover_folder(folder: Path, *, key: Path | None = None) -> Iterator[str]:
     if not folder.is_dir():
         raise OutputError(f"{folder}: expected the folder of a run, found none; check the path")
     require_unlocked(folder)
-    signer = None if key is None else Signer(key)
+    signer = Signer(key)
     repairs = list[Repair]()
     for repair in repair_recordings(folder):
         repairs.append(repair)
@@ -151,11 +151,11 @@ def recover_folder(folder: Path, *, key: Path | None = None) -> Iterator[str]:
         return
     for path in sorted(folder.glob("*.mcap")):
         yield from _add_lengths(path, folder, signer)
-    if signer is not None:
+    if key is not None:
         sign_found(folder, [repair.path for repair in repairs], signer)
 
 
-def _add_lengths(path: Path, folder: Path, signer: Signer | None) -> Iterator[str]:
+def _add_lengths(path: Path, folder: Path, signer: Signer) -> Iterator[str]:
     try:
         recording = open_recordings([path])
         final = [one for one in messages_of(recording, LengthEstimate) if one.is_final]

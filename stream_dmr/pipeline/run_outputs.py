@@ -339,7 +339,7 @@ def _open_store(inputs: Inputs, header: RunHeader) -> LengthStore:
         haul=request.haul,
         utc_zero_ns=inputs.utc_zero_ns,
     )
-    signer = None if request.key is None else Signer(request.key)
+    signer = Signer(request.key)
     return LengthStore(request.out, facts, waits_for_disk=inputs.is_endless, signer=signer)
 
 

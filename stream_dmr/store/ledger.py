@@ -62,18 +62,36 @@ class ChainEntry:
 
 
 class Signer:
-    """Signs entries with a device's private key, each after the one before."""
+    """Continues the chain of a lengths.db with a device's private key, each entry after the last.
 
-    def __init__(self, key_file: Path) -> None:
+    `row` and `content` return the statements, for the transaction of what they sign. Without a key
+    there are none.
+    """
+
+    def __init__(self, key_file: Path | None) -> None:
         """Raises UserError where the file is no private key, or others may read it."""
-        self._key = _load_private_key(key_file)
+        self._key = None if key_file is None else _load_private_key(key_file)
         self._last: ChainEntry | None = None
 
-    def continue_after(self, last: ChainEntry | None) -> None:
-        """Go on with the chain of a folder; None: begin one."""
-        self._last = last
+    @property
+    def has_key(self) -> bool:
+        return self._key is not None
+
+    def continue_chain(self, database: sqlite3.Connection) -> None:
+        if self._key is not None:
+            self._last = next(reversed(read_chain(database)), None)
+
+    def row(self, kind: str, name: str, values: Mapping[str, object]) -> list[Statement]:
+        return self.content(kind, name, content_sha256(values)) if self._key else []
+
+    def content(self, kind: str, name: str, sha256: str) -> list[Statement]:
+        """Sign anything by its hash."""
+        return [insertion(LEDGER, asdict(self.sign(kind, name, sha256)))] if self._key else []
 
     def sign(self, kind: str, name: str, content_sha256: str) -> ChainEntry:
+        """The next entry. Raises ValueError without a key."""
+        if self._key is None:
+            raise ValueError("expected a device key to sign with, got none")
         unsigned = ChainEntry(
             number=1 if self._last is None else self._last.number + 1,
             previous="" if self._last is None else self._last.sha256,
@@ -161,29 +179,6 @@ def _no_key(path: Path, kind: str, error: object) -> UserError:
 def _canonical(values: Mapping[str, object]) -> bytes:
     # Bytes, which no row of ours has, are signed nowhere.
     return json.dumps(values, sort_keys=True, separators=(",", ":"), default=repr).encode()
-
-
-class ChainWriter:
-    """Gives the statements that sign what a store writes, for the same transaction.
-
-    Without a signer there are none.
-    """
-
-    def __init__(self, signer: Signer | None, database: sqlite3.Connection) -> None:
-        self._signer = signer
-        if signer is not None:
-            entries = read_chain(database)
-            signer.continue_after(entries[-1] if entries else None)
-
-    def row(self, kind: str, name: str, values: Mapping[str, object]) -> list[Statement]:
-        """Sign a row by its columns."""
-        return [] if self._signer is None else self.content(kind, name, content_sha256(values))
-
-    def content(self, kind: str, name: str, sha256: str) -> list[Statement]:
-        """Sign anything by its hash."""
-        if self._signer is None:
-            return []
-        return [insertion(LEDGER, asdict(self._signer.sign(kind, name, sha256)))]
 
 
 def read_chain(database: sqlite3.Connection) -> Sequence[ChainEntry]:

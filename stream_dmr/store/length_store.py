@@ -22,7 +22,6 @@ from stream_dmr.store.ledger import (
     END,
     FILE_KINDS,
     STATE,
-    ChainWriter,
     Signer,
     lines_sha256,
     read_chain,
@@ -209,8 +208,9 @@ class LengthStore:
                 self.path, self._reserve, waits_for_disk=waits_for_disk, state=self._state
             )
             self.before = self._used = _marks(self._rows.database)
-            self.is_signing = signer is not None
-            self._chain = ChainWriter(signer, self._rows.database)
+            self._signer = signer or Signer(None)
+            self.is_signing = self._signer.has_key
+            self._signer.continue_chain(self._rows.database)
             self._begin_run(waits_for_disk=waits_for_disk)
         except BaseException:
             self._lock_of_folder.release()
@@ -329,7 +329,7 @@ class LengthStore:
         """
         row = {"run_id": self.run_id, **values, "written_ns": time.time_ns()}
         with self._lock:
-            signature = self._chain.row(table.kind, name, row)
+            signature = self._signer.row(table.kind, name, row)
             self._rows.pending += [insertion(table, row), *signature]
             if is_urgent:
                 self._rows.write()
@@ -337,7 +337,7 @@ class LengthStore:
     def sign_file(self, kind: str, name: str, sha256: str) -> None:
         """Sign a file of the folder by its hash, durably; nothing without a signer."""
         with self._lock:
-            self._write(*self._chain.content(kind, name, sha256))
+            self._write(*self._signer.content(kind, name, sha256))
 
     def signed_files(self) -> set[str]:
         """The names of all files that were ever signed here."""
@@ -380,7 +380,7 @@ class LengthStore:
         values |= {name: getattr(self._facts, name) for name in END_COLUMNS if name not in values}
         with self._lock:
             self._write(*self._signed_state())
-            signature = self._chain.row(END, self.run_id, {"run_id": self.run_id} | values)
+            signature = self._signer.row(END, self.run_id, {"run_id": self.run_id} | values)
             self._write((_END, (*values.values(), self.run_id)), *signature)
         self._rows.close()
         self._reserve.release()
@@ -400,15 +400,15 @@ class LengthStore:
             return []
         state, checks = read_state(self._rows.database), check_lines(self._rows.database)
         return [
-            *self._chain.row(STATE, self.run_id, state),
-            *self._chain.content(CHECKS.kind, str(len(checks)), lines_sha256(checks)),
+            *self._signer.row(STATE, self.run_id, state),
+            *self._signer.content(CHECKS.kind, str(len(checks)), lines_sha256(checks)),
         ]
 
     def _begin_run(self, *, waits_for_disk: bool) -> None:
         values = {"run_id": self.run_id, "started_ns": time.time_ns()}
         values |= {field.name: getattr(self._facts, field.name) for field in fields(self._facts)}
         begun = {k: v for k, v in values.items() if k not in END_COLUMNS}
-        signature = self._chain.row(RUNS.kind, self.run_id, begun)
+        signature = self._signer.row(RUNS.kind, self.run_id, begun)
         self._rows.pending += [insertion(RUNS, values), *signature]
         if self._rows.is_reached:
             self._rows.write()
