@@ -68,6 +68,23 @@ class Verdict:
     condition: str | None = None  # of CONDITIONS
 
     @property
+    def in_words(self) -> str:
+        """What was decided, for the reviewer."""
+        return {
+            "accept": "accepted",
+            "reject": f"rejected, {self.reason}",
+            "duplicate": f"duplicate of fish {self.duplicate_of}",
+            "species": f"species {self.species}",
+            "fate": f"fate {self.fate}",
+            "condition": f"condition {self.condition}",
+            "correct": f"points moved in frame {self.frame_index}",
+            "withdraw": "verdicts withdrawn",
+            "add": "added",
+            "split": f"from frame {self.frame_index} on it is fish {self.other_fish}",
+            "merge": f"goes on as fish {self.other_fish}",
+        }[self.kind]
+
+    @property
     def moved(self) -> dict[int, Ends]:
         """Head and tail of a correction by its frame; empty for other kinds."""
         head_u, head_v, tail_u, tail_v = self.head_u, self.head_v, self.tail_u, self.tail_v

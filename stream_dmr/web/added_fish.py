@@ -13,7 +13,7 @@ from stream_dmr.detection.box_files import AnnotatedBox
 from stream_dmr.detection.given_fish import AnnotatedFish
 from stream_dmr.errors import UserError
 from stream_dmr.files import is_locked
-from stream_dmr.messages import LocalizedFish
+from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.pipeline.config import Config
 from stream_dmr.pipeline.session import Session, Setup
@@ -21,7 +21,14 @@ from stream_dmr.recording.codec import encode
 from stream_dmr.recording.frame_images import FoundFrame, FrameLookup
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.reading import known_shapes
-from stream_dmr.store.edits import TrackPart, edited_row, frames_of_parts, frames_of_tracks
+from stream_dmr.recording.selection import Selection
+from stream_dmr.store.edits import (
+    ReviewedMessages,
+    TrackPart,
+    edited_row,
+    frames_of_parts,
+    frames_of_tracks,
+)
 from stream_dmr.store.fish import read_measured_fish
 from stream_dmr.store.verdicts import AddedFrame, Verdict, frames_sha256, next_track_id
 from stream_dmr.web.report_page import RunReport
@@ -103,6 +110,36 @@ def measure_boxes(
     return MeasuredBoxes(frames=frames, fish=fish, is_original=is_original)
 
 
+class DoubtError(UserError):
+    """A question: an edit contradicts what is measured. Submitted again as `sure`, it is made."""
+
+
+def require_equal_lengths(measured: Mapping[int, LengthEstimate], merge: Verdict) -> None:
+    """DoubtError if the 95 % intervals of two measured fish don't meet."""
+    fish = (merge.track_id, merge.other_fish)
+    pair = [measured[one] for one in fish if one is not None and one in measured]
+    intervals = [one.ci95_mm for one in pair if one.ci95_mm is not None]
+    if len(intervals) == 2 and max(low for low, _ in intervals) > min(top for _, top in intervals):
+        lengths = " and ".join(
+            f"{_length_text(one)} ({low / 10:.1f} to {top / 10:.1f})"
+            for one, (low, top) in zip(pair, intervals, strict=True)
+        )
+        raise DoubtError(f"{lengths}: their 95 % intervals don't meet. Are they one fish?")
+
+
+def _length_text(fish: LengthEstimate) -> str:
+    return f"Fish {fish.track_id} is {(fish.length_mm or 0) / 10:.1f} cm"
+
+
+def _overlap(box: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> float:
+    """Intersection over union."""
+    sides = np.minimum(box[2:], other[2:]) - np.maximum(box[:2], other[:2])
+    common = float(np.prod(np.maximum(sides, 0)))
+    return common / float(np.prod(box[2:] - box[:2]) + np.prod(other[2:] - other[:2]) - common)
+
+
+_SAME_FISH = 0.5  # chosen: of two fish side by side, boxes share less than half of what they cover
+
 ADDED = "added by a reviewer"
 OTHER_PIXELS = "measured on pictures of the recording, which are not quite those of the run"
 
@@ -129,6 +166,12 @@ class TrackEditor:
         new_fish = self._new_fish()
         if frame_index is None:
             raise UserError("verdict: expected the first frame of the other fish")
+        whole = next(one.estimate for one in report.fish if one.estimate.track_id == track_id)
+        if not whole.first_frame < frame_index <= whole.last_frame:
+            raise UserError(
+                f"verdict: expected a frame after the first of fish {track_id} "
+                f"({whole.first_frame}) and up to its last ({whole.last_frame}), got {frame_index}"
+            )
         parts = report.edits.split(track_id, frame_index, new_fish)
         rows = self._rows(report, parts)
         made = replace(verdict, other_fish=new_fish, fish=json.dumps(rows))
@@ -143,6 +186,27 @@ class TrackEditor:
             raise UserError("verdict: expected the number of the other fish of this one's track")
         rows = self._rows(report, {other: report.edits.merge(verdict.track_id, other)})
         return TrackEdit(verdict=replace(verdict, fish=json.dumps(rows)))
+
+    def require_free(
+        self,
+        report: RunReport,
+        drawn: Boxes,
+        time_ns: tuple[int, int],
+        measured: Mapping[int, LengthEstimate],
+    ) -> None:
+        """DoubtError if the boxes lie over one of the `measured` fish."""
+        selection = Selection(time_ns=(time_ns[0], time_ns[1] + 1))
+        for crop in ReviewedMessages(report.recording, self._database, selection).of([FishCrop]):
+            assert isinstance(crop, FishCrop)
+            box = boxes_between(drawn, [crop.frame_index]).get(crop.frame_index)
+            if box is None or crop.track_id not in measured:
+                continue
+            if (overlap := _overlap(box, crop.bbox_xyxy_px)) > _SAME_FISH:
+                raise DoubtError(
+                    f"{_length_text(measured[crop.track_id])}, and in frame {crop.frame_index} "
+                    f"the new box and its box share {100 * overlap:.0f} % of their area. Is it "
+                    "another fish?"
+                )
 
     def add(
         self, report: RunReport, verdict: Verdict, drawn: Boxes, time_ns: tuple[int, int]
@@ -171,7 +235,7 @@ class TrackEditor:
     def _rows(
         self, report: RunReport, parts: Mapping[int, Iterable[TrackPart]]
     ) -> list[dict[str, Any]]:
-        """The final row of each fish. UserError where one has no frame."""
+        """The final row of each fish."""
         tracks = {part.track_id for of_fish in parts.values() for part in of_fish}
         measured = {one.estimate.track_id: one for one in read_measured_fish(self._database)}
         last = {track_id: one.estimate.last_frame for track_id, one in measured.items()}
@@ -180,10 +244,6 @@ class TrackEditor:
         rows: list[dict[str, Any]] = []
         for fish, of_fish in parts.items():
             chosen = frames_of_parts(frames, of_fish, fish=fish)
-            if not chosen:
-                raise UserError(
-                    "verdict: expected a frame that has some of the fish's frames before it"
-                )
             known = [flags.get(fish, ()), *(flags.get(part.track_id, ()) for part in of_fish)]
             said = list(dict.fromkeys(flag for some in known for flag in some))
             rows.append(edited_row(chosen, report.config.smooth_length, said))

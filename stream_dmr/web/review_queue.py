@@ -13,6 +13,7 @@ from stream_dmr.errors import ConfigError, OutputError, UserError
 from stream_dmr.species import load_species
 from stream_dmr.store.fish import Fish, database_of, read_measured_fish
 from stream_dmr.store.verdicts import NOT_REVIEWED
+from stream_dmr.web.added_fish import DoubtError
 from stream_dmr.web.clip import fish_clip
 from stream_dmr.web.report_page import PlacedReport, RunReport, fish_detail, place, render_page
 from stream_dmr.web.token_server import TokenHandler, TokenServer
@@ -43,6 +44,7 @@ class ReviewQueue:
         self.placed = place(reports)
         self._recorders = [VerdictRecorder(report, reviewer, blind=blind) for report in reports]
         self._measured = set[int]() if sample is None else measured_numbers(self.placed)
+        self._last = [recorder.last() for recorder in self._recorders]
         self._chosen = None if sample is None else sampled(self._measured, sample)
         self._about: dict[str, Any] = {"reviewer": reviewer, "blind": blind}
         self._about["species"] = species_choices(reports[0].config.species.own_list)
@@ -56,7 +58,7 @@ class ReviewQueue:
             )
             for run, recorder in enumerate(self._recorders)
         ]
-        return render_page(reports, title=title, review=self._about)
+        return render_page(reports, title=title, review=self._about | {"undo": self._undo()[1]})
 
     def reviewed_rows(self) -> list[dict[str, Any]]:
         """The rows of all fish that any verdict was about, or `{"id": ..., "gone": true}`."""
@@ -66,11 +68,20 @@ class ReviewQueue:
             rows += self._rows(run, named) if named else []
         return rows
 
-    def record(self, content: bytes) -> list[dict[str, Any]]:
-        """Take a verdict in JSON; the rows of the fish that it changes. UserError if it is none."""
+    def record(self, content: bytes) -> dict[str, Any]:
+        """Take a verdict in JSON. UserError if it is none.
+
+        Returns the `rows` of the fish that it changes, what was `said`, and what an `undo` takes
+        back next. An undo takes back the reviewer's last verdict, whichever run that is of.
+        """
         submitted = parse_verdict(content)
-        recorder = self._recorder(submitted.run)
-        return self._rows(submitted.run, recorder.record(submitted))
+        is_undo = submitted.kind == "undo"
+        run, undone = self._undo() if is_undo else (submitted.run, "")
+        recorder = self._recorder(run)
+        rows = self._rows(run, recorder.record(submitted))
+        self._last[run] = recorder.last()
+        said = f"{undone}, taken back" if is_undo else self._in_words(run)
+        return {"rows": rows, "said": said, "undo": self._undo()[1]}
 
     def detail(self, run: int, track_id: int) -> dict[str, Any]:
         """What a row opens. UserError where there is no such fish."""
@@ -92,6 +103,17 @@ class ReviewQueue:
         if not 0 <= run < len(self._recorders):
             raise UserError(f"expected a run of this review, got {run}")
         return self._recorders[run]
+
+    def _undo(self) -> tuple[int, str]:
+        """The run of this reviewer's last verdict, and that verdict in words; "" without any."""
+        times = [0 if one is None else one.written_ns for one in self._last]
+        run = times.index(max(times))
+        return run, self._in_words(run)
+
+    def _in_words(self, run: int) -> str:
+        last, placed = self._last[run], self.placed[run]
+        video = f" of {placed.report.title}" if placed.is_one_of_many else ""
+        return f"Fish {last.track_id}{video}: {last.in_words}" if last else ""
 
     def _rows(self, run: int, track_ids: Sequence[int] | set[int]) -> list[dict[str, Any]]:
         rows = {fish.estimate.track_id: row for fish, row in self._fish(run, set(track_ids))}
@@ -218,10 +240,12 @@ class _ReviewHandler(TokenHandler):
         if body is None:
             return self.answer_json(HTTPStatus.BAD_REQUEST, {"error": "expected a short verdict"})
         try:
-            rows = self.server.queue.record(body)
+            answer = self.server.queue.record(body)
+        except DoubtError as error:
+            return self.answer_json(HTTPStatus.CONFLICT, {"question": str(error)})
         except UserError as error:
             return self.answer_json(HTTPStatus.BAD_REQUEST, {"error": str(error)})
-        self.answer_json(HTTPStatus.OK, rows)
+        self.answer_json(HTTPStatus.OK, answer)
 
     def _numbers(self) -> tuple[int, int, int]:
         """The numbers of run and fish in an address, and of a clip before or after its own."""

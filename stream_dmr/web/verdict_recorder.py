@@ -20,6 +20,7 @@ from stream_dmr.store.fish import database_of
 from stream_dmr.store.verdicts import (
     BLIND,
     EDITS,
+    NOT_COUNTED,
     NOT_REVIEWED,
     Ends,
     Review,
@@ -32,7 +33,7 @@ from stream_dmr.store.verdicts import (
     reviews_of,
     standing,
 )
-from stream_dmr.web.added_fish import TrackEdit, TrackEditor
+from stream_dmr.web.added_fish import TrackEdit, TrackEditor, require_equal_lengths
 from stream_dmr.web.open_reports import reread_fish
 from stream_dmr.web.report_page import RunReport
 from stream_dmr.web.views import RecordedView, recorded_source
@@ -77,6 +78,7 @@ class SubmittedVerdict(BaseModel):
     tail: Point | None = None
     other_fish: int | None = None
     boxes: list[DrawnBox] = Field(default_factory=list[DrawnBox], max_length=500)
+    sure: bool = False  # do it although it contradicts what is measured
 
 
 def parse_verdict(content: bytes) -> SubmittedVerdict:
@@ -134,7 +136,7 @@ class VerdictRecorder:
     def record(self, submitted: SubmittedVerdict) -> list[int]:
         """Check and write a verdict; returns the fish that it changes.
 
-        UserError where it contradicts itself or what is known.
+        UserError where it contradicts itself or what is known; DoubtError where it may be right.
         """
         with self._lock:
             said = read_verdicts(self._database)
@@ -155,6 +157,12 @@ class VerdictRecorder:
             seal_verdicts(self._database.parent)
             self._follow(read_verdicts(self._database))
             return sorted({edit.verdict.track_id} | changed_fish(before, self._report.edits))
+
+    def last(self) -> Verdict | None:
+        """The verdict that an undo would take back."""
+        said = read_verdicts(self._database)
+        number = last_of(said, self._reviewer, self._reading)
+        return None if number is None else said[number - 1]
 
     def said(self) -> tuple[RunReport, dict[int, Review], set[int]]:
         """The fish as they are now, their reviews, and all fish that a verdict ever spoke of."""
@@ -203,10 +211,19 @@ class VerdictRecorder:
                 "verdict: expected accept, reject, duplicate, species or moved points: a blind "
                 "reading is of the fish as they were measured"
             )
-        if verdict.kind == "add":
-            return self._editor.add(report, verdict, *drawn_boxes(submitted.boxes))
-        there = {one.estimate.track_id for one in report.fish} - report.edits.merged.keys()
         reviews = self._reviews(said)
+        measured = {
+            one.estimate.track_id: one.estimate
+            for one in report.fish
+            if not submitted.sure
+            and one.estimate.ci95_mm is not None
+            and reviews.get(one.estimate.track_id, NOT_REVIEWED).decision not in NOT_COUNTED
+        }
+        if verdict.kind == "add":
+            boxes, time_ns = drawn_boxes(submitted.boxes)
+            self._editor.require_free(report, boxes, time_ns, measured)
+            return self._editor.add(report, verdict, boxes, time_ns)
+        there = {one.estimate.track_id for one in report.fish} - report.edits.merged.keys()
         check_verdict(verdict, there, reviews)
         if verdict.kind in EDITS:
             _require_unmoved(reviews, verdict.track_id, verdict.other_fish)
@@ -214,7 +231,9 @@ class VerdictRecorder:
             case "split":
                 return self._editor.split(report, verdict)
             case "merge":
-                return self._editor.merge(report, verdict)
+                edit = self._editor.merge(report, verdict)
+                require_equal_lengths(measured, verdict)
+                return edit
             case "correct":
                 moved = reviews.get(verdict.track_id, NOT_REVIEWED).moved
                 return TrackEdit(verdict=self._corrected(verdict, submitted, moved))

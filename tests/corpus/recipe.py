@@ -148,7 +148,9 @@ def _review(review: Review, scene: Path, folder: Path) -> None:
         review.post(kind="merge", track_id=1, other_fish=5),
         review.post(kind="split", track_id=3, frame_index=seen[3][5]),
         review.post(kind="duplicate", track_id=6, duplicate_of=3),
-        review.post(kind="add", boxes=boxes),
+        review.post(kind="reject", track_id=5, reason="no fish"),
+        review.post(kind="add", boxes=boxes),  # over fish 5, which asks while that counts
+        review.post(kind="withdraw", track_id=5),
         review.post(kind="accept", track_id=1),
         review.post(kind="undo"),
         review.get("reviewed.json").decode() + "\n",

@@ -29,7 +29,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = measure(folder)
     queue = ReviewQueue([open_report(out)], reviewer="Ada")
     submit(queue, "split", 2, frame_index=5)
-    submit(queue, "add", boxes=boxes())
+    submit(queue, "add", boxes=boxes(), sure=True)
     submit(queue, "split", 1, frame_index=4)
     submit(queue, "species", 4, species="cod")
     submit(queue, "fate", 4, fate="dropped")

@@ -4,7 +4,8 @@ import json
 import shutil
 import sqlite3
 import threading
-from contextlib import closing
+from contextlib import closing, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,8 @@ from stream_dmr.recording.reading import decoded_messages
 from stream_dmr.store.edits import edited_row
 from stream_dmr.store.fish import read_measured_fish, read_stored_fish
 from stream_dmr.store.schema import fish_row
-from stream_dmr.store.verdicts import read_verdicts
-from stream_dmr.web.added_fish import ADDED, boxes_between
+from stream_dmr.store.verdicts import Verdict, read_verdicts
+from stream_dmr.web.added_fish import ADDED, DoubtError, boxes_between, require_equal_lengths
 from stream_dmr.web.open_reports import open_report
 from stream_dmr.web.review_queue import ReviewQueue
 from stream_dmr.web.verdict_recorder import parse_verdict
@@ -53,7 +54,7 @@ def queue(out: Path) -> ReviewQueue:
 
 def submit(queue: ReviewQueue, kind: str, track_id: int = 0, **said: Any) -> dict[int, Any]:
     content = json.dumps({"kind": kind, "track_id": track_id, **said})
-    return {row["id"]: row for row in queue.record(content.encode())}
+    return {row["id"]: row for row in queue.record(content.encode())["rows"]}
 
 
 def boxes(drawn: dict[int, tuple[int, int, int, int]] = BOXES) -> list[dict[str, Any]]:
@@ -73,7 +74,7 @@ def frames_of(out: Path, track_id: int) -> list[LocalizedFish]:
 def test_an_added_fish_is_measured_as_run_does_with_the_same_boxes(
     measured: Path, queue: ReviewQueue, out: Path, tmp_path: Path
 ):
-    (row,) = submit(queue, "add", boxes=boxes()).values()
+    (row,) = submit(queue, "add", boxes=boxes(), sure=True).values()
     known = boxes_between({k: np.array(box, float) for k, box in BOXES.items()}, range(1, 7))
     file = tmp_path / "boxes.txt"
     file.write_text(
@@ -102,7 +103,7 @@ def run_again(measured: Path, out: Path, **other: object) -> None:
 
 
 def test_one_box_gives_what_run_gives_for_one_frame(queue: ReviewQueue):
-    (row,) = submit(queue, "add", boxes=boxes({3: BOXES[1]})).values()
+    (row,) = submit(queue, "add", boxes=boxes({3: BOXES[1]}), sure=True).values()
     assert (row["length_mm"], row["frames_seen"]) == (None, 1)
     assert row["status"].startswith("too few")
 
@@ -126,7 +127,7 @@ def test_a_split_fish_has_the_lengths_of_its_frames(queue: ReviewQueue, out: Pat
 def test_a_fish_that_a_reviewer_makes_has_its_haul(queue: ReviewQueue, out: Path):
     write_haul(out, "start", name="7", at="0", said_by="Ada")
     submit(queue, "split", 2, frame_index=5)
-    submit(queue, "add", boxes=boxes())
+    submit(queue, "add", boxes=boxes(), sure=True)
     hauls = {one.estimate.track_id: one.haul for one in read_stored_fish(out / "lengths.db")}
     assert hauls == dict.fromkeys((1, 2, 3, 4), "7")
 
@@ -187,8 +188,8 @@ def test_undo_of_what_others_build_on_is_refused(queue: ReviewQueue, out: Path):
 @pytest.mark.parametrize(
     ("said", "why"),
     [
-        ({"kind": "split", "track_id": 1, "frame_index": 1}, "some of the fish's frames before"),
-        ({"kind": "split", "track_id": 1, "frame_index": 6}, "some of the fish's frames before"),
+        ({"kind": "split", "track_id": 1, "frame_index": 1}, r"after the first of fish 1 \(1\)"),
+        ({"kind": "split", "track_id": 1, "frame_index": 6}, r"up to its last \(5\), got 6"),
         ({"kind": "split", "track_id": 1}, "the first frame of the other fish"),
         ({"kind": "merge", "track_id": 1, "other_fish": 2}, "in view together"),
         ({"kind": "merge", "track_id": 1, "other_fish": 1}, "the other fish"),
@@ -216,6 +217,34 @@ def test_a_fish_with_moved_points_is_not_split(queue: ReviewQueue, out: Path):
         submit(queue, "split", 1, frame_index=3)
 
 
+def test_a_box_over_a_measured_fish_is_asked_about(queue: ReviewQueue, out: Path):
+    (fish, _) = read_measured_fish(out / "lengths.db")
+    assert fish.estimate.length_mm is not None
+    with pytest.raises(DoubtError, match=f"Fish 1 is {fish.estimate.length_mm / 10:.1f} cm, .* %"):
+        submit(queue, "add", boxes=boxes())
+    assert read_verdicts(out / "lengths.db") == []
+    submit(queue, "reject", 1, reason="a glove")
+    assert submit(queue, "add", boxes=boxes()).keys() == {3}  # over what is no fish
+
+
+@pytest.mark.parametrize(("apart_mm", "is_asked"), [(19.0, False), (21.0, True)])
+def test_fish_of_two_lengths_are_asked_about_before_they_are_one(
+    out: Path, apart_mm: float, is_asked: bool
+):
+    measured = {
+        one.estimate.track_id: replace(
+            one.estimate, length_mm=length_mm, ci95_mm=np.array([length_mm - 10, length_mm + 10])
+        )
+        for one, length_mm in zip(
+            read_measured_fish(out / "lengths.db"), (674.0, 674.0 + apart_mm), strict=True
+        )
+    }
+    merge = Verdict(track_id=2, kind="merge", reviewer="Ada", other_fish=1)
+    why = r"Fish 2 is 69.5 cm \(68.5 to 70.5\) and Fish 1 is 67.4"
+    with pytest.raises(DoubtError, match=why) if is_asked else nullcontext():
+        require_equal_lengths(measured, merge)
+
+
 def test_fish_are_not_made_beside_a_run(queue: ReviewQueue, out: Path):
     lock = FolderLock(out)
     try:
@@ -227,7 +256,7 @@ def test_fish_are_not_made_beside_a_run(queue: ReviewQueue, out: Path):
 
 def test_verify_finds_a_length_that_its_frames_do_not_give(queue: ReviewQueue, out: Path):
     submit(queue, "split", 1, frame_index=3)
-    submit(queue, "add", boxes=boxes())
+    submit(queue, "add", boxes=boxes(), sure=True)
     database = out / "lengths.db"
     with closing(sqlite3.connect(database)) as edited:
         (text,) = edited.execute("SELECT fish FROM verdicts WHERE kind = 'split'").fetchone()

@@ -17,11 +17,11 @@ from tests.support.fish_run import measure
 WAIT = """
 const until = async (what) => {
   for (let k = 0; k < 600 && !what(); k += 1) await new Promise((done) => setTimeout(done, 20));
-  if (!what()) throw new Error(`waited in vain for ${what}: ${message.textContent}`);
+  if (!what()) throw new Error(`waited in vain for ${what}: ${message().textContent}`);
 };
 const key = (name) => document.activeElement.dispatchEvent(
   new KeyboardEvent("keydown", { key: name, bubbles: true, cancelable: true }));
-const message = document.getElementById("message") ?? { textContent: "" };
+const message = () => document.getElementById("message") ?? { textContent: "" };
 """
 
 
@@ -64,23 +64,41 @@ def test_four_fish_of_two_runs_by_the_keyboard(tab: Tab, out: Path):
         const frames = player.clip.frames.map((one) => [one.frame, one.image !== null]);
         key("a");
         await until(() => state.chosen === 2 && document.getElementById("species-name"));
+        const said = [message().textContent];
         key("s");
         document.activeElement.value = "cod";
         key("Enter");
         await until(() => chosenFish().species !== DATA.template && chosenFish().reviewer);
+        said.push(message().textContent, document.getElementById("do-undo").textContent);
+        send({ kind: "split", frame_index: 99 });
+        await until(() => message().className === "bad");
+        key("u");
+        said.push(message().textContent);
         key("r");
         document.activeElement.value = "not a fish";
         key("Enter");
         await until(() => state.chosen === 1000000001 && document.getElementById("do-accept"));
         key("a");
         await until(() => state.chosen === 1000000002);
+        choose(1);
         key("u");
         await until(() => state.chosen === 1000000001 && chosenFish().verdict === null);
-        return { frames, left: document.getElementById("progress").textContent };
+        said.push(message().textContent);
+        const row = document.querySelector('[data-id="1"]').textContent;
+        return { said, row, frames, left: document.getElementById("progress").textContent };
         """
     )
     assert state["frames"] == [[number, True] for number in range(1, 7)]
     assert "2 of 4 without a decision" in state["left"]
+    species = "Fish 2 of out: species Gadus morhua"
+    assert state["said"] == [
+        "Fish 1 of out: accepted. ",
+        f"{species}.",
+        f"Undo {species} u",
+        f"Nothing was saved, so nothing is taken back. Once more takes back: {species}.",
+        "Fish 1 of other: accepted, taken back.",
+    ]
+    assert "accepted" in state["row"]
     assert kinds(out) == [(1, "accept"), (2, "species"), (2, "reject")]
     assert read_verdicts(out / "lengths.db")[1].species == "Gadus morhua"
     assert kinds(out.parent / "other") == [(1, "accept"), (1, "undo")]
@@ -113,6 +131,8 @@ def test_a_missed_fish_is_drawn_measured_and_split(tab: Tab, out: Path):
     made = tab.run(
         WAIT
         + """
+        const asked = [];
+        window.confirm = (text) => asked.push(text);
         key("Enter");
         await until(() => chosenFish().track_id === 3);
         await until(() => player.clip?.isDone && player.fish.track_id === 3);
@@ -120,10 +140,10 @@ def test_a_missed_fish_is_drawn_measured_and_split(tab: Tab, out: Path):
         showFrame(3);
         key("x");
         await until(() => DATA.fish.some((one) => one.track_id === 4 && one.run === 0));
-        return seen;
+        return [asked.length, ...seen];
         """
     )
-    assert made == [5, 3]
+    assert made == [1, 5, 3]
     fish = {one.estimate.track_id: one for one in read_stored_fish(out / "lengths.db")}
     assert [fish[track_id].origin for track_id in (1, 2, 3, 4)] == ["run", "run", "split", "split"]
     assert [fish[track_id].estimate.frames_seen for track_id in (3, 4)] == [3, 2]

@@ -51,7 +51,7 @@ def judge(report: RunReport) -> ReviewQueue:
 
 
 def submit(judge: ReviewQueue, **said: Any) -> dict[str, Any]:
-    return judge.record(json.dumps(said).encode())[0]
+    return judge.record(json.dumps(said).encode())["rows"][0]
 
 
 def ends(report: RunReport, track_id: int) -> tuple[int, FittedMesh, list[list[float]]]:

@@ -168,7 +168,7 @@ function drawClip() {
   drawBoxes(draw, frame, scale);
   CLIP_SLIDER.value = player.at;
   const mine = frame.fish.find((one) => one.fish === player.fish.track_id);
-  const state = mine ? (mine.reason ? `not used: ${mine.reason}` : "used") : "fish not in view";
+  const state = mine ? (mine.reason ? `not used: ${mine.reason}` : "used") : "fish not found";
   CLIP_TEXT.textContent = `frame ${frame.frame}, ${state}${frame.image ? "" : " (no picture: give --source)"}`;
 }
 

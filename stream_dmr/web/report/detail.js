@@ -44,7 +44,7 @@ function factList(fish) {
     ["frames", `${fish.frames_used} used of ${fish.frames_seen}, ${fish.first_frame} to ${fish.last_frame}`],
     ["refused", reasons], ["flags", fish.flags.join(", ")],
     ["frames chosen by", { add: "a reviewer: added", split: "a reviewer: split", merge: "a reviewer: merged" }[fish.origin] ?? ""],
-    ["verdict", [fish.verdict, fish.verdict_reason, fish.duplicate_of === null ? null : `of fish ${fish.duplicate_of}`, fish.reviewer && `by ${fish.reviewer}, ${new Date(fish.reviewed_ns / 1e6).toISOString().slice(0, 16)} UTC`].filter(Boolean).join(", ")],
+    ["verdict", [VERDICTS[fish.verdict], fish.verdict_reason, fish.duplicate_of === null ? null : `${fish.verdict === "merge" ? "into" : "of"} fish ${fish.duplicate_of}`, fish.reviewer && `by ${fish.reviewer}, ${new Date(fish.reviewed_ns / 1e6).toISOString().slice(0, 16)} UTC`].filter(Boolean).join(", ")],
     ["species", [fish.species, fish.species_code, fish.species_share === null ? null : `${Math.round(100 * fish.species_share)} %`].filter(Boolean).join(", ")],
     ["fate", [fish.fate, fish.fate_share === null ? null : `${Math.round(100 * fish.fate_share)} % of the body`].filter(Boolean).join(", ")],
     ["condition", fish.condition && `${fish.condition}, ${DATA.conditions[fish.condition]}`],

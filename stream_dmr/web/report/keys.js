@@ -6,7 +6,7 @@ const KEYS = [
   ["a", "accept", click("do-accept")], ["r", "reject: type a reason, Enter", focusOn("reason")],
   ["s", "species: type its code or name, Enter", focusOn("species-name")], ["d", "duplicate of: its number, Enter", focusOn("duplicate-of")],
   ["f", "fate: type it, Enter", focusOn("fate-name")], ["c", "condition: type its code, Enter", focusOn("condition-code")],
-  ["u", "undo your last verdict", () => send({ kind: "undo" })], ["n", "next without a decision", () => goToNext()],
+  ["u", "undo your last verdict", () => send({ kind: "undo" })], ["n", "next without a decision", click("do-next")],
   ["j", "next fish", () => step(1)], ["k", "fish before", () => step(-1)],
   [" ", "play, pause", () => togglePlay()], ["ArrowLeft", "frame before", () => stepFrame(-1)], ["ArrowRight", "next frame", () => stepFrame(1)],
   ["<", "earlier", () => shiftClip(-1)], [">", "later", () => shiftClip(1)], ["z", "zoom", () => toggleZoom()], ["o", "outlines", () => toggleOutlines()],

@@ -38,32 +38,52 @@ function nextUnreviewed(id) {
   return order.find((one) => one.verdict === null && one.id !== id) ?? null;
 }
 
+// Shows it; what there is to say where there is none.
 function goToNext() {
   const next = nextUnreviewed(state.chosen);
-  if (next) return showFish(next);
+  if (next) { showFish(next); return ""; }
   const left = chosenFish()?.verdict === null ? 1 : 0;
-  say(left ? "This is the last fish without a decision." : `All ${state.shown.length} fish have a decision.`);
+  return left ? "This is the last fish without a decision." : `All ${state.shown.length} fish have a decision.`;
+}
+
+// What an undo takes back stands on its button.
+function undoLabel() { return bindKey(DATA.review.undo ? `Undo ${DATA.review.undo}` : "Undo", "u"); }
+
+let isRefused = false;  // the last act: an undo after it would take back the one before, unseen
+
+function refuse(text) {
+  isRefused = true;
+  say(text, true);
 }
 
 async function send(verdict) {
   const fish = chosenFish();
   if (!fish && verdict.kind !== "undo") return;
-  let rows;
+  if (isRefused && verdict.kind === "undo") {
+    isRefused = false;
+    return say(`Nothing was saved, so nothing is taken back.${DATA.review.undo && ` Once more takes back: ${DATA.review.undo}.`}`);
+  }
+  let answered;
   try {
     const answer = await fetch("verdict", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ run: fish?.run ?? 0, track_id: fish?.track_id ?? 0, ...verdict }) });
-    rows = await answer.json();
-    if (!answer.ok) return say(rows.error, true);
+    answered = await answer.json();
+    if (answered.question) return confirm(answered.question) ? send({ ...verdict, sure: true }) : refuse("Not saved.");
+    if (!answer.ok) return refuse(answered.error);
   } catch {
-    return say("Not saved: stream-dmr review has ended. Start it again, and open its new address.", true);
+    return refuse("Not saved: stream-dmr review has ended. Start it again, and open its new address.");
   }
+  const { rows, said } = answered;
+  isRefused = false;
+  DATA.review.undo = answered.undo;
+  document.getElementById("do-undo")?.replaceChildren(...undoLabel());
   takeRows(rows);
   show();
-  if (DECISIONS.includes(verdict.kind) && document.getElementById("goes-on").checked) return goToNext();
+  if (DECISIONS.includes(verdict.kind) && document.getElementById("goes-on").checked) return say(`${said}. ${goToNext()}`);
   const wanted = verdict.kind === "add" ? rows.find((row) => !DATA.seen.has(row.id)) : verdict.kind === "undo" ? rows.find((row) => !row.gone) : null;
   const shown = wanted ?? chosenFish() ?? DATA.fish[0];
   for (const row of rows) DATA.seen.add(row.id);
   if (shown) showFish(shown);
-  say(verdict.kind === "undo" ? `Took back your last verdict${wanted ? `, on fish ${wanted.track_id}` : ""}.` : "Saved.");
+  say(`${said}.`);
 }
 
 // Rows of the server in place of those of the page; a fish may be new, or gone.
@@ -109,8 +129,8 @@ function reviewTools(views) {
       button("split", "x", "Another fish from this frame on", () => currentFrame() && send({ kind: "split", frame_index: currentFrame().frame })),
       button("add", "b", "Add a missed fish", startDrawing)] : []),
     element("button", { type: "button", id: "do-correct", onclick: () => points.moved() ? send({ kind: "correct", ...points.moved() }) : say("Drag a head (red) or tail (blue) point first.") }, ...bindKey("Save moved points", "p")),
-    button("undo", "u", "Undo", () => send({ kind: "undo" })),
-    button("next", "n", "Next unreviewed", goToNext),
+    element("button", { type: "button", id: "do-undo", onclick: () => send({ kind: "undo" }) }, ...undoLabel()),
+    button("next", "n", "Next unreviewed", () => say(goToNext())),
     element("button", { type: "button", id: "do-withdraw", textContent: "Withdraw verdicts", onclick: () => send({ kind: "withdraw" }) }),
     element("div", { id: "drawing", hidden: true }, element("span", { id: "drawing-text" }),
       element("button", { type: "button", id: "do-measure", onclick: measureDrawn }, ...bindKey("Measure it", "Enter")), element("button", { type: "button", id: "do-cancel", onclick: stopDrawing }, ...bindKey("Cancel", "Esc"))),

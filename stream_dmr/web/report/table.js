@@ -9,7 +9,7 @@ const COLUMNS = [
   { title: "Frames", key: (f) => f.frames_used },
   { title: "Refused", key: (f) => f.frames_seen - f.frames_used },
   { title: "Flags", key: (f) => f.flags.length },
-  { title: "Verdict", key: (f) => f.verdict ?? "" },
+  { title: "Verdict", key: (f) => VERDICTS[f.verdict] ?? "" },
 ];
 
 const state = { shown: [], column: 1, descending: false, chosen: null };
@@ -49,7 +49,7 @@ function filtered(all, wanted) {
   const words = wanted.search.toLowerCase().split(/\s+/).filter(Boolean);
   return all.filter((f) => {
     const length = lengthOf(f);
-    const text = `${f.track_id} ${f.video} ${f.haul} ${f.trip} ${f.vessel} ${f.species} ${f.species_code ?? ""} ${f.fate ?? ""} ${f.condition ?? ""} ${f.status} ${f.verdict ?? ""} ${f.verdict_reason ?? ""} ${f.flags.join(" ")} ${Object.keys(f.refused).join(" ")}`.toLowerCase();
+    const text = `${f.track_id} ${f.video} ${f.haul} ${f.trip} ${f.vessel} ${f.species} ${f.species_code ?? ""} ${f.fate ?? ""} ${f.condition ?? ""} ${f.status} ${VERDICTS[f.verdict] ?? ""} ${f.verdict_reason ?? ""} ${f.flags.join(" ")} ${Object.keys(f.refused).join(" ")}`.toLowerCase();
     return words.every((word) => (/^\d+$/.test(word) ? String(f.track_id) === word || text.includes(word) : text.includes(word)))
       && (wanted.status !== "measured" || length !== null)
       && (wanted.status !== "not" || length === null)
@@ -60,6 +60,8 @@ function filtered(all, wanted) {
       && (wanted.frames === "" || f.frames_used >= Number(wanted.frames));
   });
 }
+
+const VERDICTS = { accept: "accepted", reject: "rejected", duplicate: "duplicate", merge: "merged" };
 
 function verdictOf(fish) {
   return [fish.verdict ?? "none", ...(fish.corrected_length_mm === null ? [] : ["corrected"])];
@@ -103,10 +105,10 @@ function rowOf(fish) {
   const reasons = Object.entries(fish.refused).map(([reason, count]) => `${count} ${reason}`).join(", ");
   const interval = intervalOf(fish)?.map((mm) => cm(mm)).join(" to ") ?? fish.status;
   const corrected = fish.corrected_length_mm === null ? [] : [element("small", { textContent: `measured ${cm(fish.length_mm)} cm` })];
-  const because = fish.verdict_reason ?? (fish.duplicate_of === null ? "" : `of ${fish.duplicate_of}`);
+  const because = fish.verdict_reason ?? (fish.duplicate_of === null ? "" : `${fish.verdict === "merge" ? "into" : "of"} ${fish.duplicate_of}`);
   const species = fish.species === DATA.template ? "" : fish.species;
   const said = [because, species, fish.fate ?? ""].filter(Boolean).map((textContent) => element("small", { textContent }));
-  const verdict = element("span", { textContent: fish.verdict ?? "" }, ...said);
+  const verdict = element("span", { textContent: VERDICTS[fish.verdict] ?? "" }, ...said);
   if (fish.verdict) verdict.className = fish.verdict === "accept" ? "good" : "bad";
   const size = fish.is_legal_size === false ? element("small", { className: "bad", textContent: "below legal size" }) : "";
   return element(
