@@ -44,7 +44,7 @@ def server(out: Path, tmp_path: Path) -> Iterator[ReviewServer]:
     served.close()
 
 
-@pytest.fixture(params=[1300, 390])
+@pytest.fixture(params=[1400, 390])
 def tab(server: ReviewServer, request: pytest.FixtureRequest) -> Iterator[Tab]:
     opened = Tab(server.address, width=request.param, height=900)
     yield opened
@@ -150,15 +150,15 @@ def test_a_missed_fish_is_drawn_measured_and_split(tab: Tab, out: Path):
     assert verify(out)[0] == []
 
 
-def test_nothing_is_cut_and_a_chosen_fish_is_in_sight(tab: Tab):
+def test_nothing_is_cut_and_clip_and_verdicts_are_in_sight_together(tab: Tab):
     assert tab.run(
         WAIT
         + """
         document.querySelector(".row").click();
         await until(() => player.clip?.isDone);
         await new Promise((done) => setTimeout(done, 300));
-        const canvas = CLIP_CANVAS.getBoundingClientRect();
-        return canvas.top >= 0 && canvas.bottom <= innerHeight;
+        const tools = document.getElementById("verdicts").getBoundingClientRect();
+        return CLIP_CANVAS.getBoundingClientRect().top >= 0 && tools.bottom <= innerHeight;
         """
     )
     assert tab.cut() == []

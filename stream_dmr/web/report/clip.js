@@ -156,6 +156,7 @@ function drawClip() {
     return;
   }
   const [width, height] = frame.size, part = shownPart(frame.size), scale = CLIP_CANVAS.width / part[2];
+  CLIP_CANVAS.style.setProperty("--aspect", width / height);
   const canvasWidth = Math.min(960, Math.round((CLIP_CANVAS.clientWidth || 480) * devicePixelRatio)), canvasHeight = Math.round((canvasWidth * height) / width);
   if (CLIP_CANVAS.width !== canvasWidth || CLIP_CANVAS.height !== canvasHeight) { Object.assign(CLIP_CANVAS, { width: canvasWidth, height: canvasHeight }); return drawClip(); }
   draw.setTransform(1, 0, 0, 1, 0, 0);

@@ -123,7 +123,7 @@ function reviewTools(views) {
     group(field("species-name", "species: code or name", "species", { list: "species-list" }), button("species", "s", "Set species", () => send({ kind: "species", species: speciesNamed(typed("species-name")) }))),
     group(field("fate-name", "fate", "fate", { list: "fate-list" }), button("fate", "f", "Set fate", () => send({ kind: "fate", fate: typed("fate-name") }))),
     group(field("condition-code", "condition: code", "condition", { list: "condition-list" }), button("condition", "c", "Set condition", () => send({ kind: "condition", condition: typed("condition-code") }))),
-    group(field("duplicate-of", "fish", "duplicate", { inputMode: "numeric" }), button("duplicate", "d", "Is a duplicate of", () => send({ kind: "duplicate", duplicate_of: Number(typed("duplicate-of")) }))),
+    group(field("duplicate-of", "fish", "duplicate", { inputMode: "numeric" }), button("duplicate", "d", "Duplicate of", () => send({ kind: "duplicate", duplicate_of: Number(typed("duplicate-of")) }))),
     ...(canEdit ? [
       group(field("merge-into", "fish", "merge", { inputMode: "numeric" }), button("merge", "m", "Goes on as", () => send({ kind: "merge", other_fish: Number(typed("merge-into")) }))),
       button("split", "x", "Another fish from this frame on", () => currentFrame() && send({ kind: "split", frame_index: currentFrame().frame })),
@@ -174,10 +174,9 @@ function startReview() {
   document.getElementById("condition-list").replaceChildren(...Object.entries(DATA.conditions).map(([value, label]) => element("option", { value, label })));
   document.getElementById("plots-too").onchange = (event) => { document.body.classList.toggle("with-plots", event.target.checked); show(); };
   drawKeys();
-  document.getElementById("keys").open = !matchMedia(NARROW).matches;
   addEventListener("keydown", onKey);
   refresh();
   setInterval(refresh, 5000);
   const first = state.shown.find((one) => one.verdict === null) ?? state.shown[0];
-  if (first && !location.hash) matchMedia(NARROW).matches || choose(first.id);
+  if (first && !location.hash) choose(first.id);
 }
