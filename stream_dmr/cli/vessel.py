@@ -5,6 +5,7 @@ import time
 import urllib.error
 import urllib.request
 from getpass import getuser
+from http import HTTPStatus
 from http.client import HTTPException
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -64,6 +65,8 @@ def _post(address: str, what: str, name: str, token_file: Path | None) -> str:
         with error:
             is_ours = error.headers.get_content_type() == "text/plain"
             said = error.read(500).decode(errors="replace").strip() if is_ours else ""
+        if error.code == HTTPStatus.UNAUTHORIZED:
+            said = "it wants its access token: --token-file FILE"
         raise UserError(f"{address}: expected it to take the haul, got: {said or error}") from error
     except (OSError, ValueError, KeyError, TypeError, HTTPException) as error:
         raise UserError(
@@ -149,15 +152,16 @@ class _Changes:
     """Prints a line for each box whose state or alarms are others than at the last look."""
 
     def __init__(self) -> None:
-        self._told: dict[str, list[str]] = {}  # by address
+        self._told: dict[str, str] = {}  # by address
 
     def show(self, states: "Iterable[BoxState]") -> None:
         from stream_dmr.web.fleet_page import alarms_of, state_text
 
         for state in states:
-            told = [state_text(state), *alarms_of(state)]
+            told = ": ".join(filter(None, (state_text(state), "; ".join(alarms_of(state)))))
             if self._told.get(state.box.address) != told:
-                print(f"{state.box.name}: {'; '.join(told)}; {_figures(state)}", flush=True)
+                said = "; ".join(filter(None, (told, _figures(state))))
+                print(f"{state.box.name}: {said}", flush=True)
             self._told[state.box.address] = told
 
 
@@ -165,7 +169,7 @@ def _figures(state: "BoxState") -> str:
     from stream_dmr.web.fleet_page import disk_text, minute_text
 
     if state.contact_ns is None or state.reading is None:
-        return "never answered"
+        return ""
     if state.error:
         return f"last contact {minute_text(state.contact_ns)}"
     return f"{state.reading.fish_per_hour:.0f} fish per hour, {disk_text(state.reading)} free"

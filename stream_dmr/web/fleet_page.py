@@ -153,8 +153,8 @@ def _failure(failure: Exception) -> str:
         return f"it answers {failure.code}, not as a stream-dmr run does"
     reason = failure.reason if isinstance(failure, urllib.error.URLError) else failure
     if isinstance(reason, TimeoutError):
-        return "no answer in time"
-    return f"no answer: {reason_of(reason) if isinstance(reason, Exception) else reason}"
+        return "it took too long"
+    return reason_of(reason) if isinstance(reason, Exception) else reason
 
 
 def _get(box: Box, path: str, timeout_s: float) -> bytes:

@@ -170,7 +170,8 @@ class TokenHandler(BaseHTTPRequestHandler):
         self.answer(HTTPStatus.FORBIDDEN, "text/plain", f"{text}\n".encode())
 
     def _refuse_token(self) -> None:
-        self.answer(HTTPStatus.UNAUTHORIZED, "text/plain", b"open this page with ?token=...\n")
+        text = b"open this page with ?token=TOKEN, or send the header Authorization: Bearer TOKEN\n"
+        self.answer(HTTPStatus.UNAUTHORIZED, "text/plain", text)
 
     @property
     def _cookie_name(self) -> str:

@@ -187,6 +187,11 @@ class WatchObserver(RunObserver):
         if settings.port:
             server = self._opened.enter_context(closing(WatchServer(state, settings)))
             self.address = server.address
+            if settings.token_file:
+                self._observer.notice(
+                    f"{server.address}metrics: for Prometheus, with the token of "
+                    f"{settings.token_file} in the header Authorization: Bearer TOKEN"
+                )
         alerts = run.config.alerts
         if alerts.webhook or alerts.mail_to:
             sender = AlertSender(

@@ -1,12 +1,14 @@
 """The status page of a run, with health, metrics and pictures."""
 
 import json
+import socket
 import threading
 import time
 from contextlib import suppress
 from datetime import UTC, datetime
 from http import HTTPStatus
 from importlib.resources import files
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +76,9 @@ class WatchServer:
                 f"[watch] {settings.host}:{settings.port}: expected an address to listen on, got: "
                 f"{error.strerror}; choose another host or port"
             ) from error
-        host, port = self._server.server_address[:2]
+        host, port = str(self._server.server_address[0]), self._server.server_port
+        if ip_address(host).is_unspecified:  # it listens on all; nobody can open that
+            host = socket.gethostname()
         self.address = f"http://{host}:{port}/"
         self._server.start()
 

@@ -168,8 +168,9 @@ def test_the_command_writes_a_page_and_tells_of_silent_boxes(state: RunState, tm
     second = invoke(f"fleet {address} --out {out}")
     assert (first.code, second.code) == (0, 0), first.err + second.err
     assert "measures; " in first.out
-    assert "does not answer" in second.out
-    assert "last contact 20" in second.out
+    assert "does not answer: Connection refused; last contact 20" in second.out
+    never = invoke(f"fleet {address} --out {tmp_path / 'never.html'}")
+    assert never.out.endswith(": never answered: Connection refused\n")
     page = out.read_text()
     assert page.startswith("<!doctype html>")
     assert "Connection refused" in page

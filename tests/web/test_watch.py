@@ -37,6 +37,7 @@ from stream_dmr.web.watch_observer import JsonLog, SystemdWatchdog, WatchObserve
 from stream_dmr.web.watch_page import WatchServer
 from tests.support.browser import chromium
 from tests.support.camera import free_port
+from tests.support.command import invoke
 from tests.support.final_estimates import FACTS
 from tests.support.final_estimates import fish as finished_fish
 from tests.support.fish_run import request
@@ -217,9 +218,14 @@ def test_others_need_the_token(state: RunState, tmp_path: Path):
     settings = WatchSettings(host="0.0.0.0", port=free_port(), token_file=str(file))
     server = WatchServer(state, settings)
     address = f"http://127.0.0.1:{settings.port}/"
+    assert server.address == f"http://{socket.gethostname()}:{settings.port}/"
+    haul = invoke("haul", {"start": None, address: None})
+    assert haul.error.endswith("it wants its access token: --token-file FILE")
     try:
         for path in ("", "status.json", "picture.jpg", "metrics", "health"):
-            assert get(address + path)[0] == 401
+            code, _, text = get(address + path)
+            assert code == 401
+            assert b"Authorization: Bearer" in text
             assert get(address + path, Authorization="Bearer wrong")[0] == 401
             assert get(f"{address}{path}?token=wrong")[0] == 401
             assert get(address + path, Cookie="stream_dmr_token=wrong")[0] == 401
