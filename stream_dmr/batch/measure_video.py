@@ -67,9 +67,11 @@ class BatchProgress:
         """The videos over, the share of all bytes, and the time left at the pace so far."""
         total = max(1, sum(self._bytes.values()))
         share = sum(self._bytes[name] * done for name, done in self._shares.items()) / total
-        left = duration(elapsed_s * (1 - share) / share) if share >= _MIN_SHARE else "unknown"
-        over = len(self._finished)
-        return f"{over} of {len(self._bytes)} videos, {100 * share:.0f} %, time left: {left}"
+        over = f"{len(self._finished)} of {len(self._bytes)} videos"
+        if share < _MIN_SHARE:
+            return f"{over}, below 1 %: at first it loads, compiles and learns shapes"
+        left = duration(elapsed_s * (1 - share) / share)
+        return f"{over}, {100 * share:.0f} %, time left: {left}"
 
 
 def duration(seconds: float) -> str:

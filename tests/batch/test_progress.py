@@ -19,7 +19,7 @@ def jobs(tmp_path: Path) -> list[Job]:
 
 def test_time_left_follows_the_share_of_bytes(jobs: list[Job]):
     progress = BatchProgress(jobs, print)
-    assert progress.line(10.0).endswith("time left: unknown")
+    assert progress.line(10.0).startswith("0 of 2 videos, below 1 %: at first it loads")
     progress.of(jobs[1])(0.5)
     assert progress.line(30.0) == "0 of 2 videos, 38 %, time left: 50 s"
     progress.finish("a")
