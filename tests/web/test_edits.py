@@ -5,7 +5,6 @@ import shutil
 import sqlite3
 import threading
 from contextlib import closing, nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +25,8 @@ from stream_dmr.recording.reading import decoded_messages
 from stream_dmr.store.edits import edited_row
 from stream_dmr.store.fish import read_measured_fish, read_stored_fish
 from stream_dmr.store.schema import fish_row
-from stream_dmr.store.verdicts import Verdict, read_verdicts
-from stream_dmr.web.added_fish import ADDED, DoubtError, boxes_between, require_equal_lengths
+from stream_dmr.store.verdicts import read_verdicts
+from stream_dmr.web.added_fish import ADDED, DoubtError, boxes_between
 from stream_dmr.web.open_reports import open_report
 from stream_dmr.web.review_queue import ReviewQueue
 from stream_dmr.web.verdict_recorder import parse_verdict
@@ -229,20 +228,22 @@ def test_a_box_over_a_measured_fish_is_asked_about(queue: ReviewQueue, out: Path
 
 @pytest.mark.parametrize(("apart_mm", "is_asked"), [(19.0, False), (21.0, True)])
 def test_fish_of_two_lengths_are_asked_about_before_they_are_one(
-    out: Path, apart_mm: float, is_asked: bool
+    queue: ReviewQueue, out: Path, apart_mm: float, is_asked: bool
 ):
-    measured = {
-        one.estimate.track_id: replace(
-            one.estimate, length_mm=length_mm, ci95_mm=np.array([length_mm - 10, length_mm + 10])
-        )
-        for one, length_mm in zip(
-            read_measured_fish(out / "lengths.db"), (674.0, 674.0 + apart_mm), strict=True
-        )
-    }
-    merge = Verdict(track_id=2, kind="merge", reviewer="Ada", other_fish=1)
-    why = r"Fish 2 is 69.5 cm \(68.5 to 70.5\) and Fish 1 is 67.4"
+    submit(queue, "split", 1, frame_index=3)
+    with closing(sqlite3.connect(out / "lengths.db")) as edited:
+        made = json.loads(edited.execute("SELECT fish FROM verdicts").fetchone()[0])
+        for row, mm in zip(made, (674.0, 674.0 + apart_mm), strict=True):
+            row |= {"length_mm": mm, "ci95_low_mm": mm - 10, "ci95_high_mm": mm + 10}
+        edited.execute("UPDATE verdicts SET fish = ?", (json.dumps(made),))
+        edited.commit()
+    again = ReviewQueue([open_report(out)], reviewer="Ada")
+    why = r"Fish 3 is 69.5 cm \(68.5 to 70.5\) and Fish 1 is 67.4 cm \(66.4 to 68.4\)"
     with pytest.raises(DoubtError, match=why) if is_asked else nullcontext():
-        require_equal_lengths(measured, merge)
+        submit(again, "merge", 3, other_fish=1)
+    assert len(read_verdicts(out / "lengths.db")) == (1 if is_asked else 2)
+    if is_asked:
+        assert submit(again, "merge", 3, other_fish=1, sure=True)[3]["gone"]
 
 
 def test_fish_are_not_made_beside_a_run(queue: ReviewQueue, out: Path):

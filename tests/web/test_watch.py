@@ -60,7 +60,7 @@ def get(address: str, **headers: str) -> tuple[int, HTTPResponse, bytes]:
 
 def metrics_of(address: str) -> dict[tuple[str, ...], float]:
     """Name and label values -> value."""
-    text = get(f"{address}metrics")[2].decode()
+    text = get(f"{address}metrics", Authorization=f"Bearer {TOKEN}")[2].decode()
     return {
         (sample.name, *sample.labels.values()): sample.value
         for family in text_string_to_metric_families(text)
@@ -277,6 +277,10 @@ class Watcher(RunObserver):
         self.address = address
         self.seen: list[dict[tuple[str, ...], float]] = []
         self.served = ""
+        self.notices: list[str] = []
+
+    def notice(self, line: str) -> None:
+        self.notices.append(line)
 
     def serving(self, address: str) -> None:
         self.served = address
@@ -289,12 +293,15 @@ def test_a_run_counts_every_frame_of_every_stage(tmp_path: Path):
     clip, port = tmp_path / "clip", free_port()
     write_clip(clip, fish=[[1, 2]] * 6)
     (clip / "quick.toml").write_text(
-        (clip / "quick.toml").read_text() + f"\n[watch]\nport = {port}\n"
+        (clip / "quick.toml").read_text()
+        + f"\n[watch]\nport = {port}\ntoken_file = '{clip / 'token'}'\n"
     )
+    (clip / "token").write_text(TOKEN)
     observer = Watcher(f"http://127.0.0.1:{port}/")
     asked = request(clip, tmp_path / "out")
     measure_source(asked, stop=threading.Event(), observer=WatchObserver(observer))
     assert observer.served == observer.address
+    assert any("/metrics: for Prometheus" in line for line in observer.notices)
     for number, metrics in enumerate(observer.seen, start=1):
         frames = {k[1:]: v for k, v in metrics.items() if k[0] == "stream_dmr_frames_total"}
         for stage in ("ReadFrames", "CropFish", "FitMesh", "Localize", "SmoothLength"):
