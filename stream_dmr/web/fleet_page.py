@@ -154,7 +154,7 @@ def _failure(failure: Exception) -> str:
     reason = failure.reason if isinstance(failure, urllib.error.URLError) else failure
     if isinstance(reason, TimeoutError):
         return "it took too long"
-    return reason_of(reason) if isinstance(reason, Exception) else reason
+    return reason_of(reason) if isinstance(reason, Exception) else str(reason)
 
 
 def _get(box: Box, path: str, timeout_s: float) -> bytes:
