@@ -50,16 +50,12 @@ def run(
 
 
 def _print_summary(summary: "RunSummary", out: Path, *, timings: bool) -> None:
-    from stream_dmr.cli.terminal import print_fish, print_timings
+    from stream_dmr.cli.terminal import print_fish, print_speed, print_timings
 
     print_fish(summary.fish, may_count_twice=summary.may_count_twice)
     if timings:
         print_timings(summary)
-    elapsed_s = summary.shapes_s + summary.elapsed_s
-    rate = summary.num_frames / elapsed_s
-    promised = summary.frames_promised
-    of = "" if promised is None or summary.num_frames >= promised - 1 else f" of {promised}"
-    print(f"{summary.num_frames}{of} frames in {elapsed_s:.1f} s, {rate:.1f} frames/s")
+    print_speed(summary)
     if summary.calibration is not None:
         distance_m = summary.calibration.plane.distance_mm / 1000
         print(f"by the calibration the reference plane is {distance_m:.2f} m from the camera")
@@ -93,7 +89,11 @@ def demo(
     )
     all_measured = print_beside_truth(out / "lengths.csv", DEMO_SCENE / "truth.csv")
     program = os.path.relpath(Path(sys.executable).with_name("stream-dmr"))  # venv not activated
-    print(f"\nlook at it: {program} view {out}")
+    print(
+        f"\nlook at it:      {program} view {out}"
+        f"\nread its report: {program} report {out}"
+        f"\nyour own video:  {program} run --source VIDEO --calibration CALIBRATION"
+    )
     if not all_measured:
         print("error: a fish of the scene was not measured", file=sys.stderr)
         raise typer.Exit(1)
@@ -118,12 +118,12 @@ def print_beside_truth(lengths: Path, truth: Path) -> bool:
 
     Fish are compared by track_id: here both count them in the order in which they come into view.
     """
-    from stream_dmr.cli.terminal import print_evaluation
+    from stream_dmr.cli.terminal import print_true_lengths
     from stream_dmr.evaluation.compare import evaluate
 
     evaluation = evaluate(lengths, truth)
-    print("\nbeside the truth:\n")
-    print_evaluation(evaluation)
+    print("\nbeside the true lengths of the scene:\n")
+    print_true_lengths(evaluation)
     return evaluation.fraction_measured == 1.0
 
 

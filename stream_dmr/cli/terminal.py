@@ -32,14 +32,14 @@ class RunDisplay(RunObserver):
             TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]:.1f} frames/s, {task.fields[num_fish]} fish"),
+            TextColumn("{task.fields[speed]}"),
             TimeRemainingColumn(),
             console=self._console,
             disable=not self._console.is_terminal,
         )
-        self._task = self._progress.add_task("measuring", total=None, rate=0.0, num_fish=0)
+        self._task = self._progress.add_task("measuring", total=None, speed="")
         self._num_frames: int | None = None
-        self._num_done = 0
+        self._num_done, self._is_measuring = 0, False
         self._fish = set[int]()  # track ids
         self._warned: set[str] = set()
         self._began = self._last_line = time.monotonic()
@@ -59,8 +59,8 @@ class RunDisplay(RunObserver):
         self._console.print(line, markup=False)
 
     def stage(self, line: str) -> None:
-        self._num_done, self._began = 0, time.monotonic()
-        self._progress.reset(self._task, description=line, rate=0.0)
+        self._num_done, self._began, self._is_measuring = 0, time.monotonic(), False
+        self._progress.reset(self._task, description=line, speed="")
         self._progress.start()
         if self._progress.disable and time.monotonic() - self._last_line >= _LINE_EVERY_S:
             self._last_line = time.monotonic()
@@ -72,25 +72,25 @@ class RunDisplay(RunObserver):
     def begin(self, num_frames: int | None) -> None:
         self._num_frames = num_frames
         self._began = self._last_line = time.monotonic()
-        self._num_done = 0
+        self._num_done, self._is_measuring = 0, True
         self._progress.reset(self._task, description="measuring", total=num_frames)
         self._progress.start()
 
     def frame_done(self) -> None:
         self._num_done += 1
         now = time.monotonic()
-        rate = self._num_done / max(now - self._began, 1e-9)
-        self._progress.update(self._task, advance=1, rate=rate)
+        speed = f"{self._num_done / max(now - self._began, 1e-9):.1f} frames/s"
+        if self._is_measuring:  # a first pass knows of no fish
+            speed += f", {len(self._fish)} fish"
+        self._progress.update(self._task, advance=1, speed=speed)
         if self._progress.disable and now - self._last_line >= _LINE_EVERY_S:
             self._last_line = now
             of = "" if self._num_frames is None else f" of {self._num_frames}"
-            print_line = f"frame {self._num_done}{of}, {rate:.1f} frames/s, {len(self._fish)} fish"
-            self._console.print(print_line)
+            self._console.print(f"frame {self._num_done}{of}, {speed}")
 
     def take(self, message: Message) -> None:
         if isinstance(message, LengthEstimate):
             self._fish.add(message.track_id)
-            self._progress.update(self._task, num_fish=len(self._fish))
 
 
 def print_fish(fish: Sequence[LengthEstimate], *, may_count_twice: Collection[int] = ()) -> None:
@@ -177,17 +177,47 @@ def print_timings(summary: RunSummary | ReplaySummary) -> None:
             f"{100 * counter.busy_s / summary.elapsed_s:.0f}",
         )
     _stdout().print(table)
+    if isinstance(summary, RunSummary):
+        print(", ".join(f"{name} {seconds:.1f} s" for name, seconds in summary.parts_s.items()))
+
+
+def print_speed(summary: RunSummary) -> None:
+    """Print how many frames were measured in what time, the passes before included, to stdout."""
+    elapsed_s = sum(summary.parts_s.values())
+    promised, num_frames = summary.frames_promised, summary.num_frames
+    of = "" if promised is None or num_frames >= promised - 1 else f" of {promised}"
+    print(
+        f"{num_frames}{of} frames in {elapsed_s:.1f} s, {num_frames / elapsed_s:.1f} frames/s, "
+        f"{summary.recorded_s / elapsed_s:.2g} times real time"
+    )
 
 
 def print_evaluation(evaluation: Evaluation) -> None:
     """Print measured lengths beside the true ones, then the summary, to stdout."""
+    _stdout().print(_beside_truth(evaluation), "", _figures(summary_rows(evaluation)), sep="\n")
+
+
+def print_true_lengths(evaluation: Evaluation) -> None:
+    """Print measured lengths beside the true ones, and how far off they are in words, to stdout."""
+    measured = [fish for fish in evaluation.fish if fish.error_mm is not None]
+    off = [abs(fish.error_mm or 0.0) / fish.truth_mm for fish in measured]
+    _stdout().print(_beside_truth(evaluation))
+    if measured and evaluation.coverage is not None:
+        mean = sum(off) / len(off)
+        print(
+            f"\n{len(measured)} of {len(evaluation.fish)} fish were measured, {mean:.1%} off on "
+            f"average; {evaluation.coverage:.0%} of the true lengths lie in their 95 % intervals"
+        )
+
+
+def _beside_truth(evaluation: Evaluation) -> Table:
     fish = _table("fish", "truth mm", "measured mm", "error mm", "error %")
     for row in evaluation.fish:
         measured = "-" if row.length_mm is None else f"{row.length_mm:.1f}"
         error_mm = "-" if row.error_mm is None else f"{row.error_mm:+.1f}"
         percent = "-" if row.error_mm is None else f"{100 * row.error_mm / row.truth_mm:+.2f}"
         fish.add_row(str(row.track_id), f"{row.truth_mm:.1f}", measured, error_mm, percent)
-    _stdout().print(fish, "", _figures(summary_rows(evaluation)), sep="\n")
+    return fish
 
 
 def print_distributions(distributions: Distributions) -> None:

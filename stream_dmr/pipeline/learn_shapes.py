@@ -153,7 +153,12 @@ S = TypeVar("S", bound=Setup)
 
 
 def with_learnt_shapes(
-    inputs: Inputs, crop_fish: CropFish, *, stop: Event, observer: RunObserver
+    inputs: Inputs,
+    crop_fish: CropFish,
+    *,
+    stop: Event,
+    observer: RunObserver,
+    on_part: Callable[[str], None],
 ) -> Inputs:
     """The inputs with the shapes of the source's own fish, and its crops.
 
@@ -165,6 +170,7 @@ def with_learnt_shapes(
         return inputs
     require_folder(request.out, overwrite=request.overwrite)  # before the work
     require_free_names(request.out, overwrite=request.overwrite)
+    on_part("finding the fish")
     observer.stage("finding the fish, for their shapes")
     crops = keep_crops(
         inputs.reader, crop_fish, config.recording, stop=stop, on_frame=observer.frame_done
@@ -174,6 +180,7 @@ def with_learnt_shapes(
     inputs = replace(inputs, reader=reader, crops=crops)
     if stop.is_set():
         return inputs
+    on_part("learning their shapes")
     return replace(inputs, candidates=_learn_and_report(crops, inputs, forms, observer))
 
 

@@ -169,11 +169,31 @@ class RunSummary:
     may_count_twice: Collection[int]  # the ids of those that were in view at a crash
     num_frames: int  # that went through the whole chain
     frames_promised: int | None  # by the source; None where it doesn't
-    shapes_s: float  # in which the shapes of the fish were learnt, or compared with a mesh
+    recorded_s: float  # capture time from the first frame to the last
     elapsed_s: float  # of the chain
+    parts_s: Mapping[str, float]  # of the whole run, the chain's among them: what took how long
     calibration: Calibration | None
     counters: Sequence[StageCounters]
     files: Sequence[Path]  # names of segments as a pattern
+
+
+class _Clock:
+    """The wall time of each part of a run; it begins with the start."""
+
+    def __init__(self) -> None:
+        self._began, self._name = time.perf_counter(), "starting"
+        self._parts_s: dict[str, float] = {}
+
+    def begin(self, name: str) -> None:
+        """Another part begins."""
+        now = time.perf_counter()
+        self._parts_s[self._name] = self._parts_s.get(self._name, 0.0) + now - self._began
+        self._began, self._name = now, name
+
+    def parts_s(self) -> Mapping[str, float]:
+        """The parts so far, in their order."""
+        self.begin(self._name)
+        return self._parts_s
 
 
 def measure_source(
@@ -202,14 +222,16 @@ def _measure(
     request: RunOptions, *, stop: threading.Event, observer: RunObserver
 ) -> tuple[RunSummary, bool]:
     """Measure the fish of a source; False if a mesh was given that does not fit them."""
+    clock = _Clock()
     inputs = checked_inputs(request)
     unused: list[str] = []
     try:
         prepare_kernels(observer.stage, stop=stop)
         crop_fish = inputs.crop_fish(inputs.finder)
-        began = time.perf_counter()
-        inputs = with_learnt_shapes(inputs, crop_fish, stop=stop, observer=observer)
-        shapes_s = time.perf_counter() - began
+        inputs = with_learnt_shapes(
+            inputs, crop_fish, stop=stop, observer=observer, on_part=clock.begin
+        )
+        clock.begin("starting")
         session = Session(inputs, given=[inputs.crops or crop_fish])
         if inputs.is_endless:  # no frame of a camera shall wait for a compiler
             settings = inputs.config.fit_mesh
@@ -226,16 +248,15 @@ def _measure(
             _report_start(inputs, outputs, observer)
             observer.begin(inputs.source.num_frames)
             seen = SeenFish()
-            summary = _run_chain(
-                inputs, session, outputs, seen, observer, shapes_s=shapes_s, stop=stop
-            )
+            clock.begin("measuring")
+            summary = _run_chain(inputs, session, outputs, seen, observer, stop=stop)
+        clock.begin("comparing with the mesh")
         if stop.is_set():
-            return summary, True
+            return replace(summary, parts_s=clock.parts_s()), True
         unused = inputs.finder.unused  # only now is it known what the source has no frames for
-        began = time.perf_counter()
         is_given = inputs.candidates is None and inputs.config.fit_mesh.are_shapes_learnt
         mesh_fits = not is_given or mesh_fits_fish(seen.crops(), inputs, observer)
-        return replace(summary, shapes_s=shapes_s + time.perf_counter() - began), mesh_fits
+        return replace(summary, parts_s=clock.parts_s()), mesh_fits
     finally:
         inputs.reader.close()
         if inputs.positions is not None:
@@ -275,7 +296,6 @@ def _run_chain(
     seen: SeenFish,
     observer: RunObserver,
     *,
-    shapes_s: float,
     stop: threading.Event,
 ) -> RunSummary:
     began = time.perf_counter()
@@ -300,8 +320,9 @@ def _run_chain(
         may_count_twice=outputs.store.may_count_twice(),
         num_frames=flow.totals.num_frames,
         frames_promised=inputs.source.num_frames,
-        shapes_s=shapes_s,
+        recorded_s=flow.totals.recorded_s,
         elapsed_s=time.perf_counter() - began,
+        parts_s={},
         calibration=inputs.calibration,
         counters=counters,
         files=[inputs.request.out / name for name in names],

@@ -138,10 +138,10 @@ def _takes(lock: IO[str]) -> bool:
 
 
 def _progress(folder: Path, began: float) -> str:
-    count = sum(1 for _ in folder.rglob("*.nbc"))
+    done = sum(1 for _ in folder.rglob("*.nbc")) / _ABOUT
     return (
-        f"compiling the numeric loops, once on this machine: {count} of {max(count, _ABOUT)}, "
-        f"{time.monotonic() - began:.0f} s"
+        f"compiling the numeric loops, once on this machine (half a minute to two): "
+        f"{min(done, 0.99):.0%} after {time.monotonic() - began:.0f} s"
     )
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from stream_dmr.messages import LengthEstimate, Message
+from stream_dmr.messages import Frame, LengthEstimate, Message
 from stream_dmr.pipeline.chain import Chain
 from stream_dmr.pipeline.config import Config
 from stream_dmr.pipeline.haul_log import HaulLog
@@ -70,11 +70,21 @@ class RunTotals(RunObserver):
     def __init__(self, *, max_fish: int | None) -> None:
         """`max_fish`: only so many of the last fish are kept; None: all."""
         self.num_frames = 0
+        self._times_ns: tuple[int, int] | None = None  # of the first frame and the last
         self._fish: deque[LengthEstimate] = deque(maxlen=max_fish)
 
     def take(self, message: Message) -> None:
-        if isinstance(message, LengthEstimate) and message.is_final:
+        if isinstance(message, Frame):
+            first_ns, _ = self._times_ns or (message.timestamp_ns, 0)
+            self._times_ns = first_ns, message.timestamp_ns
+        elif isinstance(message, LengthEstimate) and message.is_final:
             self._fish.append(message)
+
+    @property
+    def recorded_s(self) -> float:
+        """Capture time from the first frame to the last."""
+        first_ns, last_ns = self._times_ns or (0, 0)
+        return (last_ns - first_ns) / 1e9
 
     def frame_done(self) -> None:
         self.num_frames += 1
