@@ -221,7 +221,9 @@ def test_a_source_without_an_end_is_not_looked_at_first(
     asked = request(clip, tmp_path, template="auto", overwrite=overwrite)
     inputs = checked_inputs(asked)
     crop_fish = CropFish(inputs.config.crop_fish, camera=None, finder=inputs.finder)
-    same = with_learnt_shapes(inputs, crop_fish, stop=threading.Event(), observer=Listener(), on_part=print)
+    same = with_learnt_shapes(
+        inputs, crop_fish, stop=threading.Event(), observer=Listener(), on_part=print
+    )
     inputs.reader.close()
     assert same is inputs
 
