@@ -13,7 +13,7 @@ from typing import Any
 from stream_dmr.batch.manifest import Job
 from stream_dmr.errors import OutputError
 from stream_dmr.evidence.seal import add_files
-from stream_dmr.export.fish_table import FISH_TABLE, fish_record, write_parquet
+from stream_dmr.export.fish_table import FISH_TABLE, fish_record, template_of, write_parquet
 from stream_dmr.files import replacing
 from stream_dmr.pipeline.config import load_config
 from stream_dmr.store.batch_folder import TABLE_KINDS, dataset_file
@@ -46,8 +46,11 @@ def write_tables(folder: Path, job: Job) -> None:
     settings = load_config(job.options.config).fisheries
     fish = read_fish(folder, recording)
     of_video = {"video": job.name, "haul": job.options.haul}
-    template, checks = recording.header.template, last_checks(folder / DATABASE)
-    records = [fish_record(one, template, settings, checks) | of_video for one in fish]
+    checks = last_checks(folder / DATABASE)
+    records = [
+        fish_record(one, template_of(one, recording.header.template), settings, checks) | of_video
+        for one in fish
+    ]
     write_parquet(folder / "fish.parquet", _FISH_SCHEMA, records)
     frames = _frame_records(folder, fish, of_video)
     write_parquet(folder / "frames.parquet", _FRAMES_SCHEMA, frames)

@@ -32,6 +32,9 @@ def export(
         TableFormat | None,
         "Table for fisheries: total and fork length, whole cm, weight, legal size.",
     ] = None,
+    all_columns: Annotated[
+        bool, "With --fish csv: also the columns that are empty throughout."
+    ] = False,
     viame: Annotated[bool, "tracks.viame.csv: boxes, outlines and ends, for DIVE."] = False,
     agency: Annotated[
         list[Agency] | None,
@@ -76,7 +79,8 @@ def export(
         if fish:
             settings = settings_of(config, exported.header.config_toml, recording)
             notes = species_notes(settings, exported.header.template)
-            print(exported.fish(out, settings.fisheries, format=fish))
+            path = exported.fish(out, settings.fisheries, format=fish, all_columns=all_columns)
+            print(path)
         if viame:
             path = out / "tracks.viame.csv"
             print(f"{path}: {exported.viame(path)} boxes")

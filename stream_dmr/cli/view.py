@@ -42,7 +42,9 @@ def view(
     port: Annotated[
         int, typer.Option(help="Port of --web; 0: any free one.", min=0, max=65535)
     ] = 0,
-    screenshot: Annotated[Path | None, "Save a picture (.png) instead; needs no screen."] = None,
+    screenshot: Annotated[
+        Path | None, "Save a picture (.png) instead; needs no screen, but a Vulkan driver."
+    ] = None,
     frame: Annotated[int | None, "The frame of --screenshot.", "1"] = None,
     overwrite: OverwriteOption = False,
 ) -> None:

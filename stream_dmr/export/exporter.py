@@ -19,7 +19,9 @@ from stream_dmr.export.export_choices import Agency, MeshFormat, TableFormat
 from stream_dmr.export.fish_table import (
     FISH_TABLE,
     fish_record,
+    template_of,
     unweighed_note,
+    used_columns,
     write_csv,
     write_parquet,
 )
@@ -182,15 +184,30 @@ class Export:
         self._written += paths
         return paths
 
-    def fish(self, out: Path, settings: FisheriesSettings, *, format: TableFormat) -> Path:
-        """Write fish.csv (or .parquet): lengths as fisheries use them, verdicts, inputs."""
+    def fish(
+        self,
+        out: Path,
+        settings: FisheriesSettings,
+        *,
+        format: TableFormat,
+        all_columns: bool = False,
+    ) -> Path:
+        """Write fish.csv (or .parquet): lengths as fisheries use them, verdicts, inputs.
+
+        A .csv is without the columns that are empty throughout, unless `all_columns` asks for them.
+        """
         path = out / f"fish.{format}"
         self._require_writable(path)
         checks = {} if self._database is None else last_checks(self._database)
-        records = [fish_record(one, self.header.template, settings, checks) for one in self._fish]
+        records = [
+            fish_record(one, template_of(one, template), settings, checks) for one in self._fish
+        ]
         self.notes += unweighed_note(records, settings)
         with self._writing(path):
-            (write_csv if format == "csv" else write_parquet)(path, FISH_TABLE, records)
+            if format == "csv":
+                write_csv(path, FISH_TABLE if all_columns else used_columns(records), records)
+            else:
+                write_parquet(path, FISH_TABLE, records)
         return path
 
     def viame(self, path: Path) -> int:
@@ -214,7 +231,7 @@ class Export:
         """Write the fish as wcpfc.csv or rdbes.csv; rejected ones and doubles are left out."""
         path, (columns, row) = out / f"{agency}.csv", AGENCIES[agency]
         self._require_writable(path)
-        rows = [row(one, self.header.template) for one in self._fish if one.counts]
+        rows = [row(one, template_of(one, template)) for one in self._fish if one.counts]
         with self._writing(path):
             write_csv(path, columns, rows)
         return path

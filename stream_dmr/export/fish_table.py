@@ -2,14 +2,17 @@
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from stream_dmr.export.agency_tables import ICES_LENGTHS
+from stream_dmr.fitting.shape.candidates import AUTO
 from stream_dmr.species import CODE
 from stream_dmr.store.fish import Fish, is_same_species
 from stream_dmr.store.fisheries import Derived, FisheriesSettings, derive
+from stream_dmr.store.run_tables import LENGTHS_COLUMNS
 from stream_dmr.store.scale_checks import ScaleCheck
 from stream_dmr.tables import cell, seconds, utc_text, write_table
 from stream_dmr.template.template import Template
@@ -110,7 +113,18 @@ _COLUMNS: dict[str, _Column] = {
     # Which length `length_mm` is, by the ICES vocabulary.
     "length_type": (str, lambda row: ICES_LENGTHS.get(row.template.tail_gives or "")),
 }
+_ALWAYS = {
+    *LENGTHS_COLUMNS,
+    *("vessel", "trip", "haul", "species", "species_code", "fate"),
+    *("time_utc", "latitude", "longitude", "verdict"),
+}
 FISH_TABLE: dict[str, type] = {name: kind for name, (kind, _) in _COLUMNS.items()}
+
+
+def template_of(fish: Fish, template: Template) -> Template:
+    """The run's template; with `auto` and of an unknown species it names no kind of length."""
+    is_known = template.name != AUTO or fish.sure_code
+    return template if is_known else replace(template, tail_gives=None)
 
 
 def fish_record(
@@ -130,6 +144,15 @@ def fish_record(
     check = (checks or {}).get(fish.facts.calibration_sha256)
     row = _Row(fish, template, settings, species, derived, check)
     return {name: value(row) for name, (_, value) in _COLUMNS.items()}
+
+
+def used_columns(records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The columns in which a fish has something, and those that other programs rely on."""
+    return [
+        name
+        for name in FISH_TABLE
+        if name in _ALWAYS or any(record[name] not in (None, "", "[]", "{}") for record in records)
+    ]
 
 
 def unweighed_note(records: Sequence[dict[str, Any]], settings: FisheriesSettings) -> list[str]:

@@ -32,7 +32,7 @@ from stream_dmr.pipeline.run_outputs import Outputs, ResultWriter, open_outputs,
 from stream_dmr.pipeline.session import Session
 from stream_dmr.sources.positions import PositionSource
 from stream_dmr.store.length_store import LengthStore
-from stream_dmr.store.open_results import LEARNT, MADE_BY_RUN
+from stream_dmr.store.open_results import LEARNT, MADE_BY_RUN, learnt_files
 from stream_dmr.store.run_facts import ENDLESS_STOPPED, SOURCE_ENDED, STOPPED
 
 
@@ -325,7 +325,7 @@ def _run_chain(
         parts_s={},
         calibration=inputs.calibration,
         counters=counters,
-        files=[inputs.request.out / name for name in names],
+        files=[*(inputs.request.out / name for name in names), *learnt_files(inputs.request.out)],
     )
 
 

@@ -15,11 +15,16 @@ from pyarrow import parquet
 from stream_dmr.errors import TemplateError
 from stream_dmr.evidence.seal import read_provenance
 from stream_dmr.export.exporter import Export
-from stream_dmr.export.fish_table import FISH_TABLE
+from stream_dmr.export.fish_table import FISH_TABLE, template_of
+from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
 from stream_dmr.pipeline.config import parse_config
+from stream_dmr.store.fish import Fish
 from stream_dmr.store.fisheries import Derived, FisheriesSettings, derive, whole_cm
 from stream_dmr.store.verdicts import Verdict, add_verdict
 from stream_dmr.template.template_file import BUNDLED, load_template
+from tests.support.command import invoke
+from tests.support.final_estimates import FACTS
+from tests.support.final_estimates import fish as final_fish
 from tests.support.fish_run import measure
 
 HALIBUT = load_template("halibut")
@@ -89,7 +94,7 @@ def exported(out: Path, folder: Path, **fisheries: object) -> list[dict[str, str
     export = Export(out)
     settings = FisheriesSettings(**{"species": "tiny", **fisheries})  # type: ignore[arg-type]
     with export.into(folder):
-        path = export.fish(folder, settings, format="csv")
+        path = export.fish(folder, settings, format="csv", all_columns=True)
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
@@ -109,7 +114,34 @@ def test_fish_csv_has_all_of_it(finished: Path, tmp_path: Path):
         assert row["is_legal_size"] == "true"
         assert row["weight_source"].startswith("Clark")
         assert row["length_from"] == "measurement"
-        assert (row["verdict"], row["reviewer"], row["corrected_length_mm"]) == ("", "", "")
+        assert row["verdict"] == ""
+        assert (row["reviewer"], row["corrected_length_mm"]) == ("", "")
+
+
+def test_columns_that_are_empty_throughout_are_left_out_unless_asked_for(
+    finished: Path, tmp_path: Path
+):
+    columns = {}
+    for option in ("", "--all-columns"):
+        out = tmp_path / f"out{option}"
+        assert invoke(f"export {finished} --fish csv {option} --out {out}").code == 0
+        with (out / "fish.csv").open(newline="") as file:
+            columns[option] = csv.DictReader(file).fieldnames
+    assert columns["--all-columns"] == list(FISH_TABLE)
+    left_out = {*FISH_TABLE} - {*columns[""]}
+    assert {"reviewer", "corrected_length_mm", "scale_error_percent"} <= left_out
+    assert not {"length_mm", "latitude", "species_code", "verdict", "iou"} & left_out
+
+
+def test_the_kind_of_a_length_is_said_if_the_species_is_known():
+    auto, _ = load_shapes(AUTO)
+    for template, species, kind in (
+        (auto, None, None),
+        (auto, "HAL", auto.tail_gives),
+        (HALIBUT, None, HALIBUT.tail_gives),
+    ):
+        one = Fish(estimate=final_fish(1, species_code=species), facts=FACTS, run_id="")
+        assert template_of(one, template).tail_gives == kind
 
 
 def test_every_export_names_what_made_it(finished: Path, tmp_path: Path):

@@ -26,6 +26,7 @@ def lost(out: Path, tmp_path: Path) -> Path:
 
 def test_tables_have_all_that_the_database_has(out: Path, lost: Path, tmp_path: Path):
     options = {"--fish": "csv", "--tables": "csv", "--hauls": None, "--agency": "rdbes"}
+    options["--all-columns"] = None
     for folder, name in ((out, "whole"), (lost, "rest")):
         done = invoke(f"export {folder} --out {tmp_path / name}", options)
         assert done.code == 0, done.err

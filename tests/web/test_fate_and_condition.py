@@ -75,7 +75,8 @@ def test_a_reviewer_types_fate_condition_and_species(
     ]
     assert invoke("export", {str(out): None, "--fish": "csv", "--out": str(tmp_path)}).code == 0
     first, second = rows(tmp_path / "fish.csv")
-    assert (first["fate"], first["fate_share"], first["condition"]) == ("dropped", "", "A2")
+    assert (first["fate"], first["condition"]) == ("dropped", "A2")
+    assert "fate_share" not in first  # nobody but the reviewer said it
     assert (first["species"], first["species_code"]) == ("Xiphias gladius", "SWO")
     assert (second["fate"], second["condition"], second["species_code"]) == ("", "", "")
     assert verify(out)[0] == []

@@ -89,15 +89,11 @@ def _headless() -> Generator[ViewerClient]:
 
 def _wait_for(process: subprocess.Popen[str]) -> None:
     """Wait until the viewer runs. Raises RecordingError where it doesn't."""
-    lines = []
-    for line in process.stdout or ():
-        lines.append(line)
-        if "Headless viewer running" in line:
-            return
-    raise RecordingError(
-        f"expected a viewer without a screen, got: {_last_line(''.join(lines))}; it needs a Vulkan "
-        "driver, a software one does (Debian: apt install mesa-vulkan-drivers)"
-    )
+    if not any("Headless viewer running" in line for line in process.stdout or ()):
+        raise RecordingError(
+            "expected a viewer without a screen, but it did not start; it needs a Vulkan driver, a "
+            "software one does (Debian: apt install mesa-vulkan-drivers)"
+        )
 
 
 def _go_to(viewer: ViewerClient, frame_index: int) -> None:
