@@ -1,5 +1,8 @@
 """Errors of the user's input; each message says what was expected, what came, and what to do."""
 
+from collections.abc import Generator
+from contextlib import contextmanager
+
 
 def reason_of(error: Exception) -> str:
     """What went wrong, without number and file name where the system says it."""
@@ -43,3 +46,19 @@ class OutputError(UserError):
 
 class RecordingError(UserError):
     """A recording can't be read: damaged, torn, of a newer version, or none at all."""
+
+
+@contextmanager
+def requires_extra(extra: str, what: str) -> Generator[None]:
+    """Turn a package that an import of the block lacks into a UserError that says how to get it.
+
+    `extra`: of pyproject.toml, or "torch".
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        install = extra if extra == "torch" else f"'stream-dmr[{extra}]'"
+        raise UserError(
+            f"{what}: expected the package {error.name}, found none; install it with: "
+            f"pip install {install}"
+        ) from error

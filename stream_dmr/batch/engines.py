@@ -30,7 +30,7 @@ from stream_dmr.batch.measure_video import (
     measure_video,
     read_outcome,
 )
-from stream_dmr.errors import ConfigError, UserError
+from stream_dmr.errors import UserError, requires_extra
 
 FINISHED = "finished"
 
@@ -201,16 +201,11 @@ class RayEngine:
     def __init__(self, *, address: str | None = None, gpus: float = 0.0) -> None:
         """`address` of a cluster, "auto" for the one that this machine belongs to, None: a new one.
 
-        `gpus`: share of a GPU for each video. Raises ConfigError without the package, UserError
+        `gpus`: share of a GPU for each video. Raises UserError without the package, and
         where the cluster can't be reached or has no GPUs though `gpus` asks for some.
         """
-        try:
+        with requires_extra("ray", "--engine ray"):
             ray: Any = import_module("ray")
-        except ModuleNotFoundError as error:
-            raise ConfigError(
-                "--engine ray: expected the package ray, found none; install it with: "
-                "pip install 'stream-dmr[ray]'"
-            ) from error
         self._ray = ray
         try:
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from stream_dmr.cli.shared_options import OverwriteOption, command_line, stop_on_signals, warn
-from stream_dmr.errors import UserError
+from stream_dmr.errors import UserError, requires_extra
 
 Device = Literal["cpu", "cuda"]
 
@@ -39,10 +39,12 @@ def train(
     if backgrounds is not None and images is None:
         raise UserError("--backgrounds needs your own fish: give --images and --masks")
     with stop_on_signals() as stop:
-        from stream_dmr.cli.train_display import TrainDisplay
         from stream_dmr.evidence.own_files import require_writable
         from stream_dmr.pipeline.config import load_config
-        from stream_dmr.training.train_unet import TRAINING_FILES, TrainRequest, train_unet
+
+        with requires_extra("torch", "a training"):
+            from stream_dmr.cli.train_display import TrainDisplay
+            from stream_dmr.training.train_unet import TRAINING_FILES, TrainRequest, train_unet
 
         if not resume and not (out / "last.pt").exists():  # else it refuses the earlier training
             require_writable(*(out / name for name in TRAINING_FILES), overwrite=overwrite)
@@ -87,7 +89,6 @@ def evaluate(
 ) -> None:
     """Compare measured lengths with known ones: fish by fish, as intervals, as distributions."""
     from stream_dmr.cli.terminal import print_distributions, print_evaluation
-    from stream_dmr.errors import OutputError
     from stream_dmr.evaluation.compare import evaluate, evaluate_histogram, plot_histograms
     from stream_dmr.evaluation.length_tables import is_histogram
     from stream_dmr.evidence.own_files import is_made_by, require_writable
@@ -111,9 +112,9 @@ def evaluate(
     try:
         require_writable(picture, overwrite=overwrite, is_own=is_made_by("evaluate"))
         plot_histograms(picture, distributions)
-    except OutputError as error:
+    except UserError as error:
         if plot is not None:
             raise
-        print(f"not drawn: {error}; choose another place with --plot", file=sys.stderr)
+        print(f"not drawn: {error}", file=sys.stderr)
     else:
         print(f"both histograms: {picture}")

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from stream_dmr.errors import OutputError, UserError, reason_of
+from stream_dmr.errors import OutputError, UserError, reason_of, requires_extra
 from stream_dmr.evaluation.length_errors import (
     DistributionErrors,
     EvaluateSettings,
@@ -255,7 +255,8 @@ def plot_histograms(path: Path, distributions: Distributions) -> None:
 
     Raises OutputError where it can't be written.
     """
-    from matplotlib.figure import Figure  # its import takes a quarter of a second
+    with requires_extra("plots", "a plot of the lengths"):
+        from matplotlib.figure import Figure  # its import takes a quarter of a second
 
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.camera import frame_from_crop
+from stream_dmr.errors import requires_extra
 from stream_dmr.fitting.body import LOG_SIZE, ROOT_ROTATION, Body, MeshLevels
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.heading import is_reversed
@@ -104,7 +105,8 @@ class Fitter:
     def _make_solver(self) -> Solver:
         if self._settings.solver == "contour":
             return ContourSolver(self._levels, self._settings)
-        from stream_dmr.fitting.paper.adam import AdamSolver  # torch takes a second to import
+        with requires_extra("torch", '[fit_mesh] solver = "adam"'):  # it takes a second to import
+            from stream_dmr.fitting.paper.adam import AdamSolver
 
         return AdamSolver(self._template, self._settings)
 

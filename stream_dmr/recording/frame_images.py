@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
-from stream_dmr.errors import RecordingError, SourceError
+from stream_dmr.errors import SourceError, requires_extra
 from stream_dmr.messages import Frame
 from stream_dmr.recording.codec import checksum, stored_picture
 from stream_dmr.recording.reading import Recording, decoded_messages, recorded_settings
@@ -140,13 +140,8 @@ def _decoded_video(samples: Iterator[bytes]) -> Iterator[tuple[int, UInt8[np.nda
     first = next(samples, None)
     if first is None:
         return
-    try:
+    with requires_extra("h264", "the recording's pictures are H.264 (or give --source)"):
         from stream_dmr.recording.mcap.h264_topic import decode_video
-    except ModuleNotFoundError as error:
-        raise RecordingError(
-            f"the recording's pictures are H.264: expected the package {error.name}, found none; "
-            "install it with: pip install 'stream-dmr[h264]', or give --source"
-        ) from error
     yield from decode_video(chain([first], samples))
 
 

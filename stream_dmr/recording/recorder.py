@@ -1,14 +1,14 @@
 """Write every message to every sink, and return it as a replay reads it."""
 
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from queue import Empty, Queue
 from threading import Lock, Thread
 
-from stream_dmr.errors import ConfigError, OutputError
+from stream_dmr.errors import OutputError, requires_extra
 from stream_dmr.files import make_folder
 from stream_dmr.messages import FishCrop, Message
 from stream_dmr.recording.header import RunHeader
@@ -62,25 +62,13 @@ def open_recording_files(
 
 def _extra_topics(header: RunHeader, settings: RecordingSettings) -> Iterator[ExtraTopics]:
     if settings.foxglove:
-        with _requires_extra("foxglove", "foxglove = true"):
+        with requires_extra("foxglove", "[recording] foxglove = true"):
             from stream_dmr.recording.mcap.foxglove_topics import FoxgloveTopics
         yield FoxgloveTopics(header, settings)
     if settings.frames == "h264":
-        with _requires_extra("h264", 'frames = "h264"'):
+        with requires_extra("h264", '[recording] frames = "h264"'):
             from stream_dmr.recording.mcap.h264_topic import H264Topic
         yield H264Topic(crf=settings.h264_crf)
-
-
-@contextmanager
-def _requires_extra(extra: str, setting: str) -> Generator[None]:
-    """Turn a missing package into a ConfigError that names how to install it."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"[recording] {setting}: expected the package {error.name}, found none; install it "
-            f"with: pip install 'stream-dmr[{extra}]'"
-        ) from error
 
 
 _MAX_QUEUED = 64  # messages, some six frames; where the disk can't keep up, the run waits

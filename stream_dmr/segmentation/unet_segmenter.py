@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from stream_dmr.errors import ModelError
+from stream_dmr.errors import ModelError, requires_extra
 from stream_dmr.messages import FishEnds
 from stream_dmr.networks.onnx_session import open_session
 from stream_dmr.networks.unet_interface import (
@@ -139,6 +139,7 @@ def _is_unet(session: Any) -> bool:
 
 
 def _convert(path: Path) -> bytes:
-    from stream_dmr.networks.unet import load_weights, unet_as_onnx
+    with requires_extra("torch", f"{path}: weights"):
+        from stream_dmr.networks.unet import load_weights, unet_as_onnx
 
     return unet_as_onnx(load_weights(path))

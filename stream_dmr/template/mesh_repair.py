@@ -5,15 +5,19 @@ closed by construction.
 """
 
 from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING
 
-import manifold3d
 import numpy as np
 import trimesh
 from jaxtyping import Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from stream_dmr.errors import TemplateError
+from stream_dmr.errors import TemplateError, requires_extra
+
+if TYPE_CHECKING:
+    import manifold3d
 
 # Chosen. An open part with less of the surface than this (a tooth, an eyelid) does not matter for
 # an outline and is removed. One whose holes would need more than this share of its own area (a fin
@@ -42,6 +46,9 @@ def repair_mesh(mesh: trimesh.Trimesh, *, name: str) -> RepairedMesh:
         if mesh.volume < 0:
             mesh.invert()
         return RepairedMesh(mesh=mesh, changes=())
+    with requires_extra("meshes", f"template {name}: the repair of a mesh that is not closed"):
+        for package in ("manifold3d", "networkx"):  # the second is of trimesh.repair
+            import_module(package)
     cleaned = mesh.copy()
     cleaned.update_faces(cleaned.nondegenerate_faces() & cleaned.unique_faces())
     changes = [(len(mesh.faces) - len(cleaned.faces), "degenerate or double faces removed")]
@@ -118,6 +125,8 @@ def _thickened(sheet: trimesh.Trimesh, half: float) -> trimesh.Trimesh:
 
 def _united(parts: list[trimesh.Trimesh], *, name: str) -> tuple[trimesh.Trimesh, int]:
     """One closed surface around all parts, and the number of loose parts that were removed."""
+    import manifold3d
+
     bodies = manifold3d.Manifold.batch_boolean(
         [solid for part in parts if not (solid := _solid(part)).is_empty()], manifold3d.OpType.Add
     ).decompose()
@@ -134,8 +143,10 @@ def _united(parts: list[trimesh.Trimesh], *, name: str) -> tuple[trimesh.Trimesh
     return trimesh.Trimesh(vertices, faces, process=False), len(bodies) - 1
 
 
-def _solid(part: trimesh.Trimesh) -> manifold3d.Manifold:
+def _solid(part: trimesh.Trimesh) -> "manifold3d.Manifold":
     """The volume that a closed part encloses; empty where manifold3d refuses the part."""
+    import manifold3d
+
     a, b, c = part.triangles.swapaxes(0, 1)
     is_inside_out = np.sum(np.cross(a, b) * c) < 0
     faces = part.faces[:, ::-1] if is_inside_out else part.faces

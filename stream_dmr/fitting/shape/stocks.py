@@ -122,6 +122,7 @@ _EVIDENCE_WORTH = 1 / 3
 # Most evidence of one fish for and against separating two groups, nats: a mask may be wrong. Chosen
 # by trial.
 _MAX_FOR, _MAX_AGAINST = 20.0, -6.0
+_RULED_OUT = 1000.0  # nats against a form that a fish can't have
 
 
 class _Group:
@@ -277,7 +278,9 @@ class _StockLearner:
 
     def _odds(self, fish: Iterable[int]) -> FormOdds:
         """How probable each body form is by all that decided the forms of these fish."""
-        against = np.sum([self._against[one] for one in sorted(fish)], axis=0)
+        each = np.array([self._against[one] for one in sorted(fish)])
+        # Finite, since fish of one stock may each rule out another form.
+        against = np.minimum(each - each.min(axis=1, keepdims=True), _RULED_OUT).sum(axis=0)
         nats = _EVIDENCE_WORTH * against - np.log(self._forms.shares)
         shares = np.exp(nats.min() - nats)
         return FormOdds(self._forms.coefficients, shares / shares.sum())

@@ -91,6 +91,13 @@ class TestLearnStocks:
         std = [float(np.sqrt(TRUNK @ one.covariances[0] @ TRUNK)) for one in (decided, left_open)]
         assert std[1] > 1.1 * std[0]
 
+    def test_fish_of_one_stock_may_rule_out_each_others_forms(self):
+        fish = [
+            fish_of(broader(0.0), track_id=1, against=(0.0, np.inf)),
+            fish_of(broader(0.0), track_id=2, against=(np.inf, 0.0)),
+        ]
+        assert np.isfinite(learn(fish).coefficients).all()
+
     def test_many_fish_decide_the_form_that_one_leaves_open(self):
         """Each mask says little against the broad form, all of them together enough."""
         fish = [
