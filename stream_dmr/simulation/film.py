@@ -19,15 +19,12 @@ _SUBPIXEL = 4  # fractional bits, OpenCV's `shift`
 
 # Colour map of the waves: grey level -> BGR, from troughs over green slopes to foam.
 _SEA_STOPS = [0, 70, 130, 185, 212, 235, 255]
-_SEA_BGR = [
-    (38, 30, 18),
-    (66, 56, 34),
-    (98, 88, 60),
-    (140, 130, 100),
-    (176, 170, 146),
-    (218, 216, 205),
-    (240, 240, 236),
-]
+_SEA_BGR = np.array(
+    [
+        *([38, 30, 18], [66, 56, 34], [98, 88, 60], [140, 130, 100], [176, 170, 146]),
+        *([218, 216, 205], [240, 240, 236]),
+    ]
+)
 
 
 class Backdrop:
@@ -40,13 +37,8 @@ class Backdrop:
             0.8 * noise(rng, *big, grain_px=(90.0, 34.0)) + _ripples(rng, big, 11.0)
         )
         self._chop = _grey(_ripples(rng, big, 5.0) + 0.5 * _ripples(rng, big, 2.2))
-        self._colours = np.stack(
-            [
-                np.interp(np.arange(256), _SEA_STOPS, channel)
-                for channel in zip(*_SEA_BGR, strict=True)
-            ],
-            axis=-1,
-        ).astype(np.uint8)[:, None]
+        channels = [np.interp(np.arange(256), _SEA_STOPS, channel) for channel in _SEA_BGR.T]
+        self._colours = np.stack(channels, axis=-1).astype(np.uint8)[:, None]
         self._rail, self._rail_mask = _draw_rail(rng, width)
         self._drift = rng.uniform(0.0, 2 * np.pi, 2)
         self.roller_px = np.array([width * rng.uniform(0.35, 0.65), _RAIL_PX - 14.0])
@@ -104,10 +96,10 @@ def draw_gaff(
     along = (tip_px - hand_px) / (np.linalg.norm(tip_px - hand_px) + 1e-9)
     bend = _fixed(tip_px + 12 * np.array([-along[1], along[0]]))
     angle = float(np.degrees(np.arctan2(along[1], along[0])))
-    axes = (12 << _SUBPIXEL, 12 << _SUBPIXEL)
     covered = np.zeros(image.shape[:2], np.uint8)
-    cv2.ellipse(image, bend, axes, angle, -90, 110, (165, 168, 168), 5, cv2.LINE_AA, _SUBPIXEL)
-    cv2.ellipse(covered, bend, axes, angle, -90, 110, 1, 5, cv2.LINE_8, _SUBPIXEL)
+    arc = (bend, (12 << _SUBPIXEL, 12 << _SUBPIXEL), angle, -90, 110)
+    cv2.ellipse(image, *arc, (165, 168, 168), 5, cv2.LINE_AA, _SUBPIXEL)
+    cv2.ellipse(covered, *arc, 1, 5, cv2.LINE_8, _SUBPIXEL)
     cv2.line(covered, hand, tip, 1, _GAFF_PX, cv2.LINE_8, _SUBPIXEL)
     return covered.astype(bool)
 
@@ -196,7 +188,12 @@ def film(scene: RailScene) -> Iterator[FilmedFrame]:
     backdrop = Backdrop(
         np.random.default_rng((scene.seed, _BACKDROP)), width=camera.width, height=camera.height
     )
-    noise = _draw_sensor_noise(scene)
+    # Noise in grey levels, larger than the frames; every frame takes a random window of it:
+    # independent noise for every frame would take longer than all the rest.
+    size = (camera.height + _NOISE_MARGIN_PX, camera.width + _NOISE_MARGIN_PX, 3)
+    rng = np.random.default_rng((scene.seed, _SENSOR))
+    noise = scene.preset.noise_levels * rng.standard_normal(size, np.float32)
+    noise = np.round(noise).astype(np.int16)
     for frame_index in range(1, scene.num_frames + 1):
         yield _render_frame(scene, backdrop, noise, frame_index)
 
@@ -220,9 +217,11 @@ def _render_frame(
         num_pixels[track_id] = int(mask.sum())
     for visit in visits:
         labels[_draw_gaff(scene, visit, posed[visit.fish.track_id], image, frame_index)] = 0
+    y, x = rng.integers(_NOISE_MARGIN_PX, size=2)
+    grain = noise[y : y + image.shape[0], x : x + image.shape[1]]
     return FilmedFrame(
         frame_index=frame_index,
-        image=_expose(image, rng, noise),
+        image=cv2.add(image, grain, dtype=cv2.CV_8U),
         labels=labels,
         boxes=_boxes(labels, num_pixels, frame_index),
     )
@@ -255,16 +254,11 @@ def _draw_fish(
     mouth_px, center_px = camera.project(posed.keypoints)[:2]
     patch = draw_fish_patch(posed, camera=camera, seed=scene.seed)
     draw_line(image, mouth_px=mouth_px, roller_px=backdrop.roller_px)
-    motion = (center_px - _center_before(scene, visit, frame_index)) * preset.exposure_frames
+    earlier = scene.pose(visit, max(frame_index - 1, visit.first_frame))
+    motion = (center_px - camera.project(earlier.keypoints)[1]) * preset.exposure_frames
     paste(image, patch, defocus_px=preset.defocus_px, motion_px=motion)
     draw_hook(image, mouth_px=mouth_px)
     return patch
-
-
-def _center_before(scene: RailScene, visit: Visit, frame_index: int) -> Float[np.ndarray, "2"]:
-    """Pixel of the center keypoint one frame ago; in the first frame, of this frame."""
-    earlier = scene.pose(visit, max(frame_index - 1, visit.first_frame))
-    return scene.calibration.camera.project(earlier.keypoints)[1]
 
 
 def _draw_gaff(
@@ -306,24 +300,3 @@ def _boxes(
                 )
             )
     return boxes
-
-
-def _draw_sensor_noise(scene: RailScene) -> Int16[np.ndarray, "A B 3"]:
-    """Noise in grey levels, larger than the frames; every frame takes a random window of it.
-
-    Independent noise for every frame would take longer than all the rest.
-    """
-    rng = np.random.default_rng((scene.seed, _SENSOR))
-    camera = scene.calibration.camera
-    size = (camera.height + _NOISE_MARGIN_PX, camera.width + _NOISE_MARGIN_PX, 3)
-    noise = scene.preset.noise_levels * rng.standard_normal(size, np.float32)
-    return np.round(noise).astype(np.int16)
-
-
-def _expose(
-    image: UInt8[np.ndarray, "H W 3"], rng: np.random.Generator, noise: Int16[np.ndarray, "A B 3"]
-) -> UInt8[np.ndarray, "H W 3"]:
-    """The picture with sensor noise added."""
-    height, width = image.shape[:2]
-    y, x = rng.integers(_NOISE_MARGIN_PX, size=2)
-    return cv2.add(image, noise[y : y + height, x : x + width], dtype=cv2.CV_8U)

@@ -1,6 +1,4 @@
-"""Scenes at the rail: fish, their poses over time, presets.
-
-Poses of a fish over time: hauled up past the camera, swaying, turning and bending.
+"""Scenes at the rail: fish that are hauled up past the camera, swaying, turning and bending.
 
 Amplitudes and rates were chosen by eye.
 """
@@ -115,9 +113,9 @@ def draw_poses(
     seconds = np.arange(num_frames) / FPS
     bends = _draw_bends(rng, preset, seconds)
     turned_over = np.pi * (rng.random() < preset.blind_side_share)
-    yaw = turned_over + np.radians(preset.yaw_deg) * _smooth_noise(rng, seconds, (), fastest_hz=0.8)
-    sway = np.radians(preset.sway_deg) * _smooth_noise(rng, seconds, (), fastest_hz=0.6)
-    tilt = np.radians(preset.tilt_deg) * _smooth_noise(rng, seconds, (), fastest_hz=0.6)
+    yaw = turned_over + np.radians(preset.yaw_deg) * _smooth_noise(rng, seconds, fastest_hz=0.8)
+    sway = np.radians(preset.sway_deg) * _smooth_noise(rng, seconds, fastest_hz=0.6)
+    tilt = np.radians(preset.tilt_deg) * _smooth_noise(rng, seconds, fastest_hz=0.6)
     centers = _draw_path(rng, seconds, lane_mm=lane_mm)
     return [
         HangingPose(
@@ -133,13 +131,12 @@ def _draw_bends(
     """Curvature coefficients over time; the maximum total bend is 70 to 100 % of the preset's."""
     sizes = _ROW_SIZES[:, None] * _ORDER_SIZES
     posture = rng.standard_normal(sizes.shape)  # the constant part
-    bends = sizes * (posture + _smooth_noise(rng, seconds, sizes.shape, fastest_hz=1.2))
+    bends = sizes * (posture + _smooth_noise(rng, seconds, fastest_hz=1.2, shape=sizes.shape))
     peak = max(total_bend_rad(frame) for frame in bends)
     bends *= np.radians(preset.max_bend_deg) * rng.uniform(0.7, 1.0) / peak
-    twist = np.radians(preset.max_twist_deg) * np.tanh(
-        _smooth_noise(rng, seconds, (), fastest_hz=0.8)
-    )
-    bends[:, 0, 0] = twist * np.pi / 2  # sin(pi s) integrates to 2 / pi
+    twist = np.tanh(_smooth_noise(rng, seconds, fastest_hz=0.8))
+    # sin(pi s) integrates to 2 / pi
+    bends[:, 0, 0] = np.radians(preset.max_twist_deg) * twist * np.pi / 2
     return bends
 
 
@@ -148,23 +145,20 @@ def _draw_path(
 ) -> Float[np.ndarray, "T 3"]:
     """World positions (mm) of the center: up through the picture, slower in its middle."""
     progress = np.linspace(-1.0, 1.0, len(seconds))
-    drift = rng.uniform(-120.0, 120.0) * progress + 40.0 * _smooth_noise(
-        rng, seconds, (), fastest_hz=0.7
-    )
+    drift = rng.uniform(-120.0, 120.0) * progress
+    drift = drift + 40.0 * _smooth_noise(rng, seconds, fastest_hz=0.7)
     climb = -_TRAVEL_MM * (0.45 * progress + 0.55 * progress**3)
-    off = _OFF_PLANE_MM * (
-        rng.standard_normal() + 0.5 * _smooth_noise(rng, seconds, (), fastest_hz=0.7)
-    )
-    off = off.clip(-_MAX_OFF_PLANE_MM, _MAX_OFF_PLANE_MM)
+    off = rng.standard_normal() + 0.5 * _smooth_noise(rng, seconds, fastest_hz=0.7)
+    off = (_OFF_PLANE_MM * off).clip(-_MAX_OFF_PLANE_MM, _MAX_OFF_PLANE_MM)
     return np.stack([lane_mm + drift, climb, off], axis=-1)
 
 
 def _smooth_noise(
     rng: np.random.Generator,
     seconds: Float[np.ndarray, "T"],
-    shape: tuple[int, ...],
     *,
     fastest_hz: float,
+    shape: tuple[int, ...] = (),
 ) -> Float[np.ndarray, "T ..."]:
     """Smooth random functions of time of unit variance: three sines of random rate and phase."""
     rate = 2 * np.pi * rng.uniform(0.15, fastest_hz, (3, *shape))
@@ -193,9 +187,6 @@ class Visit:
     poses: list[HangingPose]
     is_gaffed: bool
 
-    def pose_at(self, frame_index: int) -> HangingPose:
-        return self.poses[frame_index - self.first_frame]
-
     def progress(self, frame_index: int) -> float | None:
         """From 0 (first frame of the visit) to 1 (last frame); None outside of it."""
         passed = frame_index - self.first_frame
@@ -219,7 +210,7 @@ class RailScene:
         return [visit for visit in self.visits if visit.progress(frame_index) is not None]
 
     def pose(self, visit: Visit, frame_index: int) -> PosedFish:
-        pose = visit.pose_at(frame_index)
+        pose = visit.poses[frame_index - visit.first_frame]
         return pose_fish(visit.fish, pose, calibration=self.calibration)
 
 
@@ -243,14 +234,7 @@ def make_scene(
         calibration=draw_calibration(np.random.default_rng((seed, _CALIBRATION))),
         num_frames=num_frames,
         visits=[
-            _draw_visit(
-                index,
-                num_fish=num_fish,
-                num_frames=num_frames,
-                preset=chosen,
-                seed=seed,
-                species=species[index % len(species)],
-            )
+            _draw_visit(seed, index, num_fish, num_frames, chosen, species[index % len(species)])
             for index in range(num_fish)
         ],
     )
@@ -289,13 +273,7 @@ def second_camera(calibration: Calibration, *, degrees: float) -> Calibration:
 
 
 def _draw_visit(
-    index: int,
-    *,
-    num_fish: int,
-    num_frames: int,
-    preset: Preset,
-    seed: int,
-    species: SimulatedBody,
+    seed: int, index: int, num_fish: int, num_frames: int, preset: Preset, species: SimulatedBody
 ) -> Visit:
     """Fish number `index` (from 0), when it comes, and its poses."""
     rng = np.random.default_rng((seed, _FISH, index))

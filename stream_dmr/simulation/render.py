@@ -10,11 +10,14 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numba import njit
 
 from stream_dmr.camera import Camera
-from stream_dmr.simulation.simulated_fish import PosedFish, draw_skin
+from stream_dmr.simulation.simulated_fish import ALONG_END, PosedFish, draw_skin, line_kernel
 
 _TOWARDS_LIGHT = np.array([-0.35, -0.75, -0.56])  # camera frame: from above, behind the camera
 _AMBIENT = 0.5  # of the light; this and the direction are chosen
 _MARGIN_PX = 24  # around a patch, for blur and ragged outlines
+
+
+_skin = lru_cache(maxsize=64)(draw_skin)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -52,18 +55,15 @@ def draw_fish_patch(posed: PosedFish, *, camera: Camera, seed: int) -> Patch:
         vertex_normals(posed.vertices, posed.faces) @ _TOWARDS_LIGHT, 0.0
     )
     attributes = np.column_stack([mesh.points[:, 0], mesh.across, shade]).astype(np.float32)
-    face, values = rasterize(
-        pixels - low,
-        posed.vertices[:, 2],
-        posed.faces,
-        attributes,
-        width=int(width),
-        height=int(height),
-    )
+    size = {"width": int(width), "height": int(height)}
+    face, values = rasterize(pixels - low, posed.vertices[:, 2], posed.faces, attributes, **size)
     mask = face >= 0
     shows_eyes = (mesh.points[posed.faces, 2].mean(axis=1) > 0)[face] & mask
-    skin = _skin(seed, posed.fish.track_id)
-    colour = _sample(skin, values, shows_eyes) * (values[..., 2:] * mask[..., None])
+    skin = _skin(seed=seed, track_id=posed.fish.track_id)
+    along = values[..., 0] * (skin.shape[1] - 1) / ALONG_END
+    across = (values[..., 1] + 1) / 2 * (skin.shape[2] - 1)
+    sides = [cv2.remap(side, across, along, cv2.INTER_LINEAR) for side in skin]
+    colour = np.where(shows_eyes[..., None], *sides) * (values[..., 2:] * mask[..., None])
     return Patch(left=int(low[0]), top=int(low[1]), mask=mask, colour=colour)
 
 
@@ -77,7 +77,10 @@ def paste(
     """Blend a patch into the frame, blurred by the lens (defocus) and the shutter (motion)."""
     layers = np.dstack([patch.colour, patch.mask.astype(np.float32)])
     layers = cv2.GaussianBlur(layers, (0, 0), max(defocus_px, 0.3))
-    layers = cv2.filter2D(layers, -1, _motion_kernel(motion_px))
+    # The motion during the exposure, limited to the margin.
+    reach = motion_px / 2 * min(1.0, _MARGIN_PX / (np.linalg.norm(motion_px) + 1e-9))
+    kernel = line_kernel(reach, int(np.ceil(np.abs(reach).max())))
+    layers = cv2.filter2D(layers, -1, kernel)
     rows, columns, inside = frame_window(patch, image.shape[1], image.shape[0])
     layers = layers[inside]
     under = image[rows, columns]
@@ -89,39 +92,9 @@ def frame_window(patch: Patch, width: int, height: int) -> tuple[slice, slice, t
     patch_height, patch_width = patch.mask.shape
     top, bottom = np.clip([patch.top, patch.top + patch_height], 0, height).tolist()
     left, right = np.clip([patch.left, patch.left + patch_width], 0, width).tolist()
-    inside = (
-        slice(top - patch.top, bottom - patch.top),
-        slice(left - patch.left, right - patch.left),
-    )
-    return slice(top, bottom), slice(left, right), inside
-
-
-@lru_cache(maxsize=64)
-def _skin(seed: int, track_id: int) -> Float32[np.ndarray, "2 S Y 3"]:
-    return draw_skin(seed=seed, track_id=track_id)
-
-
-def _sample(
-    skin: Float32[np.ndarray, "2 S Y 3"],
-    values: Float32[np.ndarray, "H W A"],
-    shows_eyes: Bool[np.ndarray, "H W"],
-) -> Float32[np.ndarray, "H W 3"]:
-    """The skin's colour at each pixel."""
-    along = values[..., 0] * (skin.shape[1] - 1) / 1.03  # the lobes of the tail reach past 1
-    across = (values[..., 1] + 1) / 2 * (skin.shape[2] - 1)
-    eyed, blind = (cv2.remap(side, across, along, cv2.INTER_LINEAR) for side in skin)
-    return np.where(shows_eyes[..., None], eyed, blind)
-
-
-def _motion_kernel(motion_px: Float[np.ndarray, "2"]) -> Float32[np.ndarray, "K K"]:
-    """Line kernel of the motion during the exposure, limited to the margin."""
-    reach = motion_px / 2 * min(1.0, _MARGIN_PX / (np.linalg.norm(motion_px) + 1e-9))
-    half = int(np.ceil(np.abs(reach).max()))
-    kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
-    for part in np.linspace(-1.0, 1.0, 4 * half + 1):
-        column, row = np.round(half + part * reach).astype(int)
-        kernel[row, column] += 1.0
-    return kernel / kernel.sum()
+    rows = slice(top - patch.top, bottom - patch.top)
+    columns = slice(left - patch.left, right - patch.left)
+    return slice(top, bottom), slice(left, right), (rows, columns)
 
 
 def vertex_normals(

@@ -1,26 +1,14 @@
-"""Simulated fish: body, center line, skin and pose.
-
-The body of a simulated fish: outline, thickness and tail fin as formulas, and a straight mesh.
+"""Simulated fish: bodies of species as formulas, bent center lines, skins, and hanging poses.
 
 Body coordinates, in body lengths: s along the body from the snout (0) to the fork of the tail fin
 (1), y across the broad side, z through the thickness. The lobes of the tail fin reach beyond s = 1.
 
-The centre line of a bent fish: continuous curvature, integrated so that its length is exact.
-
-There are no joints and no blended transforms here, on purpose: a fit that is tested on these fish
-must not be tested against its own deformation model.
-
-Mean bodies of species that scenes can be drawn with.
-
-Drawn by formulas of their own, not from the tables of the bundled templates, so that measuring them
-with those is no test against itself. Proportions as anglers' and FAO's guides draw these fish; good
-to some 10 %.
-
-The skin of a simulated halibut: a mottled eyed side and a pale blind side.
-
-Colours and marks were chosen by eye.
+A bent fish has a centre line of continuous curvature, integrated so that its length is exact. There
+are no joints and no blended transforms here, and no tables of the bundled templates, on purpose: a
+fit that is tested on these fish must not be tested against its own model.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -28,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.camera import Calibration, ReferencePlane
+from stream_dmr.camera import Calibration
 from stream_dmr.errors import UserError
 from stream_dmr.geometry import arc_length, bending_ratio
 
@@ -78,12 +66,10 @@ class SimulatedBody:
         """
         across = np.cos(angle)
         through = np.sign(np.sin(angle)) * np.abs(np.sin(angle)) ** 1.5
-        bow = (
-            self.fork_depth * across**2 * _smooth_step((s - self.tail_from) / (1 - self.tail_from))
-        )
-        return np.stack(
-            [s + bow, self.half_width_at(s) * across, self.half_thickness_at(s) * through], axis=-1
-        )
+        step = _smooth_step((s - self.tail_from) / (1 - self.tail_from))
+        bow = self.fork_depth * across**2 * step
+        y, z = self.half_width_at(s) * across, self.half_thickness_at(s) * through
+        return np.stack([s + bow, y, z], axis=-1)
 
 
 HALIBUT = SimulatedBody()
@@ -142,13 +128,9 @@ def _faces(num_rings: int, num_sides: int) -> Int[np.ndarray, "F 3"]:
     last, k = ring[-1], np.arange(num_sides // 2)
     upper, upper_after = last[k], last[k + 1]
     lower, lower_after = last[-k], last[-k - 1]
-    seam = np.concatenate(
-        [
-            np.stack([upper, upper_after, lower_after], axis=-1)[:-1],  # the last one has no area
-            np.stack([upper, lower_after, lower], axis=-1)[1:],  # nor has the first one
-        ]
-    )
-    return np.concatenate([snout, *sides, seam])
+    # The last one of the first half has no area, nor has the first one of the second.
+    seam = np.stack([upper, upper_after, lower_after], axis=-1)[:-1]
+    return np.concatenate([snout, *sides, seam, np.stack([upper, lower_after, lower], axis=-1)[1:]])
 
 
 def _bump(
@@ -165,6 +147,7 @@ def _smooth_step(x: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
 
 
 NUM_STEPS = 200  # chosen: 0.6 degrees a step in the most severe bend
+_MIDDLES = (np.arange(NUM_STEPS) + 0.5) / NUM_STEPS  # of the steps
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -199,11 +182,8 @@ class CenterLine:
         self, rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]
     ) -> "CenterLine":
         """This line under a rigid motion: point -> rotation @ point + translation."""
-        return CenterLine(
-            points=self.points @ rotation.T + translation,
-            frames=rotation @ self.frames,
-            length_mm=self.length_mm,
-        )
+        points = self.points @ rotation.T + translation
+        return replace(self, points=points, frames=rotation @ self.frames)
 
 
 def curvature(
@@ -220,7 +200,7 @@ def curvature(
 
 def total_bend_rad(bends: Float[np.ndarray, "3 K"]) -> float:
     """Total turning of the tangent from head to tail: the integral of |curvature| without twist."""
-    turning = curvature(_middles(), bends)[:, 1:]
+    turning = curvature(_MIDDLES, bends)[:, 1:]
     return float(np.linalg.norm(turning, axis=1).sum() / NUM_STEPS)
 
 
@@ -230,7 +210,7 @@ def bend_center_line(bends: Float[np.ndarray, "3 K"], *, length_mm: float) -> Ce
     All steps have the same length, each along the tangent at its middle (exponential midpoint
     rule), so the arc length of the points is `length_mm` up to rounding for any bend.
     """
-    turning = curvature(_middles(), bends) / NUM_STEPS
+    turning = curvature(_MIDDLES, bends) / NUM_STEPS
     whole = Rotation.from_rotvec(turning).as_matrix()
     half = Rotation.from_rotvec(turning / 2).as_matrix()
     frames = np.empty((NUM_STEPS + 1, 3, 3))
@@ -240,10 +220,6 @@ def bend_center_line(bends: Float[np.ndarray, "3 K"], *, length_mm: float) -> Ce
     tangents = (frames[:-1] @ half)[:, :, 0]
     points = np.concatenate([np.zeros((1, 3)), np.cumsum(tangents, axis=0)])
     return CenterLine(points=points * (length_mm / NUM_STEPS), frames=frames, length_mm=length_mm)
-
-
-def _middles() -> Float[np.ndarray, "N"]:
-    return (np.arange(NUM_STEPS) + 0.5) / NUM_STEPS
 
 
 # World: X right, Y down, Z away from the camera. A straight fish hangs head up along Y with its
@@ -265,17 +241,12 @@ class SimulatedFish:
 class HangingPose:
     """How a fish hangs in one frame."""
 
-    bends: Float[np.ndarray, "3 K"]  # see `center_line.curvature`
+    bends: Float[np.ndarray, "3 K"]  # see `curvature`
     yaw_rad: float  # about the vertical; 0 shows the side with the eyes, pi the blind side
     sway_rad: float  # about the line of sight, as a pendulum
     tilt_rad: float  # towards and away from the camera
-    center_world_mm: Float[
-        np.ndarray, "3"
-    ]  # of the center keypoint; [2] is its distance from the plane
-
-    @property
-    def total_bend_rad(self) -> float:
-        return total_bend_rad(self.bends)
+    # of the center keypoint; [2] is its distance from the plane
+    center_world_mm: Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -289,7 +260,6 @@ class PosedFish:
 
     @property
     def faces(self) -> Int[np.ndarray, "F 3"]:
-        """Faces of `vertices`, counter-clockwise outside."""
         return self.fish.mesh.faces
 
     @property
@@ -299,7 +269,6 @@ class PosedFish:
 
     @property
     def bending_ratio(self) -> float:
-        """Arc over chord of the midline."""
         return bending_ratio(self.midline)
 
 
@@ -316,7 +285,8 @@ def draw_fish(
 
 def pose_fish(fish: SimulatedFish, pose: HangingPose, *, calibration: Calibration) -> PosedFish:
     """The fish in this pose, in the camera frame."""
-    line = _in_camera(_hang(fish, pose), calibration.plane)
+    plane = calibration.plane
+    line = _hang(fish, pose).moved(plane.rotation, plane.translation_mm)
     return PosedFish(
         fish=fish,
         vertices=line.place(fish.mesh.points),
@@ -340,67 +310,27 @@ def _hang(fish: SimulatedFish, pose: HangingPose) -> CenterLine:
     return turned.moved(np.eye(3), pose.center_world_mm - center)
 
 
-def _in_camera(line_world: CenterLine, plane: ReferencePlane) -> CenterLine:
-    return line_world.moved(plane.rotation, plane.translation_mm)
-
-
-SPECIES: dict[str, SimulatedBody] = {
-    "halibut": HALIBUT,
-    "haddock": SimulatedBody(
-        half_width=0.108,
-        widest_at=0.33,
-        half_thickness=0.068,
-        thickest_at=0.28,
-        peduncle_half_width=0.024,
-        tail_half_width=0.085,
-        fork_depth=0.018,
-    ),
-    "trout": SimulatedBody(
-        half_width=0.118,
-        widest_at=0.43,
-        half_thickness=0.058,
-        thickest_at=0.38,
-        peduncle_half_width=0.045,
-        tail_half_width=0.098,
-        fork_depth=0.012,
-    ),
-    "perch": SimulatedBody(
-        half_width=0.155,
-        widest_at=0.37,
-        half_thickness=0.075,
-        thickest_at=0.32,
-        peduncle_half_width=0.042,
-        tail_half_width=0.11,
-        fork_depth=0.028,
-    ),
-    "gar": SimulatedBody(
-        half_width=0.056,
-        widest_at=0.55,
-        half_thickness=0.046,
-        thickest_at=0.5,
-        peduncle_half_width=0.027,
-        tail_half_width=0.062,
-        fork_depth=0.005,
-    ),
-    "skipjack": SimulatedBody(
-        half_width=0.13,
-        widest_at=0.4,
-        half_thickness=0.1,
-        thickest_at=0.38,
-        peduncle_half_width=0.012,
-        tail_from=0.9,
-        tail_half_width=0.14,
-        fork_depth=0.09,
-    ),
-    "conger": SimulatedBody(
-        half_width=0.046,
-        widest_at=0.34,
-        half_thickness=0.037,
-        thickest_at=0.3,
-        peduncle_half_width=0.02,
-        tail_half_width=0.017,
-        fork_depth=0.0,
-    ),
+# Mean bodies of species that scenes can be drawn with, as anglers' and FAO's guides draw them;
+# good to some 10 %.
+SPECIES: dict[str, SimulatedBody] = {"halibut": HALIBUT} | {
+    name: SimulatedBody(
+        half_width=half_width,
+        widest_at=widest_at,
+        half_thickness=half_thickness,
+        thickest_at=thickest_at,
+        peduncle_half_width=stem,
+        tail_from=tail_from,
+        tail_half_width=tail,
+        fork_depth=fork,
+    )
+    for name, half_width, widest_at, half_thickness, thickest_at, stem, tail_from, tail, fork in (
+        ("haddock", 0.108, 0.33, 0.068, 0.28, 0.024, 0.885, 0.085, 0.018),
+        ("trout", 0.118, 0.43, 0.058, 0.38, 0.045, 0.885, 0.098, 0.012),
+        ("perch", 0.155, 0.37, 0.075, 0.32, 0.042, 0.885, 0.11, 0.028),
+        ("gar", 0.056, 0.55, 0.046, 0.5, 0.027, 0.885, 0.062, 0.005),
+        ("skipjack", 0.13, 0.4, 0.1, 0.38, 0.012, 0.9, 0.14, 0.09),
+        ("conger", 0.046, 0.34, 0.037, 0.3, 0.02, 0.885, 0.017, 0.0),
+    )
 }
 
 
@@ -412,6 +342,8 @@ def find_species(names: str) -> list[SimulatedBody]:
     return [SPECIES[name] for name in names.split(",")]
 
 
+ALONG_END = 1.03  # body lengths at the texture's last row: the tail's lobes reach past the fork
+# Colours and marks were chosen by eye: a mottled eyed side and a pale blind side.
 _ALONG, _ACROSS = 384, 160  # texture pixels from snout to tail, and across the broad side
 _EYED_BGR = np.array([62.0, 82.0, 92.0], np.float32)
 _BLIND_BGR = np.array([205.0, 214.0, 218.0], np.float32)
@@ -428,30 +360,41 @@ def noise(
     rng: np.random.Generator, height: int, width: int, *, grain_px: tuple[float, float]
 ) -> Float32[np.ndarray, "H W"]:
     """Smooth noise of unit variance with a grain of this size along x and along y."""
-    shrink = max(
-        1, int(min(grain_px) / 3)
-    )  # coarse noise is blurred at low resolution, which is faster
+    # Coarse noise is blurred at low resolution, which is faster.
+    shrink = max(1, int(min(grain_px) / 3))
     white = rng.standard_normal((height // shrink + 1, width // shrink + 1), dtype=np.float32)
     smooth = cv2.GaussianBlur(white, (0, 0), grain_px[0] / shrink, sigmaY=grain_px[1] / shrink)
     smooth = cv2.resize(smooth, (width, height), interpolation=cv2.INTER_CUBIC)
     return (smooth - smooth.mean()) / smooth.std()
 
 
+def line_kernel(reach_px: Float[np.ndarray, "2"], half: int) -> Float32[np.ndarray, "K K"]:
+    """Convolution kernel of a motion from -reach to +reach (x, y); its sum is 1, K = 2 half + 1."""
+    kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
+    for part in np.linspace(-1.0, 1.0, 4 * half + 1):
+        column, row = np.round(half + part * reach_px).astype(int)
+        kernel[row, column] += 1.0
+    return kernel / kernel.sum()
+
+
 def _eyed_side(rng: np.random.Generator) -> Float32[np.ndarray, "S Y 3"]:
-    s, y = _grid()
+    s, y = texture_grid(_ALONG, _ACROSS)
     tone = 1 + 0.20 * _noise(rng, 14.0) + 0.12 * _noise(rng, 5.0) + 0.08 * _noise(rng, 1.5)
     tone *= rng.uniform(0.8, 1.25)
     tone += 0.45 * np.clip(_noise(rng, 5.0) - 1.6, 0.0, 1.0)  # pale spots
-    tone *= _fins(s, y) * _lateral_line(s, y)
+    # The lateral line, with the arch over the pectoral fin that halibut have.
+    arch = 0.28 * np.exp(-(((s - 0.30) / 0.06) ** 2))
+    line = np.exp(-(((y - arch) / 0.02) ** 2)) * ((s > 0.2) & (s < 0.9))
+    tone *= _fins(s, y) * (1 - 0.30 * line)
     tone *= 1 - 0.35 * _arc(s, y, 0.215)  # the gill cover
     side = tone[..., None] * _EYED_BGR * rng.uniform(0.92, 1.08, 3).astype(np.float32)
     for eye_s, eye_y in ((0.075, 0.30), (0.11, -0.22)):
-        _draw_eye(side, eye_s, eye_y)
+        draw_eye(side, eye_s, eye_y, white=(11, 5), iris=(70.0, 105.0, 110.0), pupil=(6, 3))
     return np.clip(side, 8, 255).astype(np.float32)
 
 
 def _blind_side(rng: np.random.Generator) -> Float32[np.ndarray, "S Y 3"]:
-    s, y = _grid()
+    s, y = texture_grid(_ALONG, _ACROSS)
     tone = 1 + 0.035 * _noise(rng, 12.0) + 0.02 * _noise(rng, 2.0)
     tone *= 1 - 0.10 * (1 - _fins(s, y)) - 0.2 * _arc(s, y, 0.215)
     side = tone[..., None] * _BLIND_BGR
@@ -460,10 +403,12 @@ def _blind_side(rng: np.random.Generator) -> Float32[np.ndarray, "S Y 3"]:
     return np.clip(side, 8, 255).astype(np.float32)
 
 
-def _grid() -> tuple[Float32[np.ndarray, "S 1"], Float32[np.ndarray, "1 Y"]]:
-    s = np.linspace(0.0, 1.03, _ALONG, dtype=np.float32)[:, None]
-    y = np.linspace(-1.0, 1.0, _ACROSS, dtype=np.float32)[None]
-    return s, y
+def texture_grid(
+    along: int, across: int
+) -> tuple[Float32[np.ndarray, "S 1"], Float32[np.ndarray, "1 Y"]]:
+    """Places s (0 to ALONG_END) and y (-1 to 1) of a texture's rows and columns."""
+    s = np.linspace(0.0, ALONG_END, along, dtype=np.float32)[:, None]
+    return s, np.linspace(-1.0, 1.0, across, dtype=np.float32)[None]
 
 
 def _noise(rng: np.random.Generator, grain: float) -> Float32[np.ndarray, "S Y"]:
@@ -478,22 +423,25 @@ def _fins(s: Float[np.ndarray, "S 1"], y: Float[np.ndarray, "1 Y"]) -> Float[np.
     return 1 - 0.28 * fringe - rays
 
 
-def _lateral_line(
-    s: Float[np.ndarray, "S 1"], y: Float[np.ndarray, "1 Y"]
-) -> Float[np.ndarray, "S Y"]:
-    """Straight along the middle, with the arch over the pectoral fin that halibut have."""
-    arch = 0.28 * np.exp(-(((s - 0.30) / 0.06) ** 2))
-    return 1 - 0.30 * np.exp(-(((y - arch) / 0.02) ** 2)) * ((s > 0.2) & (s < 0.9))
-
-
 def _arc(
     s: Float[np.ndarray, "S 1"], y: Float[np.ndarray, "1 Y"], at: float
 ) -> Float[np.ndarray, "S Y"]:
     return np.exp(-(((s - at + 0.05 * y**2) / 0.006) ** 2)) * (np.abs(y) < 0.8)
 
 
-def _draw_eye(side: Float[np.ndarray, "S Y 3"], s: float, y: float) -> None:
-    center = (round((y + 1) / 2 * (_ACROSS - 1)), round(s / 1.03 * (_ALONG - 1)))
-    # Wider across, since the texture is compressed there: the head is narrow.
-    cv2.ellipse(side, center, (11, 5), 0, 0, 360, (70, 105, 110), -1, cv2.LINE_AA)
-    cv2.ellipse(side, center, (6, 3), 0, 0, 360, (12, 12, 14), -1, cv2.LINE_AA)
+def draw_eye(
+    side: Float32[np.ndarray, "S Y 3"],
+    s: float,
+    y: float,
+    *,
+    white: tuple[int, int],
+    iris: Sequence[float],
+    pupil: tuple[int, int],
+) -> None:
+    """Draw an eye into a texture, with the half axes (px) of its two ellipses.
+
+    They are wider across: the head is narrow, so the texture is compressed there.
+    """
+    center = round((y + 1) / 2 * (side.shape[1] - 1)), round(s / ALONG_END * (side.shape[0] - 1))
+    cv2.ellipse(side, center, white, 0, 0, 360, iris, -1, cv2.LINE_AA)
+    cv2.ellipse(side, center, pupil, 0, 0, 360, (12, 12, 14), -1, cv2.LINE_AA)

@@ -20,6 +20,7 @@ from stream_dmr.simulation.simulated_fish import (
     find_species,
     keypoints,
     straight_body,
+    total_bend_rad,
 )
 from stream_dmr.tables import write_table
 
@@ -77,7 +78,12 @@ def simulate(
     Raises UserError for counts, a preset, a species or a seed out of range, OutputError where `out`
     can't be written to.
     """
-    _check(num_fish=num_fish, num_frames=num_frames, seed=seed)
+    if not 0 <= num_fish <= _MAX_FISH:
+        raise UserError(f"--fish: expected a number from 0 to {_MAX_FISH}, got {num_fish}")
+    if num_frames < 1:
+        raise UserError(f"--frames: expected at least 1, got {num_frames}")
+    if seed < 0:
+        raise UserError(f"--seed: expected a number from 0 on, got {seed}")
     if second_deg is not None and not abs(second_deg) <= _MOST_TURNED_DEG:
         raise UserError(
             f"--second: expected at most {_MOST_TURNED_DEG} degrees to either side, got "
@@ -96,9 +102,15 @@ def simulate(
 def write_scene(out: Path, scene: RailScene, *, species: str = "halibut") -> None:
     """Write a clip of this scene, as `simulate` does. Raises OutputError."""
     try:
-        _empty_masks(out / "masks")
+        (out / "masks").mkdir(parents=True, exist_ok=True)
+        for path in (out / "masks").iterdir():  # of an earlier clip, which may have been longer
+            if re.fullmatch(r"\d{6}\.png", path.name):
+                path.unlink()
         _write_all_species(out, species.split(","), num_fish=len(scene.visits))
-        _write_truth(out, scene)
+        fish = [visit.fish for visit in scene.visits]
+        lengths = [(one.track_id, f"{one.length_mm:.6f}") for one in fish]
+        write_table(out / "truth.csv", ("track_id", "length_mm"), lengths)
+        write_table(out / "truth_frames.csv", TRUTH_FRAMES_COLUMNS, _truth_rows(scene))
         save_calibration(out / "calibration.yaml", scene.calibration)
         _write_film(out, scene)
     except OSError as error:
@@ -137,36 +149,12 @@ def encode_mask(labels: UInt16[np.ndarray, "H W"], *, num_fish: int) -> bytes:
     return encoded.tobytes()
 
 
-def _check(*, num_fish: int, num_frames: int, seed: int) -> None:
-    if not 0 <= num_fish <= _MAX_FISH:
-        raise UserError(f"--fish: expected a number from 0 to {_MAX_FISH}, got {num_fish}")
-    if num_frames < 1:
-        raise UserError(f"--frames: expected at least 1, got {num_frames}")
-    if seed < 0:
-        raise UserError(f"--seed: expected a number from 0 on, got {seed}")
-
-
-def _empty_masks(folder: Path) -> None:
-    """Make the folder, and delete masks of an earlier clip, which may have been longer."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in folder.iterdir():
-        if re.fullmatch(r"\d{6}\.png", path.name):
-            path.unlink()
-
-
-def _write_truth(out: Path, scene: RailScene) -> None:
-    fish = [visit.fish for visit in scene.visits]
-    lengths = [(one.track_id, f"{one.length_mm:.6f}") for one in fish]
-    write_table(out / "truth.csv", ("track_id", "length_mm"), lengths)
-    write_table(out / "truth_frames.csv", TRUTH_FRAMES_COLUMNS, _truth_rows(scene))
-
-
 def _truth_rows(scene: RailScene) -> Iterable[tuple[int | str, ...]]:
     for frame_index in range(1, scene.num_frames + 1):
         for visit in scene.visits_at(frame_index):
             posed = scene.pose(visit, frame_index)
             pixels = scene.calibration.camera.project(posed.keypoints)
-            bend_deg = float(np.degrees(visit.pose_at(frame_index).total_bend_rad))
+            bends = visit.poses[frame_index - visit.first_frame].bends
             yield (
                 frame_index,
                 visit.fish.track_id,
@@ -174,7 +162,7 @@ def _truth_rows(scene: RailScene) -> Iterable[tuple[int | str, ...]]:
                 *(f"{value:.4f}" for value in pixels.ravel()),
                 f"{posed.arc_mm:.6f}",
                 f"{posed.bending_ratio:.6f}",
-                f"{bend_deg:.3f}",
+                f"{np.degrees(total_bend_rad(bends)):.3f}",
             )
 
 

@@ -121,7 +121,7 @@ def test_bends_and_distance_from_the_plane_stay_within_the_preset(seed, preset):
     scene = make_scene(num_fish=3, num_frames=60, preset=preset, seed=seed)
     limit = PRESETS[preset].max_bend_deg
     for visit in scene.visits:
-        largest = max(np.degrees(pose.total_bend_rad) for pose in visit.poses)
+        largest = max(np.degrees(total_bend_rad(pose.bends)) for pose in visit.poses)
         assert 0.7 * limit * (1 - 1e-9) <= largest <= limit
         assert all(abs(pose.center_world_mm[2]) <= 25.0 for pose in visit.poses)
 
