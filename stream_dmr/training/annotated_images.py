@@ -76,7 +76,12 @@ def _read_folder(paths: dict[str, Path], masks: Path) -> Iterator[AnnotatedImage
     have_ids = any(_ids(labels).any() for labels in map(_read_labels, files.values()))
     for path, mask in files.items():
         image, labels = read_image(path), _read_labels(mask)
-        _check_size(mask, labels.shape, image)
+        height, width = image.shape[:2]
+        if labels.shape != (height, width):
+            raise AnnotationError(
+                f"{mask}: expected a mask of its image's size, {width}x{height} px, "
+                f"got {labels.shape[1]}x{labels.shape[0]} px"
+            )
         labels = _ids(labels) if have_ids else labels
         ids = np.unique(labels[labels > 0]).tolist()
         masks_of_it, unmarked = [labels == one for one in ids], [_ends({})] * len(ids)
@@ -204,15 +209,6 @@ def _refuse_huge(path: Path) -> None:
         )
 
 
-def _check_size(mask: Path, shape: tuple[int, ...], image: UInt8[np.ndarray, "H W 3"]) -> None:
-    height, width = image.shape[:2]
-    if shape != (height, width):
-        raise AnnotationError(
-            f"{mask}: expected a mask of its image's size, {width}x{height} px, "
-            f"got {shape[1]}x{shape[0]} px"
-        )
-
-
 _CUTOUT_PX = 448  # width and height of a cutout: the fish is longer than in a crop
 _MARGIN = 0.6  # on each side, of the fish's longer side: room to rotate it
 _MIN_AREA_PX = 64  # of a fish's mask, as `[crop_fish] min_mask_area_px`
@@ -240,9 +236,8 @@ def load_fish_cutouts(images: Path, masks: Path) -> tuple[list[Cutout], list[Cut
             for mask, ends in zip(annotated.masks, annotated.ends_px, strict=True)
             if np.count_nonzero(mask) >= _MIN_AREA_PX
         ]
-        (validation if index % _VALIDATION_EVERY == _VALIDATION_EVERY - 1 else training).extend(
-            fish
-        )
+        is_training = (index + 1) % _VALIDATION_EVERY
+        (training if is_training else validation).extend(fish)
     if not training or not validation:
         raise AnnotationError(
             f"{masks}: expected fish of at least {_MIN_AREA_PX} px in at least {_VALIDATION_EVERY} "
@@ -270,9 +265,7 @@ def draw_annotated_sample(
     box = jitter_box(rng, box, limits=everywhere)
     crop_from_rotated = crop_affine(box, margin=rng.uniform(0.08, 0.22), size=size_px)
     crop_from_cutout = crop_from_rotated @ np.vstack([rotation, [0.0, 0.0, 1.0]])
-    crop = cv2.warpAffine(
-        cutout.pixels, crop_from_cutout, (size_px, size_px), flags=cv2.INTER_LINEAR
-    )
+    crop = cv2.warpAffine(cutout.pixels, crop_from_cutout, (size_px, size_px))
     picture = crop[..., :3].astype(np.float32)
     if is_faded := rng.random() < FADED_SHARE:
         picture = fade_end(rng, picture, crop[..., 3] > 127)
@@ -333,7 +326,7 @@ def cutout_patch(cutout: Cutout) -> FishPatch:
     inner = cv2.erode(fish.astype(np.float32), np.ones((3, 3), np.uint8))
     coverage = cv2.GaussianBlur(inner, (0, 0), 0.6)[..., None]
     layer = np.dstack([cutout.pixels[..., :3] * coverage, 255 * coverage])
-    patch = cv2.warpAffine(layer, affine, (PATCH_PX, PATCH_PX), flags=cv2.INTER_LINEAR)
+    patch = cv2.warpAffine(layer, affine, (PATCH_PX, PATCH_PX))
     bgra = np.clip(np.round(patch), 0, 255).astype(np.uint8)
     return FishPatch(bgra=bgra, ends_px=transformed(cutout.ends_px, affine))
 
@@ -362,8 +355,6 @@ def _cut_out(
     shrink = int(1 / cutout_from_image[0, 0])
     if shrink > 1:  # average pixels that would be skipped
         layers = cv2.blur(layers, (shrink, shrink))
-    cutout = cv2.warpAffine(
-        layers, cutout_from_image, (_CUTOUT_PX, _CUTOUT_PX), flags=cv2.INTER_LINEAR
-    )
+    cutout = cv2.warpAffine(layers, cutout_from_image, (_CUTOUT_PX, _CUTOUT_PX))
     cutout[..., 3] = np.where(cutout[..., 3] > 127, 255, 0)
     return Cutout(cutout, transformed(ends_px, cutout_from_image))

@@ -1,22 +1,19 @@
-"""Weather, optics and sensor: random changes of a picture that move no outline in it.
+"""Random changes of a picture, and the fish and backgrounds that pictures are composed of.
 
-The ranges were chosen by hand.
-
-The fish and backgrounds that training pictures are composed of: simulated, and photographed.
-
-The simulated ones are cached in a file.
+Weather, optics and sensor move no outline; their ranges were chosen by hand. Simulated fish and
+backgrounds are cached in a file, beside them are photographed ones.
 """
 
-import os
-import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from stream_dmr.files import replacing
+from stream_dmr.simulation.simulated_fish import line_kernel
 from stream_dmr.training.random_fish import PATCH_PX, FishPatch, draw_fish_patch
 from stream_dmr.training.surroundings import BACKGROUND_PX, draw_background
 
@@ -40,14 +37,23 @@ def add_weather(rng: np.random.Generator, picture: Picture) -> Picture:
         veil = np.clip(_cloud(rng, size, rng.uniform(2.0, 14.0)) * 1.8 - 0.9, 0.0, 0.7)
         picture = picture + veil[..., None] * (235 - picture)
     if rng.random() < 0.12:
-        _draw_drops(rng, picture)
+        # Drops in the air or on the lens: small, bright, half transparent.
+        for _ in range(rng.integers(5, 60)):
+            x, y = rng.integers(0, size, 2)
+            radius = int(rng.integers(0, 3))
+            area = picture[max(0, y - radius) : y + radius + 1, max(0, x - radius) : x + radius + 1]
+            area += np.float32(rng.uniform(0.2, 0.9)) * (np.float32(rng.uniform(180, 255)) - area)
     return picture
 
 
 def simulate_camera(rng: np.random.Generator, picture: Picture) -> UInt8[np.ndarray, "S S 3"]:
     """Optics, sensor, processing and compression of a random camera; 40 % are good ones."""
     is_good = rng.random() < 0.4
-    picture = _develop(rng, np.clip(_blur(rng, picture), 0, 255))
+    if rng.random() < 0.5:
+        picture = cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.3, 1.4))
+    if rng.random() < 0.15:
+        picture = cv2.filter2D(picture, -1, motion_kernel(rng, rng.uniform(1.5, 6.0)))
+    picture = _develop(rng, np.clip(picture, 0, 255))
     if not is_good and rng.random() < 0.4:
         picture = _enlarge(rng, picture)
     if rng.random() < 0.7:
@@ -66,22 +72,9 @@ def simulate_camera(rng: np.random.Generator, picture: Picture) -> UInt8[np.ndar
 
 def motion_kernel(rng: np.random.Generator, length_px: float) -> Float32[np.ndarray, "K K"]:
     """Convolution kernel of a straight motion blur in a random direction; it sums to 1."""
-    half = int(np.ceil(length_px / 2))
-    kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
     angle = rng.uniform(0.0, np.pi)
-    half_blur = length_px / 2 * np.array([np.cos(angle), np.sin(angle)])
-    for part in np.linspace(-1.0, 1.0, 4 * half + 1):
-        column, row = np.round(half + part * half_blur).astype(int)
-        kernel[row, column] += 1.0
-    return kernel / kernel.sum()
-
-
-def _blur(rng: np.random.Generator, picture: Picture) -> Picture:
-    if rng.random() < 0.5:
-        picture = cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.3, 1.4))
-    if rng.random() < 0.15:
-        picture = cv2.filter2D(picture, -1, motion_kernel(rng, rng.uniform(1.5, 6.0)))
-    return picture
+    reach = length_px / 2 * np.array([np.cos(angle), np.sin(angle)])
+    return line_kernel(reach, int(np.ceil(length_px / 2)))
 
 
 def _develop(rng: np.random.Generator, picture: Picture) -> Picture:
@@ -103,7 +96,7 @@ def _enlarge(rng: np.random.Generator, picture: Picture) -> Picture:
     if rng.random() < 0.5:
         pixels = np.clip(shrunken, 0, 255).astype(np.uint8)
         shrunken = _compress(pixels, int(rng.integers(30, 96))).astype(np.float32)
-    return cv2.resize(shrunken, (size, size), interpolation=cv2.INTER_LINEAR)
+    return cv2.resize(shrunken, (size, size))
 
 
 def _compress(pixels: UInt8[np.ndarray, "H W 3"], quality: int) -> UInt8[np.ndarray, "H W 3"]:
@@ -117,26 +110,14 @@ def _glare(rng: np.random.Generator, size: int) -> Float32[np.ndarray, "S S"]:
         center, axes = rng.integers(0, size, 2).tolist(), rng.uniform(1.0, 14.0, 2)
         axes = tuple(np.ceil(axes).astype(int).tolist())
         cv2.ellipse(canvas, center, axes, float(rng.uniform(0, 180)), 0, 360, 1.0, -1)
-    return np.float32(rng.uniform(0.3, 1.5)) * cv2.GaussianBlur(
-        canvas, (0, 0), rng.uniform(0.6, 4.0)
-    )
-
-
-def _draw_drops(rng: np.random.Generator, picture: Picture) -> None:
-    """Drops in the air or on the lens, drawn in place: small, bright, half transparent."""
-    for _ in range(rng.integers(5, 60)):
-        x, y = rng.integers(0, len(picture), 2)
-        radius = int(rng.integers(0, 3))
-        area = picture[max(0, y - radius) : y + radius + 1, max(0, x - radius) : x + radius + 1]
-        area += np.float32(rng.uniform(0.2, 0.9)) * (np.float32(rng.uniform(180, 255)) - area)
+    strength = np.float32(rng.uniform(0.3, 1.5))
+    return strength * cv2.GaussianBlur(canvas, (0, 0), rng.uniform(0.6, 4.0))
 
 
 def _cloud(rng: np.random.Generator, size: int, grain: float) -> Float32[np.ndarray, "S S"]:
     """Smooth noise between 0 and 1."""
     cells = max(2, round(size / grain) + 1)
-    return cv2.resize(
-        rng.random((cells, cells), np.float32), (size, size), interpolation=cv2.INTER_LINEAR
-    )
+    return cv2.resize(rng.random((cells, cells), np.float32), (size, size))
 
 
 _PHOTOGRAPHED_SHARE = 0.4  # of fish, and of backgrounds, where there are any; chosen by hand
@@ -168,11 +149,11 @@ class PatchBank:
         self, fish: list[FishPatch], backgrounds: list[UInt8[np.ndarray, "B B 3"]]
     ) -> "PatchBank":
         """The bank with these besides; either list may be empty."""
-        return PatchBank(
+        ends_px = [self.ends_px, *(one.ends_px[None] for one in fish)]
+        return replace(
+            self,
             fish=np.concatenate([self.fish, *(one.bgra[None] for one in fish)]),
-            ends_px=np.concatenate(
-                [self.ends_px, *(one.ends_px[None] for one in fish)], dtype=np.float32
-            ),
+            ends_px=np.concatenate(ends_px, dtype=np.float32),
             backgrounds=np.concatenate([self.backgrounds, *(one[None] for one in backgrounds)]),
             num_photographed_fish=self.num_photographed_fish + len(fish),
             num_photographed_backgrounds=self.num_photographed_backgrounds + len(backgrounds),
@@ -218,11 +199,9 @@ def load_or_make_bank(
     if path.exists():
         with np.load(path) as arrays:
             return PatchBank(**arrays)
-    bank = make_bank(
-        num_fish=num_fish, num_backgrounds=num_backgrounds, seed=seed, progress=progress
-    )
+    numbers = {"num_fish": num_fish, "num_backgrounds": num_backgrounds, "seed": seed}
+    bank = make_bank(**numbers, progress=progress)
     folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=folder, suffix=".npz", delete=False) as file:
+    with replacing(path) as draft, draft.open("wb") as file:
         np.savez(file, fish=bank.fish, ends_px=bank.ends_px, backgrounds=bank.backgrounds)
-    os.replace(file.name, path)  # atomic: other processes never read half a file
     return bank

@@ -1,13 +1,10 @@
-"""Fish of random shape in random poses, as meshes, whose outlines the network is trained on.
+"""Fish of random shape and skin in random poses, as meshes, whose outlines the network learns.
 
 The bodies are the simulator's, with proportions far beyond its halibut: flat and round, slim and
-deep, with separate fins, unequal back and belly, and tails from truncate to deeply forked. The
-ranges were chosen by hand.
-
-Random skins: any colour, mottled, spotted, barred or striped; with eyes, gills and fin rays.
-
-Textures of shape (S, Y, 3), BGR: rows from snout to tail, columns from back to belly. The ranges
-were chosen by hand.
+deep, with separate fins, unequal back and belly, and tails from truncate to deeply forked. Skins
+have any colour, mottled, spotted, barred or striped; with eyes, gills and fin rays. Textures have
+the shape (S, Y, 3), BGR: rows from snout to tail, columns from back to belly. The ranges were
+chosen by hand.
 """
 
 from dataclasses import dataclass
@@ -19,11 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from stream_dmr.simulation.render import rasterize, vertex_normals
 from stream_dmr.simulation.simulated_fish import (
-    CenterLine,
+    ALONG_END,
     SimulatedBody,
     bend_center_line,
+    draw_eye,
+    keypoints,
     noise,
     straight_body,
+    texture_grid,
     total_bend_rad,
 )
 
@@ -57,17 +57,16 @@ def draw_shape(rng: np.random.Generator) -> FishShape:
     body = _draw_flat(rng) if is_flatfish else _draw_round(rng)
     mesh = straight_body(body, num_rings=_RINGS, num_sides=_SIDES)
     sheets = [] if is_flatfish and rng.random() < 0.8 else _draw_fins(rng, body)
-    points, texture, faces = [mesh.points], [np.column_stack([mesh.points[:, 0], mesh.across])], []
-    faces.append(mesh.faces)
+    points, faces = [mesh.points], [mesh.faces]
+    texture = [np.column_stack([mesh.points[:, 0], mesh.across])]
     for sheet, colour in sheets:
         faces.append(_grid_faces(_FIN_COLUMNS, _FIN_ROWS) + sum(map(len, points)))
         points.append(sheet)
         texture.append(colour)
-    is_fin = np.arange(sum(map(len, points))) >= len(mesh.points)
     return FishShape(
         points=_deform(rng, np.concatenate(points)),
         texture=np.concatenate(texture),
-        is_fin=is_fin,
+        is_fin=np.arange(sum(map(len, points))) >= len(mesh.points),
         faces=np.concatenate(faces),
         is_flatfish=is_flatfish,
     )
@@ -86,11 +85,7 @@ def pose_shape(rng: np.random.Generator, shape: FishShape) -> PosedShape:
     centre = spine.points.mean(axis=0)
     distance = np.array([0.0, 0.0, rng.uniform(2.5, 12.0)])
     spine = spine.moved(np.eye(3), distance - centre)
-    return PosedShape(vertices=spine.place(shape.points), ends=_ends(spine))
-
-
-def _ends(spine: CenterLine) -> Float[np.ndarray, "2 3"]:
-    return spine.place(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
+    return PosedShape(vertices=spine.place(shape.points), ends=spine.place(keypoints((0.0, 1.0))))
 
 
 def _draw_flat(rng: np.random.Generator) -> SimulatedBody:
@@ -149,10 +144,8 @@ def _draw_fin(
     s = start + along * (end - start)
     y = 0.85 * body.half_width_at(s) + out * profile * height
     s = s + out * rng.uniform(0.0, 1.0) * height  # swept back
-    z = np.zeros_like(s)
-    points = np.stack([s, side * y, z], axis=-1).reshape(-1, 3)
-    colour = np.stack([s, np.full_like(s, 0.9 * side)], axis=-1).reshape(-1, 2)
-    return points, colour
+    points = np.stack([s, side * y, np.zeros_like(s)], axis=-1).reshape(-1, 3)
+    return points, np.stack([s, np.full_like(s, 0.9 * side)], axis=-1).reshape(-1, 2)
 
 
 def _deform(rng: np.random.Generator, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
@@ -173,9 +166,7 @@ def _draw_bends(rng: np.random.Generator, is_flatfish: bool) -> Float[np.ndarray
     sizes = np.array([0.0, 1.0, in_broad_side])[:, None] * _BEND_SIZES
     bends = sizes * rng.standard_normal(sizes.shape)
     bends *= np.radians(120.0) * rng.beta(1.0, 2.0) / max(total_bend_rad(bends), 1e-6)
-    twist_deg = rng.normal(
-        0.0, 80.0 if rng.random() < 0.35 else 12.0
-    )  # 80: the tail is seen edge-on
+    twist_deg = rng.normal(0.0, 80.0 if rng.random() < 0.35 else 12.0)  # 80: the tail is edge-on
     bends[:, 0][0] = np.radians(twist_deg) * np.pi / 2
     return bends
 
@@ -189,7 +180,6 @@ def _grid_faces(columns: int, rows: int) -> Int[np.ndarray, "F 3"]:
 
 
 _ALONG, _ACROSS = 256, 96  # texture pixels from snout to tail, and from back to belly
-ALONG_END = 1.03  # body lengths at the texture's last row: the tail's lobes reach past the fork
 _BASE_COLOURS_BGR = np.array(  # browns, greys, olive, silver, gold, red, blue-grey, black, white
     [
         *([62, 82, 92], [90, 100, 105], [45, 75, 70], [190, 195, 190], [70, 140, 175]),
@@ -215,12 +205,17 @@ def draw_skin_pair(
 
 def _draw_side(rng: np.random.Generator, *, is_countershaded: bool) -> Float32[np.ndarray, "S Y 3"]:
     """One side of a fish; a countershaded one is pale below."""
-    s, y = _grid()
+    s, y = texture_grid(_ALONG, _ACROSS)
     colour = _BASE_COLOURS_BGR[rng.integers(len(_BASE_COLOURS_BGR))] * rng.uniform(0.6, 1.3)
     colour = colour * rng.uniform(0.8, 1.2, 3)
     side = np.broadcast_to(colour, (_ALONG, _ACROSS, 3)).astype(np.float32)
     if rng.random() < _TWO_COLOURS_SHARE:
-        side = _draw_second_colour(rng, side, s, y)
+        # Another colour behind, before, above or below a slanting edge.
+        other = _BASE_COLOURS_BGR[rng.integers(len(_BASE_COLOURS_BGR))] * rng.uniform(0.5, 1.4, 3)
+        slant, at = rng.normal(0.0, 0.25), rng.uniform(0.15, 0.85)
+        along = (s - at) * rng.choice([-1.0, 1.0]) + slant * y + 0.02 * _noise(rng, 10.0)
+        covered = 1 / (1 + np.exp(-along / rng.uniform(0.004, 0.03)))
+        side = (side + covered[..., None] * (other - side)).astype(np.float32)
     if is_countershaded and rng.random() < 0.85:
         belly = colour + rng.uniform(0.2, 1.0) * (np.array([215.0, 220.0, 220.0]) - colour)
         at, width = rng.uniform(-0.3, 0.7), rng.uniform(0.1, 0.6)
@@ -231,27 +226,15 @@ def _draw_side(rng: np.random.Generator, *, is_countershaded: bool) -> Float32[n
     tone = tone * _draw_marks(rng, s, y)
     side = np.ascontiguousarray(side * np.maximum(tone, 0.15)[..., None], np.float32)
     for eye_s, eye_y in _draw_eyes(rng, is_countershaded):
-        _draw_eye(rng, side, eye_s, eye_y)
+        size, iris = rng.uniform(0.6, 1.4), rng.uniform(30, 230, 3).tolist()
+        white, pupil = (round(8 * size), round(4 * size)), (round(5 * size), round(2.5 * size))
+        draw_eye(side, eye_s, eye_y, white=white, iris=iris, pupil=pupil)
     return np.clip(side, 4, 255).astype(np.float32)
-
-
-def _draw_second_colour(
-    rng: np.random.Generator,
-    side: Float32[np.ndarray, "S Y 3"],
-    s: Float[np.ndarray, "S 1"],
-    y: Float[np.ndarray, "1 Y"],
-) -> Float32[np.ndarray, "S Y 3"]:
-    """Another colour behind, before, above or below a slanting edge."""
-    other = _BASE_COLOURS_BGR[rng.integers(len(_BASE_COLOURS_BGR))] * rng.uniform(0.5, 1.4, 3)
-    slant, at = rng.normal(0.0, 0.25), rng.uniform(0.15, 0.85)
-    along = (s - at) * rng.choice([-1.0, 1.0]) + slant * y + 0.02 * _noise(rng, 10.0)
-    covered = 1 / (1 + np.exp(-along / rng.uniform(0.004, 0.03)))
-    return (side + covered[..., None] * (other - side)).astype(np.float32)
 
 
 def _draw_blind_side(rng: np.random.Generator) -> Float32[np.ndarray, "S Y 3"]:
     """The pale lower side of a flatfish, with red spots."""
-    s, y = _grid()
+    s, y = texture_grid(_ALONG, _ACROSS)
     colour = np.array([205.0, 214.0, 218.0]) * rng.uniform(0.75, 1.1) * rng.uniform(0.93, 1.07, 3)
     tone = 1 + rng.uniform(0.2, 1.0) * _draw_mottling(rng)
     side = (tone * _draw_marks(rng, s, y))[..., None] * colour
@@ -263,10 +246,8 @@ def _draw_mottling(rng: np.random.Generator) -> Float[np.ndarray, "S Y"]:
     """Noise of three grain sizes, around 0."""
     sizes = rng.uniform(0.0, 1.0, 3) * [0.30, 0.22, 0.18]
     grains = (rng.uniform(9.0, 22.0), rng.uniform(3.0, 8.0), rng.uniform(0.8, 2.0))
-    return sum(
-        (size * _noise(rng, grain) for size, grain in zip(sizes, grains, strict=True)),
-        np.zeros((_ALONG, _ACROSS)),
-    )
+    layers = (size * _noise(rng, grain) for size, grain in zip(sizes, grains, strict=True))
+    return sum(layers, np.zeros((_ALONG, _ACROSS)))
 
 
 def _draw_pattern(
@@ -299,9 +280,8 @@ def _draw_marks(
     arch = rng.uniform(0.0, 0.3) * np.exp(-(((s - 0.30) / 0.06) ** 2))
     line = np.exp(-(((y - arch - rng.uniform(-0.2, 0.1)) / 0.03) ** 2)) * ((s > 0.2) & (s < 0.9))
     pectoral_s, pectoral_y = rng.uniform(0.26, 0.36), rng.uniform(0.0, 0.5)
-    pectoral = ((s - pectoral_s) / 0.06) ** 2 + (
-        (y - pectoral_y - 1.5 * (s - pectoral_s)) / 0.12
-    ) ** 2 < 1
+    across = (y - pectoral_y - 1.5 * (s - pectoral_s)) / 0.12
+    pectoral = ((s - pectoral_s) / 0.06) ** 2 + across**2 < 1
     fringe = (abs(y) > rng.uniform(0.7, 0.9)) & (s > 0.2) & (s < 0.86)
     tail = s > rng.uniform(0.86, 0.93)
     rays = 0.1 * (np.sin(rng.uniform(25, 60) * y) > 0) * tail
@@ -314,29 +294,8 @@ def _draw_eyes(rng: np.random.Generator, is_round: bool) -> list[tuple[float, fl
     """Places (s, y) of the eyes on one side: one of a round fish, both of a flatfish."""
     if is_round:
         return [(rng.uniform(0.06, 0.12), rng.uniform(-0.6, -0.1))]
-    first = rng.uniform(0.06, 0.1)
-    return [
-        (first, rng.uniform(0.1, 0.4)),
-        (first + rng.uniform(0.0, 0.05), rng.uniform(-0.4, -0.1)),
-    ]
-
-
-def _draw_eye(
-    rng: np.random.Generator, side: Float32[np.ndarray, "S Y 3"], s: float, y: float
-) -> None:
-    center = (round((y + 1) / 2 * (_ACROSS - 1)), round(s / ALONG_END * (_ALONG - 1)))
-    size = rng.uniform(0.6, 1.4)
-    # Wider across: the head is narrow, so the texture is compressed there.
-    white, pupil = (round(8 * size), round(4 * size)), (round(5 * size), round(2.5 * size))
-    iris = rng.uniform(30, 230, 3).tolist()
-    cv2.ellipse(side, center, white, 0, 0, 360, iris, -1, cv2.LINE_AA)
-    cv2.ellipse(side, center, pupil, 0, 0, 360, (12, 12, 14), -1, cv2.LINE_AA)
-
-
-def _grid() -> tuple[Float32[np.ndarray, "S 1"], Float32[np.ndarray, "1 Y"]]:
-    s = np.linspace(0.0, ALONG_END, _ALONG, dtype=np.float32)[:, None]
-    y = np.linspace(-1.0, 1.0, _ACROSS, dtype=np.float32)[None]
-    return s, y
+    first, below = rng.uniform(0.06, 0.1), rng.uniform(0.1, 0.4)
+    return [(first, below), (first + rng.uniform(0.0, 0.05), rng.uniform(-0.4, -0.1))]
 
 
 def _noise(rng: np.random.Generator, grain: float) -> Float32[np.ndarray, "S Y"]:
@@ -361,8 +320,7 @@ def draw_fish_patch(rng: np.random.Generator) -> FishPatch:
     shape = draw_shape(rng)
     posed = pose_shape(rng, shape)
     pixels, ends = _fit_to_patch(posed)
-    coverage, colour = _shade(rng, shape, posed, pixels)
-    fine = np.dstack([colour, coverage])
+    fine = _shade(rng, shape, posed, pixels)
     small = cv2.resize(fine, (PATCH_PX, PATCH_PX), interpolation=cv2.INTER_AREA)
     small = np.clip(np.round(small * [1, 1, 1, 255]), 0, 255)
     return FishPatch(bgra=small.astype(np.uint8), ends_px=(ends + 0.5) / _OVERSAMPLING - 0.5)
@@ -381,8 +339,8 @@ def _fit_to_patch(posed: PosedShape) -> tuple[Float[np.ndarray, "V 2"], Float[np
 
 def _shade(
     rng: np.random.Generator, shape: FishShape, posed: PosedShape, pixels: Float[np.ndarray, "V 2"]
-) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W 3"]]:
-    """Coverage (0 or 1), and BGR colour where it is 1, in the oversampled patch."""
+) -> Float[np.ndarray, "H W 4"]:
+    """BGR colour where there is fish, and coverage (0 or 1), in the oversampled patch."""
     normals = vertex_normals(posed.vertices, shape.faces)
     shade, gloss = _draw_light(rng, normals)
     shade = np.where(shape.is_fin, shade * rng.uniform(0.55, 1.25), shade)
@@ -400,7 +358,7 @@ def _shade(
     colour = np.where(is_first, *sides) * values[..., 2:3]
     wet = np.clip(noise(rng, side, side, grain_px=(5.0, 5.0)) + 0.5, 0.0, 1.5)
     colour += (255 * values[..., 3] * wet)[..., None]
-    return mask.astype(np.float32), np.clip(colour, 0, 255) * mask[..., None]
+    return np.dstack([np.clip(colour, 0, 255) * mask[..., None], mask.astype(np.float32)])
 
 
 def _draw_light(

@@ -1,7 +1,5 @@
 """Training examples: drawn one by one, read in batches.
 
-Draw a simulated training example.
-
 The order is that of a real crop: a scene, the visible part of its target fish, a box around that
 with a detector's errors, and the crop around the box.
 """
@@ -21,7 +19,6 @@ from stream_dmr.networks.unet_interface import SIZES_PX, box_coverage
 from stream_dmr.training.image_degradation import PatchBank, add_weather, simulate_camera
 from stream_dmr.training.surroundings import draw_into
 from stream_dmr.training.training_scene import (
-    SceneFish,
     TrainingScene,
     draw_scene,
     frame_coverage,
@@ -85,13 +82,12 @@ def load_batches(samples: SampleDataset, *, workers: int) -> DataLoader[Training
 
 def collate_samples(samples: list[TrainingSample]) -> Batch:
     unknown = np.full((2, 2), np.nan, np.float32)
+    ends_px = [unknown if sample.ends_px is None else sample.ends_px for sample in samples]
     return (
         torch.from_numpy(np.stack([sample.image for sample in samples])),
         torch.from_numpy(np.stack([sample.mask for sample in samples])),
         torch.from_numpy(np.stack([sample.in_box for sample in samples])),
-        torch.from_numpy(
-            np.stack([unknown if sample.ends_px is None else sample.ends_px for sample in samples])
-        ),
+        torch.from_numpy(np.stack(ends_px)),
     )
 
 
@@ -109,10 +105,7 @@ def crop_affine(
 
 
 def jitter_box(
-    rng: np.random.Generator,
-    bbox_xyxy: Float[np.ndarray, "4"],
-    *,
-    limits: Float[np.ndarray, "4"],
+    rng: np.random.Generator, bbox_xyxy: Float[np.ndarray, "4"], *, limits: Float[np.ndarray, "4"]
 ) -> Float[np.ndarray, "4"]:
     """A box with random errors, clipped to `limits`: some per cent, for one box in three far more.
 
@@ -134,9 +127,7 @@ def jitter_box(
 
 
 def draw_part_box(
-    rng: np.random.Generator,
-    bbox_xyxy: Float[np.ndarray, "4"],
-    points: Float[np.ndarray, "N 2"],
+    rng: np.random.Generator, bbox_xyxy: Float[np.ndarray, "4"], points: Float[np.ndarray, "N 2"]
 ) -> Float[np.ndarray, "4"]:
     """A box within a box, with 25 to 60 % of its sides, around one of the points as far as it fits.
 
@@ -164,15 +155,13 @@ def draw_spot_sample(
     box = jitter_box(rng, spot, limits=edges)
     affine = crop_affine(box, margin=rng.uniform(0.08, 0.22), size=size_px)
     size = (size_px, size_px)
-    crop = cv2.warpAffine(
-        background, affine, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
-    )
+    crop = cv2.warpAffine(background, affine, size, borderMode=cv2.BORDER_REFLECT)
     image = simulate_camera(rng, add_weather(rng, crop.astype(np.float32)))
-    low, high = transformed(box.reshape(2, 2), affine)
+    edges = transformed(box.reshape(2, 2), affine) + 0.5
     return TrainingSample(
         image=np.ascontiguousarray(image),
         mask=np.zeros(size, np.float32),
-        in_box=box_coverage(np.concatenate([low, high]) + 0.5, size=size_px),
+        in_box=box_coverage(edges.ravel(), size=size_px),
         ends_px=None,
     )
 
@@ -206,7 +195,7 @@ _PART_SHARE = 0.055  # of the examples: the box is around a part of the fish
 _MIN_VISIBLE = 0.2  # of the target fish; with less visible the scene is drawn again
 
 
-def draw_sample(rng: np.random.Generator, bank: PatchBank, *, size_px: int) -> TrainingSample:
+def draw_sample(rng: np.random.Generator, size_px: int, *, bank: PatchBank) -> TrainingSample:
     """One crop, `size_px` wide and high, with its true mask and ends."""
     kind = rng.random()
     is_boxed, is_empty = kind >= _NO_BOX_SHARE, kind >= 1 - _NO_FISH_SHARE
@@ -234,14 +223,15 @@ def draw_sample(rng: np.random.Generator, bank: PatchBank, *, size_px: int) -> T
     picture, mask = render_scene(
         rng, bank, scene, crop_from_scene, targets=targets, size_px=size_px
     )
-    low, high = transformed(box.reshape(2, 2), crop_from_scene)
-    in_box = box_coverage(np.concatenate([low, high]) + 0.5, size=size_px)
-    has_ends = is_boxed and not is_empty
+    edges = transformed(box.reshape(2, 2), crop_from_scene) + 0.5
+    in_box = box_coverage(edges.ravel(), size=size_px)
+    ends = scene.target.to_scene(bank.ends_px[scene.target.patch].astype(np.float64))
+    ends_px = transformed(ends, crop_from_scene).astype(np.float32)
     return TrainingSample(
         image=picture,
         mask=mask,
         in_box=in_box if is_boxed else np.ones_like(in_box),
-        ends_px=_ends_px(bank, scene.target, crop_from_scene) if has_ends else None,
+        ends_px=ends_px if is_boxed and not is_empty else None,
     )
 
 
@@ -301,11 +291,3 @@ def _scene_box(
     """A box of the overview's pixels in scene units."""
     edges = np.array([x, y, x + width, y + height]) - 0.5
     return (edges - np.tile(overview[:, 2], 2)) / overview[0, 0]
-
-
-def _ends_px(
-    bank: PatchBank, fish: SceneFish, crop_from_scene: Float[np.ndarray, "2 3"]
-) -> Float32[np.ndarray, "2 2"]:
-    """Head and tail in the crop, x, y."""
-    ends = fish.to_scene(bank.ends_px[fish.patch].astype(np.float64))
-    return transformed(ends, crop_from_scene).astype(np.float32)

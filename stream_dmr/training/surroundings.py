@@ -1,13 +1,8 @@
-"""Random backgrounds, and objects that hide fish.
+"""Random backgrounds, and objects that hide fish. The ranges were chosen by hand.
 
-Random backgrounds: sea, murk, rock, deck, table, steel, clutter, or two of them.
-
-The ranges were chosen by hand.
-
-Random objects between the camera and a fish: poles, gloves, ropes, edges, lines.
-
-Each is a set of polygons in scene units (fish lengths, the fish at the origin), so that it can be
-drawn into any crop. The ranges were chosen by hand.
+Backgrounds are sea, murk, rock, deck, table, steel, clutter, or two of them. Objects are poles,
+gloves, ropes, edges, lines: polygons in scene units (fish lengths, the fish at the origin), which
+can be drawn into any crop.
 """
 
 from collections.abc import Callable
@@ -59,7 +54,8 @@ def _draw_sea(rng: np.random.Generator) -> Picture:
     stops = np.stack([dark, dark * 1.8 + 10, dark * 2.6 + 40, [225.0, 225.0, 220.0]])
     foam_from = rng.uniform(0.75, 1.3)
     heights = np.clip((waves - waves.min()) / np.ptp(waves) / foam_from, 0, 1)
-    return _colour_map(heights, stops, [0.0, 0.5, 0.85, 1.0])
+    channels = [np.interp(heights, [0.0, 0.5, 0.85, 1.0], channel) for channel in stops.T]
+    return np.stack(channels, axis=-1)
 
 
 def _draw_murk(rng: np.random.Generator) -> Picture:
@@ -87,11 +83,10 @@ def _draw_rock(rng: np.random.Generator) -> Picture:
         relief = cv2.Sobel(height, cv2.CV_32F, *((1, 0) if rng.random() < 0.5 else (0, 1)))
         tone = 1 + rng.uniform(0.0, 0.5) * relief / (relief.std() + 1e-6)
         tone = tone + rng.uniform(0.0, 0.3) * _noise(rng, 1.5, 1.5)
-        own = (
-            _any_colour(rng)
-            if is_colourful
-            else main * rng.uniform(0.4, 1.5) * rng.uniform(0.8, 1.2, 3)
-        )
+        if is_colourful:
+            own = _any_colour(rng)
+        else:
+            own = main * rng.uniform(0.4, 1.5) * rng.uniform(0.8, 1.2, 3)
         colour = own * np.clip(tone, 0.2, 2.5)[..., None]
         picture += cv2.GaussianBlur(mask, (0, 0), 0.7)[..., None] * (colour - picture)
     return picture
@@ -138,9 +133,8 @@ def _draw_steel(rng: np.random.Generator) -> Picture:
 
 def _draw_clutter(rng: np.random.Generator) -> Picture:
     """Shapes upon shapes, each with a texture of its own."""
-    picture = np.ascontiguousarray(
-        _any_colour(rng) + np.zeros((BACKGROUND_PX, BACKGROUND_PX, 3)), np.float32
-    )
+    picture = np.empty((BACKGROUND_PX, BACKGROUND_PX, 3), np.float32)
+    picture[:] = _any_colour(rng)
     for _ in range(rng.integers(3, 16)):
         _draw_shape(rng, picture, _any_colour(rng))
     grain = rng.uniform(1.0, 8.0)
@@ -150,31 +144,25 @@ def _draw_clutter(rng: np.random.Generator) -> Picture:
 
 def _draw_shape(rng: np.random.Generator, picture: Picture, colour: np.ndarray) -> None:
     """An ellipse, a bar lit along its middle, or a polygon, drawn in place."""
-    """An ellipse, a bar lit along its middle, or a polygon, drawn in place."""
     center = rng.integers(0, BACKGROUND_PX, 2)
     size = rng.uniform(6.0, 90.0)
     match int(rng.integers(4)):
         case 0:
             axes = (round(size), round(size * rng.uniform(0.2, 1.0)))
-            angle_deg = float(rng.uniform(0, 180))
-            cv2.ellipse(
-                picture, center.tolist(), axes, angle_deg, 0, 360, colour.tolist(), -1, cv2.LINE_AA
-            )
+            arc = (center.tolist(), axes, float(rng.uniform(0, 180)), 0, 360)
+            cv2.ellipse(picture, *arc, colour.tolist(), -1, cv2.LINE_AA)
         case 1:
-            other = rng.integers(0, BACKGROUND_PX, 2)
+            ends = center.tolist(), rng.integers(0, BACKGROUND_PX, 2).tolist()
             width = int(rng.integers(1, 22))
-            cv2.line(picture, center.tolist(), other.tolist(), colour.tolist(), width, cv2.LINE_AA)
-            lit = (colour * 1.4).tolist()
-            cv2.line(picture, center.tolist(), other.tolist(), lit, max(1, width // 3), cv2.LINE_AA)
+            cv2.line(picture, *ends, colour.tolist(), width, cv2.LINE_AA)
+            cv2.line(picture, *ends, (colour * 1.4).tolist(), max(1, width // 3), cv2.LINE_AA)
         case _:
             angles = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 9)))
-            corners = center + size * np.column_stack([np.cos(angles), np.sin(angles)])
-            points = np.round(corners).astype(np.int32)
+            points = np.round(center + size * _direction(angles)).astype(np.int32)
             cv2.fillPoly(picture, [points], colour.tolist(), cv2.LINE_AA)
 
 
 def _draw_net(rng: np.random.Generator, picture: Picture) -> None:
-    """A net of slanted meshes, drawn in place."""
     """A net of slanted meshes, drawn in place."""
     mesh, width = int(rng.integers(10, 50)), int(rng.integers(1, 4))
     slope = int(rng.integers(-BACKGROUND_PX, BACKGROUND_PX))
@@ -186,7 +174,6 @@ def _draw_net(rng: np.random.Generator, picture: Picture) -> None:
 
 def _half_plane(rng: np.random.Generator) -> Layer:
     """1 on one side of a random, slightly wavy edge, 0 on the other."""
-    """1 on one side of a random, slightly wavy edge, 0 on the other."""
     y, x = np.mgrid[:BACKGROUND_PX, :BACKGROUND_PX] - BACKGROUND_PX / 2
     angle = rng.choice([0.0, np.pi / 2, rng.uniform(0, 2 * np.pi)])
     distance_px = x * np.cos(angle) + y * np.sin(angle) - rng.uniform(-80.0, 80.0)
@@ -195,7 +182,6 @@ def _half_plane(rng: np.random.Generator) -> Layer:
 
 
 def _draw_illumination(rng: np.random.Generator) -> Layer:
-    """Brightness factors that change linearly across the picture."""
     """Brightness factors that change linearly across the picture."""
     y, x = (np.mgrid[:BACKGROUND_PX, :BACKGROUND_PX] / BACKGROUND_PX - 0.5).astype(np.float32)
     slope = rng.normal(0.0, 0.35, 2)
@@ -210,17 +196,12 @@ def _water_colour(rng: np.random.Generator) -> np.ndarray:
 
 def _any_colour(rng: np.random.Generator) -> np.ndarray:
     """BGR of any hue; low saturations are more frequent."""
-    """BGR of any hue; low saturations are more frequent."""
     return _from_hsv(rng.uniform(0.0, 180.0), 255 * rng.beta(1.0, 1.8), rng.uniform(20.0, 240.0))
 
 
 def _from_hsv(hue: float, saturation: float, value: float) -> np.ndarray:
     pixel = np.array([[[hue, saturation, value]]]).astype(np.uint8)
     return cv2.cvtColor(pixel, cv2.COLOR_HSV2BGR)[0, 0].astype(np.float64)
-
-
-def _colour_map(heights: Layer, colours: np.ndarray, stops: list[float]) -> Picture:
-    return np.stack([np.interp(heights, stops, channel) for channel in colours.T], axis=-1)
 
 
 def _noise(rng: np.random.Generator, grain_x: float, grain_y: float) -> Layer:
@@ -249,7 +230,7 @@ def draw_occluders(rng: np.random.Generator) -> list[Occluder]:
 def draw_line(rng: np.random.Generator, start: Float[np.ndarray, "2"]) -> Occluder:
     """A fishing line from a point upwards, out of the picture; half of them with a hook."""
     angle = np.radians(rng.normal(-90.0, 12.0))
-    end = start + 3.0 * np.array([np.cos(angle), np.sin(angle)])
+    end = start + 3.0 * _direction(angle)
     width = rng.uniform(0.004, 0.02)
     bars = [_bar(start, end, width, width)]
     if rng.random() < 0.5:
@@ -313,7 +294,8 @@ def _draw_glove(rng: np.random.Generator) -> Occluder:
     angle = rng.uniform(0.0, 2 * np.pi)
     size = rng.uniform(0.06, 0.16)
     polygons = [_bar(palm, palm + 3.0 * _direction(angle), 1.5 * size, 2.2 * size)]
-    polygons.append(_blob(rng, palm, size))
+    around = np.linspace(0.0, 2 * np.pi, 12, endpoint=False)
+    polygons.append(palm + size * rng.uniform(0.8, 1.2, 12)[:, None] * _direction(around))
     for spread in np.linspace(-0.9, 0.9, rng.integers(3, 6)):
         bend = angle + np.pi + spread + rng.normal(0.0, 0.1)
         tip = palm + rng.uniform(1.2, 2.4) * size * _direction(bend)
@@ -361,13 +343,13 @@ def _hook(
 ) -> list[Float[np.ndarray, "_ 2"]]:
     """A bent wire that begins at `at`, opposite to a bar that leaves at `angle`."""
     turns = angle + np.pi + np.linspace(-0.4, 2.6, 9) * rng.choice([-1.0, 1.0])
-    arc = radius * np.column_stack([np.cos(turns), np.sin(turns)])
+    arc = radius * _direction(turns)
     arc = arc - arc[0] + at
     return [_bar(a, b, width, width) for a, b in pairwise(arc)]
 
 
-def _direction(angle: float) -> Float[np.ndarray, "2"]:
-    return np.array([np.cos(angle), np.sin(angle)])
+def _direction(angle: float | Float[np.ndarray, "N"]) -> Float[np.ndarray, "*N 2"]:
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def _bar(
@@ -377,7 +359,7 @@ def _bar(
     along = (end - start) / (np.linalg.norm(end - start) + 1e-9)
     angle = np.arctan2(along[1], along[0])
     turns = angle + np.linspace(np.pi / 2, 3 * np.pi / 2, 7)
-    cap = np.column_stack([np.cos(turns), np.sin(turns)])
+    cap = _direction(turns)
     return np.concatenate([start + width / 2 * cap, end - end_width / 2 * cap])
 
 
@@ -390,17 +372,9 @@ def _strip(
     return np.array([start + beside, end + beside, end - beside, start - beside])
 
 
-def _blob(rng: np.random.Generator, center: np.ndarray, size: float) -> Float[np.ndarray, "_ 2"]:
-    turns = np.linspace(0.0, 2 * np.pi, 12, endpoint=False)
-    radii = size * rng.uniform(0.8, 1.2, 12)[:, None]
-    return center + radii * np.column_stack([np.cos(turns), np.sin(turns)])
-
-
 def _colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
     """BGR of wood, skin, steel, orange and blue gloves, or any other."""
-    known = np.array(
-        [[84, 122, 160], [130, 150, 200], [165, 168, 168], [30, 110, 230], [170, 110, 40]]
-    )
+    known = [[84, 122, 160], [130, 150, 200], [165, 168, 168], [30, 110, 230], [170, 110, 40]]
     if rng.random() < 0.6:
-        return known[rng.integers(len(known))] * rng.uniform(0.5, 1.2)
+        return np.array(known[rng.integers(len(known))]) * rng.uniform(0.5, 1.2)
     return rng.uniform(10.0, 245.0, 3)

@@ -1,11 +1,12 @@
-"""Train a U-Net: command, plots, checkpoints."""
+"""Train a U-Net, and write its scores and plots."""
 
 import json
 import threading
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from itertools import pairwise
+from functools import partial
+from itertools import count, pairwise
 from pathlib import Path
 
 import cv2
@@ -45,14 +46,12 @@ def draw_training_curve(history: Sequence[EpochScores], path: Path) -> None:
         cv2.line(canvas, left, right, _GRID, 1)
         _write(canvas, f"{tenth / 10:.1f}", (8, left[1] + 4), _TEXT)
     highest = max((scores.loss for scores in history if scores.loss is not None), default=1.0)
+    losses = [None if s.loss is None else s.loss / highest for s in history]
     curves = {
         "mean IoU": ([s.iou for s in history], (180, 90, 0)),
         "10th percentile of IoU": ([s.iou_p10 for s in history], (220, 170, 90)),
         "heads found at the head": ([s.ends_right for s in history], (60, 140, 30)),
-        f"loss / {highest:.2f}": (
-            [None if s.loss is None else s.loss / highest for s in history],
-            (90, 90, 200),
-        ),
+        f"loss / {highest:.2f}": (losses, (90, 90, 200)),
     }
     for index, (name, (values, colour)) in enumerate(curves.items()):
         steps = max(len(values) - 1, 1)
@@ -204,72 +203,55 @@ def _prepare(request: TrainRequest) -> UNetTrainer:
 
 
 def _sources(request: TrainRequest, observer: TrainObserver) -> tuple[Draw, Draw]:
-    """The functions that draw training and validation examples."""
+    """The functions that draw training and validation examples; worker processes unpickle them."""
     if request.images is None or request.masks is None:
-        simulated = _SimulatedSource(_bank(request, observer))
-        return simulated, _SimulatedSource(_bank(request, observer, is_validation=True))
+        simulated = partial(draw_sample, bank=_bank(request, observer))
+        return simulated, partial(draw_sample, bank=_bank(request, observer, is_validation=True))
     training, validation = load_fish_cutouts(request.images, request.masks)
     bank = _bank(request, observer).with_photographs(
         [cutout_patch(one) for one in training],
         load_backgrounds(request.backgrounds) if request.backgrounds is not None else [],
     )
-    mixed = _MixedSource(_SimulatedSource(bank), training, request.settings.own_share)
-    return mixed, _AnnotatedSource(validation)
+    share = request.settings.own_share
+    mixed = partial(_draw_mixed, bank=bank, cutouts=training, own_share=share)
+    return mixed, partial(_draw_annotated, cutouts=validation)
 
 
 def _bank(
     request: TrainRequest, observer: TrainObserver, *, is_validation: bool = False
 ) -> PatchBank:
     settings = request.settings
-    counts = (settings.bank_fish, settings.bank_backgrounds)
-    num_fish, num_backgrounds = (
-        (max(1, n // _VALIDATION_BANK_DIVISOR) for n in counts) if is_validation else counts
-    )
-    done = 0
-
-    def progress() -> None:
-        nonlocal done
-        done += 1
-        observer.patches_drawn(done, num_fish + num_backgrounds)
-
+    divisor = _VALIDATION_BANK_DIVISOR if is_validation else 1
+    num_fish = max(1, settings.bank_fish // divisor)
+    num_backgrounds = max(1, settings.bank_backgrounds // divisor)
+    done = count(1)
     return load_or_make_bank(
         request.out / "cache",
         num_fish=num_fish,
         num_backgrounds=num_backgrounds,
         seed=settings.seed + is_validation,
-        progress=progress,
+        progress=lambda: observer.patches_drawn(next(done), num_fish + num_backgrounds),
     )
 
 
-@dataclass(frozen=True)
-class _SimulatedSource:
-    """A class, not a closure: worker processes receive it pickled."""
-
-    bank: PatchBank
-
-    def __call__(self, rng: np.random.Generator, size_px: int) -> TrainingSample:
-        return draw_sample(rng, self.bank, size_px=size_px)
+def _draw_annotated(
+    rng: np.random.Generator, size_px: int, *, cutouts: Sequence[Cutout]
+) -> TrainingSample:
+    cutout = cutouts[int(rng.integers(len(cutouts)))]
+    return draw_annotated_sample(rng, cutout, size_px=size_px)
 
 
-@dataclass(frozen=True)
-class _AnnotatedSource:
-    cutouts: Sequence[Cutout]
-
-    def __call__(self, rng: np.random.Generator, size_px: int) -> TrainingSample:
-        cutout = self.cutouts[int(rng.integers(len(self.cutouts)))]
-        return draw_annotated_sample(rng, cutout, size_px=size_px)
-
-
-@dataclass(frozen=True)
-class _MixedSource:
-    simulated: _SimulatedSource
-    cutouts: Sequence[Cutout]
-    own_share: float
-
-    def __call__(self, rng: np.random.Generator, size_px: int) -> TrainingSample:
-        is_own = rng.random() < self.own_share
-        source = _AnnotatedSource(self.cutouts) if is_own else self.simulated
-        return source(rng, size_px)
+def _draw_mixed(
+    rng: np.random.Generator,
+    size_px: int,
+    *,
+    bank: PatchBank,
+    cutouts: Sequence[Cutout],
+    own_share: float,
+) -> TrainingSample:
+    if rng.random() < own_share:
+        return _draw_annotated(rng, size_px, cutouts=cutouts)
+    return draw_sample(rng, size_px, bank=bank)
 
 
 def _write_report(

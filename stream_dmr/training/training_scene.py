@@ -59,7 +59,7 @@ class SceneFish:
     scene_from_patch: Float[np.ndarray, "2 3"]
     gain: Float[np.ndarray, "3"]  # factors on B, G, R
     tint: Float[np.ndarray, "4"]  # B, G, R of a colour, and the fraction of it that is mixed in
-    fade: "Fade | None" = None
+    fade: Fade | None = None
 
     def to_scene(self, patch_px: Float[np.ndarray, "*N 2"]) -> Float[np.ndarray, "*N 2"]:
         """Points of the fish's patch, in px, as points of the scene."""
@@ -209,7 +209,9 @@ def render_scene(
         covered, tones = draw_into(occluder, crop_from_scene, size=size_px)
         if occluder.hides:
             mask *= 1 - covered
-        tone = tones[..., None] * _draw_texture(rng, bank, size_px)
+        grey = _draw_backdrop(rng, bank, size_px).mean(axis=2, keepdims=True)
+        texture = grey / max(float(grey.mean()), 1.0) - 1
+        tone = tones[..., None] * (1 + np.float32(rng.uniform(0.0, 0.4)) * texture)
         picture += covered[..., None] * (tone * occluder.colour.astype(np.float32) - picture)
     inside = frame_coverage(scene.frame, crop_from_scene, size=size_px)
     pixels = simulate_camera(rng, add_weather(rng, picture))
@@ -254,7 +256,7 @@ def cast_shadow(
 ) -> Float32[np.ndarray, "S S"]:
     """The fraction of the light that is missing in each pixel."""
     shift = np.column_stack([np.eye(2), shadow.offset_px])
-    moved = cv2.warpAffine(coverage, shift, coverage.shape[::-1], flags=cv2.INTER_LINEAR)
+    moved = cv2.warpAffine(coverage, shift, coverage.shape[::-1])
     return np.float32(shadow.strength) * cv2.GaussianBlur(moved, (0, 0), shadow.blur_px)
 
 
@@ -268,7 +270,7 @@ def warp_fish(
         patch = cv2.resize(patch, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         linear, shift = 2 * linear, shift + linear @ np.array([0.5, 0.5])
     affine = np.column_stack([linear, shift])
-    layer = cv2.warpAffine(patch, affine, (size, size), flags=cv2.INTER_LINEAR).astype(np.float32)
+    layer = cv2.warpAffine(patch, affine, (size, size)).astype(np.float32)
     layer[..., 3] /= 255
     tint = fish.tint.astype(np.float32)
     own = layer[..., :3] * fish.gain.astype(np.float32)
@@ -294,9 +296,7 @@ def _draw_backdrop(
     affine = cv2.getRotationMatrix2D((half, half), angle_deg, np.exp(rng.normal(-0.15, 0.45)))
     affine[:, 2] += size_px / 2 - half + rng.uniform(-60.0, 60.0, 2)
     size = (size_px, size_px)
-    piece = cv2.warpAffine(
-        background, affine, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
-    )
+    piece = cv2.warpAffine(background, affine, size, borderMode=cv2.BORDER_REFLECT)
     return piece.astype(np.float32)
 
 
@@ -316,11 +316,3 @@ def recolour_backdrop(
     colour = cv2.blur(fish[..., :3], (3, 3))[rows[place], columns[place]]
     factor = (colour + 4) / (backdrop.mean(axis=(0, 1)) + 4)
     return np.clip(backdrop * factor ** np.float32(rng.uniform(0.6, 1.0)), 0, 255)
-
-
-def _draw_texture(
-    rng: np.random.Generator, bank: PatchBank, size_px: int
-) -> Float32[np.ndarray, "S S 1"]:
-    """Factors around 1, from the grey levels of a background."""
-    grey = _draw_backdrop(rng, bank, size_px).mean(axis=2, keepdims=True)
-    return 1 + np.float32(rng.uniform(0.0, 0.4)) * (grey / max(float(grey.mean()), 1.0) - 1)

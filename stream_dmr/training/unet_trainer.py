@@ -80,9 +80,7 @@ def mask_iou(logits: Float[Tensor, "B S S"], masks: Float[Tensor, "B S S"]) -> F
     """Intersection over union of each pair of masks, at probability 0.5; 1 where both are empty."""
     found, true = logits > 0, masks > 0.5
     both, either = (found & true).sum(dim=(1, 2)), (found | true).sum(dim=(1, 2))
-    return torch.where(
-        either > 0, both / either.clamp(min=1), torch.ones_like(both, dtype=torch.float32)
-    )
+    return torch.where(either > 0, both / either.clamp(min=1), 1.0)
 
 
 def ends_are_right(
@@ -216,7 +214,22 @@ class UNetTrainer:
             iou_p10=float(self.ious.quantile(0.1)),
             ends_right=right,
         )
-        self._keep(scores)
+        self.history.append(scores)
+        if scores.iou > self.best:
+            self.best = scores.iou
+            network = self.averaged.module
+            assert isinstance(network, UNet)
+            save_weights(network, self.out / "unet.pt")
+            export_unet(network, self.out / "unet.onnx")
+        state = {
+            "settings": self._identity(),
+            "network": self.network.state_dict(),
+            "averaged": self.averaged.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "history": [asdict(one) for one in self.history],
+        }
+        with replacing(self.out / "last.pt") as draft:  # a crash leaves the previous one
+            torch.save(state, draft)
         return scores
 
     @torch.no_grad()
@@ -268,24 +281,6 @@ class UNetTrainer:
         rise = min(1.0, (part + 1e-3) / _WARM_UP)
         for group in self.optimizer.param_groups:
             group["lr"] = peak * rise * 0.5 * (1 + math.cos(math.pi * min(1.0, part)))
-
-    def _keep(self, scores: EpochScores) -> None:
-        self.history.append(scores)
-        if scores.iou > self.best:
-            self.best = scores.iou
-            network = self.averaged.module
-            assert isinstance(network, UNet)
-            save_weights(network, self.out / "unet.pt")
-            export_unet(network, self.out / "unet.onnx")
-        state = {
-            "settings": self._identity(),
-            "network": self.network.state_dict(),
-            "averaged": self.averaged.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "history": [asdict(scores) for scores in self.history],
-        }
-        with replacing(self.out / "last.pt") as draft:  # a crash leaves the previous one
-            torch.save(state, draft)
 
     def _identity(self) -> dict[str, Any]:
         """The settings that a resumed run must share with the one before."""

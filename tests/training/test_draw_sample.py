@@ -20,7 +20,9 @@ def assert_equal(one: TrainingSample, other: TrainingSample):
 
 def test_equal_seeds_give_equal_pictures(bank):
     for seed in range(8):
-        one, other = (draw_sample(np.random.default_rng(seed), bank, size_px=192) for _ in range(2))
+        one, other = (
+            draw_sample(np.random.default_rng(seed), size_px=192, bank=bank) for _ in range(2)
+        )
         assert_equal(one, other)
     again = make_bank(num_fish=12, num_backgrounds=4, seed=5, progress=lambda: None)
     np.testing.assert_array_equal(again.fish, bank.fish)
@@ -29,7 +31,7 @@ def test_equal_seeds_give_equal_pictures(bank):
 def test_boxes_fit_their_fish(bank):
     shares, extents = [], []
     for seed in range(150):
-        sample = draw_sample(np.random.default_rng((1, seed)), bank, size_px=128)
+        sample = draw_sample(np.random.default_rng((1, seed)), size_px=128, bank=bank)
         assert 0 <= sample.mask.min() <= sample.mask.max() <= 1 + 1e-6
         if sample.in_box.min() == 1 or sample.mask.sum() < 50:
             continue  # no box is given, or next to nothing is seen
@@ -45,7 +47,7 @@ def test_boxes_fit_their_fish(bank):
 def test_heads_and_tails_lie_at_the_ends_of_their_fish(bank):
     distances = []
     for seed in range(80):
-        sample = draw_sample(np.random.default_rng((2, seed)), bank, size_px=128)
+        sample = draw_sample(np.random.default_rng((2, seed)), size_px=128, bank=bank)
         if sample.ends_px is None:
             assert sample.in_box.min() == 1 or not sample.mask.any()  # no box, or no fish in it
             continue
