@@ -91,8 +91,7 @@ def _add_field(message: DescriptorProto, label: str, kind: str, name: str, numbe
 
 @cache
 def _file_descriptor() -> FileDescriptorProto:
-    text = (files("stream_dmr.recording") / "messages.proto").read_text(encoding="utf-8")
-    return parse_proto(text)
+    return parse_proto((files("stream_dmr.recording") / "messages.proto").read_text("utf-8"))
 
 
 @cache
@@ -126,16 +125,12 @@ def compress(
     """A BGR picture as "png" (exact), "jpeg", or "reference" (only its size and checksum)."""
     if format == "reference":
         return _picture(format, image, b"", crc32=checksum(image))
-    return _picture(format, image, _encoded(image, format, jpeg_quality))
-
-
-def _encoded(image: UInt8[np.ndarray, "H W 3"], format: Format, jpeg_quality: int) -> bytes:
     if format == "jpeg":
         parameters = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
     else:
         # Level 1: on sensor noise higher levels take many times as long and save 2 %.
         parameters = [cv2.IMWRITE_PNG_COMPRESSION, 1]
-    return cv2.imencode(f".{format}", image, parameters)[1].tobytes()
+    return _picture(format, image, cv2.imencode(f".{format}", image, parameters)[1].tobytes())
 
 
 def compress_mask(mask: Bool[np.ndarray, "H W"]) -> EncodedPicture:

@@ -180,8 +180,7 @@ class FrameLookup:
             if found.image.size == 0 and self._source is not None:
                 missing.append((message, payload))  # a folder is read from its start
                 continue
-            is_original = has_original_pixels(found, payload)
-            yield FoundFrame(frame=found, is_original=is_original)
+            yield FoundFrame(frame=found, is_original=has_original_pixels(found, payload))
         yield from self._of_source(missing)
 
     def close(self) -> None:
@@ -210,5 +209,4 @@ class FrameLookup:
                     found = pictures.restore(frame, payload)
                 except SourceError:  # another file of the same name
                     found = frame
-                is_original = has_original_pixels(found, payload)
-                yield FoundFrame(frame=found, is_original=is_original)
+                yield FoundFrame(frame=found, is_original=has_original_pixels(found, payload))

@@ -4,7 +4,7 @@ import os
 import platform
 import shlex
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
@@ -89,7 +89,11 @@ class RunInputs:
         None where it is no `stream-dmr run` or names no source.
         """
         try:
-            words = [part for word in shlex.split(command) for part in _option_and_value(word)]
+            words = [
+                part  # --option=value is two words
+                for word in shlex.split(command)
+                for part in word.split("=", 1 if word.startswith("--") else 0)
+            ]
         except ValueError:  # not as a shell would read it
             return None
         names = {f"--{field.name}": field.name for field in fields(cls)}
@@ -113,11 +117,6 @@ def content_sha256(path: Path) -> str:
         raise SourceError(
             f"{error.filename}: expected a file that can be read, got: {error.strerror}"
         ) from error
-
-
-def _option_and_value(word: str) -> list[str]:
-    """`--option=value` as two words."""
-    return word.split("=", 1) if word.startswith("--") else [word]
 
 
 @cache
@@ -183,11 +182,13 @@ class RunHeader:
     def metadata(self) -> dict[str, str]:
         """The metadata record `run`: the inputs, and the versions of what wrote the recording."""
         given = {} if self.inputs is None else self.inputs.metadata()
+        if self.runs:  # such as: 0 0, 1400 7
+            runs = (f"{run.frames_before} {run.tracks_before}" for run in self.runs)
+            given["runs"] = ", ".join(runs)
         return {
             "source": self.source,
             "command": self.command,
             **given,
-            **({"runs": _runs_text(self.runs)} if self.runs else {}),
             "codec_version": str(CODEC_VERSION),
             "attachments_crc32": str(self.checksum),
             "stream_dmr": __version__,
@@ -215,6 +216,7 @@ class RunHeader:
         Raises KeyError where a part is missing, RecordingError where one is damaged.
         """
         calibration, shapes = attachments.get("calibration.pb"), attachments.get("shapes.pb")
+        runs = [run.split() for run in metadata.get("runs", "").split(",") if run]
         header = cls(
             source=metadata["source"],
             command=metadata["command"],
@@ -224,7 +226,7 @@ class RunHeader:
             calibration=None if calibration is None else decode(Calibration, calibration),
             calibration_file=attachments.get("calibration.yaml", b""),
             inputs=RunInputs.from_metadata(metadata),
-            runs=_runs_in(metadata.get("runs", "")),
+            runs=tuple(RunStart(frames_before=int(f), tracks_before=int(t)) for f, t in runs),
         )
         recorded = metadata.get("attachments_crc32")  # the first recordings have none
         if recorded is not None and recorded != str(_checksum(attachments)):
@@ -236,16 +238,6 @@ def joined_runs(headers: Iterable[RunHeader]) -> tuple[RunStart, ...]:
     """The runs of several segments, each once, by their frames."""
     runs = {run for header in headers for run in header.runs}
     return tuple(sorted(runs, key=lambda run: (run.frames_before, run.tracks_before)))
-
-
-def _runs_text(runs: Sequence[RunStart]) -> str:
-    """Such as: 0 0, 1400 7."""
-    return ", ".join(f"{run.frames_before} {run.tracks_before}" for run in runs)
-
-
-def _runs_in(text: str) -> tuple[RunStart, ...]:
-    pairs = [part.split() for part in text.split(",") if part]
-    return tuple(RunStart(frames_before=int(f), tracks_before=int(t)) for f, t in pairs)
 
 
 def _checksum(attachments: Mapping[str, bytes]) -> int:

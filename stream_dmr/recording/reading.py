@@ -3,6 +3,7 @@
 import tomllib
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -126,16 +127,14 @@ class _Segments:
     def payloads(
         self, kinds: MessageTypes, selection: Selection = EVERYTHING
     ) -> Iterator[tuple[type[Message], bytes]]:
-        for segment in self._segments:
-            yield from segment.payloads(kinds, selection)
+        return chain.from_iterable(one.payloads(kinds, selection) for one in self._segments)
 
     def carried_over(self) -> Iterator[bytes]:
         """What the first segment took over: the others continue it."""
         return self._segments[0].carried_over()
 
     def video(self, selection: Selection = EVERYTHING) -> Iterator[bytes]:
-        for segment in self._segments:
-            yield from segment.video(selection)
+        return chain.from_iterable(segment.video(selection) for segment in self._segments)
 
 
 def require_messages(recording: Recording) -> None:
@@ -149,7 +148,8 @@ def require_selected(recording: Recording, selection: Selection) -> None:
     """Raise UserError where a recording has no frame of the selected time, or lacks a fish."""
     require_time(recording, selection)
     if selection.tracks is not None:
-        require_tracks(selection, localized_tracks(recording, selection))
+        fish = messages_of(recording, LocalizedFish, selection)
+        require_tracks(selection, {one.track_id for one in fish})
 
 
 def require_time(recording: Recording, selection: Selection) -> None:
@@ -182,10 +182,6 @@ def require_frame(recording: Recording, frame_index: int, selection: Selection) 
         raise UserError(
             f"--frame {frame_index}: expected a frame of the recording{spans}, got none"
         )
-
-
-def localized_tracks(recording: Recording, selection: Selection) -> set[int]:
-    return {fish.track_id for fish in messages_of(recording, LocalizedFish, selection)}
 
 
 def learnt_shapes(recording: Recording) -> list[LearntShapes]:

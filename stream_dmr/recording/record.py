@@ -70,24 +70,17 @@ def as_recorded(message: Message, settings: RecordingSettings) -> Message:
 
 def _record_frame(frame: Frame, settings: RecordingSettings) -> Record:
     """A frame by reference or with a picture for viewing keeps its own pixels in the run."""
+    if settings.frames != "jpeg" or settings.keeps_crops:
+        return Record(message=frame, whole=frame, encoding=partial(_encode_frame, frame, settings))
+    picture = compress(frame.image, format="jpeg", jpeg_quality=settings.jpeg_quality)
+    decoded = replace(frame, image=decompress(picture))
+    return Record(message=decoded, whole=frame, encoding=partial(encode, decoded, picture=picture))
+
+
+def _encode_frame(frame: Frame, settings: RecordingSettings) -> bytes:
     if settings.frames != "jpeg":
-        encoding = partial(_encode_by_reference, frame)
-    elif settings.keeps_crops:
-        encoding = partial(_encode_for_viewing, frame, settings.jpeg_quality)
-    else:
-        picture = compress(frame.image, format="jpeg", jpeg_quality=settings.jpeg_quality)
-        decoded = replace(frame, image=decompress(picture))
-        encoding = partial(encode, decoded, picture=picture)
-        return Record(message=decoded, whole=frame, encoding=encoding)
-    return Record(message=frame, whole=frame, encoding=encoding)
-
-
-def _encode_by_reference(frame: Frame) -> bytes:
-    return encode(frame, picture=compress(frame.image, format="reference"))
-
-
-def _encode_for_viewing(frame: Frame, jpeg_quality: int) -> bytes:
-    picture = compress(frame.image, format="jpeg", jpeg_quality=jpeg_quality)
+        return encode(frame, picture=compress(frame.image, format="reference"))
+    picture = compress(frame.image, format="jpeg", jpeg_quality=settings.jpeg_quality)
     return encode(frame, picture=replace(picture, crc32=checksum(frame.image)))
 
 
@@ -155,14 +148,10 @@ class SinkStates:
         """An output was written to, or was refused with `error`."""
         with self._lock:
             state, is_failing = self._states.get(name), bool(error)
-            if state is None or state.is_failing != is_failing:
-                last_error = "" if state is None else state.last_error
-                state = SinkState(
-                    name=name,
-                    is_failing=is_failing,
-                    since_ns=time.time_ns(),
-                    last_error=last_error,
-                )
+            if state is None:
+                state = SinkState(name=name, is_failing=is_failing, since_ns=time.time_ns())
+            elif state.is_failing != is_failing:
+                state = replace(state, is_failing=is_failing, since_ns=time.time_ns())
             self._states[name] = replace(state, last_error=error) if error else state
 
     def all(self) -> list[SinkState]:

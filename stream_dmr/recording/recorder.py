@@ -144,14 +144,12 @@ class Recorder:
         """
         if not self._is_open:
             raise ValueError("the recorder is closed")
-        settings = self._of_photographs if self._is_photograph(message) else self._settings
+        settings, chooser = self._settings, self._chooser
+        if chooser is not None and isinstance(message, FishCrop) and chooser.takes(message):
+            settings = self._of_photographs
         record = make_record(message, settings)
         self.put(record)
         return record.message
-
-    def _is_photograph(self, message: Message) -> bool:
-        chooser = self._chooser
-        return chooser is not None and isinstance(message, FishCrop) and chooser.takes(message)
 
     def put(self, record: Record) -> None:
         """Record a message that is encoded already."""

@@ -65,28 +65,28 @@ class Retention:
             return
         done: Counter[str] = Counter()
         steps = self._steps()
-        while self._is_short() and not self._stop.is_set() and (step := next(steps, None)):
+        while free_bytes(self._folder) < self._free_bytes and not self._stop.is_set():
+            if (step := next(steps, None)) is None:
+                break
             done[step] += 1
         if done:
             what = ", ".join(f"{step} of {count}" for step, count in done.items())
-            gigabytes = self._free_bytes / 1e9
-            self._on_notice(
-                f"less than {gigabytes:g} GB were free, so the oldest recordings went: {what}"
-            )
+            wanted = f"{self._free_bytes / 1e9:g} GB"
+            self._on_notice(f"less than {wanted} were free, so the oldest recordings went: {what}")
 
     def _watch(self) -> None:
         while not self._stop.wait(_PERIOD_S):
             with suppress(OSError, OutputError):  # measuring goes on
                 self.free_space()
 
-    def _is_short(self) -> bool:
-        return free_bytes(self._folder) < self._free_bytes
-
     def _steps(self) -> Iterator[str]:
         """Delete one thing at a time, and yield its name for the notice."""
         for table in rotated_files(self._folder / "frames.csv"):
             yield from self._remove(table, "the table of frames")
-        stems, flagged = self._finished_stems(), set(self._flagged())
+        recordings = [*self._folder.glob(f"{STEM}-*.mcap"), *self._folder.glob(f"{STEM}-*.rrd")]
+        stems = {path.with_suffix("") for path in recordings}
+        stems = sorted((stem for stem in stems if not _is_open(stem)), key=natural_order)
+        flagged = set(self._flagged())
         has_flagged = {stem: bool(flagged & set(self._facts(stem)[0])) for stem in stems}
         for flag in (False, True):
             group = [stem for stem in stems if has_flagged[stem] is flag]
@@ -95,12 +95,6 @@ class Retention:
                 yield from self._thin(stem.with_suffix(".mcap"))
             for stem in group:
                 yield from self._remove(stem.with_suffix(".mcap"), "all")
-
-    def _finished_stems(self) -> list[Path]:
-        """Segments that are not being written, the oldest first, without suffix."""
-        recordings = [*self._folder.glob(f"{STEM}-*.mcap"), *self._folder.glob(f"{STEM}-*.rrd")]
-        stems = {path.with_suffix("") for path in recordings}
-        return sorted((stem for stem in stems if not _is_open(stem)), key=natural_order)
 
     def _facts(self, stem: Path) -> tuple[Collection[int], bool]:
         """The track ids of a segment, and True where its pictures and masks are gone."""
@@ -133,9 +127,8 @@ class Retention:
 
 def _is_open(stem: Path) -> bool:
     rrd = stem.with_suffix(".rrd")
-    return stem.with_name(f"{stem.name}.mcap{PART}").exists() or (
-        rrd.exists() and not is_closed(rrd)
-    )
+    has_part = stem.with_name(f"{stem.name}.mcap{PART}").exists()
+    return has_part or (rrd.exists() and not is_closed(rrd))
 
 
 class _Thinning:

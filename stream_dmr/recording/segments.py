@@ -322,24 +322,23 @@ class RotatingSink:
         """Cut before this frame if it is time; complete the segment before an earlier cut."""
         now_ns = self._files.now_ns = frame.timestamp_ns
         if self._open and self._files.is_disk_full:
-            self._stop_recording()
+            self._complete()  # and close what is open while there is room for its end
+            self._files.close(self._open)
+            self._files.refuse_for_room()
         if self._cut_ns is not None:
             self._frames_since_cut += 1
             if self._frames_since_cut >= _MAX_IN_FLIGHT:
                 self._complete()
         elif self._began_ns is None:
             self._began_ns = now_ns
-        elif self._files.may_try and self._is_due(now_ns - self._began_ns):
-            self._next = self._open_next()
-            if self._next:
-                self._cut_ns, self._frames_since_cut = now_ns, 0
-
-    def _is_due(self, age_ns: int) -> bool:
-        """True where the segment is long or large enough, or lacks a file that the disk refused."""
-        size = sum(sink.size for sink in self._open if isinstance(sink, McapSink))
-        is_long = age_ns >= self._settings.segment_s * 1e9
-        lacks_file = len(self._open) < self._settings.mcap + self._settings.rrd
-        return is_long or size >= self._settings.segment_mb * 1e6 or lacks_file
+        elif self._files.may_try:
+            size = sum(sink.size for sink in self._open if isinstance(sink, McapSink))
+            is_long = now_ns - self._began_ns >= self._settings.segment_s * 1e9
+            lacks_file = len(self._open) < self._settings.mcap + self._settings.rrd  # refused
+            if is_long or size >= self._settings.segment_mb * 1e6 or lacks_file:
+                self._next = self._open_next()
+                self._cut_ns = now_ns if self._next else None
+                self._frames_since_cut = 0
 
     def _open_next(self) -> list[FileSink]:
         sinks = self._files.open_next()
@@ -361,12 +360,6 @@ class RotatingSink:
         for record in self._ahead:
             self._open_tracks.add(record)
         self._ahead.clear()
-
-    def _stop_recording(self) -> None:
-        """Close what is open while there is room for its end."""
-        self._complete()
-        self._files.close(self._open)
-        self._files.refuse_for_room()
 
     def _carry_over_to(self, sinks: list[FileSink]) -> None:
         def carry_over(sink: FileSink) -> None:

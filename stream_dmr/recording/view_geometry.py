@@ -13,7 +13,7 @@ from stream_dmr.camera import frame_from_crop
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.shape.space import reshaped
-from stream_dmr.fitting.solver.spine import KINDS, Kind, deform
+from stream_dmr.fitting.solver.spine import KINDS, deform
 from stream_dmr.geometry import arc_length
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, Frame, LocalizedFish
 from stream_dmr.template.template import Template
@@ -65,9 +65,7 @@ class MeshRebuilder:
     """Deforms the template of a recording, or its candidate shapes, by recorded parameters."""
 
     def __init__(self, template: Template, candidates: CandidateShapes | None) -> None:
-        shapes = (
-            [] if candidates is None else [reshaped(template, c.coefficients) for c in candidates]
-        )
+        shapes = [reshaped(template, c.coefficients) for c in candidates or ()]
         self._bodies = [Body.from_template(shape) for shape in shapes or [template]]
 
     def with_vertices(self, fit: FittedMesh) -> FittedMesh:
@@ -75,15 +73,12 @@ class MeshRebuilder:
         shape, report = fit.shape, fit.report
         if shape is None or report is None or shape.vertices is not None:
             return fit
-        return replace(fit, shape=self._deformed(shape, KINDS[report.deformation]))
-
-    def _deformed(self, shape: FittedShape, kind: Kind) -> FittedShape:
         body = self._bodies[shape.candidate or 0]
-        points = deform(body, kind, shape.parameters)
+        points = deform(body, KINDS[report.deformation], shape.parameters)
         v = body.num_vertices
         # The recorded keypoints say where the fit stands along the viewing ray of its crop.
         offset = (shape.keypoints - points[v : v + 3]).mean(axis=0)
-        return replace(shape, vertices=points[:v] + offset)
+        return replace(fit, shape=replace(shape, vertices=points[:v] + offset))
 
 
 # RGB after Okabe and Ito, "Color Universal Design" (2008): distinct also for the colour-blind.

@@ -3,7 +3,7 @@
 Lengths are in metres there, and in body lengths without a calibration.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from stream_dmr.camera import Calibration, Camera
+from stream_dmr.camera import Calibration
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, Frame, LocalizedFish, Position
 from stream_dmr.recording.codec import compress
 from stream_dmr.recording.header import RunHeader
@@ -66,7 +66,9 @@ class FoxgloveTopics:
             if self._throttle.shows(message):
                 yield from self._frame(message)
         elif isinstance(message, Position):
-            yield "/foxglove/position", _location(message)
+            place = LocationFix(timestamp=_time(max(0, message.timestamp_ns)), frame_id=_CAMERA)
+            place.latitude, place.longitude = message.latitude, message.longitude
+            yield "/foxglove/position", place
         elif not self._throttle.has_shown(message.frame_index):
             return
         elif isinstance(message, FishCrop):
@@ -86,10 +88,8 @@ class FoxgloveTopics:
             yield "/foxglove/plane", _plane(self._calibration, now)
         picture = shrink_by_halves(frame.image, most_px=self._most_px)
         jpeg = compress(picture, format="jpeg", jpeg_quality=_JPEG_QUALITY).data
-        yield (
-            "/foxglove/picture",
-            CompressedImage(timestamp=now, frame_id=_CAMERA, data=jpeg, format="jpeg"),
-        )
+        shown = CompressedImage(timestamp=now, frame_id=_CAMERA, data=jpeg, format="jpeg")
+        yield "/foxglove/picture", shown
 
     def _fish(self, fish: LocalizedFish) -> Iterator[tuple[str, Any]]:
         if fish.keypoints_px is not None:
@@ -122,12 +122,13 @@ class FoxgloveTopics:
         K = camera.K.copy()
         K[:2, 2] = (K[:2, 2] + 0.5) - 0.5 * factor  # pixel centres are integers on both sides
         K[:2] /= factor
+        model = "rational_polynomial" if len(camera.distortion) > 5 else "plumb_bob"
         return CameraCalibration(
             timestamp=now,
             frame_id=_CAMERA,
             width=camera.width // factor,
             height=camera.height // factor,
-            distortion_model=_distortion_model(camera),
+            distortion_model="kannala_brandt" if camera.is_fisheye else model,  # OpenCV's fisheye
             D=camera.distortion.tolist(),
             K=K.ravel().tolist(),
             R=np.eye(3).ravel().tolist(),
@@ -137,22 +138,6 @@ class FoxgloveTopics:
     def _in_view(self, pixels: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
         """Frame pixels as pixels of the shown picture; pixel centres are integers in both."""
         return (pixels + 0.5) / self._factor - 0.5
-
-
-def _distortion_model(camera: Camera) -> str:
-    """Foxglove's name; "kannala_brandt" is OpenCV's fisheye model."""
-    if camera.is_fisheye:
-        return "kannala_brandt"
-    return "rational_polynomial" if len(camera.distortion) > 5 else "plumb_bob"
-
-
-def _location(position: Position) -> LocationFix:
-    return LocationFix(
-        timestamp=_time(max(0, position.timestamp_ns)),
-        frame_id=_CAMERA,
-        latitude=position.latitude,
-        longitude=position.longitude,
-    )
 
 
 def _plane(calibration: Calibration, now: Timestamp) -> FrameTransform:
@@ -175,9 +160,8 @@ def _points(pixels: Float[np.ndarray, "N 2"], track_id: int) -> PointsAnnotation
 
 
 def _stamped(
-    annotations: Iterable[PointsAnnotation], fish: FishCrop | LocalizedFish
+    annotations: list[PointsAnnotation], fish: FishCrop | LocalizedFish
 ) -> list[PointsAnnotation]:
-    annotations = list(annotations)
     for annotation in annotations:
         annotation.timestamp.FromNanoseconds(fish.timestamp_ns)
     return annotations

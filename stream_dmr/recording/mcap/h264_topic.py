@@ -47,7 +47,11 @@ class H264Topic:
 
     def _encode(self, frame: Frame) -> bytes:
         # Measured: OpenCV's conversion takes a sixth of FFmpeg's time and loses less.
-        planes = cv2.cvtColor(_even(frame.image), cv2.COLOR_BGR2YUV_I420)
+        image, (height, width) = frame.image, frame.image.shape[:2]
+        if height % 2 or width % 2:
+            edges = (0, height % 2, 0, width % 2)
+            image = cv2.copyMakeBorder(image, *edges, cv2.BORDER_REPLICATE)
+        planes = cv2.cvtColor(image, cv2.COLOR_BGR2YUV_I420)
         picture = av.VideoFrame.from_ndarray(planes.astype(np.uint8, copy=False), format="yuv420p")
         size = (picture.width, picture.height)
         if self._context is None or (self._context.width, self._context.height) != size:
@@ -60,9 +64,7 @@ class H264Topic:
         return b"".join(bytes(packet) for packet in self._context.encode(picture))
 
 
-def decode_video(
-    samples: Iterable[bytes],
-) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
+def decode_video(samples: Iterable[bytes]) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
     """Capture times in ns and BGR pictures of CompressedVideo messages, from the first key frame.
 
     Raises RecordingError where one can't be decoded.
@@ -73,7 +75,8 @@ def decode_video(
     for sample in samples:
         try:
             video = CompressedVideo.FromString(sample)
-            has_begun = has_begun or _is_key_frame(video.data)
+            start = video.data.find(b"\0\0\1")
+            has_begun = has_begun or (start >= 0 and video.data[start + 3] & 0x1F == _SPS)
             if not has_begun:
                 continue
             (picture,) = context.decode(av.Packet(video.data))  # type: ignore[arg-type]
@@ -81,7 +84,8 @@ def decode_video(
             raise RecordingError(
                 f"expected an H.264 picture in the recording, found other bytes: {error}"
             ) from error
-        yield video.timestamp.ToNanoseconds(), _bgr(picture.to_ndarray(format="yuv420p"))
+        image = cv2.cvtColor(picture.to_ndarray(format="yuv420p"), cv2.COLOR_YUV2BGR_I420)
+        yield video.timestamp.ToNanoseconds(), image.astype(np.uint8, copy=False)
 
 
 def _encoder(picture: av.VideoFrame, crf: int) -> VideoCodecContext:
@@ -100,19 +104,3 @@ def _encoder(picture: av.VideoFrame, crf: int) -> VideoCodecContext:
         "x264-params": "scenecut=0:repeat-headers=1",
     }
     return context
-
-
-def _is_key_frame(access_unit: bytes) -> bool:
-    start = access_unit.find(b"\0\0\1")
-    return start >= 0 and access_unit[start + 3] & 0x1F == _SPS
-
-
-def _bgr(planes: np.ndarray) -> UInt8[np.ndarray, "H W 3"]:
-    return cv2.cvtColor(planes, cv2.COLOR_YUV2BGR_I420).astype(np.uint8, copy=False)
-
-
-def _even(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    height, width = image.shape[:2]
-    if height % 2 == width % 2 == 0:
-        return image
-    return cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)

@@ -134,7 +134,11 @@ class McapRecording:
     def _read_header(self) -> RunHeader:
         attachments: dict[str, bytes] = {}
         with self._open() as stream:
-            _require_mcap(stream)
+            if not MCAP0_MAGIC.startswith(stream.read(len(MCAP0_MAGIC))):  # torn ones do begin so
+                raise RecordingError(
+                    "expected a recording (.mcap or .rrd), got a file of another kind; give the "
+                    "folder of a run, or the recording in it"
+                )
             self.ends_early = _is_torn(stream)
             try:
                 for record in _records(stream, emit_chunks=True):
@@ -167,11 +171,7 @@ class McapRecording:
     @contextmanager
     def _open(self) -> Generator[IO[bytes]]:
         try:
-            if self._snapshot is not None:
-                with self._snapshot.open() as stream:
-                    yield stream
-                return
-            with self.path.open("rb") as stream:
+            with self._snapshot.open() if self._snapshot else self.path.open("rb") as stream:
                 yield stream
         except OSError as error:
             raise RecordingError(
@@ -198,16 +198,6 @@ def _snapshot(path: Path) -> Snapshot:
         raise RecordingError(
             f"{path}: expected a recording (.mcap or .rrd), got: {error.strerror}; check the path"
         ) from error
-
-
-def _require_mcap(stream: IO[bytes]) -> None:
-    """Raise RecordingError where a file doesn't begin as an .mcap does, torn ones included."""
-    if not MCAP0_MAGIC.startswith(stream.read(len(MCAP0_MAGIC))):
-        raise RecordingError(
-            "expected a recording (.mcap or .rrd), got a file of another kind; give the folder of "
-            "a run, or the recording in it"
-        )
-    stream.seek(0)
 
 
 def is_torn(path: Path) -> bool:

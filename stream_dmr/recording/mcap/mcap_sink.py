@@ -87,7 +87,13 @@ class McapSink:
             raise self._output_error(error) from error
         try:
             sync_path(path.parent)
-            self._writer = _start(self._file, header, segment_number)
+            self._writer = new_writer(self._file)
+            self._writer.add_metadata(RUN, header.metadata())
+            if segment_number is not None:
+                self._writer.add_metadata(SEGMENT, {"number": str(segment_number)})
+            for name, data in header.attachments().items():
+                media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/protobuf")
+                self._writer.add_attachment(0, 0, name, media_type, data)
             self._register_topics()
             self._flush()
         except OSError as error:
@@ -112,12 +118,14 @@ class McapSink:
         with self._closing_on_error():
             self._add(self._channels[type(record.message)], timestamp_ns, record.payload)
             if isinstance(record.message, FishMessage):
-                self._extend_span(record.message.track_id, timestamp_ns)
+                track_id = record.message.track_id
+                first, last = self._spans.get(track_id, (timestamp_ns, timestamp_ns))
+                self._spans[track_id] = min(first, timestamp_ns), max(last, timestamp_ns)
             for topic, drawn in chain.from_iterable(e.draw(record) for e in self._extras):
-                channel = self._extra_channels[topic]
-                self._add(channel, timestamp_ns, drawn.SerializeToString())
+                self._add(self._extra_channels[topic], timestamp_ns, drawn.SerializeToString())
             self._last_ns = max(self._last_ns, timestamp_ns)
-            if self._is_flush_due():
+            is_late = self._is_segment and self._last_ns >= self._flush_at_capture_ns
+            if is_late or time.monotonic_ns() >= self._flush_at_ns:
                 self._flush()
 
     def flush_due(self) -> None:
@@ -163,10 +171,6 @@ class McapSink:
         log_ns = max(0, timestamp_ns)  # a position before a video's start; MCAP has no time for it
         self._writer.add_message(channel, log_ns, data, log_ns, self._sequences[channel])
 
-    def _extend_span(self, track_id: int, timestamp_ns: int) -> None:
-        first, last = self._spans.get(track_id, (timestamp_ns, timestamp_ns))
-        self._spans[track_id] = min(first, timestamp_ns), max(last, timestamp_ns)
-
     def _register_topics(self) -> None:
         for kind, row in TOPICS.items():
             schema = self._writer.register_schema(row.schema, "protobuf", schema_bytes())
@@ -177,12 +181,7 @@ class McapSink:
                 )
         for topic, kind in chain.from_iterable(e.topics.items() for e in self._extras):
             schema = register_schema(self._writer, kind)
-            channel = self._writer.register_channel(topic, "protobuf", schema)
-            self._extra_channels[topic] = channel
-
-    def _is_flush_due(self) -> bool:
-        is_late = self._is_segment and self._last_ns >= self._flush_at_capture_ns
-        return is_late or time.monotonic_ns() >= self._flush_at_ns
+            self._extra_channels[topic] = self._writer.register_channel(topic, "protobuf", schema)
 
     def _flush(self) -> None:
         self._writer.flush()
@@ -228,15 +227,4 @@ def new_writer(file: TransactionalFile) -> Writer:
         enable_data_crcs=True,  # else metadata and attachments have no checksum
     )
     writer.start(profile="stream-dmr", library=f"stream-dmr {__version__}")
-    return writer
-
-
-def _start(file: TransactionalFile, header: RunHeader, segment_number: int | None) -> Writer:
-    writer = new_writer(file)
-    writer.add_metadata(RUN, header.metadata())
-    if segment_number is not None:
-        writer.add_metadata(SEGMENT, {"number": str(segment_number)})
-    for name, data in header.attachments().items():
-        media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/protobuf")
-        writer.add_attachment(0, 0, name, media_type, data)
     return writer

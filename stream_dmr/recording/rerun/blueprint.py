@@ -90,10 +90,8 @@ def blueprint(header: RunHeader) -> Layout:
             rrb.Horizontal(
                 rrb.Spatial2DView(origin=CAMERA, name="Frame: masks, outlines, keypoints"),
                 rrb.Tabs(
-                    _scene_view(
-                        calibration, "Fish", eye=_RELATIVE if calibration is None else _NEAR
-                    ),
-                    _scene_view(calibration, "Whole scene", eye=_FAR),
+                    _scene_view(calibration, "Fish", _RELATIVE if calibration is None else _NEAR),
+                    _scene_view(calibration, "Whole scene", _FAR),
                 ),
             ),
             rrb.Horizontal(
@@ -124,10 +122,7 @@ def _series(origin: str, name: str, *, axis_y: rrb.ScalarAxis | None = None) -> 
 
 
 def _scene_view(
-    calibration: Calibration | None,
-    name: str,
-    *,
-    eye: Float[np.ndarray, "2 3"],
+    calibration: Calibration | None, name: str, eye: Float[np.ndarray, "2 3"]
 ) -> rrb.Spatial3DView:
     """`eye` is the eye's position and target, in units of the fish's depth."""
     depth = NOMINAL_DEPTH if calibration is None else middle_mm(calibration)[2]
@@ -165,9 +160,8 @@ def log_plane(rec: rr.RecordingStream, calibration: Calibration) -> None:
     half = 0.6 * middle[2] * max(camera.width / camera.K[0, 0], camera.height / camera.K[1, 1])
     lines = _grid(plane.rotation.T @ (middle - plane.translation_mm), half)
     strips = lines @ plane.rotation.T + plane.translation_mm
-    rec.log(
-        PLANE, rr.LineStrips3D(strips, colors=[_GREY], radii=rr.Radius.ui_points(0.7)), static=True
-    )
+    grid = rr.LineStrips3D(strips, colors=[_GREY], radii=rr.Radius.ui_points(0.7))
+    rec.log(PLANE, grid, static=True)
 
 
 def middle_mm(calibration: Calibration) -> Float[np.ndarray, "3"]:
@@ -181,9 +175,8 @@ def middle_mm(calibration: Calibration) -> Float[np.ndarray, "3"]:
 
 def _grid(middle: Float[np.ndarray, "3"], half: float) -> Float[np.ndarray, "L 2 3"]:
     """Start and end of the lines of a square grid at world Z = 0, on multiples of its spacing."""
-    spacing = _GRID_MM * max(
-        1.0, np.ceil(half / _GRID_MM / 20)
-    )  # at most 40 lines in each direction
+    # At most 40 lines in each direction.
+    spacing = _GRID_MM * max(1.0, np.ceil(half / _GRID_MM / 20))
     count = int(np.ceil(half / spacing))
     center = np.round(middle[:2] / spacing) * spacing
     offsets = np.arange(-count, count + 1) * spacing

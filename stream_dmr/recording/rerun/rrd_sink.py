@@ -32,15 +32,6 @@ def new_stream(sink: Any, header: RunHeader) -> rr.RecordingStream:
     return rec
 
 
-def end_streams() -> None:
-    """End the threads of streams that are disconnected and that nobody holds any more.
-
-    Rerun does so at the next `rr.init` only, which a process that measures video after video, or
-    a camera's segments, never calls.
-    """
-    flush_and_cleanup_orphaned_recordings()
-
-
 _HEADER_ENTITY = ["messages", "header"]
 # One for so many of the .mcap, which is the record of truth: what is flushed together is sent in a
 # third of the time, and Rerun keeps some kilobytes of each piece until the file is closed.
@@ -62,14 +53,19 @@ class RrdSink:
         self._closed = False
         self._counts: dict[str, int] = {}  # rows of the header, by entity
         try:
-            _require_room(path)
+            with suppress(OSError):  # which Rerun reports
+                if free_bytes(path.parent) < _BEGIN_BYTES:  # it would wait for ever for its layout
+                    raise RuntimeError(os.strerror(errno.ENOSPC))
             self._rec = new_stream(rr.FileSink(str(path)), header)
         except RuntimeError as error:
             raise self._output_error(error) from error
         self._drawing = SceneDrawing(self._rec, header, settings)
         log_run(self._rec, header)
         if self._with_messages:
-            self._log_header(header)
+            parts = {"run.json": json.dumps(header.metadata()).encode(), **header.attachments()}
+            for name, data in parts.items():
+                self._log([*_HEADER_ENTITY, name], data)
+                self._counts["/".join(["", *_HEADER_ENTITY, name])] = 1
         self._flush()
 
     @property
@@ -92,28 +88,20 @@ class RrdSink:
         try:
             self._drawing.finish()
             if self._with_messages:
-                self._log_end()
+                # The number of messages, by which a reader knows when some are missing.
+                counts = {f"/{path}": n for path, n in self._drawing.num_payloads.items()}
+                self._log(END.split("/"), json.dumps(self._counts | counts).encode())
             self._flush()
         finally:
             self._rec.disconnect()
             del self._rec, self._drawing
-            end_streams()
-
-    def _log_header(self, header: RunHeader) -> None:
-        parts = {"run.json": json.dumps(header.metadata()).encode(), **header.attachments()}
-        for name, data in parts.items():
-            self._log([*_HEADER_ENTITY, name], data)
-            self._counts["/".join(["", *_HEADER_ENTITY, name])] = 1
-
-    def _log_end(self) -> None:
-        """Log the number of messages, by which a reader knows when some are missing."""
-        messages = {f"/{path}": count for path, count in self._drawing.num_payloads.items()}
-        self._log(END.split("/"), json.dumps(self._counts | messages).encode())
+            # End the threads of disconnected streams that nobody holds any more. Rerun does so only
+            # at the next `rr.init`, which many videos or segments in one process never call.
+            flush_and_cleanup_orphaned_recordings()
 
     def _log(self, path: Sequence[object], data: bytes) -> None:
-        self._rec.log(
-            [*path], rr.AnyValues(drop_untyped_nones=True, **payload_columns(data)), static=True
-        )
+        values = rr.AnyValues(drop_untyped_nones=True, **payload_columns(data))
+        self._rec.log([*path], values, static=True)
 
     def _flush(self) -> None:
         self._drawing.send()
@@ -130,13 +118,6 @@ class RrdSink:
             f"{self.path}: expected a file with room to write to, got: {error}; "
             "make room or choose another --out"
         )
-
-
-def _require_room(path: Path) -> None:
-    """Raise RuntimeError where a file can't be begun: Rerun would wait for ever for its layout."""
-    with suppress(OSError):  # which Rerun reports
-        if free_bytes(path.parent) < _BEGIN_BYTES:
-            raise RuntimeError(os.strerror(errno.ENOSPC))
 
 
 def log_run(rec: rr.RecordingStream, header: RunHeader) -> None:

@@ -80,11 +80,8 @@ class ColumnBuffer:
         for key in sorted(self._rows, key=lambda key: key[1] is not rr.Clear):
             path, archetype = key
             rows = self._rows[key]
-            columns = [
-                column
-                for name in rows[0]
-                for column in _column(archetype, name, [row[name] for row in rows])
-            ]
+            of_each = (_column(archetype, name, [row[name] for row in rows]) for name in rows[0])
+            columns = list(chain.from_iterable(of_each))
             self._rec.send_columns(path, indexes=_times(self._moments[key]), columns=columns)
         self._rows.clear()
         self._moments.clear()
@@ -101,15 +98,11 @@ def _column(archetype: Any, name: str, rows: Sequence[_Values]) -> rr.ComponentC
     if isinstance(rows[0], np.ndarray):
         values = np.concatenate(rows)
         if archetype is rr.AnyValues:  # which would split arrays into numbers
-            return archetype.columns(**{name: _lists(values, lengths)})
+            offsets = np.cumsum([0, *lengths], dtype=np.int32)
+            return archetype.columns(**{name: pa.ListArray.from_arrays(offsets, values)})
     else:
         values = list(chain.from_iterable(rows))
     return archetype.columns(**{name: values}).partition(lengths)
-
-
-def _lists(values: np.ndarray, lengths: Sequence[int]) -> pa.Array:
-    offsets = np.cumsum([0, *lengths], dtype=np.int32)
-    return pa.ListArray.from_arrays(offsets, values)
 
 
 def _times(moments: Sequence[tuple[int, int]]) -> list[rr.TimeColumn]:
@@ -183,9 +176,8 @@ class SceneDrawing:
         path = record.topic.payload
         number = np.array([self.num_payloads[path]], np.uint64)
         self.num_payloads[path] += 1
-        self._add(
-            path, rr.AnyValues, record.message, number=number, **payload_columns(record.payload)
-        )
+        columns = payload_columns(record.payload)
+        self._add(path, rr.AnyValues, record.message, number=number, **columns)
 
     def send(self) -> None:
         self._draw_masks()
@@ -231,7 +223,10 @@ class SceneDrawing:
     def _crop(self, crop: FishCrop) -> None:
         if self._factor is None:
             self._set_camera(crop.frame_camera, depth=NOMINAL_DEPTH)
-        self._log_appearance(crop.track_id)
+        if crop.track_id not in self._tracks:  # colours and names, once and static
+            self._tracks.add(crop.track_id)
+            for path, what in appearance(crop.track_id, self._faces).items():
+                self._rec.log(path.format(id=crop.track_id), what, static=True)
         if not self._throttle.has_shown(crop.frame_index):
             return
         self._boxes.put(crop, crop.bbox_xyxy_px)
@@ -282,12 +277,9 @@ class SceneDrawing:
     def _box(self, bbox_xyxy_px: Float[np.ndarray, "4"], fish: LocalizedFish) -> None:
         """Draw the box, labelled with the frame's length or reason."""
         low, high = self._in_view(bbox_xyxy_px.reshape(2, 2) - _HALF_PIXEL)
-        parts = {
-            "centers": (low + high)[None] / 2,
-            "half_sizes": (high - low)[None] / 2,
-            "labels": [f"fish {fish.track_id}: {_frame_result(fish)}"],
-        }
-        self._add(topics.BOX, rr.Boxes2D, fish, **parts)
+        labels = [f"fish {fish.track_id}: {_frame_result(fish)}"]
+        parts = {"centers": (low + high)[None] / 2, "half_sizes": (high - low)[None] / 2}
+        self._add(topics.BOX, rr.Boxes2D, fish, **parts, labels=labels)
 
     def _body(self, shape: FittedShape, fish: LocalizedFish) -> None:
         vertices, keypoints, midline = place_fit(shape, fish)
@@ -309,14 +301,6 @@ class SceneDrawing:
         if estimate.length_mm is not None and estimate.ci95_mm is not None:
             values = [estimate.length_mm, *estimate.ci95_mm]
             self._add(topics.LENGTH, rr.Scalars, estimate, scalars=values)
-
-    def _log_appearance(self, track_id: int) -> None:
-        """Log colours and names of a track, once and static."""
-        if track_id in self._tracks:
-            return
-        self._tracks.add(track_id)
-        for path, what in appearance(track_id, self._faces).items():
-            self._rec.log(path.format(id=track_id), what, static=True)
 
     def _event(
         self, path: str, estimate: LengthEstimate, text: str, level: rr.TextLogLevel
@@ -346,7 +330,6 @@ def _fish_result(estimate: LengthEstimate) -> str:
     frames = f"{estimate.frames_used} of {estimate.frames_seen} frames used"
     if estimate.length_mm is None:
         return f"no length ({estimate.status}), {frames}"
-    interval = ""
-    if estimate.ci95_mm is not None:
-        interval = " (95 %: {:.1f} to {:.1f})".format(*estimate.ci95_mm)
+    ci95_mm = estimate.ci95_mm
+    interval = "" if ci95_mm is None else f" (95 %: {ci95_mm[0]:.1f} to {ci95_mm[1]:.1f})"
     return f"{estimate.length_mm:.1f} mm{interval}, {frames}"

@@ -70,30 +70,20 @@ def screenshot(rrd: str, png: Path, *, frame_index: int) -> None:
 
     Needs a Vulkan driver; a software one does (Debian: mesa-vulkan-drivers). Takes some 5 seconds.
     """
-    with _headless() as viewer:
-        viewer.open([rrd])
-        _go_to(viewer, frame_index)
-        with writing_to(png):
-            png.write_bytes(_settled_picture(viewer))
-
-
-@contextmanager
-def _headless() -> Generator[ViewerClient]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     with _running(["--headless", "--hide-welcome-screen", "--port", str(port)]) as process:
-        _wait_for(process)
-        yield ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-
-
-def _wait_for(process: subprocess.Popen[str]) -> None:
-    """Wait until the viewer runs. Raises RecordingError where it doesn't."""
-    if not any("Headless viewer running" in line for line in process.stdout or ()):
-        raise RecordingError(
-            "expected a viewer without a screen, but it did not start; it needs a Vulkan driver, a "
-            "software one does (Debian: apt install mesa-vulkan-drivers)"
-        )
+        if not any("Headless viewer running" in line for line in process.stdout or ()):
+            raise RecordingError(
+                "expected a viewer without a screen, but it did not start; it needs a Vulkan "
+                "driver, a software one does (Debian: apt install mesa-vulkan-drivers)"
+            )
+        viewer = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+        viewer.open([rrd])
+        _go_to(viewer, frame_index)
+        with writing_to(png):
+            png.write_bytes(_settled_picture(viewer))
 
 
 def _go_to(viewer: ViewerClient, frame_index: int) -> None:
