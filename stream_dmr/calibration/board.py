@@ -131,7 +131,11 @@ def _find_boards(
             picture = read_grey(path)
             _refuse_other_size(picture, size, "the plane's picture is")
             found = _corners_or_refuse(picture, board)
-            _refuse_same_view(found, corners, diagonal_px=np.hypot(*size))
+            for name, other in corners.items():
+                here, there = found.shared_with(other)
+                gaps_px = np.linalg.norm(here - there, axis=1)
+                if len(here) and gaps_px.max() < _SAME_VIEW * np.hypot(*size):
+                    raise CalibrationError(f"almost the same view as {name.name}")
             corners[path] = found
         except CalibrationError as error:
             left_out.append(LeftOut(path=path, reason=_reason(error, path)))
@@ -168,15 +172,6 @@ def _refuse_other_size(
     height, width = picture.shape
     if (width, height) != size:
         raise CalibrationError(f"{width}x{height} px, another size: {other} {size[0]}x{size[1]}")
-
-
-def _refuse_same_view(
-    found: BoardCorners, others: dict[Path, BoardCorners], *, diagonal_px: float
-) -> None:
-    for path, other in others.items():
-        here, there = found.shared_with(other)
-        if len(here) and np.linalg.norm(here - there, axis=1).max() < _SAME_VIEW * diagonal_px:
-            raise CalibrationError(f"almost the same view as {path.name}")
 
 
 _FILM_DIAGONAL_MM = 43.27  # of a picture on 35 mm film, 36 x 24 mm

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from stream_dmr.calibration.calibration_values import CALIBRATE, read_values, require_lens
@@ -18,10 +17,8 @@ from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.errors import CalibrationError, OutputError
 
 _PLANE_KEYS = ("rvec", "tvec")
-_KEYS = (
-    *("image_width", "image_height", "camera_matrix", "distortion_coefficients"),
-    *_PLANE_KEYS,
-)
+_LENS_KEYS = ("image_width", "image_height", "camera_matrix", "distortion_coefficients")
+_KEYS = (*_LENS_KEYS, *_PLANE_KEYS)
 # Chosen: a plane seen at less than 3 degrees gives no usable depth; a plane nearer than 10 mm means
 # that tvec is in metres.
 _MIN_SLOPE = np.sin(np.radians(3.0))
@@ -52,7 +49,12 @@ def load_calibration(path: Path | str) -> Calibration:
     camera = lens_of(values, path).camera((0, 0))
     require_lens(camera, path)
     rvec, tvec = (read_array(values, key, shapes=[(3,)], path=path) for key in _PLANE_KEYS)
-    _check_rotation(rvec, path)
+    angle = float(np.linalg.norm(rvec))
+    if angle > _MAX_ANGLE:
+        raise CalibrationError(
+            f"{path}: rvec: expected a rotation of at most one turn, {2 * np.pi:.2f} radians, got "
+            f"{angle:.1f}; check that rvec is not in degrees, or {CALIBRATE}"
+        )
     plane = ReferencePlane(rotation=Rotation.from_rotvec(rvec).as_matrix(), translation_mm=tvec)
     _check_plane(camera, plane, path=path)
     return Calibration(camera=camera, plane=plane)
@@ -68,9 +70,8 @@ def save_calibration(path: Path | str, calibration: Calibration) -> None:
     camera, plane = calibration.camera, calibration.plane
     # cv2.Rodrigues takes the angle from its cosine, which loses half the digits of small angles.
     rvec = Rotation.from_matrix(plane.rotation).as_rotvec()[:, None]
-    storage = cv2.FileStorage(
-        ".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
-    )
+    flags = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
+    storage = cv2.FileStorage(".yaml", flags)
     storage.write("image_width", camera.width)
     storage.write("image_height", camera.height)
     storage.write("camera_matrix", camera.K)
@@ -94,15 +95,6 @@ def require_size(calibration: Calibration, *, width: int, height: int) -> None:
         raise CalibrationError(
             f"expected pictures of {camera.width}x{camera.height} px, the calibration's size, "
             f"got {width}x{height}; calibrate with pictures of {width}x{height} px from this camera"
-        )
-
-
-def _check_rotation(rvec: Float[np.ndarray, "3"], path: Path) -> None:
-    angle = float(np.linalg.norm(rvec))
-    if angle > _MAX_ANGLE:
-        raise CalibrationError(
-            f"{path}: rvec: expected a rotation of at most one turn, {2 * np.pi:.2f} radians, got "
-            f"{angle:.1f}; check that rvec is not in degrees, or {CALIBRATE}"
         )
 
 

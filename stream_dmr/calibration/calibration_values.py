@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 import yaml
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from stream_dmr.camera import Camera
 from stream_dmr.errors import CalibrationError
@@ -71,19 +71,15 @@ def _stored(text: str, path: Path) -> Values:
     return {name: _node_value(node) for name, node in nodes.items() if not node.empty()}
 
 
-def _node_value(node: cv2.FileNode) -> object:
+def _node_value(node: cv2.FileNode) -> float | str | Float[np.ndarray, "..."] | None:
+    """A number, a text, an !!opencv-matrix, or OpenCV 5's vector with `sizes`; else None.
+
+    Read number by number: `FileNode.mat` writes out of bounds where the data don't match the size.
+    """
     if node.isInt() or node.isReal():
         return node.real()
     if node.isString():
         return node.string()
-    return _matrix(node)
-
-
-def _matrix(node: cv2.FileNode) -> Float[np.ndarray, "..."] | None:
-    """An !!opencv-matrix, or OpenCV 5's vector with `sizes`; None for another kind of node.
-
-    Read number by number: `FileNode.mat` writes out of bounds where the data don't match the size.
-    """
     if not node.isMap():
         return None
     sizes = _numbers(node.getNode("sizes"))
@@ -106,24 +102,18 @@ def _numbers(node: cv2.FileNode) -> list[float] | None:
     return [number.real() for number in numbers]
 
 
-def _parsed_yaml(text: str) -> object:
-    """YAML without aliases, of which a few lines can stand for all of the memory."""
-    events = yaml.parse(text, Loader=yaml.CSafeLoader)
-    if any(isinstance(event, yaml.AliasEvent) for event in events):
-        raise ValueError("aliases")
-    return yaml.load(text, Loader=yaml.CSafeLoader)
-
-
 def _parsed(text: str, path: Path) -> Values:
-    """JSON, or YAML without OpenCV's head."""
+    """JSON, or YAML without OpenCV's head and aliases: a few of those can fill the memory."""
     try:
-        is_json = text.lstrip().startswith("{")
-        values = json.loads(text) if is_json else _parsed_yaml(text)
-    except (ValueError, TypeError, yaml.YAMLError, RecursionError) as error:
+        if text.lstrip().startswith("{"):
+            values = json.loads(text)
+        elif any(isinstance(e, yaml.AliasEvent) for e in yaml.parse(text, yaml.CSafeLoader)):
+            raise ValueError("aliases")
+        else:
+            values = yaml.load(text, yaml.CSafeLoader)
+        return {str(name): value for name, value in values.items()}
+    except (ValueError, TypeError, AttributeError, yaml.YAMLError, RecursionError) as error:
         raise _no_calibration(path, f"a file that begins with {text[:20]!r}") from error
-    if not isinstance(values, dict):
-        raise _no_calibration(path, f"a file that begins with {text[:20]!r}")
-    return {str(name): value for name, value in values.items()}
 
 
 def _krtd(text: str) -> Values | None:
@@ -189,7 +179,10 @@ def require_lens(camera: Camera, path: Path) -> None:
     """
     if camera.is_fisheye:  # rays end where its model folds
         return
-    pixels, is_inside = _places(camera)
+    half = np.array([camera.width - 1, camera.height - 1]) / 2
+    x, y = np.meshgrid(*2 * [np.linspace(-1.0, 1.0, _GRID)])
+    places = np.stack([x.ravel(), y.ravel()], axis=1)
+    pixels, is_inside = half + half * places, (places**2).sum(axis=1) <= 1.0
     rays = camera.back_project(pixels)
     gaps_px = np.linalg.norm(camera.project(rays) - pixels, axis=1)
     folded = float(np.mean(~(gaps_px < _MAX_ROUND_TRIP_PX)[is_inside]))
@@ -206,14 +199,6 @@ def require_lens(camera: Camera, path: Path) -> None:
         )
 
 
-def _places(camera: Camera) -> tuple[Float[np.ndarray, "N 2"], Bool[np.ndarray, "N"]]:
-    """Pixels all over the picture, row by row, and which lie in the ellipse."""
-    half = np.array([camera.width - 1, camera.height - 1]) / 2
-    x, y = np.meshgrid(*2 * [np.linspace(-1.0, 1.0, _GRID)])
-    places = np.stack([x.ravel(), y.ravel()], axis=1)
-    return half + half * places, (places**2).sum(axis=1) <= 1.0
-
-
 def _enlargements(rays: Float[np.ndarray, "N 3"], camera: Camera) -> Float[np.ndarray, "N"]:
     """Areas in the picture over those that a lens without distortion would show.
 
@@ -223,6 +208,5 @@ def _enlargements(rays: Float[np.ndarray, "N 3"], camera: Camera) -> Float[np.nd
         (camera.project(rays + step) - camera.project(rays - step)) / (2 * _STEP)
         for step in _STEP * np.eye(3)[:2]
     )
-    return (
-        np.abs(by_x[:, 0] * by_y[:, 1] - by_x[:, 1] * by_y[:, 0]) / camera.K[[0, 1], [0, 1]].prod()
-    )
+    areas = np.abs(by_x[:, 0] * by_y[:, 1] - by_x[:, 1] * by_y[:, 0])
+    return areas / camera.K[[0, 1], [0, 1]].prod()

@@ -1,10 +1,9 @@
-"""Find the corners of chessboards and ChArUco boards, and print such boards.
+"""Find the inner corners of chessboards and ChArUco boards, and print such boards.
 
-Finds the inner corners of a ChArUco board, of which a part in view is enough.
-
-A chessboard with a marker in each white square: the markers say which corner is which (Garrido-
-Jurado et al., Pattern Recognition 2014; OpenCV's `CharucoDetector`). Which dictionary the markers
-are of, and whether the first square is black or white (OpenCV 4.6 turned that round), is found out.
+A ChArUco board is a chessboard with a marker in each white square, which say which corner is which
+(Garrido-Jurado et al., Pattern Recognition 2014; OpenCV's `CharucoDetector`): a part in view is
+enough. Which dictionary the markers are of, and whether the first square is black or white (OpenCV
+4.6 turned that round), is found out.
 """
 
 import re
@@ -31,13 +30,6 @@ _WINDOW_SQUARES = 0.4
 _MAX_WINDOW_PX = 30  # larger ones took longer and were not more accurate
 _STOP_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-4)
 _DRAWN_SIDE_PX = 1600
-
-
-def board_points_mm(board: Board, square_mm: float) -> Float[np.ndarray, "N 3"]:
-    """Inner corners on the board's plane, Z = 0, row by row, in the order of `find_corners`."""
-    rows, columns = np.mgrid[: board[1], : board[0]]
-    points = np.stack([columns, rows, np.zeros_like(rows)], axis=-1)
-    return points.reshape(-1, 3) * float(square_mm)
 
 
 def read_grey(path: Path) -> UInt8[np.ndarray, "H W"]:
@@ -67,11 +59,8 @@ def find_corners(
     board's Z points away from the camera, in whichever order the detector returns them.
     """
     scale = max(1.0, max(picture.shape) / _SEARCH_SIDE_PX)
-    found, corners = cv2.findChessboardCornersSB(
-        _resized(picture, scale),
-        board,
-        flags=cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE,
-    )
+    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
+    found, corners = cv2.findChessboardCornersSB(_resized(picture, scale), board, flags=flags)
     if not found:
         return None
     coarse = (corners.reshape(-1, 2).astype(np.float64) + 0.5) * scale - 0.5
@@ -81,15 +70,10 @@ def find_corners(
 def seen_board(picture: UInt8[np.ndarray, "H W"]) -> Board | None:
     """The inner corners of whatever board is in a picture, the larger number first; None: none."""
     scale = max(1.0, max(picture.shape) / _SEARCH_SIDE_PX)
-    found, _, meta = cv2.findChessboardCornersSBWithMeta(
-        _resized(picture, scale),
-        (3, 3),
-        cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE,
-    )
-    if not found:
-        return None
-    rows, columns = meta.shape[:2]
-    return max(rows, columns), min(rows, columns)
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
+    small = _resized(picture, scale)
+    found, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
+    return (max(meta.shape[:2]), min(meta.shape[:2])) if found else None
 
 
 def draw_corners(path: Path, corners: Float[np.ndarray, "N 2"], board: Board, out: Path) -> None:
@@ -172,7 +156,8 @@ class CharucoFinder:
                 continue
             corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(picture)
             numbers = _numbers(ids)
-            if _spans_a_plane(numbers, self._inner):
+            rows, columns = np.divmod(numbers, self._inner[0])
+            if len(numbers) >= _MIN_CORNERS and np.ptp(rows) > 0 and np.ptp(columns) > 0:
                 return np.asarray(corners, np.float64).reshape(-1, 2), numbers
         return None
 
@@ -182,11 +167,8 @@ class CharucoFinder:
         The rows are as many as the highest marker in view needs.
         """
         for dictionary, markers in self._seen_markers(picture):
-            _, ids = markers
-            sizes = [
-                (columns, max(2, -(-2 * (int(ids.max()) + 1) // columns)))
-                for columns in range(3, _MAX_SQUARES + 1)
-            ]
+            needed = 2 * (int(markers[1].max()) + 1)  # squares; every other one has a marker
+            sizes = [(n, max(2, -(-needed // n))) for n in range(3, _MAX_SQUARES + 1)]
             board = _fitting_board(markers, sizes, dictionary, self._marker_share)
             if board is not None:
                 columns, rows = board.getChessboardSize()
@@ -237,11 +219,6 @@ def _off_squares(markers: Markers, board: cv2.aruco.CharucoBoard) -> float:
 def _numbers(ids: object) -> Int[np.ndarray, "N"]:
     """OpenCV's list of ids, which is None where nothing was found."""
     return np.zeros(0, np.int64) if ids is None else np.asarray(ids, np.int64).ravel()
-
-
-def _spans_a_plane(ids: Int[np.ndarray, "N"], inner: Board) -> bool:
-    rows, columns = np.divmod(ids, inner[0])
-    return len(ids) >= _MIN_CORNERS and bool(np.ptp(rows) > 0 and np.ptp(columns) > 0)
 
 
 _SQUARES_MM = (1.0, 1000.0)  # chosen: what is outside of them is in m, or a slip
@@ -309,8 +286,10 @@ class PrintedBoard:
 
     @property
     def points_mm(self) -> Float[np.ndarray, "N 3"]:
-        """All inner corners on the board's plane, row by row."""
-        return board_points_mm(self.inner, self.square_mm)
+        """All inner corners on the board's plane, Z = 0, in the order of `find_corners`."""
+        rows, columns = np.mgrid[: self.inner[1], : self.inner[0]]
+        points = np.stack([columns, rows, np.zeros_like(rows)], axis=-1)
+        return points.reshape(-1, 3) * float(self.square_mm)
 
     def find(self, picture: UInt8[np.ndarray, "H W"]) -> BoardCorners | None:
         """The corners in a picture; None where the board, or enough of a ChArUco board, is not."""
@@ -325,22 +304,17 @@ class PrintedBoard:
 
     def not_found(self, picture: UInt8[np.ndarray, "H W"]) -> str:
         """What to say of a picture without this board: with another one's size, if it shows one."""
-        what = f"no board of {self.name} ({self._counted}) found"
         if self.marker_mm is None:
-            other = seen_board(picture)
+            counted, other = "inner corners", seen_board(picture)
         else:
-            other = self._charuco.seen_squares(picture)
+            counted, other = "squares", self._charuco.seen_squares(picture)
         seen = "" if other is None else f"; saw one of {other[0]}x{other[1]}: check --board"
-        return what + seen
+        return f"no board of {self.name} ({counted}) found{seen}"
 
     @cached_property
     def _charuco(self) -> CharucoFinder:
         marker_mm = self.marker_mm or 0.0
         return CharucoFinder(self.inner, marker_share=marker_mm / self.square_mm)
-
-    @property
-    def _counted(self) -> str:
-        return "inner corners" if self.marker_mm is None else "squares"
 
 
 def parse_board(text: str) -> Board:

@@ -28,10 +28,7 @@ def find_plane(corners: BoardCorners, camera: Camera) -> tuple[ReferencePlane, f
     _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
         corners.points_mm, rays, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_IPPE
     )
-    starts = [
-        np.concatenate([rvec.ravel(), tvec.ravel()])
-        for rvec, tvec in zip(rvecs, tvecs, strict=True)
-    ]
+    starts = [np.concatenate([r.ravel(), t.ravel()]) for r, t in zip(rvecs, tvecs, strict=True)]
     return min((_refined(start, corners, camera) for start in starts), key=lambda found: found[1])
 
 
@@ -147,8 +144,7 @@ def _fit_pinhole(
     boards: list[BoardCorners], size: tuple[int, int]
 ) -> tuple[Camera, Float[np.ndarray, "2"]]:
     camera, stds = _calibrate_pinhole(boards, size, flags=0)
-    k3, k3_std = camera.distortion[4], stds[8]
-    if abs(k3) <= 3 * k3_std:
+    if abs(camera.distortion[4]) <= 3 * stds[8]:  # k3 and its standard deviation
         camera, stds = _calibrate_pinhole(boards, size, flags=cv2.CALIB_FIX_K3)
     return camera, stds[:2]
 
@@ -334,11 +330,7 @@ def quality_warnings(fit: LensFit) -> Iterator[str]:
 
 
 def _attempt(
-    boards: Mapping[Path, BoardCorners],
-    size: tuple[int, int],
-    plane_image: Path,
-    *,
-    is_fisheye: bool,
+    boards: Mapping[Path, BoardCorners], size: tuple[int, int], plane_image: Path, is_fisheye: bool
 ) -> ChosenFit | CalibrationError:
     try:
         chosen = _without_outliers(boards, size, plane_image, is_fisheye=is_fisheye)
@@ -356,11 +348,7 @@ def _is_worth(fisheye: ChosenFit, pinhole: ChosenFit | CalibrationError) -> bool
 
 
 def _without_outliers(
-    boards: Mapping[Path, BoardCorners],
-    size: tuple[int, int],
-    plane_image: Path,
-    *,
-    is_fisheye: bool,
+    boards: Mapping[Path, BoardCorners], size: tuple[int, int], plane_image: Path, is_fisheye: bool
 ) -> ChosenFit:
     fit = fit_lens(boards, size, is_fisheye=is_fisheye)
     outliers = _outliers(fit, plane_image)
@@ -394,7 +382,7 @@ def _is_bad(fit: LensFit) -> bool:
 
 def _folds_over(fit: LensFit) -> bool:
     """True where the rays through the picture's corners are not seen in its corners."""
-    camera: Camera = fit.camera
+    camera = fit.camera
     right, bottom = camera.width - 1, camera.height - 1
     rim = np.array([[0, 0], [right, 0], [0, bottom], [right, bottom]], np.float64)
     moved = camera.project(camera.back_project(rim)) - rim

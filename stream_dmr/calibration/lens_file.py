@@ -87,10 +87,8 @@ def lens_of(values: Values, path: Path) -> LensFile:
     distortion = read_array(values, "distortion_coefficients", shapes=sizes, path=path)
     size = None
     if "image_width" in values or "image_height" in values:
-        size = (
-            _positive_int(values, "image_width", path),
-            _positive_int(values, "image_height", path),
-        )
+        width = _positive_int(values, "image_width", path)
+        size = (width, _positive_int(values, "image_height", path))
     return LensFile(K=K, distortion=distortion, is_fisheye=is_fisheye, size=size)
 
 
@@ -122,27 +120,27 @@ def read_array(
 
 def with_common_names(values: Values) -> Values:
     """The same, with the names that OpenCV's samples have now instead of their earlier ones."""
-    earlier = {"image_Width": "image_width", "image_Height": "image_height"}
-    earlier |= {"Camera_Matrix": "camera_matrix"}
-    earlier |= {"Distortion_Coefficients": "distortion_coefficients"}
-    return {earlier.get(name, name): value for name, value in values.items()}
+    names = ("image_Width", "image_Height", "Camera_Matrix", "Distortion_Coefficients")
+    return {name.lower() if name in names else name: value for name, value in values.items()}
 
 
 def _named_cameras(values: Values) -> dict[str, Values]:
     """The cameras in a file, each with the names of OpenCV's samples."""
-    chain = {name: camera for name, camera in values.items() if _is_of_kalibr(camera)}
-    if chain:
-        return {name: _from_kalibr(camera) for name, camera in chain.items()}
-    sides = {side: _from_rig(values, side) for side in _SIDES if f"fx_{side}" in values} or {
-        side: _from_npz(values, letter)
+    chain: dict[str, Values] = {
+        name: _from_kalibr(camera)
+        for name, camera in values.items()
+        if isinstance(camera, Mapping) and "camera_model" in camera
+    }
+    rig = {side: _from_rig(values, side) for side in _SIDES if f"fx_{side}" in values}
+    npz: dict[str, Values] = {
+        side: {
+            "camera_matrix": values[f"cameraMatrix{letter}"],
+            "distortion_coefficients": values.get(f"distCoeffs{letter}"),
+        }
         for side, letter in _SIDES.items()
         if f"cameraMatrix{letter}" in values
     }
-    return sides or {"the only one": with_common_names(values)}
-
-
-def _is_of_kalibr(camera: object) -> bool:
-    return isinstance(camera, Mapping) and "camera_model" in camera
+    return chain or rig or npz or {"the only one": with_common_names(values)}
 
 
 def _from_kalibr(camera: Values) -> Values:
@@ -170,13 +168,6 @@ def _from_rig(values: Values, side: str) -> Values:
         "camera_matrix": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
         "distortion_coefficients": [part(name) for name in ("k1", "k2", "p1", "p2", "k3")],
         **size,
-    }
-
-
-def _from_npz(values: Values, letter: str) -> Values:
-    return {
-        "camera_matrix": values[f"cameraMatrix{letter}"],
-        "distortion_coefficients": values.get(f"distCoeffs{letter}"),
     }
 
 
