@@ -10,7 +10,6 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8, UInt16
 
 from stream_dmr.errors import SourceError
 from stream_dmr.files import natural_order
@@ -70,7 +69,11 @@ class PictureFolder(Source):
         if other_sizes == "leave_out":  # one picture of another telephone may be the first
             sizes = Counter(p.shape[:2] for p in self._sample()) or {first.shape[:2]: 1}
             self.height, self.width = max(sizes, key=lambda size: sizes[size])
-        self._white = self._full_scale() if first.dtype == np.uint16 else 2**16 - 1
+        # Sensors of 12 bits often write their values unscaled into 16 bits, where they come out all
+        # but black. A folder is taken for 12 bits where a sample stays below 4096.
+        self._white = 2**16 - 1
+        if first.dtype == np.uint16 and all(p.max() < 2**12 for p in self._sample()):
+            self._white = 2**12 - 1
 
     def __iter__(self) -> Iterator[Frame]:
         for frame_index, path in enumerate(self._paths, start=1):
@@ -82,20 +85,32 @@ class PictureFolder(Source):
                     f"{path.name}: can't be decoded, or is cut off, so was left out"
                 )
                 continue
-            self._warn_if_turned(path)
+            if self._as_sensor and not self._is_warned and is_turned(path):
+                self._is_warned = True
+                self.warnings.append(
+                    f"pictures such as {path.name} are to be turned by their EXIF; with a "
+                    "calibration they are measured as the sensor saw them, and masks and boxes "
+                    "must be so"
+                )
             size = picture.shape[1], picture.shape[0]
-            if self._other_sizes == "refuse":
-                self._require_size(size, path)
-            elif self._other_sizes == "leave_out" and size != (self.width, self.height):
+            if self._other_sizes == "refuse" and size != (self.width, self.height):
+                raise SourceError(
+                    f"{path}: expected {self.width}x{self.height} px, as the first picture has, "
+                    f"got {size[0]}x{size[1]} px; give --stills where pictures stand for "
+                    'themselves, or set [read_frames] other_sizes to "leave_out" or "take"'
+                )
+            if self._other_sizes == "leave_out" and size != (self.width, self.height):
                 self.warnings.append(
                     f"{path.name}: {size[0]}x{size[1]} px, the calibration is for {self.width}x"
                     f"{self.height}, so was left out; calibrate its camera and run it by itself"
                 )
                 continue
+            if picture.dtype != np.uint8:  # one factor for the whole folder: it must not flicker
+                picture = cv2.convertScaleAbs(picture, alpha=255 / self._white)
             yield Frame(
                 frame_index=frame_index,
                 timestamp_ns=nominal_ns(frame_index, self.fps),
-                image=_to_8_bit(picture, self._white),
+                image=picture,
                 source=path.name,
             )
 
@@ -110,43 +125,18 @@ class PictureFolder(Source):
                 f"{huge}"
             )
         flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+        if self._as_sensor:
+            flags |= cv2.IMREAD_IGNORE_ORIENTATION
         try:
-            picture = read_picture(
-                path, flags | cv2.IMREAD_IGNORE_ORIENTATION if self._as_sensor else flags
-            )
+            picture = read_picture(path, flags)
         except OSError:
             return None
         return picture if picture is not None and picture.dtype.name in _DEPTHS else None
-
-    def _full_scale(self) -> int:
-        """The value of white in a folder of 16-bit pictures: 4095 or 65535.
-
-        Sensors of 12 bits often write their values unscaled into 16 bits, where they come out all
-        but black. A folder is taken for 12 bits where a sample stays below 4096.
-        """
-        brightest = max((int(p.max()) for p in self._sample()), default=2**16 - 1)
-        return 2**12 - 1 if brightest < 2**12 else 2**16 - 1
 
     def _sample(self) -> Iterator[np.ndarray]:
         """About five pictures, evenly spaced; those that can be read."""
         sample = map(self._read, self._paths[:: max(1, len(self._paths) // 4)])
         return (picture for picture in sample if picture is not None)
-
-    def _warn_if_turned(self, path: Path) -> None:
-        if self._as_sensor and not self._is_warned and is_turned(path):
-            self._is_warned = True
-            self.warnings.append(
-                f"pictures such as {path.name} are to be turned by their EXIF; with a calibration "
-                "they are measured as the sensor saw them, and masks and boxes must be so"
-            )
-
-    def _require_size(self, size: tuple[int, int], path: Path) -> None:
-        if size != (self.width, self.height):
-            raise SourceError(
-                f"{path}: expected {self.width}x{self.height} px, as the first picture has, got "
-                f"{size[0]}x{size[1]} px; give --stills where pictures stand for themselves, or "
-                'set [read_frames] other_sizes to "leave_out" or "take"'
-            )
 
     def close(self) -> None:
         """End the iteration; no file is held."""
@@ -172,15 +162,6 @@ def _pictures_in(folder: Path) -> tuple[list[Path], list[str]]:
 
 def _not_read(names: list[str]) -> str:
     return f"{len(names)} pictures such as {names[0]} can't be read; save them as JPEG or PNG"
-
-
-def _to_8_bit(
-    picture: UInt8[np.ndarray, "H W 3"] | UInt16[np.ndarray, "H W 3"], full_scale: int
-) -> UInt8[np.ndarray, "H W 3"]:
-    """Scaled by one factor for the whole folder, so that brightness does not flicker; clipped."""
-    if picture.dtype == np.uint8:
-        return picture
-    return cv2.convertScaleAbs(picture, alpha=255 / full_scale)
 
 
 _SUFFIXES = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv"}
@@ -249,7 +230,10 @@ class ClipFolder(Source):
             self._video = self._open(path)
             if self._video is None:
                 continue
-            start_ns = max(_start_ns(path, self._video), last_ns + round(1e9 / self._video.fps))
+            # It ended with the last write; 0 if it was removed meanwhile.
+            state, duration_s = _state_of(path), (self._video.num_frames or 0) / self._video.fps
+            start_ns = 0 if state is None else state.modified_ns - round(duration_s * 1e9)
+            start_ns = max(start_ns, last_ns + round(1e9 / self._video.fps))
             for frame in self._video:
                 frame_index += 1
                 last_ns = start_ns + frame.timestamp_ns
@@ -311,7 +295,8 @@ class ClipFolder(Source):
                 if state != seen.get(paths[0].name):
                     seen[paths[0].name] = state
                     unchanged_since = waiting_since = now
-                if now - unchanged_since >= _SETTLE_S or _is_old(state):
+                age_s = (time.time_ns() - state.modified_ns) / 1e9  # by the clock that files use
+                if now - unchanged_since >= _SETTLE_S or age_s > _SETTLE_S:
                     return paths[0]
             elif now - waiting_since >= self._settings.clips_wait_s:
                 return None
@@ -338,14 +323,3 @@ def _state_of(path: Path) -> _FileState | None:
     except FileNotFoundError:
         return None
     return _FileState(num_bytes=status.st_size, modified_ns=status.st_mtime_ns)
-
-
-def _is_old(state: _FileState) -> bool:
-    """Whether the last write was longer ago than `_SETTLE_S`, by the wall clock that files use."""
-    return time.time_ns() - state.modified_ns > _SETTLE_S * 1e9
-
-
-def _start_ns(path: Path, video: VideoFile) -> int:
-    """Capture time of the first frame: last write minus duration, ns since 1970; 0 if removed."""
-    state, duration_s = _state_of(path), (video.num_frames or 0) / video.fps
-    return 0 if state is None else state.modified_ns - round(duration_s * 1e9)

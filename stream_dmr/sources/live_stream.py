@@ -1,6 +1,4 @@
-"""Frames of cameras and streams, with capture times.
-
-Capture times of live sources, robust to steps of the stream's and the system's clocks.
+"""Frames of cameras and streams, with capture times that no step of a clock changes.
 
 Three clocks: the system's wall clock, which may be stepped; its monotonic clock, which is not; and
 the stream's own timestamps, which space frames exactly but may jump or begin again.
@@ -156,13 +154,17 @@ class LiveStream(Source):
             if arrival.connection != connection:
                 connection = arrival.connection
                 clock.reconnected()
-            self._report_clock_step(clock)
+            step_ns = clock.wall_step_ns(wall_ns=time.time_ns(), monotonic_ns=time.monotonic_ns())
+            if abs(step_ns) > _CLOCK_STEP_NS:
+                self._on_notice(
+                    "the system's clock was set; capture times continue from the time of the start"
+                )
+            # A stream may give no time, or one beyond 31 years.
+            ms = arrival.picture.milliseconds
+            stream_ns = round(ms * 1e6) if 0 < ms < 1e12 else None
             yield Frame(
                 frame_index=frame_index,
-                timestamp_ns=clock.stamp(
-                    monotonic_ns=arrival.monotonic_ns,
-                    stream_ns=_stream_ns(arrival.picture.milliseconds),
-                ),
+                timestamp_ns=clock.stamp(monotonic_ns=arrival.monotonic_ns, stream_ns=stream_ns),
                 image=arrival.picture.image,
                 source=self.name,
             )
@@ -282,15 +284,3 @@ class LiveStream(Source):
             return self._decoder.read(timeout_s=self._settings.connect_s)
         except DecodingError:
             return None
-
-    def _report_clock_step(self, clock: CaptureClock) -> None:
-        step_ns = clock.wall_step_ns(wall_ns=time.time_ns(), monotonic_ns=time.monotonic_ns())
-        if abs(step_ns) > _CLOCK_STEP_NS:
-            self._on_notice(
-                "the system's clock was set; capture times continue from the time of the start"
-            )
-
-
-def _stream_ns(milliseconds: float) -> int | None:
-    """The stream's own timestamp; None where it gives none, or one beyond 31 years."""
-    return round(milliseconds * 1e6) if 0 < milliseconds < 1e12 else None

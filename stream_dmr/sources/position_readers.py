@@ -100,7 +100,9 @@ class PositionFile(PositionSource):
         """Time on the clock of the frames, increasing, and fix; others are counted as jumps."""
         last_ns: int | None = None
         waiting: tuple[int, Fix] | None = None  # a wrong first date is known by what follows it
-        for fix in self._csv_fixes() if self._path.suffix.lower() == ".csv" else self._nmea_fixes():
+        is_csv = self._path.suffix.lower() == ".csv"
+        sentences = map(self._builder.take, self._file)
+        for fix in self._csv_fixes() if is_csv else filter(None, sentences):
             time_ns = (fix.utc_ns or 0) - self._zero_ns
             if waiting is not None and time_ns > waiting[0]:
                 last_ns = waiting[0]
@@ -117,11 +119,6 @@ class PositionFile(PositionSource):
     def _leave_out(self) -> None:
         self.counts.positions -= 1
         self.counts.jumps += 1
-
-    def _nmea_fixes(self) -> Iterator[Fix]:
-        for line in self._file:
-            if (fix := self._builder.take(line)) is not None:
-                yield fix
 
     def _csv_fixes(self) -> Iterator[Fix]:
         reader = csv.DictReader(line.decode("utf-8-sig", "replace") for line in self._file)
@@ -208,9 +205,8 @@ class ReceiverAddress:
         protocol, host, port = self._place
         if protocol == "udp":
             return _SocketStream(_bound(host, port), is_stream=False)
-        return _SocketStream(
-            socket.create_connection((host, port), timeout=_CONNECT_S), is_stream=True
-        )
+        connection = socket.create_connection((host, port), timeout=_CONNECT_S)
+        return _SocketStream(connection, is_stream=True)
 
 
 def is_serial_device(text: str) -> bool:
@@ -360,11 +356,17 @@ class PositionReceiver(PositionSource):
             stream = None
             try:
                 stream = self._address.open()
-                self._connected()
-                pause_s = _FIRST_PAUSE_S
+                if self._trouble:
+                    self._on_notice(f"the receiver of positions {self.name} is back")
+                    with self._lock:
+                        self._builder.counts.reconnects += 1
+                self._trouble, pause_s = "", _FIRST_PAUSE_S
                 self._read(stream)
             except (OSError, ValueError) as error:
-                self._lost(error)
+                if not self._trouble:
+                    lost = f"the receiver of positions {self.name} is lost: {error}"
+                    self._on_notice(f"{lost}; reconnecting")
+                self._trouble = str(error)
             finally:
                 if stream is not None:
                     stream.close()
@@ -407,15 +409,3 @@ class PositionReceiver(PositionSource):
                 f"this machine's clock is {abs(ahead_s):.0f} s {word} the receiver of positions; "
                 "the UTC of a fish is the receiver's"
             )
-
-    def _connected(self) -> None:
-        if self._trouble:
-            self._on_notice(f"the receiver of positions {self.name} is back")
-            with self._lock:
-                self._builder.counts.reconnects += 1
-        self._trouble = ""
-
-    def _lost(self, error: Exception) -> None:
-        if not self._trouble:
-            self._on_notice(f"the receiver of positions {self.name} is lost: {error}; reconnecting")
-        self._trouble = str(error)

@@ -71,10 +71,14 @@ def _position(kind: str, text: bytes) -> PositionSentence:
         else message.quality in _MEASURED_QUALITIES
     )
     latitude, longitude = _degrees(message.lat, 90.0), _degrees(message.lon, 180.0)
+    day, at, time_of_day_ns = getattr(message, "date", None), message.time, None
+    if isinstance(at, time):
+        seconds = (at.hour * 60 + at.minute) * 60 + at.second
+        time_of_day_ns = seconds * 1_000_000_000 + at.microsecond * 1000
     return PositionSentence(
         kind=kind,
-        day=_of_type(getattr(message, "date", None), date),
-        time_of_day_ns=_time_of_day_ns(message.time),
+        day=day if isinstance(day, date) else None,
+        time_of_day_ns=time_of_day_ns,
         latitude=latitude,
         longitude=longitude,
         speed_knots=_number(getattr(message, "spd", None)),
@@ -91,17 +95,6 @@ def _degrees(value: object, limit: float) -> float | None:
 def _number(value: object) -> float | None:
     """A field as a number; an empty one is a text for pynmeagps."""
     return float(value) if isinstance(value, int | float) else None
-
-
-def _of_type(value: object, kind: type[date]) -> date | None:
-    return value if isinstance(value, kind) else None
-
-
-def _time_of_day_ns(value: object) -> int | None:
-    if not isinstance(value, time):
-        return None
-    seconds = (value.hour * 60 + value.minute) * 60 + value.second
-    return seconds * 1_000_000_000 + value.microsecond * 1000
 
 
 _DAY_NS = 86_400_000_000_000
@@ -278,9 +271,8 @@ class JumpGate:
 
     def _follows(self, before: tuple[Fix, int], now: tuple[Fix, int]) -> bool:
         seconds = (now[1] - before[1]) / 1e9
-        return seconds >= 0 and distance_m(before[0], now[0]) <= (
-            self._max_m_per_s * seconds + _NOISE_M
-        )
+        reach_m = self._max_m_per_s * seconds + _NOISE_M
+        return seconds >= 0 and distance_m(before[0], now[0]) <= reach_m
 
 
 def distance_m(one: Fix, other: Fix) -> float:
@@ -333,12 +325,4 @@ class PositionSource(ABC):
 
 def position(fix: Fix, *, timestamp_ns: int, frame_index: int) -> Position:
     """A fix as a message, after the frame of this number."""
-    return Position(
-        frame_index=frame_index,
-        timestamp_ns=timestamp_ns,
-        utc_ns=fix.utc_ns,
-        latitude=fix.latitude,
-        longitude=fix.longitude,
-        speed_knots=fix.speed_knots,
-        course_deg=fix.course_deg,
-    )
+    return Position(frame_index=frame_index, timestamp_ns=timestamp_ns, **vars(fix))
