@@ -69,7 +69,13 @@ def fish_outline(
     the message.
     """
     blob = _one_blob(mask, name=name)
-    left, right = _far_ends(blob)
+    # The left and the right end of its principal axis.
+    pixels = np.argwhere(blob)[:, ::-1].astype(np.float64)
+    center = pixels.mean(axis=0)
+    _, vectors = np.linalg.eigh(np.cov((pixels - center).T))
+    axis = vectors[:, 1] * (1.0 if vectors[0, 1] >= 0 else -1.0)
+    along = (pixels - center) @ axis
+    left, right = center + along.min() * axis, center + along.max() * axis
     length_px = float(np.linalg.norm(right - left))
     if length_px < _MIN_FISH_PX:
         raise TemplateError(
@@ -119,18 +125,6 @@ def _one_blob(mask: Bool[np.ndarray, "H W"], *, name: str) -> Bool[np.ndarray, "
             f"{name}: expected the whole fish, got one cut off by the picture's rim"
         )
     return blob
-
-
-def _far_ends(
-    blob: Bool[np.ndarray, "H W"],
-) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """The left and the right end of the blob's principal axis, in pixels (x, y)."""
-    points = np.argwhere(blob)[:, ::-1].astype(np.float64)
-    middle = points.mean(axis=0)
-    _, vectors = np.linalg.eigh(np.cov((points - middle).T))
-    axis = vectors[:, 1] * (1.0 if vectors[0, 1] >= 0 else -1.0)
-    along = (points - middle) @ axis
-    return middle + along.min() * axis, middle + along.max() * axis
 
 
 def _straightened(

@@ -133,11 +133,8 @@ def nearest_form(outline: FishOutline) -> BodyForm:
     """The bundled body form with the least mean square difference in depth along the body."""
     place = np.linspace(0.0, 1.0, 200)
     half_depth = np.interp(place, outline.x, (outline.upper + outline.lower) / 2)
-
-    def difference(form: BodyForm) -> float:
-        return float(np.mean((form.half_depth_at(place) - half_depth) ** 2))
-
-    return min(load_body_forms().values(), key=difference)
+    forms = load_body_forms().values()
+    return min(forms, key=lambda form: np.mean((form.half_depth_at(place) - half_depth) ** 2))
 
 
 def outline_mesh(outline: FishOutline, half_thickness: Float[np.ndarray, "N"]) -> trimesh.Trimesh:
@@ -203,6 +200,4 @@ def _read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
         raise TemplateError(
             f"{path}: expected a picture of a mask, such as a PNG, got another file"
         )
-    return (
-        np.asarray(image > 0) if image.ndim == 2 else np.asarray((image[..., :3] > 0).any(axis=2))
-    )
+    return np.asarray(image > 0 if image.ndim == 2 else (image[..., :3] > 0).any(axis=2))

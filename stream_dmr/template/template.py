@@ -78,13 +78,17 @@ def canonical_template(
     def to_canonical(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
         return (points - keypoints[1]) @ canonical.T / body_length
 
+    spine = to_canonical(spine)
+    at = arc_lengths(spine)
+    even = np.linspace(0.0, at[-1], NUM_MIDLINE_POINTS)
+    midline = [np.interp(even, at, coordinates) for coordinates in spine.T]
     return Template(
         name=name,
         rest_vertices=to_canonical(np.asarray(mesh.vertices, np.float64)),
         faces=np.asarray(mesh.faces, np.int64),
         keypoints=to_canonical(keypoints),
         joints=to_canonical(joints),
-        midline=_resample(to_canonical(spine), NUM_MIDLINE_POINTS),
+        midline=np.stack(midline, axis=1),
     )
 
 
@@ -129,13 +133,6 @@ def _canonical_axes(
     # The sign of a singular vector is arbitrary: fix it, so that templates are reproducible.
     y *= np.sign(y[np.argmax(np.abs(y))]) / np.linalg.norm(y)
     return np.stack([x, y, np.cross(x, y)])
-
-
-def _resample(points: Float[np.ndarray, "N 3"], count: int) -> Float[np.ndarray, "M 3"]:
-    """Points evenly spaced along a polyline, its ends included."""
-    at = arc_lengths(points)
-    even = np.linspace(0.0, at[-1], count)
-    return np.stack([np.interp(even, at, points[:, k]) for k in range(3)], axis=1)
 
 
 # Every mesh that this project makes has these points on its straight midline, in fork lengths. The

@@ -44,12 +44,23 @@ def load_template(
     if repaired.changes:
         on_notice(f"template {path}: repaired: {', '.join(repaired.changes)}")
     toml = mesh_path.with_suffix(".toml")
-    table = _read_toml(toml) if toml.is_file() else {}
+    table: dict[str, Any] = {}
     if toml.is_file():
+        try:
+            table = tomllib.loads(read_text(toml))
+        except (OSError, ValueError, RecursionError) as error:  # ValueError: not TOML, or not text
+            raise TemplateError(
+                f"template {toml}: expected TOML, got: {reason_of(error)}"
+            ) from error
         points = _points_of(table, toml)
     else:
         points = find_points(repaired.mesh, name=str(path))
-        on_notice(_note_of_points(points, path=toml))
+        head, _, tail = ([float(f"{n:.4g}") for n in point] for point in points["keypoints"])
+        places = " and ".join(f"{place:g}" for place in JOINTS)
+        on_notice(
+            f"template: no {toml}: head found at {head}, tail at {tail}, joints placed at {places} "
+            "of the length"
+        )
     template = canonical_template(repaired.mesh, points, name=mesh_path.stem)
     tail_gives, total_per_fork = _length_of(table, toml)
     return replace(template, tail_gives=tail_gives, total_per_fork=total_per_fork)
@@ -115,22 +126,6 @@ def _read_mesh(path: Path) -> trimesh.Trimesh:
     # Some formats repeat a vertex for each face, or along the seams of a texture.
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     return mesh
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(read_text(path))
-    except (OSError, ValueError, RecursionError) as error:  # ValueError: not TOML, or not text
-        raise TemplateError(f"template {path}: expected TOML, got: {reason_of(error)}") from error
-
-
-def _note_of_points(points: dict[str, Float[np.ndarray, "N 3"]], *, path: Path) -> str:
-    head, _, tail = ([float(f"{value:.4g}") for value in point] for point in points["keypoints"])
-    places = " and ".join(f"{place:g}" for place in JOINTS)
-    return (
-        f"template: no {path}: head found at {head}, tail at {tail}, joints placed at {places} of "
-        "the length"
-    )
 
 
 def _length_of(table: dict[str, Any], path: Path) -> tuple[str | None, float | None]:
