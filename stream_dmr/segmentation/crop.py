@@ -92,12 +92,8 @@ class FrameView:
 
     def camera_around(self, bbox_xyxy_px: Float[np.ndarray, "4"]) -> Camera:
         """The crop camera of a box, with the margin and size of the settings."""
-        return camera_around(
-            bbox_xyxy_px,
-            frame_camera=self.camera,
-            margin=self.settings.margin,
-            size_px=self.settings.crop_size_px,
-        )
+        margin, size_px = self.settings.margin, self.settings.crop_size_px
+        return camera_around(bbox_xyxy_px, frame_camera=self.camera, margin=margin, size_px=size_px)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -204,7 +200,8 @@ def _segment(
     height, width = view.shape
     is_in_frame = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
     probability = np.mean([look.probability for look in looks], axis=0) * is_in_frame
-    areas = _pixel_areas(x, y)
+    # Of each crop pixel in frame pixels: |det| of the Jacobian of the crop-to-frame map.
+    areas = np.abs(_slope(x.T).T * _slope(y) - _slope(x) * _slope(y.T).T)
     min_area_px = math.ceil(view.settings.min_mask_area_px / float(areas.mean()))
     mask = clean_mask(probability > 0.5, min_area_px=min_area_px)
     ends = looks[-1].ends
@@ -281,13 +278,6 @@ def picture_sizes(side_px: float, sizes_px: Sequence[int]) -> list[int]:
     """
     smallest, *larger = sorted(sizes_px)
     return [smallest, *(size for size in larger if size <= side_px)]
-
-
-def _pixel_areas(
-    x: Float32[np.ndarray, "S S"], y: Float32[np.ndarray, "S S"]
-) -> Float32[np.ndarray, "S S"]:
-    """Area of each crop pixel in frame pixels: |det| of the Jacobian of the crop-to-frame map."""
-    return np.abs(_slope(x.T).T * _slope(y) - _slope(x) * _slope(y.T).T)
 
 
 def _slope(values: Float32[np.ndarray, "S S"]) -> Float32[np.ndarray, "S S"]:
@@ -434,7 +424,10 @@ def _lengthened(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> Mask
     if crop.extent is None:
         return crop
     low, high = crop.extent[:2], crop.extent[2:]
-    longer = _segment(view, np.concatenate([low, high]) + _beyond(low, high), segmenter)
+    sides = high - low
+    share = np.where(sides == sides.max(), _BEYOND_ENDS, _BEYOND_SIDES)
+    beyond = np.concatenate([-share, share]) * sides.max()
+    longer = _segment(view, np.concatenate([low, high]) + beyond, segmenter)
     if longer.is_cut or agreement(crop, longer) < _MIN_SAME_FISH:
         return replace(crop, length_doubt=_BEYOND_ENDS)  # it may go on as far as was looked
     before, after = _end_to_end_px(view, crop, longer)
@@ -443,26 +436,16 @@ def _lengthened(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> Mask
     if not 0 < change < _MAX_COST - lost:
         return replace(crop, length_doubt=abs(change))
     # Where head and tail are says the first crop as well: a loose box says less of which is which.
-    ends = _moved(crop.ends, _crop_to_crop(crop, longer))
+    ends, affine = crop.ends, _crop_to_crop(crop, longer)
+    if ends is not None:
+        head_px, tail_px = (affine[:, :2] @ p + affine[:, 2] for p in (ends.head_px, ends.tail_px))
+        ends = FishEnds(head_px=head_px, tail_px=tail_px, confidence=ends.confidence)
     return replace(longer, ends=ends, confidence=crop.confidence, length_doubt=abs(change))
 
 
 def _crop_to_crop(crop: MaskedCrop, other: MaskedCrop) -> Float[np.ndarray, "2 3"]:
     """The affine map from one crop's pixels to another's: their cameras look the same way."""
     return (other.crop_camera.K @ np.linalg.inv(crop.crop_camera.K))[:2]
-
-
-def _moved(ends: FishEnds | None, affine: Float[np.ndarray, "2 3"]) -> FishEnds | None:
-    if ends is None:
-        return None
-    head_px, tail_px = (affine[:, :2] @ p + affine[:, 2] for p in (ends.head_px, ends.tail_px))
-    return FishEnds(head_px=head_px, tail_px=tail_px, confidence=ends.confidence)
-
-
-def _beyond(low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]) -> Float[np.ndarray, "4"]:
-    sides = high - low
-    share = np.where(sides == sides.max(), _BEYOND_ENDS, _BEYOND_SIDES)
-    return np.concatenate([-share, share]) * sides.max()
 
 
 def _end_to_end_px(view: FrameView, *crops: MaskedCrop) -> list[float]:

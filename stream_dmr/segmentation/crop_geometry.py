@@ -1,6 +1,4 @@
-"""Cameras, pixel maps and quality of crops.
-
-Boxes and pixels between frame and crop.
+"""Cameras, pixel maps and quality of crops; boxes and pixels between frame and crop.
 
 Boxes are half-open and count from pixel edges; cameras count from pixel centers. A crop is free of
 lens distortion, so that a box's edges are curves there: they are mapped by their midpoints, which
@@ -35,20 +33,16 @@ def mask_bbox_in_frame(crop: FishCrop) -> Float[np.ndarray, "4"] | None:
     box = mask_bbox(crop.mask)
     if box is None:
         return None
-    midpoints = frame_from_crop(
-        _edge_midpoints(box), crop_camera=crop.crop_camera, frame_camera=crop.frame_camera
-    )
-    return _box_of_midpoints(midpoints)
+    cameras = {"crop_camera": crop.crop_camera, "frame_camera": crop.frame_camera}
+    return _box_of_midpoints(frame_from_crop(_edge_midpoints(box), **cameras))
 
 
 def box_in_crop(
     bbox_xyxy_px: Float[np.ndarray, "4"], *, crop_camera: Camera, frame_camera: Camera
 ) -> Float[np.ndarray, "4"]:
     """A box of the frame in the crop's pixels, half-open."""
-    midpoints = crop_from_frame(
-        _edge_midpoints(bbox_xyxy_px), crop_camera=crop_camera, frame_camera=frame_camera
-    )
-    return _box_of_midpoints(midpoints)
+    cameras = {"crop_camera": crop_camera, "frame_camera": frame_camera}
+    return _box_of_midpoints(crop_from_frame(_edge_midpoints(bbox_xyxy_px), **cameras))
 
 
 def _edge_midpoints(bbox_xyxy_px: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4 2"]:
@@ -217,9 +211,7 @@ def clean_mask(mask: Bool[np.ndarray, "H W"], *, min_area_px: int) -> Bool[np.nd
 
 def _without_pinholes(region: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     # Padding makes the background one component, that of pixel (0, 0); all others are holes.
-    outside = cv2.copyMakeBorder(
-        (~region).view(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(1,)
-    )
+    outside = np.pad(~region, 1, constant_values=True).view(np.uint8)
     count, labels = cv2.connectedComponents(outside, connectivity=4)
     if count == 2:  # none, as mostly; to measure them takes ten times as long
         return region

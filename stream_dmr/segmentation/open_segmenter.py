@@ -1,6 +1,4 @@
-"""Open a segmenter by its name; GrabCut is one.
-
-Masks from boxes alone, with no trained weights: GrabCut on each crop by itself.
+"""Open a segmenter by its name; GrabCut is one, with no trained weights.
 
 Rother, Kolmogorov, Blake: "GrabCut: interactive foreground extraction using iterated graph cuts",
 SIGGRAPH 2004. It follows colour, so shadows and lines may be taken for fish.
@@ -45,27 +43,24 @@ def segment_box(
     Deterministic, and independent of every other frame.
     """
     mask = np.zeros(image.shape[:2], bool)
-    x0, y0, x1, y1 = _with_context(bbox_xyxy_px, width=image.shape[1], height=image.shape[0])
+    # The box and its surroundings in whole pixels, half-open, inside the frame.
+    ring = _CONTEXT * max(bbox_xyxy_px[2:] - bbox_xyxy_px[:2])
+    x0, y0 = np.floor(bbox_xyxy_px[:2] - ring).astype(int).clip(0, mask.shape[::-1]).tolist()
+    x1, y1 = np.ceil(bbox_xyxy_px[2:] + ring).astype(int).clip(0, mask.shape[::-1]).tolist()
     region = image[y0:y1, x0:x1]
     scale = min(1.0, _WORKING_PX / max(region.shape[0], region.shape[1], 1))
     box = np.round((bbox_xyxy_px - [x0, y0, x0, y0]) * scale).astype(int)
     if min(box[2] - box[0], box[3] - box[1], *region.shape[:2]) < _MIN_SIDE_PX:
         return mask
     small = cv2.resize(region, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    fish = _largest_smooth_part(_grab_cut(small, box))
+    # The largest component, without threads and notches thinner than a few pixels.
+    fish = cv2.medianBlur(_grab_cut(small, box), 5)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(fish, connectivity=4)
+    if count > 1:
+        fish = labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
     size = (region.shape[1], region.shape[0])
     mask[y0:y1, x0:x1] = cv2.resize(fish * np.uint8(255), size) > 127
     return mask
-
-
-def _with_context(
-    bbox_xyxy_px: Float[np.ndarray, "4"], *, width: int, height: int
-) -> tuple[int, int, int, int]:
-    """The box and its surroundings in whole pixels, half-open, inside the frame."""
-    ring = _CONTEXT * max(bbox_xyxy_px[2:] - bbox_xyxy_px[:2])
-    low = np.floor(bbox_xyxy_px[:2] - ring).astype(int).clip(0, [width, height])
-    high = np.ceil(bbox_xyxy_px[2:] + ring).astype(int).clip(0, [width, height])
-    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 
 def _grab_cut(image: UInt8[np.ndarray, "h w 3"], box: np.ndarray) -> UInt8[np.ndarray, "h w"]:
@@ -83,16 +78,6 @@ def _grab_cut(image: UInt8[np.ndarray, "h w 3"], box: np.ndarray) -> UInt8[np.nd
         image, labels, unused, models[0], models[1], _NUM_ITERATIONS, mode=cv2.GC_INIT_WITH_MASK
     )
     return ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).astype(np.uint8)
-
-
-def _largest_smooth_part(fish: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-    """The largest component, without threads and notches thinner than a few pixels."""
-    fish = cv2.medianBlur(fish, 5)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(fish, connectivity=4)
-    if count < 2:
-        return fish
-    largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-    return (labels == largest).astype(np.uint8)
 
 
 def open_segmenter(name: str) -> Segmenter:

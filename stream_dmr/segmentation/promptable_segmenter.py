@@ -43,7 +43,7 @@ class PromptableSegmenter:
         """The fish in a box, half-open in pixels of the crop `image` (BGR)."""
         size = len(image)
         logits = self._run(image, bbox_xyxy_px)
-        logits = cv2.resize(logits, (size, size), interpolation=cv2.INTER_LINEAR)
+        logits = cv2.resize(logits, (size, size))
         probability = 1 / (1 + np.exp(-np.nan_to_num(logits).clip(-50, 50)))
         return SegmentedFish(probability=probability.astype(np.float32), ends=None)
 

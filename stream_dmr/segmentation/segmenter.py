@@ -23,10 +23,12 @@ class SegmentedFish:
 
     def resized(self, size_px: int) -> "SegmentedFish":
         """The same fish in a crop of another size; pixel edges stay where they are."""
-        scale = size_px / len(self.probability)
+        scale, ends = size_px / len(self.probability), self.ends
+        if ends is not None:
+            head_px, tail_px = ((p + 0.5) * scale - 0.5 for p in (ends.head_px, ends.tail_px))
+            ends = FishEnds(head_px=head_px, tail_px=tail_px, confidence=ends.confidence)
         return SegmentedFish(
-            probability=np.clip(resize(self.probability, size_px), 0, 1),
-            ends=None if self.ends is None else _scaled(self.ends, scale),
+            probability=np.clip(resize(self.probability, size_px), 0, 1), ends=ends
         )
 
 
@@ -36,14 +38,6 @@ def resize(picture: np.ndarray, size_px: int) -> np.ndarray:
         return picture
     interpolation = cv2.INTER_AREA if len(picture) > size_px else cv2.INTER_LINEAR
     return cv2.resize(picture, (size_px, size_px), interpolation=interpolation)
-
-
-def _scaled(ends: FishEnds, scale: float) -> FishEnds:
-    return FishEnds(
-        head_px=(ends.head_px + 0.5) * scale - 0.5,
-        tail_px=(ends.tail_px + 0.5) * scale - 0.5,
-        confidence=ends.confidence,
-    )
 
 
 @runtime_checkable

@@ -52,9 +52,8 @@ def _peaks(log_probability: Float32[np.ndarray, "s s"]) -> list[tuple[int, int]]
     """Row and column of the highest cell, and of the highest one away from it."""
     row, column = divmod(int(log_probability.argmax()), len(log_probability))
     away = log_probability.copy()
-    away[
-        max(0, row - _NEAR) : row + _NEAR + 1, max(0, column - _NEAR) : column + _NEAR + 1
-    ] = -np.inf
+    top, left = max(0, row - _NEAR), max(0, column - _NEAR)
+    away[top : row + _NEAR + 1, left : column + _NEAR + 1] = -np.inf
     return [(row, column), divmod(int(away.argmax()), len(away))]
 
 
@@ -67,10 +66,8 @@ def _refine(
     around = log_probability[top : row + _PEAK_RADIUS + 1, left : column + _PEAK_RADIUS + 1]
     weights = np.exp((around - around.max()).astype(np.float64))
     rows, columns = np.indices(weights.shape)
-    total = weights.sum()
-    return np.array(
-        [left + (columns * weights).sum() / total, top + (rows * weights).sum() / total]
-    )
+    x, y = ((places * weights).sum() / weights.sum() for places in (columns, rows))
+    return np.array([left + x, top + y])
 
 
 SHIPPED = WEIGHTS / "unet.onnx"
