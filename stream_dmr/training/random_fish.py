@@ -59,12 +59,19 @@ def draw_shape(rng: np.random.Generator) -> FishShape:
     sheets = [] if is_flatfish and rng.random() < 0.8 else _draw_fins(rng, body)
     points, faces = [mesh.points], [mesh.faces]
     texture = [np.column_stack([mesh.points[:, 0], mesh.across])]
+    index = np.arange(_FIN_COLUMNS * _FIN_ROWS).reshape(_FIN_COLUMNS, _FIN_ROWS)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    halves = [np.stack(corners, axis=-1).reshape(-1, 3) for corners in ((a, b, c), (a, c, d))]
     for sheet, colour in sheets:
-        faces.append(_grid_faces(_FIN_COLUMNS, _FIN_ROWS) + sum(map(len, points)))
+        faces.append(np.concatenate(halves) + sum(map(len, points)))
         points.append(sheet)
         texture.append(colour)
+    s, y, z = np.concatenate(points).T
+    s = np.maximum(s, 0.0) ** rng.uniform(0.8, 1.3)  # the snout is blunter or more pointed
+    y = y * (1 + rng.uniform(-0.25, 0.25) * np.sign(y))  # back and belly differ in depth
+    y = y + rng.uniform(-0.04, 0.04) * np.sin(np.pi * np.clip(s, 0.0, 1.0))
     return FishShape(
-        points=_deform(rng, np.concatenate(points)),
+        points=np.stack([s, y, z], axis=-1),
         texture=np.concatenate(texture),
         is_fin=np.arange(sum(map(len, points))) >= len(mesh.points),
         faces=np.concatenate(faces),
@@ -148,15 +155,6 @@ def _draw_fin(
     return points, np.stack([s, np.full_like(s, 0.9 * side)], axis=-1).reshape(-1, 2)
 
 
-def _deform(rng: np.random.Generator, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    """Make the snout blunter or more pointed, and back and belly of different depth."""
-    s, y, z = points.T
-    s = np.maximum(s, 0.0) ** rng.uniform(0.8, 1.3)
-    y = y * (1 + rng.uniform(-0.25, 0.25) * np.sign(y))
-    y = y + rng.uniform(-0.04, 0.04) * np.sin(np.pi * np.clip(s, 0.0, 1.0))
-    return np.stack([s, y, z], axis=-1)
-
-
 def _draw_bends(rng: np.random.Generator, is_flatfish: bool) -> Float[np.ndarray, "3 K"]:
     """Bends of a body that turns by 0 to 120 degrees in all from head to tail, mostly by less.
 
@@ -169,14 +167,6 @@ def _draw_bends(rng: np.random.Generator, is_flatfish: bool) -> Float[np.ndarray
     twist_deg = rng.normal(0.0, 80.0 if rng.random() < 0.35 else 12.0)  # 80: the tail is edge-on
     bends[:, 0][0] = np.radians(twist_deg) * np.pi / 2
     return bends
-
-
-def _grid_faces(columns: int, rows: int) -> Int[np.ndarray, "F 3"]:
-    index = np.arange(columns * rows).reshape(columns, rows)
-    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
-    return np.concatenate(
-        [np.stack(corners, axis=-1).reshape(-1, 3) for corners in ((a, b, c), (a, c, d))]
-    )
 
 
 _ALONG, _ACROSS = 256, 96  # texture pixels from snout to tail, and from back to belly

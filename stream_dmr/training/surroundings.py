@@ -30,7 +30,11 @@ def draw_background(rng: np.random.Generator) -> UInt8[np.ndarray, "B B 3"]:
         picture = picture + share * (other - picture)
     if rng.random() < 0.15:
         _draw_net(rng, picture)
-    picture *= _draw_illumination(rng)[..., None]
+    # Brightness changes linearly across the picture.
+    y, x = (np.mgrid[:BACKGROUND_PX, :BACKGROUND_PX] / BACKGROUND_PX - 0.5).astype(np.float32)
+    slope = rng.normal(0.0, 0.35, 2)
+    light = np.clip(1 + slope[0] * x + slope[1] * y, 0.3, 1.7).astype(np.float32)
+    picture *= light[..., None]
     return np.clip(picture, 0, 255).astype(np.uint8)
 
 
@@ -179,13 +183,6 @@ def _half_plane(rng: np.random.Generator) -> Layer:
     distance_px = x * np.cos(angle) + y * np.sin(angle) - rng.uniform(-80.0, 80.0)
     distance_px = distance_px + rng.uniform(0.0, 6.0) * _noise(rng, 12.0, 12.0)
     return np.clip(distance_px / rng.uniform(1.0, 4.0) + 0.5, 0.0, 1.0).astype(np.float32)
-
-
-def _draw_illumination(rng: np.random.Generator) -> Layer:
-    """Brightness factors that change linearly across the picture."""
-    y, x = (np.mgrid[:BACKGROUND_PX, :BACKGROUND_PX] / BACKGROUND_PX - 0.5).astype(np.float32)
-    slope = rng.normal(0.0, 0.35, 2)
-    return np.clip(1 + slope[0] * x + slope[1] * y, 0.3, 1.7).astype(np.float32)
 
 
 def _water_colour(rng: np.random.Generator) -> np.ndarray:

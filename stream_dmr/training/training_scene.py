@@ -111,8 +111,12 @@ def draw_scene(rng: np.random.Generator, bank: PatchBank) -> TrainingScene:
     if rng.random() < 0.1:  # fish are laid beside rulers; without any those were taken for fish
         along = target.scene_from_patch[:, 0]
         occluders.append(draw_ruler(rng, float(np.arctan2(along[1], along[0]))))
+    frame = np.array([-9.0, -9.0, 9.0, 9.0])  # edges far off, or one across or close to the target
+    if rng.random() < 0.16:
+        edge = rng.integers(4)
+        frame[edge] = (-1.0 if edge < 2 else 1.0) * rng.uniform(0.0, 0.6)
     return TrainingScene(
-        behind=behind, target=target, before=before, occluders=occluders, frame=_draw_frame(rng)
+        behind=behind, target=target, before=before, occluders=occluders, frame=frame
     )
 
 
@@ -154,15 +158,6 @@ def _draw_fish(
     )
 
 
-def _draw_frame(rng: np.random.Generator) -> Float[np.ndarray, "4"]:
-    """The picture's edges: far off, or for 16 % one across or close to the target fish."""
-    frame = np.array([-9.0, -9.0, 9.0, 9.0])
-    if rng.random() < 0.16:
-        edge = rng.integers(4)
-        frame[edge] = (-1.0 if edge < 2 else 1.0) * rng.uniform(0.0, 0.6)
-    return frame
-
-
 # Share of the scenes in which fish cast shadows on what is behind them, chosen by hand: without any
 # the network took shadows on steel tables for fish.
 _SHADOW_SHARE = 0.35
@@ -201,7 +196,12 @@ def render_scene(
         if fish in targets:
             mask += layer[..., 3]
         if fish.fade is not None:
-            layer = layer * _seen_share(fish.fade, fish, crop_from_scene, size_px)[..., None]
+            linear, shift = fish.to_crop(crop_from_scene)
+            to_patch_x = np.linalg.inv(linear)[0]
+            rows, columns = np.indices((size_px, size_px))
+            patch_x = to_patch_x[0] * (columns - shift[0]) + to_patch_x[1] * (rows - shift[1])
+            seen = fish.fade.seen((patch_x - RIM_PX) / (PATCH_PX - 2 * RIM_PX))
+            layer = layer * seen.astype(np.float32)[..., None]
         layer = cv2.GaussianBlur(layer, (0, 0), blur_px) if blur_px else layer
         layer = layer if motion is None else cv2.filter2D(layer, -1, motion)
         picture = picture * (1 - layer[..., 3:]) + layer[..., :3]
@@ -216,17 +216,6 @@ def render_scene(
     inside = frame_coverage(scene.frame, crop_from_scene, size=size_px)
     pixels = simulate_camera(rng, add_weather(rng, picture))
     return (pixels * (inside[..., None] > 0.5)).astype(np.uint8), mask * inside
-
-
-def _seen_share(
-    fade: Fade, fish: SceneFish, crop_from_scene: Float[np.ndarray, "2 3"], size_px: int
-) -> Float32[np.ndarray, "S S"]:
-    """The share of the fish's own light at each pixel of the crop."""
-    linear, shift = fish.to_crop(crop_from_scene)
-    to_patch_x = np.linalg.inv(linear)[0]
-    rows, columns = np.indices((size_px, size_px))
-    patch_x = to_patch_x[0] * (columns - shift[0]) + to_patch_x[1] * (rows - shift[1])
-    return fade.seen((patch_x - RIM_PX) / (PATCH_PX - 2 * RIM_PX)).astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -194,11 +194,15 @@ class UNetTrainer:
             seed=(settings.seed, epoch),
         )
         losses = []
+        peak = settings.learning_rate * (_FINE_TUNING_RATE if self.is_fine_tuning else 1.0)
         batches = load_batches(pictures, workers=settings.workers)
         for step, batch in enumerate(batches):
             if stop.is_set():
                 return None
-            self._set_rate((epoch - 1 + step / len(batches)) / settings.epochs)
+            part = (epoch - 1 + step / len(batches)) / settings.epochs  # of the training
+            rise = min(1.0, (part + 1e-3) / _WARM_UP)  # linear, then a cosine's decay
+            for group in self.optimizer.param_groups:
+                group["lr"] = peak * rise * 0.5 * (1 + math.cos(math.pi * min(1.0, part)))
             losses.append(self._step(batch))
             progress(len(batch[0]))
         return self._check_and_keep(validation, epoch=epoch, loss=sum(losses) / len(losses))
@@ -206,13 +210,22 @@ class UNetTrainer:
     def _check_and_keep(
         self, validation: SampleDataset, *, epoch: int, loss: float | None
     ) -> EpochScores:
-        self.ious, right = self.check(validation)
+        self.averaged.eval()
+        ious, num_right, num_known = [], 0, 0
+        with torch.no_grad():
+            for batch in load_batches(validation, workers=0):
+                mask_logits, ends_logits, masks, ends_px = self._forward(self.averaged, batch)
+                ious.append(mask_iou(mask_logits, masks).cpu())
+                is_right, is_known = ends_are_right(ends_logits, ends_px)
+                num_right += int((is_right & is_known).sum())
+                num_known += int(is_known.sum())
+        self.ious = torch.cat(ious)
         scores = EpochScores(
             epoch=epoch,
             loss=loss,
             iou=float(self.ious.mean()),
             iou_p10=float(self.ious.quantile(0.1)),
-            ends_right=right,
+            ends_right=num_right / num_known if num_known else None,
         )
         self.history.append(scores)
         if scores.iou > self.best:
@@ -231,19 +244,6 @@ class UNetTrainer:
         with replacing(self.out / "last.pt") as draft:  # a crash leaves the previous one
             torch.save(state, draft)
         return scores
-
-    @torch.no_grad()
-    def check(self, validation: SampleDataset) -> tuple[Tensor, float | None]:
-        """IoU of each validation picture, and the fraction of heads found at the head."""
-        self.averaged.eval()
-        ious, num_right, num_known = [], 0, 0
-        for batch in load_batches(validation, workers=0):
-            mask_logits, ends_logits, masks, ends_px = self._forward(self.averaged, batch)
-            ious.append(mask_iou(mask_logits, masks).cpu())
-            is_right, is_known = ends_are_right(ends_logits, ends_px)
-            num_right += int((is_right & is_known).sum())
-            num_known += int(is_known.sum())
-        return torch.cat(ious), num_right / num_known if num_known else None
 
     @torch.no_grad()
     def predict(self, sample: TrainingSample) -> Bool[np.ndarray, "S S"]:
@@ -274,13 +274,6 @@ class UNetTrainer:
                 "learning_rate or set bfloat16 = false"
             )
         return value
-
-    def _set_rate(self, part: float) -> None:
-        """Linear warm-up, then cosine decay; `part` is the fraction of the training done."""
-        peak = self.settings.learning_rate * (_FINE_TUNING_RATE if self.is_fine_tuning else 1.0)
-        rise = min(1.0, (part + 1e-3) / _WARM_UP)
-        for group in self.optimizer.param_groups:
-            group["lr"] = peak * rise * 0.5 * (1 + math.cos(math.pi * min(1.0, part)))
 
     def _identity(self) -> dict[str, Any]:
         """The settings that a resumed run must share with the one before."""
