@@ -161,8 +161,7 @@ class FrameLookup:
 
     def __init__(self, recording: Recording, source: str | None) -> None:
         """`source`: the path of the recorded source, where it is at hand."""
-        self._recording = recording
-        self._source = source
+        self._recording, self._source = recording, source
         self._video: SeekableVideo | None = None
         if source is not None and Path(source).is_file():
             self._video = SeekableVideo(Path(source))

@@ -85,10 +85,8 @@ def messages_of(
     recording: Recording, kind: type[M], selection: Selection = EVERYTHING
 ) -> Iterator[M]:
     """The selected messages of one kind. Raises RecordingError."""
-    for _, payload in recording.payloads([kind], selection):
-        message = decode(kind, payload)
-        if selection.includes(message):
-            yield message
+    decoded = (decode(kind, payload) for _, payload in recording.payloads([kind], selection))
+    return filter(selection.includes, decoded)
 
 
 def files_of(path: Path) -> list[Path]:

@@ -225,7 +225,6 @@ def whole_records(path: Path) -> Iterator[object]:
 def _by_index(
     stream: IO[bytes], topics: Collection[str], selection: Selection
 ) -> Iterator[tuple[str, McapMessage]]:
-    stream.seek(-_FOOTER_BYTES - len(MCAP0_MAGIC), 2)
     _check_index(stream, _footer(stream))
     stream.seek(0)
     reader = SeekingReader(stream, validate_crcs=True)
@@ -252,13 +251,13 @@ def _spans(stream: IO[bytes], reader: SeekingReader) -> Spans:
 
 def _has_index(stream: IO[bytes]) -> bool:
     """False where a full disk left no room for the index."""
-    stream.seek(-_FOOTER_BYTES - len(MCAP0_MAGIC), 2)
     footer = _footer(stream)
     stream.seek(0)
     return footer.summary_start > 0
 
 
 def _footer(stream: IO[bytes]) -> Footer:
+    stream.seek(-_FOOTER_BYTES - len(MCAP0_MAGIC), 2)
     opcode, _, *fields = struct.unpack("<BQQQI", stream.read(_FOOTER_BYTES))
     if opcode != Opcode.FOOTER:
         raise ValueError("it has no footer")
