@@ -94,35 +94,27 @@ class Decoder:
         deadline_s = time.monotonic() + timeout_s
         while (message := self._receive(deadline_s)) is not None:
             if "shape" in message:
-                self._map_slots(message)
+                self.height, self.width = message["shape"][:2]
+                self.fps, self.promised = message["fps"], message["promised"]
+                shared = mmap.mmap(self._memory, NUM_SLOTS * self.height * self.width * 3)
+                slots = np.frombuffer(shared, np.uint8)
+                self._slots = slots.reshape(-1, self.height, self.width, 3)
             elif "resized" in message:
                 height, width = message["resized"][:2]
                 raise ResizedError(width=width, height=height)
             elif "slot" in message:
-                return self._copy_picture(message)
+                assert self._slots is not None
+                assert self._process.stdin is not None
+                image = self._slots[message["slot"]].copy()
+                with suppress(BrokenPipeError):  # the child has died; the next read raises
+                    self._process.stdin.write(bytes([message["slot"]]))
+                return DecodedPicture(milliseconds=message["milliseconds"], image=image)
             else:
                 return None
         if self._slots is None:
             return None  # it could not be opened, holds no picture, or was closed
         status = self._process.wait()
         raise DecodingError(f"the decoder crashed (status {status})")
-
-    def _map_slots(self, message: dict[str, Any]) -> None:
-        """Map the shared memory, of which the child now says how large it is."""
-        self.height, self.width = message["shape"][:2]
-        self.fps, self.promised = message["fps"], message["promised"]
-        size = NUM_SLOTS * self.height * self.width * 3
-        shared = mmap.mmap(self._memory, size)
-        self._slots = np.frombuffer(shared, np.uint8).reshape(-1, self.height, self.width, 3)
-
-    def _copy_picture(self, message: dict[str, Any]) -> DecodedPicture:
-        """Copy a picture out of its slot, and return the slot to the child."""
-        assert self._slots is not None
-        assert self._process.stdin is not None
-        image = self._slots[message["slot"]].copy()
-        with suppress(BrokenPipeError):  # the child has died; the next read raises
-            self._process.stdin.write(bytes([message["slot"]]))
-        return DecodedPicture(milliseconds=message["milliseconds"], image=image)
 
     def _receive(self, deadline_s: float) -> dict[str, Any] | None:
         """The child's next message; None where it has ended. Raises DecodingError if too late."""

@@ -34,11 +34,14 @@ def main(address: str, memory: int) -> None:
     for slot in range(NUM_SLOTS):
         free.put(slot)
     threading.Thread(target=_collect_free_slots, args=(free,), daemon=True).start()
-    capture = _open(address)
+    place = (int(address),) if address.isdecimal() else (address, cv2.CAP_FFMPEG)
+    capture = cv2.VideoCapture(*place)
     is_read, image = capture.read()
     if not is_read or image.ndim != 3 or image.dtype != np.uint8:
         return
-    slots = _map_slots(image.shape, memory)
+    os.ftruncate(memory, NUM_SLOTS * image.size)
+    shared = mmap.mmap(memory, NUM_SLOTS * image.size)
+    slots = np.frombuffer(shared, np.uint8).reshape(NUM_SLOTS, *image.shape)
     _send(
         shape=image.shape,
         fps=capture.get(cv2.CAP_PROP_FPS),
@@ -58,18 +61,6 @@ def main(address: str, memory: int) -> None:
             np.copyto(slots[slot], image)
         _send(slot=slot, milliseconds=capture.get(cv2.CAP_PROP_POS_MSEC))
     return _send(end=True)
-
-
-def _open(address: str) -> cv2.VideoCapture:
-    if address.isdecimal():
-        return cv2.VideoCapture(int(address))
-    return cv2.VideoCapture(address, cv2.CAP_FFMPEG)
-
-
-def _map_slots(shape: tuple[int, ...], memory: int) -> np.ndarray:
-    size = NUM_SLOTS * int(np.prod(shape))
-    os.ftruncate(memory, size)
-    return np.frombuffer(mmap.mmap(memory, size), np.uint8).reshape(NUM_SLOTS, *shape)
 
 
 def _collect_free_slots(free: "SimpleQueue[int]") -> None:

@@ -96,7 +96,7 @@ def fish_outline(
         canvas, to_pixels = _straightened(blob, head, tail)
         head, tail = (to_pixels(point) for point in _snout_and_fork(canvas))
     canvas, _ = _straightened(blob, head, tail)
-    outline = _measured(canvas, head_px=head, tail_px=tail)
+    outline = _measured(canvas, head, tail)
     body = outline.x <= outline.peduncle
     middle = (outline.upper - outline.lower)[body] / 2
     bow = np.abs(uniform_filter1d(middle, round(_BOW_WINDOW * _LENGTH_PX), mode="nearest")).max()
@@ -213,10 +213,7 @@ def _middle_row(columns: Bool[np.ndarray, "R C"]) -> float:
 
 
 def _measured(
-    canvas: Bool[np.ndarray, "R C"],
-    *,
-    head_px: Float[np.ndarray, "2"],
-    tail_px: Float[np.ndarray, "2"],
+    canvas: Bool[np.ndarray, "R C"], head: Float[np.ndarray, "2"], tail: Float[np.ndarray, "2"]
 ) -> FishOutline:
     """The outline of a canvas whose row between snout and fork is the middle one."""
     middle = canvas.shape[0] // 2
@@ -240,8 +237,8 @@ def _measured(
         edge_x = gaussian_filter1d(ends.astype(np.float64), _SMOOTH_PX, mode="nearest")
         edge_x, edge_y = peduncle + edge_x / _LENGTH_PX, (middle - rows) / _LENGTH_PX
     return FishOutline(
-        head_px=head_px,
-        tail_px=tail_px,
+        head_px=head,
+        tail_px=tail,
         x=x,
         upper=upper,
         lower=lower,
@@ -269,7 +266,14 @@ def find_points(mesh: trimesh.Trimesh, *, name: str) -> dict[str, Float[np.ndarr
     """
     axes = _fish_axes(mesh)
     fish = trimesh.Trimesh(mesh.vertices @ axes.T, mesh.faces, process=False)
-    _require_fish(fish, name=name)
+    length = fish.extents[0]
+    elongation, volume = length / fish.extents[1:].max(), fish.volume / length**3
+    if elongation < _MIN_ELONGATION or not _MIN_VOLUME <= volume <= _MAX_VOLUME:
+        raise TemplateError(
+            f"template {name}: expected a fish, {_MIN_ELONGATION:g} times as long as broad or more "
+            f"and of {_MIN_VOLUME:g} to {_MAX_VOLUME:g} of its length cubed in volume, got "
+            f"{elongation:.1f} and {volume:.2g}; put a TOML with its points beside the mesh"
+        )
     view, origin, scale = _side_view(fish)
     outline = fish_outline(view, name=f"template {name}", head_is_left=True)
     snout, fork = (pixel / scale + origin for pixel in (outline.head_px, outline.tail_px))
@@ -297,17 +301,6 @@ def _fish_axes(mesh: trimesh.Trimesh) -> Float[np.ndarray, "3 3"]:
     tail = min(thickness, key=lambda sign: thickness[sign])
     x, y = tail * axes[0], across[tail]
     return np.stack([x, y, np.cross(x, y)])
-
-
-def _require_fish(fish: trimesh.Trimesh, *, name: str) -> None:
-    length = fish.extents[0]
-    elongation, volume = length / fish.extents[1:].max(), fish.volume / length**3
-    if elongation < _MIN_ELONGATION or not _MIN_VOLUME <= volume <= _MAX_VOLUME:
-        raise TemplateError(
-            f"template {name}: expected a fish, {_MIN_ELONGATION:g} times as long as broad or more "
-            f"and of {_MIN_VOLUME:g} to {_MAX_VOLUME:g} of its length cubed in volume, got "
-            f"{elongation:.1f} and {volume:.2g}; put a TOML with its points beside the mesh"
-        )
 
 
 def _side_view(

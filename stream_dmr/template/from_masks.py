@@ -58,14 +58,8 @@ def _faces(num_rings: int, num_sectors: int) -> Int[np.ndarray, "F 3"]:
     after = (first + 1) % num_sectors
     last = (num_rings - 1) * num_sectors
     snout = np.full(num_sectors, num_rings * num_sectors)
-    return np.vstack(
-        [
-            np.stack([a, c, b], axis=1),
-            np.stack([b, c, d], axis=1),
-            np.stack([snout, first, after], axis=1),
-            np.stack([snout + 1, last + after, last + first], axis=1),
-        ]
-    )
+    fans = ((snout, first, after), (snout + 1, last + after, last + first))
+    return np.vstack([np.stack(corners, axis=1) for corners in ((a, c, b), (b, c, d), *fans)])
 
 
 _MIN_HALF_THICKNESS = 0.003  # of the fork length: that of the tail fin's edge in `body_forms.toml`
@@ -164,19 +158,14 @@ def _trailing_edge(outline: FishOutline, across: Float[np.ndarray, "S"]) -> Floa
     """The tail fin's trailing edge (x) for `across` from -1, the lower lobe's tip, to 1."""
     if len(outline.edge_x) == 0:
         return np.ones_like(across)
-    lower, upper = (_lobe_height(outline, sign) for sign in (-1.0, 1.0))
-    heights = across * np.where(across > 0, upper, -lower)
+    tips = {-1.0: 0.0, 1.0: 0.0}  # heights of the lower and the upper lobe's; 0 without that lobe
+    for sign in tips:
+        half = sign * outline.edge_y >= 0
+        x, y = outline.edge_x[half], outline.edge_y[half]
+        if len(x):
+            tips[sign] = float((sign * y[x >= x.max() - _LOBE_TIP]).max())
+    heights = across * np.where(across > 0, tips[1.0], tips[-1.0])
     return np.interp(heights, outline.edge_y, outline.edge_x)
-
-
-def _lobe_height(outline: FishOutline, sign: float) -> float:
-    """Height (y) of the tip of the upper (1) or lower (-1) lobe; 0 without one on that side."""
-    half = sign * outline.edge_y >= 0
-    x, y = outline.edge_x[half], outline.edge_y[half]
-    if len(x) == 0:
-        return 0.0
-    tips = y[x >= x.max() - _LOBE_TIP]
-    return float(sign * (sign * tips).max())
 
 
 def _on_axis(*places: float) -> Float[np.ndarray, "N 3"]:

@@ -22,28 +22,19 @@ def body_mesh(form: BodyForm) -> trimesh.Trimesh:
     place, angle = ring_places(), ring_angles()
     depth, thickness = form.half_depth_at(place), form.half_thickness_at(place)
     lobe = form.lobe * np.clip((place - _TAIL_FROM) / (1 - _TAIL_FROM), 0.0, 1.0) ** 2
-    rings = np.stack(
-        [
-            place[:, None] + lobe[:, None] * np.cos(angle) ** 2,
-            depth[:, None] * np.cos(angle),
-            thickness[:, None] * np.sin(angle),
-        ],
-        axis=-1,
-    )
-    return ring_mesh(rings)
+    x = place[:, None] + lobe[:, None] * np.cos(angle) ** 2
+    y, z = depth[:, None] * np.cos(angle), thickness[:, None] * np.sin(angle)
+    return ring_mesh(np.stack([x, y, z], axis=-1))
 
 
 def template_toml(form: BodyForm) -> str:
     """The text of the TOML beside the mesh, as `load_template` reads it."""
-
-    def point(place: float) -> str:
-        return f"[{place}, 0.0, 0.0]"
-
+    head, center, tail, *joints = ([x, 0.0, 0.0] for x in (0.0, CENTER, 1.0, *JOINTS))
     return (
         f'name = "{form.title}"\n'
-        f"joints = [{', '.join(map(point, JOINTS))}]\n"
+        f"joints = {joints}\n"
         "[keypoints]\n"
-        f"head = {point(0.0)}\ncenter = {point(CENTER)}\ntail = {point(1.0)}\n"
+        f"head = {head}\ncenter = {center}\ntail = {tail}\n"
         "[length]  # of this template: the tail keypoint is the middle of the fin\n"
         f'tail = "fork"\ntotal_per_fork = {1 + form.lobe:g}\n'
     )

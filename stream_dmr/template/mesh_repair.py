@@ -112,10 +112,8 @@ def _thickened(sheet: trimesh.Trimesh, half: float) -> trimesh.Trimesh:
     offset = half * oriented.vertex_normals
     faces, num_vertices = oriented.faces, len(oriented.vertices)
     a, b = _rim(oriented).T
-    walls = [
-        np.stack([b, a, a + num_vertices], 1),
-        np.stack([b, a + num_vertices, b + num_vertices], 1),
-    ]
+    c, d = a + num_vertices, b + num_vertices
+    walls = [np.stack([b, a, c], 1), np.stack([b, c, d], 1)]
     return trimesh.Trimesh(
         np.vstack([oriented.vertices + offset, oriented.vertices - offset]),
         np.vstack([faces, faces[:, ::-1] + num_vertices, *walls]),
