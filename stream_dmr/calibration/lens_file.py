@@ -97,13 +97,14 @@ def read_array(
 ) -> Float[np.ndarray, "..."]:
     """Return a finite float64 array of one of `shapes`; rows and columns both pass as vectors."""
     given = values[key]
-    if isinstance(given, Mapping):  # ROS, and OpenCV's JSON
-        given = _matrix_of(given)
     try:
-        value = np.squeeze(np.array(given, np.float64))
-    except (TypeError, ValueError, OverflowError) as error:
+        if isinstance(given, Mapping):  # ROS, and OpenCV's JSON
+            shape = int(given["rows"]), int(given["cols"])
+            given = np.array(given["data"], np.float64).reshape(shape)
+        value = np.squeeze(np.array([] if given is None else given, np.float64))
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise _no_numbers(path, key) from error
-    if given is None or value.size == 0:
+    if value.size == 0:
         raise _no_numbers(path, key)
     if value.shape not in shapes:
         expected = " or ".join("x".join(map(str, shape)) for shape in shapes)
@@ -181,14 +182,6 @@ def _is_fisheye(values: Values, path: Path) -> bool:
             f"{model}; calibrate again with `stream-dmr calibrate --model fisheye`"
         )
     return _IS_FISHEYE[model]
-
-
-def _matrix_of(given: Mapping[str, object]) -> object:
-    try:
-        shape = int(given["rows"]), int(given["cols"])  # pyright: ignore[reportArgumentType]
-        return np.array(given["data"], np.float64).reshape(shape)
-    except (KeyError, TypeError, ValueError, OverflowError):
-        return None
 
 
 def _no_numbers(path: Path, key: str) -> CalibrationError:

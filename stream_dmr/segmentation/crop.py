@@ -208,12 +208,14 @@ def _segment(
     unknown = None if ends is None else beyond_head(mask, ends)
     if unknown is not None:
         mask = clean_mask(mask & ~unknown, min_area_px=min_area_px)
+    inside = np.round(np.column_stack([x[mask], y[mask]]))  # the frame pixels of the mask's
+    low, high = inside.min(axis=0, initial=np.inf), inside.max(axis=0, initial=-np.inf)
     return MaskedCrop(
         image=resize(pictures[-1], crop_camera.width),
         crop_camera=crop_camera,
         mask=mask,
         area_px=float(areas[mask].sum()),
-        extent=_extent(x[mask], y[mask]),
+        extent=np.array([*low, *(high + 1)], np.float64) if len(inside) else None,
         is_cut=bool(mask[[0, -1]].any() or mask[:, [0, -1]].any()),
         confidence=mask_confidence(probability, mask),
         ends=ends,
@@ -286,17 +288,6 @@ def _slope(values: Float32[np.ndarray, "S S"]) -> Float32[np.ndarray, "S S"]:
     slope[1:-1] = (values[2:] - values[:-2]) / 2
     slope[0], slope[-1] = values[1] - values[0], values[-1] - values[-2]
     return slope
-
-
-def _extent(
-    x: Float32[np.ndarray, "N"], y: Float32[np.ndarray, "N"]
-) -> Float[np.ndarray, "4"] | None:
-    """The half-open box of the frame pixels that contain these points; None without points."""
-    if not len(x):
-        return None
-    columns, rows = np.round(x), np.round(y)
-    low, high = (columns.min(), rows.min()), (columns.max() + 1, rows.max() + 1)
-    return np.array([*low, *high], np.float64)
 
 
 def mask_confidence(

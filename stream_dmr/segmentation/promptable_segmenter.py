@@ -30,7 +30,11 @@ class PromptableSegmenter:
         self._path = path
         self._session = open_session(path)
         self._picture, self._prompts = self._read_inputs()
-        self._size = self._read_size()
+        shape = next(i.shape for i in self._session.get_inputs() if i.name == self._picture)
+        sides = {n for n in shape[2:] if isinstance(n, int)}
+        if len(sides) > 1 or any(n < 32 for n in sides):
+            raise self._refusal("square pictures of at least 32 px", f"{shape}")
+        self._size = sides.pop() if sides else _DEFAULT_SIDE_PX  # of the input's side, px
         box = np.array([40.0, 30.0, 90.0, 100.0])
         for value in (0, 90, 255):
             picture = np.full((128, 128, 3), value, np.uint8)
@@ -84,14 +88,6 @@ class PromptableSegmenter:
             names = ", ".join(f"{i.name} {i.shape}" for i in self._session.get_inputs()) or "none"
             raise self._refusal("one input (1, 3, H, W) and one for a box", names)
         return pictures[0], prompts
-
-    def _read_size(self) -> int:
-        """The side of the square image that the model takes, px."""
-        shape = next(i.shape for i in self._session.get_inputs() if i.name == self._picture)
-        sides = {n for n in shape[2:] if isinstance(n, int)}
-        if len(sides) > 1 or any(n < 32 for n in sides):
-            raise self._refusal("square pictures of at least 32 px", f"{shape}")
-        return sides.pop() if sides else _DEFAULT_SIDE_PX
 
     def _try(self, image: UInt8[np.ndarray, "S S 3"], box: Float[np.ndarray, "4"]) -> None:
         try:

@@ -34,7 +34,7 @@ _FIN_COLUMNS, _FIN_ROWS = 9, 3  # of a fin's mesh
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FishShape:
-    """A straight fish as a mesh, in body lengths (see `simulation.simulated_body`)."""
+    """A straight fish as a mesh, in body lengths (see `simulation.simulated_fish`)."""
 
     points: Float[np.ndarray, "V 3"]
     texture: Float[np.ndarray, "V 2"]  # along (0 to ALONG_END) and across (-1 to 1) the skin
