@@ -178,17 +178,19 @@ def print_timings(summary: RunSummary | ReplaySummary) -> None:
         )
     _stdout().print(table)
     if isinstance(summary, RunSummary):
-        print(", ".join(f"{name} {seconds:.1f} s" for name, seconds in summary.parts_s.items()))
+        parts = [f"{name} {seconds:.1f} s" for name, seconds in summary.parts_s.items()]
+        print(", ".join(part for part in parts if not part.endswith(" 0.0 s")))
 
 
 def print_speed(summary: RunSummary) -> None:
-    """Print how many frames were measured in what time, the passes before included, to stdout."""
-    elapsed_s = sum(summary.parts_s.values())
+    """Print how many frames were measured in what time, all passes included, to stdout."""
+    start_s = summary.parts_s["starting"]
+    elapsed_s = sum(summary.parts_s.values()) - start_s
     promised, num_frames = summary.frames_promised, summary.num_frames
     of = "" if promised is None or num_frames >= promised - 1 else f" of {promised}"
     print(
         f"{num_frames}{of} frames in {elapsed_s:.1f} s, {num_frames / elapsed_s:.1f} frames/s, "
-        f"{summary.recorded_s / elapsed_s:.2g} times real time"
+        f"{summary.recorded_s / elapsed_s:.2g} times real time; {start_s:.1f} s to start"
     )
 
 
