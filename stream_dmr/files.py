@@ -132,6 +132,16 @@ class _SnapshotStream(io.RawIOBase):
         return len(data)
 
 
+def require_file(path: Path) -> None:
+    """Raise OSError for a pipe or a device: reading it may never begin, or never end.
+
+    Opening a folder raises an OSError of its own.
+    """
+    mode = path.stat().st_mode
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        raise OSError(errno.EINVAL, "no file but a pipe or a device", str(path))
+
+
 def read_text(path: Path, *, encoding: str = "utf-8", max_bytes: int = MAX_TEXT_BYTES) -> str:
     """The text of a file that people write, such as settings; devices don't end.
 
@@ -143,14 +153,10 @@ def read_text(path: Path, *, encoding: str = "utf-8", max_bytes: int = MAX_TEXT_
 def read_small(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
     """The content of a file that should be small. Raises OSError as `read_text` does.
 
-    A pipe or a device is refused: reading it may never end.
+    A pipe or a device is refused.
     """
-    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
-        mode = os.fstat(file.fileno()).st_mode
-        if stat.S_ISDIR(mode):
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        if not stat.S_ISREG(mode):
-            raise OSError(errno.EINVAL, "no file but a pipe or a device")
+    require_file(path)
+    with path.open("rb") as file:
         data = file.read(max_bytes + 1)
     if len(data) > max_bytes:
         raise OSError(errno.EFBIG, f"more than {max_bytes // 1000} kB")
@@ -235,6 +241,8 @@ def make_folder(path: Path) -> Path:
 
 
 def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, in hex. Raises OSError."""
+    require_file(path)
     with path.open("rb") as file:
         return file_digest(file, "sha256").hexdigest()
 

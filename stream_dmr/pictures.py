@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from stream_dmr.files import natural_order
+from stream_dmr.files import natural_order, require_file
 
 MAX_PIXELS = 150_000_000  # chosen: the largest cameras have some 100 megapixels
 PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
@@ -31,6 +31,7 @@ def size_if_huge(path: Path) -> str:
     Its pixels alone would take half a gigabyte and more.
     """
     try:
+        require_file(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(path) as picture:
@@ -59,6 +60,7 @@ def read_picture(path: Path, flags: int) -> np.ndarray | None:
 
     Raises OSError.
     """
+    require_file(path)
     content = path.read_bytes()
     if not content or is_cut_off(content):
         return None

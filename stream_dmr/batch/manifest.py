@@ -12,7 +12,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from stream_dmr.errors import UserError, reason_of
-from stream_dmr.files import read_text
+from stream_dmr.files import read_text, sha256_of
 from stream_dmr.pipeline.run_options import RunOptions, options_of
 from stream_dmr.version import __version__
 
@@ -140,6 +140,6 @@ def _size_and_time(path: str) -> list[int]:
 
 def _content_hash(path: str) -> str:
     try:
-        return sha256(Path(path).read_bytes()).hexdigest() if path else ""
+        return sha256_of(Path(path)) if path else ""
     except OSError:
         return ""

@@ -76,9 +76,10 @@ def _post(address: str, what: str, name: str, token_file: Path | None) -> str:
 
 def _read_token(path: Path) -> str:
     from stream_dmr.errors import UserError, reason_of
+    from stream_dmr.files import read_text
 
     try:
-        return path.read_text(encoding="utf-8").strip()
+        return read_text(path).strip()
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(
             f"--token-file {path}: expected a file with the access token, got: {reason_of(error)}"

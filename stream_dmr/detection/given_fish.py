@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float
 from stream_dmr.detection.box_files import UNKNOWN_ID, AnnotatedBox, load_boxes, unused_boxes
 from stream_dmr.detection.detector import Candidate, Detector
 from stream_dmr.detection.mask_folder import Labels, MaskFolder
-from stream_dmr.errors import AnnotationError
+from stream_dmr.errors import AnnotationError, reason_of
+from stream_dmr.files import MAX_TEXT_BYTES, read_text
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.crop import Detection
 
@@ -215,7 +216,8 @@ def names_pictures(path: Path) -> bool:
     """True for a CSV whose header speaks of `picture` and `fish`, whatever stands between them."""
     if path.suffix.lower() != ".csv" or not path.is_file():
         return False
-    header = path.read_text(encoding="utf-8-sig", errors="replace").partition("\n")[0]
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        header = file.readline(MAX_TEXT_BYTES)
     return {PICTURE, FISH} <= set(re.findall(r"\w+", header.lower()))
 
 
@@ -299,12 +301,17 @@ def _area(bbox_xyxy_px: Float[np.ndarray, "4"]) -> float:
     return float(np.prod(bbox_xyxy_px[2:] - bbox_xyxy_px[:2]))
 
 
+_MAX_BYTES = 100_000_000  # a million pictures; chosen
+
+
 def _read(path: Path) -> dict[str, int]:
     try:
-        header, *rows = csv.reader(path.read_text(encoding="utf-8-sig").splitlines())
-    except (UnicodeDecodeError, csv.Error) as error:
+        header, *rows = csv.reader(
+            read_text(path, encoding="utf-8-sig", max_bytes=_MAX_BYTES).splitlines()
+        )
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise AnnotationError(
-            f"{path}: expected a CSV in UTF-8, got: {error}; save it as CSV UTF-8"
+            f"{path}: expected a CSV in UTF-8, got: {reason_of(error)}; save it as CSV UTF-8"
         ) from error
     columns = [cell.strip() for cell in header]
     if not {PICTURE, FISH} <= {*columns}:

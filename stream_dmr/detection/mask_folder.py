@@ -14,6 +14,7 @@ from jaxtyping import Bool, Integer
 from PIL import Image
 
 from stream_dmr.errors import AnnotationError
+from stream_dmr.files import require_file
 from stream_dmr.pictures import PICTURE_SUFFIXES
 
 _FILE_NAME = re.compile(r"\d{6,}\.png")
@@ -111,6 +112,7 @@ class MaskFolder:
         stem = f"{frame_index:06d}" if self._is_numbered else Path(picture).stem
         path = self.folder / f"{stem}.png"
         try:
+            require_file(path)
             with Image.open(path) as file:
                 _check_labels(file, path, size=(width, height))
                 file.verify()  # the checksums, which decoding leaves out; then it must be reopened
@@ -170,8 +172,12 @@ class MaskFolder:
         if self._is_numbered:
             names = [name for name in names if _FILE_NAME.fullmatch(name)]
         for name in names[:: max(1, len(names) // _MAX_LOOKED_AT)]:
-            with Image.open(self.folder / name) as picture:
-                values = np.unique(np.asarray(picture))
+            try:
+                require_file(self.folder / name)
+                with Image.open(self.folder / name) as picture:
+                    values = np.unique(np.asarray(picture))
+            except _DECODING_ERRORS:
+                continue  # said where its frame comes
             if ((values > 0) & (values < largest)).any():
                 return
         raise AnnotationError(

@@ -17,6 +17,7 @@ import numpy as np
 
 from stream_dmr.errors import UserError
 from stream_dmr.evaluation.length_errors import Histogram
+from stream_dmr.files import require_file
 
 Interval = tuple[float, float]
 _Record = Mapping[str, str | None]
@@ -106,6 +107,7 @@ def _records(path: Path, *required: str) -> Iterator[tuple[str, _Record]]:
 
 def _open(path: Path) -> tuple[list[str], list[tuple[str, _Record]]]:
     try:
+        require_file(path)
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file, strict=True)
             columns = list(reader.fieldnames or [])

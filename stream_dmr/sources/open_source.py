@@ -31,7 +31,7 @@ def open_source(source: str, settings: ReadFramesSettings) -> Source:
             other_sizes=settings.other_sizes,
             as_sensor=settings.orientation == "sensor",
         )
-    if path.is_file():
+    if path.exists():
         return VideoFile(path, settings)
     if source.isdecimal() or "://" in source:
         return LiveStream(source, settings)

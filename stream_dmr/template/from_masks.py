@@ -9,7 +9,7 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 
 from stream_dmr.errors import TemplateError
-from stream_dmr.pictures import MAX_PIXELS, size_if_huge
+from stream_dmr.pictures import MAX_PIXELS, read_picture, size_if_huge
 from stream_dmr.template.fish_outline import FishOutline, fish_outline
 from stream_dmr.template.template import (
     CENTER,
@@ -179,12 +179,11 @@ def _read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
             f"{path}: expected a mask of {MAX_PIXELS // 10**6} megapixels or less, got {huge}"
         )
     try:
-        content = np.frombuffer(path.read_bytes(), np.uint8)
+        image = read_picture(path, cv2.IMREAD_UNCHANGED)
     except OSError as error:
         raise TemplateError(
             f"{path}: expected a mask, but it can't be read: {error.strerror}"
         ) from error
-    image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if len(content) else None
     if image is None:
         raise TemplateError(
             f"{path}: expected a picture of a mask, such as a PNG, got another file"

@@ -10,15 +10,18 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Integer, UInt8
 
-from stream_dmr.errors import AnnotationError
+from stream_dmr.errors import AnnotationError, reason_of
+from stream_dmr.files import read_text
 from stream_dmr.geometry import transformed
 from stream_dmr.networks.unet_interface import box_coverage
-from stream_dmr.pictures import MAX_PIXELS, PICTURE_SUFFIXES, size_if_huge
+from stream_dmr.pictures import MAX_PIXELS, PICTURE_SUFFIXES, read_picture, size_if_huge
 from stream_dmr.training.image_degradation import add_weather, simulate_camera
 from stream_dmr.training.random_fish import PATCH_PX, RIM_PX, FishPatch
 from stream_dmr.training.samples import TrainingSample, crop_affine, draw_part_box, jitter_box
 from stream_dmr.training.surroundings import BACKGROUND_PX
 from stream_dmr.training.training_scene import FADED_SHARE, draw_fade
+
+_MAX_BYTES = 1_000_000_000  # of a COCO file; chosen
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -90,7 +93,7 @@ def _read_folder(paths: dict[str, Path], masks: Path) -> Iterator[AnnotatedImage
 
 def _read_labels(mask: Path) -> Integer[np.ndarray, "H W"]:
     _refuse_huge(mask)
-    labels = cv2.imread(str(mask), cv2.IMREAD_UNCHANGED)
+    labels = _decoded(mask, cv2.IMREAD_UNCHANGED)
     if labels is None or labels.ndim != 2:
         raise AnnotationError(f"{mask}: expected a PNG of one channel, the ids of fish")
     return labels
@@ -128,7 +131,7 @@ def _ends(annotation: dict[str, Any]) -> Float[np.ndarray, "2 2"]:
 
 def _parse_coco(file: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = json.loads(read_text(file, max_bytes=_MAX_BYTES))
         pictures, annotations = content["images"], content["annotations"]
         pictures = sorted(pictures, key=lambda one: str(one["file_name"]))
         if all("id" in one for one in pictures) and all("segmentation" in a for a in annotations):
@@ -196,10 +199,17 @@ def _unpack(text: str) -> list[int]:
 def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     """The image, BGR. Raises AnnotationError where it can't be decoded, or is too large for it."""
     _refuse_huge(path)
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    image = _decoded(path, cv2.IMREAD_COLOR)
     if image is None:
         raise AnnotationError(f"{path}: expected an image, but it can't be decoded")
     return image
+
+
+def _decoded(path: Path, flags: int) -> np.ndarray | None:
+    try:
+        return read_picture(path, flags)
+    except OSError as error:
+        raise AnnotationError(f"{path}: expected a picture, got: {reason_of(error)}") from None
 
 
 def _refuse_huge(path: Path) -> None:

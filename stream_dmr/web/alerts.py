@@ -13,6 +13,7 @@ from email.message import EmailMessage
 from pathlib import Path
 
 from stream_dmr.errors import ConfigError, reason_of
+from stream_dmr.files import read_text
 from stream_dmr.pipeline.config import AlertSettings
 
 _LOOK_S = 2.0  # between two looks at the health
@@ -145,6 +146,6 @@ def _mail(settings: AlertSettings, alert: Alert) -> None:
         if server.has_extn("starttls") or settings.mail_password_file:
             server.starttls(context=context)
         if settings.mail_password_file:
-            password = Path(settings.mail_password_file).read_text(encoding="utf-8").strip()
+            password = read_text(Path(settings.mail_password_file)).strip()
             server.login(settings.mail_from, password)
         server.send_message(message)

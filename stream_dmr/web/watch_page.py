@@ -18,6 +18,7 @@ from jaxtyping import UInt8
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from stream_dmr.errors import ConfigError, OutputError, UserError
+from stream_dmr.files import read_text
 from stream_dmr.lengths.fate import FATE_OF_ZONE
 from stream_dmr.pipeline.config import WatchSettings
 from stream_dmr.sources.positions import COUNTED
@@ -96,7 +97,7 @@ def _read_token(settings: WatchSettings) -> str:
             "reach this address; make one with: openssl rand -hex 16 > token"
         )
     try:
-        token = Path(settings.token_file).read_text(encoding="utf-8").strip()
+        token = read_text(Path(settings.token_file)).strip()
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not text"
         raise ConfigError(

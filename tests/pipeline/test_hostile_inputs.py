@@ -12,9 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
+from stream_dmr.batch.manifest import read_manifest
 from stream_dmr.calibration.calibration_file import load_calibration
 from stream_dmr.calibration.corners import read_grey
+from stream_dmr.cli.vessel import haul
 from stream_dmr.detection.box_files import load_boxes
+from stream_dmr.detection.mask_folder import MaskFolder
 from stream_dmr.errors import (
     AnnotationError,
     CalibrationError,
@@ -23,9 +26,13 @@ from stream_dmr.errors import (
     TemplateError,
     UserError,
 )
+from stream_dmr.evaluation.length_tables import read_truth
 from stream_dmr.pipeline.config import load_config
-from stream_dmr.sources.open_source import open_source
+from stream_dmr.recording.reading import open_recordings
+from stream_dmr.sources.open_source import open_positions, open_source
+from stream_dmr.sources.sensors_settings import SensorsSettings
 from stream_dmr.sources.source import ReadFramesSettings
+from stream_dmr.store.ledger import Signer, load_public_key
 from stream_dmr.template.from_masks import template_from_masks
 from stream_dmr.template.template_file import load_template
 from stream_dmr.training.annotated_images import read_annotated_images, read_image
@@ -61,12 +68,51 @@ def large_file(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("kind", ENDLESS)
-@pytest.mark.parametrize("device", ["/dev/zero", "/dev/urandom"])
-def test_a_device_that_never_ends_is_refused(kind: str, device: str):
-    load, error = ENDLESS[kind]
-    with pytest.raises(error, match="a pipe or a device"):
-        load(Path(device))
+def read_mask(path: Path) -> object:
+    (path.parent / "000001.png").symlink_to(path)
+    return MaskFolder(path.parent).labels(1, width=8, height=8)
+
+
+def read_coco(path: Path) -> object:
+    cv2.imwrite(str(path.with_name("1.jpg")), np.zeros((48, 64, 3), np.uint8))
+    (coco := path.with_suffix(".json")).symlink_to(path)
+    return list(read_annotated_images(path.parent, coco))
+
+
+def read_positions(path: Path) -> object:
+    return open_positions(str(path), SensorsSettings(), is_since_1970=False)
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "calibration": load_calibration,
+    "config": load_config,
+    "boxes": load_boxes,
+    "manifest": lambda path: read_manifest(path, config=None, template="cod"),
+    "truth": read_truth,
+    "public key": load_public_key,
+    "private key": Signer,
+    "board": read_grey,
+    "image": read_image,
+    "mask": read_mask,
+    "mask of a template": lambda path: template_from_masks(path, thickness=0.5, name="fish"),
+    "COCO": read_coco,
+    "video": lambda path: open_source(str(path), ReadFramesSettings()),
+    "positions": read_positions,
+    "recording": lambda path: open_recordings([path]),
+    "token": lambda path: haul("start", "http://127.0.0.1:1/", token_file=path),
+}
+
+
+@pytest.mark.parametrize("kind", READERS)
+@pytest.mark.parametrize("device", ["/dev/zero", "a pipe"])
+def test_pipes_and_devices_are_refused(tmp_path: Path, kind: str, device: str):
+    path = tmp_path / "given"
+    if device == "a pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to(device)
+    with pytest.raises(UserError):
+        READERS[kind](path)
 
 
 @pytest.mark.parametrize("kind", ENDLESS)
