@@ -1,5 +1,6 @@
 """Compiles kernels by numba: once, cached on disk, without the GIL."""
 
+import atexit
 import hashlib
 import inspect
 import logging
@@ -96,7 +97,8 @@ def users_cache(name: str, *, installed: Path) -> Path:
             folder,
             error.strerror or error,
         )
-        return Path(tempfile.mkdtemp(prefix="stream-dmr-"))
+        folder = Path(tempfile.mkdtemp(prefix="stream-dmr-"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
 
 
@@ -120,12 +122,12 @@ def _require_private(folder: Path) -> None:
 def _fill(folder: Path, installed: Path) -> None:
     """Make a folder, with copies of the installation's compiled functions where there are any."""
     draft = Path(tempfile.mkdtemp(prefix=f"{folder.name}.", dir=folder.parent))
-    if installed.is_dir():
-        shutil.copytree(installed, draft, dirs_exist_ok=True, copy_function=shutil.copyfile)
-        draft.chmod(0o700)
     try:
+        if installed.is_dir():
+            shutil.copytree(installed, draft, dirs_exist_ok=True, copy_function=shutil.copyfile)
+            draft.chmod(0o700)
         draft.rename(folder)
-    except OSError:  # another process was faster
+    except OSError:  # no room, or another process was faster
         shutil.rmtree(draft)
         if not folder.exists():
             raise

@@ -76,6 +76,18 @@ def test_code_of_others_is_not_taken(
     assert "compiling for this process alone" in caplog.text
 
 
+def test_a_folder_for_one_process_is_gone_with_it(tmp_path: Path):
+    (no_folder := tmp_path / "file").touch()
+    code = "from stream_dmr.compiled import users_cache; from pathlib import Path; "
+    code += "print(users_cache('compiled', installed=Path('none')).is_dir())"
+    paths = {"CACHE_DIRECTORY": str(no_folder / "cache"), "TMPDIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | paths, capture_output=True, text=True
+    )
+    assert done.stdout == "True\n", done.stderr
+    assert list(tmp_path.iterdir()) == [no_folder]
+
+
 CODE = """
 import os
 import sys

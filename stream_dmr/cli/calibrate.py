@@ -1,5 +1,6 @@
 """The commands `calibrate` and `check`."""
 
+import sys
 from collections.abc import Iterator
 from contextlib import closing
 from itertools import chain, islice
@@ -14,6 +15,7 @@ from stream_dmr.cli.shared_options import (
     OverwriteOption,
     SquareOption,
     parse_ends,
+    printable,
 )
 from stream_dmr.errors import OutputError, UserError
 
@@ -94,9 +96,9 @@ def calibrate(
         )
     require_writable(out, overwrite=overwrite)
     printed = PrintedBoard.parse(board, square_mm=square_mm, marker_mm=marker_mm)
-    console = Console()
+    console = Console(file=sys.stdout)
     if lens is not None:
-        _with_known_lens(lens, camera, plane=plane, board=printed, out=out, console=console)
+        _with_known_lens(lens, camera, plane=plane, board=printed, out=out)
         return
     _from_photographs(
         images or [],
@@ -148,7 +150,6 @@ def _with_known_lens(
     plane: Path,
     board: "PrintedBoard",
     out: Path,
-    console: "Console",
 ) -> None:
     from stream_dmr.calibration.board import calibrate_plane
     from stream_dmr.calibration.calibration_file import save_calibration
@@ -164,7 +165,7 @@ def _with_known_lens(
         f"reference plane {view.plane.distance_mm:.0f} mm from the camera",
         f"calibration: {out}",
     ):
-        console.print(line, markup=False, soft_wrap=True)
+        print(line)
 
 
 def _from_photographs(
@@ -198,12 +199,12 @@ def _from_photographs(
     save_calibration(out, result.calibration)
     console.print(_views_table(result))
     for left in result.left_out:
-        console.print(f"left out: {left.path.name}: {left.reason}", markup=False, soft_wrap=True)
+        print(f"left out: {left.path.name}: {left.reason}")
     for line in _summary(result):
-        console.print(line, markup=False, soft_wrap=True)
-    console.print(f"calibration: {out}", markup=False, soft_wrap=True)
+        print(line)
+    print(f"calibration: {out}")
     draw_views(result, folder)
-    console.print(f"corners drawn: {folder}", markup=False, soft_wrap=True)
+    print(f"corners drawn: {folder}")
 
 
 def _views_table(result: "BoardResult") -> "Table":
@@ -215,7 +216,7 @@ def _views_table(result: "BoardResult") -> "Table":
     for view in result.fit.views:
         errors = view.distances
         table.add_row(
-            f"{view.path.name} (plane)" if view is result.plane_view else view.path.name,
+            printable(view.path.name) + (" (plane)" if view is result.plane_view else ""),
             f"{view.rms_px:.3f}",
             f"{errors.mean_mm:.2f}",
             f"{errors.max_mm:.2f}",

@@ -1,5 +1,7 @@
 """The command `stream-dmr`. What is heavy is imported inside the commands: --help must be quick."""
 
+import io
+import os
 import sys
 import traceback
 from collections.abc import Callable, Generator
@@ -18,13 +20,13 @@ from stream_dmr.cli.export import export
 from stream_dmr.cli.replay import combine, replay
 from stream_dmr.cli.review import agreement, review
 from stream_dmr.cli.run import demo, recover, run, setup, simulate
-from stream_dmr.cli.shared_options import typer_command
+from stream_dmr.cli.shared_options import printable, typer_command
 from stream_dmr.cli.templates import learn_template, make_template
 from stream_dmr.cli.train import evaluate, train
 from stream_dmr.cli.verify import keygen, report, verify
 from stream_dmr.cli.vessel import fleet, haul
 from stream_dmr.cli.view import convert, view
-from stream_dmr.errors import UserError
+from stream_dmr.errors import OutputError, UserError
 from stream_dmr.version import __version__
 
 # In the order and groups of --help, each with what it says there.
@@ -93,8 +95,60 @@ for _group in _GROUPS.values():
 
 def main() -> None:
     sys.meta_path.insert(0, _WithoutPandas())
+    _open_standard_streams()
+    if sys.stdout is sys.__stdout__:  # no other program has put its own there
+        sys.stdout, sys.stderr = _PlainStream(1), _PlainStream(2)
     with exit_codes():
-        sys.exit(app(prog_name=app.info.name, standalone_mode=False))
+        code = app(prog_name=app.info.name, standalone_mode=False)
+        if isinstance(sys.stdout, _PlainStream) and (reason := sys.stdout.lost_for()):
+            raise OutputError(
+                f"stdout: expected room for what is printed, got: {reason}; part of it is lost, "
+                "files that were written are complete"
+            )
+        sys.exit(code)
+
+
+def _open_standard_streams() -> None:
+    """Lead closed ones to /dev/null: the next file that is opened would be one of them."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+
+
+class _PlainStream(io.TextIOWrapper):
+    """Stdout or stderr: control characters are escaped, and an error ends no command."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._file = _LossyFile(descriptor, "w", closefd=False)
+        options: Any = {
+            "encoding": "utf-8" if sys.__stderr__ is None else sys.__stderr__.encoding,
+            "errors": "backslashreplace",
+            "line_buffering": self._file.isatty() or descriptor == 2,
+            "write_through": True,
+        }
+        super().__init__(io.BufferedWriter(self._file), **options)
+        # Rich, which asks for this name, has controls of its own; a `Console` is given this stream
+        # as its file, since on a terminal its bars put another one into `sys`.
+        self.rich_proxied_file = io.TextIOWrapper(self.buffer, **options)
+
+    def write(self, text: str, /) -> int:
+        return super().write(printable(text))
+
+    def lost_for(self) -> str:
+        """Why something could not be written; "" if nothing was lost."""
+        self.flush()
+        return self._file.reason
+
+
+class _LossyFile(io.FileIO):
+    reason = ""
+
+    def write(self, data: Any, /) -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            self.reason = error.strerror or str(error)
+            return len(data)
 
 
 class _WithoutPandas(MetaPathFinder, Loader):

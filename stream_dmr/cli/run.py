@@ -134,7 +134,7 @@ def setup() -> None:
     from stream_dmr.cli.shared_options import stop_on_signals
     from stream_dmr.pipeline.prepare_kernels import prepare_kernels
 
-    began, console = time.monotonic(), Console(stderr=True, highlight=False)
+    began, console = time.monotonic(), Console(file=sys.stderr, highlight=False)
     with stop_on_signals() as stop, console.status("") as status:
         said = list[str]()
 

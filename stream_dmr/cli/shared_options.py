@@ -2,6 +2,7 @@
 
 import _thread
 import gc
+import re
 import shlex
 import signal
 import sys
@@ -105,6 +106,14 @@ def parse_ends(ends: str) -> "np.ndarray":
 def command_line() -> str:
     """The command as typed, for the recording; passwords are left out."""
     return without_password(shlex.join(["stream-dmr", *sys.argv[1:]]))
+
+
+_CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+
+
+def printable(text: str) -> str:
+    """The text with its control characters escaped, which a file's name may hold."""
+    return _CONTROLS.sub(lambda found: repr(found[0])[1:-1], text)
 
 
 def warn(lines: Iterable[str]) -> None:

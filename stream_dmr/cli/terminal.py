@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from stream_dmr.cli.shared_options import printable
 from stream_dmr.evaluation.compare import Distributions, Evaluation, distribution_rows, summary_rows
 from stream_dmr.messages import LengthEstimate, Message
 from stream_dmr.pipeline.measure_source import RunSummary
@@ -27,7 +28,7 @@ class RunDisplay(RunObserver):
     """Progress on stderr: a bar on a terminal, elsewhere a plain line every few seconds."""
 
     def __init__(self) -> None:
-        self._console = Console(stderr=True, highlight=False, soft_wrap=True)
+        self._console = Console(file=sys.stderr, highlight=False, soft_wrap=True)
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -53,10 +54,10 @@ class RunDisplay(RunObserver):
     def warn(self, line: str) -> None:
         if line not in self._warned:
             self._warned.add(line)
-            self._console.print(f"warning: {line}", markup=False)
+            self._console.print(printable(f"warning: {line}"), markup=False)
 
     def notice(self, line: str) -> None:
-        self._console.print(line, markup=False)
+        self._console.print(printable(line), markup=False)
 
     def stage(self, line: str) -> None:
         self._num_done, self._began, self._is_measuring = 0, time.monotonic(), False
@@ -64,7 +65,7 @@ class RunDisplay(RunObserver):
         self._progress.start()
         if self._progress.disable and time.monotonic() - self._last_line >= _LINE_EVERY_S:
             self._last_line = time.monotonic()
-            self._console.print(line, markup=False)
+            self._console.print(printable(line), markup=False)
 
     def serving(self, address: str) -> None:
         self._console.print(f"watch it with: {address}", markup=False)

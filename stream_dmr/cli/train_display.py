@@ -1,5 +1,7 @@
 """Progress of a training on the terminal."""
 
+import sys
+
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -12,7 +14,7 @@ class TrainDisplay(TrainObserver):
     """Progress on stderr: a bar per task on a terminal, and a line per epoch."""
 
     def __init__(self, settings: TrainSettings) -> None:
-        self._console = Console(stderr=True, highlight=False, soft_wrap=True)
+        self._console = Console(file=sys.stderr, highlight=False, soft_wrap=True)
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),

@@ -1,5 +1,7 @@
 """The command itself: help, version, exit codes, and the commands beside `run`."""
 
+import re
+import shlex
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -34,6 +36,37 @@ def test_help_imports_nothing_heavy():
     assert result.stderr.strip() == "[]"
     for command in ("run", "simulate", "calibrate", "evaluate"):
         assert command in result.stdout
+
+
+MAIN = """
+import os, sys
+from stream_dmr.cli.main import main
+try:
+    main()
+finally:
+    sys.stderr.write(os.readlink("/proc/self/fd/1").removeprefix("/dev/full"))
+"""
+
+
+def in_shell(command: str, to: str = "") -> subprocess.CompletedProcess[str]:
+    line = f"{shlex.quote(sys.executable)} -c {shlex.quote(MAIN)} {command} {to}"
+    return subprocess.run(line, shell=True, capture_output=True, text=True, check=False)
+
+
+def test_a_full_stdout_is_one_line():
+    done = in_shell("--version", ">/dev/full")
+    assert done.returncode == 2
+    assert re.fullmatch("error: stdout: .*No space left on device; .*\n", done.stderr)
+
+
+def test_a_closed_stdout_is_not_opened_as_something_else():
+    done = in_shell("--version", ">&-")
+    assert (done.returncode, done.stderr) == (0, "/dev/null")
+
+
+def test_control_characters_of_names_do_not_reach_the_terminal():
+    done = in_shell("report '\x1b[31mred'")
+    assert r"error: \x1b[31mred: " in done.stderr
 
 
 def test_version():

@@ -9,6 +9,7 @@ import pytest
 
 from stream_dmr.cli.shared_options import command_line, parse_selection, stop_on_signals
 from stream_dmr.cli.terminal import (
+    RunDisplay,
     interval_text,
     length_text,
     print_check,
@@ -39,6 +40,20 @@ def summary(**changes: object) -> ReplaySummary:
         "mismatches": [],
     }
     return ReplaySummary(**values | changes)  # type: ignore[arg-type]
+
+
+def test_a_run_draws_its_bar_on_a_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    with RunDisplay() as display:
+        display.warn("\x1b[31mred.mp4")
+        display.stage("compiling")
+        display.begin(3)
+        display.frame_done()
+    drawn = capsys.readouterr().err
+    assert r"warning: \x1b[31mred.mp4" in drawn
+    assert "1/3" in drawn
 
 
 def test_a_length_is_shown_with_its_std_and_interval():
