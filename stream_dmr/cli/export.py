@@ -9,7 +9,6 @@ from stream_dmr.cli.shared_options import (
     OverwriteOption,
     TimeOption,
     TrackOption,
-    exit_on_signals,
     parse_selection,
     settings_of,
     warn,
@@ -68,7 +67,7 @@ def export(
 
     exported = Export(recording, parse_selection(time, track), overwrite=overwrite)
     notes: list[str] = []
-    with exit_on_signals(), exported.into(out):
+    with exported.into(out):
         if meshes:
             print(f"{out / 'meshes'}: {exported.meshes(out / 'meshes', format=meshes)} meshes")
         if masks:

@@ -20,7 +20,7 @@ from stream_dmr.cli.export import export
 from stream_dmr.cli.replay import combine, replay
 from stream_dmr.cli.review import agreement, review
 from stream_dmr.cli.run import demo, recover, run, setup, simulate
-from stream_dmr.cli.shared_options import printable, typer_command
+from stream_dmr.cli.shared_options import exit_on_signals, printable, typer_command
 from stream_dmr.cli.templates import learn_template, make_template
 from stream_dmr.cli.train import evaluate, train
 from stream_dmr.cli.verify import keygen, report, verify
@@ -98,7 +98,7 @@ def main() -> None:
     _open_standard_streams()
     if sys.stdout is sys.__stdout__:  # no other program has put its own there
         sys.stdout, sys.stderr = _PlainStream(1), _PlainStream(2)
-    with exit_codes():
+    with exit_codes(), exit_on_signals():
         code = app(prog_name=app.info.name, standalone_mode=False)
         if isinstance(sys.stdout, _PlainStream) and (reason := sys.stdout.lost_for()):
             raise OutputError(
