@@ -52,7 +52,7 @@ def run(
 def _print_summary(summary: "RunSummary", out: Path, *, timings: bool) -> None:
     from stream_dmr.cli.terminal import print_fish, print_speed, print_timings
 
-    print_fish(summary.fish, may_count_twice=summary.may_count_twice)
+    print_fish(summary.fish, summary.flags)
     if timings:
         print_timings(summary)
     print_speed(summary)

@@ -3,9 +3,10 @@
 import sys
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from math import inf
 from pathlib import Path
+from types import MappingProxyType
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -17,7 +18,7 @@ from stream_dmr.messages import LengthEstimate, Message
 from stream_dmr.pipeline.measure_source import RunSummary
 from stream_dmr.pipeline.replay_recording import LENGTH_TOLERANCE, ReplaySummary
 from stream_dmr.pipeline.run_observer import RunObserver
-from stream_dmr.store.schema import MAY_COUNT_TWICE
+from stream_dmr.store.schema import flags_in_status
 
 _LINE_EVERY_S = 10.0  # where there is no terminal to draw a bar on
 _PLAIN_WIDTH = 120
@@ -94,8 +95,10 @@ class RunDisplay(RunObserver):
             self._fish.add(message.track_id)
 
 
-def print_fish(fish: Sequence[LengthEstimate], *, may_count_twice: Collection[int] = ()) -> None:
-    """Print the table of fish to stdout; `may_count_twice`: ids of which it says so."""
+def print_fish(
+    fish: Sequence[LengthEstimate], flags: Mapping[int, Sequence[str]] = MappingProxyType({})
+) -> None:
+    """Print the table of fish to stdout; `flags`: of the fish that have some, by track id."""
     titles = {"species": "species_code", "fate": "fate"}  # of the run's fish, if it knows any
     known = {t: name for t, name in titles.items() if any(getattr(one, name) for one in fish)}
     table = _table("fish", "length mm", "95 % interval mm", "frames used/seen", *known, "status")
@@ -106,9 +109,7 @@ def print_fish(fish: Sequence[LengthEstimate], *, may_count_twice: Collection[in
             interval_text(estimate),
             f"{estimate.frames_used}/{estimate.frames_seen}",
             *(getattr(estimate, name) or "-" for name in known.values()),
-            f"{status_text(estimate)}; {MAY_COUNT_TWICE}"
-            if estimate.track_id in may_count_twice
-            else status_text(estimate),
+            status_text(estimate) + flags_in_status(flags.get(estimate.track_id, ())),
         )
     _stdout().print(table if fish else "no fish")
     for title, name in known.items():

@@ -72,7 +72,6 @@ from stream_dmr.store.schema import (
     FISH,
     HAULS,
     LEDGER,
-    MAY_COUNT_TWICE,
     POSITIONS,
     RUNS,
     WATCHED,
@@ -285,8 +284,8 @@ def _stored(
         track_id = row["track_id"]
         fish[track_id] = row
         try:
-            twice = any(MAY_COUNT_TWICE in flag for flag in json.loads(row["flags"]))
-            lengths[str(track_id)] = lengths_row(estimate_of(row), may_count_twice=twice)
+            flags = json.loads(row["flags"])
+            lengths[str(track_id)] = lengths_row(estimate_of(row), flags)
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             yield Change(database, f"fish {track_id}: its row is damaged: {error!r}")
 

@@ -173,8 +173,8 @@ class Export:
             *(estimate for track_id, estimate in kept.items() if track_id not in edits.merged),
             *(one for one in finished if one.track_id not in kept),
         ]
-        doubtful = {one.estimate.track_id for one in fish if one.may_count_twice}
-        write_lengths(out / "lengths.csv", finished, may_count_twice=doubtful)
+        flags = {one.estimate.track_id: one.flags for one in fish}
+        write_lengths(out / "lengths.csv", finished, flags)
         if format == "parquet":
             from pyarrow import csv, parquet
 

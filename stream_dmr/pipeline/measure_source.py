@@ -2,9 +2,10 @@
 
 import threading
 import time
-from collections.abc import Callable, Collection, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -33,7 +34,8 @@ from stream_dmr.pipeline.session import Session
 from stream_dmr.sources.positions import PositionSource
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.open_results import LEARNT, MADE_BY_RUN, learnt_files
-from stream_dmr.store.run_facts import ENDLESS_STOPPED, SOURCE_ENDED, STOPPED
+from stream_dmr.store.run_facts import ENDLESS_STOPPED, SOURCE_CUT_OFF, SOURCE_ENDED, STOPPED
+from stream_dmr.store.schema import CUT_OFF_BY_SOURCE, CUT_OFF_BY_STOP
 
 
 class PositionFeed:
@@ -80,12 +82,13 @@ class MessageFlow:
         outputs: Outputs,
         seen: SeenFish,
         observer: RunObserver,
+        stop: threading.Event,
     ) -> None:
         """The source is made to go on after earlier runs, positions begin to come."""
         self.totals = RunTotals(max_fish=_MAX_SUMMARY_FISH if inputs.is_endless else None)
         self.policy = ErrorPolicy(is_endless=inputs.is_endless, on_notice=observer.warn)
         self._seen, self._observer = seen, observer
-        self._writer = _result_writer(inputs, outputs, on_notice=observer.warn)
+        self._writer = _result_writer(inputs, outputs, stop, on_notice=observer.warn)
         _begin_positions(inputs, outputs, observer)
         self._positions = PositionFeed(inputs.positions, self._take_position)
         self._shapes = None
@@ -138,7 +141,7 @@ def _begin_positions(inputs: Inputs, outputs: Outputs, observer: RunObserver) ->
 
 
 def _result_writer(
-    inputs: Inputs, outputs: Outputs, *, on_notice: Callable[[str], None]
+    inputs: Inputs, outputs: Outputs, stop: threading.Event, *, on_notice: Callable[[str], None]
 ) -> ResultWriter:
     """The writer of a run; its source is made to continue after earlier runs."""
     store = outputs.store
@@ -152,6 +155,7 @@ def _result_writer(
         outputs.recorder,
         clips=clips,
         interrupted=outputs.interrupted,
+        flag_at_end=partial(_flag_at_end, inputs, stop),
         drift=DriftAlarms(store, inputs.config.drift, on_notice=on_notice)
         if has_drift_alarms
         else None,
@@ -166,7 +170,7 @@ class RunSummary:
     """The results of a run."""
 
     fish: Sequence[LengthEstimate]  # final, by track id; of an endless source the last 100
-    may_count_twice: Collection[int]  # the ids of those that were in view at a crash
+    flags: Mapping[int, Sequence[str]]  # what a reader of a length must know, by track id
     num_frames: int  # that went through the whole chain
     frames_promised: int | None  # by the source; None where it doesn't
     recorded_s: float  # capture time from the first frame to the last
@@ -300,7 +304,7 @@ def _run_chain(
 ) -> RunSummary:
     began = time.perf_counter()
     outputs.store.count_frames(inputs.source.num_frames)
-    flow = MessageFlow(inputs, session, outputs, seen, observer)
+    flow = MessageFlow(inputs, session, outputs, seen, observer, stop)
     try:
         with _noting_the_end(inputs, outputs.store, stop):
             counters = run_chain(
@@ -317,7 +321,7 @@ def _run_chain(
     names = result_names(inputs.config.recording, is_endless=inputs.is_endless)
     return RunSummary(
         fish=flow.totals.fish(),
-        may_count_twice=outputs.store.may_count_twice(),
+        flags=outputs.store.flags(),
         num_frames=flow.totals.num_frames,
         frames_promised=inputs.source.num_frames,
         recorded_s=flow.totals.recorded_s,
@@ -348,8 +352,15 @@ def _noting_the_end(inputs: Inputs, store: LengthStore, stop: threading.Event) -
 def _end_of(inputs: Inputs, stop: threading.Event) -> str:
     """What ended a run that no error ended."""
     if not stop.is_set():
-        return SOURCE_ENDED
+        return SOURCE_CUT_OFF if inputs.source.is_cut_off else SOURCE_ENDED
     return ENDLESS_STOPPED if inputs.is_endless else STOPPED
+
+
+def _flag_at_end(inputs: Inputs, stop: threading.Event) -> str:
+    """The flag of a fish that is in view at the end; "" at the end of a whole source."""
+    if stop.is_set():  # also by an error
+        return CUT_OFF_BY_STOP
+    return CUT_OFF_BY_SOURCE if inputs.source.is_cut_off else ""
 
 
 def _frames_received(inputs: Inputs) -> int | None:

@@ -55,6 +55,7 @@ from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.open_results import LEARNT, MADE_BY_RUN, require_free_names
 from stream_dmr.store.run_facts import SOURCE_ENDED, STOPPED, RunFacts, cut_short, run_facts
 from stream_dmr.store.run_tables import FramesTable, LengthsTable
+from stream_dmr.store.schema import CUT_OFF_BY_STOP
 from stream_dmr.tracking.finder import open_finder
 
 
@@ -141,6 +142,7 @@ def open_replay_outputs(
             lengths,
             recorder,
             flags=recorded.flags,
+            flag_at_end=lambda: CUT_OFF_BY_STOP if stop.is_set() else "",
             sensors=inputs.config.sensors,
             on_notice=observer.warn,
         )

@@ -172,5 +172,4 @@ def _add_lengths(path: Path, folder: Path, signer: Signer) -> Iterator[str]:
         for estimate in missing:
             store.add(estimate, flags=[FROM_RECORDING])
             yield f"fish {estimate.track_id}: its length was only in {path.name}, now in {NAME}"
-        doubtful = store.may_count_twice()
-        write_lengths(folder / "lengths.csv", store.estimates(), may_count_twice=doubtful)
+        write_lengths(folder / "lengths.csv", store.estimates(), store.flags())

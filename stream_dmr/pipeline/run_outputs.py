@@ -20,6 +20,7 @@ from stream_dmr.messages import (
     LocalizedFish,
     Message,
     Position,
+    TrackEnded,
 )
 from stream_dmr.pipeline.drift import DriftAlarms
 from stream_dmr.pipeline.haul_log import HaulLog
@@ -61,6 +62,7 @@ class ResultWriter:
         clips: Mapping[str, int] | None = None,
         interrupted: Sequence[LocalizedFish] = (),
         flags: Mapping[int, Sequence[str]] = MappingProxyType({}),
+        flag_at_end: Callable[[], str] = str,
         drift: DriftAlarms | None = None,
         sensors: SensorsSettings = _SENSORS,
         hauls: HaulLog | None = None,
@@ -69,10 +71,12 @@ class ResultWriter:
         """`clips`: frames done of each clip before; None where the source has no clips.
 
         `interrupted`: frames of fish that a crash interrupted, and that this run finishes. `flags`:
-        what is known already, by track, of the fish of a recording.
+        what is known already, by track, of the fish of a recording. `flag_at_end`: gives that of
+        the fish that are in view at the end of the frames; "": none.
         """
         self._store, self._lengths, self._recorder = store, lengths, recorder
-        self._flags = flags
+        self._flags, self._flag_at_end = flags, flag_at_end
+        self._gone = set[int]()  # track ids of fish that left before the end of the frames
         self._hauls = hauls
         self._thinner = PositionThinner(keep_s=sensors.keep_s, max_gap_s=sensors.max_gap_s)
         self._drift, self._on_notice = drift, on_notice
@@ -99,6 +103,8 @@ class ResultWriter:
                 self._store.reserve_track(message.track_id)
             case LocalizedFish():
                 self._take_iou(message)
+            case TrackEnded() if message.cause != "end":
+                self._gone.add(message.track_id)
             case LengthEstimate(is_final=True):
                 self._store_fish(message)
             case LengthEstimate():
@@ -175,6 +181,10 @@ class ResultWriter:
             flags += self._drift.take_fish(iou, estimate.timestamp_ns)
         if estimate.track_id in self._interrupted:
             flags.append(INTERRUPTED)
+        if estimate.track_id in self._gone:
+            self._gone.remove(estimate.track_id)
+        elif (flag := self._flag_at_end()) and flag not in flags:
+            flags.append(flag)
         self._take_fish(estimate)
         self._store.add(estimate, iou=iou, flags=flags)
 

@@ -52,6 +52,7 @@ class Source(ABC):
     height: int
     num_frames: int | None  # as the source promises; None where it doesn't
     fps: float
+    is_cut_off: bool = False  # True once it ended before what it promises, or by damage
     warnings: list[str]  # problems that did not end the reading, one line each; complete at the end
 
     @property

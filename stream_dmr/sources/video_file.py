@@ -87,6 +87,7 @@ class VideoFile(Source):
             ) from None
         except DecodingError as error:
             if not self._is_closed:
+                self.is_cut_off = True
                 self.warnings.append(
                     f"{self.name}: {error} after frame {after}; the file seems damaged there"
                 )
@@ -102,6 +103,7 @@ class VideoFile(Source):
         if self._is_matroska and last_ns >= nominal_ns(self.num_frames - _NEAR_END, self.fps):
             self.num_frames = num_read
         if num_read < self.num_frames - 1:
+            self.is_cut_off = True
             self.warnings.append(
                 f"{self.name}: the file promises {self.num_frames} frames, only {num_read} could "
                 "be read; it seems cut off or damaged"

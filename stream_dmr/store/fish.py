@@ -1,7 +1,7 @@
 """Read finished fish with their run, haul, position, species and review."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from pathlib import Path
@@ -21,7 +21,6 @@ from stream_dmr.store.schema import (
     CATCH_COLUMNS,
     FISH,
     HAULS,
-    MAY_COUNT_TWICE,
     NAME,
     RUNS,
     Table,
@@ -83,11 +82,6 @@ class Fish:
         if self.where.utc_ns is not None or self.facts.utc_zero_ns is None:
             return self.where.utc_ns
         return self.middle_ns + self.facts.utc_zero_ns
-
-    @property
-    def may_count_twice(self) -> bool:
-        """True if it was in view at a crash, and maybe again after it."""
-        return any(MAY_COUNT_TWICE in flag for flag in self.flags)
 
     @property
     def fate(self) -> str | None:
@@ -243,7 +237,7 @@ def read_runs(database: Path) -> dict[str, RunFacts]:
 
 
 def run_notes(path: Path) -> list[str]:
-    """A line for each run that measured a part of its source, and for each wrong scale.
+    """A line for each run that measured a part of its source, wrong clock and wrong scale.
 
     Raises OutputError.
     """
@@ -253,7 +247,18 @@ def run_notes(path: Path) -> list[str]:
     runs, checks = read_runs(database), last_checks(database)
     used = {facts.calibration_sha256 for facts in runs.values()}
     alarms = [c.alarm for sha256, c in checks.items() if c.alarm and sha256 in used]
-    return [*(line for facts in runs.values() if (line := cut_short(facts))), *alarms]
+    parts = [line for facts in runs.values() if (line := cut_short(facts))]
+    return [*parts, *_clock_notes(database, runs), *alarms]
+
+
+def _clock_notes(database: Path, runs: Mapping[str, RunFacts]) -> Iterator[str]:
+    for run_id, (began_ns, ended_ns) in run_times(database).items():
+        if began_ns is not None and ended_ns is not None and ended_ns < began_ns:
+            early_s = (began_ns - ended_ns) / 1e9
+            yield (
+                f"the run of {runs[run_id].source} ended {early_s:.0f} s before it began: its "
+                "machine's clock was set back meanwhile"
+            )
 
 
 def numbers_its_own(folder: Path) -> bool:

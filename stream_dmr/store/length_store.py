@@ -4,6 +4,7 @@ The database also holds what a restart must not use again: track ids, frame numb
 times.
 """
 
+import json
 import os
 import sqlite3
 import time
@@ -34,7 +35,6 @@ from stream_dmr.store.schema import (
     EVENTS,
     FISH,
     MARK,
-    MAY_COUNT_TWICE,
     NAME,
     REVIEWED_ID,
     RUNS,
@@ -356,11 +356,11 @@ class LengthStore:
                     "choose another --out"
                 ) from error
 
-    def may_count_twice(self) -> set[int]:
-        """The track ids of the fish that were in view at a crash."""
-        query = "SELECT track_id FROM fish WHERE flags LIKE ?"
+    def flags(self) -> dict[int, list[str]]:
+        """The flags of the fish that have some, by track id."""
+        query = "SELECT track_id, flags FROM fish WHERE flags != '[]'"
         with self._lock:
-            return {i for (i,) in self._rows.database.execute(query, (f"%{MAY_COUNT_TWICE}%",))}
+            return {i: json.loads(flags) for i, flags in self._rows.database.execute(query)}
 
     def counts(self, column: Literal["status", "species_code", "fate"]) -> dict[str, int]:
         """The number of finished fish by what stands in a column; not of those without it."""

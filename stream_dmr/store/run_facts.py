@@ -9,6 +9,7 @@ from stream_dmr.version import __version__
 
 # What `ended_by` says; beside these "an error: ..." with the error's line.
 SOURCE_ENDED = "the end of the source"
+SOURCE_CUT_OFF = "the source, which is damaged or cut off there"
 STOPPED = "a stop before the end of the source"
 ENDLESS_STOPPED = "a stop; the source has no end"
 NOT_ENDED = "nothing so far: it goes on, or a crash ended it"

@@ -1,7 +1,7 @@
 """Write lengths.csv and frames.csv."""
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from stream_dmr.files import replacing
 from stream_dmr.messages import LengthEstimate, LocalizedFish
 from stream_dmr.recording.record import Record
 from stream_dmr.store.length_store import LengthStore
-from stream_dmr.store.schema import MAY_COUNT_TWICE
+from stream_dmr.store.schema import flags_in_status
 from stream_dmr.tables import CsvFile, cells, column_kinds, seconds
 
 
@@ -36,7 +36,7 @@ class FishRow:
     first_time: float  # capture times, s (cameras: since 1970), exact to the nanosecond
     last_time: float
     # `measured`, or [why there is no length](troubleshooting.md#reasons); with `; may count twice`
-    # for a fish that was in view at a crash
+    # for a fish that was in view at a crash, `; cut off` at a stop or at damage of the source
     status: str
 
 
@@ -77,8 +77,8 @@ class LengthsTable:
         try:
             while self._waiting:
                 estimate = self._waiting[0]
-                is_doubtful = estimate.track_id in self._store.may_count_twice()
-                self._rows.add(lengths_row(estimate, may_count_twice=is_doubtful))
+                flags = self._store.flags().get(estimate.track_id, ())
+                self._rows.add(lengths_row(estimate, flags))
                 self._waiting.popleft()
             self.trouble = ""
         except OutputError as error:
@@ -95,7 +95,7 @@ class LengthsTable:
             return
         try:
             store = self._store
-            write_lengths(self._path, store.estimates(), may_count_twice=store.may_count_twice())
+            write_lengths(self._path, store.estimates(), store.flags())
         except OutputError as error:
             self._refuse(error)
 
@@ -107,21 +107,19 @@ class LengthsTable:
 
 
 def write_lengths(
-    path: Path, estimates: Iterable[LengthEstimate], *, may_count_twice: Collection[int] = ()
+    path: Path, estimates: Iterable[LengthEstimate], flags: Mapping[int, Sequence[str]]
 ) -> None:
     """Replace lengths.csv in one step.
 
-    `may_count_twice`: the ids of the fish of which `status` says so. Raises OutputError where the
-    disk refuses it.
+    `flags`: of the fish that have some, by track id. Raises OutputError where the disk refuses it.
     """
     with replacing(path) as draft, closing(CsvFile(draft, LENGTHS_COLUMNS)) as table:
         for estimate in estimates:
-            is_doubtful = estimate.track_id in may_count_twice
-            table.add(lengths_row(estimate, may_count_twice=is_doubtful))
+            table.add(lengths_row(estimate, flags.get(estimate.track_id, ())))
         table.sync()
 
 
-def lengths_row(estimate: LengthEstimate, *, may_count_twice: bool = False) -> list[str]:
+def lengths_row(estimate: LengthEstimate, flags: Sequence[str] = ()) -> list[str]:
     """The cells of a final estimate; times in seconds, exact to the nanosecond."""
     low, high = (None, None) if estimate.ci95_mm is None else estimate.ci95_mm.tolist()
     return cells(
@@ -131,7 +129,7 @@ def lengths_row(estimate: LengthEstimate, *, may_count_twice: bool = False) -> l
         ci95_high_mm=high,
         first_time=seconds(estimate.first_timestamp_ns),
         last_time=seconds(estimate.last_timestamp_ns),
-        status=f"{estimate.status}; {MAY_COUNT_TWICE}" if may_count_twice else estimate.status,
+        status=f"{estimate.status}{flags_in_status(flags)}",
     )
 
 

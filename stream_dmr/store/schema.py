@@ -10,7 +10,7 @@ import json
 import os
 import shutil
 import sqlite3
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, fields
 from functools import cache, partial
@@ -472,6 +472,16 @@ def check_lines(database: sqlite3.Connection) -> Sequence[str]:
 MAY_COUNT_TWICE = "may count twice"
 # A flag of a fish that was in view at a crash: it came into view again, with another number.
 INTERRUPTED = f"{MAY_COUNT_TWICE}: interrupted by a restart, finished with what was recorded"
+CUT_OFF = "cut off"
+# Flags of a fish that was in view at an end that is not that of the source.
+CUT_OFF_BY_STOP = f"{CUT_OFF}: in view when the run was stopped"
+CUT_OFF_BY_SOURCE = f"{CUT_OFF}: in view where the source is damaged or cut off"
+
+
+def flags_in_status(flags: Iterable[str]) -> str:
+    """What the tables of fish say of some flags beside the status, such as `; cut off`."""
+    shown = [name for name in (MAY_COUNT_TWICE, CUT_OFF) if any(name in flag for flag in flags)]
+    return "".join(f"; {name}" for name in shown)
 
 
 ESTIMATE_COLUMNS = [

@@ -22,6 +22,7 @@ from stream_dmr.errors import UserError
 from stream_dmr.pipeline.chain import StageCounters
 from stream_dmr.pipeline.comparator import Difference, Mismatch
 from stream_dmr.pipeline.replay_recording import ReplaySummary
+from stream_dmr.store.schema import INTERRUPTED
 from tests.support.final_estimates import fish
 
 DIFFERENCE = Mismatch(3, 1, "FittedMesh", Difference("shape.iou", "0.9", "0.8"))
@@ -69,7 +70,7 @@ def test_a_fish_without_a_length_says_why_most_frequent_first():
 
 
 def test_the_table_names_every_fish(capsys: pytest.CaptureFixture[str]):
-    print_fish([fish(7), fish(8)], may_count_twice=[8])
+    print_fish([fish(7), fish(8)], {8: [INTERRUPTED]})
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["fish", "7", "8"]
     assert "twice" in lines[2]

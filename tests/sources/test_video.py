@@ -85,6 +85,7 @@ def test_what_decodes_of_a_cut_video_is_read_and_the_rest_reported(tmp_path, nam
     whole = read(write_video(tmp_path / name))[1]
     opened, frames = read(cut(tmp_path / name))
     assert 3 <= len(frames) < 12
+    assert opened.is_cut_off
     assert opened.warnings == [
         f"{Path(name).stem}_cut{Path(name).suffix}: the file promises 12 frames, only "
         f"{len(frames)} could be read; it seems cut off or damaged"

@@ -1,7 +1,9 @@
 """What a run measured of its source, and why it ended: in every output."""
 
 import json
+import sqlite3
 import threading
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,16 +12,19 @@ import pytest
 from stream_dmr.errors import SourceError
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.run_observer import RunObserver
-from stream_dmr.store.fish import read_runs, run_notes
+from stream_dmr.sources.source import Source
+from stream_dmr.store.fish import read_runs, read_stored_fish, run_notes
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.run_facts import (
     ENDLESS_STOPPED,
     NOT_ENDED,
+    SOURCE_CUT_OFF,
     SOURCE_ENDED,
     STOPPED,
     RunFacts,
     cut_short,
 )
+from stream_dmr.store.schema import CUT_OFF_BY_SOURCE, CUT_OFF_BY_STOP, NAME
 from stream_dmr.web.open_reports import open_report
 from stream_dmr.web.report_page import render_page
 from tests.support.command import invoke, rows
@@ -82,6 +87,36 @@ def test_every_output_says_that_a_run_was_stopped(stopped: Path, tmp_path: Path)
     export = invoke("export", {str(stopped): None, "--out": str(tmp_path), "--fish": "csv"})
     assert line in export.err
     assert {row["ended_by"] for row in rows(tmp_path / "fish.csv")} == {STOPPED}
+
+
+def test_a_fish_in_view_at_a_stop_says_so_everywhere(stopped: Path, tmp_path: Path):
+    flagged = {1: [CUT_OFF_BY_STOP], 2: [CUT_OFF_BY_STOP]}
+    assert {one.estimate.track_id: one.flags for one in read_stored_fish(stopped / NAME)} == flagged
+    assert all(row["status"].endswith("; cut off") for row in rows(stopped / "lengths.csv"))
+    assert CUT_OFF_BY_STOP in render_page([open_report(stopped)], title="x")
+    assert invoke("verify", {str(stopped): None}).code == 0
+    invoke("replay", {str(stopped): None, "--from": "smooth", "--out": str(tmp_path / "again")})
+    again = read_stored_fish(tmp_path / "again" / NAME)
+    assert {one.estimate.track_id: one.flags for one in again} == flagged
+
+
+def test_a_fish_in_view_where_a_source_breaks_off_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(Source, "is_cut_off", True)
+    out = measure(tmp_path)
+    assert facts_of(out).ended_by == SOURCE_CUT_OFF
+    assert {flag for one in read_stored_fish(out / NAME) for flag in one.flags} == {
+        CUT_OFF_BY_SOURCE
+    }
+
+
+def test_an_end_before_the_start_is_noted(tmp_path: Path):
+    out = measure(tmp_path)
+    with closing(sqlite3.connect(out / NAME)) as database, database:
+        database.execute("UPDATE runs SET ended_ns = started_ns - 3600000000000")
+    (line,) = run_notes(out)
+    assert "ended 3600 s before it began" in line
 
 
 def test_an_error_is_what_ended_the_run(tmp_path: Path):
