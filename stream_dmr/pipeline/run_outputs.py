@@ -76,12 +76,12 @@ class ResultWriter:
         """
         self._store, self._lengths, self._recorder = store, lengths, recorder
         self._flags, self._flag_at_end = flags, flag_at_end
-        self._gone = set[int]()  # track ids of fish that left before the end of the frames
+        self._gone: dict[int, int] = {}  # by track that ended before the frames: after which one
         self._hauls = hauls
         self._thinner = PositionThinner(keep_s=sensors.keep_s, max_gap_s=sensors.max_gap_s)
         self._drift, self._on_notice = drift, on_notice
         self._clips = None if clips is None else Counter(clips)
-        self._clips_in_chain: deque[str] = deque()  # of the frames that are in the chain, in order
+        self._in_chain = deque[tuple[int, str]]()  # index and clip of each frame, in order
         self._interrupted = {fish.track_id for fish in interrupted}
         self._ious: defaultdict[int, list[float]] = defaultdict(list)  # by track, while it is open
         for fish in interrupted:
@@ -104,7 +104,7 @@ class ResultWriter:
             case LocalizedFish():
                 self._take_iou(message)
             case TrackEnded() if message.cause != "end":
-                self._gone.add(message.track_id)
+                self._gone[message.track_id] = message.frame_index
             case LengthEstimate(is_final=True):
                 self._store_fish(message)
             case LengthEstimate():
@@ -130,10 +130,10 @@ class ResultWriter:
     def frame_done(self) -> None:
         """Take note that a frame has left the last stage: its clip is measured so far."""
         self._store.frame_done()
+        _, clip = self._in_chain.popleft()
         if self._hauls is not None:
             self._hauls.frame_done()
         if self._clips is not None:
-            clip = self._clips_in_chain.popleft()
             self._clips[clip] += 1
             self._store.clip_progress(clip, frames_done=self._clips[clip])
 
@@ -163,8 +163,7 @@ class ResultWriter:
     def _take_frame(self, frame: Frame) -> None:
         if self._hauls is not None:
             self._hauls.take_frame(frame.timestamp_ns)
-        if self._clips is not None:
-            self._clips_in_chain.append(frame.source)
+        self._in_chain.append((frame.frame_index, frame.source))
         if self._drift is not None:
             self._drift.take_frame(frame)
         self._store.frame_passed(frame_index=frame.frame_index, timestamp_ns=frame.timestamp_ns)
@@ -181,9 +180,10 @@ class ResultWriter:
             flags += self._drift.take_fish(iou, estimate.timestamp_ns)
         if estimate.track_id in self._interrupted:
             flags.append(INTERRUPTED)
-        if estimate.track_id in self._gone:
-            self._gone.remove(estimate.track_id)
-        elif (flag := self._flag_at_end()) and flag not in flags:
+        # A stop drops the ends of tracks that come after the frame that the last stage is at.
+        gone = self._gone.pop(estimate.track_id, None)
+        is_in_view = gone is None or (bool(self._in_chain) and gone > self._in_chain[0][0])
+        if is_in_view and (flag := self._flag_at_end()) and flag not in flags:
             flags.append(flag)
         self._take_fish(estimate)
         self._store.add(estimate, iou=iou, flags=flags)

@@ -33,7 +33,7 @@ def test_everyone_takes_what_the_next_stage_gets(tmp_path: Path):
     observer, passed_on = Keeping(), list[Message]()
     session = Session(inputs, given=[inputs.crop_fish(inputs.finder)])
     with open_outputs(inputs, observer) as outputs:
-        flow = MessageFlow(inputs, session, outputs, SeenFish(), observer)
+        flow = MessageFlow(inputs, session, outputs, SeenFish(), observer, threading.Event())
 
         def on_message(message: Message) -> Message:
             passed_on.append(taken := flow.take(message))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from stream_dmr.messages import LocalizedFish
+from stream_dmr.messages import Frame, LocalizedFish, TrackEnded
 from stream_dmr.pipeline.run_outputs import ResultWriter
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.topics import RecordingSettings
@@ -79,6 +79,22 @@ def test_an_interrupted_fish_is_flagged_and_keeps_its_earlier_frames(opened, tmp
 def test_known_flags_are_kept(opened, tmp_path: Path):
     writer(opened, flags={5: ["the camera seems bumped"]}).write(fish(5))
     assert stored(tmp_path)[5][1] == ["the camera seems bumped"]
+
+
+@pytest.mark.parametrize(
+    ("ended", "flags"),
+    [
+        (TrackEnded.after(LOCALIZED, 5, "lost"), []),
+        (TrackEnded.after(replace(LOCALIZED, frame_index=9), 5, "lost"), ["cut off"]),
+        (TrackEnded.after(LOCALIZED, 5, "end"), ["cut off"]),
+    ],
+)
+def test_a_fish_whose_end_came_after_a_stop_is_flagged(opened, tmp_path: Path, ended, flags):
+    results = writer(opened, flag_at_end=lambda: "cut off")
+    results.write(next(m for m in MESSAGES if isinstance(m, Frame)))
+    results.write(ended)
+    results.write(fish(5))
+    assert stored(tmp_path)[5][1] == flags
 
 
 def test_a_clip_s_frames_are_counted_on_from_those_of_earlier_runs(tmp_path: Path):

@@ -20,8 +20,8 @@ from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.run_folder import RESULTS, SEGMENTS, result_names
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.recording.topics import RecordingSettings
+from stream_dmr.store.fish import read_stored_fish
 from stream_dmr.store.run_tables import lengths_row
-from stream_dmr.store.schema import open_for_reading, read_estimates
 from tests.support.command import invoke, rows
 from tests.support.fish_run import request
 from tests.support.reading import read_header, read_messages
@@ -42,10 +42,10 @@ def assert_readable(out: Path) -> None:
     assert counts[LocalizedFish] == len(frames)
     assert counts[LengthEstimate] == len(frames) + len(lengths)
     assert {row["track_id"] for row in frames} == {row["track_id"] for row in lengths}
-    database = open_for_reading(out / "lengths.db")
-    stored = [list(row.values()) for row in lengths]
-    assert [lengths_row(estimate) for estimate in read_estimates(database)] == stored
-    database.close()
+    stored = read_stored_fish(out / "lengths.db")
+    assert [lengths_row(fish.estimate, fish.flags) for fish in stored] == [
+        list(row.values()) for row in lengths
+    ]
     verified = subprocess.run(
         [sys.executable, "-m", "rerun", "rrd", "verify", str(out / "recording.rrd")],
         capture_output=True,
