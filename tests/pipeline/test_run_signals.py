@@ -52,4 +52,4 @@ def test_a_signal_ends_the_run_early_and_leaves_valid_results(
     assert str(out) in stdout
     assert_readable(out)
     assert 6 <= len(rows(out / "frames.csv")) < 3000
-    assert [row["status"] for row in rows(out / "lengths.csv")] == ["measured"] * 2
+    assert [row["status"] for row in rows(out / "lengths.csv")] == ["measured; cut off"] * 2
