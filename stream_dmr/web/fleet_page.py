@@ -2,20 +2,23 @@
 
 import json
 import time
-import urllib.error
-import urllib.request
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
 from html import escape
-from http.client import HTTPException
+from http import HTTPStatus
+from http.client import HTTPConnection, HTTPException, HTTPSConnection
 from importlib.resources import files
 from pathlib import Path
+from socket import SHUT_RDWR
 from string import Template
+from threading import Timer
 from typing import Annotated, Any
+from urllib.error import HTTPError
 from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from prometheus_client.parser import text_string_to_metric_families
@@ -30,7 +33,6 @@ _MAX_AT_ONCE = 16
 _MAX_ALARM_CHARACTERS = 300
 _MAX_WARNINGS = 5  # shown of each box, the latest
 _WARNING_AGE_S = 86_400.0  # older ones are history
-_UNAUTHORIZED, _UNAVAILABLE = 401, 503  # the second is how an unhealthy box answers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,10 +135,10 @@ def ask_all(states: Iterable[BoxState], *, timeout_s: float = _TIMEOUT_S) -> lis
 
 
 def _ask(before: BoxState, *, timeout_s: float) -> BoxState:
-    box = before.box
+    box, until_s = before.box, time.monotonic() + timeout_s
     try:
-        health = json.loads(_get(box, "health", timeout_s))
-        reading = _reading(health, _values(_get(box, "metrics", timeout_s).decode()))
+        health = json.loads(_get(box, "health", until_s))
+        reading = _reading(health, _values(_get(box, "metrics", until_s).decode()))
     except (KeyError, TypeError, ValueError, ValidationError, RecursionError):
         error = "something answers there that is no stream-dmr run, or one of another version"
     except (OSError, HTTPException) as failure:
@@ -147,27 +149,38 @@ def _ask(before: BoxState, *, timeout_s: float) -> BoxState:
 
 
 def _failure(failure: Exception) -> str:
-    if isinstance(failure, urllib.error.HTTPError):
-        if failure.code == _UNAUTHORIZED:
+    if isinstance(failure, HTTPError):
+        if failure.code == HTTPStatus.UNAUTHORIZED:
             return "it asks for a token, or for another: ADDRESS?token=..."
         return f"it answers {failure.code}, not as a stream-dmr run does"
-    reason = failure.reason if isinstance(failure, urllib.error.URLError) else failure
-    if isinstance(reason, TimeoutError):
-        return "it took too long"
-    return reason_of(reason) if isinstance(reason, Exception) else str(reason)
+    return "it took too long" if isinstance(failure, TimeoutError) else reason_of(failure)
 
 
-def _get(box: Box, path: str, timeout_s: float) -> bytes:
+def _get(box: Box, path: str, until_s: float) -> bytes:
+    """What a box answers. Raises OSError or HTTPException; TimeoutError if it is not whole then."""
+    url, left_s = urlsplit(box.address + path), max(until_s - time.monotonic(), 0.001)
     headers = {"Authorization": f"Bearer {box.token}"} if box.token else {}
-    request = urllib.request.Request(box.address + path, headers=headers)
-    try:
-        with urllib.request.urlopen(request, timeout=timeout_s) as answer:
-            return answer.read(_MAX_ANSWER_BYTES)
-    except urllib.error.HTTPError as error:
-        with error:
-            if error.code != _UNAVAILABLE:
+    kind = HTTPSConnection if url.scheme == "https" else HTTPConnection
+    with closing(kind(url.netloc, timeout=left_s)) as connection:
+        connection.connect()
+        # The timeout is that of one byte; this ends an answer that drips.
+        timer = Timer(left_s, connection.sock.shutdown, (SHUT_RDWR,))
+        timer.start()
+        try:
+            connection.request("GET", url.path, headers=headers)
+            answer = connection.getresponse()
+            content = answer.read(_MAX_ANSWER_BYTES)
+        except (OSError, HTTPException, ValueError):
+            if time.monotonic() < until_s:
                 raise
-            return error.read(_MAX_ANSWER_BYTES)
+            raise TimeoutError from None
+        finally:
+            timer.cancel()
+    if time.monotonic() >= until_s:
+        raise TimeoutError
+    if answer.status not in (HTTPStatus.OK, HTTPStatus.SERVICE_UNAVAILABLE):  # an unhealthy box
+        raise HTTPError(box.address, answer.status, answer.reason, answer.headers, None)
+    return content
 
 
 def _values(text: str) -> dict[str, float]:

@@ -45,7 +45,9 @@ class TokenServer(ThreadingHTTPServer):
     ) -> None:
         """Listens; OSError where it can't have the address."""
         self.token = token
-        self._connections = threading.BoundedSemaphore(self.max_connections)
+        self._lock = threading.Lock()
+        self._connections = set[socket.socket]()
+        self._strangers: dict[socket.socket, bool] = {}  # whether local; in their order
         super().__init__(address, handler)
         self.is_local = is_loopback(str(self.server_address[0]))
         self._thread = threading.Thread(target=self.serve_forever, daemon=True)
@@ -60,22 +62,51 @@ class TokenServer(ThreadingHTTPServer):
         self._thread.join()
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Handle a connection in a thread of its own; close it where there are too many."""
-        if not self._connections.acquire(blocking=False):
+        """Handle a connection in a thread of its own.
+
+        Where there are too many, the oldest that has sent no request with the token makes room, one
+        of another machine first; where all have, this one is closed.
+        """
+        with self._lock:
+            is_busy = len(self._connections) >= self.max_connections and not self._end_stranger()
+            if not is_busy:
+                self._connections.add(request)
+                self._strangers[request] = is_loopback(client_address[0])
+        if is_busy:
             with suppress(OSError):
                 request.sendall(_BUSY)
             return self.shutdown_request(request)
         try:
             super().process_request(request, client_address)
         except BaseException:
-            self._connections.release()
+            self._forget(request)
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._connections.release()
+            self._forget(request)
+
+    def admit(self, request: socket.socket) -> None:
+        """Let a connection stay whoever comes: it may read what it asks for."""
+        with self._lock:
+            self._strangers.pop(request, None)
+
+    def _end_stranger(self) -> bool:
+        oldest = min(self._strangers, key=self._strangers.__getitem__, default=None)
+        if oldest is None:
+            return False
+        del self._strangers[oldest]
+        self._connections.discard(oldest)
+        with suppress(OSError):
+            oldest.shutdown(socket.SHUT_RDWR)
+        return True
+
+    def _forget(self, request: socket.socket) -> None:
+        with self._lock:
+            self._connections.discard(request)
+            self._strangers.pop(request, None)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Print a traceback, but not for a reader who left."""
@@ -125,6 +156,7 @@ class TokenHandler(BaseHTTPRequestHandler):
         elif token and self._is_valid(token):
             self._set_cookie(url.path)
         elif self._is_authorized():
+            self.server.admit(self.connection)
             self.answer_get(url.path)
         else:
             self._refuse_token()
@@ -133,6 +165,7 @@ class TokenHandler(BaseHTTPRequestHandler):
         if not self._is_own_page():
             self._refuse_site()
         elif self._is_authorized():
+            self.server.admit(self.connection)
             self.answer_post(self.path)
         else:
             self._refuse_token()
@@ -213,12 +246,13 @@ class TokenHandler(BaseHTTPRequestHandler):
         self.answer(code, "application/json", json.dumps(content).encode())
 
     def answer(self, code: HTTPStatus, media_type: str, content: bytes) -> None:
-        """Answer with bytes, which no browser caches or guesses the type of."""
+        """Answer with bytes, which no browser caches, guesses the type of or shows in a frame."""
         self.send_response(code)
         self.send_header("Content-Type", media_type)
         self.send_header("Content-Length", str(len(content)))
         self.send_header("Cache-Control", "no-store")
         self.send_header("X-Content-Type-Options", "nosniff")
+        self.send_header("Content-Security-Policy", "frame-ancestors 'none'")
         self.send_header("Referrer-Policy", "no-referrer")
         self.end_headers()
         self.wfile.write(content)

@@ -1,7 +1,9 @@
 """The page of a fleet: read from real servers, a box that is silent, what is kept of it."""
 
+import socket
+import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from threading import Thread
@@ -118,6 +120,26 @@ def test_another_server_is_said_to_be_one(answer: bytes):
         (state,) = ask(Box(name="one", address=f"http://127.0.0.1:{server.server_port}/"))
         server.shutdown()
     assert "no stream-dmr run" in state.error
+
+
+@pytest.mark.parametrize("begun", [b"HTTP/1.0 200 OK\r\nX: ", b"HTTP/1.0 200 OK\r\n\r\n["])
+def test_a_box_that_drips_does_not_hold_the_page(begun: bytes):
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def drip() -> None:
+            client, _ = listening.accept()
+            with client, suppress(OSError):
+                client.sendall(begun)
+                while True:
+                    client.sendall(b" ")
+                    time.sleep(0.02)
+
+        thread = Thread(target=drip)
+        thread.start()
+        address = f"http://127.0.0.1:{listening.getsockname()[1]}/"
+        (state,) = ask_all([BoxState(box=Box(name="slow", address=address))], timeout_s=0.3)
+        thread.join()
+    assert state.error == "it took too long"
 
 
 def test_boxes_come_from_addresses_and_files(tmp_path: Path):

@@ -76,6 +76,18 @@ def test_requests_that_stand_still_take_few_descriptors_and_end(server: TokenSer
         assert num_descriptors() <= before + 30 + PatientServer.max_connections
 
 
+def test_half_open_connections_keep_nobody_out(server: TokenServer):
+    with ExitStack() as stack:
+        for _ in range(3 * PatientServer.max_connections):
+            for _ in range(PatientServer.max_connections):  # they come again as soon as they can
+                stack.enter_context(socket.create_connection(server.server_address[:2]))
+            assert status_of(server) == 200
+
+
+def test_no_other_page_shows_ours_in_a_frame(server: TokenServer):
+    assert b"frame-ancestors 'none'" in answer_to(server, b"GET / HTTP/1.0\r\n\r\n")
+
+
 def test_a_request_that_drips_ends(server: TokenServer):
     with socket.create_connection(server.server_address[:2]) as client:
         client.settimeout(10)
