@@ -1,11 +1,8 @@
-"""A template prepared for deformation: points bound to the midline, edges paired with faces.
+"""A template bound for deformation, and the parameters of a deformation.
 
-Plain arrays, so that torch, numpy and kernels (`stream_dmr.compiled`) all work on one and the same
-binding.
-
-The parameters of a deformation: their layout in one vector, and their priors.
-
-The vector has P = NUM_ROOT + NUM_PER_JOINT * J numbers: the root's, then one block for each joint.
+All are plain arrays, so that torch, numpy and kernels (`stream_dmr.compiled`) work on one binding.
+The vector of parameters has P = NUM_ROOT + NUM_PER_JOINT * J numbers: the root's, then one block
+for each joint.
 """
 
 from typing import NamedTuple

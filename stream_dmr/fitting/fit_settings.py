@@ -77,9 +77,7 @@ class FitMeshSettings(Settings):
         default=100, ge=1, description="smallest mask that is fitted, crop pixels"
     )
     edge_std_px: float = Field(
-        default=1.0,
-        gt=0,
-        description="std of a mask's edge, crop pixels; enters the uncertainty",
+        default=1.0, gt=0, description="std of a mask's edge, crop pixels; enters the uncertainty"
     )
     edge_correlation_px: float = Field(
         default=8.0,
@@ -89,7 +87,7 @@ class FitMeshSettings(Settings):
 
     @property
     def scans_sizes(self) -> bool:
-        """Whether a fit's size is what is to be expected rather than the likeliest.
+        """True if a fit's size is what is to be expected rather than the likeliest.
 
         Only the spine's size is its length; and the paper's solver is left as the paper has it.
         """
@@ -97,7 +95,7 @@ class FitMeshSettings(Settings):
 
     @property
     def are_shapes_learnt(self) -> bool:
-        """Whether shapes are learnt, which takes the equations of our own solver."""
+        """True if shapes are learnt, which takes the equations of our own solver."""
         return self._is_ours and self.learn_shapes
 
     @property
@@ -106,16 +104,8 @@ class FitMeshSettings(Settings):
 
     def lambdas(self) -> Float[np.ndarray, "6"]:
         """Weights of the terms of eq. (3): iou, boundary, scale, translation, normal, laplacian."""
-        return np.array(
-            [
-                1.0,
-                1.0,
-                self.lambda_scale,
-                self.lambda_translation,
-                self.lambda_normal,
-                self.lambda_laplacian,
-            ]
-        )
+        rest = self.lambda_scale, self.lambda_translation, self.lambda_normal, self.lambda_laplacian
+        return np.array([1.0, 1.0, *rest])
 
     @property
     def nat(self) -> float:

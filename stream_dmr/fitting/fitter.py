@@ -160,14 +160,16 @@ class Fitter:
             sized, size_std = self._scanner.expected(target, solution, coarse=coarse)
             if not _is_finite(sized):
                 return Fit(_message(crop, refusal=Reason.FIT_DIVERGED), None)
-            own_std = self._shape_std(coarse, sized.parameters)
-            shape_std = float(np.hypot(own_std, form_std_ratio))
+            own_std = shape_std_ratio(
+                self._problem(self._levels.coarse, coarse),
+                sized.parameters,
+                self._directions,
+                self._shape_covariance,
+            )
+            slant_std = self._hidden_slant_std(sized.parameters)
+            shape_std = float(np.hypot(np.hypot(own_std, slant_std), form_std_ratio))
         shape = self._shape(target, sized, crop, size_std, shape_std)
-        report = self._report(solution, is_cold=is_cold, since_ns=since_ns)
-        return Fit(_message(crop, shape, report), solution.parameters)
-
-    def _report(self, solution: Solution, *, is_cold: bool, since_ns: int) -> SolverReport:
-        return SolverReport(
+        report = SolverReport(
             solver=self._settings.solver,
             deformation=self._settings.deformation,
             iterations=solution.iterations,
@@ -176,6 +178,7 @@ class Fitter:
             cold_start=is_cold,
             elapsed_ns=time.perf_counter_ns() - since_ns,
         )
+        return Fit(_message(crop, shape, report), solution.parameters)
 
     def _refusal(self, crop: FishCrop) -> Reason | None:
         area = np.count_nonzero(crop.mask)
@@ -234,13 +237,8 @@ class Fitter:
             length_std_ratio=size_std,
             candidate=self._index,
             shape_std_ratio=shape_std,
-            height_ratio=self._height_ratio(parameters),
+            height_ratio=self._reach(parameters, self.plane_normal),
         )
-
-    def _shape_std(self, coarse: Target, parameters: Float[np.ndarray, "P"]) -> float:
-        problem = self._problem(self._levels.coarse, coarse)
-        std = shape_std_ratio(problem, parameters, self._directions, self._shape_covariance)
-        return float(np.hypot(std, self._hidden_slant_std(parameters)))
 
     def _hidden_slant_std(self, parameters: Float[np.ndarray, "P"]) -> float:
         """Std of the log length by a slant that a breadth not known exactly may hide.
@@ -253,7 +251,7 @@ class Fitter:
         R = Rotation.from_rotvec(parameters[ROOT_ROTATION]).as_matrix()
         across = np.cross(self.plane_normal, R[:, 0])
         across /= max(float(np.linalg.norm(across)), 1e-9)
-        shown = self._reach(R, across)
+        shown = self._reach(parameters, across)
         roundness = min(float(self._half_section.min()) / max(shown, 1e-9), 1.0)
         return roundness * slant_std_ratio(
             float(np.arcsin(np.clip(self.plane_normal @ R[:, 0], -1, 1))),
@@ -261,13 +259,11 @@ class Fitter:
             breadth_std=self._breadth_std,
         )
 
-    def _height_ratio(self, parameters: Float[np.ndarray, "P"]) -> float:
-        """How far the elliptic section at the center reaches along the plane's normal."""
+    def _reach(
+        self, parameters: Float[np.ndarray, "P"], direction: Float[np.ndarray, "3"]
+    ) -> float:
+        """How far the elliptic section at the center of a body reaches in a direction."""
         R = Rotation.from_rotvec(parameters[ROOT_ROTATION]).as_matrix()
-        return self._reach(R, self.plane_normal)
-
-    def _reach(self, R: Float[np.ndarray, "3 3"], direction: Float[np.ndarray, "3"]) -> float:
-        """How far the section at the center of a body rotated by R reaches in a direction."""
         return float(np.linalg.norm(self._half_section * (direction @ R)[1:]))
 
     def _problem(self, body: Body, target: Target) -> Problem:

@@ -1,15 +1,14 @@
-"""The expected size of a fish, given one mask: the mean over all sizes, not the best fit's.
+"""The expected size of a fish, given its mask, and how well a mask agrees with a shape.
 
 A silhouette bounds the size of a fish on one side only. A fish that seems to be flat may be a
 slanting one that is longer, but not a shorter one; and a long fish, slanting and bent, can look
 like a short one in more ways than the other way round. The best fit alone is therefore too short on
 average, or wherever its search has led it. So sizes near it are tried, with everything else
-refitted.
+refitted, and the mean over all sizes is taken.
 
-How well a mask agrees with a shape: not in one pose alone, but in all that are likely.
-
-The best pose is not the mean one. A body that is too broad can always roll a little, one that is
-too narrow can't; but where it must roll, it must do so exactly, so that fewer of its poses fit.
+Shapes are compared in all poses that are likely, not in the best one alone. A body that is too
+broad can always roll a little, one that is too narrow can't; but where it must roll, it must do so
+exactly, so that fewer of its poses fit.
 """
 
 import numpy as np

@@ -1,10 +1,9 @@
 """What a fit gets and returns: the target of a mask, the solver, its solution.
 
-The exact signed distance map of a mask in two passes: compiled loops.
-
-Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions", 2012: along the columns
-by counting, along the rows by the lower envelope of parabolas. Both sides of the edge are done in
-one sweep, since within a row nothing beyond the ends of a pixel's own run can be nearer than these.
+The signed distance map of a mask is exact and made in two passes, by Felzenszwalb and Huttenlocher,
+"Distance transforms of sampled functions", 2012: along the columns by counting, along the rows by
+the lower envelope of parabolas. Both sides of the edge are done in one sweep, since within a row
+nothing beyond the ends of a pixel's own run can be nearer than these.
 """
 
 from typing import NamedTuple, Protocol, runtime_checkable

@@ -1,8 +1,6 @@
-"""The paper's solver: reconstruction loss and Adam, in torch.
+"""The paper's solver in torch: the reconstruction loss, eq. (3)-(5) of Sec. 2.2, and Adam.
 
-The reconstruction loss (paper, Sec. 2.2, eq. (3)-(5)): each term one small function.
-
-Every term is batched: it takes B fits at once and returns B numbers, before its lambda.
+Every term of the loss takes B fits at once and returns B numbers, before its lambda.
 """
 
 from typing import NamedTuple

@@ -1,20 +1,17 @@
 """The deformed body and its silhouette in torch, differentiable.
 
-The deformation of the template (paper, Sec. 2.1): eq. (1)-(2), and the spine that keeps length.
+Two deformations, eq. (1)-(2) of the paper (Sec. 2.1) and the spine that keeps length, share their
+parameters: a root rotation, translation and scale, and for each joint a rotation, a translation, a
+scale and the precision Q of its Gaussian skinning weight. The root's translation has no depth:
+under a perspective camera depth and scale of one silhouette can't be distinguished, so the root
+stays at depth 1 and the localization finds the millimetres.
 
-Both variants share their parameters: a root rotation, translation and scale, and for each joint a
-rotation, a translation, a scale and the precision Q of its Gaussian skinning weight.
-
-The root's translation has no depth: under a perspective camera depth and scale of one silhouette
-can't be distinguished, so the root stays at depth 1 and the localization finds the millimetres.
-
-The differentiable silhouette: the exact share of each pixel that the mesh covers.
-
-A soft rasterizer blurs the outline and thereby dilates it. Here nothing is blurred: the outline of
-a closed mesh is made of its rim edges (between a face that looks at the camera and one that does
-not), and the area that directed edges enclose inside each pixel has a closed form. Summed over the
-rim this counts the layers of the body that lie over each pixel; where it is folded over itself the
-count exceeds 1, and clamping it gives the silhouette. No depth buffer, no blur, no parameter.
+The silhouette is the exact share of each pixel that the mesh covers; a soft rasterizer blurs the
+outline and thereby dilates it. The outline of a closed mesh is made of its rim edges (between a
+face that looks at the camera and one that does not), and the area that directed edges enclose
+inside each pixel has a closed form. Summed over the rim this counts the layers of the body that lie
+over each pixel; where it is folded over itself the count exceeds 1, and clamping it gives the
+silhouette. No depth buffer, no blur, no parameter.
 """
 
 from collections.abc import Callable

@@ -6,6 +6,7 @@ mask, a long thin snout is learnt, and fish are measured from the end of the lin
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -62,10 +63,8 @@ class CandidateShapes:
     since_ns: Int[np.ndarray, "N"] | None = None
 
     def __iter__(self) -> Iterator[CandidateShape]:
-        rows = zip(
-            self.names.split(","), self.coefficients, self.covariances, self.shares, strict=True
-        )
-        return (CandidateShape(*row[:3], float(row[3])) for row in rows)
+        names, shares = self.names.split(","), self.shares.tolist()
+        return map(CandidateShape, names, self.coefficients, self.covariances, shares)
 
     def __len__(self) -> int:
         return len(self.shares)
@@ -120,15 +119,10 @@ class CandidateShapes:
             return self
         if self.since_ns is None:
             return None
-        last = [
-            shape
-            for shape, since_ns in zip(self, self.since_ns, strict=True)
-            if since_ns == self.since_ns.max()
-        ]
+        last = [*compress(self, self.since_ns == self.since_ns.max())]
         total = sum(shape.share for shape in last)
-        return CandidateShapes.of(
-            [shape._replace(share=shape.share / total) for shape in last], are_learnt=True
-        )
+        stocks = [shape._replace(share=shape.share / total) for shape in last]
+        return CandidateShapes.of(stocks, are_learnt=True)
 
     @classmethod
     def of(cls, candidates: list[CandidateShape], *, are_learnt: bool) -> "CandidateShapes":
@@ -149,13 +143,11 @@ def body_forms(template: Template, *, named: str | None = None) -> CandidateShap
     names = bundled_names()
     odds = np.array([_NAMED_ODDS if name == named else 1.0 for name in names])
     covariance = np.linalg.inv(form_precision())
-    return CandidateShapes.of(
-        [
-            CandidateShape(name, coefficients_of(load_template(name), template), covariance, share)
-            for name, share in zip(names, odds / odds.sum(), strict=True)
-        ],
-        are_learnt=False,
-    )
+    forms = [
+        CandidateShape(name, coefficients_of(load_template(name), template), covariance, share)
+        for name, share in zip(names, odds / odds.sum(), strict=True)
+    ]
+    return CandidateShapes.of(forms, are_learnt=False)
 
 
 def load_shapes(
@@ -219,8 +211,6 @@ def _factor(log: float, more: str, less: str) -> str:
 # Squared distance to the nearest form, in its own std: of stocks that are as far from a form as
 # `form_precision` says, one in a thousand is further (chi-square).
 _MAX_DISTANCE = float(chdtri(NUM_COEFFICIENTS, 1e-3))
-
-
 # Of the fish; a smaller group is mostly one whose masks misled, and says little of its shape.
 _MIN_SHARE = 0.1
 _NEVER = 1.5  # times that distance: no fish at all; between the two it is doubted more and more
@@ -242,13 +232,17 @@ def believable(forms: CandidateShapes, stocks: CandidateShapes) -> Believed:
     for stock, line in zip(stocks, describe(forms, stocks), strict=True):
         if stock.share < _MIN_SHARE:
             continue
-        off, distance = _off_form(forms, stock)
-        doubt = max(0.0, (distance / _MAX_DISTANCE - 1) / (_NEVER - 1))
+        # From the form that it is nearest to.
+        off = min(
+            (stock.coefficients - form.coefficients for form in forms), key=distance_from_form
+        )
+        doubt = max(0.0, (distance_from_form(off) / _MAX_DISTANCE - 1) / (_NEVER - 1))
         if doubt <= 1:
             covariance = stock.covariance + doubt * np.outer(off, off)
             believed.append(stock._replace(covariance=covariance))
         if doubt > 0:
-            doubts.append(f"the masks show a shape that fish {_doubt(doubt)} ({line}){_REMEDY}")
+            words = _HARDLY if doubt <= 1 else _NO_FISH
+            doubts.append(f"the masks show a shape that fish {words} ({line}){_REMEDY}")
     if not believed:
         return Believed(forms, doubts)
     kept = CandidateShapes.of(believed, are_learnt=True)
@@ -259,20 +253,8 @@ _REMEDY = (
     ": look whether the masks hold more than the fish, such as its line; for fish that do look so "
     "give a mesh of them (--template)"
 )
-
-
-def _doubt(doubt: float) -> str:
-    if doubt > 1:
-        return "don't have, so that these are measured as the form that each is most like"
-    return "hardly have, so that their lengths are less certain"
-
-
-def _off_form(
-    forms: CandidateShapes, stock: CandidateShape
-) -> tuple[Float[np.ndarray, "W"], float]:
-    """How a stock differs from the form that it is nearest to, and the squared distance."""
-    offs = [stock.coefficients - form.coefficients for form in forms]
-    return min(((off, distance_from_form(off)) for off in offs), key=lambda one: one[1])
+_HARDLY = "hardly have, so that their lengths are less certain"
+_NO_FISH = "don't have, so that these are measured as the form that each is most like"
 
 
 # Log factors between head and peduncle: on the mean breadth, beside one std, and on single places

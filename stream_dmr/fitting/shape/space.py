@@ -5,14 +5,13 @@ y > 0 and on the side y < 0, logs of factors on the thickness at `THICKNESS_KNOT
 further the lobes of the tail reach past its middle (body lengths). Zeros are the template itself;
 between knots the logs are linear. Length, midline, joints and keypoints are the template's.
 
-Breadth and thickness of a stock where nobody knows how its fish are rolled.
-
-A silhouette shows the breadth b as sqrt(b^2 cos^2 r + t^2 sin^2 r) at a roll r, with the thickness
-t, and the length as its cosine at a slant. Both are second order, so that the equations of a bundle
+Breadth and thickness of a stock are inferred although nobody knows how its fish are rolled. A
+silhouette shows the breadth b as sqrt(b^2 cos^2 r + t^2 sin^2 r) at a roll r, with the thickness t,
+and the length as its cosine at a slant. Both are second order, so that the equations of a bundle
 adjustment are blind to them, and no single fish tells a narrow body from a rolled one. All fish
 together do: roll only narrows and slant only shortens, so that what is seen is spread to one side
-of what is true. Here rolls and slants are integrated out, with the spreads of both learnt. A fish
-that is bent out of the picture looks shorter too, and counts as slanted.
+of what is true. Rolls and slants are integrated out, with the spreads of both learnt. A fish that
+is bent out of the picture looks shorter too, and counts as slanted.
 """
 
 from collections.abc import Mapping, Sequence
@@ -154,16 +153,17 @@ def _form_rows() -> Float[np.ndarray, "R W"]:
     """Rows whose products with a difference of shapes are independent, of std 1."""
     unit = np.eye(NUM_COEFFICIENTS)
     left, right = unit[LEFT], unit[RIGHT]
-    parts = [
-        np.diff(left, 2, axis=0) / _CURVATURE_STD,
-        np.diff(right, 2, axis=0) / _CURVATURE_STD,
-        (left - right) / _SIDES_STD,
-        unit[BREADTH] / _KNOT_STD,
-        unit[THICKNESS] / _THICKNESS_STD,
-        np.diff(unit[THICKNESS], axis=0) / _THICKNESS_STEP_STD,
-        unit[LOBES:] / _LOBES_STD,
-    ]
-    return np.concatenate(parts)
+    return np.concatenate(
+        [
+            np.diff(left, 2, axis=0) / _CURVATURE_STD,
+            np.diff(right, 2, axis=0) / _CURVATURE_STD,
+            (left - right) / _SIDES_STD,
+            unit[BREADTH] / _KNOT_STD,
+            unit[THICKNESS] / _THICKNESS_STD,
+            np.diff(unit[THICKNESS], axis=0) / _THICKNESS_STEP_STD,
+            unit[LOBES:] / _LOBES_STD,
+        ]
+    )
 
 
 def std_of(mean: Float[np.ndarray, "W"], covariance: Float[np.ndarray, "W W"]) -> float:
@@ -265,7 +265,8 @@ def infer_proportions(
     what may be so without these fish: one Gaussian for each body form.
     """
     frames = np.concatenate([np.asarray(values) for values in seen.values()])
-    worth = np.concatenate([_worth(len(values)) for values in seen.values()])
+    counts = [len(values) for values in seen.values()]
+    worth = np.repeat([min(_FRAMES_WORTH, count) / count for count in counts], counts)
     log_density = np.log(_densities(slant_std_rad) + _OUTLIERS)
     log_posterior = np.empty((len(_BREADTHS), len(_THICKNESSES), log_density.shape[2]))
     for n, breadth in enumerate(_BREADTHS):
@@ -329,7 +330,3 @@ def _weights(angles: Float[np.ndarray, "A"], std: float) -> Float[np.ndarray, "A
     """Of a normal distribution; angles of both signs are alike, 0 has but one."""
     weights = np.where(angles == 0.0, 0.5, 1.0) * np.exp(-0.5 * (angles / std) ** 2)
     return weights / weights.sum()
-
-
-def _worth(num_frames: int) -> Float[np.ndarray, "F"]:
-    return np.full(num_frames, min(_FRAMES_WORTH, num_frames) / num_frames)

@@ -1,39 +1,23 @@
-"""Learn the mean shape of one stock of fish.
-
-Roll, the turn of a fish about its own axis, in which a wrong breadth can hide.
-
-A fish that is rolled by r shows the breadth sqrt(b^2 cos^2 r + t^2 sin^2 r), with its breadth b and
-its thickness t. So a body that is too broad is fitted nearly as well, rolled away from the camera,
-and no step of a descent leads out of there: breadth and roll would have to change together.
-
-Fits of a fish as if it faced the camera squarely: neither rolled, slanted, twisted nor arched.
-
-What these hide or feign of a shape is second order: where a body that is wrong is fitted rolled or
-arched, no step of a descent leads back, since shape and pose would have to change together. So a
-shape is learnt from square fits, in which all that differs from it is its own, and how fish are
-turned is thought of afterwards, for all of them at once (`proportions.py`).
-
-The least-squares problem of one fit over pose and shape together.
-
-The contour residuals of `contour.contour_residuals`, with further columns: a coefficient of
-`space.py` moves rest vertices, and the deformation carries that along as it carries the vertices.
-
-The mean shape of a stock, from frames of its fish: a bundle adjustment with a prior.
+"""The mean shape of a stock, from frames of its fish: a bundle adjustment with a prior.
 
 Of every frame the pose is free; all fish of a stock share its shape s, from which individuals
-differ by a known covariance. At given poses the normal equations of a frame (`equations.py`) have
-the pose eliminated by a Schur complement, as in bundle adjustment (Triggs et al., "Bundle
-Adjustment: a Modern Synthesis", 2000); the frames of a fish are averaged, for they are much alike;
-its own deviation is integrated out, which leaves each fish a Gaussian in s. Their product with the
-prior about a body form is solved, the template reshaped, the poses followed, and so on.
+differ by a known covariance. At given poses the least-squares problem of a frame over pose and
+shape together has the pose eliminated by a Schur complement (Triggs et al., "Bundle Adjustment: a
+Modern Synthesis", 2000); the frames of a fish are averaged, for they are much alike; its own
+deviation is integrated out, which leaves each fish a Gaussian in s. Their product with the prior
+about a body form is solved, the template reshaped, the poses followed, and so on.
 
-All of that in square fits (`square_fit.py`): once with all frames, then with those that show the
-fish's broad side. The factors on breadth and thickness that turned fish hide are inferred from all
-of them (`proportions.py`).
+A fish that is rolled by r about its own axis shows the breadth sqrt(b^2 cos^2 r + t^2 sin^2 r),
+with its breadth b and its thickness t. So a body that is too broad is fitted nearly as well, rolled
+away from the camera or arched, and no step of a descent leads back, since shape and pose would have
+to change together. Shapes are therefore learnt from square fits, as if fish were neither rolled,
+slanted, twisted nor arched: once of all frames, then of those that show the fish's broad side. The
+factors on breadth and thickness that turned fish hide are inferred for all of them at once
+(`space.infer_proportions`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -245,13 +229,9 @@ class PosedTarget:
     target: Target
     pose: Float[np.ndarray, "P"]
 
-    def copy(self) -> "PosedTarget":
-        """One whose pose may follow another shape."""
-        return PosedTarget(self.fish, self.target, self.pose)
-
     def unrolled(self) -> "PosedTarget":
-        """One whose broad side faces the camera."""
-        return PosedTarget(self.fish, self.target, unrolled(self.pose, self.target.anchor))
+        """A copy whose broad side faces the camera."""
+        return replace(self, pose=unrolled(self.pose, self.target.anchor))
 
 
 class FormOdds(NamedTuple):
@@ -260,10 +240,6 @@ class FormOdds(NamedTuple):
     coefficients: Float[np.ndarray, "K W"]
     shares: Float[np.ndarray, "K"]  # how probable each is; sum to 1
 
-    @classmethod
-    def certain(cls, form: Float[np.ndarray, "W"]) -> "FormOdds":
-        return cls(form[None], np.ones(1))
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Stock:
@@ -271,7 +247,7 @@ class Stock:
 
     coefficients: Float[np.ndarray, "W"]
     covariance: Float[np.ndarray, "W W"]
-    nats: dict[int, float]  # of each fish: mean of its frames, see `evidence.nats_against`
+    nats: dict[int, float]  # of each fish: mean of its frames, see `size.nats_against`
     frames: list[PosedTarget]  # with the poses that go with this shape
 
 
@@ -299,7 +275,7 @@ class StockFitter:
         The outline is that of fish near `form`; how broad and thick they are, which turned fish
         hide, may be near any of `odds` (default: that form alone).
         """
-        odds = odds or FormOdds.certain(form)
+        odds = odds or FormOdds(form[None], np.ones(1))
         shape, _ = self._outline(frames, form, start)
         _, seen, known = self._read(frames, shape, odds)
         shape, inverse = self._outline(_broadside(frames, seen - known.breadth), form, shape)
@@ -325,7 +301,8 @@ class StockFitter:
             A += self._precision
             b -= self._precision @ (shape - form)
             inverse = cho_solve(cho_factor((A + A.T) / 2), np.eye(len(A)))
-            step = _limited(inverse @ b)
+            step: np.ndarray = inverse @ b
+            step /= max(1.0, float(np.abs(step[:LOBES]).max()) / _MAX_STEP)
             shape += step
             if np.abs(step).max() < _SETTLED:
                 break
@@ -342,10 +319,7 @@ class StockFitter:
         return _means(against)
 
     def _read(
-        self,
-        frames: Sequence[PosedTarget],
-        shape: Float[np.ndarray, "W"],
-        odds: FormOdds,
+        self, frames: Sequence[PosedTarget], shape: Float[np.ndarray, "W"], odds: FormOdds
     ) -> tuple[list[PosedTarget], Float[np.ndarray, "F"], Proportions]:
         """Read each frame's breadth off a square fit that may be arched, and what all say.
 
@@ -353,7 +327,7 @@ class StockFitter:
         """
         template = reshaped(self._template, shape)
         body, square = Body.from_template(template), [frame.unrolled() for frame in frames]
-        by_fish: dict[int, list[float]] = {}
+        by_fish, seen = dict[int, list[float]](), list[float]()
         for frame in square:
             problem = square_problem(
                 self._settings,
@@ -363,7 +337,8 @@ class StockFitter:
                 arch_std_rad=self._settings.arch_std_rad,
             )
             frame.pose = square_pose(problem, frame.pose)
-            by_fish.setdefault(frame.fish, []).append(_log_breadth(frame))
+            seen.append(float(joints_of(frame.pose).log_scale.mean()))
+            by_fish.setdefault(frame.fish, []).append(seen[-1])
         spread = np.linalg.inv(self._precision)
         breadth_std, thickness_std = std_of(TRUNK, spread), std_of(MEAN_THICKNESS, spread)
         known = infer_proportions(
@@ -376,12 +351,12 @@ class StockFitter:
                     breadth_std,
                     float(MEAN_THICKNESS @ off),
                     thickness_std,
-                    float(share),
+                    share,
                 )
-                for off, share in zip(odds.coefficients - shape, odds.shares, strict=True)
+                for off, share in zip(odds.coefficients - shape, odds.shares.tolist(), strict=True)
             ],
         )
-        return square, np.array([_log_breadth(frame) for frame in square]), known
+        return square, np.array(seen), known
 
     def _placed(
         self,
@@ -402,7 +377,7 @@ class StockFitter:
         for frame, flat, log_breadth in zip(frames, square, seen, strict=True):
             rolled = rolled_as_seen(flat.pose, float(log_breadth), thin)
             joints_of(rolled).log_scale[:] = 0.0
-            starts = frame.copy(), PosedTarget(frame.fish, frame.target, rolled)
+            starts = replace(frame), replace(frame, pose=rolled)
             nats = [self._follow(body, one) for one in starts]
             best = int(np.argmin(nats))
             placed.append(starts[best])
@@ -441,10 +416,6 @@ class StockFitter:
         return nats_against(problem, frame.pose, nat=self._nat)
 
 
-def _log_breadth(frame: PosedTarget) -> float:
-    return float(joints_of(frame.pose).log_scale.mean())
-
-
 def _broadside(frames: Sequence[PosedTarget], off: Float[np.ndarray, "F"]) -> Sequence[PosedTarget]:
     """The frames that show about the whole breadth, or those nearest to it.
 
@@ -457,10 +428,6 @@ def _broadside(frames: Sequence[PosedTarget], off: Float[np.ndarray, "F"]) -> Se
 
 def _means(values: dict[int, list[float]]) -> dict[int, float]:
     return {fish: float(np.mean(each)) for fish, each in values.items()}
-
-
-def _limited(step: Float[np.ndarray, "W"]) -> Float[np.ndarray, "W"]:
-    return step / max(1.0, float(np.abs(step[:LOBES]).max()) / _MAX_STEP)
 
 
 def without_deviation(

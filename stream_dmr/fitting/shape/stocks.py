@@ -78,7 +78,9 @@ class GoodCrops:
 
     def add(self, crop: FishCrop) -> None:
         """Take the next crop of the fish; its picture is not kept."""
-        if not _is_good(crop):
+        quality = crop.quality
+        is_sure = quality.mask_confidence is None or quality.mask_confidence >= _MIN_CONFIDENCE
+        if not is_sure or quality.touches_border or quality.visible_fraction < _MIN_VISIBLE:
             return
         if self._num_good % self._stride == 0:
             self._kept.append(replace(crop, image=None))
@@ -108,12 +110,6 @@ def evenly(items: Sequence[T], most: int) -> list[T]:
     return [items[place] for place in np.unique(places)]
 
 
-def _is_good(crop: FishCrop) -> bool:
-    quality = crop.quality
-    is_sure = quality.mask_confidence is None or quality.mask_confidence >= _MIN_CONFIDENCE
-    return is_sure and not quality.touches_border and quality.visible_fraction >= _MIN_VISIBLE
-
-
 # The frames of a fish, far apart, determine its shape as two independent ones would.
 _FRAMES_WORTH = 2.0
 # Of the evidence for a form, summed over the frames that decided it: they follow each other, so
@@ -125,20 +121,16 @@ _MAX_FOR, _MAX_AGAINST = 20.0, -6.0
 _RULED_OUT = 1000.0  # nats against a form that a fish can't have
 
 
+@dataclass(eq=False)
 class _Group:
     """Fish that share a shape, and the body form that it is near to."""
 
-    def __init__(self, form: CandidateShape, stock: Stock) -> None:
-        self.form, self.stock = form, stock
+    form: CandidateShape
+    stock: Stock
 
     @property
     def num_fish(self) -> int:
         return len(self.stock.nats)
-
-    @property
-    def num_effective(self) -> float:
-        """How many of the shape's coefficients its fish determine rather than the prior."""
-        return NUM_COEFFICIENTS - float(np.trace(self.stock.covariance @ form_precision()))
 
 
 def learn_stocks(
@@ -159,7 +151,7 @@ def learn_stocks(
     if not fish:
         return None
     learner = _StockLearner(template, forms, fish, settings, plane_normal)
-    groups = learner.by_form(list(forms), fish)
+    groups = learner.by_form(fish)
     progress(f"{len(fish)} fish of {len(groups)} body forms")
     groups = learner.merged(groups)
     stocks = _shapes_of(groups)
@@ -173,18 +165,13 @@ def learn_stocks(
 def _shapes_of(groups: Sequence[_Group]) -> CandidateShapes:
     """The largest group first."""
     total = sum(group.num_fish for group in groups)
-    return CandidateShapes.of(
-        [
-            CandidateShape(
-                group.form.name,
-                group.stock.coefficients,
-                group.stock.covariance,
-                group.num_fish / total,
-            )
-            for group in sorted(groups, key=lambda group: -group.num_fish)
-        ],
-        are_learnt=True,
-    )
+    shapes = [
+        CandidateShape(
+            one.form.name, one.stock.coefficients, one.stock.covariance, one.num_fish / total
+        )
+        for one in sorted(groups, key=lambda group: -group.num_fish)
+    ]
+    return CandidateShapes.of(shapes, are_learnt=True)
 
 
 class _StockLearner:
@@ -201,7 +188,7 @@ class _StockLearner:
         self._fitter = StockFitter(template, settings)
         self._forms, self._against = forms, {one.track_id: one.against for one in fish}
 
-    def by_form(self, forms: Sequence[CandidateShape], fish: Sequence[FishSamples]) -> list[_Group]:
+    def by_form(self, fish: Sequence[FishSamples]) -> list[_Group]:
         """One group of each form that any fish was fitted with."""
         frames: dict[int, list[PosedTarget]] = {}
         for one in fish:
@@ -213,9 +200,9 @@ class _StockLearner:
                 )
                 for sample in one.samples
             )
+        forms = [*self._forms]
         return [
-            self._learn(forms[n], group, forms[n].coefficients)
-            for n, group in sorted(frames.items())
+            self._learn(forms[n], own, forms[n].coefficients) for n, own in sorted(frames.items())
         ]
 
     def merged(self, groups: list[_Group]) -> list[_Group]:
@@ -247,17 +234,14 @@ class _StockLearner:
 
         for options in side_by_side(posed, by_fish.values()):
             nats = [
-                list(self._fitter.nats([one.copy() for one in option], shape).values())
+                list(self._fitter.nats([replace(one) for one in option], shape).values())
                 for option, shape in zip(options, shapes, strict=True)
             ]
             best = int(np.argmin(_FRAMES_WORTH * np.mean(nats, axis=1) - shares))
             frames[best] += options[best]
         return [
             self._learn(
-                group.form,
-                own,
-                group.stock.coefficients,
-                self._odds({frame.fish for frame in own}),
+                group.form, own, group.stock.coefficients, self._odds({frame.fish for frame in own})
             )
             for group, own in zip(groups, frames, strict=True)
             if own
@@ -294,7 +278,7 @@ class _StockLearner:
 
         def search(frame: PosedTarget) -> PosedTarget:
             found = solver.search(frame.target, cold_starts(frame.target, template))
-            return PosedTarget(frame.fish, frame.target, found.parameters)
+            return replace(frame, pose=found.parameters)
 
         return search
 
@@ -303,7 +287,9 @@ def _evidence_for_two(a: _Group, b: _Group, both: _Group) -> float:
     """Nats by which masks prefer two shapes to one, less the parameters of the smaller group."""
     apart = a.stock.nats | b.stock.nats
     gains = [_FRAMES_WORTH * (both.stock.nats[fish] - nats) for fish, nats in apart.items()]
-    return float(np.clip(gains, _MAX_AGAINST, _MAX_FOR).sum()) - b.num_effective
+    # How many of the shape's coefficients the fish of b determine rather than the prior.
+    num_effective = NUM_COEFFICIENTS - float(np.trace(b.stock.covariance @ form_precision()))
+    return float(np.clip(gains, _MAX_AGAINST, _MAX_FOR).sum()) - num_effective
 
 
 _MIN_IOU = 0.85  # of a fit from which a shape is learnt; chosen
