@@ -1,20 +1,18 @@
-"""The background of a moving camera.
+"""The background of a moving camera, and the camera's motion.
 
-Motion of a camera that is held by hand, rolls, pans or heaves, from what stands still before it.
-
-Sparse optical flow (Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000)
+A camera that is held by hand, rolls, pans or heaves is followed by what stands still before it:
+sparse optical flow (Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2000)
 and a similarity by RANSAC. A sea drifts, so the best similarity explains only part of what changes,
 and the vessel's rail, which it would move as well, stays in place. A camera's own motion explains
 nearly all changes everywhere. Accumulated over many pictures, this distinguishes a moving camera
 from a moving sea before a camera at rest.
 
-A running model of the picture without fish, in the pixels of a moving camera.
-
-Pixel by pixel a running mean, as in Stauffer and Grimson ("Adaptive background mixture models for
-real-time tracking", CVPR 1999) with one mode, that moves with the camera as in Yi et al.
-("Detection of moving objects with non-stationary cameras in 5.8 ms", CVPR workshops 2013).
-Deviations from the mean are judged by the colour covariance of their surroundings: waves vary along
-one line of colours, from trough to foam, and a fish stands out by lying beside that line.
+The picture without fish is modelled pixel by pixel by a running mean, as in Stauffer and Grimson
+("Adaptive background mixture models for real-time tracking", CVPR 1999) with one mode, that moves
+with the camera as in Yi et al. ("Detection of moving objects with non-stationary cameras in
+5.8 ms", CVPR workshops 2013). Deviations from the mean are judged by the colour covariance of their
+surroundings: waves vary along one line of colours, from trough to foam, and a fish stands out by
+lying beside that line.
 """
 
 from typing import Any

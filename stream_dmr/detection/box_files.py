@@ -1,18 +1,16 @@
 """Read boxes from MOT, COCO and CVAT files.
 
-Boxes from COCO's JSON (cocodataset.org, "Data format"), as annotation tools export it.
+COCO's JSON (cocodataset.org, "Data format") is read as annotation tools export it. Frames of a
+video are those that names of six and more digits say, as `export --masks` writes them, else counted
+from 1 in the natural order of the pictures' file names. The track id is `track_id` or
+`instance_id`, of the annotation itself or among its `attributes`; boxes without either get
+`UNKNOWN_ID`.
 
-Pictures of a folder are known by their names. Frames of a video are those that names of six and
-more digits say, as `export --masks` writes them, else counted from 1 in the natural order of the
-pictures' file names. The track id is
-`track_id` or `instance_id`, of the annotation itself or among its `attributes`; boxes without
-either get `UNKNOWN_ID`.
+CVAT's XML, version 1.1 (docs.cvat.ai, "CVAT"), is read for videos and for pictures. CVAT counts
+frames, pictures and tracks from 0, this package from 1. A box inside a video's track gets the
+track's id; a box of a single picture gets `UNKNOWN_ID`.
 
-Boxes from CVAT's XML, version 1.1 (docs.cvat.ai, "CVAT"), for videos and for pictures.
-
-CVAT counts frames, pictures and tracks from 0, this package from 1. Pictures of a folder are known
-by their names, since CVAT may have another order. A box inside a video's track
-gets the track's id; a box of a single picture gets `UNKNOWN_ID`.
+COCO and CVAT know pictures of a folder by their names, since they may have another order.
 """
 
 import json
@@ -97,13 +95,8 @@ def parse_mot(text: str, path: Path) -> dict[int, list[AnnotatedBox]]:
 
     Raises AnnotationError with the line's number and what was expected there.
     """
-    return group_by_frame(_parse_lines(text, path))
-
-
-def _parse_lines(text: str, path: Path) -> Iterator[tuple[str, int, AnnotatedBox]]:
-    for number, line in enumerate(text.splitlines(), start=1):
-        if line.strip():
-            yield _parse_line(line, f"{path}, line {number}")
+    lines = enumerate(text.splitlines(), start=1)
+    return group_by_frame(_parse_line(one, f"{path}, line {n}") for n, one in lines if one.strip())
 
 
 def _parse_line(line: str, where: str) -> tuple[str, int, AnnotatedBox]:

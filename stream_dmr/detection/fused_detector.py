@@ -3,7 +3,7 @@
 Motion finds what a network has never seen, with an outline, and also plants that sway; it misses
 what hangs still, of a fish that fills the picture it sees parts, and of one behind a gaff two
 pieces. Looks find fish that don't move, and also marks that look like fish. What either finds is
-followed; what counts is said by `tracking.fish_evidence`.
+followed; what counts is decided by `tracking.confirmation`.
 
 Most of a film is water, in which neither has to look at every picture: see `passes_over`.
 """

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from stream_dmr.detection.box_files import UNKNOWN_ID, AnnotatedBox, load_boxes, unused_boxes
 from stream_dmr.detection.detector import Candidate, Detector
@@ -97,11 +97,12 @@ class AnnotatedFish:
             return [] if labels is None else _detections_of(labels)
         boxes = self._boxes_inside(frame, self._boxes.get(frame.frame_index, ()))
         labels = self._labels(frame, is_expected=bool(boxes))
+        nothing = None if self._masks is None else np.zeros(frame.image.shape[:2], bool)
         return [
             Detection(
                 source_id=box.track_id,
                 bbox_xyxy_px=box.bbox_xyxy_px,
-                mask=self._mask(frame, box, labels),
+                mask=nothing if labels is None else labels.ids == box.track_id,
                 visible_fraction=box.visibility,
                 unknown=None if labels is None else labels.unknown,
             )
@@ -146,7 +147,7 @@ class AnnotatedFish:
 
     @property
     def unused(self) -> list[str]:
-        """Whether boxes and masks are beyond the last frame so far, one line each."""
+        """Boxes and masks that are beyond the last frame so far, one line each."""
         boxes = [] if self._boxes is None else unused_boxes(self._boxes, self._last_frame)
         masks = [] if self._masks is None else self._masks.unused(self._last_frame)
         return [*boxes, *masks]
@@ -176,15 +177,6 @@ class AnnotatedFish:
                 self._boxes_outside.append((frame.frame_index, box.track_id))
         self._boxed_ids.update(box.track_id for box in inside)
         return inside
-
-    def _mask(
-        self, frame: Frame, box: AnnotatedBox, labels: Labels | None
-    ) -> Bool[np.ndarray, "H W"] | None:
-        if self._masks is None:
-            return None
-        if labels is None:
-            return np.zeros(frame.image.shape[:2], bool)
-        return labels.ids == box.track_id
 
 
 def _detections_of(labels: Labels) -> list[Detection]:
@@ -290,15 +282,12 @@ class NamedPictures:
         height, width = frame.image.shape[:2]
         found = [] if self._detector is None else self._detector.find(frame)
         boxes = [candidate.bbox_xyxy_px for candidate in found]
-        return max(boxes, key=_area, default=np.array([0.0, 0.0, width, height]))
+        areas = [np.prod(box[2:] - box[:2]) for box in boxes]
+        return boxes[int(np.argmax(areas))] if boxes else np.array([0.0, 0.0, width, height])
 
     def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:
         """All ids: every picture that is named shows a fish."""
         return list(crops)
-
-
-def _area(bbox_xyxy_px: Float[np.ndarray, "4"]) -> float:
-    return float(np.prod(bbox_xyxy_px[2:] - bbox_xyxy_px[:2]))
 
 
 _MAX_BYTES = 100_000_000  # a million pictures; chosen
@@ -352,7 +341,7 @@ class BoxDetector:
 
     @property
     def unused(self) -> list[str]:
-        """What of the file was not used so far."""
+        """Boxes that are beyond the last frame so far, in one line."""
         return unused_boxes(self._frames, self._last_frame)
 
     def find(self, frame: Frame) -> list[Candidate]:

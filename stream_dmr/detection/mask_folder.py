@@ -80,7 +80,10 @@ class MaskFolder:
         if not folder.is_dir():
             raise AnnotationError(f"{folder}: expected a folder of masks, found none there")
         names = sorted(entry.name for entry in folder.iterdir() if entry.suffix == ".png")
-        stems, own = _stems_in(pictures), {Path(name).stem for name in names}
+        stems, own = set[str](), {Path(name).stem for name in names}
+        if pictures is not None and pictures.is_dir():
+            files = (one for one in pictures.iterdir() if one.suffix.lower() in PICTURE_SUFFIXES)
+            stems = {one.stem for one in files}
         # Pictures may have numbers for names that are not those of their frames.
         is_named = bool(stems) and stems <= own
         self._is_numbered = not is_named and any(_FILE_NAME.fullmatch(name) for name in names)
@@ -96,7 +99,8 @@ class MaskFolder:
                 "rename them by one"
             )
         self.folder = folder
-        self._names = names
+        # Of its masks, where they are numbered; else of all its pictures.
+        self._names = [n for n in names if not self._is_numbered or _FILE_NAME.fullmatch(n)]
         self._has_ids = False
         self._across_frames = across_frames
 
@@ -149,7 +153,7 @@ class MaskFolder:
 
         The pictures are not opened: one without any id counts as well.
         """
-        frames = self._frames
+        frames = sorted(int(name[:-4]) for name in self._names) if self._is_numbered else []
         beyond = [index for index in frames if index > last_frame]
         if not beyond:
             return []
@@ -159,19 +163,9 @@ class MaskFolder:
             f"{beyond[0]} on, and it ended at frame {last_frame}; are they of another video?"
         ]
 
-    @property
-    def _frames(self) -> list[int]:
-        """The frames of numbered pictures, ascending; none where they are named otherwise."""
-        if not self._is_numbered:
-            return []
-        return sorted(int(name[:-4]) for name in self._names if _FILE_NAME.fullmatch(name))
-
     def _check_ids(self, largest: int) -> None:
         """A fish drawn as 255 on 0 is one that nobody would measure. Raises AnnotationError."""
-        names = self._names
-        if self._is_numbered:
-            names = [name for name in names if _FILE_NAME.fullmatch(name)]
-        for name in names[:: max(1, len(names) // _MAX_LOOKED_AT)]:
+        for name in self._names[:: max(1, len(self._names) // _MAX_LOOKED_AT)]:
             try:
                 require_file(self.folder / name)
                 with Image.open(self.folder / name) as picture:
@@ -212,12 +206,6 @@ def are_grey_levels(labels: Labels) -> bool:
     is_inside = cv2.erode(ids, block) == cv2.dilate(ids, block)
     num_with_inside = len(np.unique(ids[is_inside & (ids > 0)]))
     return num_with_inside < len(labels.present) / 2
-
-
-def _stems_in(pictures: Path | None) -> set[str]:
-    if pictures is None or not pictures.is_dir():
-        return set()
-    return {one.stem for one in pictures.iterdir() if one.suffix.lower() in PICTURE_SUFFIXES}
 
 
 def _check_labels(picture: Image.Image, path: Path, *, size: tuple[int, int]) -> None:

@@ -1,6 +1,7 @@
-"""Candidates by ONNX detectors and by the U-Net.
+"""Candidates by a user's own ONNX detector and by the U-Net.
 
-Decode the outputs of families of detectors into boxes and scores.
+An ONNX file is run by onnxruntime on the CPU. It is tried on three pictures before the first frame,
+so that an unusable model is refused at once and not in the middle of a run. Its outputs are:
 
 yolo: (1, 4 + C, N), x, y, w, h of the center and C scores, input pixels (YOLOv8 and later).
 yolov5: (1, N, 5 + C), x, y, w, h, objectness, C scores, input pixels (YOLOv5, YOLOX decoded).
@@ -8,14 +9,8 @@ yolo-nms: (1, N, 6), left, top, right, bottom, score, class, input pixels (expor
 detr: boxes (1, N, 4) as x, y, w, h, fractions of the input, and logits (1, N, C + 1), the last of
 them "nothing" (DETR). rt-detr: the same with C independent logits (RT-DETR, RF-DETR, DINO).
 
-A user's detector from an ONNX file, run by onnxruntime on the CPU.
-
-It is tried on three pictures before the first frame, so that an unusable model is refused at once
-and not in the middle of a run.
-
-Fish in the whole frame by the network that also finds masks, at low resolution, without boxes.
-
-For cameras and seas that move so much that no fish stands out by its motion.
+The U-Net, which also finds masks, finds fish in the whole frame at low resolution, for cameras and
+seas that move so much that no fish stands out by its motion.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -176,14 +171,10 @@ class OnnxSettings(Settings):
     """The part of `[detect_fish]` that a detector from an ONNX file reads."""
 
     onnx_layout: Layout = Field(
-        default="yolo",
-        description="output format of the model; docs/models.md has the shapes",
+        default="yolo", description="output format of the model; docs/models.md has the shapes"
     )
     onnx_input_px: int = Field(
-        default=640,
-        ge=_MIN_INPUT_PX,
-        le=4096,
-        description="input side of a model of any size, px",
+        default=640, ge=_MIN_INPUT_PX, le=4096, description="input side of a model of any size, px"
     )
     onnx_imagenet: bool = Field(
         default=False, description="input by ImageNet's mean and std, as DETR wants; else 0 to 1"
@@ -307,10 +298,8 @@ class OnnxDetector:
             ) from None
         if not (np.isfinite(boxes).all() and np.isfinite(scores).all()):
             raise self._refusal("finite boxes and scores", "NaN or infinity", remedy="export again")
-        if (
-            len(scores)
-            and not -_SCORE_TOLERANCE <= scores.min() <= scores.max() <= 1 + _SCORE_TOLERANCE
-        ):
+        low, high = scores.min(initial=0.0), scores.max(initial=0.0)
+        if low < -_SCORE_TOLERANCE or high > 1 + _SCORE_TOLERANCE:
             raise self._refusal("scores from 0 to 1", f"{scores.min():.3g} to {scores.max():.3g}")
 
     def _refusal(self, expected: str, got: str, *, remedy: str = "") -> ModelError:
@@ -345,24 +334,17 @@ class UNetDetector:
         probability = self._segmenter.segment_all(small)
         fish = cv2.resize(probability, (width, height), interpolation=cv2.INTER_LINEAR)
         min_area_px = _MIN_AREA_PX * width * height / (size[0] * size[1])
-        return [_candidate(shape, fish) for shape in _large_components(fish > 0.5, min_area_px)]
-
-
-def _large_components(
-    fish: Bool[np.ndarray, "H W"], min_area_px: float
-) -> list[Bool[np.ndarray, "H W"]]:
-    count, labels, stats = components(fish.astype(np.uint8))
-    large = [i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] >= min_area_px]
-    return [labels == i for i in large]
+        count, labels, stats = components((fish > 0.5).astype(np.uint8))
+        large = [i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] >= min_area_px]
+        return [_candidate(labels == i, fish) for i in large]
 
 
 def _candidate(
     shape: Bool[np.ndarray, "H W"], probability: Float32[np.ndarray, "H W"]
 ) -> Candidate:
     x, y, w, h = cv2.boundingRect(shape.view(np.uint8))
-    foreground = shape[y : y + h, x : x + w].copy()
     return Candidate(
         bbox_xyxy_px=np.array([x, y, x + w, y + h], np.float64),
         score=float(probability[shape].mean()),
-        foreground=foreground,
+        foreground=shape[y : y + h, x : x + w].copy(),
     )

@@ -55,7 +55,7 @@ def open_detector(settings: DetectFishSettings) -> Detector:
     suffix = Path(settings.detector).suffix.lower()
     path = SHIPPED if settings.detector == "unet" else Path(settings.detector)
     if path == SHIPPED or suffix == ".pt" or (suffix == ".onnx" and is_unet_file(path)):
-        return _open_unet(path, settings)
+        return UNetDetector(UNetSegmenter.load(path), longer_px=settings.unet_working_px)
     if suffix == ".onnx":
         return OnnxDetector(Path(settings.detector), settings)
     raise ModelError(
@@ -68,7 +68,3 @@ def _open_looks() -> OnnxDetector:
     """The detector that ships, see docs/model-card.md."""
     settings = OnnxSettings(onnx_layout="yolov5")
     return OnnxDetector(_LOOKS, settings, min_score=FISH_LIKE, threads=_LOOKS_THREADS)
-
-
-def _open_unet(path: Path, settings: UNetDetectorSettings) -> UNetDetector:
-    return UNetDetector(UNetSegmenter.load(path), longer_px=settings.unet_working_px)

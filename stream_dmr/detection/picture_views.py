@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -38,21 +39,19 @@ def find_in_still(detector: Detector, frame: Frame) -> list[Candidate]:
     large = [
         one
         for one in find_in_view(detector, frame, afar, (-rim_px, -rim_px))
-        if _longer_px(one) > _LARGE * max(height, width)
+        if (one.bbox_xyxy_px[2:] - one.bbox_xyxy_px[:2]).max() > _LARGE * max(height, width)
     ]
     whole, others = [*detector.find(frame)], list[Candidate]()
     rows, columns = round(_TILE_SHARE * height), round(_TILE_SHARE * width)
-    for top in (0, height - rows):
-        for left in (0, width - columns):
-            tile = frame.image[top : top + rows, left : left + columns]
-            near = find_in_view(detector, frame, tile, (left, top))
-            others += [
-                one
-                for one in near
-                if one.score >= _SURE_NEAR
-                and not _is_cut(one, frame, tile, (left, top))
-                and not any(_is_part(one, fish) for fish in [*large, *whole])
-            ]
+    for top, left in product((0, height - rows), (0, width - columns)):
+        tile = frame.image[top : top + rows, left : left + columns]
+        others += [
+            one
+            for one in find_in_view(detector, frame, tile, (left, top))
+            if one.score >= _SURE_NEAR
+            and not _is_cut(one, frame, tile, (left, top))
+            and not any(_is_part(one, fish) for fish in [*large, *whole])
+        ]
     kept = [*large]
     for one in sorted([*whole, *others], key=lambda one: -one.score):
         if not any(_are_same(one, fish) for fish in kept):
@@ -78,7 +77,3 @@ def _is_cut(
     at_low = (one.bbox_xyxy_px[:2] < low + _EDGE_PX) & (low > 0)
     at_high = (one.bbox_xyxy_px[2:] > high - _EDGE_PX) & (high < frame.image.shape[1::-1])
     return bool(at_low.any() or at_high.any())
-
-
-def _longer_px(one: Candidate) -> float:
-    return float((one.bbox_xyxy_px[2:] - one.bbox_xyxy_px[:2]).max())
