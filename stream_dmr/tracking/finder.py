@@ -1,9 +1,8 @@
 """Find the fish of a video: detector, tracker and confirmation together.
 
-Fish that a detector found twice in one picture, and parts of fish that it took for others.
-
-A box with a fish's tail and one without it, or a fish and its fin, overlap too little to be one
-box. Their masks tell: fish share no pixels.
+A detector may find a fish of a picture twice, or take a part of a fish for another one: a box with
+a fish's tail and one without it, or a fish and its fin, overlap too little to be one box. Their
+masks tell: fish share no pixels.
 """
 
 from collections.abc import Collection, Mapping
@@ -48,11 +47,7 @@ class Sightings:
 
 
 def explain_no_fish(
-    seen: Sightings,
-    refused: Mapping[str, int],
-    *,
-    min_frames: int,
-    min_confidence: float,
+    seen: Sightings, refused: Mapping[str, int], *, min_frames: int, min_confidence: float
 ) -> str:
     """One line: why no fish was found in these frames, and what to do.
 
@@ -66,7 +61,8 @@ def explain_no_fish(
             "need a detector of your own (.onnx), or --boxes"
         )
     if seen.candidates == 0:
-        shapes = ", ".join(f"{count} {reason}" for reason, count in _commonest(refused))
+        commonest = sorted(refused.items(), key=lambda item: -item[1])
+        shapes = ", ".join(f"{count} {reason}" for reason, count in commonest)
         return begin + (
             f"all {sum(refused.values())} moving shapes were refused ({shapes}); change that "
             "setting where these were fish"
@@ -92,10 +88,6 @@ def explain_no_fish(
         f"{seen.tracks} shapes were followed, none with a sure mask in {min_frames} frames within "
         "the zone; lower [track_fish] min_track_frames, or widen zone; --stills for single pictures"
     )
-
-
-def _commonest(refused: Mapping[str, int]) -> list[tuple[str, int]]:
-    return sorted(refused.items(), key=lambda item: -item[1])
 
 
 # Of a mask that lies inside another one. In 70 stills, repeats and fins had 0.85 and more of theirs
@@ -216,11 +208,10 @@ class TrackedFish:
         ]
         if self._are_stills:
             fish = without_repeats({track: crops[track] for track in fish}, self._scores)
-        self._found_any = self._found_any or bool(fish)
-        self._seen.tracks = max(self._seen.tracks, *crops) if crops else self._seen.tracks
-        for crop in crops.values():
-            confidence = crop.quality.mask_confidence or 0.0
-            self._seen.best_confidence = max(self._seen.best_confidence, confidence)
+        self._found_any |= bool(fish)
+        self._seen.tracks = max([self._seen.tracks, *crops])
+        confidences = [crop.quality.mask_confidence or 0.0 for crop in crops.values()]
+        self._seen.best_confidence = max([self._seen.best_confidence, *confidences])
         return fish
 
     @property
@@ -233,14 +224,13 @@ class TrackedFish:
         """Why there are no fish, where there are none; a missed one of several is not noticed."""
         if self._found_any or self._seen.frames == 0:
             return []
-        return [
-            explain_no_fish(
-                self._seen,
-                self._detector.refused,
-                min_frames=self._settings.min_track_frames,
-                min_confidence=self._settings.min_mask_confidence,
-            ),
-        ]
+        line = explain_no_fish(
+            self._seen,
+            self._detector.refused,
+            min_frames=self._settings.min_track_frames,
+            min_confidence=self._settings.min_mask_confidence,
+        )
+        return [line]
 
     @property
     def unused(self) -> list[str]:
@@ -264,9 +254,9 @@ class FishFinder(Protocol):
 
     @property
     def unused(self) -> list[str]:
-        """What of the given files no frame so far had, one line each.
+        """Entries of the given files that matched no frame so far, one line each.
 
-        True of the whole source only once it was read to its end.
+        Complete at the end of the source.
         """
         ...
 

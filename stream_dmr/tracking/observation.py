@@ -1,10 +1,8 @@
 """A candidate with the features that the tracker compares.
 
-How alike two views of fish look: histograms of the colours of their pixels.
-
-Of seven cues that were compared (mean colour, area, length, silhouette, picture patch, histograms
-of one and of three channels), the joint histogram separates fish best; see
-docs/research/tracking.md.
+How alike two views of fish look is told by histograms of the colours of their pixels. Of seven cues
+that were compared (mean colour, area, length, silhouette, picture patch, histograms of one and of
+three channels), the joint histogram separates fish best; see docs/research/tracking.md.
 """
 
 from typing import NamedTuple
@@ -36,11 +34,9 @@ class Colours(NamedTuple):
 def colours_of(
     region: UInt8[np.ndarray, "h w 3"], silhouette: Bool[np.ndarray, "h w"] | None
 ) -> Colours:
-    """Those of the BGR content of a box."""
-    return Colours(
-        silhouette=None if silhouette is None else root_histogram(region, silhouette),
-        middle=root_histogram(region, middle_of(*region.shape[:2])),
-    )
+    """Colours of a box and of the silhouette in it (BGR)."""
+    own = None if silhouette is None else root_histogram(region, silhouette)
+    return Colours(silhouette=own, middle=root_histogram(region, middle_of(*region.shape[:2])))
 
 
 def middle_of(height: int, width: int) -> Bool[np.ndarray, "h w"]:
@@ -86,9 +82,8 @@ def dissimilarity_if_covered(a: Colours, b: Colours) -> float:
     """
     if a.silhouette is None or b.silhouette is None:
         return 1.0
-    return min(
-        _without_cover(a.silhouette, b.silhouette), _without_cover(b.silhouette, a.silhouette)
-    )
+    first, second = a.silhouette, b.silhouette
+    return min(_without_cover(first, second), _without_cover(second, first))
 
 
 def _without_cover(bare: Float32[np.ndarray, "N"], covered: Float32[np.ndarray, "N"]) -> float:

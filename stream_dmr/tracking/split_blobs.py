@@ -37,7 +37,9 @@ class PredictedSilhouette:
     is_whole: bool  # the fish was seen separately, so its size is known
 
 
-def split_merged_blob(candidate: Candidate, fish: Sequence[PredictedSilhouette]) -> list[Candidate]:
+def split_merged_blob(
+    candidate: Candidate, known: Sequence[PredictedSilhouette]
+) -> list[Candidate]:
     """The candidate's pieces: one per visible fish, then those that no known fish explains.
 
     `[candidate]` where it has no `foreground`, or fewer than two pieces are large enough.
@@ -46,18 +48,23 @@ def split_merged_blob(candidate: Candidate, fish: Sequence[PredictedSilhouette])
         return [candidate]
     x, y, _, _ = whole_pixels(candidate.bbox_xyxy_px)
     foreground = candidate.foreground
-    fish = [
-        one for one in fish if _visible_fraction(one, foreground, (x, y)) > _MIN_VISIBLE_FRACTION
-    ]
+    fish, regions = list[PredictedSilhouette](), list[Bool[np.ndarray, "H W"]]()
+    for one in known:
+        region = _in_region(one, foreground.shape, (x, y))
+        visible_px = np.count_nonzero(foreground & region)
+        if visible_px / max(np.count_nonzero(one.shape), 1) > _MIN_VISIBLE_FRACTION:
+            fish.append(one)
+            regions.append(region)
     if not fish or (len(fish) == 1 and not _may_be_several(foreground, fish[0])):
         return [candidate]
-    distances = np.stack([_distance_px(one, foreground.shape, (x, y)) for one in fish])
+    distances = np.stack([_distance_px(region) for region in regions])
     nearest = distances.argmin(axis=0)
     radii = [max(_MIN_MATCH_RADIUS_PX, _MATCH_RADIUS * one.length_px) for one in fish]
     is_near = distances.min(axis=0) <= np.array(radii)[nearest]
     line_px = round(_LINE_WIDTH_RATIO * min(one.length_px for one in fish)) | 1
     owned = [foreground & is_near & (nearest == i) for i in range(len(fish))]
-    pieces = [_largest_component(_opened(one, line_px)) for one in owned]
+    parts = [_components(_opened(one, line_px)) for one in owned]
+    pieces = [max(own, key=np.count_nonzero) for own in parts if own]
     pieces += _components(_opened(foreground & ~is_near, line_px))
     min_area = _MIN_AREA_RATIO * min(one.area_px for one in fish)
     pieces = [piece for piece in pieces if np.count_nonzero(piece) >= min_area]
@@ -77,19 +84,9 @@ def _may_be_several(blob: Bool[np.ndarray, "H W"], fish: PredictedSilhouette) ->
     )
 
 
-def _visible_fraction(
-    fish: PredictedSilhouette, foreground: Bool[np.ndarray, "H W"], corner: tuple[int, int]
-) -> float:
-    """The fraction of a predicted silhouette that lies in a region, which begins at `corner`."""
-    visible = foreground & _in_region(fish, foreground.shape, corner)
-    return np.count_nonzero(visible) / max(np.count_nonzero(fish.shape), 1)
-
-
-def _distance_px(
-    fish: PredictedSilhouette, shape: tuple[int, ...], corner: tuple[int, int]
-) -> Float[np.ndarray, "H W"]:
-    """Distance of each pixel of a region from a predicted silhouette, px."""
-    outside = (~_in_region(fish, shape, corner)).astype(np.uint8)
+def _distance_px(silhouette: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """Distance of each pixel from a silhouette, px."""
+    outside = (~silhouette).astype(np.uint8)
     return cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_3).astype(np.float64)
 
 
@@ -114,11 +111,6 @@ def _opened(mask: Bool[np.ndarray, "H W"], diameter_px: int) -> UInt8[np.ndarray
 def _components(mask: UInt8[np.ndarray, "H W"]) -> list[Bool[np.ndarray, "H W"]]:
     count, labels, _ = components(mask)
     return [labels == label for label in range(1, count)]
-
-
-def _largest_component(mask: UInt8[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    parts = _components(mask)
-    return max(parts, key=np.count_nonzero) if parts else mask > 0
 
 
 def _piece(piece: Bool[np.ndarray, "H W"], whole: Candidate, corner: tuple[int, int]) -> Candidate:

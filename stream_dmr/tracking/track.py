@@ -126,9 +126,8 @@ class Track:
         self._evidence.add(observation.candidate, self.size)
         self._separate_frames = 0 if observation.is_piece else self._separate_frames + 1
         if observation.is_piece and self.was_separate:
-            self._filter.update(
-                observation.center[:, None], R=_PIECE_VARIANCE_RATIO * self._filter.R
-            )
+            R = _PIECE_VARIANCE_RATIO * self._filter.R
+            self._filter.update(observation.center[:, None], R=R)
             return
         if self.frames_seen > 2:  # before, the speed is not known
             square = self._distance(observation) ** 2
@@ -167,9 +166,8 @@ class Track:
     def take_identity(self, number: int, snapshot: TrackSnapshot) -> None:
         """Continue as another fish: with its number and features, at this track's position."""
         if number != self.number:
-            self.number, self.snapshot = number, snapshot
+            self.number, self.snapshot, self.colours = number, snapshot, snapshot.colours
             self.area, self.length = snapshot.area, snapshot.length
-            self.colours = snapshot.colours
 
     def resume(self, observation: Observation) -> None:
         """Continue from the snapshot with an observation after a gap."""

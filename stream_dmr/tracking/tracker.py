@@ -5,8 +5,6 @@ Bewley et al., "Simple online and realtime tracking", ICIP 2016. Where fish meet
 little, so area and colour weigh as well; a blob that contains several fish is split by
 `split_blobs` or assigned to none of them, and `occlusion` settles their identities afterwards.
 
-The one place where a fish gets its `track_id`.
-
 Three numbers name a fish on its way. A detection's `source_id` is that of its annotation file or of
 its track in the tracker, and stays inside of segmentation. `TrackNumbering` turns it into the
 `track_id` of the FishCrop, once; every later message, table, database and recording has that one.
@@ -47,8 +45,7 @@ class TrackerSettings(Settings):
         "where the next fish soon hangs in its place",
     )
     across_frames: bool = Field(
-        default=True,
-        description="false: each picture stands for itself, as with --stills",
+        default=True, description="false: each picture stands for itself, as with --stills"
     )
     min_score: float = Field(
         default=0.3, ge=0, le=1, description="least score of a detector's candidate that counts"
