@@ -229,12 +229,10 @@ def distribution_rows(distributions: Distributions) -> list[tuple[str, str]]:
 
 
 def _error_rows(e: FishErrors) -> list[tuple[str, str]]:
+    median = f"{e.median_absolute_mm:.1f} mm, {e.median_absolute_percent:.2f} %"
     return [
         ("mean absolute error", f"{e.mean_absolute_mm:.1f} mm, {e.mean_absolute_percent:.2f} %"),
-        (
-            "median absolute error",
-            f"{e.median_absolute_mm:.1f} mm, {e.median_absolute_percent:.2f} %",
-        ),
+        ("median absolute error", median),
         ("90th percentile", f"{e.p90_absolute_mm:.1f} mm, {e.p90_absolute_percent:.2f} %"),
         ("bias", f"{e.bias_mm:+.1f} mm, {e.bias_percent:+.2f} %"),
     ]
@@ -271,13 +269,10 @@ def plot_histograms(path: Path, distributions: Distributions) -> None:
     )
     axes.legend(frameon=False)
     try:
-        figure.savefig(path, dpi=110, metadata=_made_by(path))
+        # By which `evaluate` knows its own pictures; other formats have other names for it.
+        made_by = {"Software": "stream-dmr evaluate"} if path.suffix in ("", ".png") else None
+        figure.savefig(path, dpi=110, metadata=made_by)
     except (OSError, ValueError) as error:  # ValueError: a suffix that matplotlib doesn't know
         raise OutputError(
             f"{path}: expected to write a picture there, got: {reason_of(error)}"
         ) from error
-
-
-def _made_by(path: Path) -> dict[str, str] | None:
-    """By what `evaluate` knows its own pictures; formats have names of their own for it."""
-    return {"Software": "stream-dmr evaluate"} if path.suffix in ("", ".png") else None

@@ -148,7 +148,7 @@ def fish_errors(
 def is_covered(
     truth_mm: Float[np.ndarray, "N"], intervals_mm: Float[np.ndarray, "N 2"]
 ) -> Bool[np.ndarray, "N"]:
-    """Whether each interval, both ends included, contains its true length."""
+    """True for each interval, both ends included, that contains its true length."""
     return (intervals_mm[:, 0] <= truth_mm) & (truth_mm <= intervals_mm[:, 1])
 
 
