@@ -70,15 +70,11 @@ def shares_in(settings: ZonesSettings, points: Float[np.ndarray, "N 2"]) -> dict
     """The share of `points` in each zone, by its fate; where zones overlap, the first has them."""
     is_left, shares = np.ones(len(points), bool), dict[str, float]()
     for name, corners in settings.polygons():
-        inside = [_is_inside(corners, point) for point in points]
+        polygon = corners.astype(np.float32)
+        inside = [cv2.pointPolygonTest(polygon, (x, y), False) >= 0 for x, y in points.tolist()]
         shares[name] = float(np.mean(inside & is_left))
         is_left &= ~np.array(inside)
     return shares
-
-
-def _is_inside(corners: Float[np.ndarray, "N 2"], point: Float[np.ndarray, "2"]) -> bool:
-    x, y = float(point[0]), float(point[1])
-    return cv2.pointPolygonTest(corners.astype(np.float32), (x, y), False) >= 0
 
 
 UNKNOWN_FATE = "unknown"
@@ -106,7 +102,6 @@ class FateTracker:
         self._last_ns = 0
 
     def add(self, fish: LocalizedFish) -> None:
-        """Take the next frame."""
         self._last_ns = fish.timestamp_ns
         self._is_hidden = fish.reason in (Reason.MOSTLY_HIDDEN,)
         if fish.keypoints_px is not None and np.isfinite(fish.keypoints_px).all():
@@ -128,13 +123,13 @@ class FateTracker:
             or (ended.cause == "end" and ended.timestamp_ns - self._last_ns <= gap_ns)
         ):
             return Fate(UNKNOWN_FATE, None)
-        shares = shares_in(self._settings, self._in_frame(body_points(seen.keypoints_px)))
+        points = body_points(seen.keypoints_px)
+        shares = shares_in(
+            self._settings, points if self._limit is None else points.clip(0, self._limit)
+        )
         name = max(shares, key=lambda zone: shares[zone])
         is_sure = shares[name] >= self._settings.min_share
         return Fate(name if is_sure else UNKNOWN_FATE, shares[name])
-
-    def _in_frame(self, points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
-        return points if self._limit is None else points.clip(0, self._limit)
 
 
 def body_points(keypoints_px: Float[np.ndarray, "3 2"]) -> Float[np.ndarray, "N 2"]:

@@ -130,7 +130,6 @@ class _ErrorCorrelation:
         self._pairs = 0.0  # the same over all pairs
 
     def add(self, timestamp_ns: int) -> None:
-        """Take one frame more."""
         fading = math.exp(-abs(timestamp_ns - self._last_ns) / self._tau_ns)
         self._with_earlier = fading * (self._with_earlier + 1.0) if self._count else 0.0
         self._pairs += self._with_earlier

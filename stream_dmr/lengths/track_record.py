@@ -146,12 +146,10 @@ class TrackLength:
         """Std from the filter's variance and from what frames of one fish have in common."""
         assert self._filter is not None
         shared = (self._settings.common_std_ratio * length_mm) ** 2
-        shared += (self._shared_std_ratio() * length_mm) ** 2
+        # Of the log length, by the fish's own shape and distance from the plane.
+        ratio = float(np.mean([one.shared_std_ratio for one in self._measurements]))
+        shared += (ratio * length_mm) ** 2
         return np.sqrt(variance * self._filter.design_effect + shared)
-
-    def _shared_std_ratio(self) -> float:
-        """Of the log length, by the fish's own shape and distance from the plane: the mean."""
-        return float(np.mean([one.shared_std_ratio for one in self._measurements]))
 
     def _status(self, num_used: int, *, is_measured: bool, is_final: bool) -> str:
         if Reason.NO_CALIBRATION in self._refused:
