@@ -171,20 +171,6 @@ def locate_keypoints(
     return np.stack([head_mm, center_mm, tail_mm])
 
 
-def place_midline(
-    midline: Float[np.ndarray, "M 3"],
-    center: Float[np.ndarray, "3"],
-    keypoints_mm: Float[np.ndarray, "3 3"],
-) -> Float[np.ndarray, "M 3"]:
-    """Midline in mm: moved so that `center` is C', scaled so that its chord is |H'T'|.
-
-    Its arc length is therefore the length of eq. (13).
-    """
-    head_mm, center_mm, tail_mm = keypoints_mm
-    scale = np.linalg.norm(head_mm - tail_mm) / np.linalg.norm(midline[0] - midline[-1])
-    return center_mm + scale * (midline - center)
-
-
 def mask_std_ratio(quality: CropQuality) -> float:
     """Std of the log length by what a found mask may lack or have too much at the ends."""
     if quality.mask_confidence is None:
@@ -194,10 +180,7 @@ def mask_std_ratio(quality: CropQuality) -> float:
 
 
 def locate(
-    shape: FittedShape,
-    quality: CropQuality,
-    calibration: Calibration,
-    settings: LocalizeSettings,
+    shape: FittedShape, quality: CropQuality, calibration: Calibration, settings: LocalizeSettings
 ) -> Location:
     """Where the fish is and how long, by eq. (13): |H'T'| times the bending ratio of the fit.
 
@@ -227,11 +210,17 @@ def locate(
         settings.misfit_std * ((1.0 - shape.iou) / 0.1) ** 3,
     ]
     std_mm = length_mm * float(np.linalg.norm(parts))
-    plane_std = plane_std_ratio(calibration.plane, settings)
+    # A fish hangs as far off the plane in its last frame as in its first, so this does not average
+    # out over its frames. A center off the plane by d scales the whole fish by d over the camera's
+    # distance from the plane, along its normal: |R_3 . T|, which is the depth where the camera
+    # looks at it squarely.
+    plane_std = settings.plane_std_mm / calibration.plane.distance_mm
     shared = [shape.shape_std_ratio or 0.0, plane_std, height_std, mask_std_ratio(quality)]
+    # The center becomes C' and the chord |H'T'|, so that the arc length is the one of eq. (13).
+    scale = chord_mm / np.linalg.norm(shape.midline[0] - shape.midline[-1])
     return Location(
         keypoints_mm=keypoints_mm,
-        midline_mm=place_midline(shape.midline, shape.keypoints[1], keypoints_mm),
+        midline_mm=keypoints_mm[1] + scale * (shape.midline - shape.keypoints[1]),
         length_mm=length_mm,
         length_std_mm=std_mm if np.isfinite(std_mm) else None,
         shared_std_ratio=float(np.linalg.norm(shared)),
@@ -277,17 +266,6 @@ def bend(shape: FittedShape) -> float | None:
     if not np.isfinite(shape.midline).all() or np.array_equal(shape.midline[0], shape.midline[-1]):
         return None
     return bending_ratio(shape.midline)
-
-
-def plane_std_ratio(plane: ReferencePlane, settings: LocalizeSettings) -> float:
-    """Std of a length as a fraction of it, since centers lie off the plane.
-
-    A fish hangs as far off the plane in its last frame as in its first, so this does not average
-    out over its frames. A center off the plane by d scales the whole fish by d over the camera's
-    distance from the plane, along its normal: |R_3 . T|, which is the depth where the camera looks
-    at it squarely.
-    """
-    return settings.plane_std_mm / plane.distance_mm
 
 
 def slant(keypoints_mm: Float[np.ndarray, "3 3"]) -> float:
