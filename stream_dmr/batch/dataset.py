@@ -5,10 +5,9 @@ partitioned as by Hive, with one file a video: `vessel=.../trip=.../VIDEO.parque
 """
 
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from stream_dmr.batch.manifest import Job
 from stream_dmr.errors import OutputError
@@ -17,7 +16,7 @@ from stream_dmr.export.fish_table import FISH_TABLE, fish_record, template_of, w
 from stream_dmr.files import replacing
 from stream_dmr.pipeline.config import load_config
 from stream_dmr.store.batch_folder import TABLE_KINDS, dataset_file
-from stream_dmr.store.fish import Fish, read_fish
+from stream_dmr.store.fish import read_fish
 from stream_dmr.store.open_results import open_results
 from stream_dmr.store.run_tables import FrameRow
 from stream_dmr.store.scale_checks import last_checks
@@ -52,17 +51,11 @@ def write_tables(folder: Path, job: Job) -> None:
         for one in fish
     ]
     write_parquet(folder / "fish.parquet", _FISH_SCHEMA, records)
-    frames = _frame_records(folder, fish, of_video)
-    write_parquet(folder / "frames.parquet", _FRAMES_SCHEMA, frames)
-    add_files(folder, [folder / f"{kind}.parquet" for kind in TABLE_KINDS])
-
-
-def _frame_records(
-    folder: Path, fish: Sequence[Fish], of_video: dict[str, str]
-) -> list[dict[str, Any]]:
     by_track = {one.estimate.track_id: {"run_id": one.run_id} | asdict(one.facts) for one in fish}
     frames = read_records(folder / "frames.csv", FrameRow)
-    return [frame | of_video | by_track.get(frame["track_id"], {}) for frame in frames]
+    records = [frame | of_video | by_track.get(frame["track_id"], {}) for frame in frames]
+    write_parquet(folder / "frames.parquet", _FRAMES_SCHEMA, records)
+    add_files(folder, [folder / f"{kind}.parquet" for kind in TABLE_KINDS])
 
 
 def publish(folder: Path, job: Job, out: Path) -> None:

@@ -114,7 +114,10 @@ class _BatchResults:
         if outcome.status == DONE:
             publish(results_folder(job.name, self._out), job, self._out)
         else:
-            _record_failure(job, self._out, outcome)
+            if read_outcome(job, self._out) is None:  # its process died before it could write one
+                folder = unfinished_folder(job.name, self._out)
+                shutil.rmtree(folder, ignore_errors=True)
+                finish_folder(folder, results_folder(job.name, self._out), outcome)
             self._log(f"{outcome.name}: failed: {outcome.reason}")
         self._write_table()
 
@@ -159,18 +162,15 @@ def _require_own_folders(jobs: Sequence[Job], out: Path) -> None:
             )
 
 
-def _is_unfinished(folder: Path) -> bool:
-    """True for what a killed batch left: an empty folder, or one with files of a run."""
-    entries = list(folder.iterdir()) if folder.is_dir() else [folder]
-    return not entries or any(path.name == OUTCOME or has_run_name(path) for path in entries)
-
-
 def _remove_unfinished(out: Path) -> None:
-    """Remove the folders that a killed batch left unfinished.
+    """Remove the folders that a killed batch left: empty ones, and those with files of a run.
 
     Raises OutputError where another batch is still writing to one.
     """
-    for folder in filter(_is_unfinished, out.glob(f"{VIDEO_FOLDERS}/*.part")):
+    for folder in out.glob(f"{VIDEO_FOLDERS}/*.part"):
+        entries = list(folder.iterdir()) if folder.is_dir() else [folder]
+        if entries and not any(path.name == OUTCOME or has_run_name(path) for path in entries):
+            continue
         deadline = time.monotonic() + _LOCK_PATIENCE_S
         while True:
             try:
@@ -181,11 +181,3 @@ def _remove_unfinished(out: Path) -> None:
                     raise
                 time.sleep(_LOCK_POLL_S)
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _record_failure(job: Job, out: Path, outcome: Outcome) -> None:
-    """Write the outcome of a video whose process died before it could."""
-    if read_outcome(job, out) is None:
-        folder = unfinished_folder(job.name, out)
-        shutil.rmtree(folder, ignore_errors=True)
-        finish_folder(folder, results_folder(job.name, out), outcome)

@@ -1,10 +1,9 @@
 """Measure the videos of a batch in local processes or on a Ray cluster.
 
-A process that measures videos: `python -m stream_dmr.batch.engines OUT`, one job a line on stdin.
-
-It answers on stdout: the share of the video that is done, whenever that grew by a hundredth, and
-FINISHED. When its stdin closes it exits at once, in the middle of a video as well: the process that
-started it has ended, and nothing would record the outcome.
+A local process, `python -m stream_dmr.batch.engines OUT`, takes one job a line on stdin. It answers
+on stdout: the share of the video that is done, whenever that grew by a hundredth, and FINISHED.
+When its stdin closes it exits at once, in the middle of a video as well: the process that started
+it has ended, and nothing would record the outcome.
 """
 
 import json
@@ -125,13 +124,12 @@ class _Worker:
     ) -> None:
         with tempfile.TemporaryFile() as self._errors:
             try:
-                while not self._stop.is_set():
-                    job = jobs.get_nowait()
-                    outcome = self._measure(job, progress.of(job))
-                    if outcome is not None:
-                        finished.put(outcome)
-            except queue.Empty:
-                pass
+                with suppress(queue.Empty):
+                    while not self._stop.is_set():
+                        job = jobs.get_nowait()
+                        outcome = self._measure(job, progress.of(job))
+                        if outcome is not None:
+                            finished.put(outcome)
             finally:
                 self._end()
 
@@ -144,25 +142,21 @@ class _Worker:
         process = self._process = self._process or self._start()
         assert process.stdin is not None
         assert process.stdout is not None
-        is_finished = False
         with suppress(BrokenPipeError):
             process.stdin.write(json.dumps(asdict(job)) + "\n")
             process.stdin.flush()
         for line in process.stdout:
-            if is_finished := line.strip() == FINISHED:
+            if line.strip() == FINISHED:
                 break
             on_progress(float(line))
-        if is_finished:
-            self._num_videos += 1
-            if self._num_videos >= self._videos_a_process:
-                self._end()
-            return read_outcome(job, self._out) or Outcome.failed(
-                job, job.key, "its files changed meanwhile"
-            )
-        code = self._end()
-        if self._stop.is_set():
-            return None
-        return Outcome.failed(job, job.key, f"its process ended ({code}): {self._end_of_stderr()}")
+        else:
+            reason = f"its process ended ({self._end()}): {self._end_of_stderr()}"
+            return None if self._stop.is_set() else Outcome.failed(job, job.key, reason)
+        self._num_videos += 1
+        if self._num_videos >= self._videos_a_process:
+            self._end()
+        changed = "its files changed meanwhile"
+        return read_outcome(job, self._out) or Outcome.failed(job, job.key, changed)
 
     def _start(self) -> subprocess.Popen[str]:
         self._errors.truncate(0)
