@@ -215,7 +215,7 @@ def test_a_video_cut_off_is_measured_as_far_as_it_goes(clip: Path):
     outcome = invoke("run", options_of(clip) | {"--source": str(clip / "v.avi")})
     assert outcome.code == 0, outcome.err
     assert outcome.err.count("warning: v.avi") == 1
-    assert rows(clip / "out" / "lengths.csv")[0]["status"] == "measured"
+    assert rows(clip / "out" / "lengths.csv")[0]["status"] == "measured; cut off"
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from stream_dmr.errors import ConfigError, RecordingError
+from stream_dmr.errors import RecordingError, UserError
 from stream_dmr.messages import FishCrop, Frame, Message
 from stream_dmr.recording.frame_images import RecordedPictures, has_original_pixels
 from stream_dmr.recording.mcap.h264_topic import H264Topic, decode_video
@@ -135,7 +135,7 @@ def test_without_ffmpeg_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.M
     record(tmp_path, [*frames(2)], H264)
     monkeypatch.delitem(sys.modules, "stream_dmr.recording.mcap.h264_topic")
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(ConfigError, match=r"pip install 'stream-dmr\[h264\]'"):
+    with pytest.raises(UserError, match=r"pip install 'stream-dmr\[h264\]'"):
         Recorder(tmp_path / "b", header(), H264)
-    with pytest.raises(RecordingError, match=r"pip install 'stream-dmr\[h264\]'"):
+    with pytest.raises(UserError, match=r"pip install 'stream-dmr\[h264\]'"):
         list(restored(tmp_path))
