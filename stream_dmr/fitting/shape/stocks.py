@@ -264,7 +264,7 @@ class _StockLearner:
         """How probable each body form is by all that decided the forms of these fish."""
         each = np.array([self._against[one] for one in sorted(fish)])
         # Finite, since fish of one stock may each rule out another form.
-        against = np.minimum(each - each.min(axis=1, keepdims=True), _RULED_OUT).sum(axis=0)
+        against = np.minimum(each, each.min(axis=1, keepdims=True) + _RULED_OUT).sum(axis=0)
         nats = _EVIDENCE_WORTH * against - np.log(self._forms.shares)
         shares = np.exp(nats.min() - nats)
         return FormOdds(self._forms.coefficients, shares / shares.sum())
