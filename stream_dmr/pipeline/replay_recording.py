@@ -26,7 +26,7 @@ from stream_dmr.pipeline.comparator import MessageComparator, Mismatch
 from stream_dmr.pipeline.learn_shapes import save_stocks
 from stream_dmr.pipeline.replay_inputs import ReplayInputs, new_header, read_inputs
 from stream_dmr.pipeline.run_folder import prepare_folder
-from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.pipeline.run_observer import RunObserver, RunTotals
 from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.pipeline.run_outputs import ResultWriter
 from stream_dmr.pipeline.session import (
@@ -179,17 +179,10 @@ class ReplayWriter:
     ) -> None:
         self._recorded, self._recomputed, self._settings = recorded, recomputed, settings
         self._outputs, self._comparator = outputs, comparator
-        self._first_ns: int | None = None
-        self._last_ns = 0
         self._positions = recorded.of_type(Position, keep_payloads=False)
         self._next_position = None if outputs is None else next(self._positions, None)
-        self.final: list[LengthEstimate] = []
+        self.totals = RunTotals(max_fish=None)
         self.num_frames = 0
-
-    @property
-    def recorded_s(self) -> float:
-        """Capture time from the first frame to the last, in seconds."""
-        return (self._last_ns - (self._first_ns or 0)) / 1e9 if self.num_frames else 0.0
 
     def write(self, message: Message) -> Message:
         """Record, compare and count a message; returns it as the next node is to get it."""
@@ -198,8 +191,7 @@ class ReplayWriter:
         payload = self._recorded.payload(message)
         if isinstance(message, Frame):
             self.num_frames += 1
-            self._first_ns = message.timestamp_ns if self._first_ns is None else self._first_ns
-            self._last_ns = message.timestamp_ns
+            self.totals.take(message)
         if self._outputs is not None:
             self._outputs.results.store(message)
             self._outputs.recorder.put(Record.of_payload(message, payload))
@@ -232,8 +224,7 @@ class ReplayWriter:
             message = as_recorded(message, self._settings)
         if self._comparator is not None and not isinstance(message, TrackEnded):
             self._comparator.compare(message)
-        if isinstance(message, LengthEstimate) and message.is_final:
-            self.final.append(message)
+        self.totals.take(message)
         return message
 
 
@@ -316,10 +307,10 @@ def replay(
     for line in (*recording.warnings, *recorded.notes):
         observer.warn(line)
     return ReplaySummary(
-        fish=sorted(writer.final, key=lambda estimate: estimate.track_id),
+        fish=writer.totals.fish(),
         num_frames=writer.num_frames,
         elapsed_s=time.perf_counter() - began,
-        recorded_s=writer.recorded_s,
+        recorded_s=writer.totals.recorded_s,
         counters=counters,
         num_compared=comparator.num_compared if comparator else 0,
         num_left_out=comparator.num_left_out if comparator else 0,

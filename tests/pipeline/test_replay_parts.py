@@ -93,7 +93,7 @@ def test_recorded_messages_pass_as_they_are_and_are_counted(recording: Recording
     for message in of_kinds(recorded, [Frame, LocalizedFish]):
         assert writer.write(message) is message
     assert writer.num_frames == NUM_FRAMES
-    assert writer.recorded_s == pytest.approx((NUM_FRAMES - 1) * FRAME_NS / 1e9)
+    assert writer.totals.recorded_s == pytest.approx((NUM_FRAMES - 1) * FRAME_NS / 1e9)
 
 
 def test_recomputed_messages_are_compared_and_final_lengths_kept(recording: Recording):
@@ -110,7 +110,7 @@ def test_recomputed_messages_are_compared_and_final_lengths_kept(recording: Reco
         writer.write(message)
     comparator.finish()
     assert comparator.mismatches == []
-    assert [estimate.track_id for estimate in writer.final] == [1, 2]
+    assert [estimate.track_id for estimate in writer.totals.fish()] == [1, 2]
 
 
 def test_the_database_beside_a_recording_knows_vessel_and_flags(
