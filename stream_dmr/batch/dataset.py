@@ -12,7 +12,7 @@ from pathlib import Path
 from stream_dmr.batch.manifest import Job
 from stream_dmr.errors import OutputError
 from stream_dmr.evidence.seal import add_files
-from stream_dmr.export.fish_table import FISH_TABLE, fish_record, template_of, write_parquet
+from stream_dmr.export.fish_table import FISH_TABLE, fish_record, write_parquet
 from stream_dmr.files import replacing
 from stream_dmr.pipeline.config import load_config
 from stream_dmr.store.batch_folder import TABLE_KINDS, dataset_file
@@ -46,10 +46,8 @@ def write_tables(folder: Path, job: Job) -> None:
     fish = read_fish(folder, recording)
     of_video = {"video": job.name, "haul": job.options.haul}
     checks = last_checks(folder / DATABASE)
-    records = [
-        fish_record(one, template_of(one, recording.header.template), settings, checks) | of_video
-        for one in fish
-    ]
+    template = recording.header.template
+    records = [fish_record(one, template, settings, checks) | of_video for one in fish]
     write_parquet(folder / "fish.parquet", _FISH_SCHEMA, records)
     by_track = {one.estimate.track_id: {"run_id": one.run_id} | asdict(one.facts) for one in fish}
     frames = read_records(folder / "frames.csv", FrameRow)

@@ -5,7 +5,10 @@ What a camera can't know stays empty: nothing is guessed. Sources: draft longlin
 vocabularies TypeMeasured and ValueUnitOrScale.
 """
 
+from dataclasses import replace
+
 from stream_dmr.export.export_choices import Agency
+from stream_dmr.fitting.shape.candidates import AUTO
 from stream_dmr.lengths.fate import FATE_OF_ZONE
 from stream_dmr.store.effort import HaulEffort
 from stream_dmr.store.fish import Fish
@@ -35,6 +38,12 @@ _WCPFC_LENGTHS = {"fork": "UF", "total": "TL"}  # upper jaw to fork; tip of snou
 ICES_LENGTHS = {"fork": "LengthFork", "total": "LengthTotal"}
 
 
+def template_of(fish: Fish, template: Template) -> Template:
+    """The run's template; with `auto` and of an unknown species it names no kind of length."""
+    is_known = template.name != AUTO or fish.sure_code
+    return template if is_known else replace(template, tail_gives=None)
+
+
 def wcpfc_row(fish: Fish, template: Template) -> Row:
     date, _, time = (utc_text(fish.utc_ns) or "").partition("T")
     length_mm, where = fish.length_mm, fish.where
@@ -54,14 +63,17 @@ def wcpfc_row(fish: Fish, template: Template) -> Row:
         "length_cm": "" if length_mm is None else str(int(length_mm // 10)),
         "length_code": ""
         if length_mm is None
-        else _WCPFC_LENGTHS.get(template.tail_gives or "", ""),
+        else _WCPFC_LENGTHS.get(template_of(fish, template).tail_gives or "", ""),
         "comments": "; ".join(note for note in notes if note),
     }
 
 
 def rdbes_row(fish: Fish, template: Template) -> Row:
     """One measured length, as a biological variable with the sample's and the haul's keys."""
-    kind, length_mm = ICES_LENGTHS.get(template.tail_gives or "", ""), fish.length_mm
+    kind, length_mm = (
+        ICES_LENGTHS.get(template_of(fish, template).tail_gives or "", ""),
+        fish.length_mm,
+    )
     is_measured = length_mm is not None
     place = fish.where.latitude, fish.where.longitude
     return {

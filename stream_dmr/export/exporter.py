@@ -19,7 +19,6 @@ from stream_dmr.export.export_choices import Agency, MeshFormat, TableFormat
 from stream_dmr.export.fish_table import (
     FISH_TABLE,
     fish_record,
-    template_of,
     unweighed_note,
     used_columns,
     write_csv,
@@ -49,7 +48,6 @@ from stream_dmr.store.open_results import open_results, require_recording
 from stream_dmr.store.run_facts import run_facts
 from stream_dmr.store.run_tables import FramesTable, write_lengths
 from stream_dmr.store.scale_checks import last_checks
-from stream_dmr.template.template import Template
 
 Stage = TypeVar("Stage", FishCrop, FittedMesh)
 
@@ -200,7 +198,7 @@ class Export:
         path = out / f"fish.{format}"
         self._require_writable(path)
         checks = {} if self._database is None else last_checks(self._database)
-        records = [fish_record(one, self._template_of(one), settings, checks) for one in self._fish]
+        records = [fish_record(one, self.header.template, settings, checks) for one in self._fish]
         self.notes += unweighed_note(records, settings)
         with self._writing(path):
             if format == "csv":
@@ -230,7 +228,7 @@ class Export:
         """Write the fish as wcpfc.csv or rdbes.csv; rejected ones and doubles are left out."""
         path, (columns, row) = out / f"{agency}.csv", AGENCIES[agency]
         self._require_writable(path)
-        rows = [row(one, self._template_of(one)) for one in self._fish if one.counts]
+        rows = [row(one, self.header.template) for one in self._fish if one.counts]
         with self._writing(path):
             write_csv(path, columns, rows)
         return path
@@ -249,9 +247,6 @@ class Export:
         with self._writing(path):
             write_csv(path, HAUL_COLUMNS, [haul_row(one, utc_zero_ns=zero_ns) for one in efforts])
         return path
-
-    def _template_of(self, fish: Fish) -> Template:
-        return template_of(fish, self.header.template)
 
     @cached_property
     def _fish(self) -> list[Fish]:

@@ -2,13 +2,11 @@
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from stream_dmr.export.agency_tables import ICES_LENGTHS
-from stream_dmr.fitting.shape.candidates import AUTO
+from stream_dmr.export.agency_tables import ICES_LENGTHS, template_of
 from stream_dmr.species import CODE
 from stream_dmr.store.fish import Fish, is_same_species
 from stream_dmr.store.fisheries import Derived, FisheriesSettings, derive
@@ -121,12 +119,6 @@ _ALWAYS = {
 FISH_TABLE: dict[str, type] = {name: kind for name, (kind, _) in _COLUMNS.items()}
 
 
-def template_of(fish: Fish, template: Template) -> Template:
-    """The run's template; with `auto` and of an unknown species it names no kind of length."""
-    is_known = template.name != AUTO or fish.sure_code
-    return template if is_known else replace(template, tail_gives=None)
-
-
 def fish_record(
     fish: Fish,
     template: Template,
@@ -137,6 +129,7 @@ def fish_record(
 
     `checks`: the last ones of the scale, by the SHA-256 of their calibration.
     """
+    template = template_of(fish, template)
     found = fish.species
     named = "" if CODE.fullmatch(fish.review.species) else fish.review.species
     species = named or (found.english_name if found else "") or fish.review.species

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from stream_dmr.camera import crop_from_frame
 from stream_dmr.export.agency_tables import haul_row
-from stream_dmr.export.fish_table import fish_record, template_of
+from stream_dmr.export.fish_table import fish_record
 from stream_dmr.fitting.shape.candidates import AUTO, describe, load_shapes
 from stream_dmr.lengths.fate import CONDITIONS, FATES
 from stream_dmr.pipeline.config import Config
@@ -284,8 +284,7 @@ def _fill_template(title: str, data: str, scripts: Sequence[str], *, trip: str) 
 
 def summary_row(fish: Fish, report: RunReport) -> dict[str, Any]:
     """The row of a fish in the table: that of fish.csv, and its best view, small."""
-    template = template_of(fish, report.recording.header.template)
-    record = fish_record(fish, template, report.settings)
+    record = fish_record(fish, report.recording.header.template, report.settings)
     of_run = asdict(fish.facts)
     row = {name: value for name, value in record.items() if name not in of_run}
     views = report.views.get(fish.estimate.track_id, [])

@@ -14,8 +14,9 @@ from pyarrow import parquet
 
 from stream_dmr.errors import TemplateError
 from stream_dmr.evidence.seal import read_provenance
+from stream_dmr.export.agency_tables import template_of
 from stream_dmr.export.exporter import Export
-from stream_dmr.export.fish_table import FISH_TABLE, template_of
+from stream_dmr.export.fish_table import FISH_TABLE
 from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
 from stream_dmr.pipeline.config import parse_config
 from stream_dmr.store.fish import Fish
