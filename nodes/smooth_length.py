@@ -70,13 +70,9 @@ class SmoothLength:
     def close(self) -> Sequence[LengthEstimate]:
         """Finish the tracks whose end did not come here, since the chain was stopped."""
         last = self._last
-        return (
-            []
-            if last is None
-            else [
-                self._finish(TrackEnded.after(last, track_id, "end")) for track_id in [*self._open]
-            ]
-        )
+        if last is None:
+            return []
+        return [self._finish(TrackEnded.after(last, one, "end")) for one in [*self._open]]
 
     def _finish(self, ended: TrackEnded) -> LengthEstimate:
         self._ended.add(ended.track_id)

@@ -180,8 +180,8 @@ def print_timings(summary: RunSummary | ReplaySummary) -> None:
         )
     _stdout().print(table)
     if isinstance(summary, RunSummary):
-        parts = [f"{name} {seconds:.1f} s" for name, seconds in summary.parts_s.items()]
-        print(", ".join(part for part in parts if not part.endswith(" 0.0 s")))
+        parts = [(name, seconds) for name, seconds in summary.parts_s.items() if seconds >= 0.05]
+        print(", ".join(f"{name} {seconds:.1f} s" for name, seconds in parts))
 
 
 def print_speed(summary: RunSummary) -> None:

@@ -255,11 +255,11 @@ def _measure(
             clock.begin("measuring")
             summary = _run_chain(inputs, session, outputs, seen, observer, stop=stop)
         clock.begin("comparing with the mesh")
-        if stop.is_set():
-            return replace(summary, parts_s=clock.parts_s()), True
-        unused = inputs.finder.unused  # only now is it known what the source has no frames for
-        is_given = inputs.candidates is None and inputs.config.fit_mesh.are_shapes_learnt
-        mesh_fits = not is_given or mesh_fits_fish(seen.crops(), inputs, observer)
+        mesh_fits = True
+        if not stop.is_set():
+            unused = inputs.finder.unused  # only now is it known what the source has no frames for
+            if inputs.candidates is None and inputs.config.fit_mesh.are_shapes_learnt:
+                mesh_fits = mesh_fits_fish(seen.crops(), inputs, observer)
         return replace(summary, parts_s=clock.parts_s()), mesh_fits
     finally:
         inputs.reader.close()
