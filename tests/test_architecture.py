@@ -69,6 +69,7 @@ WHO_KNOWS = {
     "google": ["stream_dmr.recording"],  # protobuf
     "torch": ["stream_dmr.networks", "stream_dmr.training", "stream_dmr.fitting.paper"],
     "prometheus_client": ["stream_dmr.web"],
+    "jinja2": ["stream_dmr.web"],
     "sqlite3": ["stream_dmr.store", "stream_dmr.evidence"],
     "cryptography": ["stream_dmr.store", "stream_dmr.evidence"],
     "filterpy": ["stream_dmr.lengths", "stream_dmr.tracking"],

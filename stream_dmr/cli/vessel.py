@@ -156,10 +156,8 @@ class _Changes:
         self._told: dict[str, str] = {}  # by address
 
     def show(self, states: "Iterable[BoxState]") -> None:
-        from stream_dmr.web.fleet_page import alarms_of, state_text
-
         for state in states:
-            told = ": ".join(filter(None, (state_text(state), "; ".join(alarms_of(state)))))
+            told = ": ".join(filter(None, (state.text, "; ".join(state.alarms))))
             if self._told.get(state.box.address) != told:
                 said = "; ".join(filter(None, (told, _figures(state))))
                 print(f"{state.box.name}: {said}", flush=True)
@@ -167,10 +165,8 @@ class _Changes:
 
 
 def _figures(state: "BoxState") -> str:
-    from stream_dmr.web.fleet_page import disk_text, minute_text
-
     if state.contact_ns is None or state.reading is None:
         return ""
     if state.error:
-        return f"last contact {minute_text(state.contact_ns)}"
-    return f"{state.reading.fish_per_hour:.0f} fish per hour, {disk_text(state.reading)} free"
+        return f"last contact {state.contact_text}"
+    return f"{state.reading.fish_per_hour:.0f} fish per hour, {state.reading.disk_text} free"

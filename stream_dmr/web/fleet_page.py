@@ -9,13 +9,10 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
-from html import escape
 from http import HTTPStatus
 from http.client import HTTPConnection, HTTPException, HTTPSConnection
-from importlib.resources import files
 from pathlib import Path
 from socket import SHUT_RDWR
-from string import Template
 from threading import Timer
 from typing import Annotated, Any
 from urllib.error import HTTPError
@@ -26,6 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from stream_dmr.errors import ConfigError, OutputError, reason_of
 from stream_dmr.files import read_text, replacing
+from stream_dmr.web.pages import render
 
 _TIMEOUT_S = 10.0  # chosen: a link by satellite takes a second or two
 _MAX_ANSWER_BYTES = 1_000_000  # chosen: a hundred times what a box says
@@ -33,6 +31,11 @@ _MAX_AT_ONCE = 16
 _MAX_ALARM_CHARACTERS = 300
 _MAX_WARNINGS = 5  # shown of each box, the latest
 _WARNING_AGE_S = 86_400.0  # older ones are history
+
+
+_WORDS = {"healthy": "measures", "unhealthy": "has a problem", "silent": "does not answer"}
+_SUMMARY = {"healthy": "measuring", "unhealthy": "with a problem", "silent": "silent"}
+_ORDER = tuple(reversed(_WORDS))  # what needs a look comes first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +61,11 @@ class BoxReading(BaseModel):
     disk_free_bytes: int = Field(ge=0)
     last_frame_age_s: float | None = None  # None: its source is no camera
 
+    @property
+    def disk_text(self) -> str:
+        """Free space in GB."""
+        return f"{self.disk_free_bytes / 1e9:.1f} GB"
+
 
 @dataclass(frozen=True, kw_only=True)
 class BoxState:
@@ -74,6 +82,19 @@ class BoxState:
         if self.error or self.reading is None:
             return "silent"
         return "healthy" if self.reading.is_healthy else "unhealthy"
+
+    @property
+    def text(self) -> str:
+        return "never answered" if self.reading is None else _WORDS[self.kind]
+
+    @property
+    def alarms(self) -> Sequence[str]:
+        """What is wrong now: the failed contact, or the problems that the box reports."""
+        return [self.error] if self.error or self.reading is None else self.reading.problems
+
+    @property
+    def contact_text(self) -> str:
+        return "never" if self.contact_ns is None else minute_text(self.contact_ns)
 
 
 def load_boxes(given: Sequence[str]) -> list[Box]:
@@ -259,23 +280,16 @@ def replace_text(path: Path, text: str) -> None:
         draft.write_text(text, encoding="utf-8")
 
 
-_WORDS = {"healthy": "measures", "unhealthy": "has a problem", "silent": "does not answer"}
-_SUMMARY = {"healthy": "measuring", "unhealthy": "with a problem", "silent": "silent"}
-_ORDER = tuple(reversed(_WORDS))  # what needs a look comes first
-
-
 def fleet_page(states: Sequence[BoxState], *, title: str, every_s: float, now_ns: int) -> str:
     """The HTML of the page; with `every_s` above 0 a browser loads it again as often."""
     ordered = sorted(states, key=lambda state: (_ORDER.index(state.kind), state.box.name))
-    template = Template(files("stream_dmr.web").joinpath("watch/fleet.html").read_text("utf-8"))
-    refresh = f'<meta http-equiv="refresh" content="{max(1, round(every_s))}">' if every_s else ""
-    return template.substitute(
-        refresh=refresh,
-        title=escape(title),
-        summary=escape(f"{fleet_summary(states)}; written {minute_text(now_ns)}"),
-        rows="\n".join(_row(state) for state in ordered),
-        every=f"{every_s:g}",
-        written=_iso(now_ns),
+    return render(
+        "watch/fleet.html",
+        title=title,
+        states=ordered,
+        summary=f"{fleet_summary(states)}; written {minute_text(now_ns)}",
+        every_s=every_s,
+        now_ns=now_ns,
     )
 
 
@@ -288,68 +302,6 @@ def fleet_summary(states: Sequence[BoxState]) -> str:
     return f"{boxes}: {', '.join(parts)}; {hourly:.0f} fish per hour"
 
 
-def state_text(state: BoxState) -> str:
-    if state.reading is None:
-        return "never answered"
-    return _WORDS[state.kind]
-
-
-def alarms_of(state: BoxState) -> list[str]:
-    """What is wrong now: the failed contact, or the problems that the box says."""
-    if state.error or state.reading is None:
-        return [state.error]
-    return list(state.reading.problems)
-
-
-def disk_text(reading: BoxReading) -> str:
-    """Free space in GB."""
-    return f"{reading.disk_free_bytes / 1e9:.1f} GB"
-
-
 def minute_text(time_ns: int) -> str:
     """A time for people, to the minute, UTC."""
     return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):%Y-%m-%d %H:%M} UTC"
-
-
-def _iso(time_ns: int) -> str:
-    return datetime.fromtimestamp(time_ns // 10**9, UTC).isoformat()
-
-
-def _row(state: BoxState) -> str:
-    """A row of the table; what a silent box said last stays, in grey."""
-    reading, box = state.reading, state.box
-    contact = "never"
-    if state.contact_ns is not None:
-        contact = (
-            f'<span>{minute_text(state.contact_ns)}<small data-time="{_iso(state.contact_ns)}">'
-            "</small></span>"
-        )
-    numbers = ["", "", "", ""]
-    if reading is not None:
-        numbers = [
-            f"{reading.fish_per_hour:.0f}",
-            f"{reading.num_fish}",
-            f"{reading.frames_per_s:.1f}",
-            disk_text(reading),
-        ]
-    titles = ("Fish an hour", "Fish", "Pictures a second", "Disk free", "Last contact")
-    cells = [
-        f'<td class="number{"" if text else " empty"}" data-title="{title}">{text}</td>'
-        for title, text in zip(titles, [*numbers, contact], strict=True)
-    ]
-    link = f'<a href="{escape(box.address)}">{escape(box.name)}</a>'
-    return (
-        f'<tr class="{state.kind}"><td>{link}</td>'
-        f'<td><span class="state">{state_text(state)}</span></td>'
-        f'<td class="said">{_alarms(state)}</td>{"".join(cells)}</tr>'
-    )
-
-
-def _alarms(state: BoxState) -> str:
-    now = [f'<li class="now">{escape(line)}</li>' for line in alarms_of(state)]
-    reading = state.reading
-    said = [] if reading is None else list(reading.warnings)
-    if reading is not None and state.error:
-        said = [*reading.problems, *said]
-    lines = now + [f"<li>{escape(line)}</li>" for line in said]
-    return f"<ul>{''.join(lines)}</ul>" if lines else "no alarm"

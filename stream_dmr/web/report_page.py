@@ -1,12 +1,10 @@
 """One self-contained HTML page about a run or a batch."""
 
-import json
 import math
 from base64 import b64encode
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from html import escape
 from importlib.resources import files
 from pathlib import Path
 from statistics import mean
@@ -30,6 +28,7 @@ from stream_dmr.store.trip import VesselTrack
 from stream_dmr.tables import utc_text
 from stream_dmr.template.template_file import bundled_names
 from stream_dmr.version import __version__
+from stream_dmr.web.pages import render
 from stream_dmr.web.trip_map import Line, draw_map
 from stream_dmr.web.views import DrawnView, DrawnViews, FishFrame, RecordedTrack
 
@@ -63,9 +62,6 @@ class RunReport:
         return first / 1e9, max((one.last_timestamp_ns for one in estimates), default=0) / 1e9
 
 
-_HEAD = ("haul", "UTC", "watched", "measured", "fish", "with length", "mean", "species", "fate")
-
-
 def trip_section(
     reports: Sequence[RunReport], *, coast: Sequence[Line] = (), is_folded: bool = False
 ) -> str:
@@ -75,18 +71,11 @@ def trip_section(
     """
     fish = [one for report in reports for one in report.fish if one.counts]
     rows = [row for report in reports for row in _haul_rows(report, many=len(reports) > 1)]
-    table = ""
-    if rows:
-        head = "".join(f"<th>{name}</th>" for name in _HEAD)
-        table = f'<div class="wide"><table><tr>{head}</tr>{"".join(rows)}</table></div>'
     drawn = draw_map([report.track for report in reports if report.track is not None], fish, coast)
     heading = _heading(fish)
     if not (heading or drawn or any(one.haul for one in fish)):
         return ""
-    title = f"<h2>{escape(heading)}</h2>"
-    if is_folded:
-        return f"<details><summary>{title}</summary>{table}{drawn}</details>"
-    return f"{title}{table}{drawn}"
+    return render("report/trip.html", heading=heading, rows=rows, map=drawn, is_folded=is_folded)
 
 
 def _heading(fish: Sequence[Fish]) -> str:
@@ -118,37 +107,27 @@ def _span(*times: str) -> str:
     return f"{first} to {last[11:] if last[:10] == first[:10] else last}"
 
 
-def _haul_rows(report: RunReport, *, many: bool) -> list[str]:
+def _haul_rows(report: RunReport, *, many: bool) -> Iterator[dict[str, str]]:
+    """A row of the table for each haul: texts by the heads of their columns."""
     counted = [one for one in report.fish if one.counts]
     zeros = {one.facts.utc_zero_ns for one in counted}
     zero_ns = zeros.pop() if len(zeros) == 1 else None
-    return [
-        _haul_row(effort, counted, zero_ns, title=report.title if many else "")
-        for effort in report.efforts
-    ]
-
-
-def _haul_row(
-    effort: HaulEffort, counted: Sequence[Fish], zero_ns: int | None, *, title: str
-) -> str:
-    fish = [one for one in counted if one.haul == effort.haul]
-    row = haul_row(effort, utc_zero_ns=zero_ns)
-    share, lengths = effort.share_measured, [one.length_mm for one in fish if one.length_mm]
-    name = effort.haul or "-"
-    cells = [
-        f"{title}: {name}" if title else name,
-        _span(row["began_utc"], row["ended_utc"]),
-        _hours(effort.hours_watched),
-        "" if share is None else f"{100 * share:.0f} %",
-        str(len(fish)),
-        str(len(lengths)),
-        f"{mean(lengths) / 10:.1f} cm" if lengths else "",
-        _counted(_species(one) for one in fish),
-        _counted(one.fate or "" for one in fish),
-    ]
-    named = zip(_HEAD, cells, strict=True)
-    row_cells = "".join(f'<td data-name="{name}">{escape(cell)}</td>' for name, cell in named)
-    return f"<tr>{row_cells}</tr>"
+    for effort in report.efforts:
+        fish = [one for one in counted if one.haul == effort.haul]
+        row = haul_row(effort, utc_zero_ns=zero_ns)
+        share, lengths = effort.share_measured, [one.length_mm for one in fish if one.length_mm]
+        name = effort.haul or "-"
+        yield {
+            "haul": f"{report.title}: {name}" if many else name,
+            "UTC": _span(row["began_utc"], row["ended_utc"]),
+            "watched": _hours(effort.hours_watched),
+            "measured": "" if share is None else f"{100 * share:.0f} %",
+            "fish": str(len(fish)),
+            "with length": str(len(lengths)),
+            "mean": f"{mean(lengths) / 10:.1f} cm" if lengths else "",
+            "species": _counted(_species(one) for one in fish),
+            "fate": _counted(one.fate or "" for one in fish),
+        }
 
 
 def _species(fish: Fish) -> str:
@@ -203,17 +182,21 @@ def render_page(
         "fates": FATES,
         "conditions": CONDITIONS,
     }
-    rows, details = list[dict[str, Any]](), list[str]()
-    for placed in place(reports):
-        for fish in placed.report.fish:
-            row = placed.row(fish)
-            rows.append(row)
-            detail = fish_detail(fish, placed.report)
-            details.append(json_element(f"fish-{row['id']}", detail))
-    data = json_element("data", about | {"fish": rows}) + "".join(details)
-    scripts = [*_SCRIPTS, *(_REVIEW_SCRIPTS if review else ()), "page.js"]
-    return _fill_template(
-        title, data, scripts, trip=trip_section(reports, coast=coast, is_folded=bool(review))
+    placed = place(reports)
+    rows = [one.row(fish) for one in placed for fish in one.report.fish]
+    details = (
+        (one.row_id(fish.estimate.track_id), fish_detail(fish, one.report))
+        for one in placed
+        for fish in one.report.fish
+    )
+    return render(
+        "report/page.html",
+        title=title,
+        trip=trip_section(reports, coast=coast, is_folded=bool(review)),
+        data=about | {"fish": rows},
+        details=details,
+        plotly=str(files("plotly").joinpath("package_data/plotly.min.js")),
+        scripts=[*_SCRIPTS, *(_REVIEW_SCRIPTS if review else ()), "page.js"],
     )
 
 
@@ -265,21 +248,6 @@ def place(reports: Sequence[RunReport]) -> list[PlacedReport]:
         many = len(reports) > 1
         placed.append(PlacedReport(report=report, run=run, is_one_of_many=many, shift_s=shift_s))
     return placed
-
-
-def _fill_template(title: str, data: str, scripts: Sequence[str], *, trip: str) -> str:
-    folder = files("stream_dmr.web").joinpath("report")
-    parts = {
-        "TRIP": trip,
-        "TITLE": title.replace("&", "&amp;").replace("<", "&lt;"),
-        "STYLE": folder.joinpath("page.css").read_text(encoding="utf-8"),
-        "PLOTLY": files("plotly").joinpath("package_data/plotly.min.js").read_text("utf-8"),
-        "DATA": data,
-        "CODE": "".join(folder.joinpath(name).read_text(encoding="utf-8") for name in scripts),
-    }
-    text = folder.joinpath("page.html").read_text(encoding="utf-8")
-    pieces = text.split("@@")  # text, name, text, name, ..., text
-    return "".join(parts[piece] if k % 2 else piece for k, piece in enumerate(pieces))
 
 
 def summary_row(fish: Fish, report: RunReport) -> dict[str, Any]:
@@ -375,12 +343,6 @@ def _mesh_values(view: DrawnView) -> dict[str, Any] | None:
         "vertices": len(view.vertices),
         "points": _packed(np.round(points / step).astype("<i2")),
     }
-
-
-def json_element(name: str, content: object) -> str:
-    """An element with JSON for the page's scripts; no text in it can end the element."""
-    text = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    return f'<script type="application/json" id="{name}">{text}</script>\n'
 
 
 def _packed(array: np.ndarray) -> str:

@@ -5,18 +5,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
-from stream_dmr.errors import ConfigError, OutputError, UserError
+from stream_dmr.errors import ConfigError, UserError
 from stream_dmr.species import load_species
 from stream_dmr.store.fish import Fish, database_of, read_measured_fish
 from stream_dmr.store.verdicts import NOT_REVIEWED
 from stream_dmr.web.added_fish import DoubtError
 from stream_dmr.web.clip import fish_clip
 from stream_dmr.web.report_page import PlacedReport, RunReport, fish_detail, place, render_page
-from stream_dmr.web.token_server import TokenHandler, TokenServer
+from stream_dmr.web.token_server import Request, Response, Route, TokenServer, json_response
 from stream_dmr.web.verdict_recorder import VerdictRecorder, parse_verdict
 
 
@@ -176,92 +175,34 @@ def sampled(numbers: set[int], sample: AuditSample) -> set[int]:
     return set(rng.choice(sorted(numbers), size, replace=False).tolist())
 
 
-_HOST = "127.0.0.1"
-_MAX_VERDICT_BYTES = 1 << 16
+class ReviewServer(TokenServer):
+    """Serves the page on this machine, to those who have the token in `address`."""
 
-
-class ReviewServer:
-    """Serves the page from the start, to those who have the token in `address`."""
+    setting = "--port"
 
     def __init__(self, queue: ReviewQueue, *, title: str, port: int = 0) -> None:
-        """OutputError where the port is taken."""
         self._queue = queue
-        try:
-            self._server = _ReviewHttpServer(queue, title, port)
-        except OSError as error:
-            raise OutputError(
-                f"{_HOST}:{port}: expected a free port, got: {error.strerror}; choose another "
-                "--port"
-            ) from error
-        self.address = (
-            f"http://{_HOST}:{self._server.server_address[1]}/?token={self._server.token}"
-        )
-        self._server.start()
+        routes: dict[tuple[str, str], Route] = {
+            ("GET", "/"): lambda _: Response(queue.page(title).encode()),
+            ("GET", "/reviewed.json"): lambda _: json_response(queue.reviewed_rows()),
+            ("GET", "/fish.json"): lambda asked: json_response(
+                queue.detail(asked.number("run"), asked.number("fish"))
+            ),
+            ("GET", "/clip"): lambda asked: Response(
+                queue.clip(asked.number("run"), asked.number("fish"), asked.number("shift")),
+                "application/octet-stream",
+            ),
+            ("POST", "/verdict"): self._take_verdict,
+        }
+        super().__init__(("127.0.0.1", port), routes, token=secrets.token_urlsafe(24))
+        self.address += f"?token={self.token}"
 
     def close(self) -> None:
-        self._server.stop()
+        super().close()
         self._queue.close()
 
-
-class _ReviewHttpServer(TokenServer):
-    def __init__(self, queue: ReviewQueue, title: str, port: int) -> None:
-        self.queue = queue
-        self.title = title
-        super().__init__((_HOST, port), _ReviewHandler, token=secrets.token_urlsafe(24))
-
-
-class _ReviewHandler(TokenHandler):
-    server: _ReviewHttpServer  # pyright: ignore[reportIncompatibleVariableOverride]
-
-    def answer_get(self, path: str) -> None:
-        queue = self.server.queue
+    def _take_verdict(self, asked: Request) -> Response:
         try:
-            match path:
-                case "/":
-                    page = queue.page(self.server.title).encode()
-                    self.answer(HTTPStatus.OK, "text/html; charset=utf-8", page)
-                case "/reviewed.json":
-                    self.answer_json(HTTPStatus.OK, queue.reviewed_rows())
-                case "/fish.json":
-                    run, fish, _ = self._numbers()
-                    self.answer_json(HTTPStatus.OK, queue.detail(run, fish))
-                case "/clip":
-                    self._answer_in_parts(queue.clip(*self._numbers()))
-                case _:
-                    self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
-        except UserError as error:
-            self.answer_json(HTTPStatus.BAD_REQUEST, {"error": str(error)})
-
-    def answer_post(self, path: str) -> None:
-        """Take a verdict. Only this page's own scripts can send JSON with the cookie."""
-        if path != "/verdict" or self.headers.get_content_type() != "application/json":
-            return self.answer_json(HTTPStatus.NOT_FOUND, {"error": "expected a verdict as JSON"})
-        body = self.body(max_bytes=_MAX_VERDICT_BYTES)
-        if body is None:
-            return self.answer_json(HTTPStatus.BAD_REQUEST, {"error": "expected a short verdict"})
-        try:
-            answer = self.server.queue.record(body)
+            return json_response(self._queue.record(asked.body))
         except DoubtError as error:
-            return self.answer_json(HTTPStatus.CONFLICT, {"question": str(error)})
-        except UserError as error:
-            return self.answer_json(HTTPStatus.BAD_REQUEST, {"error": str(error)})
-        self.answer_json(HTTPStatus.OK, answer)
-
-    def _numbers(self) -> tuple[int, int, int]:
-        """The numbers of run and fish in an address, and of a clip before or after its own."""
-        query = parse_qs(urlsplit(self.path).query)
-        try:
-            run, fish, shift = (int(query.get(n, ["0"])[0]) for n in ("run", "fish", "shift"))
-        except ValueError:
-            raise UserError("expected numbers in the address") from None
-        return run, fish, shift
-
-    def _answer_in_parts(self, parts: Iterator[bytes]) -> None:
-        """Answer with bytes as they come; the connection ends with them."""
-        self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", "application/octet-stream")
-        self.send_header("Cache-Control", "no-store")
-        self.send_header("X-Content-Type-Options", "nosniff")
-        self.end_headers()
-        for part in parts:
-            self.wfile.write(part)
+            return json_response({"question": str(error)}, HTTPStatus.CONFLICT)

@@ -10,13 +10,17 @@ import json
 import socket
 import sys
 import threading
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_address
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
+
+from stream_dmr.errors import OutputError, UserError
 
 _BUSY = b"HTTP/1.0 503 Service Unavailable\r\nContent-Length: 0\r\n\r\n"
 
@@ -29,8 +33,46 @@ def is_loopback(host: str) -> bool:
         return False
 
 
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """What was asked for, by who may ask."""
+
+    query: Mapping[str, list[str]]
+    body: bytes  # of a POST
+
+    def number(self, name: str) -> int:
+        """A number in the address, 0 without it. Raises UserError for another value."""
+        try:
+            return int(self.query.get(name, ["0"])[0])
+        except ValueError:
+            raise UserError("expected numbers in the address") from None
+
+
+@dataclass(frozen=True)
+class Response:
+    """An answer; one in parts ends with its connection."""
+
+    content: bytes | Iterator[bytes]
+    media_type: str = "text/html; charset=utf-8"
+    code: HTTPStatus = HTTPStatus.OK
+
+
+def json_response(content: object, code: HTTPStatus = HTTPStatus.OK) -> Response:
+    return Response(json.dumps(content).encode(), "application/json", code)
+
+
+def _text(code: HTTPStatus, line: object) -> Response:
+    return Response(f"{line}\n".encode(), "text/plain", code)
+
+
+Route = Callable[[Request], Response]  # raises UserError for a request that it does not take
+
+
 class TokenServer(ThreadingHTTPServer):
-    """A server whose handlers are `TokenHandler`s; with the token "" it lets everybody in."""
+    """Serves a table of routes from threads of its own until `close`; token "": to everybody.
+
+    A POST must bring JSON: a form of another site can't send that with the cookie.
+    """
 
     daemon_threads = True
     block_on_close = False
@@ -39,24 +81,38 @@ class TokenServer(ThreadingHTTPServer):
     max_connections = 32
     request_timeout_s = 5.0  # until the headers are there
     answer_timeout_s = 30.0  # from there on
+    max_body_bytes = 1 << 16
+    setting = "host or port"  # to name in an error, if the address can't be had
 
     def __init__(
-        self, address: tuple[str, int], handler: type["TokenHandler"], *, token: str
+        self,
+        address: tuple[str, int],
+        routes: Mapping[tuple[str, str], Route],  # by method and path
+        *,
+        token: str,
     ) -> None:
-        """Listens; OSError where it can't have the address."""
-        self.token = token
+        """Raises OutputError if it can't have the address."""
+        self.routes, self.token = routes, token
         self._lock = threading.Lock()
         self._connections = set[socket.socket]()
         self._strangers: dict[socket.socket, bool] = {}  # whether local; in their order
-        super().__init__(address, handler)
-        self.is_local = is_loopback(str(self.server_address[0]))
+        try:
+            super().__init__(address, _Handler)
+        except OSError as error:
+            host, port = address
+            raise OutputError(
+                f"{host}:{port}: expected an address to listen on, got: {error.strerror}; choose "
+                f"another {self.setting}"
+            ) from error
+        host = str(self.server_address[0])
+        self.is_local = is_loopback(host)
+        if ip_address(host).is_unspecified:  # it listens on all; nobody can open that
+            host = socket.gethostname()
+        self.address = f"http://{host}:{self.server_port}/"
         self._thread = threading.Thread(target=self.serve_forever, daemon=True)
-
-    def start(self) -> None:
-        """Serve from a thread of its own, until `stop`."""
         self._thread.start()
 
-    def stop(self) -> None:
+    def close(self) -> None:
         self.shutdown()
         self.server_close()
         self._thread.join()
@@ -114,20 +170,12 @@ class TokenServer(ThreadingHTTPServer):
             super().handle_error(request, client_address)
 
 
-class TokenHandler(BaseHTTPRequestHandler):
-    """Refuses requests without the token or from other sites; subclasses answer the rest."""
+class _Handler(BaseHTTPRequestHandler):
+    """Refuses requests without the token or from other sites."""
 
     server: TokenServer  # pyright: ignore[reportIncompatibleVariableOverride]
     server_version = "stream-dmr"
     sys_version = ""
-
-    def answer_get(self, path: str) -> None:
-        """Answer a GET that has the token."""
-        raise NotImplementedError
-
-    def answer_post(self, path: str) -> None:
-        """Answer a POST that has the token."""
-        self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"expected GET\n")
 
     def setup(self) -> None:
         """Begin to wait for the request."""
@@ -146,29 +194,49 @@ class TokenHandler(BaseHTTPRequestHandler):
         super().finish()
 
     def do_GET(self) -> None:
+        if (response := self._response()) is not None:
+            self._answer(response)
+
+    do_POST = do_GET
+
+    def _response(self) -> Response | None:
+        """The answer; None if there was one already."""
         try:
             url = urlsplit(self.path)
         except ValueError:  # such as http://[::1
-            return self.answer(HTTPStatus.BAD_REQUEST, "text/plain", b"expected an address\n")
-        token = parse_qs(url.query).get("token", [""])[0]
+            return _text(HTTPStatus.BAD_REQUEST, "expected an address")
+        query = parse_qs(url.query)
+        token = query.get("token", [""])[0]
         if not self._is_own_page():
-            self._refuse_site()
-        elif token and self._is_valid(token):
-            self._set_cookie(url.path)
-        elif self._is_authorized():
-            self.server.admit(self.connection)
-            self.answer_get(url.path)
-        else:
-            self._refuse_token()
-
-    def do_POST(self) -> None:
-        if not self._is_own_page():
-            self._refuse_site()
-        elif self._is_authorized():
-            self.server.admit(self.connection)
-            self.answer_post(self.path)
-        else:
-            self._refuse_token()
+            return _text(
+                HTTPStatus.FORBIDDEN,
+                f"open http://localhost:{self.server.server_port}/, got a request for another name "
+                "or from another page",
+            )
+        if self.command == "GET" and token and self._is_valid(token):
+            return self._set_cookie(url.path)
+        if not self._is_authorized():
+            return _text(
+                HTTPStatus.UNAUTHORIZED,
+                "open this page with ?token=TOKEN, or send the header Authorization: Bearer TOKEN",
+            )
+        self.server.admit(self.connection)
+        route = self.server.routes.get((self.command, url.path))
+        if route is None:
+            return _text(HTTPStatus.NOT_FOUND, "no such page")
+        body = b""
+        if self.command == "POST":
+            if self.headers.get_content_type() != "application/json":
+                return _text(HTTPStatus.NOT_FOUND, "expected JSON")
+            length = self.headers.get("Content-Length", "")
+            is_number = length.isdecimal() and len(length) < 10
+            if not is_number or int(length) > self.server.max_body_bytes:
+                return _text(HTTPStatus.BAD_REQUEST, "expected a short text with its length")
+            body = self.rfile.read(int(length))
+        try:
+            return route(Request(query=query, body=body))
+        except UserError as error:
+            return _text(HTTPStatus.BAD_REQUEST, error)
 
     def _start_timer(self, seconds: float) -> threading.Timer:
         timer = threading.Timer(seconds, self._end_connection)
@@ -197,19 +265,10 @@ class TokenHandler(BaseHTTPRequestHandler):
                 return False
         return origin is None or origin == f"http://{host}"
 
-    def _refuse_site(self) -> None:
-        port = self.server.server_address[1]
-        text = f"open http://localhost:{port}/, got a request for another name or from another page"
-        self.answer(HTTPStatus.FORBIDDEN, "text/plain", f"{text}\n".encode())
-
-    def _refuse_token(self) -> None:
-        text = b"open this page with ?token=TOKEN, or send the header Authorization: Bearer TOKEN\n"
-        self.answer(HTTPStatus.UNAUTHORIZED, "text/plain", text)
-
     @property
     def _cookie_name(self) -> str:
         """A name with the port: a browser shares cookies between all ports of a machine."""
-        return f"stream_dmr_{self.server.server_address[1]}"
+        return f"stream_dmr_{self.server.server_port}"
 
     def _set_cookie(self, path: str) -> None:
         """Keep the token as a cookie, so that it is in no address that is shown or logged."""
@@ -236,26 +295,20 @@ class TokenHandler(BaseHTTPRequestHandler):
     def _is_valid(self, token: str) -> bool:
         return hmac.compare_digest(token.encode(), self.server.token.encode())
 
-    def body(self, *, max_bytes: int) -> bytes | None:
-        """What a POST brings; None if it does not say how long it is, or is too long."""
-        length = self.headers.get("Content-Length", "")
-        is_short = length.isdecimal() and len(length) < 10 and int(length) <= max_bytes
-        return self.rfile.read(int(length)) if is_short else None
-
-    def answer_json(self, code: HTTPStatus, content: object) -> None:
-        self.answer(code, "application/json", json.dumps(content).encode())
-
-    def answer(self, code: HTTPStatus, media_type: str, content: bytes) -> None:
-        """Answer with bytes, which no browser caches, guesses the type of or shows in a frame."""
-        self.send_response(code)
-        self.send_header("Content-Type", media_type)
-        self.send_header("Content-Length", str(len(content)))
+    def _answer(self, response: Response) -> None:
+        """Send it; no browser caches it, guesses its type or shows it in a frame."""
+        content = response.content
+        self.send_response(response.code)
+        self.send_header("Content-Type", response.media_type)
+        if isinstance(content, bytes):
+            self.send_header("Content-Length", str(len(content)))
         self.send_header("Cache-Control", "no-store")
         self.send_header("X-Content-Type-Options", "nosniff")
         self.send_header("Content-Security-Policy", "frame-ancestors 'none'")
         self.send_header("Referrer-Policy", "no-referrer")
         self.end_headers()
-        self.wfile.write(content)
+        for part in [content] if isinstance(content, bytes) else content:
+            self.wfile.write(part)
 
     def log_message(self, format: str, *args: object) -> None:
         """Log no requests."""

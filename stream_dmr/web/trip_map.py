@@ -3,7 +3,6 @@
 import json
 import math
 from collections.abc import Iterator, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from stream_dmr.errors import UserError, reason_of
 from stream_dmr.files import read_text
 from stream_dmr.store.fish import Fish
 from stream_dmr.store.trip import VesselTrack
+from stream_dmr.web.pages import render
 
 Line = Sequence[tuple[float, float]]  # longitude and latitude of each point, degrees
 
@@ -86,35 +86,29 @@ def draw_map(
         return ""
     view = _View(places)
     step = max(1, len(places) // _MAX_POINTS)
-    lines = "".join(
-        f'<polyline points="{" ".join(view.point(p) for p in [*piece[::step], piece[-1]])}"/>'
-        for piece in pieces
-    )
-    shores = "".join(f'<polyline points="{p}"/>' for one in coast for p in view.pieces(one))
-    shores = f'<g class="coast">{shores}</g>' if shores else ""
     hauls = sorted({one.haul for one in fish})
-    dots = "".join(_dot(one, view, _COLOURS[hauls.index(one.haul) % len(_COLOURS)]) for one in fish)
-    keys = "".join(
-        f'<span style="color: {_COLOURS[i % len(_COLOURS)]}">'
-        f"\u25cf {escape(f'haul {haul}' if haul else 'no haul')}</span> "
-        for i, haul in enumerate(hauls)
-    )
-    return (
-        f'<figure id="map"><svg viewBox="0 0 {_WIDTH:.0f} {_HEIGHT:.0f}" role="img" '
-        f'aria-label="Track of the vessel and its fish">{shores}<g class="track">{lines}</g>{dots}'
-        f"{view.scale_bar()}</svg><figcaption>{keys}{view.middle()}</figcaption></figure>"
+    colours = {haul: _COLOURS[k % len(_COLOURS)] for k, haul in enumerate(hauls)}
+    return render(
+        "report/map.html",
+        width=_WIDTH,
+        height=_HEIGHT,
+        shores=[points for one in coast for points in view.pieces(one)],
+        lines=[" ".join(map(view.point, [*piece[::step], piece[-1]])) for piece in pieces],
+        dots=[dot for one in fish if (dot := _dot(one, view, colours[one.haul]))],
+        colours=colours,
+        bar=view.scale_bar(),
+        middle=view.middle(),
     )
 
 
-def _dot(fish: Fish, view: "_View", colour: str) -> str:
+def _dot(fish: Fish, view: "_View", colour: str) -> dict[str, str] | None:
     where = fish.where
     if where.latitude is None or where.longitude is None:
-        return ""
+        return None
     x, y = view.point((where.longitude, where.latitude)).split(",")
     length = "no length" if fish.length_mm is None else f"{fish.length_mm / 10:.1f} cm"
     facts = (f"fish {fish.estimate.track_id}", length, fish.sure_code, fish.fate)
-    title = escape(", ".join(fact for fact in facts if fact))
-    return f'<circle cx="{x}" cy="{y}" r="4" fill="{colour}"><title>{title}</title></circle>'
+    return {"x": x, "y": y, "colour": colour, "title": ", ".join(filter(None, facts))}
 
 
 class _View:
@@ -166,25 +160,18 @@ class _View:
         north = (place[1] - self._middle[1]) * _M_PER_DEGREE
         return _WIDTH / 2 + east * self.px_per_m, _HEIGHT / 2 - north * self.px_per_m
 
-    def scale_bar(self) -> str:
+    def scale_bar(self) -> dict[str, object]:
         """A round number of metres or kilometres, about a fifth of the width."""
         target_m = _WIDTH / 5 / self.px_per_m
         power = 10 ** math.floor(math.log10(target_m))
         metres = max(f for f in (power, 2 * power, 5 * power) if f <= target_m)
         text = f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m"
-        x1, y = _WIDTH - _MARGIN, _HEIGHT - 12.0
-        x0 = x1 - metres * self.px_per_m
-        return (
-            f'<line x1="{x0:.1f}" y1="{y}" x2="{x1:.1f}" y2="{y}" class="scale"/>'
-            f'<text x="{x0:.1f}" y="{y - 5}">{text}</text>'
-        )
+        x1 = _WIDTH - _MARGIN
+        return {"x0": x1 - metres * self.px_per_m, "x1": x1, "y": _HEIGHT - 12.0, "text": text}
 
     def middle(self) -> str:
         """The place of the middle, and where north is, in words."""
         longitude, latitude = self._middle
         longitude = (longitude + 180) % 360 - 180
-        place = (
-            f"{abs(latitude):.3f}° {'NS'[latitude < 0]}, {abs(longitude):.3f}° "
-            f"{'EW'[longitude < 0]}"
-        )
-        return f"middle: {place}; north is up"
+        ns, ew = "NS"[latitude < 0], "EW"[longitude < 0]
+        return f"middle: {abs(latitude):.3f}° {ns}, {abs(longitude):.3f}° {ew}; north is up"

@@ -1,14 +1,12 @@
 """The status page of a run, with health, metrics and pictures."""
 
 import json
-import socket
 import threading
 import time
 from contextlib import suppress
 from datetime import UTC, datetime
 from http import HTTPStatus
 from importlib.resources import files
-from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +15,21 @@ import numpy as np
 from jaxtyping import UInt8
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
-from stream_dmr.errors import ConfigError, OutputError, UserError
+from stream_dmr.errors import ConfigError, UserError
 from stream_dmr.files import read_text
 from stream_dmr.lengths.fate import FATE_OF_ZONE
 from stream_dmr.pipeline.config import WatchSettings
 from stream_dmr.sources.positions import COUNTED
 from stream_dmr.tables import utc_text
 from stream_dmr.web.run_state import MeasuredFrame, RunState, make_registry
-from stream_dmr.web.token_server import TokenHandler, TokenServer, is_loopback
+from stream_dmr.web.token_server import (
+    Request,
+    Response,
+    Route,
+    TokenServer,
+    is_loopback,
+    json_response,
+)
 
 _MAX_SIDE_PX = 960
 _ACCEPTED_BGR, _REFUSED_BGR = (90, 230, 90), (60, 140, 255)
@@ -61,30 +66,64 @@ def _write_label(drawn: UInt8[np.ndarray, "H W 3"], text: str, *, at: tuple[int,
 
 _PICTURE_INTERVAL_S = 0.5  # one picture for all who ask meanwhile: measuring must not slow down
 _MIN_TOKEN_CHARACTERS = 16
-_MAX_HAUL_BYTES = 1000
 
 
-class WatchServer:
-    """Serves a run from threads of its own, from the start until `close`."""
+class WatchServer(TokenServer):
+    """Serves a run."""
+
+    max_body_bytes = 1000
+    setting = "host or port of [watch]"
 
     def __init__(self, state: RunState, settings: WatchSettings) -> None:
         """ConfigError where others could read along without a token; OutputError for the port."""
-        token = _read_token(settings)
-        try:
-            self._server = _WatchHttpServer((settings.host, settings.port), state, token)
-        except OSError as error:
-            raise OutputError(
-                f"[watch] {settings.host}:{settings.port}: expected an address to listen on, got: "
-                f"{error.strerror}; choose another host or port"
-            ) from error
-        host, port = str(self._server.server_address[0]), self._server.server_port
-        if ip_address(host).is_unspecified:  # it listens on all; nobody can open that
-            host = socket.gethostname()
-        self.address = f"http://{host}:{port}/"
-        self._server.start()
+        self._state = state
+        registry = make_registry(state)
+        self._picture_lock = threading.Lock()
+        self._picture, self._picture_until_s = b"", 0.0
+        routes: dict[tuple[str, str], Route] = {
+            ("GET", "/"): lambda _: _page("page.html"),
+            ("GET", "/zones"): lambda _: _page("zones.html"),
+            ("GET", "/zones.json"): lambda _: json_response(zones_json(state)),
+            ("GET", "/status.json"): lambda _: json_response(status_json(state)),
+            ("GET", "/picture.jpg"): lambda _: Response(self._latest_picture(), "image/jpeg"),
+            ("GET", "/metrics"): lambda _: Response(generate_latest(registry), CONTENT_TYPE_LATEST),
+            ("GET", "/health"): self._health,
+            ("POST", "/haul"): self._haul,
+        }
+        super().__init__((settings.host, settings.port), routes, token=_read_token(settings))
 
-    def close(self) -> None:
-        self._server.stop()
+    def _health(self, _: Request) -> Response:
+        health = health_json(self._state)
+        code = HTTPStatus.OK if health["healthy"] else HTTPStatus.SERVICE_UNAVAILABLE
+        return json_response(health, code)
+
+    def _haul(self, request: Request) -> Response:
+        """Begin or end a haul."""
+        if self._state.hauls is None:
+            raise UserError("expected a run that takes hauls")
+        told = None
+        with suppress(ValueError):
+            told = json.loads(request.body)
+        if not isinstance(told, dict):
+            got = request.body.decode(errors="replace")
+            raise UserError(
+                f"expected a haul as a JSON object with what, name, said_by, got {got!r}"
+            )
+        what, name, said_by = (str(told.get(key) or "") for key in ("what", "name", "said_by"))
+        return json_response({"name": self._state.hauls.tell(what, name, said_by=said_by)})
+
+    def _latest_picture(self) -> bytes:
+        """The latest measured frame as JPEG; empty before the first."""
+        with self._picture_lock:
+            if time.monotonic() >= self._picture_until_s:
+                measured = self._state.latest_frame()
+                self._picture = b"" if measured is None else encode_jpeg(draw_fish(measured))
+                self._picture_until_s = time.monotonic() + _PICTURE_INTERVAL_S
+            return self._picture
+
+
+def _page(name: str) -> Response:
+    return Response(files("stream_dmr.web").joinpath("watch", name).read_bytes())
 
 
 def _read_token(settings: WatchSettings) -> str:
@@ -110,80 +149,6 @@ def _read_token(settings: WatchSettings) -> str:
             f"got {len(token)}; make one with: openssl rand -hex 16"
         )
     return token
-
-
-class _WatchHttpServer(TokenServer):
-    def __init__(self, address: tuple[str, int], state: RunState, token: str) -> None:
-        self.state = state
-        self.registry = make_registry(state)
-        self._picture_lock = threading.Lock()
-        self._picture, self._picture_until_s = b"", 0.0
-        super().__init__(address, _WatchHandler, token=token)
-
-    def picture(self) -> bytes:
-        """The latest measured frame as JPEG; empty before the first."""
-        with self._picture_lock:
-            if time.monotonic() >= self._picture_until_s:
-                measured = self.state.latest_frame()
-                self._picture = b"" if measured is None else encode_jpeg(draw_fish(measured))
-                self._picture_until_s = time.monotonic() + _PICTURE_INTERVAL_S
-            return self._picture
-
-
-class _WatchHandler(TokenHandler):
-    server: _WatchHttpServer  # pyright: ignore[reportIncompatibleVariableOverride]
-
-    def answer_get(self, path: str) -> None:
-        state = self.server.state
-        match path:
-            case "/":
-                self._answer_page("page.html")
-            case "/zones":
-                self._answer_page("zones.html")
-            case "/zones.json":
-                self.answer_json(HTTPStatus.OK, zones_json(state))
-            case "/status.json":
-                self.answer_json(HTTPStatus.OK, status_json(state))
-            case "/picture.jpg":
-                self.answer(HTTPStatus.OK, "image/jpeg", self.server.picture())
-            case "/metrics":
-                self.answer(
-                    HTTPStatus.OK, CONTENT_TYPE_LATEST, generate_latest(self.server.registry)
-                )
-            case "/health":
-                health = health_json(state)
-                code = HTTPStatus.OK if health["healthy"] else HTTPStatus.SERVICE_UNAVAILABLE
-                self.answer_json(code, health)
-            case _:
-                self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
-
-    def answer_post(self, path: str) -> None:
-        """Begin or end a haul. Only this page's own scripts can send JSON with the cookie."""
-        hauls, body = self.server.state.hauls, None
-        if path == "/haul" and self.headers.get_content_type() == "application/json":
-            body = self.body(max_bytes=_MAX_HAUL_BYTES)
-        if hauls is None or body is None:
-            return self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"expected a haul as JSON\n")
-        try:
-            told = _parse_haul(body)
-            what, name, said_by = (str(told.get(key) or "") for key in ("what", "name", "said_by"))
-            name = hauls.tell(what, name, said_by=said_by)
-        except UserError as error:
-            return self.answer(HTTPStatus.BAD_REQUEST, "text/plain", f"{error}\n".encode())
-        self.answer_json(HTTPStatus.OK, {"name": name})
-
-    def _answer_page(self, name: str) -> None:
-        page = files("stream_dmr.web").joinpath("watch", name).read_bytes()
-        self.answer(HTTPStatus.OK, "text/html; charset=utf-8", page)
-
-
-def _parse_haul(content: bytes) -> dict[str, Any]:
-    """The JSON object of a haul. Raises UserError where it is none."""
-    with suppress(ValueError):
-        if isinstance(told := json.loads(content), dict):
-            return told
-    got = content.decode(errors="replace")
-    raise UserError(f"expected a haul as a JSON object with what, name, said_by, got {got!r}")
 
 
 def zones_json(state: RunState) -> dict[str, Any]:

@@ -7,7 +7,7 @@ ROOT = Path(__file__).parents[2]
 
 # What a run needs not, in MB and seconds: torch 200 and 1, pandas 40 and 0.2, matplotlib 15, 0.2;
 # onnx for training and the paper's solver alone.
-UNNEEDED = ["torch", "onnx", "pandas", "matplotlib", "ray", "trimesh.viewer"]
+UNNEEDED = ["torch", "jinja2", "onnx", "pandas", "matplotlib", "ray", "trimesh.viewer"]
 
 CODE = """
 import sys

@@ -2,50 +2,45 @@
 
 import os
 import socket
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
-from http import HTTPStatus
+from contextlib import ExitStack, closing
 from http.client import HTTPConnection
 
 import pytest
 
-from stream_dmr.web.token_server import TokenHandler, TokenServer, is_loopback
+from stream_dmr.web.token_server import Response, Route, TokenServer, is_loopback
 
 
 class PatientServer(TokenServer):
     """For a test: little is allowed, and not for long."""
 
-    max_connections = 4
+    max_connections, max_body_bytes = 4, 20
     request_timeout_s = 0.4
     answer_timeout_s = 0.8
 
 
-class Hello(TokenHandler):
-    def answer_get(self, path: str) -> None:
-        self.answer(HTTPStatus.OK, "text/plain", b"hello" * (1 << 22 if path == "/large" else 1))
-
-    def answer_post(self, path: str) -> None:
-        body = self.body(max_bytes=20)
-        self.answer(HTTPStatus.OK, "text/plain", b"too long" if body is None else body)
+JSON = {"Content-Type": "application/json"}
+ROUTES: dict[tuple[str, str], Route] = {
+    ("GET", "/"): lambda asked: Response(b"hello", "text/plain"),
+    ("GET", "/large"): lambda asked: Response(b"hello" * (1 << 22), "text/plain"),
+    ("GET", "/number"): lambda asked: Response(str(asked.number("n")).encode()),
+    ("GET", "/parts"): lambda asked: Response(iter([b"one", b"two"])),
+    ("POST", "/"): lambda asked: Response(asked.body, "text/plain"),
+}
 
 
 @pytest.fixture
 def server() -> Iterator[TokenServer]:
-    served = PatientServer(("127.0.0.1", 0), Hello, token="")
-    thread = threading.Thread(target=lambda: served.serve_forever(poll_interval=0.02))
-    thread.start()
+    served = PatientServer(("127.0.0.1", 0), ROUTES, token="")
     yield served
-    served.shutdown()
-    served.server_close()
-    thread.join()
+    served.close()
 
 
 def status_of(server: TokenServer, method: str = "GET", **headers: str) -> int:
     connection = HTTPConnection("127.0.0.1", server.server_address[1], timeout=10)
     try:
-        connection.request(method, "/", headers=headers)
+        connection.request(method, "/", headers=JSON | {"Content-Length": "0"} | headers)
         return connection.getresponse().status
     finally:
         connection.close()
@@ -130,18 +125,12 @@ def test_a_page_of_another_site_reads_and_sends_nothing(
 
 
 def test_a_server_for_others_answers_to_every_name_with_the_token():
-    with PatientServer(("0.0.0.0", 0), Hello, token="secret") as server:
-        thread = threading.Thread(target=lambda: server.serve_forever(poll_interval=0.02))
-        thread.start()
+    with closing(PatientServer(("0.0.0.0", 0), ROUTES, token="secret")) as server:
         with_token = {"Authorization": "Bearer secret"}
-        try:
-            assert status_of(server, Host="camera.vessel") == 401
-            assert status_of(server, Host="camera.vessel", **with_token) == 200
-            elsewhere = with_token | {"Origin": "http://rebound.example"}
-            assert status_of(server, Host="camera.vessel", **elsewhere) == 403
-        finally:
-            server.shutdown()
-            thread.join()
+        assert status_of(server, Host="camera.vessel") == 401
+        assert status_of(server, Host="camera.vessel", **with_token) == 200
+        elsewhere = with_token | {"Origin": "http://rebound.example"}
+        assert status_of(server, Host="camera.vessel", **elsewhere) == 403
 
 
 @pytest.mark.parametrize(
@@ -165,9 +154,37 @@ def test_an_address_that_is_none_is_a_bad_request_and_no_traceback(server: Token
 
 @pytest.mark.parametrize(
     ("length", "answer"),
-    [("5", b"hello"), ("21", b"too long"), ("9" * 5000, b"too long"), ("-1", b"too long")],
+    [
+        ("5", b"hello"),
+        ("21", b"expected a short text with its length\n"),
+        ("9" * 5000, b"expected a short text with its length\n"),
+        ("-1", b"expected a short text with its length\n"),
+    ],
 )
 def test_a_body_is_read_if_it_says_that_it_is_short(server: TokenServer, length, answer, capsys):
-    head = f"POST / HTTP/1.0\r\nContent-Length: {length}\r\n\r\n".encode()
+    head = (
+        f"POST / HTTP/1.0\r\nContent-Type: application/json\r\nContent-Length: {length}\r\n\r\n"
+    ).encode()
     assert answer_to(server, head + b"hello").endswith(answer)
     assert capsys.readouterr().err == ""
+
+
+def test_a_form_of_another_site_is_not_taken(server: TokenServer):
+    head = b"POST / HTTP/1.0\r\nContent-Type: text/plain\r\nContent-Length: 5\r\n\r\n"
+    assert b" 404 " in answer_to(server, head + b"hello").splitlines()[0]
+
+
+@pytest.mark.parametrize(
+    ("path", "status", "ends"),
+    [
+        ("/number?n=-12", b"200", b"-12"),
+        ("/number", b"200", b"0"),
+        ("/number?n=x", b"400", b"expected numbers in the address\n"),
+        ("/parts", b"200", b"onetwo"),
+        ("/none", b"404", b"no such page\n"),
+    ],
+)
+def test_routes_answer_and_refuse(server: TokenServer, path: str, status: bytes, ends: bytes):
+    answer = answer_to(server, f"GET {path} HTTP/1.0\r\n\r\n".encode())
+    assert answer.split()[1] == status
+    assert answer.endswith(ends)

@@ -66,9 +66,9 @@ async function send(verdict) {
   let answered;
   try {
     const answer = await fetch("verdict", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ run: fish?.run ?? 0, track_id: fish?.track_id ?? 0, ...verdict }) });
+    if (!answer.ok && answer.status !== 409) return refuse((await answer.text()).trim());
     answered = await answer.json();
     if (answered.question) return confirm(answered.question) ? send({ ...verdict, sure: true }) : refuse("Not saved.");
-    if (!answer.ok) return refuse(answered.error);
   } catch {
     return refuse("Not saved: stream-dmr review has ended. Start it again, and open its new address.");
   }
