@@ -14,7 +14,7 @@ from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import Any
 
-from stream_dmr.errors import OutputError
+from stream_dmr.errors import ConfigError, OutputError, reason_of
 
 MAX_TEXT_BYTES = 1_000_000  # chosen: many times what any settings or calibration take
 
@@ -148,6 +148,17 @@ def read_text(path: Path, *, encoding: str = "utf-8", max_bytes: int = MAX_TEXT_
     Raises OSError where it can't be read or is larger than `max_bytes`, UnicodeDecodeError.
     """
     return read_small(path, max_bytes=max_bytes).decode(encoding)
+
+
+def read_token(path: Path, *, where: str) -> str:
+    """The access token of a status page. Raises ConfigError about the option or key `where`."""
+    try:
+        return read_text(path).strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"{where} {path}: expected a file with the access token, it can't be read: "
+            f"{reason_of(error)}"
+        ) from error
 
 
 def read_small(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> bytes:

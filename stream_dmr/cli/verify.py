@@ -66,22 +66,15 @@ def report(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Write results as one page that opens offline: plots, a table of fish, their best frames."""
-    from stream_dmr.errors import UserError
     from stream_dmr.evidence.own_files import is_made_by, require_writable
-    from stream_dmr.web.open_reports import is_batch, open_batch, open_report, write_report
+    from stream_dmr.web.open_reports import open_folders, write_report
     from stream_dmr.web.trip_map import load_coast
 
     if out is None:
         out = (path if path.is_dir() else path.parent) / "report.html"
     require_writable(out, overwrite=overwrite, is_own=is_made_by("report"))
     shores = [] if coast is None else load_coast(coast)
-    failed = list[str]()
-    if is_batch(path):
-        if source is not None:
-            raise UserError(f"--source: {path} is of a batch, whose videos have their own")
-        reports, failed = open_batch(path, config=config)
-    else:
-        reports = [open_report(path, source=source, config=config)]
+    reports, failed = open_folders([path], source=source, config=config)
     size = write_report(reports, out, title=path.resolve().name, notes=failed, coast=shores)
     warn(line for report in reports for line in report.recording.warnings)
     print(f"{out}: {sum(len(report.fish) for report in reports)} fish, {size / 1e6:.1f} MB")

@@ -52,10 +52,11 @@ def haul(
 
 def _post(address: str, what: str, name: str, token_file: Path | None) -> str:
     from stream_dmr.errors import UserError
+    from stream_dmr.files import read_token
 
     headers = {"Content-Type": "application/json"}
     if token_file is not None:
-        headers["Authorization"] = f"Bearer {_read_token(token_file)}"
+        headers["Authorization"] = f"Bearer {read_token(token_file, where='--token-file')}"
     content = json.dumps({"what": what, "name": name, "said_by": getuser()}).encode()
     try:
         request = urllib.request.Request(f"{address.rstrip('/')}/haul", content, headers)
@@ -71,18 +72,6 @@ def _post(address: str, what: str, name: str, token_file: Path | None) -> str:
     except (OSError, ValueError, KeyError, TypeError, HTTPException) as error:
         raise UserError(
             f"{address}: expected the status page of a run ([watch] port), got: {error}"
-        ) from error
-
-
-def _read_token(path: Path) -> str:
-    from stream_dmr.errors import UserError, reason_of
-    from stream_dmr.files import read_text
-
-    try:
-        return read_text(path).strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(
-            f"--token-file {path}: expected a file with the access token, got: {reason_of(error)}"
         ) from error
 
 
@@ -136,7 +125,7 @@ def fleet(
         raise UserError(f"--out: expected a page such as fleet.html, got {out}")
     require_writable(out, memory, overwrite=overwrite, is_own=is_made_by("fleet"))
     states = read_memory(memory, load_boxes(boxes))
-    changes = _Changes()
+    told = dict[str, str]()  # by address
     with stop_on_signals() as stop:
         while not stop.is_set():
             began_s = time.monotonic()
@@ -144,24 +133,20 @@ def fleet(
             page = fleet_page(states, title="Fleet", every_s=every, now_ns=time.time_ns())
             write_memory(memory, states)
             replace_text(out, page)
-            changes.show(states)
+            _print_changes(states, told)
             if not every or stop.wait(max(0.0, every - (time.monotonic() - began_s))):
                 break
 
 
-class _Changes:
-    """Prints a line for each box whose state or alarms are others than at the last look."""
-
-    def __init__(self) -> None:
-        self._told: dict[str, str] = {}  # by address
-
-    def show(self, states: "Iterable[BoxState]") -> None:
-        for state in states:
-            told = ": ".join(filter(None, (state.text, "; ".join(state.alarms))))
-            if self._told.get(state.box.address) != told:
-                said = "; ".join(filter(None, (told, _figures(state))))
-                print(f"{state.box.name}: {said}", flush=True)
-            self._told[state.box.address] = told
+def _print_changes(states: "Iterable[BoxState]", told: dict[str, str]) -> None:
+    """A line for each box whose state or alarms are not those that were `told` last."""
+    for state in states:
+        now = ": ".join(filter(None, (state.text, "; ".join(state.alarms))))
+        if told.get(state.box.address) != now:
+            print(
+                f"{state.box.name}: {'; '.join(filter(None, (now, _figures(state))))}", flush=True
+            )
+        told[state.box.address] = now
 
 
 def _figures(state: "BoxState") -> str:

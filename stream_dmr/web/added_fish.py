@@ -48,15 +48,6 @@ def boxes_between(drawn: Boxes, frame_indices: Sequence[int]) -> Boxes:
     return dict(zip(between, np.stack(columns, axis=1), strict=True))
 
 
-@dataclass(frozen=True, kw_only=True)
-class MeasuredBoxes:
-    """The frames of a fish that was measured in boxes."""
-
-    frames: Sequence[AddedFrame]
-    fish: Sequence[LocalizedFish]  # the last message of each
-    is_original: bool  # measured on the very pixels of the run
-
-
 def measure_boxes(
     found: Sequence[FoundFrame],
     drawn: Boxes,
@@ -64,11 +55,12 @@ def measure_boxes(
     track_id: int,
     header: RunHeader,
     config: Config,
-) -> MeasuredBoxes:
+) -> tuple[list[AddedFrame], list[LocalizedFish], bool]:
     """Cut out, segment, fit and localize the fish of the boxes, as `run --boxes` does.
 
     `found` are the frames from the first box to the last. Shapes are those that the run knew or
-    has learnt. Raises UserError where there are no pictures.
+    has learnt. Returns the frames to store, the fish in them, and True if they were measured on the
+    very pixels of the run. Raises UserError where there are no pictures.
     """
     pictures = [one for one in found if one.frame.image.size]
     boxes = boxes_between(drawn, [one.frame.frame_index for one in pictures])
@@ -106,8 +98,7 @@ def measure_boxes(
                 fish=encode(localized),
             )
         )
-    is_original = all(one.is_original for one in pictures)
-    return MeasuredBoxes(frames=frames, fish=fish, is_original=is_original)
+    return frames, fish, all(one.is_original for one in pictures)
 
 
 class DoubtError(UserError):
@@ -213,24 +204,24 @@ class TrackEditor:
     ) -> TrackEdit:
         """A fish that was missed, measured in the drawn boxes; `time_ns`: of the first and last."""
         new_fish = self._new_fish()
-        measured = measure_boxes(
+        frames, fish, is_original = measure_boxes(
             list(self._pictures.frames((time_ns[0], time_ns[1] + 1))),
             drawn,
             track_id=new_fish,
             header=replace(report.recording.header, candidates=known_shapes(report.recording)),
             config=report.config,
         )
-        if not measured.fish:
+        if not fish:
             raise UserError("verdict: expected boxes inside the picture, got none")
-        flags = [ADDED, *([] if measured.is_original else [OTHER_PIXELS])]
-        row = edited_row(measured.fish, report.config.smooth_length, flags)
+        flags = [ADDED, *([] if is_original else [OTHER_PIXELS])]
+        row = edited_row(fish, report.config.smooth_length, flags)
         made = replace(
             verdict,
             track_id=new_fish,
             fish=json.dumps([row]),
-            frames_sha256=frames_sha256(measured.frames),
+            frames_sha256=frames_sha256(frames),
         )
-        return TrackEdit(verdict=made, frames=measured.frames, new_fish=new_fish)
+        return TrackEdit(verdict=made, frames=frames, new_fish=new_fish)
 
     def _rows(
         self, report: RunReport, parts: Mapping[int, Iterable[TrackPart]]

@@ -60,10 +60,6 @@ class Reading:
     species: Mapping[_Fish, str] = field(default_factory=dict[_Fish, str])
     lengths_mm: Mapping[_Fish, float] = field(default_factory=dict[_Fish, float])
 
-    @property
-    def is_empty(self) -> bool:
-        return not (self.decisions or self.species or self.lengths_mm)
-
 
 @dataclass(frozen=True, kw_only=True)
 class ReadingPair:
@@ -112,7 +108,7 @@ def agreements(folders: Sequence[Path]) -> list[ReadingPair]:
     The measurement itself stands beside them with its lengths. Raises UserError where there are no
     two readings.
     """
-    readings = [one for one in _readings(folders) if not one.is_empty]
+    readings = [one for one in _readings(folders) if one.decisions or one.species or one.lengths_mm]
     if len(readings) < 2:
         raise UserError(
             f"{folders[0]}: expected verdicts to compare, found none; take them with stream-dmr "

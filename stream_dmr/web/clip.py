@@ -3,7 +3,6 @@
 import json
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -13,38 +12,17 @@ from jaxtyping import UInt8
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.errors import UserError
 from stream_dmr.messages import FishCrop, LocalizedFish
-from stream_dmr.recording.codec import decode
 from stream_dmr.recording.frame_images import FrameLookup
-from stream_dmr.recording.reading import decoded_messages
 from stream_dmr.recording.selection import Selection
+from stream_dmr.store.edits import ReviewedMessages
 from stream_dmr.store.fish import database_of
-from stream_dmr.store.verdicts import read_added_frames
 from stream_dmr.web.report_page import RunReport
+from stream_dmr.web.views import mask_outlines
 
 # Chosen: what leads to a fish and what becomes of it is seen; a fish that stays is seen in parts.
 _MARGIN_NS, _MAX_NS = 1_000_000_000, 10_000_000_000
 _MAX_WIDTH_PX = 960  # of a picture that is sent; the page's canvas is no wider
 _JPEG_QUALITY = 80
-
-
-@dataclass(kw_only=True)
-class FrameOutlines:
-    """What is drawn over one frame: by fish its outline and its points, in frame pixels."""
-
-    masks: dict[int, list[list[float]]] = field(default_factory=dict[int, list[list[float]]])
-    fish: dict[int, LocalizedFish] = field(default_factory=dict[int, LocalizedFish])
-
-    def values(self) -> list[dict[str, Any]]:
-        """By fish, for the page."""
-        return [
-            {
-                "fish": fish,
-                "mask": self.masks.get(fish, []),
-                "points": _points(self.fish.get(fish)),
-                "reason": "" if (one := self.fish.get(fish)) is None else one.reason,
-            }
-            for fish in sorted(self.masks.keys() | self.fish.keys())
-        ]
 
 
 def clip_span_ns(report: RunReport, track_id: int, shift: int) -> tuple[int, int]:
@@ -69,78 +47,50 @@ def fish_clip(
     The JSON has the frame's number, time, size and outlines; the JPEG is empty where neither the
     source nor the recording has the picture. UserError where there is no such fish.
     """
-    span_ns = clip_span_ns(report, track_id, shift)
-    return _chunks(report, pictures, span_ns)
+    return _chunks(report, pictures, clip_span_ns(report, track_id, shift))
 
 
 def _chunks(report: RunReport, pictures: FrameLookup, span_ns: tuple[int, int]) -> Iterator[bytes]:
-    outlines = read_outlines(report, span_ns)
+    fish = _outlines(report, span_ns)
     for found in pictures.frames(span_ns):
         frame = found.frame
         values = {
             "frame": frame.frame_index,
             "time_ns": str(frame.timestamp_ns),  # text: JavaScript would round it
             "size": _size(report, frame.image),
-            "fish": outlines[frame.frame_index].values(),
+            "fish": fish.get(frame.frame_index, []),
         }
         for part in (json.dumps(values).encode(), _jpeg(frame.image)):
             yield len(part).to_bytes(4, "little")
             yield part
 
 
-def read_outlines(report: RunReport, span_ns: tuple[int, int]) -> dict[int, FrameOutlines]:
-    """The outlines of all fish in the frames of a time, added ones too, by frame."""
-    outlines: defaultdict[int, FrameOutlines] = defaultdict(FrameOutlines)
-    selection = Selection(time_ns=span_ns)
-    recorded = decoded_messages(report.recording, [FishCrop, LocalizedFish], selection)
-    for message, _ in recorded:
-        if isinstance(message, FishCrop | LocalizedFish):
-            _take(message, report, outlines)
-    database = database_of(report.path)
-    added = {} if database is None else read_added_frames(database)
-    for track_id in added.keys() & {
-        part.track_id for f in report.edits.fish.values() for part in f.parts
-    }:
-        for one in added[track_id]:
-            fish = decode(LocalizedFish, one.fish)
-            if selection.includes_time(fish.timestamp_ns):
-                _take(decode(FishCrop, one.crop), report, outlines)
-                _take(fish, report, outlines)
-    return outlines
-
-
-def _take(
-    message: FishCrop | LocalizedFish, report: RunReport, outlines: dict[int, FrameOutlines]
-) -> None:
-    fish = report.edits.fish_of(message.track_id, message.frame_index)
-    if isinstance(message, LocalizedFish):
-        outlines[message.frame_index].fish[fish] = message
-    else:
-        outlines[message.frame_index].masks[fish] = _outline(message)
-
-
-def _outline(crop: FishCrop) -> list[list[float]]:
-    """The outer lines of a mask in frame pixels: x, y, x, y, ..."""
-    lines, _ = cv2.findContours(
-        crop.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
-    )
-    simple = (cv2.approxPolyDP(line, 0.7, closed=True)[:, 0].astype(float) for line in lines)
-    return [
-        np.round(
-            frame_from_crop(line, crop_camera=crop.crop_camera, frame_camera=crop.frame_camera), 1
+def _outlines(report: RunReport, span_ns: tuple[int, int]) -> dict[int, list[dict[str, Any]]]:
+    """By frame: outline, points and reason of each fish, in frame pixels."""
+    database = database_of(report.path) if report.edits.fish else None
+    messages = ReviewedMessages(report.recording, database, Selection(time_ns=span_ns))
+    frames = defaultdict[int, dict[int, dict[str, Any]]](dict)
+    for message in messages.of([FishCrop, LocalizedFish]):
+        if not isinstance(message, FishCrop | LocalizedFish):
+            continue
+        fish = message.track_id
+        one = frames[message.frame_index].setdefault(
+            fish, {"fish": fish, "mask": [], "points": [], "reason": ""}
         )
-        .ravel()
-        .tolist()
-        for line in simple
-        if len(line) > 2
-    ]
+        if isinstance(message, FishCrop):
+            one["mask"] = _mask_lines(message)
+        else:
+            one["reason"] = message.reason
+            if message.keypoints_px is not None:  # None: the fit was refused
+                one["points"] = np.round(message.keypoints_px, 1).tolist()
+    return {frame: [of[fish] for fish in sorted(of)] for frame, of in frames.items()}
 
 
-def _points(fish: LocalizedFish | None) -> list[list[float]]:
-    """Head, center and tail in frame pixels; none where the fit was refused."""
-    if fish is None or fish.keypoints_px is None:
-        return []
-    return np.round(fish.keypoints_px, 1).tolist()
+def _mask_lines(crop: FishCrop) -> list[list[float]]:
+    """The outer lines of a mask in frame pixels: x, y, x, y, ..."""
+    cameras = {"crop_camera": crop.crop_camera, "frame_camera": crop.frame_camera}
+    lines = mask_outlines(crop.mask, tolerance_px=0.7)
+    return [np.round(frame_from_crop(line, **cameras), 1).ravel().tolist() for line in lines]
 
 
 def _size(report: RunReport, image: UInt8[np.ndarray, "H W 3"]) -> list[int]:

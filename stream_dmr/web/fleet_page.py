@@ -16,7 +16,7 @@ from socket import SHUT_RDWR
 from threading import Timer
 from typing import Annotated, Any
 from urllib.error import HTTPError
-from urllib.parse import SplitResult, parse_qs, urlsplit
+from urllib.parse import parse_qs, urlsplit
 
 from prometheus_client.parser import text_string_to_metric_families
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -137,16 +137,13 @@ def _box(text: str, *, where: str, name: str = "") -> Box:
     except ValueError as error:
         raise ConfigError(f"{expected}, got: {error}") from error
     if parts.scheme not in ("http", "https") or not host or parts.username:
-        raise ConfigError(f"{expected}, got {_without_secrets(parts)!r}")
+        without_secrets = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
+        raise ConfigError(f"{expected}, got {without_secrets!r}")
     token = parse_qs(parts.query).get("token", [""])[0]
     address = f"{parts.scheme}://{parts.netloc}{parts.path.rstrip('/')}/"
     return Box(
         name=name or (host if port is None else f"{host}:{port}"), address=address, token=token
     )
-
-
-def _without_secrets(parts: SplitResult) -> str:
-    return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
 
 
 def ask_all(states: Iterable[BoxState], *, timeout_s: float = _TIMEOUT_S) -> list[BoxState]:

@@ -21,7 +21,7 @@ from stream_dmr.store.fish import (
     recorded_track,
     run_notes,
 )
-from stream_dmr.store.open_results import LostRecording, open_results, require_recording
+from stream_dmr.store.open_results import LostRecording, open_results
 from stream_dmr.store.trip import VesselTrack, read_positions
 from stream_dmr.store.verdicts import read_added_frames, read_verdicts
 from stream_dmr.web.report_page import RunReport, render_page
@@ -105,34 +105,20 @@ def reread_fish(report: RunReport, changed: frozenset[int], pictures: FrameLooku
     )
 
 
-def is_batch(path: Path) -> bool:
-    return (path / VIDEOS).is_file()
-
-
-def open_batch(
-    out: Path, *, config: Path | None = None, as_measured: bool = False
-) -> tuple[list[RunReport], list[str]]:
-    """A report of each video that is done, and a line for each that failed. Raises UserError."""
-    done = run_folders([out])
-    if not done:
-        raise UserError(f"{out / VIDEOS}: expected videos that are done, got none")
-    reports = [open_report(one, config=config, as_measured=as_measured) for one in done]
-    _require_one_template(reports, out)
-    rows = read_videos(out)
-    failed = [f"{row['name']}: {row['reason']}" for row in rows if row["status"] == FAILED]
-    return reports, failed
-
-
 def run_folders(folders: Sequence[Path]) -> list[Path]:
-    """The folders of runs, those of batches taken apart into their videos that are done."""
+    """The folders of runs; of a batch those of its videos that are done."""
     found = list[Path]()
     for folder in folders:
-        if is_batch(folder):
+        if _is_batch(folder):
             done = (row["name"] for row in read_videos(folder) if row["status"] == DONE)
             found += [folder / VIDEO_FOLDERS / name for name in done]
         else:
             found.append(folder)
     return found
+
+
+def _is_batch(path: Path) -> bool:
+    return (path / VIDEOS).is_file()
 
 
 def open_folders(
@@ -148,27 +134,25 @@ def open_folders(
     """
     reports, failed = list[RunReport](), list[str]()
     for folder in folders:
-        if is_batch(folder):
-            opened, lines = open_batch(folder, config=config, as_measured=as_measured)
-            failed += lines
-        else:
-            opened = [open_report(folder, source=source, config=config, as_measured=as_measured)]
-        reports += opened
-    for report in reports:
-        require_recording(report.recording, where=report.path, what="a review")
-    if source is not None and len(reports) > 1:
-        raise UserError("--source: expected one run, got several, which have their own")
-    _require_one_template(reports, folders[0])
-    return reports, failed
-
-
-def _require_one_template(reports: Sequence[RunReport], where: Path) -> None:
+        done = run_folders([folder])
+        if not done:
+            raise UserError(f"{folder / VIDEOS}: expected videos that are done, got none")
+        if source is not None and (_is_batch(folder) or len(folders) > 1):
+            raise UserError(
+                f"--source: expected one run, got {', '.join(map(str, folders))}, whose videos "
+                "have their own"
+            )
+        for one in done:
+            reports.append(open_report(one, source=source, config=config, as_measured=as_measured))
+        rows = read_videos(folder) if _is_batch(folder) else []
+        failed += [f"{row['name']}: {row['reason']}" for row in rows if row["status"] == FAILED]
     names = {report.recording.header.template.name for report in reports}
     if len(names) > 1:
         raise UserError(
-            f"{where}: expected videos of one template, got {', '.join(sorted(names))}; take them "
-            f"one by one: {reports[0].path}, ..."
+            f"{folders[0]}: expected videos of one template, got {', '.join(sorted(names))}; take "
+            f"them one by one: {reports[0].path}, ..."
         )
+    return reports, failed
 
 
 def write_report(
@@ -184,9 +168,8 @@ def write_report(
     `coast` is drawn on the map.
     """
     make_folder(out.parent)
+    page = render_page(reports, title=title, notes=notes, coast=coast)
     with writing_to(out):
-        out.write_text(
-            render_page(reports, title=title, notes=notes, coast=coast), encoding="utf-8"
-        )
+        out.write_text(page, encoding="utf-8")
     add_files(out.parent, [out])
     return out.stat().st_size

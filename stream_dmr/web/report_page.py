@@ -125,14 +125,12 @@ def _haul_rows(report: RunReport, *, many: bool) -> Iterator[dict[str, str]]:
             "fish": str(len(fish)),
             "with length": str(len(lengths)),
             "mean": f"{mean(lengths) / 10:.1f} cm" if lengths else "",
-            "species": _counted(_species(one) for one in fish),
+            "species": _counted(
+                one.sure_code or one.review.species or one.estimate.species_code or ""
+                for one in fish
+            ),
             "fate": _counted(one.fate or "" for one in fish),
         }
-
-
-def _species(fish: Fish) -> str:
-    """Its code; without one what was said of it."""
-    return fish.sure_code or fish.review.species or fish.estimate.species_code or ""
 
 
 def _hours(hours: float) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from stream_dmr.errors import ConfigError, UserError
 from stream_dmr.species import load_species
 from stream_dmr.store.fish import Fish, database_of, read_measured_fish
+from stream_dmr.store.open_results import require_recording
 from stream_dmr.store.verdicts import NOT_REVIEWED
 from stream_dmr.web.added_fish import DoubtError
 from stream_dmr.web.clip import fish_clip
@@ -38,7 +39,9 @@ class ReviewQueue:
         blind: bool = False,
         sample: AuditSample | None = None,
     ) -> None:
-        """UserError where a report has no database."""
+        """UserError where a report has no database or no recording."""
+        for report in reports:
+            require_recording(report.recording, where=report.path, what="a review")
         self._reviewer, self._blind = reviewer, blind
         self.placed = place(reports)
         self._recorders = [VerdictRecorder(report, reviewer, blind=blind) for report in reports]

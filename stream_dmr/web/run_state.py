@@ -4,8 +4,9 @@ import shutil
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -226,96 +227,71 @@ class RunMetrics(Collector):
         self._state = state
 
     def collect(self) -> Iterator[Metric]:
-        yield from self._stages()
-        yield from self._camera()
-        yield from self._positions()
-        yield from self._results()
-
-    def _stages(self) -> Iterator[Metric]:
-        chain = self._state.chain
-        if chain is None:
-            return
-        frames = CounterMetricFamily(
-            "stream_dmr_frames", "Frames of each stage.", labels=["stage", "outcome"]
-        )
-        waiting = GaugeMetricFamily(
-            "stream_dmr_queue_frames", "Frames that wait before a stage.", labels=["stage"]
-        )
-        for one in chain.counters:
-            for outcome in ("in", "processed", "dropped", "failed"):
-                frames.add_metric([one.stage, outcome], getattr(one, f"frames_{outcome}"))
-        for one, number in zip(chain.counters[1:], chain.waiting(), strict=True):
-            waiting.add_metric([one.stage], number)
-        yield frames
-        yield waiting
-
-    def _camera(self) -> Iterator[Metric]:
-        counts = self._state.source.counts
-        if counts is None:
-            return
-        frames = CounterMetricFamily(
-            "stream_dmr_camera_frames", "Frames that came from the camera.", labels=["outcome"]
-        )
-        for outcome in ("received", "passed_on", "dropped", "failed"):
-            frames.add_metric([outcome], getattr(counts, outcome))
-        yield frames
-        yield _gauge("camera_queue_frames", "Frames that wait for the chain.", counts.waiting)
-        yield CounterMetricFamily(
-            "stream_dmr_camera_reconnects",
-            "How often a lost camera was found again.",
-            value=counts.reconnects,
-        )
-        age_s = self._state.last_frame_age_s()
-        yield _gauge("last_frame_age_seconds", "Since the last frame came.", age_s or 0.0)
-
-    def _positions(self) -> Iterator[Metric]:
-        if self._state.positions is None:
-            return
-        sentences = CounterMetricFamily(
-            "stream_dmr_position_sentences",
-            "Sentences from the receiver of positions, and what became of them.",
-            labels=["outcome"],
-        )
-        counts = asdict(self._state.positions.counts)
-        for outcome in COUNTED:
-            sentences.add_metric([outcome], counts[outcome])
-        yield sentences
-
-    def _results(self) -> Iterator[Metric]:
-        fish = CounterMetricFamily("stream_dmr_fish", "Finished fish.", labels=["status"])
-        for status, number in dict(self._state.num_fish).items():
-            fish.add_metric([status], number)
-        yield fish
-        for name, text, counts in (
-            ("fates", "Finished fish by what became of them.", self._state.fates),
-            ("species", "Finished fish by FAO code.", self._state.species),
-        ):
-            family = CounterMetricFamily(f"stream_dmr_{name}", text, labels=[name])
-            for value, number in dict(counts).items():
-                family.add_metric([value], number)
-            yield family
-        fit = GaugeMetricFamily(
-            "stream_dmr_fit_seconds", "Time of a fit, of the last 1000.", labels=["quantile"]
-        )
-        for quantile, seconds in self._state.fit_quantiles().items():
-            fit.add_metric([f"{quantile:g}"], seconds)
-        yield fit
-        yield _gauge("fish_per_hour", "Of the last hour.", self._state.fish_per_hour())
-        yield _gauge("frames_per_second", "That left the chain.", self._state.frames_per_s())
-        yield _gauge("disk_free_bytes", "Room for results.", self._state.disk_free_bytes())
-        sinks = GaugeMetricFamily(
-            "stream_dmr_output_works", "1: can be written, 0: not.", labels=["name"]
-        )
-        for sink in self._state.sinks.all():
-            sinks.add_metric([sink.name], 0.0 if sink.is_failing else 1.0)
-        yield sinks
-        warnings = sum(warning.count for warning in self._state.warnings())
+        state = self._state
+        yield from _stages(state)
+        if (camera := state.source.counts) is not None:
+            outcomes = ("received", "passed_on", "dropped", "failed")
+            frames = {outcome: getattr(camera, outcome) for outcome in outcomes}
+            yield _counter("camera_frames", "Frames that came from the camera.", "outcome", frames)
+            yield _gauge("camera_queue_frames", "Frames that wait for the chain.", camera.waiting)
+            text = "How often a lost camera was found again."
+            yield CounterMetricFamily("stream_dmr_camera_reconnects", text, camera.reconnects)
+            age_s = state.last_frame_age_s() or 0.0
+            yield _gauge("last_frame_age_seconds", "Since the last frame came.", age_s)
+        if state.positions is not None:
+            counts = asdict(state.positions.counts)
+            text = "Sentences from the receiver of positions, and what became of them."
+            counted = {outcome: counts[outcome] for outcome in COUNTED}
+            yield _counter("position_sentences", text, "outcome", counted)
+        yield _counter("fish", "Finished fish.", "status", state.num_fish)
+        yield _counter("fates", "Finished fish by what became of them.", "fates", state.fates)
+        yield _counter("species", "Finished fish by FAO code.", "species", state.species)
+        fits = {f"{quantile:g}": fit_s for quantile, fit_s in state.fit_quantiles().items()}
+        yield _gauges("fit_seconds", "Time of a fit, of the last 1000.", "quantile", fits)
+        yield _gauge("fish_per_hour", "Of the last hour.", state.fish_per_hour())
+        yield _gauge("frames_per_second", "That left the chain.", state.frames_per_s())
+        yield _gauge("disk_free_bytes", "Room for results.", state.disk_free_bytes())
+        works = {sink.name: 0.0 if sink.is_failing else 1.0 for sink in state.sinks.all()}
+        yield _gauges("output_works", "1: can be written, 0: not.", "name", works)
+        warnings = sum(warning.count for warning in state.warnings())
         yield _gauge("warnings", "Warnings that are shown.", warnings)
-        yield _gauge("healthy", "1: healthy, 0: not.", 0.0 if self._state.problems() else 1.0)
+        yield _gauge("healthy", "1: healthy, 0: not.", 0.0 if state.problems() else 1.0)
+
+
+def _stages(state: RunState) -> Iterator[Metric]:
+    if (chain := state.chain) is None:
+        return
+    frames = CounterMetricFamily(
+        "stream_dmr_frames", "Frames of each stage.", labels=["stage", "outcome"]
+    )
+    for one in chain.counters:
+        for outcome in ("in", "processed", "dropped", "failed"):
+            frames.add_metric([one.stage, outcome], getattr(one, f"frames_{outcome}"))
+    yield frames
+    numbers = zip(chain.counters[1:], chain.waiting(), strict=True)
+    waiting = {one.stage: number for one, number in numbers}
+    yield _gauges("queue_frames", "Frames that wait before a stage.", "stage", waiting)
 
 
 def _gauge(name: str, text: str, value: float | int) -> Metric:
     return GaugeMetricFamily(f"stream_dmr_{name}", text, value=value)
+
+
+def _labelled(
+    kind: type[CounterMetricFamily | GaugeMetricFamily],
+    name: str,
+    text: str,
+    label: str,
+    values: Mapping[str, float | int],
+) -> Metric:
+    family = kind(f"stream_dmr_{name}", text, labels=[label])
+    for key, value in dict(values).items():  # a copy: threads of the run count on
+        family.add_metric([key], value)
+    return family
+
+
+_counter = partial(_labelled, CounterMetricFamily)
+_gauges = partial(_labelled, GaugeMetricFamily)
 
 
 def make_registry(state: RunState) -> CollectorRegistry:

@@ -41,28 +41,16 @@ def _refusal(path: Path, what: str) -> UserError:
 
 def _lines(element: Any) -> Iterator[Line]:
     """Of a collection, a feature or a geometry; points are left out."""
-    match element["type"]:
-        case "FeatureCollection":
-            for feature in element["features"]:
-                yield from _lines(feature)
-        case "GeometryCollection":
-            for geometry in element["geometries"]:
-                yield from _lines(geometry)
-        case "Feature":
-            if element["geometry"] is not None:
-                yield from _lines(element["geometry"])
-        case kind if kind in _DEPTHS:
-            yield from _unpacked(element["coordinates"], _DEPTHS[kind])
-        case _:
-            pass
-
-
-def _unpacked(coordinates: Any, depth: int) -> Iterator[Line]:
-    if depth:
-        for part in coordinates:
-            yield from _unpacked(part, depth - 1)
-        return
-    yield [(float(point[0]), float(point[1])) for point in coordinates]
+    within = [*element.get("features", ()), *element.get("geometries", ()), element.get("geometry")]
+    for part in within:
+        if part is not None:
+            yield from _lines(part)
+    if (depth := _DEPTHS.get(element["type"])) is not None:
+        lines = [element["coordinates"]]
+        for _ in range(depth):
+            lines = [part for one in lines for part in one]
+        for line in lines:
+            yield [(float(point[0]), float(point[1])) for point in line]
 
 
 _WIDTH, _HEIGHT, _MARGIN = 720.0, 360.0, 34.0
@@ -93,7 +81,7 @@ def draw_map(
         width=_WIDTH,
         height=_HEIGHT,
         shores=[points for one in coast for points in view.pieces(one)],
-        lines=[" ".join(map(view.point, [*piece[::step], piece[-1]])) for piece in pieces],
+        lines=[view.points([*piece[::step], piece[-1]]) for piece in pieces],
         dots=[dot for one in fish if (dot := _dot(one, view, colours[one.haul]))],
         colours=colours,
         bar=view.scale_bar(),
@@ -101,11 +89,11 @@ def draw_map(
     )
 
 
-def _dot(fish: Fish, view: "_View", colour: str) -> dict[str, str] | None:
+def _dot(fish: Fish, view: "_View", colour: str) -> dict[str, object] | None:
     where = fish.where
     if where.latitude is None or where.longitude is None:
         return None
-    x, y = view.point((where.longitude, where.latitude)).split(",")
+    x, y = view.xy((where.longitude, where.latitude))
     length = "no length" if fish.length_mm is None else f"{fish.length_mm / 10:.1f} cm"
     facts = (f"fish {fish.estimate.track_id}", length, fish.sure_code, fish.fate)
     return {"x": x, "y": y, "colour": colour, "title": ", ".join(filter(None, facts))}
@@ -128,19 +116,18 @@ class _View:
         """Near the first one, so that no track is torn at 180 degrees."""
         return self._origin + (longitude - self._origin + 180) % 360 - 180
 
-    def point(self, place: tuple[float, float]) -> str:
-        """`x,y` of a longitude and latitude."""
-        x, y = self._xy(place)
-        return f"{x:.1f},{y:.1f}"
+    def points(self, line: Line) -> str:
+        """Longitudes and latitudes as the points of a line in SVG."""
+        return " ".join(f"{x:.1f},{y:.1f}" for x, y in map(self.xy, line))
 
     def pieces(self, line: Line) -> Iterator[str]:
         """The points of each part of a line that comes into the picture, or near it."""
-        points, near = [self._xy(place) for place in line], list[int]()
+        points, near = [self.xy(place) for place in line], list[int]()
         for k in range(1, len(points) + 1):
             if k < len(points) and self._is_near(points[k - 1], points[k]):
                 near.append(k)
             elif near:
-                yield " ".join(f"{x:.1f},{y:.1f}" for x, y in points[near[0] - 1 : near[-1] + 1])
+                yield self.points(line[near[0] - 1 : near[-1] + 1])
                 near.clear()
 
     def _is_near(self, a: tuple[float, float], b: tuple[float, float]) -> bool:
@@ -154,7 +141,7 @@ class _View:
             and max(a[1], b[1]) >= 0
         )
 
-    def _xy(self, place: tuple[float, float]) -> tuple[float, float]:
+    def xy(self, place: tuple[float, float]) -> tuple[float, float]:
         """Pixels of the picture, to the right and down."""
         east = (self._unwrapped(place[0]) - self._middle[0]) * self._squeeze * _M_PER_DEGREE
         north = (place[1] - self._middle[1]) * _M_PER_DEGREE

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.errors import UserError
 from stream_dmr.evidence.seal import seal_verdicts
-from stream_dmr.messages import FishCrop, FittedMesh, LengthEstimate
+from stream_dmr.messages import FishCrop, FittedMesh
 from stream_dmr.recording.codec import decode
 from stream_dmr.recording.frame_images import FrameLookup
 from stream_dmr.store.edits import changed_fish, corrected_fish, corrected_length, edits_of
@@ -53,11 +53,6 @@ class DrawnBox(BaseModel):
     y0: float = Field(allow_inf_nan=False)
     x1: float = Field(allow_inf_nan=False)
     y1: float = Field(allow_inf_nan=False)
-
-    @property
-    def corners(self) -> Float[np.ndarray, "4"]:
-        """x0, y0, x1, y1."""
-        return np.array([self.x0, self.y0, self.x1, self.y1])
 
 
 class SubmittedVerdict(BaseModel):
@@ -102,7 +97,8 @@ def drawn_boxes(
         if box.x1 - box.x0 < 1 or box.y1 - box.y0 < 1:
             raise UserError(f"verdict: expected a box in frame {box.frame_index}, got a point")
     times = [int(box.timestamp_ns) for box in boxes]
-    return {box.frame_index: box.corners for box in boxes}, (min(times), max(times))
+    corners = {box.frame_index: np.array([box.x0, box.y0, box.x1, box.y1]) for box in boxes}
+    return corners, (min(times), max(times))
 
 
 class VerdictRecorder:
@@ -120,7 +116,7 @@ class VerdictRecorder:
                 "verdicts; got a recording alone"
             )
         self._database: Path = database
-        self._report = report
+        self.report = report
         self._reviewer = reviewer
         self._reading = BLIND if blind else None
         self.pictures = FrameLookup(
@@ -128,10 +124,6 @@ class VerdictRecorder:
         )
         self._editor = TrackEditor(database, self.pictures)
         self._lock = Lock()
-
-    @property
-    def report(self) -> RunReport:
-        return self._report
 
     def record(self, submitted: SubmittedVerdict) -> list[int]:
         """Check and write a verdict; returns the fish that it changes.
@@ -146,7 +138,7 @@ class VerdictRecorder:
                 edit = TrackEdit(verdict=self._undo(verdict, said))
             else:
                 edit = self._checked(verdict, submitted, said)
-            is_edit, before = verdict.kind in (*EDITS, "undo"), self._report.edits
+            is_edit, before = verdict.kind in (*EDITS, "undo"), self.report.edits
             add_verdict(
                 self._database,
                 edit.verdict,
@@ -156,7 +148,7 @@ class VerdictRecorder:
             )
             seal_verdicts(self._database.parent)
             self._follow(read_verdicts(self._database))
-            return sorted({edit.verdict.track_id} | changed_fish(before, self._report.edits))
+            return sorted({edit.verdict.track_id} | changed_fish(before, self.report.edits))
 
     def last(self) -> Verdict | None:
         """The verdict that an undo would take back."""
@@ -170,7 +162,7 @@ class VerdictRecorder:
             verdicts = read_verdicts(self._database)
             self._follow(verdicts)
             named = {one.track_id for one in verdicts} | {one.other_fish for one in verdicts}
-            return self._report, self._reviews(verdicts), {one for one in named if one is not None}
+            return self.report, self._reviews(verdicts), {one for one in named if one is not None}
 
     def _reviews(self, verdicts: Sequence[Verdict]) -> dict[int, Review]:
         """Of this reading: a blind reader sees no other verdicts."""
@@ -182,9 +174,9 @@ class VerdictRecorder:
         """Take over what any reviewer has added, split, merged or undone."""
         if self._reading is not None:
             return
-        changed = changed_fish(self._report.edits, edits_of(verdicts))
+        changed = changed_fish(self.report.edits, edits_of(verdicts))
         if changed:
-            self._report = reread_fish(self._report, frozenset(changed), self.pictures)
+            self.report = reread_fish(self.report, frozenset(changed), self.pictures)
 
     def _verdict(self, submitted: SubmittedVerdict) -> Verdict:
         kind = submitted.kind
@@ -205,7 +197,7 @@ class VerdictRecorder:
     def _checked(
         self, verdict: Verdict, submitted: SubmittedVerdict, said: Sequence[Verdict]
     ) -> TrackEdit:
-        report = self._report
+        report = self.report
         if verdict.kind in EDITS and self._reading is not None:
             raise UserError(
                 "verdict: expected accept, reject, duplicate, species or moved points: a blind "
@@ -280,24 +272,21 @@ class VerdictRecorder:
             tail_u=tail[0],
             tail_v=tail[1],
         )
-        length = self._corrected_length(submitted.track_id, {**moved, **verdict.moved})
-        return replace(verdict, length_mm=length.length_mm, length_std_mm=length.length_std_mm)
-
-    def _corrected_length(self, track_id: int, moved: Mapping[int, Ends]) -> LengthEstimate:
-        report = self._report
+        config, calibration = self.report.config, self.report.recording.header.calibration
         frames = {
             frame_index: corrected_fish(
-                decode(FittedMesh, self._view(track_id, frame_index).fit),
+                decode(FittedMesh, self._view(submitted.track_id, frame_index).fit),
                 np.array(points, float),
-                settings=report.config.localize,
-                calibration=report.recording.header.calibration,
+                settings=config.localize,
+                calibration=calibration,
             )
-            for frame_index, points in moved.items()
+            for frame_index, points in {**moved, **verdict.moved}.items()
         }
-        return corrected_length(frames, report.config.smooth_length)
+        length = corrected_length(frames, config.smooth_length)
+        return replace(verdict, length_mm=length.length_mm, length_std_mm=length.length_std_mm)
 
     def _view(self, track_id: int, frame_index: int) -> RecordedView:
-        track = self._report.tracks.get(track_id)
+        track = self.report.tracks.get(track_id)
         for view in track.views if track else ():
             if view.row.fish.frame_index == frame_index:
                 return view

@@ -1,12 +1,11 @@
 """Pictures of recorded fish with mask, mesh and keypoints."""
 
 from collections import defaultdict
-from collections.abc import Generator, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, nullcontext, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -24,12 +23,7 @@ from stream_dmr.messages import (
     LocalizedFish,
 )
 from stream_dmr.recording.codec import decode
-from stream_dmr.recording.frame_images import (
-    FrameLookup,
-    FrameRestorer,
-    RecordedPictures,
-    open_pictures,
-)
+from stream_dmr.recording.frame_images import FrameLookup, RecordedPictures, open_pictures
 from stream_dmr.recording.reading import (
     Recording,
     decoded_messages,
@@ -70,12 +64,14 @@ def crop_outlines(crop: FishCrop, shape: FittedShape, faces: Int[np.ndarray, "F 
         for face in np.round(pixels).astype(np.int32)[faces]:
             cv2.fillConvexPoly(drawn, face, 1)
         mesh = [
-            (line + 0.5) / _OVERSAMPLING - 0.5 for line in _polygons(drawn > 0, tolerance_px=1.0)
+            (line + 0.5) / _OVERSAMPLING - 0.5
+            for line in mask_outlines(drawn > 0, tolerance_px=1.0)
         ]
-    return Outlines(mask=_polygons(crop.mask, tolerance_px=0.5), mesh=mesh, keypoints=keypoints)
+    return Outlines(mask=mask_outlines(crop.mask, tolerance_px=0.5), mesh=mesh, keypoints=keypoints)
 
 
-def _polygons(mask: Bool[np.ndarray, "H W"], *, tolerance_px: float) -> list[np.ndarray]:
+def mask_outlines(mask: Bool[np.ndarray, "H W"], *, tolerance_px: float) -> list[np.ndarray]:
+    """The outer lines of a mask, in its pixels."""
     lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     simple = (cv2.approxPolyDP(line, tolerance_px, closed=True)[:, 0] for line in lines)
     return [line.astype(float) for line in simple if len(line) > 2]
@@ -119,24 +115,19 @@ def frame_images(
     A source that is not the recorded one raises SourceError where it `is_given` by the user; else
     its frames are left out.
     """
-    with _open_pictures(recording, source) as pictures:
-        for message, payload in decoded_messages(recording, [Frame], EVERYTHING):
-            if message.frame_index not in wanted or not isinstance(message, Frame):
-                continue
-            with nullcontext() if is_given else suppress(SourceError):
-                frame = pictures.restore(message, payload)
-                if frame.image.size:
-                    yield frame.frame_index, frame.image
-
-
-@contextmanager
-def _open_pictures(recording: Recording, source: str | None) -> Generator[FrameRestorer]:
+    checked = nullcontext() if is_given else suppress(SourceError)
     if source is None:
-        yield RecordedPictures(recording, EVERYTHING)
+        opened = nullcontext(RecordedPictures(recording, EVERYTHING))
     else:
         settings = recorded_settings(recording, "read_frames", ReadFramesSettings)
-        with open_pictures(source, settings) as pictures:
-            yield pictures
+        opened = open_pictures(source, settings)
+    with checked, opened as pictures:
+        for message, payload in decoded_messages(recording, [Frame], EVERYTHING):
+            if message.frame_index in wanted and isinstance(message, Frame):
+                with checked:
+                    frame = pictures.restore(message, payload)
+                    if frame.image.size:
+                        yield frame.frame_index, frame.image
 
 
 def recorded_source(recording: Recording) -> str | None:
@@ -173,14 +164,6 @@ class FishFrame:
     estimate: LengthEstimate
 
 
-class Encoded(NamedTuple):
-    """What a recording holds of one fish in one frame, encoded; None: nothing."""
-
-    crop: bytes | None
-    fit: bytes | None
-    has_picture: bool  # of the crop
-
-
 @dataclass(frozen=True, kw_only=True)
 class RecordedView:
     """One fish in one frame with its crop and fit, encoded: a season of masks fills no memory."""
@@ -210,15 +193,13 @@ class RecordedTrack:
     rows: list[FishFrame] = field(default_factory=list[FishFrame])
     views: list[RecordedView] = field(default_factory=list[RecordedView])  # the best first
 
-    def add(self, row: FishFrame, encoded: Encoded, *, max_views: int) -> None:
-        """Add a frame; keep its crop and fit if it is among the `max_views` best so far."""
+    def add(self, row: FishFrame, view: RecordedView | None, *, max_views: int) -> None:
+        """Add a frame; keep its view if it is among the `max_views` best so far."""
         self.rows.append(row)
-        crop, fit, has_picture = encoded
-        if crop is None or fit is None or row.fish.keypoints_px is None:
-            return
-        self.views.append(RecordedView(crop=crop, fit=fit, row=row, has_picture=has_picture))
-        self.views.sort(key=lambda view: view.rank, reverse=True)
-        del self.views[max_views:]
+        if view is not None and row.fish.keypoints_px is not None:
+            self.views.append(view)
+            self.views.sort(key=lambda view: view.rank, reverse=True)
+            del self.views[max_views:]
 
     def filter_again(self, settings: SmoothLengthSettings) -> None:
         """Compute the running estimates from the frames in their order."""
@@ -240,22 +221,23 @@ def read_tracks(
     """
     tracks: dict[int, RecordedTrack] = {}
     added = () if reviewed is None else _added_rows(reviewed, selection)
-    for row, encoded in chain(_read_rows(recording, selection), added):
-        fish = row.fish
+    for row, view in chain(_read_rows(recording, selection), added):
         if reviewed is not None:
-            fish_id = reviewed.edits.fish_of(fish.track_id, fish.frame_index)
-            row = replace(row, fish=replace(fish, track_id=fish_id))
+            fish_id = reviewed.edits.fish_of(row.fish.track_id, row.fish.frame_index)
+            row = replace(row, fish=replace(row.fish, track_id=fish_id))
+            view = None if view is None else replace(view, row=row)
         track = tracks.setdefault(row.fish.track_id, RecordedTrack())
-        track.add(row, encoded, max_views=max_views)
+        track.add(row, view, max_views=max_views)
     if reviewed is not None:
         for fish_id in tracks.keys() & reviewed.edits.fish.keys():
             tracks[fish_id].filter_again(reviewed.settings)
     return tracks
 
 
-def _added_rows(
-    reviewed: ReviewedTracks, selection: Selection
-) -> Iterator[tuple[FishFrame, Encoded]]:
+_Row = tuple[FishFrame, RecordedView | None]  # None: the recording lacks the crop or the fit
+
+
+def _added_rows(reviewed: ReviewedTracks, selection: Selection) -> Iterator[_Row]:
     """The frames of added fish, each with the running estimate of its fish."""
     for track_id, frames in reviewed.added.items():
         if selection.tracks is not None and track_id not in selection.tracks:
@@ -263,12 +245,12 @@ def _added_rows(
         fish = [decode(LocalizedFish, frame.fish) for frame in frames]
         running = length_of_frames(fish, reviewed.settings)[:-1]
         for frame, one, estimate in zip(frames, fish, running, strict=True):
-            encoded = Encoded(frame.crop, frame.fit, has_picture=False)
-            yield FishFrame(fish=one, estimate=estimate), encoded
+            row = FishFrame(fish=one, estimate=estimate)
+            yield row, RecordedView(crop=frame.crop, fit=frame.fit, row=row, has_picture=False)
 
 
-def _read_rows(recording: Recording, selection: Selection) -> Iterator[tuple[FishFrame, Encoded]]:
-    """Each fish in each frame, with the encodings of its crop and its fit."""
+def _read_rows(recording: Recording, selection: Selection) -> Iterator[_Row]:
+    """Each fish in each frame."""
     crops, fits = dict[_Key, tuple[bytes, bool]](), dict[_Key, bytes]()
     located = dict[_Key, LocalizedFish]()
     kinds = (FishCrop, FittedMesh, LocalizedFish, LengthEstimate)
@@ -283,8 +265,11 @@ def _read_rows(recording: Recording, selection: Selection) -> Iterator[tuple[Fis
                 located[key] = message
             case LengthEstimate() if (fish := located.pop(key, None)) is not None:
                 row = FishFrame(fish=fish, estimate=message)
-                crop, has_picture = crops.pop(key, (None, False))
-                yield row, Encoded(crop, fits.pop(key, None), has_picture)
+                (crop, has_picture), fit = crops.pop(key, (None, False)), fits.pop(key, None)
+                if crop is None or fit is None:
+                    yield row, None
+                else:
+                    yield row, RecordedView(crop=crop, fit=fit, row=row, has_picture=has_picture)
             case _:
                 pass
 
@@ -335,30 +320,19 @@ def draw_views(
             waiting[view.row.fish.frame_index].append((track_id, view))
     drawn_views: defaultdict[int, list[DrawnView]] = defaultdict(list)
     if pictures is None:
-        images = _read_frames(recording, set(waiting), source)
+        of = source or recorded_source(recording)
+        images = frame_images(recording, set(waiting), of, is_given=source is not None)
     else:
         times = {view.row.fish.timestamp_ns for views in waiting.values() for _, view in views}
         found = (one.frame for t in sorted(times) for one in pictures.frames((t, t + 1)))
         images = ((frame.frame_index, frame.image) for frame in found if frame.image.size)
-    for frame_index, image in images:
+    without = ((frame_index, None) for frame_index in list(waiting))
+    for frame_index, image in chain(images, without):  # the first that has a frame draws it
         for track_id, view in waiting.pop(frame_index, []):
             drawn_views[track_id].append(_draw_view(view, meshes, recording, image))
-    for views in waiting.values():
-        for track_id, view in views:
-            drawn_views[track_id].append(_draw_view(view, meshes, recording, None))
     for of_track in drawn_views.values():
         of_track.sort(key=lambda view: view.recorded.rank, reverse=True)
     return drawn_views
-
-
-def _read_frames(
-    recording: Recording, wanted: set[int], source: str | None
-) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
-    if source is not None:
-        yield from frame_images(recording, wanted, source, is_given=True)
-        return
-    with suppress(SourceError):  # a file of the same name that is not the recorded one
-        yield from frame_images(recording, wanted, recorded_source(recording), is_given=False)
 
 
 def _draw_view(

@@ -26,6 +26,7 @@ from stream_dmr.web.watch_page import WatchServer
 _REPEAT_INTERVAL_S = 60.0
 _MAX_KINDS = 200  # of lines that are remembered; beyond it, the one that was silent longest goes
 _PROGRESS_INTERVAL_S = 60.0
+_FISH_FACTS = ("track_id", "length_mm", "length_std_mm", "frames_used", "frames_seen", "status")
 
 
 class JsonFormatter(logging.Formatter):
@@ -95,19 +96,8 @@ class JsonLog(RunObserver):
 
     def take(self, message: Message) -> None:
         if isinstance(message, LengthEstimate) and message.is_final:
-            self._log_fish(message)
-
-    def _log_fish(self, estimate: LengthEstimate) -> None:
-        self._log_event(
-            logging.INFO,
-            "fish",
-            track_id=estimate.track_id,
-            length_mm=estimate.length_mm,
-            length_std_mm=estimate.length_std_mm,
-            frames_used=estimate.frames_used,
-            frames_seen=estimate.frames_seen,
-            status=estimate.status,
-        )
+            facts = {name: getattr(message, name) for name in _FISH_FACTS}
+            self._log_event(logging.INFO, "fish", **facts)
 
     def _log_event(self, level: int, event: str, **facts: object) -> None:
         self._log.log(level, event, extra={"facts": facts})
@@ -122,7 +112,8 @@ class SystemdWatchdog:
     def __init__(self, is_alive: Callable[[], bool]) -> None:
         self._is_alive = is_alive
         self._ended = threading.Event()
-        interval_s = _microseconds("WATCHDOG_USEC") / 1e6
+        interval_us = os.environ.get("WATCHDOG_USEC", "0")
+        interval_s = int(interval_us) / 1e6 if interval_us.isdecimal() else 0.0
         notify("READY=1")
         self._thread = threading.Thread(
             target=self._run, args=(interval_s / 2,), name="watchdog", daemon=True
@@ -154,16 +145,13 @@ def notify(line: str) -> None:
         sender.sendall(line.encode())
 
 
-def _microseconds(name: str) -> int:
-    value = os.environ.get(name, "0")
-    return int(value) if value.isdecimal() else 0
-
-
 class WatchObserver(RunObserver):
     """Passes everything on to another observer, serves it, and tells systemd that the run lives."""
 
     def __init__(self, observer: RunObserver) -> None:
         self._observer = observer
+        self.stage, self.notice = observer.stage, observer.notice
+        self.serving, self.begin = observer.serving, observer.begin
         self._state: RunState | None = None  # from `open` on
         self._opened = ExitStack()
 
@@ -221,18 +209,6 @@ class WatchObserver(RunObserver):
         if self._state is not None:
             self._state.warn(line)
         self._observer.warn(line)
-
-    def stage(self, line: str) -> None:
-        self._observer.stage(line)
-
-    def notice(self, line: str) -> None:
-        self._observer.notice(line)
-
-    def serving(self, address: str) -> None:
-        self._observer.serving(address)
-
-    def begin(self, num_frames: int | None) -> None:
-        self._observer.begin(num_frames)
 
     def frame_done(self) -> None:
         if self._state is not None:

@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from stream_dmr.errors import ConfigError, UserError
-from stream_dmr.files import read_text
+from stream_dmr.files import read_token
 from stream_dmr.lengths.fate import FATE_OF_ZONE
 from stream_dmr.pipeline.config import WatchSettings
 from stream_dmr.sources.positions import COUNTED
@@ -135,14 +135,7 @@ def _read_token(settings: WatchSettings) -> str:
             f"[watch] host = {settings.host!r}: expected a token_file beside it, since others can "
             "reach this address; make one with: openssl rand -hex 16 > token"
         )
-    try:
-        token = read_text(Path(settings.token_file)).strip()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not text"
-        raise ConfigError(
-            f"[watch] token_file: expected a file with a token, {settings.token_file} can't be "
-            f"read: {reason}"
-        ) from error
+    token = read_token(Path(settings.token_file), where="[watch] token_file")
     if len(token) < _MIN_TOKEN_CHARACTERS:
         raise ConfigError(
             f"[watch] token_file: expected a token of {_MIN_TOKEN_CHARACTERS} characters or more, "
@@ -202,15 +195,8 @@ def _warnings_json(state: RunState) -> list[dict[str, Any]]:
     ]
 
 
-def haul_json(state: RunState) -> dict[str, Any] | None:
-    """The haul that goes on: None of a run that takes none, with the name "" between hauls."""
-    if state.hauls is None:
-        return None
-    current = state.hauls.current()
-    return {"name": "" if current is None else current.name}
-
-
 def status_json(state: RunState) -> dict[str, Any]:
+    haul = None if state.hauls is None else state.hauls.current()
     return {
         "problems": state.problems(),
         "num_fish": sum(state.num_fish.values()),
@@ -218,7 +204,8 @@ def status_json(state: RunState) -> dict[str, Any]:
         "fates": dict(state.fates.most_common()),
         "fish_per_hour": state.fish_per_hour(),
         "positions": positions_json(state),
-        "haul": haul_json(state),
+        # None of a run that takes no hauls; the name is "" between hauls
+        "haul": None if state.hauls is None else {"name": "" if haul is None else haul.name},
         "frames_per_s": state.frames_per_s(),
         "last_frame_age_s": state.last_frame_age_s(),
         "fish": [
