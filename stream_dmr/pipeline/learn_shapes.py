@@ -318,9 +318,7 @@ class SeenFish:
                 self._num += 1
 
 
-# Finished fish after which shapes are learnt, then after twice as many, and so on. What an earlier
-# run has learnt is known from more fish than the first ones after a restart.
-_FIRST, _AFTER_RESTART = 3, 48
+_FIRST = 3  # finished fish after which shapes are learnt, then after twice as many, and so on
 _NICENESS = 10  # frames come first
 
 
@@ -342,7 +340,8 @@ class ShapeLearner:
     ) -> None:
         """`learnt` by earlier runs: FitMesh knows it at once. `write` records what this one learns.
 
-        `inputs` have candidates.
+        `seen` has what is left of the fish of those runs, so that it is learnt on as if they were
+        one. `inputs` have candidates.
         """
         assert inputs.candidates is not None
         self._inputs, self._seen, self._write, self._observer = inputs, seen, write, observer
@@ -353,7 +352,7 @@ class ShapeLearner:
         self._fit_mesh.learn(self._known)
         self._compared: MeshComparison | None = None  # the last one with a given mesh
         self._stop = threading.Event()
-        self._next_at = _AFTER_RESTART if learnt else _FIRST
+        self._next_at = 2 * _num_fish(learnt[-1]) if learnt else _FIRST
         self._worker = ThreadPoolExecutor(1, "shapes", initializer=_be_nice)
         self._work: Future[CandidateShapes | None] | None = None
         self._num_fish = 0  # that this work learns from
@@ -437,6 +436,12 @@ def _message(stocks: CandidateShapes, num_fish: int, frame: Frame) -> LearntShap
         covariances=stocks.covariances,
         shares=stocks.shares * num_fish / (num_fish + 1),
     )
+
+
+def _num_fish(learnt: LearntShapes) -> int:
+    """From how many fish the stocks of a `_message` were learnt."""
+    share = learnt.shares.sum()
+    return round(share / (1 - share))
 
 
 def _be_nice() -> None:

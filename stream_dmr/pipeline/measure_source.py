@@ -18,7 +18,6 @@ from stream_dmr.messages import Frame, LengthEstimate, Message, Position
 from stream_dmr.pipeline.chain import ErrorPolicy, StageCounters, run_chain
 from stream_dmr.pipeline.drift import DriftAlarms
 from stream_dmr.pipeline.learn_shapes import (
-    SeenFish,
     ShapeLearner,
     mesh_fits_fish,
     save_stocks,
@@ -80,14 +79,13 @@ class MessageFlow:
         inputs: Inputs,
         session: Session,
         outputs: Outputs,
-        seen: SeenFish,
         observer: RunObserver,
         stop: threading.Event,
     ) -> None:
         """The source is made to go on after earlier runs, positions begin to come."""
         self.totals = RunTotals(max_fish=_MAX_SUMMARY_FISH if inputs.is_endless else None)
         self.policy = ErrorPolicy(is_endless=inputs.is_endless, on_notice=observer.warn)
-        self._seen, self._observer = seen, observer
+        self._seen, self._observer = outputs.seen, observer
         self._writer = _result_writer(inputs, outputs, stop, on_notice=observer.warn)
         _begin_positions(inputs, outputs, observer)
         self._positions = PositionFeed(inputs.positions, self._take_position)
@@ -97,7 +95,7 @@ class MessageFlow:
             self._shapes = ShapeLearner(
                 inputs,
                 session,
-                seen,
+                outputs.seen,
                 learnt=outputs.learnt,
                 write=self._writer.write,
                 observer=observer,
@@ -251,15 +249,14 @@ def _measure(
             _save_learnt_meshes(inputs)
             _report_start(inputs, outputs, observer)
             observer.begin(inputs.source.num_frames)
-            seen = SeenFish()
             clock.begin("measuring")
-            summary = _run_chain(inputs, session, outputs, seen, observer, stop=stop)
+            summary = _run_chain(inputs, session, outputs, observer, stop=stop)
         clock.begin("comparing with the mesh")
         mesh_fits = True
         if not stop.is_set():
             unused = inputs.finder.unused  # only now is it known what the source has no frames for
             if inputs.candidates is None and inputs.config.fit_mesh.are_shapes_learnt:
-                mesh_fits = mesh_fits_fish(seen.crops(), inputs, observer)
+                mesh_fits = mesh_fits_fish(outputs.seen.crops(), inputs, observer)
         return replace(summary, parts_s=clock.parts_s()), mesh_fits
     finally:
         inputs.reader.close()
@@ -297,14 +294,13 @@ def _run_chain(
     inputs: Inputs,
     session: Session,
     outputs: Outputs,
-    seen: SeenFish,
     observer: RunObserver,
     *,
     stop: threading.Event,
 ) -> RunSummary:
     began = time.perf_counter()
     outputs.store.count_frames(inputs.source.num_frames)
-    flow = MessageFlow(inputs, session, outputs, seen, observer, stop)
+    flow = MessageFlow(inputs, session, outputs, observer, stop)
     try:
         with _noting_the_end(inputs, outputs.store, stop):
             counters = run_chain(

@@ -5,6 +5,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from statistics import median
 from types import MappingProxyType
@@ -12,6 +13,7 @@ from types import MappingProxyType
 from stream_dmr.errors import OutputError, RecordingError
 from stream_dmr.evidence.seal import SignedFiles, sealed
 from stream_dmr.files import natural_order
+from stream_dmr.fitting.shape.stocks import MAX_FISH
 from stream_dmr.messages import (
     FishCrop,
     Frame,
@@ -24,16 +26,18 @@ from stream_dmr.messages import (
 )
 from stream_dmr.pipeline.drift import DriftAlarms
 from stream_dmr.pipeline.haul_log import HaulLog
+from stream_dmr.pipeline.learn_shapes import SeenFish
 from stream_dmr.pipeline.run_folder import prepare_folder
 from stream_dmr.pipeline.run_inputs import Inputs
 from stream_dmr.pipeline.run_observer import OpenRun, RunObserver
 from stream_dmr.recording.header import RunHeader, RunStart
-from stream_dmr.recording.reading import learnt_shapes, open_recordings
+from stream_dmr.recording.reading import Recording, learnt_shapes, messages_of, open_recordings
 from stream_dmr.recording.record import SinkFactory, SinkStates
 from stream_dmr.recording.recorder import STEM, Recorder, open_recording_files
 from stream_dmr.recording.repair import Repair
 from stream_dmr.recording.retention import Retention
 from stream_dmr.recording.segments import open_segments, unfinished_frames
+from stream_dmr.recording.selection import Selection
 from stream_dmr.sources.sensors_settings import SensorsSettings
 from stream_dmr.sources.source import ResumePoint, Source
 from stream_dmr.store.fish import flagged_fish
@@ -210,20 +214,49 @@ def resume_source(
 
 
 def learnt_before(out: Path, header: RunHeader) -> list[LearntShapes]:
-    """What earlier runs in a folder learnt of their fish, from its last segment.
+    """What earlier runs in a folder learnt of their fish.
 
-    Nothing where that can't be read, or where fish had other candidate shapes then.
+    Each segment begins with all of it, but a crash may have left of the last ones nothing or their
+    header alone. Nothing where the fish had other candidate shapes then.
     """
-    segments = [*out.glob(f"{STEM}-*.mcap"), *out.glob(f"{STEM}-*.rrd")]
-    if header.candidates is None or not segments:
-        return []
-    try:
-        last = open_recordings([max(segments, key=natural_order)])
-        earlier = last.header.candidates
-        is_same = earlier is not None and earlier.names == header.candidates.names
-        return learnt_shapes(last) if is_same else []
-    except RecordingError:
-        return []
+    for segment in _segments(out, "mcap") or _segments(out, "rrd"):
+        with suppress(RecordingError):
+            recording, candidates = open_recordings([segment]), header.candidates
+            earlier = recording.header.candidates
+            if candidates is None or earlier is None or earlier.names != candidates.names:
+                return []
+            if learnt := learnt_shapes(recording):
+                return learnt
+            if next(recording.payloads([Frame]), None) is not None:
+                return []
+    return []
+
+
+def seen_before(out: Path) -> SeenFish:
+    """The last fish that earlier runs in a folder recorded and finished, to learn from.
+
+    Nothing of segments that can't be read, and of those whose masks were removed.
+    """
+    finished, segments = set[int](), list[Recording]()
+    for segment in _segments(out, "mcap"):
+        if len(finished) >= MAX_FISH:
+            break
+        with suppress(RecordingError):
+            recording = open_recordings([segment])
+            lengths = messages_of(recording, LengthEstimate)
+            finished |= {one.track_id for one in lengths if one.is_final}
+            segments.append(recording)
+    seen, selection = SeenFish(), Selection(tracks=frozenset(finished))
+    for recording, kind in product(reversed(segments), (FishCrop, LengthEstimate)):
+        with suppress(RecordingError):
+            for message in messages_of(recording, kind, selection):
+                seen.take(message)
+    return seen
+
+
+def _segments(out: Path, suffix: str) -> list[Path]:
+    """The last one first."""
+    return sorted(out.glob(f"{STEM}-*.{suffix}"), key=natural_order, reverse=True)
 
 
 def interrupted_tracks(
@@ -252,6 +285,7 @@ class Outputs:
     repairs: Sequence[Repair]  # of recordings that a crash left unfinished
     interrupted: Sequence[LocalizedFish]  # frames of fish that were in view at that crash
     learnt: Sequence[LearntShapes]  # by earlier runs of a camera, of its fish
+    seen: SeenFish  # by those, to which this run adds its own
 
 
 @contextmanager
@@ -287,6 +321,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
             repairs if is_endless else [], store, on_notice=observer.warn
         )
         learnt = learnt_before(out, header) if is_endless else []
+        seen = seen_before(out) if is_endless else SeenFish()
         recording = open_recording_files
         if is_endless:
             recording = partial(
@@ -310,6 +345,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
             repairs=repairs,
             interrupted=interrupted,
             learnt=learnt,
+            seen=seen,
         )
 
 

@@ -1,5 +1,6 @@
 """A camera's run learns the shapes of its fish while it measures them."""
 
+import os
 import shutil
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -8,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,18 +17,21 @@ from hypothesis import strategies as st
 
 from stream_dmr.camera import Camera
 from stream_dmr.fitting.shape.candidates import CandidateShapes, load_shapes
-from stream_dmr.messages import FishCrop, FittedMesh, LearntShapes
+from stream_dmr.messages import FishCrop, FittedMesh, LearntShapes, LengthEstimate
 from stream_dmr.pipeline.learn_shapes import SeenFish, ShapeLearner
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.replay_recording import ReplayOptions, replay
 from stream_dmr.pipeline.run_inputs import Inputs, checked_inputs
 from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.pipeline.run_outputs import learnt_before, seen_before
 from stream_dmr.pipeline.session import Session
 from stream_dmr.recording.codec import decode, encode
+from stream_dmr.recording.mcap.mcap_sink import McapSink
 from stream_dmr.recording.reading import (
     decoded_messages,
     known_shapes,
     learnt_shapes,
+    messages_of,
     open_recordings,
 )
 from stream_dmr.store.open_results import LEARNT
@@ -39,8 +44,10 @@ from tests.support.tiny_clip import calibration, draw_mask, write_clip, write_te
 
 FORMS = load_shapes("auto")[1]
 CAMERA: Camera = calibration().camera
-# The source is some frames ahead of the chain's end, so the fourth fish comes late.
-SEEN = [[1]] * 3 + [[2]] * 3 + [[3]] * 3 + [[]] * 16 + [[4]] * 3 + [[]] * 3
+# The source is some frames ahead of the chain's end, so the fourth fish comes late; it hangs where
+# the second one did.
+LATE = 25
+SEEN = [[1]] * 3 + [[2]] * 3 + [[3]] * 3 + [[]] * (LATE - 9) + [[2]] * 3 + [[]] * 3
 
 
 class Immediate:
@@ -60,22 +67,34 @@ class Immediate:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """The folder of an endless run, and a copy of it after a second run has gone on there."""
+    """A run over a clip, one that goes on there with a second clip, and one over both at once."""
     folder = tmp_path_factory.mktemp("live")
     write_clip(folder / "clip", fish=SEEN)
+    masks = folder / "clip" / "masks"
+    for number, seen in enumerate(SEEN, start=1):
+        fish = draw_mask(number, seen) > 0
+        for clip in range(2):
+            track_id = 4 * clip + (4 if number > LATE else max(seen, default=0))
+            name = f"{number + clip * len(SEEN):06d}.png"
+            cv2.imwrite(str(masks / name), np.where(fish, track_id, 0))
     config = folder / "clip" / "quick.toml"
     quick = config.read_text().replace("learn_shapes = false", "max_faces = 600")
-    config.write_text(f"{quick}\n[smooth_length]\ntrack_timeout_s = 0.15\n")
-    found = []
+    waits = "[smooth_length]\ntrack_timeout_s = 0.15\n[read_frames]\nclips_wait_s = 0.1\n"
+    config.write_text(f"{quick}\n{waits}")
+    (clips := folder / "clips").mkdir()
+    source: dict[str, str] = {"source": str(clips), "template": "auto"}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Inputs, "is_endless", property(lambda inputs: True))
         patch.setattr("stream_dmr.pipeline.learn_shapes.ThreadPoolExecutor", Immediate)
-        for _ in range(2):
-            asked = request(folder / "clip", folder / "out", template="auto")
+        for number, out in enumerate(("out-0", "out-1")):
+            shutil.copy(folder / "clip" / "video.mp4", clip := clips / f"{number}.mp4")
+            os.utime(clip, (1_000_000_000 + number, 1_000_000_000 + number))  # it is complete
+            if number:
+                shutil.copytree(folder / "out-0", folder / out)
+            asked = request(folder / "clip", folder / out, **source)
             measure_source(asked, stop=threading.Event())
-            found.append(folder / f"out-{len(found)}")
-            shutil.copytree(folder / "out", found[-1])
-    return found
+        asked = request(folder / "clip", folder / "whole", **source)
+        measure_source(asked, stop=threading.Event())
+    return [folder / "out-0", folder / "out-1", folder / "whole"]
 
 
 def candidates_of(folder: Path) -> dict[int, int | None]:
@@ -99,11 +118,46 @@ def test_fish_after_the_first_ones_may_have_the_shape_of_those(runs: list[Path])
     assert (runs[0] / LEARNT).exists()
 
 
-def test_a_restart_knows_what_was_learnt(runs: list[Path]):
+def test_a_restart_knows_what_was_learnt_and_learns_on_from_the_fish_of_both_runs(
+    runs: list[Path],
+):
     last = max(runs[1].glob("recording-*.mcap"))
     assert last not in runs[0].iterdir()
-    [earlier], [later] = (learnt_shapes(open_recordings([one])) for one in (runs[0], last))
-    np.testing.assert_array_equal(earlier.coefficients, later.coefficients)
+    [earlier] = learnt_shapes(open_recordings([runs[0]]))
+    known, learnt = learnt_shapes(open_recordings([last]))
+    np.testing.assert_array_equal(earlier.coefficients, known.coefficients)
+    assert [one.shares.sum() for one in (known, learnt)] == pytest.approx([3 / 4, 6 / 7])
+
+
+def test_the_fish_of_earlier_runs_are_seen_as_those_runs_saw_them(runs: list[Path]):
+    seen = SeenFish()
+    for kind in (FishCrop, LengthEstimate):
+        for message in messages_of(open_recordings([runs[1]]), kind):
+            seen.take(message)
+    before = seen_before(runs[1])
+    assert before.num == seen.num == 8
+    for one, other in zip(before.crops(), seen.crops(), strict=True):
+        assert encode(one) == encode(other)
+
+
+def test_what_was_learnt_survives_a_crash_at_the_start_of_a_segment(
+    runs: list[Path], tmp_path: Path
+):
+    """Such a segment has its header alone."""
+    shutil.copytree(runs[0], tmp_path / "out")
+    header = open_recordings([runs[0]]).header
+    McapSink(tmp_path / "out" / "recording-000009.mcap", header, flush_s=0.5).close()
+    [earlier], [found] = (learnt_before(one, header) for one in (runs[0], tmp_path / "out"))
+    np.testing.assert_array_equal(earlier.coefficients, found.coefficients)
+
+
+def test_a_restart_changes_no_length_of_fish_before_and_after_it(runs: list[Path]):
+    lengths = [[row["length_mm"] for row in rows(out / "lengths.csv")] for out in runs]
+    assert lengths[1] == lengths[2]
+    assert lengths[2][:4] == lengths[0]
+    assert "" not in lengths[2]
+    shapes = [*candidates_of(runs[1]).values()]
+    assert (shapes[7] or 0) > (shapes[3] or 0)  # learnt from fish of both runs
 
 
 class Warned(RunObserver):

@@ -5,7 +5,6 @@ from pathlib import Path
 
 from stream_dmr.messages import FishCrop, Message
 from stream_dmr.pipeline.chain import run_chain
-from stream_dmr.pipeline.learn_shapes import SeenFish
 from stream_dmr.pipeline.measure_source import MessageFlow
 from stream_dmr.pipeline.run_inputs import checked_inputs
 from stream_dmr.pipeline.run_observer import RunObserver
@@ -33,7 +32,7 @@ def test_everyone_takes_what_the_next_stage_gets(tmp_path: Path):
     observer, passed_on = Keeping(), list[Message]()
     session = Session(inputs, given=[inputs.crop_fish(inputs.finder)])
     with open_outputs(inputs, observer) as outputs:
-        flow = MessageFlow(inputs, session, outputs, SeenFish(), observer, threading.Event())
+        flow = MessageFlow(inputs, session, outputs, observer, threading.Event())
 
         def on_message(message: Message) -> Message:
             passed_on.append(taken := flow.take(message))
