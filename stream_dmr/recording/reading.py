@@ -168,7 +168,8 @@ def require_tracks(selection: Selection, known: Collection[int]) -> None:
     """Raise UserError where a selected fish is not among the `known` ones."""
     missing = (selection.tracks or frozenset()) - {*known}
     if missing:
-        raise UserError(f"--track {min(missing)}: expected a fish of the recording, got none")
+        place = "the recording" if selection.time_ns is None else "the selected time"
+        raise UserError(f"--track {min(missing)}: expected a fish of {place}, got none")
 
 
 def require_frame(recording: Recording, frame_index: int, selection: Selection) -> None:

@@ -52,6 +52,8 @@ class Selection:
         last = max((span[1] for span in seen), default=-1) + 1
         if self.time_ns is not None:
             first, last = max(first, self.time_ns[0]), min(last, self.time_ns[1])
+        if not first < last:  # its tracks were not seen in its time, or not at all
+            first = last = 0
         return replace(self, time_ns=(first, last))
 
 

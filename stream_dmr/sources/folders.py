@@ -241,6 +241,7 @@ class ClipFolder(Source):
                     self._frames_done[path.name] = frame.frame_index
                     yield replace(frame, frame_index=frame_index, timestamp_ns=last_ns)
             self.warnings += self._video.warnings
+            self.is_cut_off = self._video.is_cut_off  # of the last one: only that ends the frames
 
     def close(self) -> None:
         """Release the clip; the iteration ends."""

@@ -30,6 +30,7 @@ from stream_dmr.sources.sensors_settings import SensorsSettings, utc_ns_of
 
 _CSV_COLUMNS = ("time_utc", "latitude", "longitude")
 _OPTIONAL_COLUMNS = ("speed_knots", "course_deg")
+_MAX_LINE_BYTES = 4096  # chosen: a sentence has 82, a row of any table hardly more than that
 
 
 class PositionFile(PositionSource):
@@ -101,7 +102,7 @@ class PositionFile(PositionSource):
         last_ns: int | None = None
         waiting: tuple[int, Fix] | None = None  # a wrong first date is known by what follows it
         is_csv = self._path.suffix.lower() == ".csv"
-        sentences = map(self._builder.take, self._file)
+        sentences = map(self._builder.take, self._lines())
         for fix in self._csv_fixes() if is_csv else filter(None, sentences):
             time_ns = (fix.utc_ns or 0) - self._zero_ns
             if waiting is not None and time_ns > waiting[0]:
@@ -116,12 +117,23 @@ class PositionFile(PositionSource):
         if waiting is not None:
             yield waiting
 
+    def _lines(self) -> Iterator[bytes]:
+        """Raises SourceError at one that does not end."""
+        while line := self._file.readline(_MAX_LINE_BYTES + 1):
+            if len(line) > _MAX_LINE_BYTES:
+                self.close()
+                raise SourceError(
+                    f"--nmea {self._path}: expected lines of {_MAX_LINE_BYTES} bytes at most, got "
+                    "a longer one; give a text file of sentences or a CSV"
+                )
+            yield line
+
     def _leave_out(self) -> None:
         self.counts.positions -= 1
         self.counts.jumps += 1
 
     def _csv_fixes(self) -> Iterator[Fix]:
-        reader = csv.DictReader(line.decode("utf-8-sig", "replace") for line in self._file)
+        reader = csv.DictReader(line.decode("utf-8-sig", "replace") for line in self._lines())
         missing = [name for name in _CSV_COLUMNS if name not in (reader.fieldnames or ())]
         if missing:
             self.close()

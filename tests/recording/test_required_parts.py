@@ -50,6 +50,8 @@ def said_by(command: str, recording: Path, out: Path) -> str:
 def test_a_fish_or_a_time_that_is_not_in_it_is_refused(folder: Path, tmp_path: Path, command: str):
     said = said_by(f"{command} --track 2 --track 77", folder, tmp_path / "out")
     assert said == "--track 77: expected a fish of the recording, got none"
+    said = said_by(f"{command} --track 2 --time 0:0.05", folder, tmp_path / "out")
+    assert said == "--track 2: expected a fish of the selected time, got none"
     said = said_by(f"{command} --time 100:200", folder, tmp_path / "out")
     assert said == "--time 100:200: expected a time of the recording, from 0 to 0.5 s, got none"
 

@@ -138,3 +138,17 @@ def test_a_folder_without_a_readable_clip_is_refused(tmp_path: Path):
     clip(tmp_path / "2.avi", first=1)
     shutil.copy2(tmp_path / "2.avi", tmp_path / "3.avi")
     assert len(list(open_source(str(tmp_path), AT_ONCE))) >= 4
+
+
+@pytest.mark.parametrize(("cut", "is_cut_off"), [("a", False), ("b", True)])
+def test_a_last_clip_that_is_cut_off_is_said(tmp_path: Path, cut: str, is_cut_off: bool):
+    """After another one fish are seen on."""
+    for number, name in enumerate("ab"):
+        clip(tmp_path / f"{name}.avi", first=number, num_frames=20)
+    path = tmp_path / f"{cut}.avi"
+    os.truncate(path, path.stat().st_size * 3 // 4)
+    os.utime(path, (OLD_S, OLD_S))
+    folder = open_source(str(tmp_path), AT_ONCE)
+    assert 20 < len(list(folder)) < 40
+    assert folder.is_cut_off == is_cut_off
+    assert any("damaged" in line for line in folder.warnings)

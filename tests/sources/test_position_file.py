@@ -102,3 +102,13 @@ def test_times_of_the_settings():
     assert utc_ns_of("2026-11-22T07:00:00.5+01:00") == START_NS + SECOND // 2
     with pytest.raises(ConfigError, match=r"\[sensors\]: 'start_utc' expected a time in ISO 8601"):
         parse_config('[sensors]\nstart_utc = "yesterday"', where="config.toml")
+
+
+@pytest.mark.parametrize("name", ["way.nmea", "way.csv"])
+@pytest.mark.parametrize("num_good", [0, 30])
+def test_a_line_without_end_is_refused(tmp_path: Path, name: str, num_good: int):
+    good = straight_way(num_good)
+    if name.endswith(".csv"):
+        good = "time_utc,latitude,longitude\n" + "2026-11-22T06:00:11Z,57.0,-152.0\n" * num_good
+    with pytest.raises(SourceError, match="lines of 4096 bytes at most, got a longer one"):
+        all_of(opened(tmp_path / name, good + "$GPRMC," * 10_000), 0.4, 99.0)
