@@ -232,9 +232,13 @@ def _sums(folder: Path, files: Iterable[Path]) -> dict[str, str]:
 
 
 def _write(folder: Path, made: dict[str, Any]) -> Path:
-    # Two reviewers may be at it.
+    # Two reviewers may be at it; what killed processes left is removed.
     target, draft = folder / NAME, folder / f"{NAME}.{os.getpid()}.part"
     with writing_to(target):
+        for left in folder.glob(f"{NAME}.*.part"):
+            pid = left.name.split(".")[-2]
+            if pid.isdecimal() and not Path(f"/proc/{pid}").exists():
+                left.unlink(missing_ok=True)
         draft.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
         rename_durably(draft, target)
     return target
