@@ -23,6 +23,7 @@ from benchmarks.reliability.mutations import (
     by_line,
     by_node,
     by_record,
+    by_sentence,
     of_header,
 )
 from stream_dmr.calibration.calibration_file import load_calibration
@@ -35,9 +36,13 @@ from stream_dmr.recording.codec import decode
 from stream_dmr.recording.reading import open_recordings
 from stream_dmr.recording.rerun.viewer import convert
 from stream_dmr.simulation import DEMO_SCENE
-from stream_dmr.sources.open_source import open_source
+from stream_dmr.sources.open_source import open_positions, open_source
+from stream_dmr.sources.position_readers import LineSplitter
+from stream_dmr.sources.positions import FixBuilder
+from stream_dmr.sources.sensors_settings import SensorsSettings
 from stream_dmr.sources.source import ReadFramesSettings
 from stream_dmr.template.template_file import load_template
+from tests.support.nmea import straight_way
 
 _SLOW_S = 10.0
 
@@ -62,10 +67,11 @@ def inputs(folder: Path, root: Path) -> list[Input]:
     write_coco(clip / "boxes.txt", made / "coco.json")
     write_cvat(clip / "boxes.txt", made / "cvat.xml")
     convert(golden, made / "golden.rrd")
+    (made / "way.nmea").write_text(straight_way(60))
     text, species = (by_byte, by_line), (clip / "species.ply", clip / "species.toml")
     mask = next(path for path in sorted((clip / "masks").glob("*.png")) if path.stat().st_size)
     return [
-        Input(name="boxes", original=clip / "boxes.txt", read=read_boxes, mutate=text, share=0.14),
+        Input(name="boxes", original=clip / "boxes.txt", read=read_boxes, mutate=text, share=0.11),
         Input(
             **{"name": "boxes, COCO", "original": made / "coco.json", "read": read_boxes},
             **{"mutate": (by_byte, by_node), "share": 0.12},
@@ -84,7 +90,11 @@ def inputs(folder: Path, root: Path) -> list[Input]:
         ),
         Input(
             **{"name": "config", "original": root / "config.toml", "read": load_config},
-            **{"mutate": text, "share": 0.14},
+            **{"mutate": text, "share": 0.11},
+        ),
+        Input(
+            **{"name": "positions, NMEA", "original": made / "way.nmea", "read": read_positions},
+            **{"mutate": (by_byte, by_sentence), "share": 0.06},
         ),
         Input(
             **{"name": "template TOML", "original": species[1], "read": read_template},
@@ -207,6 +217,30 @@ def read_masks(path: Path) -> None:
 def read_template(path: Path) -> None:
     """A mesh and the TOML beside it."""
     load_template(str(path.with_suffix(".ply")))
+
+
+def read_positions(path: Path) -> None:
+    """All of a file, and the same bytes as a receiver sends them."""
+    settings = SensorsSettings(start_utc="2026-11-22T06:00:00Z")
+    builder, splitter = FixBuilder(settings, now_ns=time.time_ns), LineSplitter()
+    data = path.read_bytes()
+    for start in range(0, len(data), 100):
+        for line in splitter.lines(data[start : start + 100]):
+            builder.take(line, arrival_ns=time.monotonic_ns())
+    source = open_positions(str(path), settings, is_since_1970=False)
+    try:
+        found = [*source.take(frame_at(10**9)), *source.take(frame_at(10**18)), *source.finish()]
+    finally:
+        source.close()
+    for one in found:
+        assert abs(one.latitude) <= 90
+        assert abs(one.longitude) <= 180
+
+
+def frame_at(timestamp_ns: int) -> Frame:
+    """A small one."""
+    picture = np.zeros((1, 1, 3), np.uint8)
+    return Frame(frame_index=1, timestamp_ns=timestamp_ns, image=picture, source="x")
 
 
 def read_video(path: Path) -> None:

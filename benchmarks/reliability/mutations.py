@@ -13,6 +13,8 @@ from typing import Any
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from tests.support.nmea import sentence
+
 _WORDS = [b"nan", b"-1", b"1e308", b"0", b"\x00", b"\xff\xff\xff\xff", b"[[", b"../../x", b"%"]
 _VALUES = [
     *("0", "-1", "nan", "-inf", "1e308", "1e-320", "9" * 400, "0.5", "2147483648", "true", '""'),
@@ -192,3 +194,14 @@ def of_header(data: bytes, rng: random.Random) -> bytes:
     """Of a PLY: the text before its numbers."""
     head, mark, body = data.partition(b"end_header\n")
     return by_line(head, rng) + mark + body
+
+
+def by_sentence(data: bytes, rng: random.Random) -> bytes:
+    """Of NMEA: fields of sentences replaced, with right checksums."""
+    lines = data.decode().splitlines()
+    for _ in range(rng.choice((1, 2, 30))):
+        at = rng.randrange(len(lines))
+        fields = lines[at].strip("$").partition("*")[0].split(",")
+        fields[rng.randrange(len(fields))] = rng.choice([*_VALUES, "V", "S", "995959.99", "310299"])
+        lines[at] = sentence(",".join(fields)).rstrip()
+    return "\r\n".join(lines).encode()
