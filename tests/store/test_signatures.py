@@ -287,11 +287,62 @@ TAMPERING: dict[str, Callable[[Path, Path], None]] = {
 }
 
 
+SAID = {  # of each kind, by `verify --key`
+    "a length is changed": "fish 2 is not as it was signed",
+    "an uncertainty is changed": "fish 2 is not as it was signed",
+    "a capture time is changed": "fish 2 is not as it was signed",
+    "the time of writing is changed": "fish 2 is not as it was signed",
+    "a status is changed": "fish 2 is not as it was signed",
+    "an alarm's flag is taken off": "fish 2 is not as it was signed",
+    "a fish gets another number": "fish 2 is missing, and was signed",
+    "a fish is removed": "fish 2 is missing, and was signed",
+    "the last fish is removed": "fish 6 is missing, and was signed",
+    "a fish is put in": "fish 70 is not signed",
+    "fish change places": "the order of the fish is not as it was signed",
+    "a fish moves to another run": "fish 2 is not as it was signed",
+    "an event is changed": "the event 'all is well' was put in, or is not as it was signed",
+    "an event is moved in time": "the event 'bumped 2' was put in, or is not as it was signed",
+    "an event is removed": "1 events are missing, or not as they were signed",
+    "an event is put in": "the event 'wiped the lens' was put in, or is not as it was signed",
+    "an event is there twice": "an event is there twice",
+    "events change places": "the order of the events is not as it was signed",
+    "a run gets another calibration": "run ",
+    "a run gets another vessel": "run ",
+    "a run gets another start": "run ",
+    "a run's end is explained otherwise": "the end of run ",
+    "a run says that it did more": "the end of run ",
+    "a run's end is taken away": "the end of run ",
+    "a run with its fish is removed": "fish 1 is missing, and was signed",
+    "an entry of the chain is removed": "signed entries 4 to 4 are missing",
+    "the last entry of the chain is removed": " is not signed",
+    "the chain is removed": "nothing in it is signed",
+    "the chain is emptied": "nothing in it is signed",
+    "a fish is removed and the chain numbered anew": "signed entry 6 does not follow the one",
+    "the chain is signed anew with another key": "(fish 2) is not of this key",
+    "a fish and its hash are changed alike": "fish 2 is not as it was signed",
+    "a signature is borrowed": "signed entry 31 (end ",
+    "entries change places": "signed entry 1 does not follow the one before it",
+    "all after some moment is removed": "fish 3 is not signed",
+    "a mark of used ids is set back": "its marks, clips or scenes are not as",
+    "a clip is called done": "its marks, clips or scenes are not as",
+    "a clip is forgotten": "its marks, clips or scenes are not as",
+    "the scene to compare with is another": "its marks, clips or scenes are not as",
+    "a check of the scale is changed": "the checks of the scale are not as they were signed",
+    "a check of the scale is removed": "the checks of the scale are not as they were signed",
+    "a segment is changed": "recording-000004.mcap is not as it was signed",
+    "a segment is removed": "recording-000005.mcap is missing, and was signed",
+    "a segment's removal is forged": "(removed recording-000002.mcap) is not of this key",
+    "a segment is put in": "recording-000009.mcap is not signed",
+    "a segment is put in for one that went": "recording-000001.mcap is not as it was signed",
+    "segments change places": "recording-000002.mcap is not as it was signed",
+}
+
+
 @pytest.mark.parametrize("kind", TAMPERING)
-def test_tampering_is_found(season: Path, key: Path, tmp_path: Path, kind: str):
+def test_tampering_is_found_and_named(season: Path, key: Path, tmp_path: Path, kind: str):
     folder = Path(shutil.copytree(season, tmp_path / "out"))
     TAMPERING[kind](folder, key)
-    assert changes(folder, key) != []
+    assert SAID[kind] in "\n".join(changes(folder, key))
 
 
 def test_what_nobody_touched_is_sound(season: Path, measured: Path, key: Path):
