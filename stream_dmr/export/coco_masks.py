@@ -12,6 +12,7 @@ from stream_dmr.camera import crop_from_frame, frame_from_crop
 from stream_dmr.messages import FishCrop
 from stream_dmr.pictures import PICTURE_SUFFIXES
 from stream_dmr.recording.codec import EncodedPicture
+from stream_dmr.segmentation.mask_outlines import run_lengths
 
 
 def coco_masks(
@@ -68,15 +69,6 @@ def mask_in_frame(crop: FishCrop) -> Bool[np.ndarray, "H W"]:
     share = cv2.remap(crop.mask.astype(np.float32), u, v, cv2.INTER_LINEAR)
     mask[y0:y1, x0:x1] = share > 0.5
     return mask
-
-
-def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
-    """COCO's counts: pixels off, on, off, ... column by column, beginning with those off."""
-    pixels = mask.ravel(order="F")
-    changes = np.flatnonzero(np.diff(pixels)) + 1
-    edges = np.concatenate([[0], changes, [len(pixels)]])
-    counts = np.diff(edges).tolist()
-    return [0, *counts] if pixels[0] else counts
 
 
 def _extent(crop: FishCrop) -> tuple[int, int, int, int]:

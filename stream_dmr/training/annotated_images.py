@@ -15,6 +15,7 @@ from stream_dmr.files import read_text
 from stream_dmr.geometry import transformed
 from stream_dmr.networks.unet_interface import box_coverage
 from stream_dmr.pictures import MAX_PIXELS, PICTURE_SUFFIXES, read_picture, size_if_huge
+from stream_dmr.segmentation.mask_outlines import decode_coco
 from stream_dmr.training.image_degradation import add_weather, simulate_camera
 from stream_dmr.training.random_fish import PATCH_PX, RIM_PX, FishPatch
 from stream_dmr.training.samples import TrainingSample, crop_affine, draw_part_box, jitter_box
@@ -115,7 +116,12 @@ def _read_coco(paths: dict[str, Path], file: Path) -> Iterator[AnnotatedImage]:
         if name not in paths:
             raise AnnotationError(f"{file}: expected {name} among the images, found it not there")
         image = read_image(paths[name])
-        masks = [_decode(one, file, image.shape[:2]) for one in found]
+        masks = [
+            decode_coco(
+                image.shape[:2], one["segmentation"], where=f"{file}, annotation {one.get('id')}"
+            )
+            for one in found
+        ]
         ends = [_ends(one) for one in found]
         yield AnnotatedImage(path=paths[name], image=image, masks=masks, ends_px=ends)
 
@@ -144,56 +150,6 @@ def _parse_coco(file: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]
         f'{file}: expected COCO\'s JSON with "images" (id, file_name) and "annotations" (image_id, '
         "segmentation)"
     )
-
-
-def _decode(
-    annotation: dict[str, Any], file: Path, shape: tuple[int, ...]
-) -> Bool[np.ndarray, "H W"]:
-    """A mask from polygons (x, y, ... from the image's corner) or from run lengths.
-
-    COCO's runs go down the columns and begin with background.
-    """
-    segmentation = annotation["segmentation"]
-    try:
-        if isinstance(segmentation, dict):
-            counts = segmentation["counts"]
-            runs = _unpack(counts) if isinstance(counts, str) else counts
-            if sum(runs) != shape[0] * shape[1] or list(segmentation["size"]) != list(shape):
-                raise AnnotationError(
-                    f"{file}: expected a mask of {shape[1]}x{shape[0]} px, got one of another size "
-                    f"(annotation {annotation.get('id')})"
-                )
-            values = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
-            return np.ascontiguousarray(values.reshape(shape[1], shape[0]).T)
-        canvas = np.zeros(shape, np.uint8)
-        corners = [np.array(ring, np.float64).reshape(-1, 2) - 0.5 for ring in segmentation]
-        cv2.fillPoly(canvas, [np.round(ring * 16).astype(np.int32) for ring in corners], 1, shift=4)
-        return canvas > 0
-    except (ValueError, TypeError, KeyError):
-        raise AnnotationError(
-            f"{file}: expected polygons or run lengths, got something else "
-            f"(annotation {annotation.get('id')})"
-        ) from None
-
-
-def _unpack(text: str) -> list[int]:
-    """COCO's compressed run lengths: 5 bits a character, differences to the last run but one.
-
-    After `rleFrString` of the COCO API (github.com/cocodataset/cocoapi, common/maskApi.c).
-    """
-    runs: list[int] = []
-    value = shift = 0
-    for byte in text.encode("ascii"):
-        bits = byte - 48
-        value |= (bits & 31) << shift
-        shift += 5
-        if bits & 32:
-            continue
-        if bits & 16:
-            value -= 1 << shift
-        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
-        value = shift = 0
-    return runs
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:

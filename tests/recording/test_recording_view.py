@@ -18,7 +18,7 @@ from hypothesis.extra.numpy import arrays
 from rerun.chunk import RrdReader
 
 from stream_dmr.errors import SourceError
-from stream_dmr.export.coco_masks import mask_in_frame, run_lengths
+from stream_dmr.export.coco_masks import mask_in_frame
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, LocalizedFish, Message
 from stream_dmr.recording.codec import checksum
 from stream_dmr.recording.frame_images import SourcePictures
@@ -271,14 +271,6 @@ def test_an_empty_mask_stays_empty(clip: Path):
     crop = next(read_messages(clip / "out" / "recording.mcap", [FishCrop]))
     assert isinstance(crop, FishCrop)
     assert not mask_in_frame(replace(crop, mask=np.zeros_like(crop.mask))).any()
-
-
-@given(arrays(np.bool_, st.tuples(sizes, sizes)))
-def test_run_lengths_give_the_mask(mask: np.ndarray):
-    counts = run_lengths(mask)
-    values = np.arange(len(counts)) % 2 == 1
-    again = np.repeat(values, counts).reshape(mask.shape, order="F")
-    np.testing.assert_array_equal(again, mask)
 
 
 def test_a_live_view_never_waits(monkeypatch: pytest.MonkeyPatch):

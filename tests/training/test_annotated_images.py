@@ -142,7 +142,7 @@ def test_coco_files_of_another_kind_are_refused(vessel):
         file.write_text(text)
         assert "COCO's JSON" in refusal(images, file)
     coco(vessel, [{"size": [9, 9], "counts": [81]}])
-    assert "another size (annotation 0)" in refusal(images, file)
+    assert "annotation 0: expected a mask of" in refusal(images, file)
     coco(vessel, ["nonsense"])
     assert "polygons or run lengths" in refusal(images, file)
     (images / "haul-0.png").unlink()
