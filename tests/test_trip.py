@@ -150,7 +150,7 @@ def test_tracks_and_masks_have_each_fish_in_its_frames(measured: Measured):
         (category,) = {one["category_id"] for one in masks}
         names = {one["id"]: one["name"] for one in coco["categories"]}
         assert names[category] == true.species_code
-    assert "# metadata,fps: 15" in lines
+    assert "# metadata,Fps: 15,fps: 15" in lines
 
 
 @pytest.fixture(params=[1400, 390])

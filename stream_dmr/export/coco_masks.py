@@ -51,6 +51,11 @@ def coco_masks(
     }
 
 
+def is_picture(source: str) -> bool:
+    """True for a frame that is a picture of a folder, whose `source` is its name."""
+    return "://" not in source and Path(source).suffix.lower() in PICTURE_SUFFIXES
+
+
 def mask_in_frame(crop: FishCrop) -> Bool[np.ndarray, "H W"]:
     """The mask of a crop in the pixels of its frame.
 
@@ -90,6 +95,5 @@ def _extent(crop: FishCrop) -> tuple[int, int, int, int]:
 
 def _image(frame_index: int, source: str, picture: EncodedPicture) -> dict[str, Any]:
     """A picture of a folder has its own name, a frame of a video its number."""
-    is_picture = "://" not in source and Path(source).suffix.lower() in PICTURE_SUFFIXES
-    name = source if is_picture else f"{frame_index:06d}.png"
+    name = source if is_picture(source) else f"{frame_index:06d}.png"
     return {"id": frame_index, "file_name": name, "width": picture.width, "height": picture.height}

@@ -14,7 +14,7 @@ from stream_dmr.errors import OutputError
 from stream_dmr.evidence.own_files import require_writable
 from stream_dmr.evidence.seal import known_files, read_origin, seal_files
 from stream_dmr.export.agency_tables import AGENCIES, HAUL_COLUMNS, haul_row
-from stream_dmr.export.coco_masks import coco_masks
+from stream_dmr.export.coco_masks import coco_masks, is_picture
 from stream_dmr.export.export_choices import Agency, MeshFormat, TableFormat
 from stream_dmr.export.fish_table import (
     FISH_TABLE,
@@ -208,9 +208,9 @@ class Export:
         return path
 
     def viame(self, path: Path) -> int:
-        """Write boxes, outlines, ends and lengths as VIAME CSV, for DIVE; returns their number.
+        """Write boxes, outlines and what is known of each fish as VIAME CSV, for DIVE.
 
-        Rejected fish and doubles are left out.
+        Returns the number of boxes. Rejected fish and doubles are left out.
         """
         self._require_writable(path, needed_for="--viame")
         frames = messages_of(self.recording, Frame, self._selection)
@@ -218,7 +218,9 @@ class Export:
         text, count = viame_csv(
             (seen for seen in self._localized(FishCrop) if seen[0].track_id not in self._left_out),
             {one.estimate.track_id: one for one in self._fish},
+            self.header.template,
             fps=round(1e9 / float(np.median(steps)), 3) if len(steps) else None,
+            pictures={one.frame_index: one.source for one in frames if is_picture(one.source)},
         )
         with self._writing(path):
             path.write_text(text, encoding="utf-8")

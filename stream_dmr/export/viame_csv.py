@@ -2,7 +2,9 @@
 
 The columns are those of VIAME's `write_object_track_set_viame_csv` and of DIVE's reader: track,
 time or picture, frame from 0, box, confidence, length or -1, species and its confidence, and then
-`(kp) head x y`, `(kp) tail x y` and `(poly) x y x y ...`, in pixels of the frame.
+`(kp) head x y`, `(kp) tail x y`, `(atr) NAME VALUE` of the box, `(trk-atr) NAME VALUE` of the
+track, and of each part of the mask `(poly) x y x y ...`, with a `(hole) x y ...` for each hole.
+Pixels are counted from the picture's corner.
 """
 
 import csv
@@ -10,13 +12,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime, timedelta
 from io import StringIO
 
-import cv2
-import numpy as np
-from jaxtyping import Bool
-
 from stream_dmr.export.coco_masks import mask_in_frame
+from stream_dmr.export.fish_table import fish_record
 from stream_dmr.messages import FishCrop, LocalizedFish
+from stream_dmr.segmentation.mask_outlines import outlines_of
 from stream_dmr.store.fish import Fish
+from stream_dmr.store.fisheries import FisheriesSettings
+from stream_dmr.tables import cell
+from stream_dmr.template.template import Template
 
 _HEADER = (
     "# 1: Detection or Track-id,2: Video or Image Identifier,3: Unique Frame Identifier,"
@@ -24,42 +27,73 @@ _HEADER = (
     "9: Target Length (0 or -1 if invalid),10-11+: Repeated Species,Confidence Pairs or Attributes"
 )
 NO_LENGTH = -1
+_OF_TRACK = (  # columns of fish.csv
+    *("length_mm", "ci95_low_mm", "ci95_high_mm", "length_type", "length_from", "frames_used"),
+    *("status", "flags", "species", "species_code", "species_share", "fate", "fate_share"),
+    *("verdict", "verdict_reason", "condition"),
+)
+_OF_BOX = ("length_mm", "length_std_mm", "reason")  # of LocalizedFish
 
 
 def viame_csv(
-    seen: Iterable[tuple[FishCrop, LocalizedFish]], fish: Mapping[int, Fish], *, fps: float | None
+    seen: Iterable[tuple[FishCrop, LocalizedFish]],
+    fish: Mapping[int, Fish],
+    template: Template,
+    *,
+    fps: float | None,
+    pictures: Mapping[int, str],
 ) -> tuple[str, int]:
-    """The file and the number of its boxes; `fish` by track id, `fps` None where not known."""
-    rows = [[*_row(crop, located, fish.get(located.track_id))] for crop, located in seen]
-    text = StringIO()
-    text.write(f"{_HEADER}\n# metadata{'' if fps is None else f',fps: {fps:g}'}\n")
+    """The file and the number of its boxes; `fish` by track id, `fps` None where not known.
+
+    `pictures`: names by frame index, of a folder of pictures. What is known of a track stands in
+    its first row.
+    """
+    rows, text, told = list[list[object]](), StringIO(), set[int]()
+    for crop, located in seen:
+        one = fish.get(located.track_id)
+        row = _row(crop, located, one, pictures.get(located.frame_index))
+        if one is not None and located.track_id not in told:
+            told.add(located.track_id)
+            record = fish_record(one, template, FisheriesSettings())
+            row += _attributes("trk-atr", {name: record[name] for name in _OF_TRACK})
+        rows.append(row)
+    # DIVE's server takes "Fps: " in the second cell alone, its desktop program either; a line
+    # without a second cell breaks the server.
+    rate = "" if fps is None else f"# metadata,Fps: {fps:g},fps: {fps:g}\n"
+    text.write(f"{_HEADER}\n{rate}")
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue(), len(rows)
 
 
-def _row(crop: FishCrop, located: LocalizedFish, fish: Fish | None) -> Iterator[object]:
-    yield located.track_id
+def _row(
+    crop: FishCrop, located: LocalizedFish, fish: Fish | None, picture: str | None
+) -> list[object]:
     since = timedelta(microseconds=max(0, located.timestamp_ns) // 1000)
-    yield (datetime(1970, 1, 1) + since).time().isoformat("microseconds")  # of a day
-    yield located.frame_index - 1
-    yield from (f"{value:.1f}" for value in crop.bbox_xyxy_px.tolist())
-    yield "1.0"
-    yield NO_LENGTH if fish is None or fish.length_mm is None else f"{fish.length_mm:.1f}"
+    time = (datetime(1970, 1, 1) + since).time().isoformat("microseconds")  # of a day
+    length_mm = None if fish is None else fish.length_mm
     # What it is, and how sure that is; "fish" where nobody knows more.
     named, code = (fish.review.species, fish.sure_code) if fish else ("", "")
     share = fish.estimate.species_share if fish and code and not named else None
-    yield from (named or code or "fish", f"{share or 1.0:.3f}")
-    if located.keypoints_px is not None:
-        for name, (x, y) in zip(("head", "tail"), located.keypoints_px[[0, 2]], strict=True):
-            yield f"(kp) {name} {x:.1f} {y:.1f}"
-    yield from _polygon(mask_in_frame(crop))
+    px = located.keypoints_px
+    ends = {} if px is None else {"head": px[0] + 0.5, "tail": px[2] + 0.5}
+    return [
+        *(located.track_id, picture or time, located.frame_index - 1),
+        *crop.bbox_xyxy_px.tolist(),
+        *("1.0", NO_LENGTH if length_mm is None else f"{length_mm:.1f}"),
+        *(named or code or "fish", f"{share or 1.0:.3f}"),
+        *(f"(kp) {name} {x:.1f} {y:.1f}" for name, (x, y) in ends.items()),
+        *_polygons(crop),
+        *_attributes("atr", {name: getattr(located, name) for name in _OF_BOX}),
+    ]
 
 
-def _polygon(mask: Bool[np.ndarray, "H W"]) -> Iterator[str]:
-    """The outline of the largest part, to a pixel."""
-    lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    if lines:
-        largest = max(lines, key=cv2.contourArea)
-        points = cv2.approxPolyDP(largest, 1.0, closed=True)[:, 0]
-        if len(points) > 2:
-            yield "(poly) " + " ".join(f"{x} {y}" for x, y in points.tolist())
+def _attributes(kind: str, values: Mapping[str, object]) -> Iterator[str]:
+    for name, value in values.items():
+        if value not in (None, "", "[]"):
+            yield f"({kind}) {name} {cell(value)}"
+
+
+def _polygons(crop: FishCrop) -> Iterator[str]:
+    for part in outlines_of(mask_in_frame(crop)):
+        for name, ring in zip(("poly", *["hole"] * len(part)), part, strict=False):
+            yield f"({name}) " + " ".join(f"{x:g} {y:g}" for x, y in ring.tolist())

@@ -32,6 +32,21 @@ HALIBUT = Fish(
     where=Whereabouts(utc_ns=START_NS, latitude=57.5, longitude=-152.25, speed_knots=3.0),
 )
 
+UNSEEN = LocalizedFish(
+    frame_index=1,
+    timestamp_ns=61_500_000_000,
+    track_id=7,
+    keypoints_px=None,
+    keypoints_mm=None,
+    midline_mm=None,
+    bending_ratio=None,
+    length_mm=None,
+    length_std_mm=None,
+    iou=None,
+    accepted=True,
+    reason="",
+)
+
 
 def test_a_line_of_each_table():
     wcpfc, rdbes = wcpfc_row(HALIBUT, TEMPLATE), rdbes_row(HALIBUT, TEMPLATE)
@@ -79,31 +94,44 @@ def test_viame_rows_have_box_length_species_and_outline():
     box = np.array([5.0, 10.0, 50.0, 20.0])
     camera = crop_camera(size=60)
     crop = replace(crop_from_mask(mask, track_id=7), bbox_xyxy_px=box, frame_camera=camera)
-    seen = LocalizedFish(
-        frame_index=1,
-        timestamp_ns=61_500_000_000,
-        track_id=7,
-        keypoints_px=np.array([[5.0, 15.0], [25.0, 15.0], [49.0, 15.0]]),
-        keypoints_mm=None,
-        midline_mm=None,
-        bending_ratio=None,
-        length_mm=None,
-        length_std_mm=None,
-        iou=None,
-        accepted=True,
-        reason="",
-    )
-    text, count = viame_csv([(crop, seen)], {7: HALIBUT}, fps=10.0)
-    assert count == 1
-    head, fps, row = text.splitlines()
+    ends = np.array([[5.0, 15.0], [25.0, 15.0], [49.0, 15.0]])
+    seen = replace(UNSEEN, keypoints_px=ends, accepted=False, reason="low iou")
+    known = {7: replace(HALIBUT, review=Review(decision="accept", reason="clear, and whole"))}
+    text, count = viame_csv([(crop, seen)] * 2, known, TEMPLATE, fps=10.0, pictures={})
+    assert count == 2
+    head, fps, *rows = text.splitlines()
     assert head.startswith("# 1: Detection or Track-id,")
-    assert fps == "# metadata,fps: 10"
-    cells = next(csv.reader([row]))
+    assert fps == "# metadata,Fps: 10,fps: 10"
+    cells, again = csv.reader(rows)
     assert cells[:3] == ["7", "00:01:01.500000", "0"]
     assert cells[3:9] == ["5.0", "10.0", "50.0", "20.0", "1.0", "1234.5"]
-    assert cells[9:13] == ["HAL", "0.900", "(kp) head 5.0 15.0", "(kp) tail 49.0 15.0"]
-    # DIVE's own pattern of a polygon
-    assert re.fullmatch(r"\(poly\)((?: -?[0-9]+\.*[0-9]*)+)", cells[13])
+    # From the picture's corner, as the box and the outline are.
+    assert cells[9:13] == ["HAL", "0.900", "(kp) head 5.5 15.5", "(kp) tail 49.5 15.5"]
+    assert cells[13].startswith("(poly) ")
+    assert sorted(map(float, cells[13].split()[1:])) == sorted(
+        [*(5, 10.5, 5.5, 10, 49.5, 10, 50, 10.5), *(50, 19.5, 49.5, 20, 5.5, 20, 5, 19.5)]
+    )
+    # DIVE's patterns; a name has no blank, and a text that begins with a digit is cut off.
+    tail = [re.fullmatch(r"\((atr|trk-atr)\) (.*?)\s(.+)", cell) for cell in cells[14:]]
+    of = {(one[1], one[2]): one[3] for one in tail if one}
+    assert len(of) == len(tail)
+    assert of["atr", "reason"] == "low iou"
+    assert of["trk-atr", "verdict_reason"] == "clear, and whole"
+    assert float(of["trk-atr", "length_mm"]) == 1234.5
+    low, high = (float(of["trk-atr", f"ci95_{end}_mm"]) for end in ("low", "high"))
+    assert low < 1234.5 < high
+    assert (of["trk-atr", "fate"], of["trk-atr", "status"]) == ("landed", "measured")
+    assert (of["trk-atr", "species_code"], float(of["trk-atr", "species_share"])) == ("HAL", 0.9)
+    assert again == cells[: len(again)]  # without what the first row says of the track
+    assert len(again) == 15
+
+
+def test_a_picture_of_a_folder_has_its_name_and_no_rate_is_no_line():
+    text, _ = viame_csv([], {}, TEMPLATE, fps=None, pictures={})
+    assert len(text.splitlines()) == 1
+    crop = replace(crop_from_mask(np.ones((60, 60), bool)), frame_camera=crop_camera(size=60))
+    text, _ = viame_csv([(crop, UNSEEN)], {}, TEMPLATE, fps=None, pictures={1: "IMG_7.jpg"})
+    assert text.splitlines()[1].startswith("7,IMG_7.jpg,0,")
 
 
 def test_every_export_of_a_run(tmp_path: Path):

@@ -85,7 +85,7 @@ def test_masks_meshes_and_tracks_are_of_the_reviewed_fish(out: Path, exported: P
     assert meshes == Counter(fit.track_id for fit in fits if fit.shape is not None)
     assert meshes.keys() == FRAMES.keys()
     text = (exported / "tracks.viame.csv").read_text().splitlines()
-    assert text[1] == "# metadata,fps: 10"
+    assert text[1] == "# metadata,Fps: 10,fps: 10"
     tracks = Counter(int(line.split(",")[0]) for line in text[2:])
     assert tracks == {fish: len(frames) for fish, frames in FRAMES.items()}
 
