@@ -1,4 +1,4 @@
-"""Read boxes from MOT, COCO and CVAT files.
+"""Read boxes from MOT, COCO, CVAT and VIAME files.
 
 COCO's JSON (cocodataset.org, "Data format") is read as annotation tools export it. Frames of a
 video are those that names of six and more digits say, as `export --masks` writes them, else counted
@@ -10,25 +10,32 @@ CVAT's XML, version 1.1 (docs.cvat.ai, "CVAT"), is read for videos and for pictu
 frames, pictures and tracks from 0, this package from 1. A box inside a video's track gets the
 track's id; a box of a single picture gets `UNKNOWN_ID`.
 
-COCO and CVAT know pictures of a folder by their names, since they may have another order.
+VIAME CSV (github.com/Kitware/dive, `viame.py`) has a row for each box, with frames from 0; a track
+0 gets the first free number, all others keep theirs.
+
+COCO, CVAT and VIAME know pictures of a folder by their names, since they may have another order.
+Polygons and run lengths of COCO and VIAME are the masks of their boxes.
 """
 
+import csv
 import json
 import math
 import re
 import xml.etree.ElementTree as ET
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from stream_dmr.errors import AnnotationError
 from stream_dmr.files import natural_order, read_text
 from stream_dmr.pictures import pictures_in
+from stream_dmr.segmentation.mask_outlines import Ring, decode_coco, fill_parts
 
 UNKNOWN_ID = 0  # `track_id` of a box whose file does not follow fish from frame to frame
 
@@ -41,6 +48,8 @@ class AnnotatedBox:
     bbox_xyxy_px: Float[np.ndarray, "4"]  # half-open, frame pixels; may extend beyond the frame
     visibility: float  # visible fraction of the fish, 0 to 1; 1 where not given
     score: float = 1.0  # confidence of the detector, 0 to 1; 1 where not given
+    # Makes the mask in a frame of a height and width, or raises AnnotationError; None: not given.
+    mask: Callable[[tuple[int, int]], Bool[np.ndarray, "H W"]] | None = None
 
 
 def box_from_xywh(
@@ -163,6 +172,7 @@ def frames_by_name(
 
 _NUMBER = re.compile(r"[0-9]{6,}")  # of a frame, as masks are named
 _ID_NAMES = ("track_id", "instance_id")
+_BOX_LENGTH = 10  # of a polygon's list that is no more than a box, first corner repeated or not
 _TOO_LARGE = (OverflowError, RecursionError)  # an infinite number; deeply nested brackets
 
 
@@ -211,19 +221,22 @@ def _annotation_boxes(
         try:
             frame_index = frames[int(annotation["image_id"])]
             x, y, width, height = (float(value) for value in annotation["bbox"])
-            track_id = _track_id(annotation)
+            track_id, drawn = _track_id(annotation), annotation.get("segmentation")
+            is_outline = bool(drawn) and (len(drawn) > 1 or len(drawn[0]) > _BOX_LENGTH)
             score = float(annotation.get("score", 1.0))
         except (ValueError, KeyError, TypeError, AttributeError, *_TOO_LARGE):
             raise AnnotationError(
                 f"{where}: expected the image_id of one of the images and a bbox of x, y, width, "
                 f"height, got {str(annotation)[:80]}"
             ) from None
-        box = box_from_xywh(x, y, width, height, where=where)
-        yield (
-            where,
-            frame_index,
-            AnnotatedBox(track_id=track_id, bbox_xyxy_px=box, visibility=1.0, score=score),
+        box = AnnotatedBox(
+            track_id=track_id,
+            bbox_xyxy_px=box_from_xywh(x, y, width, height, where=where),
+            visibility=1.0,
+            score=score,
+            mask=partial(decode_coco, segmentation=drawn, where=where) if is_outline else None,
         )
+        yield where, frame_index, box
 
 
 def _track_id(annotation: dict[str, Any]) -> int:
@@ -289,6 +302,65 @@ def _box(
     return where, frame_index, AnnotatedBox(track_id=track_id, bbox_xyxy_px=box, visibility=1.0)
 
 
+_VIAME_HEAD = "# 1: Detection or Track-id"
+_POLYGON = re.compile(r"\((poly|hole)\)(.*)", re.DOTALL)
+
+
+def parse_viame(
+    text: str, path: Path, pictures: Sequence[Path] = ()
+) -> dict[int, list[AnnotatedBox]]:
+    """Boxes by frame, from a file's text; `path` is for messages.
+
+    `pictures` of the source, in its order; empty of a video. Raises AnnotationError with what was
+    expected, and where.
+    """
+    lines = csv.reader(text.splitlines())
+    rows = [
+        (f"{path}, line {lines.line_num}", cells)
+        for cells in lines
+        if cells and not cells[0].lstrip().startswith("#")
+    ]
+    names = dict(enumerate(dict.fromkeys(cells[1] for _, cells in rows if len(cells) > 1)))
+    by_key = frames_by_name(names, pictures, where=path)
+    frames = {name: by_key[key] for key, name in names.items()} if by_key else {}
+    boxes = [_viame_box(cells, frames, where) for where, cells in rows]
+    free = max((box.track_id for _, _, box in boxes), default=0) + 1
+    return group_by_frame(
+        (where, frame, replace(box, track_id=box.track_id or free)) for where, frame, box in boxes
+    )
+
+
+def _viame_box(
+    cells: list[str], frames: Mapping[str, int], where: str
+) -> tuple[str, int, AnnotatedBox]:
+    parts = list[list[Ring]]()
+    try:
+        track_id, frame = int(cells[0]), int(cells[2])
+        x0, y0, x1, y1, score = map(float, cells[3:8])
+        for kind, numbers in (one.groups() for one in map(_POLYGON.match, cells[9:]) if one):
+            ring = np.asarray_chkfinite(numbers.split(), np.float64).reshape(-1, 2)
+            if kind == "poly":
+                parts.append([ring])
+            else:
+                parts[-1].append(ring)
+        if track_id < 0 or frame < 0 or any(len(ring) < 3 for part in parts for ring in part):
+            raise ValueError
+    except (ValueError, IndexError):
+        raise AnnotationError(
+            f"{where}: expected VIAME's track, picture, frame from 0, box of four numbers, "
+            "confidence, length, and polygons of three points and more, "
+            f"got {','.join(cells)[:80]!r}"
+        ) from None
+    box = AnnotatedBox(
+        track_id=track_id,
+        bbox_xyxy_px=box_from_xywh(x0, y0, x1 - x0, y1 - y0, where=where),
+        visibility=1.0,
+        score=score if 0 <= score <= 1 else 1.0,
+        mask=partial(fill_parts, parts=parts) if parts else None,
+    )
+    return where, frames.get(cells[1], frame + 1), box
+
+
 _MAX_BYTES = 1 << 29  # chosen: some ten million boxes
 _PARSERS = {".json": parse_coco, ".xml": parse_cvat}
 
@@ -296,15 +368,18 @@ _PARSERS = {".json": parse_coco, ".xml": parse_cvat}
 def load_boxes(path: Path, *, pictures: Path | None = None) -> dict[int, list[AnnotatedBox]]:
     """Boxes by frame (from 1), within a frame by id; none from an empty text file.
 
-    `.json` is read as COCO, `.xml` as CVAT, everything else as MOT Challenge text. `pictures`: the
-    source of the frames; where it is a folder, COCO and CVAT name its pictures. Raises
-    AnnotationError with the place in the file and what was expected there.
+    `.json` is read as COCO, `.xml` as CVAT, a file with VIAME's header or named `.viame.csv` as
+    VIAME, everything else as MOT Challenge text. `pictures`: the source of the frames; where it is
+    a folder, all but MOT name its pictures. Raises AnnotationError with the place in the file and
+    what was expected there.
     """
-    text, suffix = _read_text(path), path.suffix.lower()
-    if suffix not in _PARSERS:
+    text, parse = _read_text(path), _PARSERS.get(path.suffix.lower())
+    if text.startswith(_VIAME_HEAD) or path.name.lower().endswith(".viame.csv"):
+        parse = parse_viame
+    if parse is None:
         return parse_mot(text, path)
     named = pictures_in(pictures) if pictures is not None and pictures.is_dir() else []
-    return _PARSERS[suffix](text, path, named)
+    return parse(text, path, named)
 
 
 def unused_boxes(frames: Mapping[int, Sequence[AnnotatedBox]], last_frame: int) -> list[str]:

@@ -4,11 +4,12 @@ import csv
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from stream_dmr.detection.box_files import UNKNOWN_ID, AnnotatedBox, load_boxes, unused_boxes
 from stream_dmr.detection.detector import Candidate, Detector
@@ -55,8 +56,10 @@ def open_annotated_fish(
 class AnnotatedFish:
     """A `FishFinder` that reads boxes and masks from files.
 
-    With boxes alone, the segmenter finds the masks. With masks alone, each id's tightest box is
-    used. With both, the boxes decide which fish there are; one without a mask gets an empty mask.
+    With boxes alone, masks are those that their file draws, and the segmenter finds the others.
+    With masks alone, each id's tightest box is
+    used. With both, the boxes decide which fish there are, the masks alone what they look like; one
+    without a mask gets an empty mask.
     """
 
     def __init__(
@@ -79,8 +82,9 @@ class AnnotatedFish:
 
     @property
     def gives_masks(self) -> bool:
-        """True with a masks folder: a fish that is in no mask gets an empty one."""
-        return self._masks is not None
+        """True with a masks folder, and where each box has a mask of its own."""
+        boxes = chain.from_iterable((self._boxes or {}).values())
+        return self._masks is not None or all(box.mask is not None for box in boxes)
 
     def detect(self, frame: Frame) -> list[Detection]:
         """The fish of one frame, ordered by id. Raises AnnotationError for an unusable mask."""
@@ -97,17 +101,25 @@ class AnnotatedFish:
             return [] if labels is None else _detections_of(labels)
         boxes = self._boxes_inside(frame, self._boxes.get(frame.frame_index, ()))
         labels = self._labels(frame, is_expected=bool(boxes))
-        nothing = None if self._masks is None else np.zeros(frame.image.shape[:2], bool)
         return [
             Detection(
                 source_id=box.track_id,
                 bbox_xyxy_px=box.bbox_xyxy_px,
-                mask=nothing if labels is None else labels.ids == box.track_id,
+                mask=self._mask_of(box, labels, frame.image.shape[:2]),
                 visible_fraction=box.visibility,
                 unknown=None if labels is None else labels.unknown,
             )
             for box in boxes
         ]
+
+    def _mask_of(
+        self, box: AnnotatedBox, labels: Labels | None, shape: tuple[int, int]
+    ) -> Bool[np.ndarray, "H W"] | None:
+        if labels is not None:
+            return labels.ids == box.track_id
+        if self._masks is not None:
+            return np.zeros(shape, bool)
+        return None if box.mask is None else box.mask(shape)
 
     @property
     def open_ids(self) -> None:

@@ -1,4 +1,4 @@
-"""A boxes file means the same in each of its three formats."""
+"""A boxes file means the same in each of its four formats."""
 
 import cv2
 import numpy as np
@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from stream_dmr.detection.box_files import AnnotatedBox, load_boxes
 from stream_dmr.errors import AnnotationError
-from tests.support.annotation_files import boxes_file, coco, cvat_video, mot
+from tests.support.annotation_files import boxes_file, coco, cvat_video, mot, viame
 
 numbers = st.integers(-200, 2000).map(lambda n: n / 8)
 
@@ -24,15 +24,15 @@ def contents(frames: dict[int, list[AnnotatedBox]]) -> list[tuple]:
 
 
 @given(tables, st.sampled_from(["track_id", "instance_id", "attributes"]))
-def test_the_same_boxes_in_three_formats_are_the_same(tmp_path_factory, table, id_place):
+def test_the_same_boxes_in_four_formats_are_the_same(tmp_path_factory, table, id_place):
     folder = tmp_path_factory.mktemp("boxes")
     texts = {"a.txt": mot(table), "a.json": coco(table, id_place=id_place)}
-    texts["a.xml"] = cvat_video(table)
+    texts |= {"a.xml": cvat_video(table), "a.csv": viame(table)}
     read = []
     for name, text in texts.items():
         (folder / name).write_text(text)
         read.append(contents(load_boxes(folder / name)))
-    assert read[0] == read[1] == read[2]
+    assert read[0] == read[1] == read[2] == read[3]
 
 
 def test_an_empty_file_means_no_fish(tmp_path):

@@ -1,4 +1,4 @@
-"""Boxes files in three formats, and label pictures, as the tests of annotations write them."""
+"""Boxes files in four formats, and label pictures, as the tests of annotations write them."""
 
 import json
 from collections.abc import Iterable
@@ -49,6 +49,15 @@ def cvat_video(table: Iterable[Row]) -> str:
         gone = '<box frame="40" outside="1" xtl="0" ytl="0" xbr="0" ybr="0"/>'
         tracks += f'<track id="{fish - 1}" label="fish">{boxes}{gone}</track>'
     return f"<annotations><version>1.1</version>{tracks}</annotations>"
+
+
+def viame(table: Iterable[Row]) -> str:
+    """With DIVE's header and cells of each kind; no masks."""
+    more = 'halibut,0.9,(kp) head 1.0 2.0,(atr) sex unknown,"(trk-atr) note small, pale"'
+    return "# 1: Detection or Track-id,2: ...\n# metadata,Fps: 10,exported_by: 1\n" + "".join(
+        f"{i},00:00:00.000000,{f - 1},{x},{y},{x + w},{y + h},0.5,-1,{more}\n"
+        for f, i, x, y, w, h in table
+    )
 
 
 LABELS_SIZE = {"width": 8, "height": 6}
