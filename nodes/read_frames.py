@@ -1,6 +1,6 @@
 """ReadFrames, the first stage: frames in order from a file, folder, camera or stream."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from stream_dmr.messages import Frame
@@ -14,15 +14,20 @@ class ReadFrames:
     def __init__(self, source: str, settings: ReadFramesSettings) -> None:
         """Raises SourceError where nothing can be read from `source`."""
         self.source = open_source(source, settings)
+        self._frames: Iterable[Frame] = self.source
         self._offset = 0
 
     def number_after(self, frame_index: int) -> None:
         """Number the frames on after those of earlier runs; call it before the iteration."""
         self._offset = frame_index
 
+    def give_again(self, frames: Iterable[Frame]) -> None:
+        """The next iteration gives these, which the source has given before and was closed."""
+        self._frames = frames
+
     def __iter__(self) -> Iterator[Frame]:
         """Raises SourceError where a frame doesn't fit those before it."""
-        for frame in self.source:
+        for frame in self._frames:
             yield replace(frame, frame_index=frame.frame_index + self._offset)
 
     def close(self) -> None:

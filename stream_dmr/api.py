@@ -187,6 +187,8 @@ _LOGGER = logging.getLogger("stream_dmr")
 class LoggingObserver(RunObserver):
     """Logs the warnings of a run, each once."""
 
+    needs_pictures = False
+
     def __init__(self) -> None:
         self._logged: set[str] = set()
 

@@ -181,6 +181,8 @@ def request_of(job: Job, out: Path) -> RunOptions:
 class _ProgressObserver(RunObserver):
     """Reports the share of a video's frames that is done."""
 
+    needs_pictures = False
+
     def __init__(self, on_progress: OnProgress) -> None:
         self._on_progress = on_progress
         self._num_frames: int | None = None

@@ -28,6 +28,8 @@ _MAX_SHOWN = 20  # differences of a replay
 class RunDisplay(RunObserver):
     """Progress on stderr: a bar on a terminal, elsewhere a plain line every few seconds."""
 
+    needs_pictures = False
+
     def __init__(self) -> None:
         self._console = Console(file=sys.stderr, highlight=False, soft_wrap=True)
         self._progress = Progress(

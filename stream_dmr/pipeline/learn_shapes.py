@@ -49,7 +49,7 @@ from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.pipeline.run_folder import require_folder
 from stream_dmr.pipeline.run_inputs import Inputs
 from stream_dmr.pipeline.run_observer import RunObserver
-from stream_dmr.pipeline.session import Session, Setup, keep_crops
+from stream_dmr.pipeline.session import KeptFrames, Session, Setup, keep_crops
 from stream_dmr.store.open_results import (
     LEARNT,
     MADE_BY_RUN,
@@ -160,7 +160,7 @@ def with_learnt_shapes(
     observer: RunObserver,
     on_part: Callable[[str], None],
 ) -> Inputs:
-    """The inputs with the shapes of the source's own fish, and its crops.
+    """The inputs with the shapes of the source's own fish, and its crops and frames.
 
     As they are where nothing is to be learnt: a mesh was given, the settings say so, or the source
     has no end.
@@ -172,12 +172,23 @@ def with_learnt_shapes(
     require_free_names(request.out, overwrite=request.overwrite)
     on_part("finding the fish")
     observer.stage("finding the fish, for their shapes")
+    frames = None
+    if not (config.recording.keeps_pictures or config.watch.port or observer.needs_pictures):
+        frames = KeptFrames(config.recording, request.out)
     crops = keep_crops(
-        inputs.reader, crop_fish, config.recording, stop=stop, on_frame=observer.frame_done
+        inputs.reader,
+        crop_fish,
+        config.recording,
+        kept_frames=frames,
+        stop=stop,
+        on_frame=observer.frame_done,
     )
     inputs.reader.close()
-    reader = ReadFrames(request.source, config.read_frames)
-    inputs = replace(inputs, reader=reader, crops=crops)
+    if frames is None:
+        inputs = replace(inputs, reader=ReadFrames(request.source, config.read_frames))
+    else:
+        inputs.reader.give_again(frames)
+    inputs = replace(inputs, crops=crops, kept_frames=frames)
     if stop.is_set():
         return inputs
     on_part("learning their shapes")

@@ -86,6 +86,7 @@ class MessageFlow:
         self.totals = RunTotals(max_fish=_MAX_SUMMARY_FISH if inputs.is_endless else None)
         self.policy = ErrorPolicy(is_endless=inputs.is_endless, on_notice=observer.warn)
         self._seen, self._observer = outputs.seen, observer
+        self._kept_frames = inputs.kept_frames
         self._writer = _result_writer(inputs, outputs, stop, on_notice=observer.warn)
         _begin_positions(inputs, outputs, observer)
         self._positions = PositionFeed(inputs.positions, self._take_position)
@@ -103,7 +104,10 @@ class MessageFlow:
 
     def take(self, message: Message) -> Message:
         """Take any message of the chain; return what the next stage gets."""
-        message = self._writer.write(message)
+        payload = None
+        if self._kept_frames is not None and isinstance(message, Frame):
+            payload = self._kept_frames.payload
+        message = self._writer.write(message, payload=payload)
         self.totals.take(message)
         self._observer.take(message)
         self._seen.take(message)

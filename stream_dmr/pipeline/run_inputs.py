@@ -21,7 +21,7 @@ from stream_dmr.pipeline.config import (
     to_toml,
 )
 from stream_dmr.pipeline.run_options import RunOptions, without_password
-from stream_dmr.pipeline.session import KeptCrops, Setup
+from stream_dmr.pipeline.session import KeptCrops, KeptFrames, Setup
 from stream_dmr.recording.header import InputFile, RunHeader, RunInputs
 from stream_dmr.sources.open_source import open_positions
 from stream_dmr.sources.positions import PositionSource
@@ -79,6 +79,7 @@ class Inputs(Setup):
     reader: ReadFrames
     positions: PositionSource | None = None  # None: none were asked for
     crops: KeptCrops | None = None  # of the whole source, where its fish were found before
+    kept_frames: KeptFrames | None = None  # that the reader gives, where it read them before
 
     @property
     def source(self) -> Source:

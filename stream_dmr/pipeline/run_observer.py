@@ -32,6 +32,9 @@ class RunObserver:
     """Is called as a run goes on, from the run's threads. This base class ignores all of it."""
 
     address: str | None = None  # where it shows the run, once `open` has been called
+    # False: `take` makes nothing of the images of frames, so a second pass may leave them out or
+    # give them smaller.
+    needs_pictures = True
 
     def warn(self, line: str) -> None:
         """The user should know this; the same line may come again."""

@@ -32,7 +32,7 @@ from stream_dmr.pipeline.run_inputs import Inputs
 from stream_dmr.pipeline.run_observer import OpenRun, RunObserver
 from stream_dmr.recording.header import RunHeader, RunStart
 from stream_dmr.recording.reading import Recording, learnt_shapes, messages_of, open_recordings
-from stream_dmr.recording.record import SinkFactory, SinkStates
+from stream_dmr.recording.record import Record, SinkFactory, SinkStates
 from stream_dmr.recording.recorder import STEM, Recorder, open_recording_files
 from stream_dmr.recording.repair import Repair
 from stream_dmr.recording.retention import Retention
@@ -91,10 +91,16 @@ class ResultWriter:
         for fish in interrupted:
             self._take_iou(fish)
 
-    def write(self, message: Message) -> Message:
-        """Write a message; returns it as the next stage must get it, see `Recorder.write`."""
+    def write(self, message: Message, *, payload: bytes | None = None) -> Message:
+        """Write a message; returns it as the next stage must get it, see `Recorder.write`.
+
+        `payload`: its encoding, where it was made before.
+        """
         self.store(message)
-        message = self._recorder.write(message)
+        if payload is None:
+            message = self._recorder.write(message)
+        else:
+            self._recorder.put(Record.of_payload(message, payload))
         self.tabulate(message)
         return message
 

@@ -4,12 +4,14 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from tempfile import SpooledTemporaryFile
+from pathlib import Path
+from tempfile import SpooledTemporaryFile, TemporaryFile
 from threading import Event
 from typing import IO, TypeVar
 
 from stream_dmr.camera import Calibration, Camera
 from stream_dmr.errors import RecordingError
+from stream_dmr.files import writing_to
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.shape.stocks import learn_shapes
 from stream_dmr.messages import (
@@ -30,13 +32,14 @@ from stream_dmr.nodes.smooth_length import SmoothLength
 from stream_dmr.pipeline.chain import Node, run_chain
 from stream_dmr.pipeline.config import Config
 from stream_dmr.pipeline.run_options import Stage
-from stream_dmr.recording.codec import decode, encode
+from stream_dmr.recording.codec import compress, decode, encode
 from stream_dmr.recording.frame_images import FrameRestorer, RecordedPictures, has_original_pixels
 from stream_dmr.recording.header import RunStart
 from stream_dmr.recording.reading import Recording
-from stream_dmr.recording.record import as_recorded
+from stream_dmr.recording.record import as_recorded, make_record
 from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.recording.topics import RecordingSettings
+from stream_dmr.recording.view_geometry import FrameThrottle, shrink_by_halves
 from stream_dmr.template.template import Template
 from stream_dmr.tracking.finder import FishFinder
 from stream_dmr.tracking.timeout import TrackTimeout
@@ -230,21 +233,65 @@ class KeptCrops:
         return crops
 
 
+_LENGTH_BYTES = 4  # before each part of the file
+
+
+class KeptFrames:
+    """The frames of a first pass as a recording by reference has them, to be iterated once.
+
+    Those that the view shows have a picture of its size, the others none.
+    """
+
+    def __init__(self, settings: RecordingSettings, folder: Path) -> None:
+        """They are on the disk of `folder`, without a name, so that a crash leaves nothing."""
+        self._settings, self._folder = settings, folder
+        self._throttle = FrameThrottle(settings.view_rate_hz)
+        self._file: IO[bytes] = TemporaryFile(dir=folder)  # noqa: SIM115, see `__iter__`
+        self.payload = b""  # of the frame that was given last, as it was encoded with its pixels
+
+    def keep(self, frame: Frame) -> None:
+        """Take the next frame. Raises OutputError where the disk is full."""
+        shown = b""
+        if self._throttle.shows(frame):
+            small = shrink_by_halves(frame.image, most_px=self._settings.view_px)
+            quality = self._settings.jpeg_quality
+            shown = encode(frame, picture=compress(small, format="jpeg", jpeg_quality=quality))
+        with writing_to(self._folder):
+            for part in (make_record(frame, self._settings).payload, shown):
+                self._file.write(len(part).to_bytes(_LENGTH_BYTES) + part)
+
+    def __iter__(self) -> Iterator[Frame]:
+        with self._file:
+            self._file.seek(0)
+            while payload := self._next():
+                self.payload = payload
+                yield decode(Frame, self._next() or payload)
+
+    def _next(self) -> bytes:
+        return self._file.read(int.from_bytes(self._file.read(_LENGTH_BYTES)))
+
+
 def keep_crops(
     frames: ReadFrames,
     crop_fish: CropFish,
     settings: RecordingSettings,
     *,
+    kept_frames: KeptFrames | None,
     stop: Event,
     on_frame: Callable[[], None],
 ) -> KeptCrops:
-    """The crops of a source, as a recording with these settings would hold them."""
+    """The crops of a source, as a recording with these settings would hold them.
+
+    `kept_frames` gets the frames, if it is given.
+    """
     kept = KeptCrops()
 
     def take(message: Message) -> Message:
         message = as_recorded(message, settings)  # from decoded pixels, as in the run
         if isinstance(message, FishCrop | TrackEnded):
             kept.keep(message)
+        elif isinstance(message, Frame) and kept_frames is not None:
+            kept_frames.keep(message)
         return message
 
     run_chain(frames, [crop_fish], on_message=take, on_frame=on_frame, stop=stop)

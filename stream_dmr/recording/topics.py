@@ -169,6 +169,11 @@ class RecordingSettings(Settings):
     )
 
     @property
+    def keeps_pictures(self) -> bool:
+        """True where the recording has the frames' pictures, beside those of the .rrd."""
+        return self.frames != "reference" or self.foxglove
+
+    @property
     def keeps_crops(self) -> bool:
         return self.crops in ("jpeg", "png")
 

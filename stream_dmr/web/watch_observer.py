@@ -67,6 +67,8 @@ class RepeatFilter(logging.Filter):
 class JsonLog(RunObserver):
     """Logs the events of a run, for a service's log."""
 
+    needs_pictures = False
+
     def __init__(self) -> None:
         self._log = logging.getLogger("stream_dmr.run")
         self._log.setLevel(logging.INFO)
@@ -152,6 +154,7 @@ class WatchObserver(RunObserver):
         self._observer = observer
         self.stage, self.notice = observer.stage, observer.notice
         self.serving, self.begin = observer.serving, observer.begin
+        self.needs_pictures = observer.needs_pictures
         self._state: RunState | None = None  # from `open` on
         self._opened = ExitStack()
 

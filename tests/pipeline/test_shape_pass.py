@@ -15,6 +15,7 @@ from stream_dmr.evidence.seal import known_files
 from stream_dmr.files import FolderLock
 from stream_dmr.fitting.shape.candidates import AUTO, CandidateShapes, load_shapes
 from stream_dmr.fitting.shape.space import reshaped
+from stream_dmr.messages import FishCrop, Frame, Message
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.pipeline.config import Config
 from stream_dmr.pipeline.learn_shapes import learnt_from, with_learnt_shapes
@@ -24,6 +25,7 @@ from stream_dmr.pipeline.run_inputs import Inputs, checked_inputs
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.run_options import RunOptions
 from stream_dmr.pipeline.session import Setup
+from stream_dmr.recording.reading import open_recordings
 from stream_dmr.store.open_results import LEARNT, learnt_files
 from stream_dmr.template.template_file import load_template
 from tests.support.command import rows
@@ -35,7 +37,8 @@ from tests.support.tiny_clip import write_clip, write_template
 class Listener(RunObserver):
     """Hears what a run says, and asks it to stop after so many frames."""
 
-    def __init__(self, *, stop_after: int | None = None) -> None:
+    def __init__(self, *, stop_after: int | None = None, needs_pictures: bool = True) -> None:
+        self.needs_pictures, self.sizes = needs_pictures, list[tuple[int, ...]]()
         self.stop, self._stop_after = threading.Event(), stop_after
         self.notices, self.warnings = list[str](), list[str]()
         self.num_frames = 0
@@ -45,6 +48,10 @@ class Listener(RunObserver):
 
     def warn(self, line: str) -> None:
         self.warnings.append(line)
+
+    def take(self, message: Message) -> None:
+        if isinstance(message, Frame):
+            self.sizes.append(message.image.shape)
 
     def frame_done(self) -> None:
         self.num_frames += 1
@@ -114,6 +121,23 @@ def test_what_can_be_refused_is_refused_before_the_first_pass(
 def test_what_was_learnt_is_written_recorded_and_said(learnt: tuple[Path, Listener]):
     assert_learnt(*learnt)
     assert [row["status"] for row in rows(learnt[0] / "lengths.csv")] == ["measured"]
+
+
+def test_the_film_is_read_once_where_its_pictures_are_not_needed(
+    clip: Path, learnt: tuple[Path, Listener], tmp_path: Path
+):
+    observer = Listener(needs_pictures=False)
+    out = measured(clip, tmp_path / "out", observer).out
+    height, width, _ = learnt[1].sizes[0]
+    assert len({*learnt[1].sizes}) == 1
+    assert {*observer.sizes} == {(height, width, 3), (0, 0, 3)}  # those that the view shows, others
+    for name in ("lengths.csv", "frames.csv"):
+        assert (out / name).read_bytes() == (learnt[0] / name).read_bytes()
+    twice, once = (open_recordings([of / "recording.mcap"]) for of in (learnt[0], out))
+    for kind in (Frame, FishCrop):
+        assert [*once.payloads([kind])] == [*twice.payloads([kind])]
+    replayed = ReplayOptions(recordings=[out / "recording.mcap"], first="crop", check=True)
+    assert not replay(replayed, stop=threading.Event()).mismatches
 
 
 def assert_learnt(out: Path, observer: Listener) -> None:
