@@ -39,7 +39,7 @@ from stream_dmr.recording.reading import Recording
 from stream_dmr.recording.record import as_recorded, make_record
 from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.recording.topics import RecordingSettings
-from stream_dmr.recording.view_geometry import FrameThrottle, shrink_by_halves
+from stream_dmr.recording.view_geometry import VIEW_QUALITY, FrameThrottle, shrink_by_halves
 from stream_dmr.template.template import Template
 from stream_dmr.tracking.finder import FishFinder
 from stream_dmr.tracking.timeout import TrackTimeout
@@ -254,8 +254,8 @@ class KeptFrames:
         shown = b""
         if self._throttle.shows(frame):
             small = shrink_by_halves(frame.image, most_px=self._settings.view_px)
-            quality = self._settings.jpeg_quality
-            shown = encode(frame, picture=compress(small, format="jpeg", jpeg_quality=quality))
+            # Compressed once more at the same quality, as for the view, it stays as it is.
+            shown = encode(frame, picture=compress(small, format="jpeg", jpeg_quality=VIEW_QUALITY))
         with writing_to(self._folder):
             for part in (make_record(frame, self._settings).payload, shown):
                 self._file.write(len(part).to_bytes(_LENGTH_BYTES) + part)

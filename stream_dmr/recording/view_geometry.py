@@ -22,6 +22,7 @@ T = TypeVar("T")
 
 # Frames, or fish in a frame, that later stages may still report on: the chain's queues hold fewer.
 _MAX_PENDING = 64
+VIEW_QUALITY = 70  # of the pictures, as JPEG: they are only for orientation
 
 
 class FrameThrottle:

@@ -25,6 +25,7 @@ from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.record import Record
 from stream_dmr.recording.topics import FOXGLOVE_TOPICS, RecordingSettings
 from stream_dmr.recording.view_geometry import (
+    VIEW_QUALITY,
     FrameThrottle,
     PendingItems,
     color,
@@ -35,7 +36,6 @@ from stream_dmr.recording.view_geometry import (
 )
 
 _CAMERA, _PLANE = "camera", "plane"
-_JPEG_QUALITY = 70  # pictures are only for orientation
 _LIFETIME_NS = 2_000_000_000  # how long a fish is shown after its last message
 _M_PER_MM = 1e-3
 _OPACITY = 0.7  # so that the midline shows through the mesh
@@ -87,7 +87,7 @@ class FoxgloveTopics:
             yield "/foxglove/camera", self._camera(self._calibration, now)
             yield "/foxglove/plane", _plane(self._calibration, now)
         picture = shrink_by_halves(frame.image, most_px=self._most_px)
-        jpeg = compress(picture, format="jpeg", jpeg_quality=_JPEG_QUALITY).data
+        jpeg = compress(picture, format="jpeg", jpeg_quality=VIEW_QUALITY).data
         shown = CompressedImage(timestamp=now, frame_id=_CAMERA, data=jpeg, format="jpeg")
         yield "/foxglove/picture", shown
 

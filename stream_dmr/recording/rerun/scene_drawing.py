@@ -40,6 +40,7 @@ from stream_dmr.recording.rerun.blueprint import (
 from stream_dmr.recording.topics import RecordingSettings
 from stream_dmr.recording.view_geometry import (
     PALETTE,
+    VIEW_QUALITY,
     FrameThrottle,
     PendingItems,
     color,
@@ -115,7 +116,6 @@ def _times(moments: Sequence[tuple[int, int]]) -> list[rr.TimeColumn]:
 
 
 _HALF_PIXEL = 0.5  # Rerun's origin is the corner of the top-left pixel, ours its centre
-_JPEG_QUALITY = 70  # pictures are only for orientation
 _MAX_TRACK_POINTS = 2000
 _TRACK_COLOR = (90, 170, 230)
 
@@ -217,7 +217,7 @@ class SceneDrawing:
             self._add(topics.MASKS, rr.EncodedImage, frame, blob=[self._no_masks])
         if frame.image.size:
             picture = shrink_by_halves(frame.image, most_px=self._settings.view_px)
-            jpeg = compress(picture, format="jpeg", jpeg_quality=_JPEG_QUALITY)
+            jpeg = compress(picture, format="jpeg", jpeg_quality=VIEW_QUALITY)
             self._add(topics.FRAME, rr.EncodedImage, frame, blob=[jpeg.data])
 
     def _crop(self, crop: FishCrop) -> None:
