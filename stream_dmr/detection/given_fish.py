@@ -82,9 +82,10 @@ class AnnotatedFish:
 
     @property
     def gives_masks(self) -> bool:
-        """True with a masks folder, and where each box has a mask of its own."""
-        boxes = chain.from_iterable((self._boxes or {}).values())
-        return self._masks is not None or all(box.mask is not None for box in boxes)
+        """True with a masks folder, and where there are boxes and each has a mask of its own."""
+        boxes = [*chain.from_iterable((self._boxes or {}).values())]
+        has_all = bool(boxes) and all(box.mask is not None for box in boxes)
+        return self._masks is not None or has_all
 
     def detect(self, frame: Frame) -> list[Detection]:
         """The fish of one frame, ordered by id. Raises AnnotationError for an unusable mask."""
