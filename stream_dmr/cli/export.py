@@ -34,7 +34,9 @@ def export(
     all_columns: Annotated[
         bool, "With --fish csv: also the columns that are empty throughout."
     ] = False,
-    viame: Annotated[bool, "tracks.viame.csv: boxes, outlines and ends, for DIVE."] = False,
+    viame: Annotated[
+        bool, "tracks.viame.csv: tracks with lengths, outlines and ends, for DIVE."
+    ] = False,
     agency: Annotated[
         list[Agency] | None,
         typer.Option(
