@@ -315,11 +315,15 @@ def parse_viame(
     expected, and where.
     """
     lines = csv.reader(text.splitlines())
-    rows = [
-        (f"{path}, line {lines.line_num}", cells)
-        for cells in lines
-        if cells and not cells[0].lstrip().startswith("#")
-    ]
+    try:
+        rows = [
+            (f"{path}, line {lines.line_num}", cells)
+            for cells in lines
+            if cells and not cells[0].lstrip().startswith("#")
+        ]
+    except csv.Error as error:  # a cell of more than 128 KiB
+        where = f"{path}, line {lines.line_num}"
+        raise AnnotationError(f"{where}: expected a row of VIAME CSV, got: {error}") from None
     names = dict(enumerate(dict.fromkeys(cells[1] for _, cells in rows if len(cells) > 1)))
     by_key = frames_by_name(names, pictures, where=path)
     frames = {name: by_key[key] for key, name in names.items()} if by_key else {}
