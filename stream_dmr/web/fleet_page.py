@@ -248,7 +248,7 @@ def read_memory(path: Path, boxes: Iterable[Box]) -> list[BoxState]:
         kept = _Kept.model_validate(json.loads(read_text(path, max_bytes=_MAX_BYTES))).boxes
     except FileNotFoundError:
         kept = dict[str, _KeptBox]()
-    except (OSError, ValueError, ValidationError) as error:
+    except (OSError, ValueError, ValidationError, RecursionError) as error:
         raise OutputError(
             f"{path}: expected what an earlier stream-dmr fleet kept there, it can't be read; "
             "choose another --out, or remove it"

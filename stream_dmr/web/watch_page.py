@@ -102,7 +102,7 @@ class WatchServer(TokenServer):
         if self._state.hauls is None:
             raise UserError("expected a run that takes hauls")
         told = None
-        with suppress(ValueError):
+        with suppress(ValueError, RecursionError):
             told = json.loads(request.body)
         if not isinstance(told, dict):
             got = request.body.decode(errors="replace")

@@ -106,7 +106,9 @@ def test_a_running_box_takes_a_haul_as_of_now_alone(server: WatchServer, hauls: 
     assert invoke("haul", {"start": None, server.address: None}).out == "haul 1: start\n"
 
 
-@pytest.mark.parametrize("told", ['["start"]', '"start"', "3", "null", "true", "[1", "\xff"])
+@pytest.mark.parametrize(
+    "told", ['["start"]', '"start"', "3", "null", "true", "[1", "\xff", "[" * 999]
+)
 def test_what_is_no_haul_is_refused_in_one_line(server: WatchServer, hauls: HaulLog, told: str):
     headers = {"Content-Type": "application/json"}
     request = urllib.request.Request(f"{server.address}haul", told.encode("latin-1"), headers)
