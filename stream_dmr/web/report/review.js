@@ -63,6 +63,7 @@ async function send(verdict) {
     isRefused = false;
     return say(`Nothing was saved, so nothing is taken back.${DATA.review.undo && ` Once more takes back: ${DATA.review.undo}.`}`);
   }
+  const seenBefore = new Set(DATA.seen);  // `refresh` may bring a new fish before the answer does
   let answered;
   try {
     const answer = await fetch("verdict", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ run: fish?.run ?? 0, track_id: fish?.track_id ?? 0, ...verdict }) });
@@ -79,7 +80,7 @@ async function send(verdict) {
   takeRows(rows);
   show();
   if (DECISIONS.includes(verdict.kind) && document.getElementById("goes-on").checked) return say(`${said}. ${goToNext()}`);
-  const wanted = verdict.kind === "add" ? rows.find((row) => !DATA.seen.has(row.id)) : verdict.kind === "undo" ? rows.find((row) => !row.gone) : null;
+  const wanted = verdict.kind === "add" ? rows.find((row) => !seenBefore.has(row.id)) : verdict.kind === "undo" ? rows.find((row) => !row.gone) : null;
   const shown = wanted ?? chosenFish() ?? DATA.fish[0];
   for (const row of rows) DATA.seen.add(row.id);
   if (shown) showFish(shown);
