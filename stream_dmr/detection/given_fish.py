@@ -56,10 +56,9 @@ def open_annotated_fish(
 class AnnotatedFish:
     """A `FishFinder` that reads boxes and masks from files.
 
-    With boxes alone, masks are those that their file draws, and the segmenter finds the others.
-    With masks alone, each id's tightest box is
-    used. With both, the boxes decide which fish there are, the masks alone what they look like; one
-    without a mask gets an empty mask.
+    With boxes alone, masks are those that their file draws, the segmenter finds the others. With
+    masks alone, each id's tightest box is used. With both, the boxes decide which fish there are,
+    the masks alone what they look like; one without a mask gets an empty mask.
     """
 
     def __init__(
