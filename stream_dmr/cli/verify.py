@@ -7,6 +7,7 @@ import typer
 
 from stream_dmr.cli.shared_options import OverwriteOption, warn
 
+_INTERRUPTED = 3  # an exit code of its own: scripts must tell a crash from a change
 _Source = Annotated[
     str | None,
     "The recorded clip, for pictures of the fish.",
@@ -21,7 +22,11 @@ def verify(
         Path | None, "The device's FILE.pub: all that it signed is checked by it as well."
     ] = None,
 ) -> None:
-    """Check that results are still what their run measured; exit 1 and say what was changed."""
+    """Check that results are still what their run measured, and say what was changed.
+
+    Exit code 1: something was changed. 3: nothing but what an interrupted run leaves, or one that
+    goes on.
+    """
     from stream_dmr.evidence.verify_batch import verify_all
     from stream_dmr.evidence.verify_folder import Change, check_signatures, summary
     from stream_dmr.store.fish import run_notes
@@ -37,6 +42,7 @@ def verify(
         for database in databases:
             check = check_signatures(database.parent, signed_by)
             changes += [Change(database.parent, what) for what in check.changes]
+            changes += [Change(database.parent, what, is_by_crash=True) for what in check.crashes]
             notes += [f"{database.parent}: {note}" for note in check.notes]
     for change in changes:
         print(f"{change.path}: {change.what}")
@@ -49,9 +55,12 @@ def verify(
             lines = [f"its runs can't be told: {type(error).__name__}"]
         for line in lines:
             print(f"{database}: {line}")
-    if changes:
+    if not all(change.is_by_crash for change in changes):
         raise typer.Exit(1)
     print(f"{folder}: {num_files} files, nothing was changed")
+    if changes:
+        print(f"{folder}: not finished: a run was interrupted by a crash, or goes on")
+        raise typer.Exit(_INTERRUPTED)
 
 
 def report(

@@ -40,7 +40,8 @@ from stream_dmr.store.verdicts import read_verdicts, verdict_line
 from stream_dmr.version import __version__
 
 RECORDINGS = ("*.mcap", "*.rrd")
-TABLES = ("lengths.csv", "frames*.csv")
+CONTINUED = ("lengths.csv", "frames.csv")  # tables to which the next run in a folder adds rows
+TABLES = (*CONTINUED, "frames-*.csv")
 
 
 class SignedFiles:
@@ -144,7 +145,7 @@ def seal_run(folder: Path, *, with_recordings: bool) -> None:
     by their runs.
     """
     database = folder / DATABASE
-    kinds = ("*.csv", "*.mcap", "*.rrd") if with_recordings else ("lengths.csv", "frames.csv")
+    kinds = ("*.csv", "*.mcap", "*.rrd") if with_recordings else CONTINUED
     files = [path for kind in kinds for path in folder.glob(kind)]
     files += learnt_files(folder)
     made = _new(read_runs(database))

@@ -24,8 +24,8 @@ import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from stream_dmr.errors import OutputError, UserError
-from stream_dmr.evidence.seal import NAME as PROVENANCE
 from stream_dmr.evidence.seal import (
+    CONTINUED,
     RECORDINGS,
     begins_as,
     haul_lines,
@@ -34,6 +34,7 @@ from stream_dmr.evidence.seal import (
     read_provenance,
     verdict_lines,
 )
+from stream_dmr.evidence.seal import NAME as PROVENANCE
 from stream_dmr.files import is_locked, sha256_of
 from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.messages import FittedMesh, LengthEstimate, LocalizedFish
@@ -211,10 +212,11 @@ Checks = Mapping[str, Callable[[Path], Iterable[tuple[Path, str]]]]
 
 
 class Change(NamedTuple):
-    """One file, run or fish that was changed after it was written."""
+    """One file, run or fish that is not as its run wrote it, or that its run never finished."""
 
     path: Path
     what: str
+    is_by_crash: bool = False  # a crash explains it; nobody need have changed anything
 
 
 def verify(folder: Path, others: Checks = MappingProxyType({})) -> tuple[list[Change], int]:
@@ -243,23 +245,27 @@ def _changes(folder: Path, others: Checks) -> Iterator[Change]:
     for path in sorted(folder.iterdir()):
         if not path.is_file() and not path.is_dir():
             yield Change(path, "is no file: a pipe, a device or a link to nothing")
-    yield from _broken(folder / PROVENANCE, _against_provenance(folder))
+    database = database_of(folder)
+    runs: dict[str, RunFacts] = {}
+    fish: dict[int, _Row] = {}
+    lengths: dict[str, list[str]] = {}
+    stored = _broken(folder / DATABASE, _stored(folder / DATABASE, runs, fish, lengths))
+    of_rows = [] if database is None else [*stored]
+    yield from _broken(folder / PROVENANCE, _against_provenance(folder, runs))
     for name, check in others.items():
         if (folder / name).is_file():
             findings = (Change(*finding) for finding in check(folder))
             yield from _broken(folder / name, findings)
-    database = database_of(folder)
     if database is None:
         return
-    runs: dict[str, RunFacts] = {}
-    fish: dict[int, _Row] = {}
-    lengths: dict[str, list[str]] = {}
-    yield from _broken(database, _stored(database, runs, fish, lengths))
+    yield from of_rows
     last_frames = {track_id: row["last_frame"] for track_id, row in fish.items()}
     edited = changed_edits(database, last_frames)
     yield from _broken(database, (Change(database, line) for line in edited))
+    is_cut = bool(_unfinished_run(runs))
     if runs:
-        yield from _csv(folder / "lengths.csv", LENGTHS_COLUMNS, lengths, witness=DATABASE)
+        table = folder / "lengths.csv"
+        yield from _csv(table, LENGTHS_COLUMNS, lengths, witness=DATABASE, is_cut=is_cut)
     frames: dict[str, list[str]] = {}
     # Every .mcap, and an .rrd, which is slow to read, where nothing knows it.
     known = known_files(folder)
@@ -268,7 +274,8 @@ def _changes(folder: Path, others: Checks) -> Iterator[Change]:
     for recording in sorted(path for path in found if path.is_file()):
         yield from _broken(recording, _recording(recording, runs, fish, frames))
     if frames:
-        yield from _csv(folder / "frames.csv", FRAMES_COLUMNS, frames, witness="the recording")
+        table, witness = folder / "frames.csv", "the recording"
+        yield from _csv(table, FRAMES_COLUMNS, frames, witness=witness, is_cut=is_cut)
 
 
 def _broken(path: Path, check: Iterable[Change]) -> Iterator[Change]:
@@ -280,6 +287,11 @@ def _stored(
 ) -> Iterator[Change]:
     """Read `runs`, the rows of `fish`, and theirs of lengths.csv; each broken row is a finding."""
     runs |= read_runs(database)
+    going_on = _unfinished_run(runs) if is_locked(database.parent) else ""
+    for run_id, facts in runs.items():
+        if facts.ended_by == NOT_ENDED:
+            what = "goes on" if run_id == going_on else "was interrupted by a crash"
+            yield Change(database, f"run {run_id} {what}", is_by_crash=True)
     for row in read_rows(database, FISH):
         track_id = row["track_id"]
         fish[track_id] = row
@@ -288,6 +300,11 @@ def _stored(
             lengths[str(track_id)] = lengths_row(estimate_of(row), flags)
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             yield Change(database, f"fish {track_id}: its row is damaged: {error!r}")
+
+
+def _unfinished_run(runs: Mapping[str, RunFacts]) -> str:
+    """The last run, where it has no end: a crash may have cut off the tables, too; else ""."""
+    return next((one for one in [*runs][-1:] if runs[one].ended_by == NOT_ENDED), "")
 
 
 def summary(database: Path) -> Iterator[str]:
@@ -309,20 +326,23 @@ def _utc(time_ns: int | None) -> str:
         return "?"
 
 
-def _against_provenance(folder: Path) -> Iterator[Change]:
+def _against_provenance(folder: Path, runs: Mapping[str, RunFacts]) -> Iterator[Change]:
     try:
         made = read_provenance(folder)
     except (ValueError, OSError) as error:
         yield Change(folder / PROVENANCE, f"damaged: {error}")
         return
+    unfinished = _unfinished_run(runs)
     if made is None:
-        yield Change(folder / PROVENANCE, "is missing; files were compared with each other alone")
+        what = "is missing; files were compared with each other alone"
+        yield Change(folder / PROVENANCE, what, is_by_crash=bool(unfinished))
         return
+    goes_on = bool(unfinished) and unfinished not in made["runs"]
     for name, expected in made["files"].items():
         path = folder / name
         if not path.is_file():
             yield Change(path, "is missing")
-        elif sha256_of(path) != expected:
+        elif sha256_of(path) != expected and not (goes_on and name in CONTINUED):
             yield Change(path, f"was changed: its SHA-256 is not that in {PROVENANCE}")
     database = database_of(folder)
     if database is None:
@@ -441,14 +461,26 @@ def _recording(
                 now, was = stored.get(column), getattr(message, column)
                 if now != was:
                     yield Change(database, f"{name}: {column} is {now}, {path.name} says {was}")
+    has_crashed = any(one.ended_by == NOT_ENDED for one in runs.values())
     for line in recording.warnings:
-        yield Change(path, line.removeprefix(f"{path}: "))
+        # A crash leaves a torn .mcap.part, which is repaired; .mcap is the name of a whole one.
+        is_cut_off = path.suffix == ".mcap" and ": torn; " in line
+        what = line.removeprefix(f"{path}: ")
+        yield Change(path, what, is_by_crash=has_crashed and not is_cut_off)
 
 
 def _csv(
-    path: Path, columns: Sequence[str], expected: dict[str, list[str]], *, witness: str
+    path: Path,
+    columns: Sequence[str],
+    expected: dict[str, list[str]],
+    *,
+    witness: str,
+    is_cut: bool,
 ) -> Iterator[Change]:
-    """Compare a table with rows of a witness; only frames.csv may have more rows."""
+    """Compare a table with rows of a witness; only frames.csv may have more rows.
+
+    `is_cut`: a crash may have kept the last rows from it.
+    """
     if not path.is_file():
         yield Change(path, "is missing")
         return
@@ -462,12 +494,14 @@ def _csv(
         found |= found_rows
     # Where room was short the oldest tables went, maybe with some rows of the first frame left.
     first = min((int(row[0]) for row in found.values()), default=0) if older else 0
-    for name, row in expected.items():
+    last = max((number for number, name in enumerate(expected) if name in found), default=-1)
+    for number, (name, row) in enumerate(expected.items()):
         if older and int(row[0]) <= first:
             continue
         label = "frame {}, fish {}".format(*name.split(",")) if "," in name else f"fish {name}"
         if name not in found:
-            yield Change(path, f"{label} is missing; {witness} has it")
+            is_at_end, what = number > last, f"{label} is missing; {witness} has it"
+            yield Change(path, what, is_by_crash=is_cut and is_at_end)
             continue
         for column, now, was in zip(columns, found[name], row, strict=True):
             if now != was:
@@ -491,12 +525,13 @@ class SignatureCheck(NamedTuple):
     """What was found in one folder."""
 
     changes: list[str]
+    crashes: list[str]  # what a crash explains, or somebody who cut off what came last
     notes: list[str]  # what a reader must know beside
 
 
 def check_signatures(folder: Path, key: Ed25519PublicKey) -> SignatureCheck:
     """Check the chain of a folder's lengths.db, and everything in the folder against it."""
-    check = SignatureCheck([], [])
+    check = SignatureCheck([], [], [])
     try:
         database = open_for_reading(folder / DATABASE)
     except OutputError as error:
@@ -513,7 +548,8 @@ def check_signatures(folder: Path, key: Ed25519PublicKey) -> SignatureCheck:
             (check.changes, "its chain", _broken_links(entries, key)),
             (check.changes, "its fish", _rows_by_name(signed, FISH, rows(database, FISH))),
             (check.changes, "its events", _events(signed)),
-            (check.changes, "its runs", _runs(signed, is_going_on=is_locked(folder))),
+            (check.changes, "its runs", _runs(signed)),
+            (check.crashes, "its last run", _last_run(signed)),
             (check.changes, "its files", _files(signed)),
             (check.changes, "its marks, clips or scenes", _signature_state(signed)),
             (check.changes, "its checks of the scale", _checks(signed)),
@@ -546,6 +582,11 @@ class _Signed(NamedTuple):
     def hashes(self, kind: str) -> dict[str, str]:
         """The last hash by name."""
         return {entry.name: entry.content_sha256 for entry in self.of(kind)}
+
+    def unfinished_run(self) -> ChainEntry | None:
+        """The begin of the last run, where its end is not signed."""
+        last = next(reversed(self.of(RUNS.kind)), None)
+        return last if last and last.name not in self.hashes(END) else None
 
 
 def _extend(found: list[str], name: str, lines: Iterable[str]) -> None:
@@ -635,11 +676,11 @@ def _events(signed: _Signed) -> Iterator[str]:
         yield "an event is there twice"
 
 
-def _runs(signed: _Signed, *, is_going_on: bool) -> Iterator[str]:
+def _runs(signed: _Signed) -> Iterator[str]:
     stored = list(rows(signed.database, RUNS))
     begun = ({k: v for k, v in row.items() if k not in END_COLUMNS} for row in stored)
     yield from _rows_by_name(signed, RUNS, begun)
-    ends, runs = signed.hashes(END), [entry.name for entry in signed.of(RUNS.kind)]
+    ends = signed.hashes(END)
     for row in stored:
         name = str(row["run_id"])
         if name in ends:
@@ -648,8 +689,11 @@ def _runs(signed: _Signed, *, is_going_on: bool) -> Iterator[str]:
                 yield f"the end of run {name} is not as it was signed"
         elif row["ended_by"] != NOT_ENDED or row["ended_ns"] is not None:
             yield f"the end of run {name} is not signed"
-        elif runs and name == runs[-1] and not is_going_on:
-            yield f"run {name} has no end: it crashed, or what came last was removed"
+
+
+def _last_run(signed: _Signed) -> Iterator[str]:
+    if (last := signed.unfinished_run()) and not is_locked(signed.folder):
+        yield f"run {last.name} has no end: it crashed, or what came last was removed"
 
 
 def _signature_state(signed: _Signed) -> Iterator[str]:
@@ -674,8 +718,11 @@ def _later_checks(signed: _Signed) -> Iterator[str]:
 
 def _files(signed: _Signed) -> Iterator[str]:
     known = {entry.name: entry for entry in signed.of(*FILE_KINDS)}
+    unfinished = signed.unfinished_run()
     for name, entry in known.items():
         path = signed.folder / Path(name).name
+        if unfinished and name in CONTINUED and entry.number < unfinished.number:
+            continue  # it has rows of that run now; each is compared with the fish and segments
         if not path.is_file():
             if entry.kind != REMOVED:
                 yield f"{name} is missing, and was signed"

@@ -11,8 +11,13 @@ import pytest
 from stream_dmr.errors import UserError
 from stream_dmr.evidence.seal import NAME, seal_verdicts
 from stream_dmr.evidence.verify_folder import verify
+from stream_dmr.store.fish import read_runs
+from stream_dmr.store.length_store import LengthStore
+from stream_dmr.store.run_facts import NOT_ENDED
+from stream_dmr.store.run_tables import write_lengths
 from stream_dmr.store.verdicts import Verdict, add_verdict
 from tests.support.command import invoke
+from tests.support.final_estimates import fish
 from tests.support.fish_run import measure
 from tests.support.tiny_clip import write_template
 
@@ -217,6 +222,31 @@ def test_a_report_beside_its_run_is_checked(out: Path):
 def test_a_missing_provenance_is_said(out: Path):
     (out / NAME).unlink()
     assert changed(out) == [f"{NAME}: is missing; files were compared with each other alone"]
+
+
+def test_what_a_crash_explains_has_an_exit_code_of_its_own(out: Path):
+    sql(out, f"UPDATE runs SET ended_by = '{NOT_ENDED}', ended_ns = NULL")
+    (out / NAME).unlink()
+    table = out / "lengths.csv"
+    columns, *rows = table.read_text().splitlines(keepends=True)
+    table.write_text("".join([columns, *rows[:-1]]))  # the last one had not reached the disk
+    outcome = invoke(f"verify {out}")
+    assert outcome.code == 3
+    assert "was interrupted by a crash" in outcome.out
+    table.write_text("".join([columns, *rows[1:]]))
+    outcome = invoke(f"verify {out}")
+    assert outcome.code == 1  # a crash takes no row from before others
+    assert "was interrupted by a crash" in outcome.out
+
+
+def test_a_run_that_crashed_over_earlier_results_explains_its_tables_alone(out: Path):
+    crashed = LengthStore(out, next(iter(read_runs(out / "lengths.db").values())))
+    crashed.add(fish(60))
+    write_lengths(out / "lengths.csv", crashed.estimates(), crashed.flags())
+    crashed.close()
+    assert invoke(f"verify {out}").code == 3
+    (out / "recording.mcap").write_bytes(b"")
+    assert invoke(f"verify {out}").code == 1
 
 
 def test_nothing_to_check_is_refused(tmp_path: Path):

@@ -443,7 +443,8 @@ def test_fish_in_view_at_a_crash_are_finished_by_the_restart_and_say_so(interrup
     exported = {int(row["track_id"]): row["status"] for row in rows(interrupted / "lengths.csv")}
     assert exported.keys() == fish.keys()
     assert {i for i, status in exported.items() if MAY_COUNT_TWICE in status} == flagged
-    assert all("recovered after a crash" in change.what for change in verify(interrupted)[0])
+    assert {change.is_by_crash for change in verify(interrupted)[0]} == {True}
+    assert invoke(f"verify {interrupted}").code == 3
 
 
 def test_what_a_crash_interrupted_is_signed_all_the_same(interrupted: Path):
