@@ -26,14 +26,17 @@ class CsvFile:
         resume: bool = False,
         retry_open: bool = False,
         max_bytes: int | None = None,
+        on_renamed: Callable[[Path], None] = lambda path: None,
     ) -> None:
         """Open `path` for writing; raises OutputError where the disk refuses it.
 
         `resume`: complete rows that are in the file stay. `retry_open`: where the file can't be
         opened now, it is opened with a later row instead of raising. `max_bytes`: a file that has
-        grown to this size is renamed (see `rotated_files`), and a new one begins.
+        grown to this size is renamed (see `rotated_files`), which `on_renamed` gets, and a new one
+        begins.
         """
         self._path, self._columns, self._max_bytes = path, columns, max_bytes
+        self._on_renamed = on_renamed
         self._file: TransactionalFile | None = None
         try:
             self._open(resume=resume)
@@ -79,7 +82,8 @@ class CsvFile:
         self.close()
         self._file = None
         number = 1 + _last_rotation(self._path)
-        self._path.rename(self._path.with_stem(f"{self._path.stem}-{number:06d}"))
+        renamed = self._path.rename(self._path.with_stem(f"{self._path.stem}-{number:06d}"))
+        self._on_renamed(renamed)
         return self._open(resume=False)
 
     def _refusal(self, error: OSError) -> OutputError:

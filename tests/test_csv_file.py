@@ -75,8 +75,10 @@ def test_a_file_that_can_not_be_opened_yet_is_opened_with_a_later_row(tmp_path: 
 
 def test_a_large_file_is_rotated(tmp_path: Path):
     path = tmp_path / "frames.csv"
-    write(path, [["1", "2"]] * 20, max_bytes=20)
-    files = [*rotated_files(path), path]
+    renamed = list[Path]()
+    write(path, [["1", "2"]] * 20, max_bytes=20, on_renamed=renamed.append)
+    assert renamed == rotated_files(path)
+    files = [*renamed, path]
     assert [file.name for file in files[:2]] == ["frames-000001.csv", "frames-000002.csv"]
     assert all(read(file)[0] == COLUMNS for file in files)
     assert sum(len(read(file)) - 1 for file in files) == 20

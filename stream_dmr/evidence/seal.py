@@ -41,7 +41,10 @@ from stream_dmr.version import __version__
 
 RECORDINGS = ("*.mcap", "*.rrd")
 CONTINUED = ("lengths.csv", "frames.csv")  # tables to which the next run in a folder adds rows
-TABLES = (*CONTINUED, "frames-*.csv")
+_CLOSED = (
+    *RECORDINGS,
+    "frames-[0-9]*.csv",
+)  # what a camera's run closes and signs while it goes on
 
 
 class SignedFiles:
@@ -64,7 +67,7 @@ class SignedFiles:
             self._store, waiting = store, self._waiting
         for path in waiting:
             self._sign(path, FILE)
-        known, found = store.signed_files(), [*repaired, *_matching(self._folder, RECORDINGS)]
+        known, found = store.signed_files(), [*repaired, *_matching(self._folder, _CLOSED)]
         for path in dict.fromkeys(found):
             if path in repaired or path.name not in known:
                 self._sign(path, FOUND)
@@ -78,8 +81,8 @@ class SignedFiles:
         self._sign(path, FILE)
 
     def finish(self, *, with_recordings: bool) -> None:
-        """Sign the files of a run that is about to end; segments were signed before."""
-        patterns = (*RECORDINGS, *TABLES) if with_recordings else ("lengths.csv",)
+        """Sign the files of a run that is about to end; a camera's were, each as it was closed."""
+        patterns = (*RECORDINGS, *CONTINUED) if with_recordings else CONTINUED
         for path in (*_matching(self._folder, patterns), *learnt_files(self._folder)):
             self.changed(path)
 

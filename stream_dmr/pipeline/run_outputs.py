@@ -339,7 +339,14 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
                 states=states,
             )
         header = replace(header, runs=(_start_of(inputs, store),))
-        recorder = _open_recorder(inputs, header, recording, on_refusal=on_refusal, states=states)
+        recorder = _open_recorder(
+            inputs,
+            header,
+            recording,
+            on_refusal=on_refusal,
+            on_closed=files.changed,
+            states=states,
+        )
         stack.enter_context(recorder)
         stack.enter_context(closing(retention))
         retention.start()
@@ -401,10 +408,13 @@ def _open_recorder(
     files: SinkFactory,
     *,
     on_refusal: Callable[[str], None] | None,
+    on_closed: Callable[[Path], None],
     states: SinkStates,
 ) -> Recorder:
     request, settings = inputs.request, inputs.config.recording
-    frames = FramesTable(request.out, resume=inputs.resumes, is_endless=inputs.is_endless)
+    frames = FramesTable(
+        request.out, resume=inputs.resumes, is_endless=inputs.is_endless, on_closed=on_closed
+    )
     return Recorder(
         request.out,
         header,

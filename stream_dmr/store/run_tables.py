@@ -182,12 +182,19 @@ class FramesTable:
 
     name = "frames.csv"
 
-    def __init__(self, out_dir: Path, *, resume: bool = False, is_endless: bool = False) -> None:
+    def __init__(
+        self,
+        out_dir: Path,
+        *,
+        resume: bool = False,
+        is_endless: bool = False,
+        on_closed: Callable[[Path], None] = lambda path: None,
+    ) -> None:
         """With `resume`, the whole rows of an earlier run stay.
 
-        In an endless run a large table is renamed frames-000001.csv and so on, and a file that the
-        disk refuses is opened with a later row; the rows refused meanwhile are lost here, and are
-        in the recording.
+        In an endless run a large table is renamed frames-000001.csv and so on, which `on_closed`
+        gets, and a file that the disk refuses is opened with a later row; the rows refused
+        meanwhile are lost here, and are in the recording.
         """
         self._table = CsvFile(
             out_dir / self.name,
@@ -195,6 +202,7 @@ class FramesTable:
             resume=resume,
             retry_open=is_endless,
             max_bytes=_MAX_BYTES if is_endless else None,
+            on_renamed=on_closed,
         )
         self._waiting: dict[tuple[int, int], LocalizedFish] = {}  # by track and frame
 

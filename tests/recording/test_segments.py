@@ -451,6 +451,17 @@ def test_what_a_crash_interrupted_is_signed_all_the_same(interrupted: Path):
     check = check_signatures(interrupted, load_public_key(interrupted.parent / "key.pub"))
     assert check.changes == []
     assert [note for note in check.notes if "signed when a run found it" in note]
+    assert not [note for note in check.notes if "not signed by the device" in note]
+
+
+def test_a_table_of_frames_that_was_put_in_is_not_signed(interrupted: Path, tmp_path: Path):
+    folder = Path(shutil.copytree(interrupted, tmp_path / "out"))
+    shutil.copy(folder / "frames.csv", folder / "frames-000001.csv")
+    check = check_signatures(folder, load_public_key(interrupted.parent / "key.pub"))
+    assert "not signed by the device: 'frames-000001.csv'" in check.notes
+    (folder / "frames.csv").write_text((folder / "frames.csv").read_text().replace(",1,", ",2,"))
+    check = check_signatures(folder, load_public_key(interrupted.parent / "key.pub"))
+    assert check.changes == ["frames.csv is not as it was signed"]
 
 
 def test_every_frame_of_clips_is_found_again_over_a_restart(interrupted: Path):
