@@ -96,7 +96,7 @@ def calibrate(
         )
     require_writable(out, overwrite=overwrite)
     printed = PrintedBoard.parse(board, square_mm=square_mm, marker_mm=marker_mm)
-    console = Console(file=sys.stdout)
+    console = Console(file=sys.stdout, markup=False, emoji=False)  # names are shown as they are
     if lens is not None:
         _with_known_lens(lens, camera, plane=plane, board=printed, out=out)
         return

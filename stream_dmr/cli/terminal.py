@@ -4,6 +4,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from math import inf
 from pathlib import Path
 from types import MappingProxyType
@@ -22,6 +23,8 @@ from stream_dmr.store.schema import flags_in_status
 
 _LINE_EVERY_S = 10.0  # where there is no terminal to draw a bar on
 _PLAIN_WIDTH = 120
+# Text is shown as it is: names of files, vessels and species may be [red] or :fish:, too.
+_console = partial(Console, highlight=False, markup=False, emoji=False)
 _MAX_SHOWN = 20  # differences of a replay
 
 
@@ -31,7 +34,7 @@ class RunDisplay(RunObserver):
     needs_pictures = False
 
     def __init__(self) -> None:
-        self._console = Console(file=sys.stderr, highlight=False, soft_wrap=True)
+        self._console = _console(file=sys.stderr, soft_wrap=True)
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -57,10 +60,10 @@ class RunDisplay(RunObserver):
     def warn(self, line: str) -> None:
         if line not in self._warned:
             self._warned.add(line)
-            self._console.print(printable(f"warning: {line}"), markup=False)
+            self._console.print(printable(f"warning: {line}"))
 
     def notice(self, line: str) -> None:
-        self._console.print(printable(line), markup=False)
+        self._console.print(printable(line))
 
     def stage(self, line: str) -> None:
         self._num_done, self._began, self._is_measuring = 0, time.monotonic(), False
@@ -68,10 +71,10 @@ class RunDisplay(RunObserver):
         self._progress.start()
         if self._progress.disable and time.monotonic() - self._last_line >= _LINE_EVERY_S:
             self._last_line = time.monotonic()
-            self._console.print(printable(line), markup=False)
+            self._console.print(printable(line))
 
     def serving(self, address: str) -> None:
-        self._console.print(f"watch it with: {address}", markup=False)
+        self._console.print(f"watch it with: {address}")
 
     def begin(self, num_frames: int | None) -> None:
         self._num_frames = num_frames
@@ -240,7 +243,7 @@ def _figures(rows: list[tuple[str, str]]) -> Table:
 def _stdout() -> Console:
     """A console as wide as the terminal, or without one, wide enough for any row."""
     width = None if sys.stdout.isatty() else _PLAIN_WIDTH
-    return Console(highlight=False, width=width)
+    return _console(width=width)
 
 
 def _table(*titles: str) -> Table:

@@ -79,6 +79,17 @@ def test_the_table_names_every_fish(capsys: pytest.CaptureFixture[str]):
     assert capsys.readouterr().out == "no fish\n"
 
 
+def test_names_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]):
+    """Brackets and colons style text and draw pictures elsewhere in Rich."""
+    name = "[red]a[/red] :fish: [/b]"
+    print_fish([fish(1, species_code=name)])
+    with RunDisplay() as display:
+        display.warn(f"{name}: left out")
+    said = capsys.readouterr()
+    assert name in said.out
+    assert f"warning: {name}: left out" in said.err
+
+
 def test_a_replay_says_how_fast_it_was_and_where_its_results_are(
     capsys: pytest.CaptureFixture[str],
 ):
