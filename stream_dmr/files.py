@@ -2,6 +2,7 @@
 
 import errno
 import fcntl
+import glob
 import io
 import itertools
 import os
@@ -231,11 +232,16 @@ def writing_to(path: Path) -> Generator[None]:
 def replacing(path: Path) -> Generator[Path]:
     """A draft to write to, which replaces `path` after the block; an error leaves nothing of it.
 
-    At any moment the old or the new file is complete. Raises OutputError where the disk refuses it.
+    At any moment the old or the new file is complete. The draft is this process's alone; those of
+    killed processes are removed. Raises OutputError where the disk refuses it.
     """
-    draft = path.with_name(f"{path.name}.part")
+    draft = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
         with writing_to(path):
+            for left in path.parent.glob(f"{glob.escape(path.name)}.*.part"):
+                pid = left.name.split(".")[-2]
+                if pid.isdecimal() and not Path(f"/proc/{pid}").exists():
+                    left.unlink(missing_ok=True)
             yield draft
             rename_durably(draft, path)
     except BaseException:

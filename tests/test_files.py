@@ -91,6 +91,17 @@ def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path):
     assert [(one.name, one.read_text()) for one in tmp_path.iterdir()] == [("table.csv", "new")]
 
 
+def test_drafts_of_killed_processes_are_removed_and_others_stay(tmp_path: Path):
+    path = tmp_path / "[a].csv"
+    (left := tmp_path / f"[a].csv.{2**22 + 1}.part").touch()  # beyond the largest process id
+    (other := tmp_path / "[a].csv.1.part").touch()
+    with replacing(path) as draft:
+        draft.write_text("new")
+        assert draft != other
+    assert sorted(tmp_path.iterdir()) == sorted([path, other])
+    assert not left.exists()
+
+
 def test_a_folder_in_the_place_of_a_file_is_refused(tmp_path: Path):
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="file/folder: expected a place to write to"):

@@ -1,7 +1,6 @@
 """Write provenance.json: run facts, checksums of files, the head of the ledger."""
 
 import json
-import os
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict
@@ -10,7 +9,7 @@ from threading import Lock
 from typing import Any
 
 from stream_dmr.errors import OutputError
-from stream_dmr.files import rename_durably, sha256_of, writing_to
+from stream_dmr.files import replacing, sha256_of
 from stream_dmr.store.fish import database_of, read_runs, rows_by_run, run_times
 from stream_dmr.store.ledger import (
     FILE,
@@ -236,15 +235,9 @@ def _sums(folder: Path, files: Iterable[Path]) -> dict[str, str]:
 
 
 def _write(folder: Path, made: dict[str, Any]) -> Path:
-    # Two reviewers may be at it; what killed processes left is removed.
-    target, draft = folder / NAME, folder / f"{NAME}.{os.getpid()}.part"
-    with writing_to(target):
-        for left in folder.glob(f"{NAME}.*.part"):
-            pid = left.name.split(".")[-2]
-            if pid.isdecimal() and not Path(f"/proc/{pid}").exists():
-                left.unlink(missing_ok=True)
+    target = folder / NAME
+    with replacing(target) as draft:  # two reviewers may be at it
         draft.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
-        rename_durably(draft, target)
     return target
 
 

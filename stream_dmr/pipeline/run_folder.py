@@ -59,7 +59,6 @@ def prepare_folder(
                 for leftover in ("", "-wal", "-shm"):  # of a database after a crash
                     path.with_name(path.name + leftover).unlink(missing_ok=True)
         repairs = list(repair_recordings(out))
-        (out / "lengths.csv.part").unlink(missing_ok=True)  # the draft of a killed process
         for path in (out / f"{STEM}.mcap", out / f"{STEM}.rrd"):
             if path.exists():
                 path.rename(free_name(path))  # recording-1.mcap, recording-2.mcap, ...

@@ -273,11 +273,3 @@ def test_tables_of_frames_that_were_set_aside_are_read_too(out: Path):
 
 def rows_changed(out: Path) -> list[str]:
     return [line for line in changed(out) if line.startswith("frames.csv: frame ")]
-
-
-def test_drafts_of_killed_processes_are_removed(out: Path):
-    (left := out / f"{NAME}.{2**22 + 1}.part").write_text("{")  # beyond the largest process id
-    (other := out / f"{NAME}.1.part").write_text("{")
-    say(out, Verdict(track_id=1, kind="accept", reviewer="Ada"))
-    assert not left.exists()
-    assert other.exists()
