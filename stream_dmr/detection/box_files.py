@@ -35,7 +35,7 @@ from jaxtyping import Bool, Float
 from stream_dmr.errors import AnnotationError
 from stream_dmr.files import natural_order, read_text
 from stream_dmr.pictures import pictures_in
-from stream_dmr.segmentation.mask_outlines import Ring, decode_coco, fill_parts
+from stream_dmr.segmentation.mask_outlines import Ring, decode_coco, fill_parts, ring_of
 
 UNKNOWN_ID = 0  # `track_id` of a box whose file does not follow fish from frame to frame
 
@@ -342,7 +342,7 @@ def _viame_box(
         track_id, frame = int(cells[0]), int(cells[2])
         x0, y0, x1, y1, score = map(float, cells[3:8])
         for kind, numbers in (one.groups() for one in map(_POLYGON.match, cells[9:]) if one):
-            ring = np.asarray_chkfinite(numbers.split(), np.float64).reshape(-1, 2)
+            ring = ring_of(numbers.split(), where=where)
             if kind == "poly":
                 parts.append([ring])
             else:

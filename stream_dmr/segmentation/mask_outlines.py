@@ -19,6 +19,7 @@ Part = Sequence[Ring]
 # Lines between the middles of pixel edges pass no pixel's centre by less than sqrt(1/8) px; 0.1 px
 # are left for the rounding of other programs, so that each pixel stays inside or outside.
 _TOLERANCE_PX = 0.25
+_MAX_CORNER_PX = 1e6  # chosen: beyond every camera's picture
 _ON_LINE_PX = 0.01  # a pixel whose centre is as near to a line is inside
 
 
@@ -82,6 +83,21 @@ def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
     return [0, *counts] if pixels[0] else counts
 
 
+def ring_of(numbers: Any, *, where: str) -> Ring:
+    """The corners of a polygon that a file gives as x, y, x, y, ...
+
+    Raises AnnotationError, about the place `where`, for corners far from any picture, with which
+    the arithmetic would overflow; ValueError and TypeError for what is no list of corners.
+    """
+    ring = np.asarray_chkfinite(numbers, np.float64).reshape(-1, 2)
+    if (far := np.abs(ring).max(initial=0.0)) > _MAX_CORNER_PX:
+        raise AnnotationError(
+            f"{where}: expected corners of polygons within {_MAX_CORNER_PX:g} px, got one at "
+            f"{far:g} px; correct it"
+        )
+    return ring
+
+
 def decode_coco(
     shape: tuple[int, int], segmentation: Any, *, where: str
 ) -> Bool[np.ndarray, "H W"]:
@@ -91,8 +107,7 @@ def decode_coco(
     """
     try:
         if not isinstance(segmentation, dict):
-            rings = [np.asarray_chkfinite(r, np.float64).reshape(-1, 2) for r in segmentation]
-            return fill_parts(shape, [[ring] for ring in rings])
+            return fill_parts(shape, [[ring_of(one, where=where)] for one in segmentation])
         counts = segmentation["counts"]
         runs = _unpack(counts) if isinstance(counts, str) else counts
         if sum(runs) == shape[0] * shape[1] and list(segmentation["size"]) == list(shape):

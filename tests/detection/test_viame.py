@@ -55,6 +55,7 @@ def test_pictures_of_a_folder_are_known_by_their_names():
         (row(1, 0, "(poly) 1 1 2 2"), "polygons of three points"),
         (row(1, 0, "(poly) 1 1 2 2 3"), "polygons of three points"),
         (row(1, 0, "(poly) 1 1 2 2 nan 3"), "polygons of three points"),
+        (row(1, 0, "(poly) 1 1 2 2 1e308 3"), "within 1e+06 px, got one at 1e+308 px"),
         (row(1, 0, "(hole) 1 1 2 2 3 3"), "polygons of three points"),
         (row(1, 0, box="5,5,5,9"), "line 1: expected a width and height above 0"),
         (row(1, 0) + row(1, 0), "line 2: expected one box per fish and frame"),

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from stream_dmr.errors import AnnotationError
 from stream_dmr.segmentation.mask_outlines import decode_coco, fill_parts, outlines_of, run_lengths
 from tests.support.frames import ellipse_mask
 
@@ -47,6 +48,12 @@ def test_what_lies_outside_the_picture_is_cut_off():
     mask = fill_parts((10, 20), [[ring], [ring + 1000]])
     assert mask[:, :5].all()
     assert not mask[:, 5:].any()
+
+
+@pytest.mark.parametrize("far", [1e308, -1e308, 2e6])
+def test_corners_far_from_any_picture_are_refused(far: float):
+    with pytest.raises(AnnotationError, match=r"annotation 3: expected corners .* within 1e.06 px"):
+        decode_coco((10, 20), [[1.0, 1.0, far, 1.0, 6.0, 6.0]], where="annotation 3")
 
 
 def test_masks_that_overlap_add_up():
