@@ -133,14 +133,22 @@ class _SnapshotStream(io.RawIOBase):
         return len(data)
 
 
-def require_file(path: Path) -> None:
-    """Raise OSError for a pipe or a device: reading it may never begin, or never end.
+@contextmanager
+def open_file(path: Path) -> Generator[io.BufferedReader]:
+    """Open a file that others wrote, to be read.
 
-    Opening a folder raises an OSError of its own.
+    Raises OSError, also for a pipe or a device: reading it may never begin, or never end. What is
+    checked is what was opened: another file may have the name a moment later.
     """
-    mode = path.stat().st_mode
-    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
-        raise OSError(errno.EINVAL, "no file but a pipe or a device", str(path))
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe would wait for its writer
+    try:
+        mode = os.fstat(descriptor).st_mode
+        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # `open` refuses a folder
+            raise OSError(errno.EINVAL, "no file but a pipe or a device", str(path))
+        with open(descriptor, "rb", closefd=False) as file:
+            yield file
+    finally:
+        os.close(descriptor)
 
 
 def read_text(path: Path, *, encoding: str = "utf-8", max_bytes: int = MAX_TEXT_BYTES) -> str:
@@ -167,8 +175,7 @@ def read_small(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
 
     A pipe or a device is refused.
     """
-    require_file(path)
-    with path.open("rb") as file:
+    with open_file(path) as file:
         data = file.read(max_bytes + 1)
     if len(data) > max_bytes:
         raise OSError(errno.EFBIG, f"more than {max_bytes // 1000} kB")
@@ -259,8 +266,7 @@ def make_folder(path: Path) -> Path:
 
 def sha256_of(path: Path) -> str:
     """SHA-256 of a file, in hex. Raises OSError."""
-    require_file(path)
-    with path.open("rb") as file:
+    with open_file(path) as file:
         return file_digest(file, "sha256").hexdigest()
 
 

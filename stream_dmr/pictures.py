@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from stream_dmr.files import natural_order, require_file
+from stream_dmr.files import natural_order, open_file
 
 MAX_PIXELS = 150_000_000  # chosen: the largest cameras have some 100 megapixels
 PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
@@ -31,10 +31,9 @@ def size_if_huge(path: Path) -> str:
     Its pixels alone would take half a gigabyte and more.
     """
     try:
-        require_file(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path) as picture:
+            with open_file(path) as file, Image.open(file) as picture:
                 width, height = picture.size
     except Image.DecompressionBombError:
         return f"more than {MAX_PIXELS // 10**6} megapixels"
@@ -60,8 +59,8 @@ def read_picture(path: Path, flags: int) -> np.ndarray | None:
 
     Raises OSError.
     """
-    require_file(path)
-    content = path.read_bytes()
+    with open_file(path) as file:
+        content = file.read()
     if not content or is_cut_off(content):
         return None
     return cv2.imdecode(np.frombuffer(content, np.uint8), flags)

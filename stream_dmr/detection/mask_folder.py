@@ -14,7 +14,7 @@ from jaxtyping import Bool, Integer
 from PIL import Image
 
 from stream_dmr.errors import AnnotationError
-from stream_dmr.files import require_file
+from stream_dmr.files import open_file
 from stream_dmr.pictures import PICTURE_SUFFIXES
 
 _FILE_NAME = re.compile(r"\d{6,}\.png")
@@ -116,13 +116,13 @@ class MaskFolder:
         stem = f"{frame_index:06d}" if self._is_numbered else Path(picture).stem
         path = self.folder / f"{stem}.png"
         try:
-            require_file(path)
-            with Image.open(path) as file:
-                _check_labels(file, path, size=(width, height))
-                file.verify()  # the checksums, which decoding leaves out; then it must be reopened
-            with Image.open(path) as file:
+            with open_file(path) as file:
+                image = Image.open(file)
+                _check_labels(image, path, size=(width, height))
+                image.verify()  # the checksums, which decoding leaves out; then it is used up
+                file.seek(0)
                 # A 1-bit picture is decoded as bool, every other mode as unsigned integers.
-                labels = np.asarray(file)
+                labels = np.asarray(Image.open(file))
         except FileNotFoundError:
             return None
         except _DECODING_ERRORS:
@@ -167,8 +167,7 @@ class MaskFolder:
         """A fish drawn as 255 on 0 is one that nobody would measure. Raises AnnotationError."""
         for name in self._names[:: max(1, len(self._names) // _MAX_LOOKED_AT)]:
             try:
-                require_file(self.folder / name)
-                with Image.open(self.folder / name) as picture:
+                with open_file(self.folder / name) as file, Image.open(file) as picture:
                     values = np.unique(np.asarray(picture))
             except _DECODING_ERRORS:
                 continue  # said where its frame comes

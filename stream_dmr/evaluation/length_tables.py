@@ -8,6 +8,7 @@
 """
 
 import csv
+import io
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ import numpy as np
 
 from stream_dmr.errors import UserError
 from stream_dmr.evaluation.length_errors import Histogram
-from stream_dmr.files import require_file
+from stream_dmr.files import open_file
 
 Interval = tuple[float, float]
 _Record = Mapping[str, str | None]
@@ -107,9 +108,9 @@ def _records(path: Path, *required: str) -> Iterator[tuple[str, _Record]]:
 
 def _open(path: Path) -> tuple[list[str], list[tuple[str, _Record]]]:
     try:
-        require_file(path)
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file, strict=True)
+        with open_file(path) as file:
+            text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
+            reader = csv.DictReader(text, strict=True)
             columns = list(reader.fieldnames or [])
             return columns, [(f"{path}, line {reader.line_num}", record) for record in reader]
     except OSError as problem:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stream_dmr.errors import SourceError
-from stream_dmr.files import require_file
+from stream_dmr.files import open_file
 from stream_dmr.messages import Frame
 from stream_dmr.sources.decoder import DecodedPicture, DecodingError, ResizedError, open_decoder
 from stream_dmr.sources.source import ReadFramesSettings, Source, nominal_ns, size_error
@@ -139,8 +139,7 @@ def promised_frames(promised: float) -> int | None:
 def _first_bytes(path: Path) -> bytes:
     """The bytes that identify a file's format. Raises SourceError where they can't be a video's."""
     try:
-        require_file(path)
-        with path.open("rb") as file:
+        with open_file(path) as file:
             start = file.read(512)
     except OSError as error:
         raise SourceError(
