@@ -208,11 +208,17 @@ def resume_source(
 ) -> dict[str, int] | None:
     """Let a source begin after what earlier runs measured.
 
-    Returns the frames done of each unfinished clip, None where the source has no clips.
+    Returns the frames done of each unfinished clip, None where the source has no clips. What is
+    wrong with a clip is an event of the run as well.
     """
     done, frames_done = store.clips_before()
     after_ns = store.resume_after_ns() if source.is_live else store.before.timestamp_ns
-    source.listen(on_notice)
+
+    def on_notice_of_clip(line: str) -> None:
+        store.note("clips", line, timestamp_ns=store.last_ns)
+        on_notice(line)
+
+    source.listen(on_notice_of_clip if source.has_clips else on_notice)
     source.resume(
         ResumePoint(after_ns=after_ns, clips_done=frozenset(done), frames_done=frames_done)
     )

@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
@@ -194,6 +194,7 @@ class ClipFolder(Source):
         self._folder = folder
         self._settings = settings
         self._closing = Event()
+        self._on_notice: Callable[[str], None] = self.warnings.append
         self._begun: set[str] = set()  # names of clips that were read, are being read or left out
         self._frames_done: dict[str, int] = {}
         self._bytes_read: dict[str, int] = {}  # sizes of the clips when their reading began
@@ -213,6 +214,10 @@ class ClipFolder(Source):
     def has_clips(self) -> bool:
         return True
 
+    def listen(self, on_notice: Callable[[str], None]) -> None:
+        """Say at once what is wrong with a clip, in the thread that reads, not in `warnings`."""
+        self._on_notice = on_notice
+
     def resume(self, point: ResumePoint) -> None:
         """Skip the clips and frames that were done, and begin after the last capture time."""
         self._begun.update(point.clips_done)
@@ -223,7 +228,7 @@ class ClipFolder(Source):
         while (path := self._next_clip()) is not None:
             if path.name in self._bytes_read:
                 done = self._frames_done.get(path.name, 0)
-                self.warnings.append(f"{path.name}: grew after its {done} frames were read")
+                self._on_notice(f"{path.name}: grew after its {done} frames were read")
             self._begun.add(path.name)
             state = _state_of(path)
             self._bytes_read[path.name] = 0 if state is None else state.num_bytes
@@ -240,7 +245,8 @@ class ClipFolder(Source):
                 if frame.frame_index > self._frames_done.get(path.name, 0):
                     self._frames_done[path.name] = frame.frame_index
                     yield replace(frame, frame_index=frame_index, timestamp_ns=last_ns)
-            self.warnings += self._video.warnings
+            for line in self._video.warnings:
+                self._on_notice(line)
             self.is_cut_off = self._video.is_cut_off  # of the last one: only that ends the frames
 
     def close(self) -> None:
@@ -262,11 +268,11 @@ class ClipFolder(Source):
         try:
             video = VideoFile(path, self._settings)
         except SourceError as error:
-            self.warnings.append(f"{error}; the clip was left out")
+            self._on_notice(f"{error}; the clip was left out")
             return None
         if (video.width, video.height) != (self.width, self.height):
             video.close()
-            self.warnings.append(
+            self._on_notice(
                 f"{path.name}: expected {self.width}x{self.height} px as the first clip has, got "
                 f"{video.width}x{video.height} px; the clip was left out"
             )

@@ -208,6 +208,7 @@ class LengthStore:
                 self.path, self._reserve, waits_for_disk=waits_for_disk, state=self._state
             )
             self.before = self._used = _marks(self._rows.database)
+            self.last_ns = self.before.timestamp_ns  # capture time of the last frame
             self._signer = signer or Signer(None)
             self.is_signing = self._signer.has_key
             self._signer.continue_chain(self._rows.database)
@@ -252,6 +253,7 @@ class LengthStore:
 
     def frame_passed(self, *, frame_index: int, timestamp_ns: int) -> None:
         """Mark a frame: its number durably at once, its capture time within seconds."""
+        self.last_ns = timestamp_ns
         is_due = time.monotonic_ns() - self._marked_at_ns > _MARK_EVERY_NS
         if is_due or frame_index > self._used.frame_index:
             self._marked_at_ns = time.monotonic_ns()

@@ -1,6 +1,6 @@
 """A run continues where earlier ones in its folder ended, and finishes their fish."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from stream_dmr.recording.repair import repair_recordings
 from stream_dmr.recording.topics import RecordingSettings
 from stream_dmr.sources.source import ResumePoint, Source
 from stream_dmr.store.length_store import LengthStore
+from stream_dmr.store.schema import EVENTS, read_rows
 from tests.support.command import rows
 from tests.support.final_estimates import FACTS, fish
 from tests.support.recorded_run import header, run
@@ -34,6 +35,7 @@ class MadeUpSource(Source):
     def __init__(self, *, is_live: bool = False, has_clips: bool = False) -> None:
         self._is_live, self._has_clips = is_live, has_clips
         self.point: ResumePoint | None = None
+        self.on_notice: Callable[[str], None] = refuse_notices
 
     @property
     def is_live(self) -> bool:
@@ -42,6 +44,9 @@ class MadeUpSource(Source):
     @property
     def has_clips(self) -> bool:
         return self._has_clips
+
+    def listen(self, on_notice: Callable[[str], None]) -> None:
+        self.on_notice = on_notice
 
     def resume(self, point: ResumePoint) -> None:
         self.point = point
@@ -82,6 +87,16 @@ def test_clips_that_were_done_are_left_out_and_others_go_on(store: LengthStore, 
         assert source.point is not None
         assert source.point.clips_done == {"a.mp4"}
         assert source.point.frames_done == {"b.mp4": 4}
+
+
+def test_what_is_wrong_with_a_clip_is_an_event(store: LengthStore):
+    source, said = MadeUpSource(has_clips=True), list[str]()
+    resume_source(source, store, on_notice=said.append)
+    store.frame_passed(frame_index=1, timestamp_ns=700)
+    source.on_notice("2.mp4: the clip was left out")
+    assert said == ["2.mp4: the clip was left out"]
+    (event,) = read_rows(store.path, EVENTS)
+    assert (event["kind"], event["text"], event["timestamp_ns"]) == ("clips", said[0], 700)
 
 
 def test_times_of_a_camera_are_later_than_all_before(store: LengthStore, tmp_path: Path):

@@ -72,6 +72,21 @@ def test_a_clip_that_can_not_be_used_is_left_out(tmp_path: Path):
     assert "3.avi: expected 64x48 px as the first clip has, got 32x48 px" in folder.warnings[1]
 
 
+def test_a_damaged_clip_is_said_at_once_and_the_next_one_is_read(tmp_path: Path):
+    for number in (1, 2, 3):
+        clip(tmp_path / f"{number}.avi", first=number, num_frames=20)
+    os.truncate(tmp_path / "2.avi", (tmp_path / "2.avi").stat().st_size * 3 // 4)
+    os.utime(tmp_path / "2.avi", (OLD_S, OLD_S))
+    folder, said, frames = open_source(str(tmp_path), AT_ONCE), list[str](), list[Frame]()
+    folder.listen(lambda line: said.append(f"{line[:5]} before {len(frames)}"))
+    for frame in folder:
+        frames.append(frame)
+    assert 40 < len(frames) < 60
+    assert {frame.source for frame in frames[-20:]} == {"3.avi"}
+    assert folder.warnings == []
+    assert said == [f"2.avi before {len(frames) - 20}"]
+
+
 def test_a_restart_reads_what_was_not_read(tmp_path: Path):
     for first in (1, 5, 9):
         clip(tmp_path / f"{first}.avi", first=first)
