@@ -5,6 +5,7 @@ import os
 import random
 import shutil
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr
@@ -26,6 +27,7 @@ from benchmarks.reliability.mutations import (
     by_sentence,
     of_header,
 )
+from benchmarks.reliability.rtsp_session import playing, write_session
 from stream_dmr.calibration.calibration_file import load_calibration
 from stream_dmr.detection.given_fish import open_annotated_fish
 from stream_dmr.errors import UserError
@@ -67,6 +69,7 @@ def inputs(folder: Path, root: Path) -> list[Input]:
     write_coco(clip / "boxes.txt", made / "coco.json")
     write_cvat(clip / "boxes.txt", made / "cvat.xml")
     convert(golden, made / "golden.rrd")
+    write_session(made / "rail.rtsp")
     (made / "way.nmea").write_text(straight_way(60))
     text, species = (by_byte, by_line), (clip / "species.ply", clip / "species.toml")
     mask = next(path for path in sorted((clip / "masks").glob("*.png")) if path.stat().st_size)
@@ -114,7 +117,11 @@ def inputs(folder: Path, root: Path) -> list[Input]:
         ),
         Input(
             **{"name": "video", "original": clip / "video.mp4", "read": read_video},
-            **{"mutate": (by_byte, by_box), "share": 0.04},
+            **{"mutate": (by_byte, by_box), "share": 0.03},
+        ),
+        Input(
+            **{"name": "RTSP session", "original": made / "rail.rtsp", "read": read_stream},
+            **{"mutate": (by_byte,), "share": 0.01},
         ),
     ]
 
@@ -251,6 +258,15 @@ def read_video(path: Path) -> None:
             assert -(2**63) <= frame.timestamp_ns < 2**63
     finally:
         source.close()
+
+
+def read_stream(path: Path) -> None:
+    """The frames that come within a second, over one connection or several."""
+    with playing(path) as address:
+        source = open_source(address, ReadFramesSettings(connect_s=2.0, silence_s=1.0))
+        threading.Timer(1.0, source.close).start()
+        for frame in source:
+            assert 0 <= frame.timestamp_ns < 2**63
 
 
 def read_messages(path: Path) -> None:
