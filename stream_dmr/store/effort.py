@@ -49,6 +49,11 @@ def read_effort(database: Path, fish: Sequence[Fish]) -> list[HaulEffort]:
     ]
 
 
+def watched_times(database: Path) -> list[int]:
+    """Capture times of the first and last frames between pauses. Raises OutputError."""
+    return [row[end] for row in read_rows(database, WATCHED) for end in ("first_ns", "last_ns")]
+
+
 def _effort(
     name: str,
     watched: Sequence[Mapping[str, Any]],

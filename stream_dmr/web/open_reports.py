@@ -13,7 +13,7 @@ from stream_dmr.recording.reading import require_messages
 from stream_dmr.recording.selection import Selection
 from stream_dmr.store.batch_folder import DONE, FAILED, VIDEO_FOLDERS, VIDEOS, read_videos
 from stream_dmr.store.edits import NO_EDITS, edits_of
-from stream_dmr.store.effort import read_effort
+from stream_dmr.store.effort import read_effort, watched_times
 from stream_dmr.store.fish import (
     database_of,
     read_fish,
@@ -69,6 +69,7 @@ def open_report(
         track=recorded_track(recording)
         if database is None
         else VesselTrack(read_positions(database)),
+        watched_ns=[] if database is None else watched_times(database),
         notes=run_notes(path),
     )
 

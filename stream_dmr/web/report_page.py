@@ -48,6 +48,7 @@ class RunReport:
     source: str | None = None  # where the user says that the source is
     efforts: Sequence[HaulEffort] = ()  # of its hauls; none of a recording without its database
     track: VesselTrack | None = None  # None: likewise
+    watched_ns: Sequence[int] = ()  # capture times between which there were frames; none: likewise
     notes: Sequence[str] = ()  # what a reader must know of the run
 
     @property
@@ -56,10 +57,11 @@ class RunReport:
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """Capture times of the first and of the last fish; 0 and 0 without any."""
+        """Capture times of the first and last frame, as far as they are known; else of the fish."""
         estimates = [one.estimate for one in self.fish]
-        first = min((one.first_timestamp_ns for one in estimates), default=0)
-        return first / 1e9, max((one.last_timestamp_ns for one in estimates), default=0) / 1e9
+        firsts = [*self.watched_ns, *(one.first_timestamp_ns for one in estimates)]
+        lasts = [*self.watched_ns, *(one.last_timestamp_ns for one in estimates)]
+        return min(firsts, default=0) / 1e9, max(lasts, default=0) / 1e9
 
 
 def trip_section(
@@ -164,8 +166,10 @@ def render_page(
     and perhaps the `sample`.
     """
     template = reports[0].recording.header.template
+    placed = place(reports)
     about = {
         "title": title,
+        "began_s": min(one.report.span_s[0] + one.shift_s for one in placed),
         "software": __version__,
         "template": template.name,
         "faces": _packed(template.faces.astype("<u4")),
@@ -180,7 +184,6 @@ def render_page(
         "fates": FATES,
         "conditions": CONDITIONS,
     }
-    placed = place(reports)
     rows = [one.row(fish) for one in placed for fish in one.report.fish]
     details = (
         (one.row_id(fish.estimate.track_id), fish_detail(fish, one.report))

@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import threading
 from pathlib import Path
 
 import cv2
@@ -10,13 +11,15 @@ import pytest
 
 from stream_dmr.errors import SourceError
 from stream_dmr.messages import FittedMesh, LocalizedFish
+from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.recording.reading import decoded_messages, open_recordings
 from stream_dmr.store.verdicts import Verdict, add_verdict
 from stream_dmr.web.open_reports import open_report, write_report
 from stream_dmr.web.views import draw_views, read_tracks
 from tests.support.browser import evaluate
 from tests.support.command import invoke, rows
-from tests.support.fish_run import measure
+from tests.support.fish_run import measure, request
+from tests.support.tiny_clip import write_clip
 
 
 @pytest.fixture(scope="module")
@@ -145,6 +148,21 @@ def test_what_the_browser_shows_is_what_was_measured(out: Path, page: Path):
     template = open_recordings([out]).header.template
     assert (shown["faces"], shown["corners"]) == (len(template.faces), len(template.rest_vertices))
     assert shown["none"] == 0
+
+
+def test_time_begins_at_the_first_frame_and_not_at_the_first_fish(tmp_path: Path):
+    write_clip(tmp_path / "clip", fish=[[], [], [], [1], [1], [1]])
+    measure_source(request(tmp_path / "clip", tmp_path / "out"), stop=threading.Event())
+    write_report([open_report(tmp_path / "out")], tmp_path / "page.html", title="out")
+    times = evaluate(
+        tmp_path / "page.html",
+        """
+        const plot = document.getElementById('time');
+        while (!plot.data) await new Promise((done) => setTimeout(done, 50));
+        return plot.data[1].x;
+        """,
+    )
+    assert times == [pytest.approx(0.3)]
 
 
 def test_filters_sorting_and_verdicts(out: Path, tmp_path: Path):

@@ -90,7 +90,7 @@ function drawHistogram(fish) {
 
 function drawTime(fish, onChoose) {
   const measured = fish.filter((f) => lengthOf(f) !== null);
-  const start = Math.min(...DATA.fish.map((f) => f.time_s));
+  const start = DATA.began_s;
   const span = Math.max(...DATA.fish.map((f) => f.time_s)) - start;
   const [unit, seconds] = span < 300 ? ["s", 1] : span < 18000 ? ["minutes", 60] : ["hours", 3600];
   const at = (f) => (f.time_s - start) / seconds;
