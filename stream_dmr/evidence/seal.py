@@ -40,10 +40,8 @@ from stream_dmr.version import __version__
 
 RECORDINGS = ("*.mcap", "*.rrd")
 CONTINUED = ("lengths.csv", "frames.csv")  # tables to which the next run in a folder adds rows
-_CLOSED = (
-    *RECORDINGS,
-    "frames-[0-9]*.csv",
-)  # what a camera's run closes and signs while it goes on
+# What a camera's run closes and signs while it goes on.
+_CLOSED = (*RECORDINGS, "frames-[0-9]*.csv")
 
 
 class SignedFiles:

@@ -249,8 +249,7 @@ def _changes(folder: Path, others: Checks) -> Iterator[Change]:
     runs: dict[str, RunFacts] = {}
     fish: dict[int, _Row] = {}
     lengths: dict[str, list[str]] = {}
-    stored = _broken(folder / DATABASE, _stored(folder / DATABASE, runs, fish, lengths))
-    of_rows = [] if database is None else [*stored]
+    of_rows = [*_broken(database, _stored(database, runs, fish, lengths))] if database else []
     yield from _broken(folder / PROVENANCE, _against_provenance(folder, runs))
     for name, check in others.items():
         if (folder / name).is_file():

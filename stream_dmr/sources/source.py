@@ -76,7 +76,10 @@ class Source(ABC):
         return None
 
     def listen(self, on_notice: Callable[[str], None]) -> None:  # noqa: B027, optional
-        """Call `on_notice`, in any thread, with a line for each loss and return of a camera."""
+        """Call `on_notice`, in any thread, with a line for each loss and return of a camera.
+
+        A folder of clips says what is wrong with one.
+        """
 
     def resume(self, point: ResumePoint) -> None:  # noqa: B027, optional
         """Continue after earlier runs; call it before the iteration."""
