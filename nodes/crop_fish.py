@@ -12,7 +12,7 @@ from stream_dmr.messages import FishCrop, Frame, TrackEnded
 from stream_dmr.segmentation.crop import CropFishSettings, crop_fish
 from stream_dmr.segmentation.open_segmenter import open_segmenter
 from stream_dmr.segmentation.species_classifier import SpeciesClassifier
-from stream_dmr.tracking.finder import FishFinder
+from stream_dmr.tracking.finder import FishFinder, TrackedFish
 from stream_dmr.tracking.timeout import TrackTimeout
 from stream_dmr.tracking.tracker import TrackNumbering
 
@@ -83,11 +83,21 @@ class CropFish:
         self._last = frame
         return [*self._crops(fish, crops), *self._ends(frame, fish)]
 
+    def pause(self) -> list[FishCrop | TrackEnded]:
+        """All open tracks end, unless their ids are given; the next frame shows other fish."""
+        if not self._open or not isinstance(self._finder, TrackedFish):
+            return []
+        self._finder.forget_tracks()
+        return self._end_all("pause")
+
     def close(self) -> list[FishCrop | TrackEnded]:
         """All open tracks end with the source."""
+        return self._end_all("end")
+
+    def _end_all(self, cause: str) -> list[FishCrop | TrackEnded]:
         last, ended = self._last, [*self._open]
         self._open.clear()
-        return [] if last is None else [TrackEnded.after(last, one, "end") for one in ended]
+        return [] if last is None else [TrackEnded.after(last, one, cause) for one in ended]
 
     def _crops(self, fish: Mapping[int, int], crops: Mapping[int, FishCrop]) -> Iterator[FishCrop]:
         for track_id, source_id in sorted(fish.items()):

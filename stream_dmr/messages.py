@@ -193,7 +193,7 @@ class TrackEnded(FishMessage):
     """A fish that no later frame shows; frame and time are those after which it ended."""
 
     # "lost": the tracker dropped it; "timeout": unseen for `track_timeout_s`; "end": of the source;
-    # "restart": in view when an earlier run broke off.
+    # "restart": in view when an earlier run broke off; "pause": in view when no further clip came.
     cause: str
 
     @classmethod

@@ -120,7 +120,7 @@ class FateTracker:
             or self._is_hidden
             or self._last_ns - seen.timestamp_ns > gap_ns
             or ended.cause == "restart"
-            or (ended.cause == "end" and ended.timestamp_ns - self._last_ns <= gap_ns)
+            or (ended.cause in ("end", "pause") and ended.timestamp_ns - self._last_ns <= gap_ns)
         ):
             return Fate(UNKNOWN_FATE, None)
         points = body_points(seen.keypoints_px)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.messages import Frame, Message, TrackEnded
@@ -47,6 +47,15 @@ class EndsTracks(Protocol):
         ...
 
 
+@runtime_checkable
+class EndsAtPause(Protocol):
+    """A node whose tracks end if the source pauses for long."""
+
+    def pause(self) -> Sequence[Message]:
+        """No frame comes for a long time: return what remains of the open tracks."""
+        ...
+
+
 @dataclass(kw_only=True)
 class StageCounters:
     """The work of one stage; at the end, frames in = processed + dropped + failed."""
@@ -64,9 +73,9 @@ class StageCounters:
 
 @dataclass(kw_only=True)
 class _Batch:
-    """The messages of one stage for one frame, or (`timestamp_ns` None) for the end."""
+    """The messages of one stage for one frame, a pause of the source, or its end."""
 
-    timestamp_ns: int | None
+    kind: Literal["frame", "pause", "end"]
     messages: list[Message] = field(default_factory=list)
 
 
@@ -132,6 +141,10 @@ class Chain:
         self._failure: BaseException | None = None
         self._lock = threading.Lock()
 
+    def pause(self) -> None:
+        """End the open tracks. To be called in the thread of the source, between two frames."""
+        self._pass_on(0, _Batch(kind="pause"))
+
     def waiting(self) -> list[int]:
         """Frames that wait before each node."""
         return [inbox.qsize() for inbox in self._inboxes]
@@ -174,7 +187,7 @@ class Chain:
                 self._pass_through(batch)
         except BaseException as error:
             self._fail(0, error)
-        self._pass_through(_Batch(timestamp_ns=None), close=True)
+        self._pass_through(_Batch(kind="end"), close=True)
         if self._failure is not None:
             raise self._failure
         return self.counters
@@ -190,7 +203,7 @@ class Chain:
                 self._pass_on(0, batch)
         except BaseException as error:
             self._fail(0, error)
-        self._pass_on(0, _Batch(timestamp_ns=None))
+        self._pass_on(0, _Batch(kind="end"))
 
     def _read(self, frames: Iterator[Frame]) -> _Batch | None:
         """Wait for the next frame; None at the end of the source or of the chain."""
@@ -201,22 +214,22 @@ class Chain:
             if self._is_cut(0):
                 self._count(0, "dropped")
                 return None
-            batch = _Batch(timestamp_ns=frame.timestamp_ns)
+            batch = _Batch(kind="frame")
             is_done = self._attempt(0, lambda: [frame], batch)
             self._count(0, "processed" if is_done else "failed")
             return batch
 
     def _run_node(self, stage: int) -> None:
         node = self._nodes[stage - 1]
-        while (batch := self._take(stage)) is not None and batch.timestamp_ns is not None:
+        while (batch := self._take(stage)) is not None and batch.kind != "end":
             self._pass_on(stage, self._process(stage, node, batch))
         # The last messages of the stage before, then our own end.
-        ending = batch or _Batch(timestamp_ns=None)
+        ending = batch or _Batch(kind="end")
         self._pass_on(stage, self._process(stage, node, ending, close=True))
 
     def _process(self, stage: int, node: Node, batch: _Batch, *, close: bool = False) -> _Batch:
         """Step through a batch, then close; messages made before an exception go on."""
-        made, is_done = _Batch(timestamp_ns=batch.timestamp_ns), True
+        made, is_done = _Batch(kind=batch.kind), True
         with self._busy(stage):
             for message in batch.messages:
                 if self._is_cut(stage):
@@ -225,7 +238,9 @@ class Chain:
                 is_done &= self._attempt(stage, partial(_answer, node, message), made)
                 if isinstance(message, TrackEnded):
                     made.messages.append(message)
-            if batch.timestamp_ns is not None:
+            if batch.kind == "pause" and isinstance(node, EndsAtPause):
+                self._attempt(stage, node.pause, made)
+            if batch.kind == "frame":
                 is_whole = not self._is_cut(stage)
                 outcome = "processed" if is_whole else "dropped"
                 self._count(stage, outcome if is_done else "failed")
@@ -261,7 +276,7 @@ class Chain:
         """Count the frames that wait before stages that take no more."""
         for stage, inbox in enumerate(self._inboxes, start=1):
             with inbox.mutex:
-                left = sum(batch.timestamp_ns is not None for batch in inbox.queue)
+                left = sum(batch.kind == "frame" for batch in inbox.queue)
             self._count(stage, "dropped", left)
 
     def _emit(self, stage: int, messages: Sequence[Message], made: _Batch) -> None:
@@ -285,7 +300,7 @@ class Chain:
                 return self._inboxes[stage].put(batch, timeout=_POLL_S)
             except queue.Full:
                 continue
-        if stage < len(self._nodes) and batch.timestamp_ns is not None:
+        if stage < len(self._nodes) and batch.kind == "frame":
             self._count(stage + 1, "dropped")
         return None
 

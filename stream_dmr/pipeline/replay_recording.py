@@ -468,4 +468,7 @@ def _open_chain(
             )
         )
 
-    return frames, Session(inputs, given=[CropFishOfRuns(open_crop_fish, recording.header.runs)])
+    ends = recorded.of_type(TrackEnded, keep_payloads=False)
+    pauses = {one.frame_index for one in ends if one.cause == "pause"}
+    crop_fish = CropFishOfRuns(open_crop_fish, recording.header.runs, pauses=pauses)
+    return frames, Session(inputs, given=[crop_fish])

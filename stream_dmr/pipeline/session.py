@@ -1,7 +1,7 @@
 """The nodes of a chain over one setup, fed live, from a recording, or from both."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -301,8 +301,18 @@ def keep_crops(
 class CropFishOfRuns:
     """A CropFish for each run: its tracks end with it, and the next one numbers its fish on."""
 
-    def __init__(self, open_crop_fish: Callable[[], CropFish], runs: Sequence[RunStart]) -> None:
-        """`runs` by their frames; none: one run, whose fish count from 1."""
+    def __init__(
+        self,
+        open_crop_fish: Callable[[], CropFish],
+        runs: Sequence[RunStart],
+        *,
+        pauses: Collection[int] = (),
+    ) -> None:
+        """`runs` by their frames; none: one run, whose fish count from 1.
+
+        `pauses`: the frames after which all tracks ended, since the source paused.
+        """
+        self._pauses = pauses
         self._open, self._runs = open_crop_fish, deque(runs)
         self._crop_fish, self._is_new = open_crop_fish(), True
         self._frames_before = -1  # of the run that goes on
@@ -319,7 +329,8 @@ class CropFishOfRuns:
                 ended += self._crop_fish.close()
                 self._begin(run)
         self._is_new = False
-        return [*ended, *self._crop_fish.step(frame)]
+        ended += self._crop_fish.step(frame)
+        return [*ended, *self._crop_fish.pause()] if frame.frame_index in self._pauses else ended
 
     def _begin(self, run: RunStart) -> None:
         if not self._is_new:

@@ -166,6 +166,7 @@ def _not_read(names: list[str]) -> str:
 
 _SUFFIXES = {".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv"}
 _SETTLE_S = 5.0  # a clip that has not grown for so long is complete, or never will be; chosen
+_PAUSE_CLIPS = 2.0  # clips' durations without a new clip after which its fish are gone; chosen
 _POLL_S = 0.5
 
 
@@ -199,6 +200,8 @@ class ClipFolder(Source):
         self._frames_done: dict[str, int] = {}
         self._bytes_read: dict[str, int] = {}  # sizes of the clips when their reading began
         self._after_ns = 0
+        self._on_pause: Callable[[], None] = lambda: None
+        self._clip_s = 0.0  # duration of the last clip
         self._video: VideoFile | None = None
         first = self._first_clip()
         self.width, self.height, self.fps = first.width, first.height, first.fps
@@ -217,6 +220,9 @@ class ClipFolder(Source):
     def listen(self, on_notice: Callable[[str], None]) -> None:
         """Say at once what is wrong with a clip, in the thread that reads, not in `warnings`."""
         self._on_notice = on_notice
+
+    def announce_pauses(self, on_pause: Callable[[], None]) -> None:
+        self._on_pause = on_pause
 
     def resume(self, point: ResumePoint) -> None:
         """Skip the clips and frames that were done, and begin after the last capture time."""
@@ -237,6 +243,7 @@ class ClipFolder(Source):
                 continue
             # It ended with the last write; 0 if it was removed meanwhile.
             state, duration_s = _state_of(path), (self._video.num_frames or 0) / self._video.fps
+            self._clip_s = duration_s
             start_ns = 0 if state is None else state.modified_ns - round(duration_s * 1e9)
             start_ns = max(start_ns, last_ns + round(1e9 / self._video.fps))
             for frame in self._video:
@@ -290,6 +297,8 @@ class ClipFolder(Source):
         """Wait for a complete clip; None when closed, or when none came for `clips_wait_s`."""
         seen: dict[str, _FileState] = {}
         unchanged_since = waiting_since = time.monotonic()
+        # A recorder brings a clip when its time is over, so the next one takes as long as the last.
+        pause_s, is_pausing = max(_SETTLE_S, _PAUSE_CLIPS * self._clip_s), False
         while not self._closing.is_set():
             paths = [path for path in clips_in(self._folder) if self._has_more(path)]
             if len(paths) > 1:
@@ -307,6 +316,9 @@ class ClipFolder(Source):
                     return paths[0]
             elif now - waiting_since >= self._settings.clips_wait_s:
                 return None
+            elif now - waiting_since >= pause_s and not is_pausing:
+                is_pausing = True
+                self._on_pause()
             self._closing.wait(_POLL_S)
         return None
 

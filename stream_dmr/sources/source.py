@@ -81,6 +81,9 @@ class Source(ABC):
         A folder of clips says what is wrong with one.
         """
 
+    def announce_pauses(self, on_pause: Callable[[], None]) -> None:  # noqa: B027, optional
+        """Call `on_pause`, in the iterating thread, if clips stay away for longer than usual."""
+
     def resume(self, point: ResumePoint) -> None:  # noqa: B027, optional
         """Continue after earlier runs; call it before the iteration."""
 

@@ -198,6 +198,10 @@ class TrackedFish:
         """The track numbers that later frames may show."""
         return self._tracker.open_numbers
 
+    def forget_tracks(self) -> None:
+        """Later frames show none of the fish of those before."""
+        self._tracker.forget_tracks()
+
     def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:
         """The track numbers of confirmed fish; `crops` are those of all detections of the frame."""
         self._corrector.update(crops)

@@ -71,6 +71,10 @@ class Tracker:
         """The numbers of the tracks that a later frame may show."""
         return {track.number for track in (*self._tracks, *self._hidden)}
 
+    def forget_tracks(self) -> None:
+        """End all tracks; their numbers are not used again."""
+        self._tracks, self._hidden = [], []
+
     def step(self, frame: Frame, candidates: Sequence[Candidate]) -> list[TrackedCandidate]:
         """The tracks seen in a frame. Frames must come in order; some may be missing."""
         observations = [
@@ -79,7 +83,7 @@ class Tracker:
             if candidate.score >= self._settings.min_score
         ]
         if not self._settings.across_frames:
-            self._tracks, self._hidden = [], []
+            self.forget_tracks()
         for track in (*self._tracks, *self._hidden):
             track.predict(frame.frame_index)
         observations = [piece for one in observations for piece in self._split(frame, one)]

@@ -39,6 +39,10 @@ class CountedFrames(CropFish):
         self.frames.append(frame.frame_index)
         return []
 
+    def pause(self) -> list[FishCrop | TrackEnded]:
+        self.frames.append(0)
+        return []
+
     def close(self) -> list[FishCrop | TrackEnded]:
         return []
 
@@ -70,6 +74,15 @@ def test_each_run_has_its_own_from_its_first_frame_on(
         node.step(Frame(frame_index=index, timestamp_ns=index, image=image, source="x"))
     seen = [(one.tracks_before, one.frames) for one in opened if one.frames]
     assert seen == expected
+
+
+def test_tracks_end_after_the_frames_at_which_the_run_paused():
+    crop_fish = CountedFrames()
+    node = CropFishOfRuns(lambda: crop_fish, [], pauses={2})
+    for index in (1, 2, 3):
+        image = np.zeros((2, 2, 3), np.uint8)
+        node.step(Frame(frame_index=index, timestamp_ns=index, image=image, source="x"))
+    assert crop_fish.frames == [1, 2, 0, 3]
 
 
 class Listener(RunObserver):

@@ -114,6 +114,40 @@ def test_the_end_of_a_track_goes_down_the_chain_and_is_told_once(in_one_thread: 
     assert answers == [("last.end", 2), ("last.end", 4), ("last.end", 6)]
 
 
+class EndsAtPauses(EndsEven):
+    """Ends its track at a pause, and not before."""
+
+    def step(self, message: Message) -> Sequence[Message]:
+        return [frame(message.frame_index, source=self.name)]
+
+    def pause(self) -> Sequence[Message]:
+        return [TrackEnded.after(frame(3), 7, "pause")]
+
+
+def test_a_pause_of_the_source_ends_tracks_and_is_no_frame():
+    chains, written, done = list[Chain](), list[Message](), list[int]()
+
+    def source() -> Iterator[Frame]:
+        for item in frames(5):
+            yield item
+            if item.frame_index == 3:
+                chains[0].pause()
+
+    counters = run_chain(
+        source(),
+        [EndsAtPauses("first"), EndsEven("last")],
+        on_message=lambda message: written.append(message) or message,
+        on_start=chains.append,
+        on_frame=lambda: done.append(1),
+        stop=threading.Event(),
+    )
+    ends = [m.source for m in written if isinstance(m, Frame) and m.source.endswith("end")]
+    assert [m.cause for m in written if isinstance(m, TrackEnded)].count("pause") == 1
+    assert ends == ["last.end"]
+    assert len(done) == 5
+    assert [(c.frames_in, c.frames_processed) for c in counters] == [(5, 5)] * 3
+
+
 @settings(max_examples=50, deadline=None)
 @given(
     count=st.integers(0, 6),

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from stream_dmr.calibration.calibration_file import save_calibration
-from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish
+from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.pipeline.config import as_calibrated, load_config, to_toml
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.run_folder import RESULTS, SEGMENTS, result_names
@@ -25,7 +25,14 @@ from stream_dmr.store.run_tables import lengths_row
 from tests.support.command import invoke, rows
 from tests.support.fish_run import request
 from tests.support.reading import read_header, read_messages
-from tests.support.tiny_clip import calibration, draw_mask, draw_picture, options, write_clip
+from tests.support.tiny_clip import (
+    box_line,
+    calibration,
+    draw_mask,
+    draw_picture,
+    options,
+    write_clip,
+)
 
 COMING_AND_GOING = [[1], [1, 2], [1, 2], [1, 2], [2, 3], [3], [3], []]
 
@@ -258,6 +265,47 @@ def add_clip(folder: Path, name: str) -> None:
     clip = folder / "clips" / name
     shutil.copy(folder / "video.mp4", clip)
     os.utime(clip, (1_700_000_000, 1_700_000_000))  # long ago, so that it is complete
+
+
+class AddsClip(RunObserver):
+    """Brings another clip once the fish of the first one are final, and stops after it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.stop, self.final_after = threading.Event(), list[int]()
+        self._folder, self._num_frames = folder, 0
+
+    def take(self, message: Message) -> None:
+        if isinstance(message, LengthEstimate) and message.is_final:
+            self.final_after.append(self._num_frames)
+            if len(self.final_after) == 1:
+                add_clip(self._folder, "2.mp4")
+
+    def frame_done(self) -> None:
+        self._num_frames += 1
+        if self._num_frames == 12:
+            self.stop.set()
+
+
+def test_fish_in_view_at_the_end_of_a_clip_are_final_if_no_further_clip_comes(tmp_path: Path):
+    clip = tmp_path / "clip"
+    write_clip(clip, fish=[[1]] * 6)
+    masks = [draw_mask((k - 1) % 6 + 1, [1]) for k in range(1, 13)]
+    boxes = [box_line(k, 1, mask).replace(",1,", ",-1,", 1) for k, mask in enumerate(masks, 1)]
+    (clip / "unnamed.txt").write_text("".join(boxes))
+    with (clip / "quick.toml").open("a") as config:
+        config.write(
+            "\n[read_frames]\nclips_wait_s = 60\n"
+            "\n[track_fish]\nmin_mask_confidence = 0.0\nmin_track_frames = 1\n"
+        )
+    (clip / "clips").mkdir()
+    add_clip(clip, "1.mp4")
+    observer, out = AddsClip(clip), tmp_path / "out"
+    options = request(clip, out, source=str(clip / "clips"), masks=None, boxes=clip / "unnamed.txt")
+    measure_source(options, stop=observer.stop, observer=observer)
+    assert observer.final_after == [6, 12]
+    assert [row["frames_seen"] for row in rows(out / "lengths.csv")] == ["6", "6"]
+    again = invoke("replay", {str(out): None, "--from": "crop", "--check": None})
+    assert again.code == 0, again.err
 
 
 def test_a_resumed_run_numbers_fish_and_recordings_on(tmp_path: Path):

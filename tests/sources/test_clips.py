@@ -125,6 +125,16 @@ def test_a_clip_is_read_when_it_has_come_and_not_before(tmp_path: Path):
     assert folder.warnings == []
 
 
+def test_a_pause_is_announced_once_if_no_clip_comes(tmp_path: Path):
+    clip(tmp_path / "1.avi", first=1)
+    folder, announced = ClipFolder(tmp_path, ReadFramesSettings(clips_wait_s=7.0)), list[int]()
+    folder.announce_pauses(lambda: announced.append(len(seen)))
+    seen: list[Frame] = []
+    for frame in folder:
+        seen.append(frame)
+    assert (len(seen), announced) == (4, [4])
+
+
 def test_a_clip_that_grows_after_it_was_read_is_read_on(tmp_path: Path):
     clip(tmp_path / "1.ts", first=1)
     whole = clip(tmp_path / "whole", first=1, num_frames=9)
