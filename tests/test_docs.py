@@ -1,18 +1,13 @@
 """The generated parts of the guide are up to date, and its links lead somewhere."""
 
 import re
-import shlex
 import subprocess
 from contextlib import closing
 from dataclasses import fields
 from pathlib import Path
 
 import pytest
-from typer.core import TyperGroup
-from typer.main import get_command
 
-import stream_dmr as sd
-from stream_dmr.cli.main import app
 from stream_dmr.export.fish_table import FISH_TABLE
 from stream_dmr.store.run_tables import FRAMES_COLUMNS, LENGTHS_COLUMNS
 from stream_dmr.store.schema import open_for_writing
@@ -111,42 +106,3 @@ def test_a_page_of_research_says_when_how_and_what_was_decided(page):
         "how?"
     )
     assert "ecided" in text, "and then?"
-
-
-def commands_of(page: Path) -> list[list[str]]:
-    """The commands of stream-dmr in the blocks of a page, as they stand there."""
-    text = re.sub(r"\\\n\s*", " ", page.read_text())
-    lines = re.findall(r"^ {4,}(?:\.venv/bin/)?stream-dmr (.*)$", text, re.MULTILINE)
-    return [shlex.split(line, comments=True) for line in lines]
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_commands_of_a_page_are_those_of_the_program(page: Path):
-    program = get_command(app)
-    assert isinstance(program, TyperGroup)
-    for name, *arguments in commands_of(page):
-        program.commands[name].make_context(name, arguments)  # raises for an unknown option
-
-
-def test_the_pages_have_commands():
-    assert sum(len(commands_of(page)) for page in PAGES) > 50
-
-
-def blocks_of(page: Path) -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
-
-
-def test_python_of_the_pages_runs_as_it_stands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    monkeypatch.chdir(tmp_path)
-    for name, copy in (("video.mp4", "haul.mp4"), ("calibration.yaml", "calibration.yaml")):
-        (tmp_path / copy).symlink_to(sd.DEMO_SCENE / name)
-    (measure,) = blocks_of(ROOT / "README.md")
-    (read_messages,) = blocks_of(ROOT / "docs" / "files.md")
-    again, open_again = blocks_of(ROOT / "docs" / "python.md")
-    assert again.splitlines()[:4] == measure.splitlines()[:4]
-    known: dict[str, object] = {}
-    for block in (measure, read_messages, open_again):
-        exec(block, known)
-        assert capsys.readouterr().out.strip()
