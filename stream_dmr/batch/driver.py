@@ -131,7 +131,7 @@ class _BatchResults:
         return [j for j in self._jobs if j.name in outcomes and outcomes[j.name].status == DONE]
 
     def _write_table(self) -> None:
-        """Write videos.csv: one row a video, in the order of the manifest."""
+        """Write videos.csv: one row per video, in the order of the manifest."""
         target = self._out / VIDEOS
         rows = (_cells(job, self.outcomes.get(job.name)) for job in self._jobs)
         with replacing(target) as draft:

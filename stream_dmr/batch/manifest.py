@@ -1,4 +1,4 @@
-"""The manifest of a batch: one row a video, with its annotations and its vessel, trip and haul."""
+"""The manifest of a batch: a row per video, with its annotations and its vessel, trip and haul."""
 
 import csv
 import io
