@@ -48,6 +48,7 @@ NOT_RUN = {
     "fleet boxes.txt": "running boxes, and no end; tests/web/test_fleet.py has some",
     "agreement ": "verdicts of two people; tests/web/test_agreement.py has them",
     "review ": "serves until it is stopped; tests/web/test_review.py",
+    "import ": "tracks that were corrected in DIVE; tests/web/test_corrected_tracks.py has some",
     "view runs/demo": "a window",
     "view haul  ": "a window",
     "view haul --web": "serves until it is stopped",

@@ -18,7 +18,7 @@ from stream_dmr.cli.batch import batch
 from stream_dmr.cli.calibrate import calibrate, check
 from stream_dmr.cli.export import export
 from stream_dmr.cli.replay import combine, replay
-from stream_dmr.cli.review import agreement, review
+from stream_dmr.cli.review import agreement, import_, review
 from stream_dmr.cli.run import demo, recover, run, setup, simulate
 from stream_dmr.cli.shared_options import exit_on_signals, printable, typer_command
 from stream_dmr.cli.templates import learn_template, make_template
@@ -47,6 +47,7 @@ _GROUPS: dict[str, dict[Callable[..., None], str]] = {
     },
     "Review": {
         review: "Review fish in the browser.",
+        import_: "Take over tracks that were corrected elsewhere.",
         agreement: "Compare the review with blind readings.",
         verify: "Check that results are what their run measured.",
     },
@@ -68,13 +69,17 @@ _GROUPS: dict[str, dict[Callable[..., None], str]] = {
 }
 
 
+def _name(command: Callable[..., None]) -> str:
+    return command.__name__.strip("_").replace("_", "-")
+
+
 class _GroupedHelp(TyperGroup):
     """Lists the commands by what they are for."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write a list of commands for each group."""
         for title, commands in _GROUPS.items():
-            names = [command.__name__.replace("_", "-") for command in commands]
+            names = [_name(command) for command in commands]
             rows = [(name, self.commands[name].short_help or "") for name in names]
             with formatter.section(title):
                 formatter.write_dl(rows)
@@ -90,7 +95,7 @@ app = typer.Typer(
 )
 for _group in _GROUPS.values():
     for _command, _summary in _group.items():
-        app.command(short_help=_summary)(typer_command(_command))
+        app.command(_name(_command), short_help=_summary)(typer_command(_command))
 
 
 def main() -> None:

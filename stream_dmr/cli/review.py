@@ -1,4 +1,4 @@
-"""`stream-dmr review` and `agreement`: what reviewers decide, and how well they agree."""
+"""`stream-dmr review`, `import` and `agreement`: what reviewers decide, and how well they agree."""
 
 from contextlib import closing
 from pathlib import Path
@@ -61,6 +61,33 @@ def review(
         with closing(ReviewServer(queue, title=title, port=port)) as server:
             print(f"open {server.address}\nCtrl-C ends it", flush=True)
             stop.wait()
+
+
+def import_(
+    folder: Annotated[Path, typer.Argument(help="The --out of a run.", metavar="DIR")],
+    viame: Annotated[Path, "Its `export --viame` after corrections in DIVE or VIAME."],
+    reviewer: Annotated[str, "Your name, for the verdicts.", "who is logged in"] = "",
+    source: Annotated[
+        str | None,
+        "The recorded clip, for fish that were drawn.",
+        "the one that was measured, if it is still there",
+    ] = None,
+) -> None:
+    """Take what was corrected in a file of tracks as verdicts and edits into lengths.db.
+
+    All of it or, where something can't be a verdict, nothing.
+    """
+    from getpass import getuser
+
+    from stream_dmr.web.corrected_tracks import import_tracks
+    from stream_dmr.web.open_reports import open_report
+
+    report = open_report(folder, source=source)
+    said, doubts = import_tracks(report, viame, reviewer=reviewer or getuser())
+    for line in said:
+        print(line)
+    print(f"{folder}: {len(said) or 'nothing differs from the review, no'} verdicts written")
+    warn([*report.recording.warnings, *doubts])
 
 
 def agreement(folders: _Folders) -> None:

@@ -50,6 +50,9 @@ class AnnotatedBox:
     score: float = 1.0  # confidence of the detector, 0 to 1; 1 where not given
     # Makes the mask in a frame of a height and width, or raises AnnotationError; None: not given.
     mask: Callable[[tuple[int, int]], Bool[np.ndarray, "H W"]] | None = None
+    # Of VIAME alone: the species or "", and head and tail in px from the picture's corner.
+    species: str = ""
+    ends_px: Float[np.ndarray, "2 2"] | None = None
 
 
 def box_from_xywh(
@@ -304,6 +307,7 @@ def _box(
 
 _VIAME_HEAD = "# 1: Detection or Track-id"
 _POLYGON = re.compile(r"\((poly|hole)\)(.*)", re.DOTALL)
+_END = re.compile(r"\(kp\) (head|tail) (\S+) (\S+)")
 
 
 def parse_viame(
@@ -337,7 +341,7 @@ def parse_viame(
 def _viame_box(
     cells: list[str], frames: Mapping[str, int], where: str
 ) -> tuple[str, int, AnnotatedBox]:
-    parts = list[list[Ring]]()
+    parts, ends = list[list[Ring]](), dict[str, list[float]]()
     try:
         track_id, frame = int(cells[0]), int(cells[2])
         x0, y0, x1, y1, score = map(float, cells[3:8])
@@ -347,6 +351,8 @@ def _viame_box(
                 parts.append([ring])
             else:
                 parts[-1].append(ring)
+        for name, *point in (one.groups() for one in map(_END.match, cells[9:]) if one):
+            ends[name] = [*map(float, point)]
         if track_id < 0 or frame < 0 or any(len(ring) < 3 for part in parts for ring in part):
             raise ValueError
     except (ValueError, IndexError):
@@ -361,23 +367,28 @@ def _viame_box(
         visibility=1.0,
         score=score if 0 <= score <= 1 else 1.0,
         mask=partial(fill_parts, parts=parts) if parts else None,
+        species="" if cells[9:10] == [] or cells[9].startswith("(") else cells[9].strip(),
+        ends_px=np.array([ends["head"], ends["tail"]]) if len(ends) == 2 else None,
     )
     return where, frames.get(cells[1], frame + 1), box
 
 
 _MAX_BYTES = 1 << 29  # chosen: some ten million boxes
-_PARSERS = {".json": parse_coco, ".xml": parse_cvat}
+Parser = Callable[[str, Path, Sequence[Path]], dict[int, list[AnnotatedBox]]]
+_PARSERS: Mapping[str, Parser] = {".json": parse_coco, ".xml": parse_cvat}
 
 
-def load_boxes(path: Path, *, pictures: Path | None = None) -> dict[int, list[AnnotatedBox]]:
+def load_boxes(
+    path: Path, *, pictures: Path | None = None, parse: Parser | None = None
+) -> dict[int, list[AnnotatedBox]]:
     """Boxes by frame (from 1), within a frame by id; none from an empty text file.
 
     `.json` is read as COCO, `.xml` as CVAT, a file with VIAME's header or named `.viame.csv` as
-    VIAME, everything else as MOT Challenge text. `pictures`: the source of the frames; where it is
-    a folder, all but MOT name its pictures. Raises AnnotationError with the place in the file and
-    what was expected there.
+    VIAME, everything else as MOT Challenge text; all by `parse` if given. `pictures`: the source of
+    the frames; where it is a folder, all but MOT name its pictures. Raises AnnotationError with the
+    place in the file and what was expected there.
     """
-    text, parse = _read_text(path), _PARSERS.get(path.suffix.lower())
+    text, parse = _read_text(path), parse or _PARSERS.get(path.suffix.lower())
     if text.startswith(_VIAME_HEAD) or path.name.lower().endswith(".viame.csv"):
         parse = parse_viame
     if parse is None:

@@ -26,7 +26,7 @@ _HEADER = (
     "4-7: Img-bbox(TL_x,TL_y,BR_x,BR_y),8: Detection or Length Confidence,"
     "9: Target Length (0 or -1 if invalid),10-11+: Repeated Species,Confidence Pairs or Attributes"
 )
-NO_LENGTH = -1
+NO_LENGTH, NO_SPECIES = -1, "fish"
 _OF_TRACK = (  # columns of fish.csv
     *("length_mm", "ci95_low_mm", "ci95_high_mm", "length_type", "length_from", "frames_used"),
     *("status", "flags", "species", "species_code", "species_share", "fate", "fate_share"),
@@ -65,22 +65,26 @@ def viame_csv(
     return text.getvalue(), len(rows)
 
 
+def species_name(fish: Fish | None) -> str:
+    """What it is as far as somebody knows, else NO_SPECIES."""
+    return (fish.review.species or fish.sure_code if fish else "") or NO_SPECIES
+
+
 def _row(
     crop: FishCrop, located: LocalizedFish, fish: Fish | None, picture: str | None
 ) -> list[object]:
     since = timedelta(microseconds=max(0, located.timestamp_ns) // 1000)
     time = (datetime(1970, 1, 1) + since).time().isoformat("microseconds")  # of a day
     length_mm = None if fish is None else fish.length_mm
-    # What it is, and how sure that is; "fish" where nobody knows more.
-    named, code = (fish.review.species, fish.sure_code) if fish else ("", "")
-    share = fish.estimate.species_share if fish and code and not named else None
+    is_by_classifier = fish is not None and fish.sure_code and not fish.review.species
+    share = fish.estimate.species_share if fish and is_by_classifier else None
     px = located.keypoints_px
     ends = {} if px is None else {"head": px[0] + 0.5, "tail": px[2] + 0.5}
     return [
         *(located.track_id, picture or time, located.frame_index - 1),
         *crop.bbox_xyxy_px.tolist(),
         *("1.0", NO_LENGTH if length_mm is None else f"{length_mm:.1f}"),
-        *(named or code or "fish", f"{share or 1.0:.3f}"),
+        *(species_name(fish), f"{share or 1.0:.3f}"),
         *(f"(kp) {name} {x:.1f} {y:.1f}" for name, (x, y) in ends.items()),
         *_polygons(crop),
         *_attributes("atr", {name: getattr(located, name) for name in _OF_BOX}),

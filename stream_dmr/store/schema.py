@@ -333,6 +333,12 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
         raise _refusal(path, error, remedy="the file is damaged; use a copy of it") from error
 
 
+def copy_database(path: Path, copy: Path) -> None:
+    """Make a copy to try something on, also beside a run. Raises OutputError."""
+    with reading(path) as database, closing(sqlite3.connect(copy)) as made:
+        database.backup(made)
+
+
 def copy_in_memory(path: Path) -> sqlite3.Connection:
     """A copy to work with while the disk has no room for SQLite's own files; empty without a file.
 

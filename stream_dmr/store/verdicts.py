@@ -247,19 +247,18 @@ def frames_sha256(frames: Sequence[AddedFrame]) -> str:
 
 def add_verdict(
     path: Path,
-    verdict: Verdict,
-    *,
+    *verdicts: Verdict,
     frames: Sequence[AddedFrame] = (),
     new_fish: int | None = None,
     known: int | None = None,
 ) -> Verdict:
-    """Write a verdict into a lengths.db, durably; returns it with its time.
+    """Write verdicts into a lengths.db, durably, all or none; returns the last with its time.
 
-    `frames` are those of an added fish, `new_fish` is a track id that it uses. With `known`, the
-    number of verdicts that it builds on, UserError where another reviewer has written meanwhile.
-    Raises OutputError where the disk refuses it.
+    `frames` are those of added fish, `new_fish` is the last track id that they use. With `known`,
+    the number of verdicts that they build on, UserError where another reviewer has written
+    meanwhile. Raises OutputError where the disk refuses it.
     """
-    verdict = replace(verdict, written_ns=time.time_ns())
+    written = [replace(verdict, written_ns=time.time_ns()) for verdict in verdicts]
     try:
         database = open_for_writing(path)
     except DiskRefusal as error:
@@ -274,12 +273,13 @@ def add_verdict(
                 "verdict: expected the fish as this page shows them, but another reviewer has "
                 "changed them meanwhile; look again, and repeat it"
             )
-        database.execute(*insertion(VERDICTS, asdict(verdict)))
+        for verdict in written:
+            database.execute(*insertion(VERDICTS, asdict(verdict)))
         for frame in frames:
             database.execute(*insertion(ADDED_FRAMES, asdict(frame)))
         if new_fish is not None:
             database.execute(MARK, (REVIEWED_ID, new_fish))  # no later run may use it
-    return verdict
+    return written[-1]
 
 
 def read_verdicts(path: Path) -> list[Verdict]:

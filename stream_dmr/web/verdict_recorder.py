@@ -72,7 +72,7 @@ class SubmittedVerdict(BaseModel):
     head: Point | None = None
     tail: Point | None = None
     other_fish: int | None = None
-    boxes: list[DrawnBox] = Field(default_factory=list[DrawnBox], max_length=500)
+    boxes: list[DrawnBox] = Field(default_factory=list[DrawnBox], max_length=10_000)
     sure: bool = False  # do it although it contradicts what is measured
 
 
@@ -101,6 +101,17 @@ def drawn_boxes(
     return corners, (min(times), max(times))
 
 
+def require_database(report: RunReport) -> Path:
+    """The database that takes the verdicts; UserError without one."""
+    database = database_of(report.path)
+    if database is None:
+        raise UserError(
+            f"{report.path}: expected the folder of a run, with its lengths.db, for the "
+            "verdicts; got a recording alone"
+        )
+    return database
+
+
 class VerdictRecorder:
     """Verdicts of one reviewer on the fish of one run. Thread-safe."""
 
@@ -109,20 +120,14 @@ class VerdictRecorder:
 
         A `blind` reading sees the fish as they were measured, and changes no review.
         """
-        database = database_of(report.path)
-        if database is None:
-            raise UserError(
-                f"{report.path}: expected the folder of a run, with its lengths.db, for the "
-                "verdicts; got a recording alone"
-            )
-        self._database: Path = database
+        self._database = require_database(report)
         self.report = report
         self._reviewer = reviewer
         self._reading = BLIND if blind else None
         self.pictures = FrameLookup(
             report.recording, report.source or recorded_source(report.recording)
         )
-        self._editor = TrackEditor(database, self.pictures)
+        self._editor = TrackEditor(self._database, self.pictures)
         self._lock = Lock()
 
     def record(self, submitted: SubmittedVerdict) -> list[int]:
