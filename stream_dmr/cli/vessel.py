@@ -51,7 +51,7 @@ def haul(
 
 
 def _post(address: str, what: str, name: str, token_file: Path | None) -> str:
-    from stream_dmr.errors import UserError
+    from stream_dmr.errors import UserError, reason_of
     from stream_dmr.files import read_token
 
     headers = {"Content-Type": "application/json"}
@@ -70,8 +70,12 @@ def _post(address: str, what: str, name: str, token_file: Path | None) -> str:
             said = "it wants its access token: --token-file FILE"
         raise UserError(f"{address}: expected it to take the haul, got: {said or error}") from error
     except (OSError, ValueError, KeyError, TypeError, HTTPException) as error:
+        # A URLError says <urlopen error ...> of what the system said, or of a text.
+        cause = error.reason if isinstance(error, urllib.error.URLError) else error
+        got = reason_of(cause) if isinstance(cause, Exception) else cause
         raise UserError(
-            f"{address}: expected the status page of a run ([watch] port), got: {error}"
+            f"{address}: expected the status page of a run, got: {got}; give the address that "
+            "the run prints when it starts ([watch] port in its config)"
         ) from error
 
 

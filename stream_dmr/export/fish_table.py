@@ -111,11 +111,6 @@ _COLUMNS: dict[str, _Column] = {
     # Which length `length_mm` is, by the ICES vocabulary.
     "length_type": (str, lambda row: ICES_LENGTHS.get(row.template.tail_gives or "")),
 }
-_ALWAYS = {
-    *LENGTHS_COLUMNS,
-    *("vessel", "trip", "haul", "species", "species_code", "fate"),
-    *("time_utc", "latitude", "longitude", "verdict"),
-}
 FISH_TABLE: dict[str, type] = {name: kind for name, (kind, _) in _COLUMNS.items()}
 
 
@@ -140,11 +135,12 @@ def fish_record(
 
 
 def used_columns(records: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The columns in which a fish has something, and those that other programs rely on."""
+    """The columns of lengths.csv, and those in which a fish has something."""
     return [
         name
         for name in FISH_TABLE
-        if name in _ALWAYS or any(record[name] not in (None, "", "[]", "{}") for record in records)
+        if name in LENGTHS_COLUMNS
+        or any(record[name] not in (None, "", "[]", "{}") for record in records)
     ]
 
 

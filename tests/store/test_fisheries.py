@@ -21,6 +21,7 @@ from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
 from stream_dmr.pipeline.config import parse_config
 from stream_dmr.store.fish import Fish
 from stream_dmr.store.fisheries import Derived, FisheriesSettings, derive, whole_cm
+from stream_dmr.store.run_tables import LENGTHS_COLUMNS
 from stream_dmr.store.verdicts import Verdict, add_verdict
 from stream_dmr.template.template_file import BUNDLED, load_template
 from tests.support.command import invoke
@@ -130,8 +131,9 @@ def test_columns_that_are_empty_throughout_are_left_out_unless_asked_for(
             columns[option] = csv.DictReader(file).fieldnames
     assert columns["--all-columns"] == list(FISH_TABLE)
     left_out = {*FISH_TABLE} - {*columns[""]}
-    assert {"reviewer", "corrected_length_mm", "scale_error_percent"} <= left_out
-    assert not {"length_mm", "latitude", "species_code", "verdict", "iou"} & left_out
+    assert {"reviewer", "verdict", "corrected_length_mm", "scale_error_percent"} <= left_out
+    assert {"fate", "latitude", "longitude"} <= left_out
+    assert not {"vessel", "trip", "haul", "species", "iou", *LENGTHS_COLUMNS} & left_out
 
 
 def test_the_kind_of_a_length_is_said_if_the_species_is_known():

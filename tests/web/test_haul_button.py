@@ -127,6 +127,17 @@ def test_an_address_that_is_none_is_said(address: str):
     told = invoke("haul", {"start": None, address: None})
     assert told.code == 2
     assert told.error.startswith(f"{address}: expected the status page of a run")
+    assert "<" not in told.error
+
+
+def test_a_box_that_does_not_answer_is_said_once_without_the_names_of_python():
+    address = f"http://127.0.0.1:{free_port()}/"
+    told = invoke("haul", {"start": None, address: None})
+    assert told.code == 2
+    assert told.error == (
+        f"{address}: expected the status page of a run, got: Connection refused; give the address "
+        "that the run prints when it starts ([watch] port in its config)"
+    )
 
 
 class Quiet(SimpleHTTPRequestHandler):
