@@ -14,12 +14,12 @@ import stream_dmr as sd
 run = sd.Run(sys.argv[1] if len(sys.argv) > 1 else "runs/example-01")
 out = Path(sys.argv[2] if len(sys.argv) > 2 else "runs/example-02")
 
-fish = pd.DataFrame(run.fish)  # one row a fish, the columns of lengths.csv
+fish = pd.DataFrame(run.fish)  # one row per fish, the columns of lengths.csv
 measured = fish[fish.status == "measured"]
 print(measured[["track_id", "length_mm", "ci95_low_mm", "ci95_high_mm"]].round(0))
 print(f"{len(measured)} of {len(fish)} fish measured, mean {measured.length_mm.mean():.0f} mm")
 
-frames = pd.DataFrame(run.frames)  # one row a fish and frame, the columns of frames.csv
+frames = pd.DataFrame(run.frames)  # one row per fish and frame, the columns of frames.csv
 print("Frames that did not count, by reason:")
 print(frames[~frames.accepted].reason.value_counts().to_string())
 

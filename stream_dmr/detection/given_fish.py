@@ -333,7 +333,7 @@ def _read(path: Path) -> dict[str, int]:
             )
         if found.setdefault(name, int(fish)) != int(fish):
             raise AnnotationError(
-                f"{path}:{line}: expected one fish a picture, got another one for {name!r}; "
+                f"{path}:{line}: expected one fish per picture, got another one for {name!r}; "
                 "pictures of several fish need --boxes or --masks with ids"
             )
     return found

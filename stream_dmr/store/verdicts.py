@@ -192,7 +192,7 @@ def check_verdict(verdict: Verdict, track_ids: set[int], reviews: Mapping[int, R
         f"a condition of {', '.join(CONDITIONS)}, got {verdict.condition!r}": (
             verdict.kind == "condition" and verdict.condition not in CONDITIONS
         ),
-        "another fish that this one repeats": verdict.kind == "duplicate"
+        f"the number of another fish, got {verdict.duplicate_of}": verdict.kind == "duplicate"
         and (verdict.duplicate_of not in track_ids or verdict.duplicate_of == verdict.track_id),
         f"a fish that is not itself a duplicate of fish {verdict.track_id}; withdraw that first": (
             verdict.kind == "duplicate" and verdict.track_id in _originals(verdict, reviews)

@@ -174,7 +174,7 @@ class TrackEditor:
         other = verdict.other_fish
         there = {one.estimate.track_id for one in report.fish} - report.edits.merged.keys()
         if other is None or other == verdict.track_id or other not in there:
-            raise UserError("verdict: expected the number of the other fish of this one's track")
+            raise UserError(f"verdict: expected the number of another fish, got {other}")
         rows = self._rows(report, {other: report.edits.merge(verdict.track_id, other)})
         return TrackEdit(verdict=replace(verdict, fish=json.dumps(rows)))
 

@@ -157,8 +157,13 @@ def test_nothing_is_cut_and_clip_and_verdicts_are_in_sight_together(tab: Tab):
         document.querySelector(".row").click();
         await until(() => player.clip?.isDone);
         await new Promise((done) => setTimeout(done, 300));
+        click("do-add")();
+        click("do-measure")();
+        const said = document.getElementById("message");
         const tools = document.getElementById("verdicts").getBoundingClientRect();
-        return CLIP_CANVAS.getBoundingClientRect().top >= 0 && tools.bottom <= innerHeight;
+        return said.textContent.startsWith("Draw a box")
+          && CLIP_CANVAS.getBoundingClientRect().top >= 0 && tools.bottom <= innerHeight
+          && said.getBoundingClientRect().bottom <= innerHeight;
         """
     )
     assert tab.cut() == []

@@ -9,6 +9,7 @@ function startDrawing() {
   player.isPlaying = false;
   CLIP_CANVAS.classList.add("drawing");
   showDrawing();
+  say("");
 }
 
 function stopDrawing() {

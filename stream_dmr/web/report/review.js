@@ -112,7 +112,7 @@ function reviewTools(views) {
   const button = (kind, key, label, onclick) => element("button", { type: "button", id: `do-${kind}`, onclick }, ...bindKey(label, key));
   const group = (input, ...more) => element("span", { className: "group" }, input, ...more);
   const field = (id, placeholder, kind, other = {}) => {
-    const input = element("input", { id, placeholder, size: 12, autocomplete: "off", "aria-label": placeholder, ...other });
+    const input = element("input", { id, placeholder, size: 12, autocomplete: "off", "aria-label": `${kind}: ${placeholder}`, ...other });
     input.onkeydown = (event) => { if (event.key === "Enter") { event.preventDefault(); document.getElementById(`do-${kind}`).click(); input.blur(); } };
     return input;
   };
@@ -121,9 +121,9 @@ function reviewTools(views) {
   return element("div", { id: "verdicts" },
     button("accept", "a", "Accept", () => send({ kind: "accept" })),
     group(field("reason", "reason", "reject"), button("reject", "r", "Reject", () => send({ kind: "reject", reason: typed("reason") }))),
-    group(field("species-name", "species: code or name", "species", { list: "species-list" }), button("species", "s", "Set species", () => send({ kind: "species", species: speciesNamed(typed("species-name")) }))),
-    group(field("fate-name", "fate", "fate", { list: "fate-list" }), button("fate", "f", "Set fate", () => send({ kind: "fate", fate: typed("fate-name") }))),
-    group(field("condition-code", "condition: code", "condition", { list: "condition-list" }), button("condition", "c", "Set condition", () => send({ kind: "condition", condition: typed("condition-code") }))),
+    group(field("species-name", "code or name", "species", { list: "species-list" }), button("species", "s", "Set species", () => send({ kind: "species", species: speciesNamed(typed("species-name")) }))),
+    group(field("fate-name", "name", "fate", { list: "fate-list" }), button("fate", "f", "Set fate", () => send({ kind: "fate", fate: typed("fate-name") }))),
+    group(field("condition-code", "code", "condition", { list: "condition-list" }), button("condition", "c", "Set condition", () => send({ kind: "condition", condition: typed("condition-code") }))),
     group(field("duplicate-of", "fish", "duplicate", { inputMode: "numeric" }), button("duplicate", "d", "Duplicate of", () => send({ kind: "duplicate", duplicate_of: Number(typed("duplicate-of")) }))),
     ...(canEdit ? [
       group(field("merge-into", "fish", "merge", { inputMode: "numeric" }), button("merge", "m", "Goes on as", () => send({ kind: "merge", other_fish: Number(typed("merge-into")) }))),
