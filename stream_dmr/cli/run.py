@@ -33,6 +33,13 @@ def run(
     Writes lengths.db, lengths.csv, frames.csv, recording.mcap and recording.rrd into --out. Ctrl-C
     ends the run early and keeps what was done.
     """
+    _measure(options, log_json=log_json, timings=timings)
+
+
+def _measure(
+    options: RunOptions, *, log_json: bool = False, timings: bool = False, truth: Path | None = None
+) -> bool:
+    """Measure and print what was found, also beside true lengths; False if any is missing there."""
     from stream_dmr.sources.decoder import decoding_ahead
 
     source = Path(options.source)
@@ -45,11 +52,14 @@ def run(
         request = replace(options, command=command_line())
         with nullcontext(JsonLog()) if log_json else RunDisplay() as observer:
             summary = measure_source(request, stop=stop, observer=WatchObserver(observer))
-        _print_summary(summary, request.out, timings=timings)
+        _print_measured(summary, timings=timings)
+        is_complete = truth is None or print_beside_truth(request.out / "lengths.csv", truth)
+        print(f"results in {request.out}: {', '.join(path.name for path in summary.files)}")
     stop.exit()
+    return is_complete
 
 
-def _print_summary(summary: "RunSummary", out: Path, *, timings: bool) -> None:
+def _print_measured(summary: "RunSummary", *, timings: bool) -> None:
     from stream_dmr.cli.terminal import print_fish, print_speed, print_timings
 
     print_fish(summary.fish, summary.flags)
@@ -59,7 +69,6 @@ def _print_summary(summary: "RunSummary", out: Path, *, timings: bool) -> None:
     if summary.calibration is not None:
         distance_m = summary.calibration.plane.distance_mm / 1000
         print(f"by the calibration the reference plane is {distance_m:.2f} m from the camera")
-    print(f"results in {out}: {', '.join(path.name for path in summary.files)}")
 
 
 def demo(
@@ -78,16 +87,14 @@ def demo(
     template = DEMO_SCENE / "species.ply"
     arguments = ["--source", source, "--calibration", calibration, "--template", template]
     print(shlex.join(["stream-dmr", "run", *map(str, arguments), "--out", str(out)]), flush=True)
-    run(
-        RunOptions(
-            source=str(source),
-            calibration=calibration,
-            template=str(template),
-            out=out,
-            overwrite=overwrite or _is_of_demo(out),
-        )
+    options = RunOptions(
+        source=str(source),
+        calibration=calibration,
+        template=str(template),
+        out=out,
+        overwrite=overwrite or _is_of_demo(out),
     )
-    all_measured = print_beside_truth(out / "lengths.csv", DEMO_SCENE / "truth.csv")
+    all_measured = _measure(options, truth=DEMO_SCENE / "truth.csv")
     program = os.path.relpath(Path(sys.executable).with_name("stream-dmr"))  # venv not activated
     print(
         f"\nlook at it:      {program} view {out}"
@@ -124,6 +131,7 @@ def print_beside_truth(lengths: Path, truth: Path) -> bool:
     evaluation = evaluate(lengths, truth)
     print("\nbeside the true lengths of the scene:\n")
     print_true_lengths(evaluation)
+    print()
     return evaluation.fraction_measured == 1.0
 
 

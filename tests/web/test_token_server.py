@@ -68,7 +68,8 @@ def test_requests_that_stand_still_take_few_descriptors_and_end(server: TokenSer
             client.sendall(sent)
         assert wait_until(lambda: num_descriptors() <= before + 30 + PatientServer.max_connections)
         assert wait_until(lambda: status_of(server) == 200)  # they are still there, and time is up
-        assert num_descriptors() <= before + 30 + PatientServer.max_connections
+        # One more may be accepted, or answered, and not closed yet.
+        assert num_descriptors() <= before + 30 + PatientServer.max_connections + 1
 
 
 def test_half_open_connections_keep_nobody_out(server: TokenServer):
