@@ -388,9 +388,10 @@ def load_boxes(
     the frames; where it is a folder, all but MOT name its pictures. Raises AnnotationError with the
     place in the file and what was expected there.
     """
-    text, parse = _read_text(path), parse or _PARSERS.get(path.suffix.lower())
-    if text.startswith(_VIAME_HEAD) or path.name.lower().endswith(".viame.csv"):
+    text, is_viame = _read_text(path), path.name.lower().endswith(".viame.csv")
+    if parse is None and (is_viame or text.startswith(_VIAME_HEAD)):
         parse = parse_viame
+    parse = parse or _PARSERS.get(path.suffix.lower())
     if parse is None:
         return parse_mot(text, path)
     named = pictures_in(pictures) if pictures is not None and pictures.is_dir() else []

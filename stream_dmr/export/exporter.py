@@ -221,6 +221,7 @@ class Export:
             self.header.template,
             fps=round(1e9 / float(np.median(steps)), 3) if len(steps) else None,
             pictures={one.frame_index: one.source for one in frames if is_picture(one.source)},
+            is_part=not self._selection.is_everything,
         )
         with self._writing(path):
             path.write_text(text, encoding="utf-8")

@@ -27,6 +27,7 @@ _HEADER = (
     "9: Target Length (0 or -1 if invalid),10-11+: Repeated Species,Confidence Pairs or Attributes"
 )
 NO_LENGTH, NO_SPECIES = -1, "fish"
+PART = "(trk-atr) exported part"  # DIVE keeps it, unlike what the metadata line has
 _OF_TRACK = (  # columns of fish.csv
     *("length_mm", "ci95_low_mm", "ci95_high_mm", "length_type", "length_from", "frames_used"),
     *("status", "flags", "species", "species_code", "species_share", "fate", "fate_share"),
@@ -42,20 +43,22 @@ def viame_csv(
     *,
     fps: float | None,
     pictures: Mapping[int, str],
+    is_part: bool = False,
 ) -> tuple[str, int]:
     """The file and the number of its boxes; `fish` by track id, `fps` None where not known.
 
     `pictures`: names by frame index, of a folder of pictures. What is known of a track stands in
-    its first row.
+    its first row; with `is_part`, that other fish or frames of the run are left out, as well.
     """
     rows, text, told = list[list[object]](), StringIO(), set[int]()
     for crop, located in seen:
         one = fish.get(located.track_id)
         row = _row(crop, located, one, pictures.get(located.frame_index))
-        if one is not None and located.track_id not in told:
+        if located.track_id not in told:
             told.add(located.track_id)
-            record = fish_record(one, template, FisheriesSettings())
-            row += _attributes("trk-atr", {name: record[name] for name in _OF_TRACK})
+            record = {} if one is None else fish_record(one, template, FisheriesSettings())
+            row += _attributes("trk-atr", {name: record.get(name) for name in _OF_TRACK})
+            row += [PART] if is_part else []
         rows.append(row)
     # DIVE's server takes "Fps: " in the second cell alone, its desktop program either; a line
     # without a second cell breaks the server.

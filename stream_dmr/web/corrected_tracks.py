@@ -22,7 +22,7 @@ from stream_dmr.detection.box_files import AnnotatedBox, load_boxes, parse_viame
 from stream_dmr.errors import AnnotationError, UserError
 from stream_dmr.evidence.seal import seal_verdicts
 from stream_dmr.export.coco_masks import mask_in_frame
-from stream_dmr.export.viame_csv import NO_SPECIES, species_name
+from stream_dmr.export.viame_csv import NO_SPECIES, PART, species_name
 from stream_dmr.messages import FishCrop, Frame, LocalizedFish
 from stream_dmr.recording.reading import messages_of
 from stream_dmr.recording.selection import EVERYTHING
@@ -94,7 +94,7 @@ class _Comparison:
         self._fish = {one.estimate.track_id: one for one in report.fish}
         source = report.source or recorded_source(report.recording)
         pictures = None if source is None else Path(source)
-        rows = load_boxes(path, pictures=pictures, parse=parse_viame)
+        rows = load_boxes(path, pictures=pictures, parse=_parse_whole)
         database = require_database(report)
         # Fish and frames of boxes that were drawn before: their points were found anew.
         self._found_anew = {
@@ -177,6 +177,15 @@ class _Comparison:
             self.moved[box.track_id, crop.frame_index] = crop_from_frame(
                 ends_px, crop_camera=crop.crop_camera, frame_camera=crop.frame_camera
             ).tolist()
+
+
+def _parse_whole(text: str, path: Path, pictures: Sequence[Path]) -> dict[int, list[AnnotatedBox]]:
+    if PART in text:
+        raise AnnotationError(
+            f"{path}: expected tracks of the whole run, as fish that are not there are rejected, "
+            "got an `export --viame` with --track or --time; export without these, correct that"
+        )
+    return parse_viame(text, path, pictures)
 
 
 class _Corrections:

@@ -310,6 +310,20 @@ def test_fish_that_were_rejected_or_named_since_are_refused(out: Path):
     assert len(read_verdicts(out / "lengths.db")) == 2
 
 
+@pytest.mark.parametrize("part", ["--track 2", "--time 0:0.35"])
+def test_an_export_of_a_part_is_refused_also_after_dive(out: Path, part: str):
+    """DIVE writes a metadata line of its own, and keeps the attributes of tracks."""
+    done = invoke(f"export {out} --viame {part}", {"--out": str(out.parent / "part")})
+    assert done.code == 0, done.err
+    path = out.parent / "part" / "tracks.viame.csv"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(line for line in lines if not line.startswith("# metadata")))
+    done = take(out, path)
+    assert done.code == 2
+    assert "expected tracks of the whole run" in done.error
+    assert read_verdicts(out / "lengths.db") == []
+
+
 def test_a_recording_alone_takes_no_corrections(out: Path):
     path = exported(out)
     report = open_report(out / "recording.mcap")
