@@ -1,4 +1,8 @@
-"""Masks as COCO JSON with run lengths, in the pixels of their frames."""
+"""Masks as COCO JSON with run lengths, and head and tail, in the pixels of their frames.
+
+Beside cocodataset.org's "Data format" there are the ids of COCO-VID, as MMTracking's `CocoVID`
+reads them: a run is one video, whose frames count from 0.
+"""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -6,49 +10,73 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from stream_dmr.camera import crop_from_frame, frame_from_crop
-from stream_dmr.messages import FishCrop
+from stream_dmr.messages import FishCrop, LocalizedFish
 from stream_dmr.pictures import PICTURE_SUFFIXES
+from stream_dmr.reasons import Reason
 from stream_dmr.recording.codec import EncodedPicture
 from stream_dmr.segmentation.mask_outlines import run_lengths
+from stream_dmr.store.fish import Fish
 
 
 def coco_masks(
     pictures: Iterable[tuple[int, str, EncodedPicture]],
-    crops: Iterable[FishCrop],
-    codes: Mapping[int, str],
+    seen: Iterable[tuple[FishCrop, LocalizedFish]],
+    fish: Mapping[int, Fish],
+    *,
+    video: str,
 ) -> dict[str, Any]:
-    """COCO's object; `pictures` with frame index and source, `codes` by track id, "" for none.
+    """COCO's object; `pictures` with frame index and source, `fish` by track id.
 
-    Categories are the codes, and "fish" where there is none.
+    Categories are the codes of species, and "fish" where there is none.
     """
+    codes = {track_id: one.sure_code for track_id, one in fish.items() if one.counts}
     names = ["fish", *sorted({code for code in codes.values() if code})]
     annotations = list[dict[str, Any]]()
-    for number, crop in enumerate(crops, start=1):
+    for number, (crop, located) in enumerate(seen, start=1):
         mask = mask_in_frame(crop)
         x0, y0, x1, y1 = crop.bbox_xyxy_px.tolist()
+        ends_px = _ends(located, fish.get(crop.track_id))
+        keypoints = [] if ends_px is None else [(x + 0.5, y + 0.5, 2) for x, y in ends_px.tolist()]
         annotations.append(
             {
                 "id": number,
                 "image_id": crop.frame_index,
                 "category_id": 1 + names.index(codes.get(crop.track_id) or "fish"),
                 "track_id": crop.track_id,
+                "instance_id": crop.track_id,
                 "bbox": [x0, y0, x1 - x0, y1 - y0],
                 "area": int(mask.sum()),
                 "iscrowd": 0,
                 "segmentation": {"size": list(mask.shape), "counts": run_lengths(mask)},
+                "keypoints": [value for point in keypoints or [(0, 0, 0)] * 2 for value in point],
+                "num_keypoints": len(keypoints),
             }
         )
+    skeleton = {"keypoints": ["head", "tail"], "skeleton": [[1, 2]]}
     return {
+        "videos": [{"id": 1, "name": video}],
         "images": [_image(*picture) for picture in pictures],
         "annotations": annotations,
         "categories": [
-            {"id": k, "name": name, "supercategory": "fish"}
+            {"id": k, "name": name, "supercategory": "fish"} | skeleton
             for k, name in enumerate(names, start=1)
         ],
     }
+
+
+def _ends(located: LocalizedFish, fish: Fish | None) -> Float[np.ndarray, "2 2"] | None:
+    """Head and tail where a reviewer put them, else as fitted; None without, and if refused.
+
+    `train` would learn from those of a refused frame.
+    """
+    placed = None if fish is None else fish.review.moved.get(located.frame_index)
+    if placed is not None:
+        return np.array(placed)
+    is_refused = not located.accepted and located.reason != str(Reason.NO_CALIBRATION)
+    return None if is_refused or located.keypoints_px is None else located.keypoints_px[[0, 2]]
 
 
 def is_picture(source: str) -> bool:
@@ -96,4 +124,6 @@ def _extent(crop: FishCrop) -> tuple[int, int, int, int]:
 def _image(frame_index: int, source: str, picture: EncodedPicture) -> dict[str, Any]:
     """A picture of a folder has its own name, a frame of a video its number."""
     name = source if is_picture(source) else f"{frame_index:06d}.png"
-    return {"id": frame_index, "file_name": name, "width": picture.width, "height": picture.height}
+    size = {"width": picture.width, "height": picture.height}
+    in_video = {"video_id": 1, "frame_id": frame_index - 1}
+    return {"id": frame_index, "file_name": name, **size, **in_video}

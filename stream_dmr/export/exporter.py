@@ -120,7 +120,7 @@ class Export:
         return count
 
     def masks(self, path: Path) -> int:
-        """Write the masks as COCO JSON with run lengths; returns their number.
+        """Write masks, head and tail as COCO JSON; returns the number of masks.
 
         They are in the pixels of the frame, lens distortion included. Frames without fish are
         listed too. Categories are the FAO codes of the fish, and "fish" where there is none.
@@ -134,12 +134,9 @@ class Export:
                 for frame, payload in frames
                 if isinstance(frame, Frame)
             ),
-            (
-                crop
-                for crop in self._reviewed.of([FishCrop])
-                if isinstance(crop, FishCrop) and crop.track_id not in self._left_out
-            ),
-            {one.estimate.track_id: one.sure_code for one in self._fish if one.counts},
+            self._counted(),
+            {one.estimate.track_id: one for one in self._fish},
+            video=self.header.source,
         )
         with self._writing(path):
             path.write_text(json.dumps(coco), encoding="utf-8")
@@ -216,7 +213,7 @@ class Export:
         frames = messages_of(self.recording, Frame, self._selection)
         steps = np.diff(np.array([frame.timestamp_ns for frame in frames], np.int64))
         text, count = viame_csv(
-            (seen for seen in self._localized(FishCrop) if seen[0].track_id not in self._left_out),
+            self._counted(),
             {one.estimate.track_id: one for one in self._fish},
             self.header.template,
             fps=round(1e9 / float(np.median(steps)), 3) if len(steps) else None,
@@ -287,6 +284,11 @@ class Export:
         with writing_to(path):
             yield
         self._written.append(path)
+
+    def _counted(self) -> Iterator[tuple[FishCrop, LocalizedFish]]:
+        """Each crop of the fish that count, with its place."""
+        seen = self._localized(FishCrop)
+        return (one for one in seen if one[0].track_id not in self._left_out)
 
     def _localized(self, kind: type[Stage]) -> Iterator[tuple[Stage, LocalizedFish]]:
         """Each crop or fit with the place of its fish."""
