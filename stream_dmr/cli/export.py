@@ -37,6 +37,7 @@ def export(
     viame: Annotated[
         bool, "tracks.viame.csv: tracks with lengths, outlines and ends, for DIVE."
     ] = False,
+    mot: Annotated[bool, "tracks.mot.txt: boxes with ids as MOTChallenge text."] = False,
     agency: Annotated[
         list[Agency] | None,
         typer.Option(
@@ -57,10 +58,10 @@ def export(
 
     provenance.json beside them says what made them; `stream-dmr verify` checks it.
     """
-    if not (meshes or masks or tables or fish or viame or agency or hauls):
+    if not (meshes or masks or tables or fish or viame or mot or agency or hauls):
         raise UserError(
-            "expected a choice of what to export, got none; give some of: "
-            "--fish csv, --meshes ply, --masks, --tables csv, --viame, --hauls, --agency wcpfc"
+            "expected a choice of what to export, got none; give some of: --fish csv, "
+            "--meshes ply, --masks, --tables csv, --viame, --mot, --hauls, --agency wcpfc"
         )
     from stream_dmr.evidence.seal import NAME as PROVENANCE
     from stream_dmr.export.exporter import Export
@@ -85,6 +86,9 @@ def export(
         if viame:
             path = out / "tracks.viame.csv"
             print(f"{path}: {exported.viame(path)} boxes")
+        if mot:
+            path = out / "tracks.mot.txt"
+            print(f"{path}: {exported.mot(path)} boxes")
         for one in dict.fromkeys(agency or ()):
             print(exported.agency(out, one))
         if hauls:

@@ -224,6 +224,22 @@ class Export:
             path.write_text(text, encoding="utf-8")
         return count
 
+    def mot(self, path: Path) -> int:
+        """Write the boxes of the fish that count as MOTChallenge text; returns their number.
+
+        Left and top are from the picture's corner, as `run --boxes` reads them; MOTChallenge's own
+        files count them from 1.
+        """
+        self._require_writable(path, needed_for="--mot")
+        boxes = sorted(
+            (crop.frame_index, crop.track_id, *crop.bbox_xyxy_px.tolist())
+            for crop, _ in self._counted()
+        )
+        with self._writing(path), path.open("w", encoding="utf-8") as file:
+            for frame_index, track_id, x0, y0, x1, y1 in boxes:
+                file.write(f"{frame_index},{track_id},{x0},{y0},{x1 - x0},{y1 - y0},1,-1,-1,-1\n")
+        return len(boxes)
+
     def agency(self, out: Path, agency: Agency) -> Path:
         """Write the fish as wcpfc.csv or rdbes.csv; rejected ones and doubles are left out."""
         path, (columns, row) = out / f"{agency}.csv", AGENCIES[agency]
