@@ -11,9 +11,10 @@ from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 
-from stream_dmr.errors import UserError, reason_of
-from stream_dmr.files import read_text, sha256_of
+from stream_dmr.errors import SourceError, UserError, reason_of
+from stream_dmr.files import read_text
 from stream_dmr.pipeline.run_options import RunOptions, options_of
+from stream_dmr.recording.header import content_sha256
 from stream_dmr.version import __version__
 
 # Options of `run` by their names; `video` is --source.
@@ -140,6 +141,6 @@ def _size_and_time(path: str) -> list[int]:
 
 def _content_hash(path: str) -> str:
     try:
-        return sha256_of(Path(path)) if path else ""
-    except OSError:
+        return content_sha256(Path(path)) if path else ""
+    except SourceError:
         return ""

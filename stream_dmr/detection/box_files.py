@@ -1,4 +1,4 @@
-"""Read boxes from MOT, COCO, CVAT and VIAME files.
+"""Read boxes from MOT, COCO, CVAT and VIAME files, and from folders of YOLO labels.
 
 COCO's JSON (cocodataset.org, "Data format") is read as annotation tools export it. Frames of a
 video are those that names of six and more digits say, as `export --masks` writes them, else counted
@@ -13,7 +13,12 @@ track's id; a box of a single picture gets `UNKNOWN_ID`.
 VIAME CSV (github.com/Kitware/dive, `viame.py`) has a row for each box, with frames from 0; a track
 0 gets the first free number, all others keep theirs.
 
-COCO, CVAT and VIAME know pictures of a folder by their names, since they may have another order.
+YOLO's labels (docs.ultralytics.com, `save_txt`) are a text per frame: `picture.txt`, or of a video
+`clip_12.txt` with the frame from 1. A row has shares of the picture: class, centre, width, height,
+and with `save_conf` the confidence, with `track` the id. The class is not used.
+
+COCO, CVAT, VIAME and YOLO know pictures of a folder by their names, since they may have another
+order.
 Polygons and run lengths of COCO and VIAME are the masks of their boxes.
 """
 
@@ -45,7 +50,8 @@ class AnnotatedBox:
     """One fish of one frame, as a boxes file gives it."""
 
     track_id: int  # 1 or more, or UNKNOWN_ID
-    bbox_xyxy_px: Float[np.ndarray, "4"]  # half-open, frame pixels; may extend beyond the frame
+    # Half-open, frame pixels; may extend beyond the frame. Shares of the frame's size, see `in_px`.
+    bbox_xyxy_px: Float[np.ndarray, "4"]
     visibility: float  # visible fraction of the fish, 0 to 1; 1 where not given
     score: float = 1.0  # confidence of the detector, 0 to 1; 1 where not given
     # Makes the mask in a frame of a height and width, or raises AnnotationError; None: not given.
@@ -53,6 +59,14 @@ class AnnotatedBox:
     # Of VIAME alone: the species or "", and head and tail in px from the picture's corner.
     species: str = ""
     ends_px: Float[np.ndarray, "2 2"] | None = None
+    is_relative: bool = False  # of YOLO: the box is in shares of the frame's width and height
+
+    def in_px(self, width: int, height: int) -> "AnnotatedBox":
+        """The box in a frame of a size."""
+        if not self.is_relative:
+            return self
+        box = self.bbox_xyxy_px * [width, height, width, height]
+        return replace(self, bbox_xyxy_px=box, is_relative=False)
 
 
 def box_from_xywh(
@@ -373,6 +387,68 @@ def _viame_box(
     return where, frames.get(cells[1], frame + 1), box
 
 
+def _read_yolo(folder: Path, pictures: Sequence[Path]) -> dict[int, list[AnnotatedBox]]:
+    """Boxes by frame. Raises AnnotationError with what was expected, and where."""
+    files = sorted(folder.glob("*.txt"), key=natural_order)
+    files = [path for path in files if path.name != "classes.txt"]
+    if not files or pictures_in(folder):
+        raise AnnotationError(
+            f"{folder}: expected a folder of YOLO labels alone, a .txt per frame, got "
+            f"{'pictures beside them' if files else 'none'}"
+        )
+    frames = frames_by_name({n: path.name for n, path in enumerate(files)}, pictures, where=folder)
+    if not (frames or pictures):
+        numbers = (re.search(r"[0-9]+$", path.stem) for path in files)
+        frames = {n: int(found[0]) for n, found in enumerate(numbers) if found and int(found[0])}
+    if len({*frames.values()}) < len(files):
+        raise AnnotationError(
+            f"{folder}: expected labels named like the pictures of the source, or each with a "
+            f"frame of its own of a video, from 1 (clip_12.txt), got such as {files[0].name}"
+        )
+    return group_by_frame(
+        _label_boxes(
+            (f"{path}, line {line}", frames[n], cells.split())
+            for n, path in enumerate(files)
+            for line, cells in enumerate(_read_text(path).splitlines(), start=1)
+            if cells.strip()
+        )
+    )
+
+
+def _label_boxes(
+    lines: Iterable[tuple[str, int, list[str]]],
+) -> Iterator[tuple[str, int, AnnotatedBox]]:
+    rows = [*lines]
+    try:
+        # One more number is a confidence, or where any is above 1 an id.
+        is_id = any(len(cells) == 6 and float(cells[5]) > 1 for _, _, cells in rows)
+    except ValueError:
+        is_id = False  # the row is refused below
+    for where, frame, cells in rows:
+        try:
+            _, x, y, width, height, *more = map(float, cells)
+            track_id = more.pop() if len(more) == 2 or (more and is_id) else UNKNOWN_ID
+            score = more.pop() if more else 1.0
+            is_pixels = max(x, y, width, height) > _MAX_SHARE
+            if more or is_pixels or not 0 <= score <= 1 or track_id < 0 or track_id % 1:
+                raise ValueError
+        except ValueError:
+            raise AnnotationError(
+                f"{where}: expected class, centre x and y, width and height in shares of the "
+                "picture, and perhaps a confidence from 0 to 1 and an id from 1, got "
+                f"{' '.join(cells)[:60]!r}"
+            ) from None
+        box = AnnotatedBox(
+            track_id=int(track_id),
+            bbox_xyxy_px=box_from_xywh(x - width / 2, y - height / 2, width, height, where=where),
+            visibility=1.0,
+            score=score,
+            is_relative=True,
+        )
+        yield where, frame, box
+
+
+_MAX_SHARE = 2.0  # chosen: a box may go on beyond the picture, and pixels are larger
 _MAX_BYTES = 1 << 29  # chosen: some ten million boxes
 Parser = Callable[[str, Path, Sequence[Path]], dict[int, list[AnnotatedBox]]]
 _PARSERS: Mapping[str, Parser] = {".json": parse_coco, ".xml": parse_cvat}
@@ -384,17 +460,19 @@ def load_boxes(
     """Boxes by frame (from 1), within a frame by id; none from an empty text file.
 
     `.json` is read as COCO, `.xml` as CVAT, a file with VIAME's header or named `.viame.csv` as
-    VIAME, everything else as MOT Challenge text; all by `parse` if given. `pictures`: the source of
-    the frames; where it is a folder, all but MOT name its pictures. Raises AnnotationError with the
-    place in the file and what was expected there.
+    VIAME, a folder as YOLO's labels, everything else as MOT Challenge text; all by `parse` if
+    given. `pictures`: the source of the frames; where it is a folder, all but MOT name its
+    pictures. Raises AnnotationError with the place in the file and what was expected there.
     """
+    named = pictures_in(pictures) if pictures is not None and pictures.is_dir() else []
+    if path.is_dir():
+        return _read_yolo(path, named)
     text, is_viame = _read_text(path), path.name.lower().endswith(".viame.csv")
     if parse is None and (is_viame or text.startswith(_VIAME_HEAD)):
         parse = parse_viame
     parse = parse or _PARSERS.get(path.suffix.lower())
     if parse is None:
         return parse_mot(text, path)
-    named = pictures_in(pictures) if pictures is not None and pictures.is_dir() else []
     return parse(text, path, named)
 
 

@@ -181,7 +181,7 @@ class AnnotatedFish:
         """The boxes that contain at least one pixel centre of the frame."""
         height, width = frame.image.shape[:2]
         inside = []
-        for box in boxes:
+        for box in (one.in_px(width, height) for one in boxes):
             x0, y0, x1, y1 = box.bbox_xyxy_px
             if x0 <= width - 1 and y0 <= height - 1 and x1 >= 1 and y1 >= 1:
                 inside.append(box)
@@ -362,7 +362,7 @@ class BoxDetector:
         height, width = frame.image.shape[:2]
         candidates = []
         for box in self._frames.get(frame.frame_index, ()):
-            inside = box.bbox_xyxy_px.clip(0, [width, height, width, height])
+            inside = box.in_px(width, height).bbox_xyxy_px.clip(0, [width, height, width, height])
             if np.all(inside[2:] - inside[:2] >= 1):
                 candidates.append(Candidate(bbox_xyxy_px=inside, score=box.score))
         return candidates

@@ -42,7 +42,10 @@ class RunOptions:
     calibration: Annotated[
         Path | None, "Calibration file. Without one: relative shapes, no millimetres."
     ] = None
-    boxes: Annotated[Path | None, "Boxes as MOT Challenge text, COCO, CVAT or VIAME CSV."] = None
+    boxes: Annotated[
+        Path | None,
+        "Boxes as MOT Challenge text, COCO, CVAT, VIAME CSV, or a folder of YOLO labels.",
+    ] = None
     masks: Annotated[
         Path | None, "Folder of PNGs of ids: 000001.png ..., or named like the pictures."
     ] = None

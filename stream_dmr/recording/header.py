@@ -106,13 +106,16 @@ class RunInputs:
 def content_sha256(path: Path) -> str:
     """SHA-256 of a file, or of the names and contents of the pictures in a folder, in hex.
 
+    Of a folder without pictures it is that of its texts, which are labels.
+
     Raises SourceError where one can't be read.
     """
     try:
         if not path.is_dir():
             return sha256_of(path)
-        pictures = (file for file in path.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES)
-        return sha256_of_files(pictures)
+        files = [*path.iterdir()]
+        pictures = [file for file in files if file.suffix.lower() in PICTURE_SUFFIXES]
+        return sha256_of_files(pictures or [one for one in files if one.suffix == ".txt"])
     except OSError as error:
         raise SourceError(
             f"{error.filename}: expected a file that can be read, got: {error.strerror}"

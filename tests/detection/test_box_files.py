@@ -43,7 +43,7 @@ def test_an_empty_file_means_no_fish(tmp_path):
 def test_files_that_cannot_be_read_are_refused(tmp_path):
     with pytest.raises(AnnotationError, match="No such file"):
         load_boxes(tmp_path / "missing.txt")
-    with pytest.raises(AnnotationError, match="directory"):
+    with pytest.raises(AnnotationError, match="folder of YOLO labels alone"):
         load_boxes(tmp_path)
     cv2.imwrite(str(tmp_path / "picture.png"), np.full((9, 9), 200, np.uint8))
     with pytest.raises(AnnotationError, match="binary"):
