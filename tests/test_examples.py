@@ -66,6 +66,7 @@ def test_replay_with_a_stricter_setting_uses_fewer_frames(
     assert 0 < after < before
 
 
+@pytest.mark.slow
 def test_own_detector_finds_the_four_fish(tmp_path: Path):
     run_example(4, tmp_path)
     lengths = [fish.length_mm for fish in sd.Run(tmp_path / "run").fish if fish.length_mm]

@@ -59,7 +59,8 @@ NOT_RUN = {
     "benchmarks.": "pictures and networks outside the repository",
 }
 SLOW = {  # pages whose blocks measure several videos
-    *("batch", "calibration", "measure", "signatures", "templates", "trip", "two-cameras"),
+    *("batch", "calibration", "measure", "replay", "report", "signatures", "templates", "trip"),
+    *("two-cameras", "view"),
 }
 CODES = {"--ends 120,300,980,310": 1}  # `check` says by its exit code that a length is wrong
 

@@ -153,7 +153,7 @@ def test_tracks_and_masks_have_each_fish_in_its_frames(measured: Measured):
     assert "# metadata,Fps: 15,fps: 15" in lines
 
 
-@pytest.fixture(params=[1400, 390])
+@pytest.fixture(params=[pytest.param(1400, marks=pytest.mark.slow), 390])
 def width(request: pytest.FixtureRequest) -> int:
     return request.param
 

@@ -162,7 +162,12 @@ def test_outlier_is_named_in_its_own_frame_and_the_next_one_is_used():
 
 @pytest.mark.parametrize(
     ("common", "lasting", "tau_s"),
-    [(0.0, 0.0, 1e-9), (0.02, 0.0, 1e-9), (0.01, 0.2, 1e-9), (0.01, 0.1, 0.1)],
+    [
+        (0.01, 0.1, 0.1),
+        pytest.param(0.0, 0.0, 1e-9, marks=pytest.mark.slow),
+        pytest.param(0.02, 0.0, 1e-9, marks=pytest.mark.slow),
+        pytest.param(0.01, 0.2, 1e-9, marks=pytest.mark.slow),
+    ],
 )
 def test_interval_covers_the_truth_as_often_as_it_says(common, lasting, tau_s):
     """300 fish of 15 frames, with and without errors that frames share."""

@@ -125,7 +125,7 @@ def tracks(rng, degrees, offset_s):
     return first_tracks, second_tracks, (FIRST, second)
 
 
-@pytest.mark.parametrize("offset_s", [0.0, 2.34, -7.77])
+@pytest.mark.parametrize("offset_s", [pytest.param(0.0, marks=pytest.mark.slow), -7.77])
 def test_fish_are_paired_and_the_clocks_difference_is_found(offset_s):
     first, second, calibrations = tracks(np.random.default_rng(4), 35.0, offset_s)
     pairing = pair_up(first, second, calibrations, frame_s=FRAME_S)

@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 CODE = """
 import gc
 import threading
@@ -39,6 +41,7 @@ assert compiled() == before, (compiled(), before)
 """
 
 
+@pytest.mark.slow
 def test_nothing_is_compiled_afterwards():
     """In a process of its own, where no other test has called a loop."""
     root = Path(__file__).resolve().parents[2]

@@ -210,7 +210,7 @@ def test_a_given_mesh_is_compared_with_the_first_fish(
     assert again.mismatches == []
 
 
-@pytest.mark.parametrize("kind", ["mcap", "rrd"])
+@pytest.mark.parametrize("kind", ["mcap", pytest.param("rrd", marks=pytest.mark.slow)])
 def test_a_replay_gives_the_same_bits(runs: list[Path], kind: str):
     for recording in sorted(runs[1].glob(f"recording-*.{kind}")):
         asked = ReplayOptions(recordings=[recording], first="fit", check=True)

@@ -231,7 +231,7 @@ def test_earlier_results_are_kept_unless_asked_to_replace_them(tmp_path: Path):
     assert [(out / name).read_text() for name in mine] == ["mine"] * 3
 
 
-@pytest.mark.parametrize("ended", ["by itself", "by a stop"])
+@pytest.mark.parametrize("ended", [pytest.param("by itself", marks=pytest.mark.slow), "by a stop"])
 def test_a_video_is_not_resumed_so_no_fish_counts_twice(tmp_path: Path, ended: str):
     options = write_clip(tmp_path / "clip", fish=[[1, 2]] * 12)
     out = Path(options["--out"])

@@ -35,7 +35,9 @@ def wait_for_rows(path: Path, count: int, process: subprocess.Popen[str]) -> Non
     pytest.fail(f"no {count} rows in {path.name}: {process.communicate()}")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM]
+)
 def test_a_signal_ends_the_run_early_and_leaves_valid_results(
     tmp_path: Path, number: signal.Signals
 ):

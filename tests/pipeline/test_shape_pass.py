@@ -153,7 +153,9 @@ def assert_learnt(out: Path, observer: Listener) -> None:
     assert LEARNT in known_files(out)
 
 
-@pytest.mark.parametrize("name", ["template.ply", "template-2.ply"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("template.ply", marks=pytest.mark.slow), "template-2.ply"]
+)
 def test_a_mesh_of_the_user_is_not_written_over(clip: Path, tmp_path: Path, name: str):
     out, observer = tmp_path / "out", Listener()
     out.mkdir()

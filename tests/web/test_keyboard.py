@@ -44,7 +44,7 @@ def server(out: Path, tmp_path: Path) -> Iterator[ReviewServer]:
     served.close()
 
 
-@pytest.fixture(params=[1400, 390])
+@pytest.fixture(params=[pytest.param(1400, marks=pytest.mark.slow), 390])
 def tab(server: ReviewServer, request: pytest.FixtureRequest) -> Iterator[Tab]:
     opened = Tab(server.address, width=request.param, height=900)
     yield opened

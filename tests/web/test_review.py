@@ -291,7 +291,7 @@ def test_a_reviewer_clicks_through_it(tab: Tab, out: Path):
     assert {verdict.reviewer for verdict in verdicts} == {"Ada <Byron>"}
 
 
-@pytest.mark.parametrize("by_finger", [False, True])
+@pytest.mark.parametrize("by_finger", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_points_are_dragged_and_stay_where_they_were_put(tab: Tab, out: Path, by_finger: bool):
     tab.run(
         "choose(1); await settled(); "
