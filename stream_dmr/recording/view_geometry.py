@@ -8,13 +8,14 @@ from typing import Generic, TypeVar
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
+from scipy.spatial import cKDTree
 
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.fitting.body import Body
 from stream_dmr.fitting.shape.candidates import CandidateShapes
 from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.fitting.solver.spine import KINDS, deform
-from stream_dmr.geometry import arc_length
+from stream_dmr.geometry import arc_length, arc_lengths
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, Frame, LocalizedFish
 from stream_dmr.template.template import Template
 
@@ -111,9 +112,10 @@ def place_fit(
     """Vertices, keypoints and midline of a fit at its localized place, mm in the camera frame.
 
     Fit and camera frame have the same orientation, so a scale (the ratio of the midlines' arc
-    lengths) and a shift (center keypoint to center keypoint) suffice. Without millimetres the shape
-    is scaled about the camera to a body length of 1, which leaves its projection unchanged.
-    Vertices are None where the shape has none.
+    lengths) and a shift (center keypoint to center keypoint) suffice. Of a fish that two cameras
+    placed, the mesh is bent along their midline. Without millimetres the shape is scaled about the
+    camera to a body length of 1, which leaves its projection unchanged. Vertices are None where the
+    shape has none.
     """
     arc, vertices = arc_length(shape.midline), shape.vertices
     if fish.keypoints_mm is None or fish.midline_mm is None:
@@ -122,7 +124,44 @@ def place_fit(
     scale = arc_length(fish.midline_mm) / arc
     if vertices is not None:
         vertices = (vertices - shape.keypoints[1]) * scale + fish.keypoints_mm[1]
+        alone = (shape.midline - shape.keypoints[1]) * scale + fish.keypoints_mm[1]
+        if not np.allclose(alone, fish.midline_mm):
+            vertices = bend_along(vertices, alone, fish.midline_mm)
     return vertices, fish.keypoints_mm, fish.midline_mm
+
+
+_STATIONS = 200  # of a midline; chosen: steps between them are not seen
+
+
+def bend_along(
+    vertices: Float[np.ndarray, "V 3"],
+    midline: Float[np.ndarray, "M 3"],
+    target: Float[np.ndarray, "N 3"],
+) -> Float[np.ndarray, "V 3"]:
+    """Vertices around a midline, moved to another one of about the same length.
+
+    Each goes with the nearest station of its midline, turned as the direction there is.
+    """
+    (old, along), (new, target_along) = _stations(midline), _stations(target)
+    nearest = cKDTree(old).query(vertices)[1]
+    offsets = vertices - old[nearest]
+    # Rodrigues: the least turn of one direction into the other.
+    axis = np.cross(along, target_along)[nearest]
+    cosine = (along * target_along).sum(axis=1)[nearest, None]
+    turned = np.cross(axis, offsets)
+    turned += np.cross(axis, turned) / np.maximum(1 + cosine, 1e-9)
+    return new[nearest] + offsets + turned
+
+
+def _stations(
+    midline: Float[np.ndarray, "M 3"],
+) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S 3"]]:
+    """Points at equal parts of a midline's length, and the directions there."""
+    arc = arc_lengths(midline)
+    places = np.linspace(0, arc[-1], _STATIONS)
+    points = np.stack([np.interp(places, arc, axis) for axis in midline.T], axis=1)
+    along = np.gradient(points, axis=0)
+    return points, along / np.linalg.norm(along, axis=1, keepdims=True)
 
 
 def outlines(crop: FishCrop) -> list[Float[np.ndarray, "N 2"]]:

@@ -37,7 +37,7 @@ from stream_dmr.recording.recorder import Recorder, open_recording_files
 from stream_dmr.recording.repair import repair_recordings
 from stream_dmr.recording.segments import open_segments
 from stream_dmr.recording.topics import FOXGLOVE_TOPICS, TOPICS, RecordingSettings, topics_table
-from stream_dmr.recording.view_geometry import place_fit
+from stream_dmr.recording.view_geometry import bend_along, place_fit
 from stream_dmr.store.run_tables import FramesTable
 from tests.support.reading import read_header, read_messages, read_metadata
 from tests.support.recorded_run import assert_same, header, run, template
@@ -367,6 +367,22 @@ def test_a_placed_mesh_lies_on_its_fish():
     unplaced = next(m for m in run(1, calibrated=False) if isinstance(m, LocalizedFish))
     _, _, midline = place_fit(shape, unplaced)
     assert arc_length(midline) == pytest.approx(1.0)
+
+
+def test_a_mesh_bent_along_another_midline_keeps_its_distances_to_it():
+    rng = np.random.default_rng(4)
+    straight = np.linspace([-300.0, 0, 0], [300.0, 0, 0], 33)
+    angle = np.linspace(-0.5, 0.5, 33)[:, None]
+    bent = 600 * (np.sin(angle) * [1.0, 0, 0] + (np.cos(angle) - 1) * [0, 0.6, 0.8]) + [0, 0, 5e3]
+    around = rng.normal(size=(33, 3)) * [0, 20, 20]
+    moved = bend_along(straight + around, straight, bent)
+    far = np.linalg.norm(moved[:, None] - bend_along(bent, bent, bent)[None], axis=2).min(axis=1)
+    np.testing.assert_allclose(far, np.linalg.norm(around, axis=1), rtol=0.02, atol=1.0)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    rigid = bend_along(bent + around, bent, bent @ turn.T)
+    far = np.linalg.norm(rigid - bent @ turn.T, axis=1)
+    np.testing.assert_allclose(far, np.linalg.norm(around, axis=1), rtol=0.02, atol=2.0)
 
 
 def test_the_documented_topics_are_the_real_ones():
