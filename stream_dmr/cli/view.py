@@ -115,7 +115,7 @@ def _convert(
     full_size: bool = False,
 ) -> None:
     from stream_dmr.errors import RecordingError
-    from stream_dmr.recording.frame_images import open_pictures
+    from stream_dmr.recording.frame_images import open_pictures, open_recorded_source
     from stream_dmr.recording.reading import open_recordings, recorded_settings
     from stream_dmr.recording.rerun.viewer import EVERY_FRAME
     from stream_dmr.recording.rerun.viewer import convert as convert_recording
@@ -125,14 +125,20 @@ def _convert(
         raise RecordingError(f"{rrd}: expected another file to write to; choose one with --out")
     settings = EVERY_FRAME.model_copy(update={"view_px": 1 << 16} if full_size else {})
     with ExitStack() as stack:
-        pictures = None
+        pictures = of_second = None
         if source is not None:
-            of_run = recorded_settings(
-                open_recordings([recording]), "read_frames", ReadFramesSettings
-            )
+            opened = open_recordings([recording])
+            of_run = recorded_settings(opened, "read_frames", ReadFramesSettings)
             pictures = stack.enter_context(open_pictures(source, of_run))
+            if (camera := opened.header.second) is not None:
+                of_second = stack.enter_context(open_recorded_source(camera.header))
         lost = convert_recording(
-            recording, rrd, source=pictures, settings=settings, selection=selection
+            recording,
+            rrd,
+            source=pictures,
+            second_source=of_second,
+            settings=settings,
+            selection=selection,
         )
     warn(lost)
 

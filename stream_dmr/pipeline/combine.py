@@ -157,12 +157,17 @@ def _apart(
 
 def open_second(
     first: Recording,
-    second: Recording,
+    second: Iterable[LocalizedFish],
+    other: Calibration | None,
     setup: Setup,
     observer: RunObserver,
 ) -> "LocalizeByTwo":
-    """The node that places the fish of two runs. Raises UserError if they saw no fish together."""
-    calibration, other = setup.calibration, second.header.calibration
+    """The node that places the fish of two runs. Raises UserError if they saw no fish together.
+
+    `second`: the fish of the other run, `other` its calibration. Those of the first are placed by
+    its fits, since of two cameras it has recorded what both know.
+    """
+    calibration = setup.calibration
     if calibration is None or other is None:
         raise UserError(
             "expected two runs with --calibration, of the same reference plane; found one without"
@@ -175,8 +180,11 @@ def open_second(
             f"expected two cameras at least {_LEAST_APART_DEG} degrees apart, as seen from the "
             f"fish, got {apart_deg:.1f} degrees"
         )
-    tracks = tracks_of(messages_of(first, LocalizedFish), calibration)
-    others = tracks_of(messages_of(second, LocalizedFish), other)
+    alone = (
+        localize(mesh, settings=setup.config.localize, calibration=calibration)
+        for mesh in messages_of(first, FittedMesh)
+    )
+    tracks, others = tracks_of(alone, calibration), tracks_of(second, other)
     steps_ns = np.concatenate([[], *(np.diff(one.times_ns) for one in tracks.values())])
     pairing = None
     if len(steps_ns) and others:
@@ -217,16 +225,16 @@ class LocalizeByTwo:
     ) -> None:
         self._settings = settings
         self._calibration, self._second_calibration = calibration, second_calibration
-        self._second, self._pairing = second, pairing
+        self._second, self.pairing = second, pairing
 
     def step(self, mesh: FittedMesh, /) -> Sequence[LocalizedFish]:
         """Return the fish of a fit."""
         alone = localize(mesh, settings=self._settings, calibration=self._calibration)
-        track = self._second.get(self._pairing.ids.get(mesh.track_id, -1))
+        track = self._second.get(self.pairing.ids.get(mesh.track_id, -1))
         is_refused = alone.reason not in _BY_ONE_CAMERA
         if track is None or is_refused or alone.midline_mm is None or alone.keypoints_mm is None:
             return [alone]
-        seen_px = track.at(mesh.timestamp_ns + round(self._pairing.offset_s * 1e9))
+        seen_px = track.at(mesh.timestamp_ns + round(self.pairing.offset_s * 1e9))
         if seen_px is None:
             return [replace(alone, accepted=False, reason=Reason.SEEN_BY_ONE)]
         px = self._calibration.camera.project(alone.midline_mm)

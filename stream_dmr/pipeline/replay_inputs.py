@@ -23,7 +23,7 @@ from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.pipeline.session import STAGES, Setup
 from stream_dmr.recording.codec import stored_picture
-from stream_dmr.recording.header import InputFile, RunHeader, RunInputs
+from stream_dmr.recording.header import InputFile, RunHeader, RunInputs, SecondCamera
 from stream_dmr.recording.reading import Recording, known_shapes, messages_of
 
 _READ = "read"  # comes before all stages of a replay, whose frames are those of the recording
@@ -226,7 +226,12 @@ def read_inputs(
     return learnt_from(messages_of(recording, FishCrop), inputs, observer)
 
 
-def new_header(request: ReplayOptions, recorded: RunHeader, inputs: ReplayInputs) -> RunHeader:
+def new_header(
+    request: ReplayOptions,
+    recorded: RunHeader,
+    inputs: ReplayInputs,
+    second: SecondCamera | None,
+) -> RunHeader:
     calibration, is_cut_anew = request.calibration, inputs.files is not None
     calibration_file = recorded.calibration_file
     if calibration is not None:
@@ -247,6 +252,7 @@ def new_header(request: ReplayOptions, recorded: RunHeader, inputs: ReplayInputs
             calibration=calibration,
         ),
         runs=recorded.runs,
+        second=second,
     )
 
 

@@ -2,8 +2,8 @@
 
 import threading
 import time
-from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from stream_dmr.messages import (
 )
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.pipeline.chain import Node, StageCounters, run_chain
-from stream_dmr.pipeline.combine import open_second
+from stream_dmr.pipeline.combine import LocalizeByTwo, open_second
 from stream_dmr.pipeline.comparator import MessageComparator, Mismatch
 from stream_dmr.pipeline.learn_shapes import save_stocks
 from stream_dmr.pipeline.replay_inputs import ReplayInputs, new_header, read_inputs
@@ -38,17 +38,21 @@ from stream_dmr.pipeline.session import (
     messages_before,
     messages_from,
 )
-from stream_dmr.recording.frame_images import open_pictures
-from stream_dmr.recording.header import REPRODUCIBLE_BY, RunHeader
+from stream_dmr.recording.frame_images import open_pictures, open_recorded_source
+from stream_dmr.recording.header import REPRODUCIBLE_BY, RunHeader, SecondCamera
 from stream_dmr.recording.reading import (
     Recording,
+    decoded_messages,
+    known_shapes,
     open_recordings,
     require_messages,
     require_selected,
 )
-from stream_dmr.recording.record import Record, as_recorded
+from stream_dmr.recording.record import as_recorded
 from stream_dmr.recording.recorder import Recorder
-from stream_dmr.recording.topics import RecordingSettings
+from stream_dmr.recording.topics import SECOND_TOPICS, RecordingSettings
+from stream_dmr.recording.view_geometry import MeshRebuilder
+from stream_dmr.recording.whole_records import SecondRecords, WholeRecords
 from stream_dmr.store.fish import database_of, read_measured_fish, read_runs
 from stream_dmr.store.ledger import Signer
 from stream_dmr.store.length_store import LengthStore
@@ -176,9 +180,10 @@ class ReplayWriter:
         settings: RecordingSettings,
         outputs: ReplayOutputs | None,
         comparator: MessageComparator | None,
+        whole: WholeRecords,
     ) -> None:
         self._recorded, self._recomputed, self._settings = recorded, recomputed, settings
-        self._outputs, self._comparator = outputs, comparator
+        self._outputs, self._comparator, self._whole = outputs, comparator, whole
         self._positions = recorded.of_type(Position, keep_payloads=False)
         self._next_position = None if outputs is None else next(self._positions, None)
         self.totals = RunTotals(max_fish=None)
@@ -194,14 +199,17 @@ class ReplayWriter:
             self.totals.take(message)
         if self._outputs is not None:
             self._outputs.results.store(message)
-            self._outputs.recorder.put(Record.of_payload(message, payload))
+            for record in self._whole.of(message, payload):
+                self._outputs.recorder.put(record)
             if isinstance(message, Frame):
                 self._put_positions(self._outputs, message.frame_index)
         return message
 
     def finish(self) -> None:
-        """Record the positions after the last frame."""
+        """Record what comes after the last frame: positions, and what a second camera saw."""
         if self._outputs is not None:
+            for record in self._whole.rest():
+                self._outputs.recorder.put(record)
             self._put_positions(self._outputs, None)
 
     def _put_positions(self, outputs: ReplayOutputs, until_frame: int | None) -> None:
@@ -272,11 +280,23 @@ def replay(
     recorded = RecordedMessages(recording, request.selection)
     carried_over = _carried_over(request, recorded)
     with ExitStack() as stack:
-        frames, session = _open_chain(request, recorded, inputs, recording, observer, stack)
+        second = _open_second(request, recording, inputs, observer)
+        node = None if second is None else second.node
+        frames, session = _open_chain(request, recorded, inputs, recording, node, stack)
         session.continue_tracks(carried_over)
         outputs = None
         if request.out is not None:
-            opening = _open_outputs(request, request.out, recording, inputs, stop, observer)
+            header = new_header(request, recording.header, inputs, second and second.camera)
+            opening = open_replay_outputs(
+                request,
+                request.out,
+                header,
+                inputs,
+                _recorded_run(request, recording, observer),
+                stop=stop,
+                observer=observer,
+                in_one_thread=_is_light(request),
+            )
             outputs = stack.enter_context(opening)
         comparator = _open_comparator(request, recorded, {fish.track_id for fish in carried_over})
         writer = ReplayWriter(
@@ -285,6 +305,7 @@ def replay(
             settings=inputs.config.recording,
             outputs=outputs,
             comparator=comparator,
+            whole=_open_whole(request, recording, inputs, second, stack),
         )
 
         def on_frame() -> None:
@@ -326,24 +347,55 @@ def _is_light(request: ReplayOptions) -> bool:
     return FittedMesh not in messages_from(request.first)
 
 
-def _open_outputs(
+@dataclass(frozen=True, kw_only=True)
+class _SecondRun:
+    """What the other camera of two recorded."""
+
+    camera: SecondCamera
+    messages: Callable[..., Iterator[tuple[Message, bytes]]]  # of kinds
+    node: LocalizeByTwo | None  # None where fish are not placed again
+
+
+def _open_second(
+    request: ReplayOptions, recording: Recording, inputs: ReplayInputs, observer: RunObserver
+) -> _SecondRun | None:
+    """Another run that is combined with this one, or that was; None for a single camera."""
+    camera = recording.header.second
+    if request.second is not None:
+        other = open_recordings([request.second])
+        header, messages = other.header, partial(decoded_messages, other)
+    elif camera is not None:
+        header, messages = camera.header, partial(decoded_messages, recording, of=SECOND_TOPICS)
+    else:
+        return None
+    node = None
+    if request.first == "localize":
+        fish = (one for one, _ in messages([LocalizedFish]) if isinstance(one, LocalizedFish))
+        node = open_second(recording, fish, header.calibration, inputs, observer)
+        offset_ns = round(node.pairing.offset_s * 1e9)
+        ids = {other: first for first, other in node.pairing.ids.items()}
+        camera = SecondCamera(header=header, offset_ns=offset_ns, ids=ids)
+    assert camera is not None
+    return _SecondRun(camera=camera, messages=messages, node=node)
+
+
+def _open_whole(
     request: ReplayOptions,
-    out: Path,
     recording: Recording,
     inputs: ReplayInputs,
-    stop: threading.Event,
-    observer: RunObserver,
-) -> AbstractContextManager[ReplayOutputs]:
-    return open_replay_outputs(
-        request,
-        out,
-        new_header(request, recording.header, inputs),
-        inputs,
-        _recorded_run(request, recording, observer),
-        stop=stop,
-        observer=observer,
-        in_one_thread=_is_light(request),
-    )
+    second: _SecondRun | None,
+    stack: ExitStack,
+) -> WholeRecords:
+    """Pictures are those of the sources of two cameras, since their view is made here first."""
+    meshes = MeshRebuilder(recording.header.template, known_shapes(recording))
+    if second is None or request.out is None:
+        return WholeRecords(meshes, None, None)
+    pictures, others = None, None
+    if inputs.config.recording.rrd:
+        pictures = stack.enter_context(open_recorded_source(recording.header))
+        others = stack.enter_context(open_recorded_source(second.camera.header))
+    messages = second.messages([*SECOND_TOPICS])
+    return WholeRecords(meshes, pictures, SecondRecords(messages, second.camera, others))
 
 
 def _other_versions(recording: Recording) -> list[str]:
@@ -367,6 +419,11 @@ def _refuse_impossible(request: ReplayOptions, recording: Recording) -> None:
         raise UserError(
             f"--out {request.out}: expected another folder than that of the recording, which would "
             "be lost; choose another"
+        )
+    if recording.header.second is not None and request.first in ("crop", "fit"):
+        raise UserError(
+            f"--from {request.first}: expected a recording of one camera, got one that two made; "
+            "replay the two runs with --out and combine these, or use --from localize"
         )
     if request.first == "fit" and recording.is_thinned:
         raise UserError(
@@ -434,7 +491,7 @@ def _open_chain(
     recorded: RecordedMessages,
     inputs: ReplayInputs,
     recording: Recording,
-    observer: RunObserver,
+    by_two: LocalizeByTwo | None,
     stack: ExitStack,
 ) -> tuple[Iterable[Frame], Session]:
     """The frames and the nodes; playback nodes that only a new recording needs only with `out`."""
@@ -445,9 +502,8 @@ def _open_chain(
         playback: list[Node] = [
             PlaybackNode(recorded, kind, track_timeout_s=timeout_s) for kind in played
         ]
-        if request.second is not None:
-            second = open_recordings([request.second])
-            playback.append(open_second(recording, second, inputs, observer))
+        if by_two is not None:
+            playback.append(by_two)
             return recorded.of_type(Frame), Session(inputs, given=playback, first="smooth")
         return recorded.of_type(Frame), Session(inputs, given=playback, first=request.first)
     restorer = None

@@ -1,5 +1,6 @@
 """Restore the images of recorded frames."""
 
+import tomllib
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ from jaxtyping import UInt8
 from stream_dmr.errors import SourceError, requires_extra
 from stream_dmr.messages import Frame
 from stream_dmr.recording.codec import checksum, stored_picture
+from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.reading import Recording, decoded_messages, recorded_settings
 from stream_dmr.recording.selection import Selection
 from stream_dmr.recording.topics import KEY_FRAME_NS
@@ -114,6 +116,18 @@ def open_pictures(source: str, settings: ReadFramesSettings) -> Generator[FrameR
     else:
         with closing(open_source(source, settings)) as frames:
             yield SourcePictures(frames)
+
+
+@contextmanager
+def open_recorded_source(header: RunHeader) -> Generator[FrameRestorer | None]:
+    """The images of a run's source; None where it is not at hand, or not as it was."""
+    source = None if header.inputs is None else header.inputs.source
+    if source is None or not source.is_unchanged():
+        yield None
+        return
+    recorded = tomllib.loads(header.config_toml).get("read_frames", {})
+    with open_pictures(source.path, ReadFramesSettings.model_validate(recorded)) as pictures:
+        yield pictures
 
 
 class RecordedPictures:

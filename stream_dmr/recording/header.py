@@ -1,5 +1,6 @@
 """The header of a recording: run, inputs, software, processor."""
 
+import json
 import os
 import platform
 import shlex
@@ -159,6 +160,39 @@ class RunStart:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class SecondCamera:
+    """The other camera of a recording of two."""
+
+    header: "RunHeader"  # of its run
+    offset_ns: int  # its clock minus the first camera's
+    ids: Mapping[int, int]  # the first camera's fish, by those of the second
+
+    def attachments(self) -> dict[str, bytes]:
+        """Those of its run by other names, and what is known of both."""
+        metadata = self.header.metadata()
+        known = {"offset_ns": self.offset_ns, "ids": [*self.ids.items()], "run": metadata}
+        parts = {"json": json.dumps(known).encode(), **self.header.attachments()}
+        return {_SECOND + name: data for name, data in parts.items()}
+
+    @classmethod
+    def from_attachments(cls, attachments: Mapping[str, bytes]) -> "SecondCamera | None":
+        """The inverse of `attachments`; None where there are none of them."""
+        parts = {
+            name.removeprefix(_SECOND): data
+            for name, data in attachments.items()
+            if name.startswith(_SECOND)
+        }
+        if not parts:
+            return None
+        known = json.loads(parts.pop("json"))
+        header = RunHeader.from_parts(known["run"], parts)
+        return cls(header=header, offset_ns=known["offset_ns"], ids=dict(known["ids"]))
+
+
+_SECOND = "second."
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class RunHeader:
     """The inputs of a run that are not messages."""
 
@@ -171,6 +205,7 @@ class RunHeader:
     calibration_file: bytes = b""  # the user's file as it was; empty where there is none
     inputs: RunInputs | None = None  # None: recorded before these were
     runs: tuple[RunStart, ...] = ()  # those that are in it, by their frames; none in old recordings
+    second: SecondCamera | None = None
 
     @property
     def known_inputs(self) -> RunInputs | None:
@@ -210,7 +245,7 @@ class RunHeader:
         if self.calibration is not None:
             files["calibration.pb"] = encode(self.calibration)
             files["calibration.yaml"] = self.calibration_file
-        return files
+        return files if self.second is None else files | self.second.attachments()
 
     @classmethod
     def from_parts(cls, metadata: dict[str, str], attachments: dict[str, bytes]) -> "RunHeader":
@@ -230,6 +265,7 @@ class RunHeader:
             calibration_file=attachments.get("calibration.yaml", b""),
             inputs=RunInputs.from_metadata(metadata),
             runs=tuple(RunStart(frames_before=int(f), tracks_before=int(t)) for f, t in runs),
+            second=SecondCamera.from_attachments(attachments),
         )
         recorded = metadata.get("attachments_crc32")  # the first recordings have none
         if recorded is not None and recorded != str(_checksum(attachments)):

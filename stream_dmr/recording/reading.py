@@ -1,7 +1,7 @@
 """Open recordings, iterate over their messages, and require what a command needs."""
 
 import tomllib
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -17,7 +17,7 @@ from stream_dmr.recording.mcap.mcap_recording import McapRecording
 from stream_dmr.recording.mcap.mcap_sink import PART
 from stream_dmr.recording.rerun.rrd_file import RrdRecording
 from stream_dmr.recording.selection import EVERYTHING, Selection
-from stream_dmr.recording.topics import TOPICS
+from stream_dmr.recording.topics import TOPICS, Topic
 from stream_dmr.settings import Settings
 
 MessageTypes = Collection[type[Message]]
@@ -39,10 +39,15 @@ class Recording(Protocol):
         ...
 
     def payloads(
-        self, kinds: MessageTypes, selection: Selection = EVERYTHING
+        self,
+        kinds: MessageTypes,
+        selection: Selection = EVERYTHING,
+        *,
+        of: Mapping[type[Message], Topic] = TOPICS,
     ) -> Iterator[tuple[type[Message], bytes]]:
         """Type and encoding of the messages of `kinds`, in the order in which they were written.
 
+        `of`: SECOND_TOPICS for those of a second camera, of which an older recording has none.
         Only those of the selected time and, where the recording has an index, of the time in which
         the selected tracks were seen; `decoded_messages` leaves out the other tracks. Raises
         RecordingError where the recording is damaged.
@@ -72,10 +77,14 @@ def open_recordings(paths: Sequence[Path]) -> Recording:
 
 
 def decoded_messages(
-    recording: Recording, kinds: MessageTypes, selection: Selection = EVERYTHING
+    recording: Recording,
+    kinds: MessageTypes,
+    selection: Selection = EVERYTHING,
+    *,
+    of: Mapping[type[Message], Topic] = TOPICS,
 ) -> Iterator[tuple[Message, bytes]]:
     """The selected messages of a recording, each with its encoding. Raises RecordingError."""
-    for kind, payload in recording.payloads(kinds, selection):
+    for kind, payload in recording.payloads(kinds, selection, of=of):
         message = decode(kind, payload)
         if selection.includes(message):
             yield message, payload
@@ -123,9 +132,13 @@ class _Segments:
         return [line for segment in self._segments for line in segment.warnings]
 
     def payloads(
-        self, kinds: MessageTypes, selection: Selection = EVERYTHING
+        self,
+        kinds: MessageTypes,
+        selection: Selection = EVERYTHING,
+        *,
+        of: Mapping[type[Message], Topic] = TOPICS,
     ) -> Iterator[tuple[type[Message], bytes]]:
-        return chain.from_iterable(one.payloads(kinds, selection) for one in self._segments)
+        return chain.from_iterable(one.payloads(kinds, selection, of=of) for one in self._segments)
 
     def carried_over(self) -> Iterator[bytes]:
         """What the first segment took over: the others continue it."""

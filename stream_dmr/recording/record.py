@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 from stream_dmr.messages import FishCrop, FittedMesh, Frame, Message
 from stream_dmr.recording.codec import checksum, compress, decompress, encode
 from stream_dmr.recording.header import RunHeader
-from stream_dmr.recording.topics import TOPICS, RecordingSettings, Topic
+from stream_dmr.recording.topics import SECOND_TOPICS, TOPICS, RecordingSettings, Topic
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -21,13 +21,20 @@ class Record:
     message: Message  # as a recording gives it back, but a frame may keep the pixels it came with
     whole: Message  # with what the recording leaves out: for drawing
     encoding: Callable[[], bytes]
+    is_second: bool = False  # of the second camera of two
 
     @classmethod
     def of_payload(
-        cls, message: Message, payload: bytes, *, whole: Message | None = None
+        cls,
+        message: Message,
+        payload: bytes,
+        *,
+        whole: Message | None = None,
+        is_second: bool = False,
     ) -> "Record":
         """A message that was recorded before, with the encoding that it had."""
-        return cls(message=message, whole=whole or message, encoding=partial(bytes, payload))
+        encoding = partial(bytes, payload)
+        return cls(message=message, whole=whole or message, encoding=encoding, is_second=is_second)
 
     @cached_property
     def payload(self) -> bytes:
@@ -36,7 +43,7 @@ class Record:
 
     @property
     def topic(self) -> Topic:
-        return TOPICS[type(self.message)]
+        return (SECOND_TOPICS if self.is_second else TOPICS)[type(self.message)]
 
 
 def make_record(message: Message, settings: RecordingSettings) -> Record:

@@ -34,6 +34,13 @@ class Selection:
             return None, None
         return self.time_ns[0] - self.lead_ns, self.time_ns[1]
 
+    def shifted(self, offset_ns: int) -> "Selection":
+        """Its time on another clock, which is ahead by so much, of all tracks."""
+        time_ns = None
+        if self.time_ns is not None:
+            time_ns = self.time_ns[0] + offset_ns, self.time_ns[1] + offset_ns
+        return Selection(time_ns=time_ns)
+
     def includes_time(self, timestamp_ns: int) -> bool:
         first, last = self.bounds_ns
         return (first is None or first <= timestamp_ns) and (last is None or timestamp_ns < last)

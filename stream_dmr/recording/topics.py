@@ -1,6 +1,6 @@
 """Topics and entity paths of every message, and the settings of `[recording]`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from pydantic import Field
@@ -49,6 +49,7 @@ IOU, BENDING, FIT_MS = "iou/{id}", "bending/{id}", "fit_ms/{id}"
 LOG, REFUSALS, RESULTS = "log", "log/refusals", "log/lengths"
 VESSEL, TRACK = "map/vessel", "map/track"  # where it is; where it has been, once and static
 CAMERA, PLANE = "scene/camera", "scene/plane"  # static, from the header
+SECOND_SCENE = "scene/second"  # of a recording of two cameras: what the second one saw
 FISH_ROOTS = ("scene/camera/fish", "scene/fish")  # cleared by every new frame
 END = "messages/end"  # the last row of a whole .rrd: how many messages each payload path has
 # Metadata records of an .mcap: of the run; of one of several segments, with its `number`; of a file
@@ -75,6 +76,13 @@ TOPICS: dict[type[Message], Topic] = {
         Topic(message=LearntShapes, topic="/shapes", entities=()),
     )
 }
+
+
+SECOND_TOPICS: dict[type[Message], Topic] = {
+    kind: replace(TOPICS[kind], topic=f"/second{TOPICS[kind].topic}")
+    for kind in (Frame, FishCrop, FittedMesh, LocalizedFish)
+}
+"""Where a recording of two cameras has the messages of the second one's run, as this has them."""
 
 
 CARRIED_OVER = "/carried/localized"

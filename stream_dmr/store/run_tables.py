@@ -209,7 +209,7 @@ class FramesTable:
     def write(self, record: Record) -> None:
         """Take any record; raises OutputError where the disk refuses a row."""
         message = record.message
-        if isinstance(message, LocalizedFish):
+        if isinstance(message, LocalizedFish) and not record.is_second:
             self._waiting[message.track_id, message.frame_index] = message
         elif isinstance(message, LengthEstimate):
             fish = self._waiting.pop((message.track_id, message.frame_index), None)

@@ -24,12 +24,12 @@ from stream_dmr.messages import FishMessage, LocalizedFish
 from stream_dmr.recording.codec import schema_bytes
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.record import Record
-from stream_dmr.recording.topics import CARRIED_OVER, RUN, SEGMENT, SPANS, TOPICS
+from stream_dmr.recording.topics import CARRIED_OVER, RUN, SECOND_TOPICS, SEGMENT, SPANS, TOPICS
 from stream_dmr.version import __version__
 
 PART = ".part"  # suffix of a file that is not closed yet
 _CHUNK_BYTES = 256 * 1024  # on kill -9 chunks of 1 MiB lost some three frames, smaller ones fewer
-_MEDIA_TYPES = {".toml": "application/toml", ".yaml": "application/yaml"}
+_MEDIA_TYPES = {f".{kind}": f"application/{kind}" for kind in ("toml", "yaml", "json")}
 
 
 @runtime_checkable
@@ -75,7 +75,7 @@ class McapSink:
         self._flush_ns = int(flush_s * 1e9)
         self._is_segment = segment_number is not None
         self._last_ns = 0  # the latest capture time written
-        self._channels: dict[type, int] = {}
+        self._channels: dict[str, int] = {}  # by topic
         self._carried_over_channel = 0
         self._extras, self._extra_channels = extras, dict[str, int]()
         self._sequences: Counter[int] = Counter()
@@ -94,7 +94,7 @@ class McapSink:
             for name, data in header.attachments().items():
                 media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/protobuf")
                 self._writer.add_attachment(0, 0, name, media_type, data)
-            self._register_topics()
+            self._register_topics(header)
             self._flush()
         except OSError as error:
             self._file.close()
@@ -116,7 +116,9 @@ class McapSink:
             raise ValueError(f"{self.path} is closed")
         timestamp_ns = record.message.timestamp_ns
         with self._closing_on_error():
-            self._add(self._channels[type(record.message)], timestamp_ns, record.payload)
+            self._add(self._channels[record.topic.topic], timestamp_ns, record.payload)
+            if record.is_second:  # neither its fish nor its clock are the recording's
+                return
             if isinstance(record.message, FishMessage):
                 track_id = record.message.track_id
                 first, last = self._spans.get(track_id, (timestamp_ns, timestamp_ns))
@@ -171,10 +173,11 @@ class McapSink:
         log_ns = max(0, timestamp_ns)  # a position before a video's start; MCAP has no time for it
         self._writer.add_message(channel, log_ns, data, log_ns, self._sequences[channel])
 
-    def _register_topics(self) -> None:
-        for kind, row in TOPICS.items():
+    def _register_topics(self, header: RunHeader) -> None:
+        rows = [*TOPICS.items(), *(() if header.second is None else SECOND_TOPICS.items())]
+        for kind, row in rows:
             schema = self._writer.register_schema(row.schema, "protobuf", schema_bytes())
-            self._channels[kind] = self._writer.register_channel(row.topic, "protobuf", schema)
+            self._channels[row.topic] = self._writer.register_channel(row.topic, "protobuf", schema)
             if self._is_segment and kind is LocalizedFish:
                 self._carried_over_channel = self._writer.register_channel(
                     CARRIED_OVER, "protobuf", schema

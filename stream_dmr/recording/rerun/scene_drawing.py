@@ -3,6 +3,7 @@
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from typing import Any
 
@@ -35,6 +36,7 @@ from stream_dmr.recording.rerun.blueprint import (
     appearance,
     log_camera,
     log_plane,
+    log_second,
     middle_mm,
 )
 from stream_dmr.recording.topics import RecordingSettings
@@ -123,13 +125,19 @@ _TRACK_COLOR = (90, 170, 230)
 class SceneDrawing:
     """Draws a run: pictures and meshes at most `view_rate_hz` times a second, plots every frame.
 
-    Rows are kept until `send`.
+    Rows are kept until `send`. Of a second camera its pictures, masks and outlines are drawn.
     """
 
     def __init__(
-        self, rec: rr.RecordingStream, header: RunHeader, settings: RecordingSettings
+        self,
+        rec: rr.RecordingStream,
+        header: RunHeader,
+        settings: RecordingSettings,
+        *,
+        scene: str = "scene",
     ) -> None:
-        self._rec = rec
+        """`scene`: the entity path in the place of "scene"."""
+        self._rec, self._scene = rec, scene
         self._settings = settings
         self._faces = header.template.faces
         self._columns = ColumnBuffer(rec)
@@ -146,15 +154,25 @@ class SceneDrawing:
         self._no_masks = b""
         self._track: list[list[float]] = []  # latitude and longitude of positions so far
         self._track_every, self._num_positions = 1, 0
-        rec.log("scene", rr.ViewCoordinates.RDF, static=True)
+        rec.log(scene, rr.ViewCoordinates.RDF, static=True)
         for path, what in PICTURES.items():
-            rec.log(path, what, static=True)
+            rec.log(self._path(path), what, static=True)
+        self._second: SceneDrawing | None = None
+        if header.second is not None:
+            log_second(rec, header)
+            second = header.second.header
+            self._second = SceneDrawing(rec, second, settings, scene=topics.SECOND_SCENE)
         if header.calibration is not None:
-            log_plane(rec, header.calibration)
+            log_plane(rec, header.calibration, self._path(topics.PLANE))
             self._set_camera(header.calibration.camera, depth=middle_mm(header.calibration)[2])
 
     def draw(self, record: Record) -> None:
         """Draw one message, with the parts of it that are not recorded."""
+        if record.is_second:
+            is_drawn = isinstance(record.whole, Frame | FishCrop) and record.whole.frame_index > 0
+            if self._second is not None and is_drawn:
+                self._second.draw(replace(record, is_second=False))
+            return
         match record.whole:
             case Frame() as frame:
                 self._frame(frame)
@@ -182,6 +200,8 @@ class SceneDrawing:
     def send(self) -> None:
         self._draw_masks()
         self._columns.send()
+        if self._second is not None:
+            self._second.send()
 
     def finish(self) -> None:
         """Draw what is known only at the end: the vessel's track."""
@@ -202,7 +222,8 @@ class SceneDrawing:
 
     def _set_camera(self, camera: Camera, *, depth: float) -> None:
         self._factor = view_factor(camera.width, camera.height, most_px=self._settings.view_px)
-        log_camera(self._rec, camera, depth=depth, factor=self._factor)
+        place = self._path(topics.CAMERA)
+        log_camera(self._rec, camera, place, depth=depth, factor=self._factor)
         size = (camera.height // self._factor, camera.width // self._factor)
         self._labels = np.zeros(size, np.uint8)
         self._no_masks = color_labels(self._labels, PALETTE)
@@ -226,7 +247,7 @@ class SceneDrawing:
         if crop.track_id not in self._tracks:  # colours and names, once and static
             self._tracks.add(crop.track_id)
             for path, what in appearance(crop.track_id, self._faces).items():
-                self._rec.log(path.format(id=crop.track_id), what, static=True)
+                self._rec.log(self._path(path).format(id=crop.track_id), what, static=True)
         if not self._throttle.has_shown(crop.frame_index):
             return
         self._boxes.put(crop, crop.bbox_xyxy_px)
@@ -310,10 +331,14 @@ class SceneDrawing:
         self._add(path, rr.TextLog, estimate, text=[line], level=[str(level)], color=tint)
 
     def _add(self, path: str, archetype: Any, message: Message, **values: Any) -> None:
+        path = self._path(path)
         if isinstance(message, FishMessage):
             path = path.format(id=message.track_id)
         moment = (message.frame_index, message.timestamp_ns)
         self._columns.add(path, archetype, moment, **values)
+
+    def _path(self, path: str) -> str:
+        return path.replace("scene/", f"{self._scene}/", 1)
 
     def _in_view(self, pixels: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
         """Frame pixels as Rerun's pixels of the shown picture."""

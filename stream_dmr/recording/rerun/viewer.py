@@ -17,7 +17,6 @@ from rerun.experimental import ViewerClient
 
 from stream_dmr.errors import RecordingError
 from stream_dmr.files import make_folder, replacing, writing_to
-from stream_dmr.messages import FittedMesh, Frame, Message
 from stream_dmr.recording.frame_images import FrameRestorer, RecordedPictures
 from stream_dmr.recording.reading import (
     decoded_messages,
@@ -26,12 +25,12 @@ from stream_dmr.recording.reading import (
     require_messages,
     require_selected,
 )
-from stream_dmr.recording.record import Record
 from stream_dmr.recording.rerun.rrd_file import rerun_program
 from stream_dmr.recording.rerun.rrd_sink import RrdSink
 from stream_dmr.recording.selection import EVERYTHING, Selection
-from stream_dmr.recording.topics import TOPICS, RecordingSettings
+from stream_dmr.recording.topics import SECOND_TOPICS, TOPICS, RecordingSettings
 from stream_dmr.recording.view_geometry import MeshRebuilder
+from stream_dmr.recording.whole_records import SecondRecords, WholeRecords
 
 WEB_MEMORY = "512MiB"  # of the server; what is older is dropped
 _VIEWER_MEMORY = "4GiB"
@@ -141,30 +140,36 @@ def convert(
     rrd: Path,
     *,
     source: FrameRestorer | None = None,
+    second_source: FrameRestorer | None = None,
     settings: RecordingSettings = EVERY_FRAME,
     selection: Selection = EVERYTHING,
 ) -> Sequence[str]:
     """Draw the selected messages of a recording into `rrd`, which can be replayed as well.
 
-    Pictures are those of `source`; without it those that the recording holds. Returns
-    what is lost of the recording, one line each. Raises RecordingError where the recording can't be
-    read, UserError where it has nothing of the selection, SourceError where a picture is not the
-    recorded one, OutputError where `rrd` can't be written.
+    Pictures are those of `source`, and `second_source` of a second camera; without them those that
+    the recording holds. Returns what is lost of the recording, one line each. Raises RecordingError
+    where the recording can't be read, UserError where it has nothing of the selection, SourceError
+    where a picture is not the recorded one, OutputError where `rrd` can't be written.
     """
     opened = open_recordings([recording])
     require_messages(opened)
     require_selected(opened, selection)
     meshes = MeshRebuilder(opened.header.template, known_shapes(opened))
     pictures = source or RecordedPictures(opened, selection)
+    second = None
+    if opened.header.second is not None:
+        camera = opened.header.second
+        of_second = selection.shifted(camera.offset_ns)
+        messages = decoded_messages(opened, [*SECOND_TOPICS], of_second, of=SECOND_TOPICS)
+        second = SecondRecords(messages, camera, second_source)
+    records = WholeRecords(meshes, pictures, second)
     with (
         replacing(make_folder(rrd.parent) / rrd.name) as draft,
         closing(RrdSink(draft, opened.header, settings)) as sink,
     ):
         for message, payload in decoded_messages(opened, list(TOPICS), selection):
-            whole: Message = message
-            if isinstance(message, Frame):
-                whole = pictures.restore(message, payload)
-            elif isinstance(message, FittedMesh):
-                whole = meshes.with_vertices(message)
-            sink.write(Record.of_payload(message, payload, whole=whole))
+            for record in records.of(message, payload):
+                sink.write(record)
+        for record in records.rest():
+            sink.write(record)
     return opened.warnings
