@@ -1,7 +1,7 @@
 """Open recordings, iterate over their messages, and require what a command needs."""
 
 import tomllib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -17,10 +17,9 @@ from stream_dmr.recording.mcap.mcap_recording import McapRecording
 from stream_dmr.recording.mcap.mcap_sink import PART
 from stream_dmr.recording.rerun.rrd_file import RrdRecording
 from stream_dmr.recording.selection import EVERYTHING, Selection
-from stream_dmr.recording.topics import TOPICS, Topic
+from stream_dmr.recording.topics import TOPICS, MessageTypes, Topics
 from stream_dmr.settings import Settings
 
-MessageTypes = Collection[type[Message]]
 M = TypeVar("M", bound=Message)
 
 
@@ -39,11 +38,7 @@ class Recording(Protocol):
         ...
 
     def payloads(
-        self,
-        kinds: MessageTypes,
-        selection: Selection = EVERYTHING,
-        *,
-        of: Mapping[type[Message], Topic] = TOPICS,
+        self, kinds: MessageTypes, selection: Selection = EVERYTHING, *, of: Topics = TOPICS
     ) -> Iterator[tuple[type[Message], bytes]]:
         """Type and encoding of the messages of `kinds`, in the order in which they were written.
 
@@ -81,7 +76,7 @@ def decoded_messages(
     kinds: MessageTypes,
     selection: Selection = EVERYTHING,
     *,
-    of: Mapping[type[Message], Topic] = TOPICS,
+    of: Topics = TOPICS,
 ) -> Iterator[tuple[Message, bytes]]:
     """The selected messages of a recording, each with its encoding. Raises RecordingError."""
     for kind, payload in recording.payloads(kinds, selection, of=of):
@@ -132,11 +127,7 @@ class _Segments:
         return [line for segment in self._segments for line in segment.warnings]
 
     def payloads(
-        self,
-        kinds: MessageTypes,
-        selection: Selection = EVERYTHING,
-        *,
-        of: Mapping[type[Message], Topic] = TOPICS,
+        self, kinds: MessageTypes, selection: Selection = EVERYTHING, *, of: Topics = TOPICS
     ) -> Iterator[tuple[type[Message], bytes]]:
         return chain.from_iterable(one.payloads(kinds, selection, of=of) for one in self._segments)
 

@@ -1,5 +1,6 @@
 """Topics and entity paths of every message, and the settings of `[recording]`."""
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -59,7 +60,9 @@ SPANS = "tracks.json"  # attachment of a whole .mcap: each track's first and las
 KEY_FRAME_NS = 1_000_000_000  # capture time between key frames: a reader seeks back one second
 VIDEO = "/video"  # in the .mcap with frames = "h264": foxglove.CompressedVideo
 
-TOPICS: dict[type[Message], Topic] = {
+MessageTypes = Collection[type[Message]]
+Topics = Mapping[type[Message], Topic]
+TOPICS: Topics = {
     row.message: row
     for row in (
         Topic(message=Frame, topic="/frame", entities=(FRAME,)),
@@ -78,7 +81,7 @@ TOPICS: dict[type[Message], Topic] = {
 }
 
 
-SECOND_TOPICS: dict[type[Message], Topic] = {
+SECOND_TOPICS: Topics = {
     kind: replace(TOPICS[kind], topic=f"/second{TOPICS[kind].topic}")
     for kind in (Frame, FishCrop, FittedMesh, LocalizedFish)
 }

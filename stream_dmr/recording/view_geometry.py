@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from stream_dmr.camera import frame_from_crop
 from stream_dmr.fitting.body import Body
@@ -22,7 +22,7 @@ from stream_dmr.template.template import Template
 T = TypeVar("T")
 
 # Frames, or fish in a frame, that later stages may still report on: the chain's queues hold fewer.
-_MAX_PENDING = 64
+MAX_PENDING = 64
 VIEW_QUALITY = 70  # of the pictures, as JPEG: they are only for orientation
 
 
@@ -32,7 +32,7 @@ class FrameThrottle:
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
         self._slot = -1
-        self._shown: deque[int] = deque(maxlen=_MAX_PENDING)
+        self._shown: deque[int] = deque(maxlen=MAX_PENDING)
 
     def shows(self, frame: Frame) -> bool:
         """Decide about the next frame, and remember the decision."""
@@ -54,9 +54,9 @@ class PendingItems(Generic[T]):
         self._items: dict[tuple[int, int], T] = {}
 
     def put(self, fish: FishCrop | FittedMesh, item: T) -> None:
-        """Keep `item`; beyond `_MAX_PENDING` the oldest one is dropped."""
+        """Keep `item`; beyond `MAX_PENDING` the oldest one is dropped."""
         self._items[fish.track_id, fish.frame_index] = item
-        if len(self._items) > _MAX_PENDING:  # a live view misses messages
+        if len(self._items) > MAX_PENDING:  # a live view misses messages
             del self._items[next(iter(self._items))]
 
     def take(self, fish: LocalizedFish) -> T | None:
@@ -143,7 +143,7 @@ def bend_along(
     Each goes with the nearest station of its midline, turned as the direction there is.
     """
     (old, along), (new, target_along) = _stations(midline), _stations(target)
-    nearest = cKDTree(old).query(vertices)[1]
+    nearest = KDTree(old).query(vertices)[1]
     offsets = vertices - old[nearest]
     # Rodrigues: the least turn of one direction into the other.
     axis = np.cross(along, target_along)[nearest]

@@ -7,7 +7,7 @@ from stream_dmr.messages import FishMessage, FittedMesh, Frame, Message
 from stream_dmr.recording.frame_images import FrameRestorer
 from stream_dmr.recording.header import SecondCamera
 from stream_dmr.recording.record import Record
-from stream_dmr.recording.view_geometry import MeshRebuilder
+from stream_dmr.recording.view_geometry import MAX_PENDING, MeshRebuilder
 
 
 class SecondRecords:
@@ -25,6 +25,9 @@ class SecondRecords:
         self._messages, self._camera, self._pictures = messages, camera, pictures
         self._next = next(messages, None)
         self._frame: Frame | None = None  # the first camera's last one
+        # Frame index and time of the first camera, by the second's index: crops come after later
+        # frames, as many as the queues of its run held.
+        self._shown: dict[int, tuple[int, int]] = {}
 
     def before(self, frame: Frame | None) -> Iterator[Record]:
         """Those that are nearer to the frame before this one; None: all that are left."""
@@ -37,18 +40,20 @@ class SecondRecords:
             message, payload = self._next
             if until_ns is not None and message.timestamp_ns >= until_ns:
                 return
-            whole = self._drawn(message, payload, last)
+            if isinstance(message, Frame) and last is not None:
+                self._shown[message.frame_index] = last.frame_index, last.timestamp_ns
+                self._shown.pop(message.frame_index - MAX_PENDING, None)
+            whole = self._drawn(message, payload)
             yield Record.of_payload(message, payload, whole=whole, is_second=True)
             self._next = next(self._messages, None)
 
-    def _drawn(self, message: Message, payload: bytes, shown: Frame | None) -> Message:
+    def _drawn(self, message: Message, payload: bytes) -> Message:
+        frame_index, timestamp_ns = self._shown.get(message.frame_index, (0, 0))
         if isinstance(message, Frame) and self._pictures is not None:
             message = self._pictures.restore(message, payload)
         elif isinstance(message, FishMessage):
             message = replace(message, track_id=self._camera.ids.get(message.track_id, 0))
-        if shown is None:
-            return replace(message, frame_index=0)
-        return replace(message, frame_index=shown.frame_index, timestamp_ns=shown.timestamp_ns)
+        return replace(message, frame_index=frame_index, timestamp_ns=timestamp_ns)
 
 
 class WholeRecords:

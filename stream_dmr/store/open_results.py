@@ -18,8 +18,9 @@ from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
 from stream_dmr.messages import Message
 from stream_dmr.recording.codec import encode
 from stream_dmr.recording.header import RunHeader
-from stream_dmr.recording.reading import MessageTypes, Recording, files_of, open_recordings
+from stream_dmr.recording.reading import Recording, files_of, open_recordings
 from stream_dmr.recording.selection import EVERYTHING, Selection
+from stream_dmr.recording.topics import TOPICS, MessageTypes, Topics
 from stream_dmr.store.fish import database_of, read_runs
 from stream_dmr.template.template import Template
 from stream_dmr.template.template_file import bundled_names
@@ -68,7 +69,7 @@ class LostRecording:
         ]
 
     def payloads(
-        self, kinds: MessageTypes, selection: Selection = EVERYTHING
+        self, kinds: MessageTypes, selection: Selection = EVERYTHING, *, of: Topics = TOPICS
     ) -> Iterator[tuple[type[Message], bytes]]:
         return iter(())
 

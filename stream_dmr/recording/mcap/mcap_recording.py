@@ -8,7 +8,7 @@ the checksums of the index and of the chunks that are read.
 import json
 import struct
 import zlib
-from collections.abc import Collection, Generator, Iterator, Mapping
+from collections.abc import Collection, Generator, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
@@ -38,7 +38,8 @@ from stream_dmr.recording.topics import (
     THINNED,
     TOPICS,
     VIDEO,
-    Topic,
+    MessageTypes,
+    Topics,
 )
 
 # What the mcap library raises on damaged bytes; its CRC error is a ValueError.
@@ -82,11 +83,7 @@ class McapRecording:
             yield message.data
 
     def payloads(
-        self,
-        kinds: Collection[type[Message]],
-        selection: Selection = EVERYTHING,
-        *,
-        of: Mapping[type[Message], Topic] = TOPICS,
+        self, kinds: MessageTypes, selection: Selection = EVERYTHING, *, of: Topics = TOPICS
     ) -> Iterator[tuple[type[Message], bytes]]:
         """Type and encoding of the messages of `kinds`; a torn file gives those that are whole."""
         topics = {of[kind].topic: kind for kind in kinds}

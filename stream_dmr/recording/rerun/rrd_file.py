@@ -8,7 +8,7 @@ import json
 import subprocess
 import warnings
 import zlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from heapq import merge
@@ -27,7 +27,7 @@ from stream_dmr.messages import Message
 from stream_dmr.recording.codec import check_version
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.selection import EVERYTHING, Selection
-from stream_dmr.recording.topics import END, TOPICS, Topic
+from stream_dmr.recording.topics import END, TOPICS, MessageTypes, Topics
 
 
 def rerun_program() -> str:
@@ -60,11 +60,7 @@ class RrdRecording:
         self.header = self._read_header()
 
     def payloads(
-        self,
-        kinds: Collection[type[Message]],
-        selection: Selection = EVERYTHING,
-        *,
-        of: Mapping[type[Message], Topic] = TOPICS,
+        self, kinds: MessageTypes, selection: Selection = EVERYTHING, *, of: Topics = TOPICS
     ) -> Iterator[tuple[type[Message], bytes]]:
         """Type and encoding of the messages of `kinds`, merged by capture time."""
 
