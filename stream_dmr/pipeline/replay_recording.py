@@ -52,7 +52,7 @@ from stream_dmr.recording.record import as_recorded
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.topics import SECOND_TOPICS, RecordingSettings
 from stream_dmr.recording.view_geometry import MeshRebuilder
-from stream_dmr.recording.whole_records import SecondRecords, WholeRecords
+from stream_dmr.recording.whole_records import WholeRecords
 from stream_dmr.store.fish import database_of, read_measured_fish, read_runs
 from stream_dmr.store.ledger import Signer
 from stream_dmr.store.length_store import LengthStore
@@ -389,13 +389,15 @@ def _open_whole(
     """Pictures are those of the sources of two cameras, since their view is made here first."""
     meshes = MeshRebuilder(recording.header.template, known_shapes(recording))
     if second is None or request.out is None:
-        return WholeRecords(meshes, None, None)
+        return WholeRecords(meshes)
     pictures, others = None, None
     if inputs.config.recording.rrd:
         pictures = stack.enter_context(open_recorded_source(recording.header))
         others = stack.enter_context(open_recorded_source(second.camera.header))
-    messages = second.messages([*SECOND_TOPICS])
-    return WholeRecords(meshes, pictures, SecondRecords(messages, second.camera, others))
+    of_second = second.messages([*SECOND_TOPICS])
+    return WholeRecords(
+        meshes, pictures, second=second.camera, of_second=of_second, second_pictures=others
+    )
 
 
 def _other_versions(recording: Recording) -> list[str]:

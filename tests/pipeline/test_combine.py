@@ -4,16 +4,20 @@ import threading
 
 import numpy as np
 import pytest
+from rerun.chunk import RrdReader
 
 import stream_dmr as sd
 from stream_dmr.errors import UserError
+from stream_dmr.geometry import box_iou
 from stream_dmr.localization.two_views import second_from_first
-from stream_dmr.messages import LocalizedFish
+from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
 from stream_dmr.pipeline.combine import FishSightings, pair_up
 from stream_dmr.pipeline.replay_recording import replay
 from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.reasons import Reason
-from stream_dmr.recording.reading import messages_of, open_recordings
+from stream_dmr.recording.reading import decoded_messages, messages_of, open_recordings
+from stream_dmr.recording.topics import SECOND_TOPICS
+from stream_dmr.recording.view_geometry import MeshRebuilder, place_fit
 from stream_dmr.simulation import SECOND, simulate
 from stream_dmr.simulation.rail_scene import FPS, second_camera
 from tests.localization.test_two_views import FIRST
@@ -79,6 +83,74 @@ def test_the_recording_holds_the_fish_where_both_see_them(scene, combined):
         (one.frame_index, one.track_id) for one in again
     ]
     assert {one.reason for one in again} <= {"", *map(str, Reason)}
+
+
+@pytest.mark.parametrize("name", ["recording.mcap", "recording.rrd"])
+@pytest.mark.parametrize("stage", ["localize", "smooth"])
+def test_a_replay_gives_the_same_lengths(scene, combined, stage, name, tmp_path):
+    replayed = invoke(f"replay {scene / 'both' / name} --from {stage} --out {tmp_path}")
+    assert replayed.code == 0, replayed.err
+    for table in ("lengths.csv", "frames.csv"):
+        assert (tmp_path / table).read_bytes() == (scene / "both" / table).read_bytes()
+    again = open_recordings([tmp_path])
+    assert seconds(again) == seconds(open_recordings([scene / "both"]))
+
+
+@pytest.mark.parametrize("stage", ["crop", "fit"])
+def test_a_replay_from_what_only_one_camera_knows_is_refused(scene, combined, stage):
+    result = invoke(f"replay {scene / 'both'} --from {stage}")
+    assert result.code == 2
+    assert "combine" in result.error
+
+
+def seconds(recording):
+    return of_kinds(recording, of=SECOND_TOPICS)
+
+
+def of_kinds(recording, **of):
+    """Encodings by type: an .rrd merges the types in another order."""
+    return {kind: [data for _, data in recording.payloads([kind], **of)] for kind in SECOND_TOPICS}
+
+
+def test_the_recording_holds_both_runs(scene, combined):
+    both, second = (open_recordings([scene / one]) for one in ("both", f"{SECOND}/run"))
+    assert seconds(both) == of_kinds(second)
+    assert both.header.second is not None
+    assert both.header.second.header.attachments() == second.header.attachments()
+
+
+def test_the_view_has_both_pictures_and_the_meshes(scene, combined):
+    chunks = RrdReader(str(scene / "both" / "recording.rrd")).stream()
+    drawn = {str(chunk.entity_path) for chunk in chunks if not chunk.is_static}
+    cameras = {f"/scene/{one}/{part}" for one in ("camera", "second/camera") for part in VIEWED}
+    assert cameras | {"/scene/fish/1/mesh", "/scene/second/camera/fish/1/outline"} <= drawn
+
+
+VIEWED = ("frame", "masks")
+
+
+def test_the_common_mesh_is_where_the_second_camera_sees_the_fish(scene, combined):
+    """The first camera's mesh, bent along the midline of both, fills the second one's box."""
+    both = open_recordings([scene / "both"])
+    second = both.header.second
+    first = both.header.calibration
+    R, t = second_from_first(first, second.header.calibration)
+    crops = {
+        (one.frame_index, second.ids.get(one.track_id)): one.bbox_xyxy_px
+        for one, _ in decoded_messages(both, [FishCrop], of=SECOND_TOPICS)
+    }
+    fits = {(one.frame_index, one.track_id): one for one in messages_of(both, FittedMesh)}
+    meshes = MeshRebuilder(both.header.template, both.header.candidates)
+    overlaps = []
+    for fish in messages_of(both, LocalizedFish):
+        key = fish.frame_index, fish.track_id
+        if fish.accepted and key in crops:
+            vertices, _, _ = place_fit(meshes.with_vertices(fits[key]).shape, fish)
+            pixels = second.header.calibration.camera.project(vertices @ R.T + t)
+            box = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
+            overlaps.append(box_iou(box, crops[key]))
+    assert len(overlaps) > 10
+    assert np.median(overlaps) > 0.8
 
 
 def test_runs_that_share_no_fish_or_no_calibration_are_refused(scene, tmp_path):

@@ -85,15 +85,13 @@ def blueprint(header: RunHeader) -> Layout:
     calibration = header.calibration
     has_positions = header.inputs is not None and header.inputs.nmea is not None
     maps = [rrb.MapView(origin="map", name="Map")] if has_positions else []
-    second: list[rrb.View] = []
-    if header.second is not None:
-        origin = CAMERA.replace("scene", topics.SECOND_SCENE, 1)
-        second = [rrb.Spatial2DView(origin=origin, name="Second camera")]
+    second = f"{topics.SECOND_SCENE}/camera"
+    seconds = [] if header.second is None else [rrb.Spatial2DView(origin=second, name="Second")]
     return Layout(
         rrb.Vertical(
             rrb.Horizontal(
                 rrb.Spatial2DView(origin=CAMERA, name="Frame: masks, outlines, keypoints"),
-                *second,
+                *seconds,
                 rrb.Tabs(
                     _scene_view(calibration, "Fish", _RELATIVE if calibration is None else _NEAR),
                     _scene_view(calibration, "Whole scene", _FAR),
@@ -136,8 +134,8 @@ def _scene_view(
         origin="scene",
         contents=[
             "scene/**",
-            *(f"- {path}" for path in ("scene/camera/fish/**", topics.MASKS)),
-            *(f"- {topics.SECOND_SCENE}/{path}" for path in _OF_SECOND),
+            *("- scene/camera/fish/**", f"- {topics.MASKS}"),
+            *(f"- {topics.SECOND_SCENE}/camera/{part}" for part in ("fish/**", "masks")),
         ],
         name=f"{name} (camera frame, {unit})",
         line_grid=rrb.LineGrid3D(visible=False),
@@ -145,20 +143,6 @@ def _scene_view(
             position=depth * eye[0], look_target=depth * eye[1], eye_up=(0.0, -1.0, 0.0)
         ),
     )
-
-
-_OF_SECOND = ("camera/fish/**", "camera/masks", "plane")  # what the 3D scene leaves out of it
-
-
-def log_second(rec: rr.RecordingStream, header: RunHeader) -> None:
-    """Log where the second camera is, static: both calibrations name the same plane."""
-    second = None if header.second is None else header.second.header.calibration
-    if header.calibration is not None and second is not None:
-        first, plane = header.calibration.plane, second.plane
-        turn = first.rotation @ plane.rotation.T
-        shift = first.translation_mm - turn @ plane.translation_mm
-        pose = rr.Transform3D(translation=shift, mat3x3=turn)
-        rec.log(topics.SECOND_SCENE, pose, static=True)
 
 
 def log_camera(
@@ -179,14 +163,14 @@ def log_camera(
     rec.log(place, pinhole, static=True)
 
 
-def log_plane(rec: rr.RecordingStream, calibration: Calibration, place: str = PLANE) -> None:
+def log_plane(rec: rr.RecordingStream, calibration: Calibration) -> None:
     """Log the reference plane, static, as a grid of 100 mm or a multiple of it."""
     middle, camera, plane = middle_mm(calibration), calibration.camera, calibration.plane
     half = 0.6 * middle[2] * max(camera.width / camera.K[0, 0], camera.height / camera.K[1, 1])
     lines = _grid(plane.rotation.T @ (middle - plane.translation_mm), half)
     strips = lines @ plane.rotation.T + plane.translation_mm
     grid = rr.LineStrips3D(strips, colors=[_GREY], radii=rr.Radius.ui_points(0.7))
-    rec.log(place, grid, static=True)
+    rec.log(PLANE, grid, static=True)
 
 
 def middle_mm(calibration: Calibration) -> Float[np.ndarray, "3"]:

@@ -13,6 +13,7 @@ import rerun as rr
 from jaxtyping import Float
 
 from stream_dmr.camera import Camera
+from stream_dmr.localization.two_views import second_from_first
 from stream_dmr.messages import (
     FishCrop,
     FishMessage,
@@ -36,7 +37,6 @@ from stream_dmr.recording.rerun.blueprint import (
     appearance,
     log_camera,
     log_plane,
-    log_second,
     middle_mm,
 )
 from stream_dmr.recording.topics import RecordingSettings
@@ -159,11 +159,15 @@ class SceneDrawing:
             rec.log(self._path(path), what, static=True)
         self._second: SceneDrawing | None = None
         if header.second is not None:
-            log_second(rec, header)
             second = header.second.header
             self._second = SceneDrawing(rec, second, settings, scene=topics.SECOND_SCENE)
+            if header.calibration is not None and second.calibration is not None:
+                R, t = second_from_first(second.calibration, header.calibration)
+                pose = rr.Transform3D(translation=t, mat3x3=R)
+                rec.log(topics.SECOND_SCENE, pose, static=True)
         if header.calibration is not None:
-            log_plane(rec, header.calibration, self._path(topics.PLANE))
+            if scene == "scene":  # both cameras have the same plane
+                log_plane(rec, header.calibration)
             self._set_camera(header.calibration.camera, depth=middle_mm(header.calibration)[2])
 
     def draw(self, record: Record) -> None:

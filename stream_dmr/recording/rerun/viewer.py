@@ -30,7 +30,7 @@ from stream_dmr.recording.rerun.rrd_sink import RrdSink
 from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.recording.topics import SECOND_TOPICS, TOPICS, RecordingSettings
 from stream_dmr.recording.view_geometry import MeshRebuilder
-from stream_dmr.recording.whole_records import SecondRecords, WholeRecords
+from stream_dmr.recording.whole_records import WholeRecords
 
 WEB_MEMORY = "512MiB"  # of the server; what is older is dropped
 _VIEWER_MEMORY = "4GiB"
@@ -156,13 +156,15 @@ def convert(
     require_selected(opened, selection)
     meshes = MeshRebuilder(opened.header.template, known_shapes(opened))
     pictures = source or RecordedPictures(opened, selection)
-    second = None
-    if opened.header.second is not None:
-        camera = opened.header.second
-        of_second = selection.shifted(camera.offset_ns)
-        messages = decoded_messages(opened, [*SECOND_TOPICS], of_second, of=SECOND_TOPICS)
-        second = SecondRecords(messages, camera, second_source)
-    records = WholeRecords(meshes, pictures, second)
+    second = opened.header.second
+    later = selection.shifted(0 if second is None else second.offset_ns)
+    records = WholeRecords(
+        meshes,
+        pictures,
+        second=second,
+        of_second=decoded_messages(opened, [*SECOND_TOPICS], later, of=SECOND_TOPICS),
+        second_pictures=second_source,
+    )
     with (
         replacing(make_folder(rrd.parent) / rrd.name) as draft,
         closing(RrdSink(draft, opened.header, settings)) as sink,
