@@ -14,7 +14,6 @@ from pathlib import Path
 from stream_dmr.errors import SourceError, UserError, reason_of
 from stream_dmr.files import read_text
 from stream_dmr.pipeline.run_options import RunOptions, options_of
-from stream_dmr.recording.header import content_sha256
 from stream_dmr.version import __version__
 
 # Options of `run` by their names; `video` is --source.
@@ -140,6 +139,8 @@ def _size_and_time(path: str) -> list[int]:
 
 
 def _content_hash(path: str) -> str:
+    from stream_dmr.recording.header import content_sha256  # --help needs no numpy
+
     try:
         return content_sha256(Path(path)) if path else ""
     except SourceError:

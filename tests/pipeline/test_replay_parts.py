@@ -20,6 +20,8 @@ from stream_dmr.recording.mcap.mcap_sink import McapSink
 from stream_dmr.recording.reading import Recording, open_recordings
 from stream_dmr.recording.record import make_record
 from stream_dmr.recording.topics import RecordingSettings
+from stream_dmr.recording.view_geometry import MeshRebuilder
+from stream_dmr.recording.whole_records import WholeRecords
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.run_facts import run_facts
 from tests.support.final_estimates import fish
@@ -68,7 +70,7 @@ def test_a_given_calibration_replaces_the_recorded_one(
     inputs = read_inputs(request, recording, RunObserver())
     assert inputs.calibration is not None
     np.testing.assert_array_equal(inputs.calibration.plane.translation_mm, [0, 0, 1200])
-    written = new_header(request, recording.header, inputs)
+    written = new_header(request, recording.header, inputs, None)
     assert written.calibration_file == path.read_bytes()
     assert written.command == "stream-dmr replay"
     assert written.source == recording.header.source
@@ -88,7 +90,12 @@ def test_no_shapes_are_learnt_where_the_settings_have_none(
 def test_recorded_messages_pass_as_they_are_and_are_counted(recording: Recording):
     recorded = RecordedMessages(recording)
     writer = ReplayWriter(
-        recorded, recomputed=[LengthEstimate], settings=SETTINGS, outputs=None, comparator=None
+        recorded,
+        recomputed=[LengthEstimate],
+        settings=SETTINGS,
+        outputs=None,
+        comparator=None,
+        whole=WholeRecords(MeshRebuilder(recording.header.template, None)),
     )
     for message in of_kinds(recorded, [Frame, LocalizedFish]):
         assert writer.write(message) is message
@@ -105,6 +112,7 @@ def test_recomputed_messages_are_compared_and_final_lengths_kept(recording: Reco
         settings=SETTINGS,
         outputs=None,
         comparator=comparator,
+        whole=WholeRecords(MeshRebuilder(recording.header.template, None)),
     )
     for message in RecordedMessages(recording).of_type(LengthEstimate):
         writer.write(message)
