@@ -158,14 +158,13 @@ def read_text(path: Path, *, encoding: str = "utf-8", max_bytes: int = MAX_TEXT_
     return read_small(path, max_bytes=max_bytes).decode(encoding)
 
 
-def read_token(path: Path, *, where: str) -> str:
-    """The access token of a status page. Raises ConfigError about the option or key `where`."""
+def read_secret(path: Path, *, where: str, what: str = "the access token") -> str:
+    """`what` a file holds alone. Raises ConfigError about the option or key `where`."""
     try:
         return read_text(path).strip()
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(
-            f"{where} {path}: expected a file with the access token, it can't be read: "
-            f"{reason_of(error)}"
+            f"{where} {path}: expected a file with {what}, it can't be read: {reason_of(error)}"
         ) from error
 
 

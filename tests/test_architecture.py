@@ -62,6 +62,7 @@ ROOMS = [
     *GROUND_FLOOR,
 ]
 WHO_KNOWS = {
+    "apprise": ["stream_dmr.web"],
     "av": ["stream_dmr.recording"],
     "mcap": ["stream_dmr.recording"],
     "rerun": ["stream_dmr.recording"],

@@ -52,11 +52,11 @@ def haul(
 
 def _post(address: str, what: str, name: str, token_file: Path | None) -> str:
     from stream_dmr.errors import UserError, reason_of
-    from stream_dmr.files import read_token
+    from stream_dmr.files import read_secret
 
     headers = {"Content-Type": "application/json"}
     if token_file is not None:
-        headers["Authorization"] = f"Bearer {read_token(token_file, where='--token-file')}"
+        headers["Authorization"] = f"Bearer {read_secret(token_file, where='--token-file')}"
     content = json.dumps({"what": what, "name": name, "said_by": getuser()}).encode()
     try:
         request = urllib.request.Request(f"{address.rstrip('/')}/haul", content, headers)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
@@ -98,20 +98,29 @@ class WatchSettings(Settings):
     )
 
 
+_MAIL_KEYS = ("mail_to", "mail_from", "mail_server", "mail_password_file")
+
+
 class AlertSettings(Settings):
     """`[alerts]`: who is told when a run becomes unhealthy, and when it is healthy again."""
 
     webhook: str = Field(
         default="", description='address that gets a POST of JSON; "": nobody is told this way'
     )
-    mail_to: str = Field(default="", description='mail address that is told; "": none')
-    mail_from: str = Field(default="", description="mail address of the sender, and its login")
-    mail_server: str = Field(
-        default="", description="mail server that takes it, host or host:port (587)"
+    # A file, since addresses hold passwords, and settings are recorded.
+    apprise_file: str = Field(
+        default="",
+        description="file with an address of apprise a line, for mail and some hundred services; "
+        '"": none',
     )
-    mail_password_file: str = Field(
-        default="", description='file with the sender\'s password; "": the server asks for none'
-    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def leave_out_mail(cls, values: object) -> object:
+        """Recordings of older versions hold keys of mails, which `load_config` refuses if set."""
+        if not isinstance(values, dict):
+            return values
+        return {key: value for key, value in values.items() if key not in _MAIL_KEYS}
 
 
 _HEADER = """\
@@ -202,11 +211,18 @@ def load_config(path: Path | str | None) -> Config:
     if path is None:
         return Config()
     try:
-        return parse_config(read_text(Path(path)), where=str(path))
+        text = read_text(Path(path))
     except OSError as error:
         raise ConfigError(f"{path}: expected a config.toml, got: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: expected TOML in UTF-8, got other bytes") from error
+    config = parse_config(text, where=str(path))
+    if tomllib.loads(text).get("alerts", {}).get("mail_to"):
+        raise ConfigError(
+            f"{path} [alerts]: mail_to is no key any more; expected apprise_file, a file with the "
+            "line mailtos://SERVER:587?user=LOGIN&pass=PASSWORD&from=ADDRESS&to=ADDRESS"
+        )
+    return config
 
 
 def parse_config(text: str, *, where: str) -> Config:

@@ -1,26 +1,23 @@
-"""Tells a webhook or a mail address when a run becomes unhealthy, and when it is healthy again."""
+"""Tells people, by a webhook or apprise, when a run becomes unhealthy, and healthy again."""
 
 import json
 import re
-import smtplib
-import ssl
 import threading
 import urllib.request
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from email.message import EmailMessage
+from functools import partial
 from pathlib import Path
 
-from stream_dmr.errors import ConfigError, reason_of
-from stream_dmr.files import read_text
+from stream_dmr.errors import ConfigError, reason_of, requires_extra
+from stream_dmr.files import read_secret
 from stream_dmr.pipeline.config import AlertSettings
 
 _LOOK_S = 2.0  # between two looks at the health
 _SETTLE_LOOKS = 3  # equal looks after which a change counts: a camera that blinks is no news
 _TIMEOUT_S = 10.0  # of a delivery
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 5.0, 3600.0  # after a delivery that failed: doubled each time
-_MAIL_PORT = 587
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +38,8 @@ class Alert:
 class AlertSender:
     """Looks at a run's health in a thread of its own, and sends each change once.
 
-    What can't be delivered is tried again, later and later; only the latest state is sent then.
+    What can't be delivered is noted once and tried again, later and later; only the latest state is
+    sent then.
     """
 
     def __init__(
@@ -56,6 +54,7 @@ class AlertSender:
     ) -> None:
         """Raises ConfigError where the settings do not fit together."""
         self._deliver = _deliveries(settings)
+        self._failing = set[Callable[[Alert], None]]()
         self._run, self._problems, self._on_notice = run, problems, on_notice
         self._look_s, self._first_pause_s = look_s, first_pause_s
         self._ended = threading.Event()
@@ -99,9 +98,13 @@ class AlertSender:
     def _try(self, deliver: Callable[[Alert], None], alert: Alert) -> bool:
         try:
             deliver(alert)
-        except (OSError, smtplib.SMTPException, ValueError) as error:
-            self._on_notice(f"[alerts] could not be sent, tried again later: {reason_of(error)}")
+        except (OSError, ValueError) as error:
+            if deliver not in self._failing:
+                line = f"[alerts] could not be sent, tried again later: {reason_of(error)}"
+                self._on_notice(line)
+            self._failing.add(deliver)
             return False
+        self._failing.discard(deliver)
         return True
 
 
@@ -118,10 +121,8 @@ def _deliveries(settings: AlertSettings) -> list[Callable[[Alert], None]]:
                 f"[alerts] webhook: expected http://... or https://..., got {settings.webhook!r}"
             )
         deliveries.append(lambda alert: _post(settings.webhook, alert))
-    if settings.mail_to:
-        if not (settings.mail_server and settings.mail_from):
-            raise ConfigError("[alerts] mail_to: expected mail_server and mail_from beside it")
-        deliveries.append(lambda alert: _mail(settings, alert))
+    if settings.apprise_file:
+        deliveries += _services(settings.apprise_file)
     return deliveries
 
 
@@ -133,19 +134,35 @@ def _post(address: str, alert: Alert) -> None:
         pass
 
 
-def _mail(settings: AlertSettings, alert: Alert) -> None:
-    message = EmailMessage()
-    message["Subject"] = " ".join(alert.title.split())[:200]
-    message["From"], message["To"] = settings.mail_from, settings.mail_to
-    message.set_content("\n".join([alert.title, *alert.problems, alert.time]))
-    host, _, port = settings.mail_server.partition(":")
-    # Without a password any encryption is better than none; a password goes to that server alone.
-    context = ssl.create_default_context() if settings.mail_password_file else None
-    with smtplib.SMTP(host, int(port or _MAIL_PORT), timeout=_TIMEOUT_S) as server:
-        server.ehlo()
-        if server.has_extn("starttls") or settings.mail_password_file:
-            server.starttls(context=context)
-        if settings.mail_password_file:
-            password = read_text(Path(settings.mail_password_file)).strip()
-            server.login(settings.mail_from, password)
-        server.send_message(message)
+def _services(file: str) -> Iterator[Callable[[Alert], None]]:
+    """One per address of the file. No message holds an address, which may hold a password."""
+    with requires_extra("alerts", "[alerts] apprise_file"):
+        from apprise import Apprise, NotifyFormat, NotifyType
+    where = "[alerts] apprise_file"
+    text = read_secret(Path(file), where=where, what="an address of apprise a line")
+
+    def send(services: Apprise, line: str, alert: Alert) -> None:
+        if not services.notify(
+            title=" ".join(alert.title.split())[:200],
+            body="\n".join([*alert.problems, alert.time]),
+            notify_type=NotifyType.SUCCESS if alert.healthy else NotifyType.FAILURE,
+            body_format=NotifyFormat.TEXT,
+        ):
+            raise OSError(f"{line} failed; why: apprise -vv --body test --config {file}")
+
+    lines = enumerate(map(str.strip, text.splitlines()), start=1)
+    addresses = {number: line for number, line in lines if line and not line.startswith("#")}
+    if not addresses:
+        raise ConfigError(f"{where} {file}: expected an address of apprise a line, got none")
+    for number, address in addresses.items():
+        services, line = Apprise(), f"{where} {file}, line {number}"
+        if not services.add(address):
+            raise ConfigError(
+                f"{line}: expected an address that apprise knows, such as "
+                "mailtos://user:password@example.org, got another"
+            )
+        if any(getattr(s, "secure_mode", "") == "insecure" and s.password for s in services):
+            raise ConfigError(
+                f"{line}: expected mailtos://, got mailto://, which hides no password"
+            )
+        yield partial(send, services, line)

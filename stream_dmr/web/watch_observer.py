@@ -184,7 +184,7 @@ class WatchObserver(RunObserver):
                     f"{settings.token_file} in the header Authorization: Bearer TOKEN"
                 )
         alerts = run.config.alerts
-        if alerts.webhook or alerts.mail_to:
+        if alerts.webhook or alerts.apprise_file:
             sender = AlertSender(
                 alerts, run=run.out.resolve().name, problems=state.problems, on_notice=self.warn
             )

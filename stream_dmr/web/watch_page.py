@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from stream_dmr.errors import ConfigError, UserError
-from stream_dmr.files import read_token
+from stream_dmr.files import read_secret
 from stream_dmr.lengths.fate import FATE_OF_ZONE
 from stream_dmr.pipeline.config import WatchSettings
 from stream_dmr.sources.positions import COUNTED
@@ -135,7 +135,7 @@ def _read_token(settings: WatchSettings) -> str:
             f"[watch] host = {settings.host!r}: expected a token_file beside it, since others can "
             "reach this address; make one with: openssl rand -hex 16 > token"
         )
-    token = read_token(Path(settings.token_file), where="[watch] token_file")
+    token = read_secret(Path(settings.token_file), where="[watch] token_file")
     if len(token) < _MIN_TOKEN_CHARACTERS:
         raise ConfigError(
             f"[watch] token_file: expected a token of {_MIN_TOKEN_CHARACTERS} characters or more, "

@@ -54,7 +54,7 @@ LEFT_OUT = """
 import sys
 from pathlib import Path
 
-BLOCKED = {"torch", "matplotlib", "DracoPy", "manifold3d", "networkx"}
+BLOCKED = {"apprise", "torch", "matplotlib", "DracoPy", "manifold3d", "networkx"}
 
 class Without:
     def __init__(self, finder):
@@ -76,6 +76,7 @@ for command in ("run", "replay out --from crop --check", "report out", "verify o
     done = invoke(command, options if command.startswith("run") else None)
     print(command, done.code, done.err if done.code else "")
 Path("adam.toml").write_text('[fit_mesh]\\nsolver = "adam"\\ndeformation = "linear-blend"\\n')
+Path("alerts.toml").write_text('[alerts]\\napprise_file = "services.txt"\\n')
 Path("plane.obj").write_text("v 0 0 0\\nv 1 0 0\\nv 0 1 0\\nv 0 0 1\\nf 1 2 3\\nf 1 3 4\\n")
 Path("bins.csv").write_text("bin_low_mm,bin_high_mm,count\\n0,500,1\\n500,1000,2\\n")
 for command in (
@@ -83,6 +84,7 @@ for command in (
     "run --config adam.toml --out two --source clip/video.mp4 --boxes clip/boxes.txt",
     "run --template plane.obj --out three --source clip/video.mp4",
     "evaluate --lengths out/lengths.csv --truth bins.csv --plot plot.png",
+    "run --config alerts.toml --out four --source clip/video.mp4 --boxes clip/boxes.txt",
 ):
     done = invoke(command)
     print(done.code, (done.err or "no error").splitlines()[-1])
@@ -100,7 +102,7 @@ def test_what_some_need_alone_may_be_left_out(tmp_path: Path):
     )
     lines = answer.stdout.splitlines()
     assert all(line.endswith(" 0 ") for line in lines[:4]), answer.stdout + answer.stderr
-    needed = ("pip install torch", "pip install torch", "stream-dmr[meshes]", "stream-dmr[plots]")
+    needed = ["pip install torch"] * 2 + [f"stream-dmr[{e}]" for e in ("meshes", "plots", "alerts")]
     for line, named in zip(lines[4:], needed, strict=True):
         assert line.startswith("2 error: ")
         assert named in line

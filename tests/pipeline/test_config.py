@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.errors import ConfigError
-from stream_dmr.pipeline.config import Config, load_config, to_toml
+from stream_dmr.pipeline.config import Config, load_config, parse_config, to_toml
 
 COMMITTED = Path(__file__).resolve().parents[2] / "config.toml"
 
@@ -112,6 +112,14 @@ MISTAKES = {
 @pytest.mark.parametrize("text", MISTAKES)
 def test_every_mistake_is_one_line_with_its_remedy(tmp_path: Path, text: str):
     assert refusal(tmp_path, text) == "config.toml" + MISTAKES[text]
+
+
+def test_mails_of_older_versions_are_refused_by_name_but_not_in_recordings(tmp_path: Path):
+    unused = "[alerts]\nmail_to = ''\nmail_server = 'example.org'\n"
+    assert load_config(write(tmp_path, unused)) == Config()
+    used = unused.replace("''", "'office@example.org'")
+    assert "expected apprise_file, a file with the line mailtos://" in refusal(tmp_path, used)
+    assert parse_config(used, where="a recording") == Config()
 
 
 def test_the_outside_key_names_the_tables_where_none_owns_it(tmp_path: Path):

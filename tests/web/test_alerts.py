@@ -1,11 +1,11 @@
-"""Alerts: each change of health once, by webhook and mail, and again until it is delivered."""
+"""Alerts: each change of health once, by webhook and services, and again until it is delivered."""
 
 import base64
 import json
 import socket
 import ssl
 import threading
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -117,7 +117,7 @@ def test_what_is_refused_is_tried_again():
         watching(AlertSettings(webhook=webhook.address), ["the measurement hangs"], notices),
     ):
         assert webhook.received.get(timeout=WAIT_S)["problems"] == ["the measurement hangs"]
-        assert len(notices) == 3
+        assert len(notices) == 1
         with pytest.raises(Empty):
             webhook.received.get(timeout=0.3)
 
@@ -134,39 +134,51 @@ def test_what_is_over_before_it_could_be_sent_is_not_sent():
         assert webhook.received.get(timeout=WAIT_S)["problems"] == problems
 
 
-def test_a_mail_goes_to_the_server():
-    received = Queue[str]()
+@pytest.fixture
+def apprise_file(tmp_path: Path) -> Callable[..., AlertSettings]:
+    """Settings with a file of these lines."""
 
-    def take_mail() -> None:
-        """One session of SMTP (RFC 5321), without extensions."""
-        with listener, listener.accept()[0] as connection, connection.makefile("rwb") as stream:
+    def write(*lines: str) -> AlertSettings:
+        (tmp_path / "services.txt").write_text("\n".join(lines))
+        return AlertSettings(apprise_file=str(tmp_path / "services.txt"))
 
-            def answer(line: str) -> None:
-                stream.write(f"{line}\r\n".encode())
-                stream.flush()
+    return write
 
-            answer("220 test")
-            while line := stream.readline().decode().strip():
-                if line.upper() == "DATA":
-                    answer("354 go on")
-                    lines = iter(lambda: stream.readline().decode().rstrip("\r\n"), ".")
-                    received.put("\n".join(lines))
-                answer("221 bye" if line.upper() == "QUIT" else "250 fine")
 
-    listener = socket.create_server(("127.0.0.1", 0))
-    port = listener.getsockname()[1]
-    thread = threading.Thread(target=take_mail, daemon=True)
-    thread.start()
-    settings = AlertSettings(
-        mail_to="office@example.org", mail_from="box@example.org", mail_server=f"127.0.0.1:{port}"
-    )
-    notices = list[str]()
-    with watching(settings, ["no picture from the camera for 21 s"], notices):
-        mail = received.get(timeout=WAIT_S)
+def test_services_of_apprise_are_told_as_well(apprise_file: Callable[..., AlertSettings]):
+    problems, notices = ["no picture from the camera for 21 s"], list[str]()
+    with serving(Webhook()) as one, serving(Webhook()) as other:
+        lines = [service_of(one), "", "  # the office", f" {service_of(other)} "]
+        with watching(apprise_file(*lines), problems, notices):
+            first, second = (server.received.get(timeout=WAIT_S) for server in (one, other))
+            problems.clear()
+            healthy = one.received.get(timeout=WAIT_S)
+    assert first == second
+    assert first["title"] == "stream-dmr: haul is unhealthy: no picture from the camera for 21 s"
+    assert str(first["message"]).startswith("no picture from the camera for 21 s\n20")
+    assert (first["type"], healthy["type"]) == ("failure", "success")
+    assert healthy["title"] == "stream-dmr: haul is healthy again"
     assert notices == []
-    thread.join(WAIT_S)
-    assert "Subject: stream-dmr: haul is unhealthy: no picture from the camera" in mail
-    assert "To: office@example.org" in mail
+
+
+def test_a_service_that_fails_is_noted_once_and_without_its_password(
+    apprise_file: Callable[..., AlertSettings],
+    capfd: pytest.CaptureFixture[str],
+):
+    notices = list[str]()
+    with serving(Webhook()) as one, serving(Webhook(num_refused=3)) as other:
+        settings = apprise_file(service_of(one), service_of(other))
+        with watching(settings, ["the measurement hangs"], notices):
+            assert other.received.get(timeout=WAIT_S)["type"] == "failure"
+    assert one.received.qsize() == 1
+    (notice,) = notices
+    assert notice.startswith("[alerts] could not be sent, tried again later: ")
+    assert "services.txt, line 2 failed; why: apprise -vv" in notice
+    assert "secret" not in notice + "".join(capfd.readouterr())
+
+
+def service_of(server: Webhook) -> str:
+    return server.address.replace("http://", "json://box:secret@")
 
 
 class TlsMailServer(threading.Thread):
@@ -236,21 +248,23 @@ def _make_certificate(path: Path) -> None:
 
 @pytest.mark.parametrize("is_trusted", [True, False])
 def test_a_password_goes_over_tls_and_to_the_right_server_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_trusted: bool
+    apprise_file: Callable[..., AlertSettings],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    is_trusted: bool,
 ):
     server = TlsMailServer(tmp_path)
     server.start()
     if is_trusted:
         monkeypatch.setenv("SSL_CERT_FILE", str(server.certificate))
-    (tmp_path / "password").write_text("secret\n")
-    settings = AlertSettings(
-        **{"mail_to": "office@example.org", "mail_from": "box@example.org"},
-        **{"mail_server": server.address, "mail_password_file": str(tmp_path / "password")},
+    settings = apprise_file(
+        f"mailtos://{server.address}?user=box@example.org&pass=secret"
+        "&from=box@example.org&to=office@example.org"
     )
     notices = list[str]()
     with watching(settings, ["the measurement hangs"], notices):
         said = list[str]()
-        while not said or said[-1] not in ("QUIT", "refused"):
+        while not said or said[-1] not in ("quit", "refused"):
             said.append(server.said.get(timeout=WAIT_S))
         server.join(WAIT_S)
     login = [line for line in said if line.startswith("AUTH PLAIN")]
@@ -261,16 +275,22 @@ def test_a_password_goes_over_tls_and_to_the_right_server_alone(
         assert notices == []
     else:
         assert login == []
-        assert any("certificate verify failed" in notice for notice in notices)
+        assert len(notices) == 1
 
 
-@pytest.mark.parametrize(
-    ("settings", "expected"),
-    [
-        (AlertSettings(webhook="ftp://example.org"), "expected http://"),
-        (AlertSettings(mail_to="office@example.org"), "expected mail_server and mail_from"),
-    ],
-)
-def test_settings_that_do_not_fit_are_refused(settings: AlertSettings, expected: str):
-    with pytest.raises(ConfigError, match=expected), watching(settings, [], []):
+def test_settings_that_do_not_fit_are_refused(apprise_file: Callable[..., AlertSettings]):
+    for lines, expected in (
+        (["json://a", "nonsense://secret"], "line 2: expected an address that apprise knows"),
+        (["mailto://box:secret@example.org"], "line 1: expected mailtos://"),
+        (["# json://a"], "expected an address of apprise a line, got none"),
+    ):
+        assert expected in refusal(apprise_file(*lines))
+    assert "expected http://" in refusal(AlertSettings(webhook="ftp://example.org"))
+    assert "expected a file with" in refusal(AlertSettings(apprise_file="missing.txt"))
+
+
+def refusal(settings: AlertSettings) -> str:
+    with pytest.raises(ConfigError) as refused, watching(settings, [], []):
         pass
+    assert "secret" not in str(refused.value)
+    return str(refused.value)
