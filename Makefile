@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo same test test-slow bench faults soak table1 check format golden config docs clean
+.PHONY: setup demo same test test-slow bench faults soak table1 check wheels format golden config docs clean
 
 setup: $(STAMP)  ## compile the numeric loops, half a minute; without it the first run does
 	$(BIN)/stream-dmr setup
@@ -39,6 +39,20 @@ check: $(STAMP)  ## style and types
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/pyright
+
+EXTRAS := alerts foxglove h264 meshes plots ray
+PLATFORMS := x86_64-manylinux_2_28 aarch64-manylinux_2_28
+
+# pip judges markers by the machine it runs on, uv by the one it is told, and it downloads no wheel.
+wheels: $(STAMP)  ## whether all that users install has wheels for x86-64 and ARM64, and what lacks
+	$(BIN)/pip install --quiet --constraint constraints.txt uv
+	@lacks=0; for platform in $(PLATFORMS); do for python in 3.11 3.12 3.13; do \
+		$(BIN)/uv pip compile --quiet --only-binary :all: --constraint constraints.txt \
+			--python-platform $$platform --python-version $$python \
+			$(EXTRAS:%=--extra %) pyproject.toml > /dev/null \
+			&& echo "$$platform, Python $$python: wheels of all" \
+			|| { echo "$$platform, Python $$python: lacks what is said above"; lacks=1; }; \
+	done; done; exit $$lacks
 
 format: $(STAMP)
 	$(BIN)/ruff format .
