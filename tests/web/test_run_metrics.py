@@ -1,5 +1,8 @@
 """The status page's picture and /metrics, without a server."""
 
+import json
+import re
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +12,9 @@ import pytest
 from prometheus_client import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
+from stream_dmr import DEMO_SCENE
 from stream_dmr.messages import Frame, LocalizedFish
+from stream_dmr.sources.live_stream import LiveStream
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.source import ReadFramesSettings
 from stream_dmr.web.run_state import MeasuredFrame, RunState, make_registry
@@ -17,6 +22,7 @@ from stream_dmr.web.watch_page import draw_fish, encode_jpeg
 from tests.support.final_estimates import fish as final_estimate
 from tests.support.recorded_run import run
 
+ROOT = Path(__file__).resolve().parents[2]
 MESSAGES = list(run(1, num_fish=1))
 FRAME = next(m for m in MESSAGES if isinstance(m, Frame))
 FISH = next(m for m in MESSAGES if isinstance(m, LocalizedFish))
@@ -93,6 +99,24 @@ def test_metrics_say_which_output_fails(state: RunState):
     assert found["stream_dmr_output_works", "frames.csv"] == 1
     assert found["stream_dmr_output_works", "recording.mcap"] == 0
     assert found["stream_dmr_healthy",] == 0
+
+
+def test_the_board_asks_for_metrics_and_labels_that_a_camera_has(tmp_path: Path):
+    video = f"file://{DEMO_SCENE / 'video.mp4'}"
+    with closing(LiveStream(video, ReadFramesSettings())) as camera:
+        state = RunState(camera, tmp_path, silence_s=20.0, stuck_s=120.0)
+        for message in MESSAGES:
+            state.take(message)
+        state.sinks.report("frames.csv")
+        state.take(final_estimate(2, fate="landed", species_code="TUR"))
+        text = generate_latest(make_registry(state)).decode()
+    board = json.loads((ROOT / "deploy/monitoring/dashboards/stream-dmr.json").read_text())
+    targets = [target for panel in board["panels"] for target in panel["targets"]]
+    assert len(targets) >= 10
+    for target in targets:
+        (name,) = re.findall(r"stream_dmr_\w+", target["expr"])
+        labels = re.findall(r"{{(\w+)}}", target["legendFormat"])
+        assert re.search(rf"^{name}{{{labels[0]}=" if labels else rf"^{name} ", text, re.MULTILINE)
 
 
 def test_a_file_has_no_metrics_of_a_camera(state: RunState):
