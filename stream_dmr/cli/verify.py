@@ -28,7 +28,8 @@ def verify(
     goes on.
     """
     from stream_dmr.evidence.verify_batch import verify_all
-    from stream_dmr.evidence.verify_folder import Change, check_signatures, summary
+    from stream_dmr.evidence.verify_folder import Change, summary
+    from stream_dmr.evidence.verify_signatures import check_signatures
     from stream_dmr.store.fish import run_notes
     from stream_dmr.store.ledger import load_public_key
     from stream_dmr.store.schema import NAME

@@ -9,10 +9,7 @@ import csv
 import io
 import json
 import math
-import sqlite3
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import fields
 from datetime import UTC, datetime
 from operator import attrgetter
@@ -21,12 +18,10 @@ from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
-from stream_dmr.errors import OutputError, UserError
+from stream_dmr.errors import UserError
 from stream_dmr.evidence.seal import (
     CONTINUED,
-    RECORDINGS,
     begins_as,
     haul_lines,
     known_files,
@@ -38,6 +33,7 @@ from stream_dmr.evidence.seal import NAME as PROVENANCE
 from stream_dmr.files import is_locked, sha256_of
 from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.messages import FittedMesh, LengthEstimate, LocalizedFish
+from stream_dmr.recording.mcap.mcap_recording import is_torn
 from stream_dmr.recording.reading import decoded_messages, open_recordings, recorded_settings
 from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.store.edits import (
@@ -52,38 +48,21 @@ from stream_dmr.store.edits import (
     settings_of,
 )
 from stream_dmr.store.fish import database_of, read_runs, rows_by_run, run_times
-from stream_dmr.store.ledger import (
-    END,
-    FILE_KINDS,
-    FOUND,
-    REMOVED,
-    STATE,
-    ChainEntry,
-    content_sha256,
-    is_entry,
-    lines_sha256,
-)
-from stream_dmr.store.run_facts import END_COLUMNS, NOT_ENDED, RunFacts, run_facts
+from stream_dmr.store.ledger import content_sha256, lines_sha256
+from stream_dmr.store.run_facts import NOT_ENDED, RunFacts, run_facts
 from stream_dmr.store.run_tables import FRAMES_COLUMNS, LENGTHS_COLUMNS, frames_row, lengths_row
 from stream_dmr.store.schema import (
     CATCH_COLUMNS,
-    CHECKS,
     ESTIMATE_COLUMNS,
     EVENTS,
     FISH,
-    HAULS,
-    LEDGER,
     POSITIONS,
-    RUNS,
     WATCHED,
-    Table,
     check_lines,
     estimate_of,
-    open_for_reading,
     read_rows,
     read_state,
     reading,
-    rows,
 )
 from stream_dmr.store.schema import NAME as DATABASE
 from stream_dmr.store.verdicts import (
@@ -98,14 +77,14 @@ from stream_dmr.store.verdicts import (
 )
 from stream_dmr.tables import rotated_files
 
-_Row = Mapping[str, Any]
+Row = Mapping[str, Any]
 _NOT_COMPUTED = ("flags",)
 
 
 T = TypeVar("T")
 
 
-def _guarded(check: Iterable[T], finding: Callable[[str], T]) -> Iterator[T]:
+def guarded(check: Iterable[T], finding: Callable[[str], T]) -> Iterator[T]:
     """The findings of a check, and `finding` where what it reads is too broken to go on."""
     try:
         yield from check
@@ -127,13 +106,13 @@ def changed_edits(database: Path, last_frames: Mapping[int, int]) -> Iterator[st
             yield f"fish {track_id}: its frames are not those that a reviewer added"
     edits = edits_of(verdicts)
     if edits.fish:
-        yield from _guarded(
+        yield from guarded(
             _lengths(database, edits, last_frames),
             lambda why: f"fish that reviewers made can't be checked: {why}",
         )
     corrections = [(n, v) for n, v in enumerate(verdicts, start=1) if v.kind == "correct"]
     if corrections:
-        yield from _guarded(
+        yield from guarded(
             _corrections(database, verdicts, corrections),
             lambda why: f"lengths that reviewers corrected can't be checked: {why}",
         )
@@ -247,7 +226,7 @@ def _changes(folder: Path, others: Checks) -> Iterator[Change]:
             yield Change(path, "is no file: a pipe, a device or a link to nothing")
     database = database_of(folder)
     runs: dict[str, RunFacts] = {}
-    fish: dict[int, _Row] = {}
+    fish: dict[int, Row] = {}
     lengths: dict[str, list[str]] = {}
     of_rows = [*_broken(database, _stored(database, runs, fish, lengths))] if database else []
     yield from _broken(folder / PROVENANCE, _against_provenance(folder, runs))
@@ -278,11 +257,11 @@ def _changes(folder: Path, others: Checks) -> Iterator[Change]:
 
 
 def _broken(path: Path, check: Iterable[Change]) -> Iterator[Change]:
-    return _guarded(check, lambda why: Change(path, f"damaged: {why.removeprefix(f'{path}: ')}"))
+    return guarded(check, lambda why: Change(path, f"damaged: {why.removeprefix(f'{path}: ')}"))
 
 
 def _stored(
-    database: Path, runs: dict[str, RunFacts], fish: dict[int, _Row], lengths: dict[str, list[str]]
+    database: Path, runs: dict[str, RunFacts], fish: dict[int, Row], lengths: dict[str, list[str]]
 ) -> Iterator[Change]:
     """Read `runs`, the rows of `fish`, and theirs of lengths.csv; each broken row is a finding."""
     runs |= read_runs(database)
@@ -310,14 +289,14 @@ def summary(database: Path) -> Iterator[str]:
     """A line for each run: vessel, source, time and number of fish. Raises OutputError."""
     times, fish = run_times(database), rows_by_run(database, FISH)
     for run_id, facts in read_runs(database).items():
-        begun, ended = (_utc(ns) for ns in times[run_id])
+        begun, ended = (utc(ns) for ns in times[run_id])
         yield (
             f"run {run_id}: vessel {facts.vessel!r}, source {facts.source!r}, {begun} to {ended}, "
             f"{len(fish.get(run_id, []))} fish"
         )
 
 
-def _utc(time_ns: int | None) -> str:
+def utc(time_ns: int | None) -> str:
     """UTC to the second; "?" where it is unknown or no time."""
     try:
         return datetime.fromtimestamp(int(time_ns or "") / 1e9, UTC).isoformat(timespec="seconds")
@@ -353,7 +332,7 @@ def _against_provenance(folder: Path, runs: Mapping[str, RunFacts]) -> Iterator[
         tables -= set(rotated_files(folder / "frames.csv"))
     yield from (Change(path, "is no table of this run") for path in sorted(tables))
     for check in (_fish_and_runs, _unsealed_rows, _verdicts, _state):
-        lines = _guarded(
+        lines = guarded(
             check(database, made), lambda why: f"can't be compared with {PROVENANCE}: {why}"
         )
         yield from (Change(database, line) for line in lines)
@@ -430,7 +409,7 @@ def _log(
 def _recording(
     path: Path,
     runs: dict[str, RunFacts],
-    fish: Mapping[int, _Row],
+    fish: Mapping[int, Row],
     frames: dict[str, list[str]],
 ) -> Iterator[Change]:
     """Compare a recording with the database; its rows of frames.csv are added to `frames`."""
@@ -461,9 +440,9 @@ def _recording(
                 if now != was:
                     yield Change(database, f"{name}: {column} is {now}, {path.name} says {was}")
     has_crashed = any(one.ended_by == NOT_ENDED for one in runs.values())
+    # A crash leaves a torn .mcap.part, which is repaired; .mcap is the name of a whole one.
+    is_cut_off = path.suffix == ".mcap" and is_torn(path)
     for line in recording.warnings:
-        # A crash leaves a torn .mcap.part, which is repaired; .mcap is the name of a whole one.
-        is_cut_off = path.suffix == ".mcap" and ": torn; " in line
         what = line.removeprefix(f"{path}: ")
         yield Change(path, what, is_by_crash=has_crashed and not is_cut_off)
 
@@ -518,239 +497,3 @@ def _rows(path: Path, columns: Sequence[str]) -> dict[str, list[str]] | None:
     fish = columns.index("track_id")
     whole = [row for row in table[1:] if len(row) == len(columns)]
     return {f"{row[0]},{row[fish]}" if fish else row[0]: row for row in whole}
-
-
-class SignatureCheck(NamedTuple):
-    """What was found in one folder."""
-
-    changes: list[str]
-    crashes: list[str]  # what a crash explains, or somebody who cut off what came last
-    notes: list[str]  # what a reader must know beside
-
-
-def check_signatures(folder: Path, key: Ed25519PublicKey) -> SignatureCheck:
-    """Check the chain of a folder's lengths.db, and everything in the folder against it."""
-    check = SignatureCheck([], [], [])
-    try:
-        database = open_for_reading(folder / DATABASE)
-    except OutputError as error:
-        check.changes.append(f"its signatures can't be read: {error}")
-        return check
-    with closing(database):
-        entries = list[ChainEntry]()
-        _extend(check.changes, "its chain", _whole_entries(database, entries))
-        if not entries:
-            check.changes.append("nothing in it is signed")
-            return check
-        signed = _Signed(folder, database, entries)
-        for found, name, lines in (
-            (check.changes, "its chain", _broken_links(entries, key)),
-            (check.changes, "its fish", _rows_by_name(signed, FISH, rows(database, FISH))),
-            (check.changes, "its events", _events(signed)),
-            (check.changes, "its runs", _runs(signed)),
-            (check.crashes, "its last run", _last_run(signed)),
-            (check.changes, "its files", _files(signed)),
-            (check.changes, "its marks, clips or scenes", _signature_state(signed)),
-            (check.changes, "its checks of the scale", _checks(signed)),
-            *(
-                (check.changes, f"its {table.name}", _added(signed, table))
-                for table in (POSITIONS, WATCHED, HAULS)
-            ),
-            (check.notes, "its events of hauls", _hauls_of_people(signed)),
-            (check.notes, "its files", _noted_files(signed)),
-            (check.notes, "its checks of the scale", _later_checks(signed)),
-            (check.notes, "its verdicts", _unsigned_verdicts(folder / DATABASE)),
-        ):
-            _extend(found, name, lines)
-    last = entries[-1]
-    count = f"{len(entries)} signed entries, the last of {_utc(last.time_ns)}"
-    check.notes.append(f"{count}: {last.sha256[:16]}")
-    return check
-
-
-class _Signed(NamedTuple):
-    """The signed entries of a folder, and what is in the folder."""
-
-    folder: Path
-    database: sqlite3.Connection
-    entries: Sequence[ChainEntry]
-
-    def of(self, *kinds: str) -> list[ChainEntry]:
-        return [entry for entry in self.entries if entry.kind in kinds]
-
-    def hashes(self, kind: str) -> dict[str, str]:
-        """The last hash by name."""
-        return {entry.name: entry.content_sha256 for entry in self.of(kind)}
-
-    def unfinished_run(self) -> ChainEntry | None:
-        """The begin of the last run, where its end is not signed."""
-        last = next(reversed(self.of(RUNS.kind)), None)
-        return last if last and last.name not in self.hashes(END) else None
-
-
-def _extend(found: list[str], name: str, lines: Iterable[str]) -> None:
-    found.extend(_guarded(lines, lambda why: f"{name} can't be checked: {why}"))
-
-
-def _whole_entries(database: sqlite3.Connection, entries: list[ChainEntry]) -> Iterator[str]:
-    """Add the entries to `entries`; those that are damaged are findings instead."""
-    for row in rows(database, LEDGER):
-        if is_entry(row):
-            entries.append(ChainEntry(**row))
-        else:
-            yield "signed entry {number!r} ({kind!r} {name!r}) is damaged".format(**row)
-
-
-def _added(signed: _Signed, table: Table) -> Iterator[str]:
-    """What was changed, removed or put in, a line each kind; people may add hauls to a folder."""
-    missing, surplus = _unmatched(signed, table)
-    if missing:
-        yield f"{missing} of its {table.name} are missing, or not as they were signed"
-    if surplus and table is not HAULS:
-        yield f"{surplus} of its {table.name} were put in, or are not as they were signed"
-
-
-def _hauls_of_people(signed: _Signed) -> Iterator[str]:
-    if surplus := _unmatched(signed, HAULS)[1]:
-        yield f"{surplus} events of hauls are not signed by the device"
-
-
-def _unmatched(signed: _Signed, table: Table) -> tuple[int, int]:
-    """The number of rows that were signed and are not there, and that are there and not signed."""
-    known = Counter(entry.content_sha256 for entry in signed.of(table.kind))
-    found = Counter(map(_content, rows(signed.database, table)))
-    return (known - found).total(), (found - known).total()
-
-
-def _unsigned_verdicts(database: Path) -> Iterator[str]:
-    """Each verdict: reviewers have no keys, so anybody who can write to the file can add one."""
-    for number, one in enumerate(read_verdicts(database), start=1):
-        length = "" if one.length_mm is None else f" to {one.length_mm} mm"
-        what = f"{one.kind} fish {one.track_id}{length}"
-        yield f"verdict {number} of {_utc(one.written_ns)} by {one.reviewer!r}: {what}; not signed"
-
-
-def _broken_links(entries: Sequence[ChainEntry], key: Ed25519PublicKey) -> Iterator[str]:
-    previous, number = "", 0
-    for entry in entries:
-        if entry.number != number + 1:
-            yield f"signed entries {number + 1} to {entry.number - 1} are missing"
-        elif entry.previous != previous:
-            yield f"signed entry {entry.number} does not follow the one before it"
-        if not entry.is_signed_by(key):
-            yield f"signed entry {entry.number} ({entry.kind} {entry.name}) is not of this key"
-        previous, number = entry.sha256, entry.number
-
-
-def _rows_by_name(signed: _Signed, table: Table, stored: Iterable[_Row]) -> Iterator[str]:
-    """Rows that were changed, removed, put in or moved; their name is what the entries say."""
-    kind, hashes = table.kind, signed.hashes(table.kind)
-    column = "run_id" if table is RUNS else "track_id"
-    contents = [(str(row[column]), _content(row)) for row in stored]
-    found = dict(contents)
-    if len(found) < len(contents):
-        yield f"{len(contents) - len(found)} {kind} are there twice"
-    for name, sha256 in hashes.items():
-        if name not in found:
-            yield f"{kind} {name} is missing, and was signed"
-        elif found[name] != sha256:
-            yield f"{kind} {name} is not as it was signed"
-    yield from (f"{kind} {name} is not signed" for name in found if name not in hashes)
-    if [name for name in found if name in hashes] != [name for name in hashes if name in found]:
-        yield f"the order of the {kind} is not as it was signed"
-
-
-def _events(signed: _Signed) -> Iterator[str]:
-    stored = list(rows(signed.database, EVENTS))
-    known = [entry.content_sha256 for entry in signed.of(EVENTS.kind)]
-    found = [_content(row) for row in stored]
-    for row, sha256 in zip(stored, found, strict=True):
-        if sha256 not in known:
-            yield f"the event {row['text']!r} was put in, or is not as it was signed"
-    if missing := len([sha256 for sha256 in known if sha256 not in found]):
-        yield f"{missing} events are missing, or not as they were signed"
-    if not missing and sorted(found) == sorted(known) and found != known:
-        yield "the order of the events is not as it was signed"
-    if len(found) > len(set(found)):
-        yield "an event is there twice"
-
-
-def _runs(signed: _Signed) -> Iterator[str]:
-    stored = list(rows(signed.database, RUNS))
-    begun = ({k: v for k, v in row.items() if k not in END_COLUMNS} for row in stored)
-    yield from _rows_by_name(signed, RUNS, begun)
-    ends = signed.hashes(END)
-    for row in stored:
-        name = str(row["run_id"])
-        if name in ends:
-            end = {column: row.get(column) for column in END_COLUMNS}
-            if content_sha256({"run_id": name} | end) != ends[name]:
-                yield f"the end of run {name} is not as it was signed"
-        elif row["ended_by"] != NOT_ENDED or row["ended_ns"] is not None:
-            yield f"the end of run {name} is not signed"
-
-
-def _last_run(signed: _Signed) -> Iterator[str]:
-    if (last := signed.unfinished_run()) and not is_locked(signed.folder):
-        yield f"run {last.name} has no end: it crashed, or what came last was removed"
-
-
-def _signature_state(signed: _Signed) -> Iterator[str]:
-    """Marks, clips and scenes as the last run left them, where it came to its end."""
-    state, last = content_sha256(read_state(signed.database)), signed.of(RUNS.kind, STATE)
-    if last and last[-1].kind == STATE and last[-1].content_sha256 != state:
-        yield "its marks, clips or scenes are not as they were signed"
-
-
-def _checks(signed: _Signed) -> Iterator[str]:
-    """The checks of the scale: each run signs those that were there at its end."""
-    checks, known = check_lines(signed.database), signed.of(CHECKS.kind)
-    if any(lines_sha256(checks[: int(one.name)]) != one.content_sha256 for one in known):
-        yield "the checks of the scale are not as they were signed"
-
-
-def _later_checks(signed: _Signed) -> Iterator[str]:
-    known = max((int(entry.name) for entry in signed.of(CHECKS.kind)), default=0)
-    if (more := len(check_lines(signed.database)) - known) > 0:
-        yield f"checks of the scale that are not signed yet: {more}"
-
-
-def _files(signed: _Signed) -> Iterator[str]:
-    known = {entry.name: entry for entry in signed.of(*FILE_KINDS)}
-    unfinished = signed.unfinished_run()
-    for name, entry in known.items():
-        path = signed.folder / Path(name).name
-        if unfinished and name in CONTINUED and entry.number < unfinished.number:
-            continue  # it has rows of that run now; each is compared with the fish and segments
-        if not path.is_file():
-            if entry.kind != REMOVED:
-                yield f"{name} is missing, and was signed"
-        elif entry.kind == REMOVED or sha256_of(path) != entry.content_sha256:
-            yield f"{name} is not as it was signed"
-    for pattern in RECORDINGS:
-        for path in sorted(signed.folder.glob(pattern)):
-            if path.name not in known:
-                yield f"{path.name} is not signed"
-
-
-def _noted_files(signed: _Signed) -> Iterator[str]:
-    """Files that were found, and others without a signature than recordings (see `_files`)."""
-    for entry in signed.of(FOUND):
-        yield f"{entry.name} was signed when a run found it, after a crash or renamed"
-    known = {entry.name for entry in signed.of(*FILE_KINDS)}
-    own = {
-        path
-        for pattern in (*RECORDINGS, f"{DATABASE}*", PROVENANCE)
-        for path in signed.folder.glob(pattern)
-    }
-    names = sorted(
-        path.name
-        for path in signed.folder.iterdir()
-        if path.is_file() and path.name not in known and path not in own
-    )
-    if names:  # exports, maybe
-        yield f"not signed by the device: {', '.join(map(repr, names))}"
-
-
-def _content(row: _Row) -> str:
-    return content_sha256({name: value for name, value in row.items() if name != "number"})

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from stream_dmr.evidence.verify_folder import check_signatures
+from stream_dmr.evidence.verify_signatures import check_signatures
 from stream_dmr.store.ledger import Signer, load_public_key, make_key
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.schema import POSITIONS

@@ -22,7 +22,8 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from stream_dmr.errors import OutputError
-from stream_dmr.evidence.verify_folder import check_signatures, verify
+from stream_dmr.evidence.verify_folder import verify
+from stream_dmr.evidence.verify_signatures import check_signatures
 from stream_dmr.files import FolderLock
 from stream_dmr.messages import Frame, LengthEstimate, LocalizedFish, Message
 from stream_dmr.recording.codec import decode

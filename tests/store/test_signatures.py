@@ -16,7 +16,7 @@ import pytest
 
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.evidence.seal import SignedFiles, seal_run
-from stream_dmr.evidence.verify_folder import check_signatures
+from stream_dmr.evidence.verify_signatures import check_signatures
 from stream_dmr.files import sha256_of
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.store.ledger import (
