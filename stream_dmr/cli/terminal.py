@@ -131,8 +131,8 @@ def print_replay(summary: ReplaySummary, out: Path | None, *, timings: bool) -> 
     print_fish(summary.fish)
     if timings:
         print_timings(summary)
-    speed = summary.recorded_s / summary.elapsed_s
-    print(f"{summary.num_frames} frames in {summary.elapsed_s:.1f} s, {speed:.0f} times real time")
+    speed = _times_real_time(summary.recorded_s, summary.elapsed_s)
+    print(f"{summary.num_frames} frames in {summary.elapsed_s:.1f} s, {speed}")
     if out is not None:
         print(f"results in {out}")
 
@@ -197,8 +197,13 @@ def print_speed(summary: RunSummary) -> None:
     of = "" if promised is None or num_frames >= promised - 1 else f" of {promised}"
     print(
         f"{num_frames}{of} frames in {elapsed_s:.1f} s, {num_frames / elapsed_s:.1f} frames/s, "
-        f"{summary.recorded_s / elapsed_s:.2g} times real time; {start_s:.1f} s to start"
+        f"{_times_real_time(summary.recorded_s, elapsed_s)}; {start_s:.1f} s to start"
     )
+
+
+def _times_real_time(recorded_s: float, elapsed_s: float) -> str:
+    speed = recorded_s / elapsed_s
+    return f"{speed:.0f} times real time" if speed > 10 else f"{speed:.2g} times real time"
 
 
 def print_evaluation(evaluation: Evaluation) -> None:
