@@ -95,6 +95,7 @@ class ReplayOutputs:
 
     recorder: Recorder
     results: ResultWriter
+    whole: WholeRecords
 
 
 @contextmanager
@@ -104,6 +105,7 @@ def open_replay_outputs(
     header: RunHeader,
     inputs: ReplayInputs,
     recorded: OriginalRun,
+    whole: WholeRecords,
     *,
     stop: threading.Event,
     observer: RunObserver,
@@ -151,7 +153,7 @@ def open_replay_outputs(
             on_notice=observer.warn,
         )
         try:
-            yield ReplayOutputs(recorder=recorder, results=results)
+            yield ReplayOutputs(recorder=recorder, results=results, whole=whole)
         except BaseException as error:
             store.end(f"an error: {error}")
             raise
@@ -180,10 +182,9 @@ class ReplayWriter:
         settings: RecordingSettings,
         outputs: ReplayOutputs | None,
         comparator: MessageComparator | None,
-        whole: WholeRecords,
     ) -> None:
         self._recorded, self._recomputed, self._settings = recorded, recomputed, settings
-        self._outputs, self._comparator, self._whole = outputs, comparator, whole
+        self._outputs, self._comparator = outputs, comparator
         self._positions = recorded.of_type(Position, keep_payloads=False)
         self._next_position = None if outputs is None else next(self._positions, None)
         self.totals = RunTotals(max_fish=None)
@@ -199,7 +200,7 @@ class ReplayWriter:
             self.totals.take(message)
         if self._outputs is not None:
             self._outputs.results.store(message)
-            for record in self._whole.of(message, payload):
+            for record in self._outputs.whole.of(message, payload):
                 self._outputs.recorder.put(record)
             if isinstance(message, Frame):
                 self._put_positions(self._outputs, message.frame_index)
@@ -208,7 +209,7 @@ class ReplayWriter:
     def finish(self) -> None:
         """Record what comes after the last frame: positions, and what a second camera saw."""
         if self._outputs is not None:
-            for record in self._whole.rest():
+            for record in self._outputs.whole.rest():
                 self._outputs.recorder.put(record)
             self._put_positions(self._outputs, None)
 
@@ -293,6 +294,7 @@ def replay(
                 header,
                 inputs,
                 _recorded_run(request, recording, observer),
+                _open_whole(recording, inputs, second, stack),
                 stop=stop,
                 observer=observer,
                 in_one_thread=_is_light(request),
@@ -305,7 +307,6 @@ def replay(
             settings=inputs.config.recording,
             outputs=outputs,
             comparator=comparator,
-            whole=_open_whole(request, recording, inputs, second, stack),
         )
 
         def on_frame() -> None:
@@ -380,15 +381,11 @@ def _open_second(
 
 
 def _open_whole(
-    request: ReplayOptions,
-    recording: Recording,
-    inputs: ReplayInputs,
-    second: _SecondRun | None,
-    stack: ExitStack,
+    recording: Recording, inputs: ReplayInputs, second: _SecondRun | None, stack: ExitStack
 ) -> WholeRecords:
     """Pictures are those of the sources of two cameras, since their view is made here first."""
     meshes = MeshRebuilder(recording.header.template, known_shapes(recording))
-    if second is None or request.out is None:
+    if second is None:
         return WholeRecords(meshes)
     pictures, others = None, None
     if inputs.config.recording.rrd:
