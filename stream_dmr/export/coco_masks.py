@@ -23,7 +23,7 @@ from stream_dmr.store.fish import Fish
 
 def coco_masks(
     pictures: Iterable[tuple[int, str, EncodedPicture]],
-    seen: Iterable[tuple[FishCrop, LocalizedFish]],
+    seen: Iterable[tuple[FishCrop, LocalizedFish | None]],
     fish: Mapping[int, Fish],
     *,
     video: str,
@@ -38,7 +38,7 @@ def coco_masks(
     for number, (crop, located) in enumerate(seen, start=1):
         mask = mask_in_frame(crop)
         x0, y0, x1, y1 = crop.bbox_xyxy_px.tolist()
-        ends_px = _ends(located, fish.get(crop.track_id))
+        ends_px = _ends(crop, located, fish.get(crop.track_id))
         keypoints = [] if ends_px is None else [(x + 0.5, y + 0.5, 2) for x, y in ends_px.tolist()]
         annotations.append(
             {
@@ -67,14 +67,18 @@ def coco_masks(
     }
 
 
-def _ends(located: LocalizedFish, fish: Fish | None) -> Float[np.ndarray, "2 2"] | None:
+def _ends(
+    crop: FishCrop, located: LocalizedFish | None, fish: Fish | None
+) -> Float[np.ndarray, "2 2"] | None:
     """Head and tail where a reviewer put them, else as fitted; None without, and if refused.
 
     `train` would learn from those of a refused frame.
     """
-    placed = None if fish is None else fish.review.moved.get(located.frame_index)
+    placed = None if fish is None else fish.review.moved.get(crop.frame_index)
     if placed is not None:
         return np.array(placed)
+    if located is None:  # a crash came between
+        return None
     is_refused = not located.accepted and located.reason != str(Reason.NO_CALIBRATION)
     return None if is_refused or located.keypoints_px is None else located.keypoints_px[[0, 2]]
 

@@ -128,13 +128,22 @@ class Export:
         """
         self._require_writable(path, needed_for="--masks")
         frames = decoded_messages(self.recording, [Frame], self._selection)
+        placed = {
+            (one.track_id, one.frame_index): one
+            for one in self._reviewed.of([LocalizedFish])
+            if isinstance(one, LocalizedFish)
+        }
         coco = coco_masks(
             (
                 (frame.frame_index, frame.source, stored_picture(payload))
                 for frame, payload in frames
                 if isinstance(frame, Frame)
             ),
-            self._counted(),
+            (
+                (crop, placed.get((crop.track_id, crop.frame_index)))
+                for crop in self._reviewed.of([FishCrop])
+                if isinstance(crop, FishCrop) and crop.track_id not in self._left_out
+            ),
             {one.estimate.track_id: one for one in self._fish},
             video=self.header.source,
         )

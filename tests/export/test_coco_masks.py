@@ -107,3 +107,10 @@ def test_ends_of_refused_frames_are_none(run: Path, reason: str, number: int):
     assert annotation["num_keypoints"] == number
     assert len(annotation["keypoints"]) == 6
     assert any(annotation["keypoints"]) == (number > 0)
+
+
+def test_a_mask_is_kept_where_a_crash_came_before_its_place(run: Path):
+    crop = by_fish_and_frame(run, FishCrop)[2, 3]
+    (annotation,) = coco_masks([], [(crop, None)], {}, video="haul")["annotations"]
+    assert annotation["area"] == mask_in_frame(crop).sum() > 0
+    assert annotation["num_keypoints"] == 0
