@@ -32,8 +32,15 @@ class FitMeshSettings(Settings):
     lambda_translation: float = Field(default=10.0, ge=0, description="weight of L_t, eq. (3)")
     lambda_normal: float = Field(default=0.003, ge=0, description="weight of L_normal, eq. (3)")
     lambda_laplacian: float = Field(default=0.003, ge=0, description="weight of L_lap, eq. (3)")
+    hang: Literal["camera", "plane"] = Field(
+        default="camera",
+        description='fish hang facing the "camera", or in the reference "plane", if the board was '
+        "held as they hang",
+    )
     tilt_std_rad: float = Field(
-        default=0.25, gt=0, description="std of a fish's tilt out of the reference plane, rad"
+        default=0.25,
+        gt=0,
+        description="std of a tilt out of the way in which fish hang, rad",
     )
     bend_std_rad: float = Field(
         default=0.5, gt=0, description="std of a joint's bend within its broad side, rad"

@@ -39,7 +39,6 @@ from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, LossTerms, So
 from stream_dmr.reasons import Reason
 from stream_dmr.template.template import Template
 
-# Without a calibration, fish are taken to hang square to the camera.
 _TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
 
 # Of L_rec: what a cold fit must gain to replace the pose of the frame before, and with it the end
@@ -77,7 +76,7 @@ class Fitter:
         plane_normal: Float[np.ndarray, "3"] | None = None,
         with_covariance: bool = False,
     ) -> None:
-        """`plane_normal`, in the camera frame, is of the plane that fish hang in, if known.
+        """`plane_normal`, in the camera frame, is of the plane that fish hang in; None: facing it.
 
         With a `candidate`, the template is given that shape, and breadth is as free as it is
         unknown; fits say its `index`. `with_covariance`: fits carry that of their parameters.

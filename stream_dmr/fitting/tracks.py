@@ -54,12 +54,14 @@ class TrackFitter:
         with_covariance: bool = False,
         species: SpeciesSettings | None = None,
     ) -> None:
-        """Fish hang in the plane of the calibration, if there is one.
+        """Fish hang as `[fit_mesh] hang` says.
 
         `candidates` are shapes of the template; without any it has its own. ConfigError for a
         list of `species` that can't be read.
         """
-        normal = None if calibration is None else calibration.plane.rotation[:, 2]
+        normal = None
+        if settings.hang == "plane" and calibration is not None:
+            normal = calibration.plane.rotation[:, 2]
         self._new_fitter = partial(
             Fitter, template, settings, plane_normal=normal, with_covariance=with_covariance
         )

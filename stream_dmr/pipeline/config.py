@@ -347,6 +347,7 @@ def _toml_name(value: object) -> str:
 # measured to. What the template can't follow are their fins, not bends that nobody sees.
 _LYING: dict[str, dict[str, Any]] = {
     "fit_mesh": {
+        "hang": "plane",
         "tilt_std_rad": 0.02,
         "bend_std_rad": 0.3,
         "arch_std_rad": 0.03,

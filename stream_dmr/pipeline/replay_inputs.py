@@ -53,6 +53,9 @@ def replay_config(
     can't be read.
     """
     recorded = parse_config(recorded_toml, where="the recording's config.toml")
+    if "hang" not in recorded.fit_mesh.model_fields_set:  # a recording older than the setting
+        in_plane = recorded.fit_mesh.model_copy(update={"hang": "plane"})
+        recorded = recorded.model_copy(update={"fit_mesh": in_plane})
     if given is None:
         return recorded
     mine = load_config(given)

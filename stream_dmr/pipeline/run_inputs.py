@@ -242,10 +242,16 @@ def start_notices(inputs: Inputs) -> Iterator[str]:
             )
         lean_rad = inputs.calibration.plane.lean_rad
         if lean_rad > _LARGEST_LEAN_RAD:
+            degrees, hang = f"{np.degrees(lean_rad):.0f} degrees", inputs.config.fit_mesh.hang
             yield (
-                f"the calibration's reference plane leans {np.degrees(lean_rad):.0f} degrees from "
-                "facing the camera; fish that hang facing it are measured up to "
-                f"{1 / np.cos(lean_rad) - 1:.0%} too long: photograph the board held as fish hang"
+                f"the calibration's reference plane leans {degrees} from facing the camera; "
+                + (
+                    "fish are taken to face the camera: where they hang in that plane, lengths are "
+                    f'up to {1 - np.cos(lean_rad):.0%} short: set [fit_mesh] hang = "plane"'
+                    if hang == "camera"
+                    else "fish are taken to hang in it: where they face the camera, lengths are "
+                    f'up to {1 / np.cos(lean_rad) - 1:.0%} long: set [fit_mesh] hang = "camera"'
+                )
             )
     if inputs.source.is_live and inputs.config.recording.frames == "reference":
         yield (

@@ -1,7 +1,10 @@
 """Fits along tracks with several candidate shapes: a fish is given the one its masks prefer."""
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from stream_dmr.camera import Calibration, Camera, ReferencePlane
 from stream_dmr.fitting.fit_settings import FitMeshSettings
 from stream_dmr.fitting.tracks import TrackFitter
 from tests.support.stocks import TEMPLATE, broader, candidates, fish_of, forms, tapered
@@ -11,6 +14,21 @@ SETTINGS = FitMeshSettings(max_faces=600)
 
 def shapes_of(fitter, fish):
     return [fitter.fit(sample.crop).shape for sample in fish.samples]
+
+
+@pytest.mark.parametrize(("hang", "lean"), [("camera", 0.0), ("plane", 0.3)])
+def test_fish_hang_facing_the_camera_or_in_the_plane(hang, lean):
+    plane = ReferencePlane(
+        rotation=Rotation.from_rotvec([0.3, 0.0, 0.0]).as_matrix(),
+        translation_mm=np.array([0.0, 0.0, 5000.0]),
+    )
+    fitter = TrackFitter(
+        TEMPLATE,
+        SETTINGS.model_copy(update={"hang": hang}),
+        calibration=Calibration(camera=Camera.nominal(width=640, height=480), plane=plane),
+    )
+    (normal,) = [fitter.plane_normal for fitter in fitter.fitters]
+    assert np.arccos(abs(normal[2])) == pytest.approx(lean)
 
 
 @pytest.mark.parametrize(("log_factor", "candidate"), [(-0.4, 0), (0.4, 1)])

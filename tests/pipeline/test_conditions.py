@@ -21,6 +21,7 @@ def test_a_condition_changes_settings_once(condition: Callable[[Config], Config]
 def test_lying_fish_rest_on_the_plane_and_hardly_tilt():
     config = lying(Config())
     assert config.localize.rests_on_plane
+    assert config.fit_mesh.hang == "plane"
     assert config.fit_mesh.tilt_std_rad < Config().fit_mesh.tilt_std_rad
     assert config.fit_mesh.arch_std_rad < 0.2 * config.fit_mesh.bend_std_rad
     assert config.smooth_length == Config().smooth_length

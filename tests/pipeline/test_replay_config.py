@@ -17,6 +17,7 @@ margin = 0.2
 model = "mine.onnx"
 forms = ["HAP=halibut"]
 [fit_mesh]
+hang = "camera"
 min_mask_px = 11
 [localize]
 min_iou = 0.5
@@ -77,3 +78,9 @@ def test_other_ones_of_earlier_stages_stay_as_recorded_and_are_named(tmp_path: P
     [line] = lines
     assert line.endswith(": [localize] min_iou = 0.5")
     assert replay_config(path, RECORDED, first="localize").localize.min_iou == 0.6
+
+
+def test_fish_of_a_recording_older_than_the_setting_hang_in_the_plane():
+    older = RECORDED.replace('hang = "camera"\n', "")
+    assert replay_config(None, older, first="fit").fit_mesh.hang == "plane"
+    assert replay_config(None, RECORDED, first="fit").fit_mesh.hang == "camera"

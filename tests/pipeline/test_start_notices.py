@@ -2,10 +2,13 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stream_dmr.fitting.fit_settings import FitMeshSettings
+from stream_dmr.pipeline.config import Config
 from stream_dmr.pipeline.run_inputs import Inputs, checked_inputs, start_notices
 from tests.support.fish_run import request
 from tests.support.tiny_clip import write_clip
@@ -29,18 +32,25 @@ def test_a_plane_that_is_too_near_for_a_rail_is_named_unless_fish_lie(tmp_path: 
     assert not [line for line in start_notices(lying) if "tvec must be in mm" in line]
 
 
-@pytest.mark.parametrize(("lean_deg", "is_named"), [(10.0, False), (35.0, True)])
+@pytest.mark.parametrize(
+    ("hang", "lean_deg", "says"),
+    [("camera", 10.0, None), ("camera", 35.0, "18% short"), ("plane", 35.0, "22% long")],
+)
 def test_a_plane_that_leans_from_the_camera_is_named(
-    tmp_path: Path, lean_deg: float, is_named: bool
+    tmp_path: Path, hang: Literal["camera", "plane"], lean_deg: float, says: str | None
 ):
     inputs = opened(tmp_path)
     assert inputs.calibration is not None
     rotation = Rotation.from_euler("xz", [lean_deg, 40.0], degrees=True).as_matrix()
     plane = replace(inputs.calibration.plane, rotation=rotation)
-    inputs = replace(inputs, calibration=replace(inputs.calibration, plane=plane))
-    named = [line for line in start_notices(inputs) if "held as fish hang" in line]
-    assert bool(named) == is_named
-    assert all("leans 35 degrees" in line and "22% too long" in line for line in named)
+    inputs = replace(
+        inputs,
+        calibration=replace(inputs.calibration, plane=plane),
+        config=Config(fit_mesh=FitMeshSettings(hang=hang)),
+    )
+    named = [line for line in start_notices(inputs) if "leans 35 degrees" in line]
+    assert bool(named) == (says is not None)
+    assert all(says is not None and says in line for line in named)
 
 
 def opened(folder: Path) -> Inputs:
