@@ -10,7 +10,7 @@ install_import_hook("stream_dmr", "beartype.beartype")
 
 # Nothing is timed in tests: the first example pays for imports and compilers. By default the same
 # examples come each time, so that a change is judged by itself; `make test-slow` draws new ones.
-settings.register_profile("same", deadline=None, derandomize=True)
+settings.register_profile("same", deadline=None, derandomize=True, max_examples=25)
 settings.register_profile("new", deadline=None)
 settings.load_profile("same")
 

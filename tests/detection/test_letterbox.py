@@ -1,7 +1,7 @@
 """Boxes come back from a letterboxed input exactly."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.detection.network_detectors import Letterbox
@@ -28,7 +28,6 @@ def test_boxes_come_back_exactly(width: int, height: int, inner: tuple[int, int]
 
 
 @given(st.integers(100, 900), st.integers(100, 900), st.integers(64, 640), st.data())
-@settings(max_examples=30)
 def test_a_picture_lands_where_the_boxes_say(width: int, height: int, side: int, data):
     x0 = data.draw(st.integers(0, width - 60))
     y0 = data.draw(st.integers(0, height - 60))

@@ -119,7 +119,6 @@ class TestNormalEquations:
         np.testing.assert_allclose(g, rows.T @ (weights * residuals), atol=1e-11)
         np.testing.assert_array_equal(H, H.T)
 
-    @settings(max_examples=100)
     @given(
         seed=seeds,
         size=st.integers(1, 32),

@@ -81,7 +81,6 @@ def test_both_deformations_leave_a_body_at_rest():
     np.testing.assert_allclose(blend_points(BODY, rest), BODY.points, atol=1e-12)
 
 
-@settings(max_examples=30)
 @given(seed=seeds)
 def test_the_spine_keeps_its_length_however_it_bends(seed: int):
     parameters = random_parameters(seed)

@@ -173,7 +173,6 @@ class TestCoverage:
 class TestBorders:
     """A picture is a window: what lies outside changes nothing inside."""
 
-    @settings(max_examples=30, deadline=None)
     @given(seed=seeds, x=st.integers(-14, 30), y=st.integers(-14, 30))
     def test_a_crop_of_a_large_picture_is_the_small_picture(self, seed, x, y):
         pixels = random_pixels(np.random.default_rng(seed), RIG, size=14, crumple=0.4)

@@ -32,7 +32,6 @@ from tests.support.shapes import (
 RIG = fish_rig()
 STRAIGHT_RIG = fish_rig(points=STRAIGHT)
 both_deformations = pytest.mark.parametrize("deformation", DEFORMATIONS.values(), ids=DEFORMATIONS)
-forty = settings(max_examples=40, deadline=None)
 
 
 def exponents(rotvec):
@@ -137,7 +136,6 @@ class TestAgainstTheSlowTwin:
         fast = spine(RIG, Parameters.from_vector(flat))[0]
         np.testing.assert_allclose(fast, slow_spine(RIG, flat), atol=1e-12)
 
-    @forty
     @given(seed=seeds)
     def test_binding_finds_the_nearest_place(self, seed):
         rng = np.random.default_rng(seed)
@@ -185,7 +183,6 @@ class TestRest:
 
 
 class TestMotion:
-    @forty
     @given(seed=seeds)
     @pytest.mark.parametrize("name", list(DEFORMATIONS))
     def test_a_root_motion_keeps_every_distance(self, seed, name):
@@ -206,7 +203,6 @@ class TestMotion:
             atol=1e-12,
         )
 
-    @forty
     @given(seed=seeds)
     @pytest.mark.parametrize("name", list(DEFORMATIONS))
     def test_equal_joint_rotations_are_a_root_rotation(self, seed, name):
@@ -222,7 +218,6 @@ class TestMotion:
         )
         torch.testing.assert_close(joint, root, rtol=0, atol=1e-13)
 
-    @forty
     @given(seed=seeds)
     def test_the_spine_keeps_its_length_in_any_bend(self, seed):
         rng = np.random.default_rng(seed)
@@ -232,7 +227,6 @@ class TestMotion:
         midline = deform(RIG, flat, spine).midline[0].numpy()
         assert arc_length(midline) == pytest.approx(arc_length(RIG.midline.numpy()), abs=1e-12)
 
-    @forty
     @given(seed=seeds, log_scale=st.floats(-1, 1))
     def test_joint_scales_make_the_spine_stouter_and_no_longer(self, seed, log_scale):
         flat = random_flat(np.random.default_rng(seed))
@@ -279,7 +273,6 @@ class TestMotion:
 
 
 class TestWeights:
-    @forty
     @given(seed=seeds, num_joints=st.integers(2, 4), size=st.floats(0, 8))
     def test_rows_are_shares(self, seed, num_joints, size):
         rng = np.random.default_rng(seed)
@@ -292,7 +285,6 @@ class TestWeights:
             # Wilder ones are positive too, but too small for a float.
             assert (weights > 0).all()
 
-    @forty
     @given(entries=st.lists(st.floats(-3, 3), min_size=6, max_size=6))
     def test_Q_is_positive_definite_whatever_is_learnt(self, entries):
         L = cholesky_factors(torch.tensor([[entries]], dtype=torch.float64))[0, 0].numpy()
@@ -300,7 +292,6 @@ class TestWeights:
         np.testing.assert_array_equal(Q, Q.T)
         assert np.linalg.eigvalsh(Q).min() > 0
 
-    @forty
     @given(seed=seeds)
     def test_every_Q_can_be_learnt(self, seed):
         A = np.random.default_rng(seed).normal(size=(3, 4))
@@ -311,7 +302,6 @@ class TestWeights:
 
 
 class TestRotationMatrices:
-    @forty
     @given(seed=seeds, angle=st.sampled_from([0.0, 1e-12, 1e-6, 1.0, np.pi - 1e-7, np.pi, 6.2, 40]))
     def test_are_rotations_as_scipy_knows_them(self, seed, angle):
         axes = np.random.default_rng(seed).normal(size=(5, 3))

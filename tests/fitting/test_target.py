@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 
@@ -13,7 +13,6 @@ from tests.support.shapes import crop_from_mask, seeds
 
 SIZE = 96
 offsets = st.floats(-0.5, 0.5)
-forty = settings(max_examples=40)
 
 
 def disc(radius, *, dx=0.0, dy=0.0, size=SIZE):
@@ -27,7 +26,6 @@ def centre(dx, dy):
 
 
 class TestSignedDistance:
-    @forty
     @given(radius=st.floats(15.0, 45.0), dx=offsets, dy=offsets)
     def test_of_a_disc_is_that_to_its_circle(self, radius, dx, dy):
         """To the staircase that stands for it, that is: without bias only near the edge."""
@@ -44,7 +42,6 @@ class TestSignedDistance:
         expected = np.tile(np.arange(SIZE) - (edge - 0.5), (SIZE, 1))
         np.testing.assert_array_equal(signed_distance(mask), expected)
 
-    @forty
     @given(seed=seeds)
     def test_is_negative_inside_and_turns_over_with_the_mask(self, seed):
         mask = np.random.default_rng(seed).random((20, 20)) < 0.5
@@ -52,7 +49,6 @@ class TestSignedDistance:
         np.testing.assert_array_equal(distance < 0, mask)
         np.testing.assert_array_equal(signed_distance(~mask), -distance)
 
-    @forty
     @given(seed=seeds, share=st.sampled_from([0.001, 0.02, 0.3, 0.98, 0.999]))
     def test_equals_scipy_s_on_specks_and_holes(self, seed, share):
         mask = np.random.default_rng(seed).random((33, 70)) < share
@@ -99,7 +95,6 @@ class TestUnknown:
 
 
 class TestContour:
-    @forty
     @given(radius=st.floats(15.0, 45.0), dx=offsets, dy=offsets)
     def test_of_a_disc_lies_on_its_circle(self, radius, dx, dy):
         # Under 15 px smoothing shrinks a circle by s^2 / (2 r), s = 1.5 px, and it shows.
@@ -120,7 +115,6 @@ class TestContour:
             errors.append(np.linalg.norm(points - centre(dx, dy), axis=1).mean() - radius)
         assert abs(np.mean(errors)) < 0.03
 
-    @forty
     @given(radius=st.floats(15.0, 45.0), dx=offsets, dy=offsets)
     def test_lengths_sum_to_the_circumference(self, radius, dx, dy):
         _, _, lengths = mask_contour(disc(radius, dx=dx, dy=dy))

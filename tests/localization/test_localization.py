@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -119,7 +119,6 @@ def exact_scenes(draw):
     return shape, midline, center, Calibration(camera=camera, plane=plane)
 
 
-@settings(max_examples=200)
 @given(exact_scenes())
 def test_exact_data_give_the_exact_length_and_place(scene):
     shape, midline, center, calibration = scene
@@ -133,7 +132,6 @@ def test_exact_data_give_the_exact_length_and_place(scene):
     np.testing.assert_allclose(fish.midline_mm, midline, rtol=1e-6, atol=1e-3)
 
 
-@settings(max_examples=50)
 @given(exact_scenes())
 def test_without_bending_the_length_is_the_chord(scene):
     shape, midline, _, calibration = scene
@@ -142,7 +140,6 @@ def test_without_bending_the_length_is_the_chord(scene):
     assert fish.bending_ratio == pytest.approx(arc_length(midline) / fish.length_mm, rel=1e-6)
 
 
-@settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1))
 def test_intersection_is_the_point_nearest_to_both_lines(seed):
     """Slow twin: minimise the sum of squared distances to both lines by the normal equations."""

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
@@ -43,7 +43,6 @@ def seen(line_mm: np.ndarray, degrees: float) -> tuple[View, View]:
     )
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     st.floats(0, 2.0),
     st.tuples(*[st.floats(-0.5, 0.5)] * 3),

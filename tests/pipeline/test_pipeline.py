@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.messages import Frame, Message, TrackEnded
@@ -148,7 +148,6 @@ def test_a_pause_of_the_source_ends_tracks_and_is_no_frame():
     assert [(c.frames_in, c.frames_processed) for c in counters] == [(5, 5)] * 3
 
 
-@settings(max_examples=50, deadline=None)
 @given(
     count=st.integers(0, 6),
     shapes=st.lists(st.tuples(st.integers(0, 3), st.booleans()), min_size=1, max_size=4),
@@ -353,7 +352,6 @@ def assert_counted(counters: Sequence[StageCounters]) -> None:
     st.booleans(),
     st.booleans(),
 )
-@settings(max_examples=60)
 def test_frames_in_are_processed_dropped_or_failed(
     count, shapes, stop_at, is_endless: bool, in_one_thread: bool
 ):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import MCAP0_MAGIC
 
@@ -213,7 +213,6 @@ def test_segments_are_read_as_one(run, tmp_path):
 
 
 class TestDamage:
-    @settings(max_examples=60, deadline=None)
     @given(seed=st.integers(0, 2**32))
     def test_a_flipped_byte_is_found(self, run, tmp_path_factory, seed):
         _check_flip(run[0] / "recording.mcap", tmp_path_factory.mktemp("flip"), seed)
@@ -232,7 +231,6 @@ class TestDamage:
                 flipped[place] ^= 1 << bit
                 _check_damaged(whole, tmp_path, flipped)
 
-    @settings(max_examples=30, deadline=None)
     @given(seed=st.integers(0, 2**32))
     def test_a_flipped_byte_is_found_or_not_read_by_a_read_of_a_part(
         self, run, tmp_path_factory, seed
@@ -251,7 +249,6 @@ class TestDamage:
         # A process each; more in the slow test.
         _check_flip(run[0] / "recording.rrd", tmp_path, seed=1)
 
-    @settings(max_examples=30, deadline=None)
     @given(share=st.floats(0.0, 0.999))
     def test_what_is_whole_of_a_torn_file_is_used(self, run, tmp_path_factory, share):
         _check_truncation(run[0] / "recording.mcap", tmp_path_factory.mktemp("torn"), share)

@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
@@ -287,7 +287,6 @@ def test_what_a_crash_left_is_made_whole(torn: Path, tmp_path: Path, messages: l
     assert list(repair_recordings(folder)) == []
 
 
-@settings(max_examples=40)
 @given(share=st.floats(0, 1), rubbish=st.binary(max_size=40))
 def test_any_beginning_of_a_recording_is_made_whole_or_set_aside(
     torn: Path, tmp_path_factory: pytest.TempPathFactory, share: float, rubbish: bytes

@@ -1,7 +1,7 @@
 """Boxes and pixels between frame and crop."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.camera import Camera, frame_from_crop
@@ -19,7 +19,6 @@ from tests.support.given_masks import crop_of
 
 
 @given(lens_cameras, st.floats(0, 639), st.floats(0, 479), st.floats(20, 500), st.integers(1, 3))
-@settings(max_examples=30, deadline=None)
 def test_the_fast_map_is_the_exact_one(camera, x, y, side, samples):
     crop = camera.crop(center_px=np.array([x, y]), side_px=side, size=32)
     map_x, map_y = frame_from_crop_map(crop, frame_camera=camera, samples=samples)
@@ -37,7 +36,6 @@ def test_the_fast_map_is_the_exact_one(camera, x, y, side, samples):
     st.floats(20, 120),
     st.floats(20, 120),
 )
-@settings(max_examples=30)
 def test_a_box_goes_to_the_crop_and_a_mask_in_it_comes_back(
     camera: Camera, x: float, y: float, w: float, h: float
 ):
@@ -76,7 +74,6 @@ def test_a_visible_box_is_clipped_and_encloses_the_mask():
 
 
 @given(lens_cameras, st.floats(100, 500), st.floats(100, 400), st.floats(20, 500), st.data())
-@settings(max_examples=30, deadline=None)
 def test_a_part_of_a_picture_is_seen_as_the_whole_one(camera, x, y, side, data):
     """As long as the rest of the picture is 0."""
     left, top = data.draw(st.integers(0, 600)), data.draw(st.integers(0, 440))

@@ -68,7 +68,6 @@ def test_a_mask_of_a_part_of_the_frame_gives_the_same_crop():
 
 
 @given(lens_cameras, st.floats(30, 400), st.floats(30, 300), st.floats(40, 200), st.floats(40, 200))
-@settings(max_examples=30, deadline=None)
 def test_a_mask_found_in_the_crop_is_the_one_given_in_the_frame(camera, x, y, w, h):
     x0, y0, x1, y1 = np.round([x, y, x + w, y + h]).astype(int)
     mask = np.zeros((480, 640), bool)
@@ -95,7 +94,6 @@ def test_a_mask_found_in_the_crop_is_the_one_given_in_the_frame(camera, x, y, w,
 
 
 @given(st.floats(0.7, 1.0), st.sampled_from([0, 1]), st.booleans())
-@settings(max_examples=30, deadline=None)
 def test_a_fish_that_extends_beyond_its_box_is_found_whole(share, axis, from_its_end):
     strip = np.array([[180, 240], [60, 360]])
     x, y = strip if axis else strip[::-1]

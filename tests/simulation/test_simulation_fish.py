@@ -104,7 +104,6 @@ def test_the_center_keypoint_lies_where_the_pose_puts_it_on_the_plane():
 
 
 @given(seed=SEEDS, preset=PRESET_NAMES)
-@settings(max_examples=25, deadline=None)
 def test_keypoints_lie_on_the_midline_at_their_arcs(seed, preset):
     posed = draw_view(preset=preset, seed=seed).posed
     head, center, tail = posed.keypoints

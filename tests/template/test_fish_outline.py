@@ -34,7 +34,6 @@ def side_view(name: str, *, turn_rad: float = 0.0, length_px: float = 800.0) -> 
     return draw(project(template.rest_vertices), template.faces), head, tail
 
 
-@settings(max_examples=25, deadline=None)
 @given(name=st.sampled_from(bundled_names()), turn_deg=st.floats(-180.0, 180.0))
 def test_head_and_fork_are_found_in_any_direction(name: str, turn_deg: float):
     mask, head, tail = side_view(name, turn_rad=np.radians(turn_deg))

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.camera import Camera
@@ -32,7 +32,6 @@ def corrected(box: np.ndarray, *, mask_box: list[int], confidence: float) -> np.
     return detection.bbox_xyxy_px
 
 
-@settings(max_examples=25)
 @given(st.lists(st.integers(-15, 15), min_size=4, max_size=4))
 def test_a_box_moves_to_the_mask_where_they_differ_clearly(offsets: list[int]):
     mask_box = (BOX + offsets).astype(int).tolist()

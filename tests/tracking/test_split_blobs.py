@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.detection.detector import Candidate
@@ -51,7 +51,6 @@ offsets = st.tuples(st.floats(-6, 6), st.floats(-6, 6))
 
 
 @given(st.integers(0, 45), st.integers(90, 130), offsets, offsets)
-@settings(max_examples=25, deadline=None)
 def test_two_known_fish_get_their_own_pieces(across, along, one_off, other_off):
     one, other = fish(200, 120), fish(200 + across, 120 + along)
     pieces = split_merged_blob(
@@ -68,7 +67,6 @@ def test_two_known_fish_get_their_own_pieces(across, along, one_off, other_off):
 
 
 @given(st.integers(-40, 40), offsets)
-@settings(max_examples=25, deadline=None)
 def test_an_unknown_fish_is_the_remainder(across, off):
     known, new = fish(250, 120), fish(250 + across, 250)
     pieces = split_merged_blob(candidate_of(known | new), [predicted(known, off=off)])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.training.image_degradation import add_weather, motion_kernel, simulate_camera
@@ -16,7 +16,6 @@ def half_bright() -> np.ndarray:
     return picture
 
 
-@settings(max_examples=40)
 @given(seeds, st.floats(0.5, 12))
 def test_a_motion_kernel_keeps_brightness_and_place(seed: int, length_px: float):
     kernel = motion_kernel(np.random.default_rng(seed), length_px)
@@ -28,7 +27,6 @@ def test_a_motion_kernel_keeps_brightness_and_place(seed: int, length_px: float)
     assert np.hypot(*(np.argwhere(kernel > 0) - half).T).max() <= length_px / 2 + 0.75
 
 
-@settings(max_examples=40)
 @given(seeds)
 def test_equal_seeds_give_equal_photographs_of_the_same_size(seed: int):
     one, other = (

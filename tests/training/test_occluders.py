@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.training.surroundings import (
@@ -23,7 +23,6 @@ def square(x: float, y: float, side: float, *, tones: list[float]) -> Occluder:
     return Occluder(polygons=polygons, tones=tones, colour=np.zeros(3), hides=True)
 
 
-@settings(max_examples=30)
 @given(st.floats(-0.5, 0.2), st.floats(-0.5, 0.2), st.floats(0.2, 0.3), st.floats(50, 90))
 def test_a_polygon_covers_its_area(x: float, y: float, side: float, scale: float):
     crop_from_scene = np.array([[scale, 0.0, 48.0], [0.0, scale, 48.0]])

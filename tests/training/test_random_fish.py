@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stream_dmr.training.random_fish import draw_shape, pose_shape
@@ -10,7 +10,6 @@ from stream_dmr.training.random_fish import draw_shape, pose_shape
 seeds = st.integers(0, 10**6)
 
 
-@settings(max_examples=30)
 @given(seeds)
 def test_a_straight_fish_is_one_body_length_long(seed: int):
     shape = draw_shape(np.random.default_rng(seed))
@@ -23,7 +22,6 @@ def test_a_straight_fish_is_one_body_length_long(seed: int):
     assert len(shape.texture) == len(shape.is_fin) == len(shape.points)
 
 
-@settings(max_examples=30)
 @given(seeds)
 def test_a_posed_fish_is_before_the_camera_and_no_longer_than_straight(seed: int):
     rng = np.random.default_rng(seed)

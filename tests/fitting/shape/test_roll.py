@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -11,7 +11,6 @@ from stream_dmr.fitting.shape.stock import rolled_as_seen, unrolled
 from stream_dmr.fitting.solver.problem import roll_and_slope
 
 RAY = np.array([0.1, -0.05, 1.0])
-thirty = settings(max_examples=30)
 angles = st.floats(-1.2, 1.2)
 rotations = st.integers(0, 2**32 - 1).map(lambda seed: Rotation.random(random_state=seed))
 
@@ -26,7 +25,6 @@ def roll_rad(pose, anchor):
     return roll_and_slope(pose, anchor)[0]
 
 
-@thirty
 @given(in_plane=st.floats(-3.1, 3.1), roll=angles)
 def test_a_turn_about_the_own_axis_is_the_roll(in_plane, roll):
     """Also for a fish that shows its other side, and one that swims the other way."""
@@ -37,7 +35,6 @@ def test_a_turn_about_the_own_axis_is_the_roll(in_plane, roll):
         assert roll_rad(pose_of(rotation), toward) == pytest.approx(-roll, abs=1e-9)
 
 
-@thirty
 @given(rotation=rotations)
 def test_an_unrolled_fish_has_its_axis_and_no_roll(rotation):
     pose = unrolled(pose_of(rotation), RAY)
@@ -46,7 +43,6 @@ def test_an_unrolled_fish_has_its_axis_and_no_roll(rotation):
     np.testing.assert_allclose(turned.apply([1, 0, 0]), rotation.apply([1, 0, 0]), atol=1e-9)
 
 
-@thirty
 @given(rotation=rotations)
 def test_the_slope_is_a_finite_difference(rotation):
     pose, step = pose_of(rotation), 1e-6
@@ -60,7 +56,6 @@ def test_the_slope_is_a_finite_difference(rotation):
         assert gap / (2 * step) == pytest.approx(slope[p], rel=1e-3, abs=1e-3)
 
 
-@thirty
 @given(rotation=rotations, roll=st.floats(0.0, 1.5), thin=st.floats(0.2, 0.9))
 def test_a_pose_is_rolled_until_a_breadth_is_seen(rotation, roll, thin):
     flat = unrolled(pose_of(rotation), RAY)
