@@ -51,6 +51,7 @@ def test_module_finds_what_it_imports_and_says_what_it_measures(file):
     assert import_module(name.removesuffix(".__init__")).__doc__
 
 
+@pytest.mark.slow
 def test_bench_measures_and_prints_without_nan(monkeypatch):
     for module, name in (
         (fit_times, "ADAM_ITERATIONS"),

@@ -73,6 +73,7 @@ def test_own_detector_finds_the_four_fish(tmp_path: Path):
     assert lengths == pytest.approx(true_lengths(), rel=0.1)
 
 
+@pytest.mark.slow
 def test_stills_print_a_length_for_every_picture(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

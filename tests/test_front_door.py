@@ -53,7 +53,11 @@ def test_every_name_is_there_and_no_other():
     ("call", "said"),
     [
         ("replay('x', out='o', first='foo')", "first: expected one of crop, fit, localize, smooth"),
-        ("measure('x', out='o', pose='standing')", "pose: expected one of hanging, lying"),
+        pytest.param(
+            "measure('x', out='o', pose='standing')",
+            "pose: expected one of hanging, lying",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_an_unknown_choice_is_a_user_error(call: str, said: str):
@@ -154,6 +158,7 @@ def test_warnings_are_logged_once(tmp_path: Path, caplog: pytest.LogCaptureFixtu
     ]
 
 
+@pytest.mark.slow
 def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")

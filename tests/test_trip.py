@@ -24,6 +24,8 @@ from tests.support.small_classifier import crops_of, train_classifier
 from tests.support.trip import CODES, NAMES, START_UTC, Trip, make_trip, small_scene
 from tests.web.test_keyboard import WAIT
 
+pytestmark = pytest.mark.slow  # each part has tests of its own
+
 _CONFIG = f"""
 [zones]
 landed = [[0, 0], [640, 0], [640, 190], [0, 190]]
@@ -153,7 +155,7 @@ def test_tracks_and_masks_have_each_fish_in_its_frames(measured: Measured):
     assert "# metadata,Fps: 15,fps: 15" in lines
 
 
-@pytest.fixture(params=[pytest.param(1400, marks=pytest.mark.slow), 390])
+@pytest.fixture(params=[1400, 390])
 def width(request: pytest.FixtureRequest) -> int:
     return request.param
 

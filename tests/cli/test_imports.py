@@ -3,6 +3,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 
 # What a run needs not, in MB and seconds: torch 200 and 1, pandas 40 and 0.2, matplotlib 15, 0.2;
@@ -91,6 +93,7 @@ for command in (
 """
 
 
+@pytest.mark.slow
 def test_what_some_need_alone_may_be_left_out(tmp_path: Path):
     """A box at sea has no torch; plots and meshes that want repair are extras."""
     answer = subprocess.run(

@@ -85,8 +85,15 @@ def test_the_recording_holds_the_fish_where_both_see_them(scene, combined):
     assert {one.reason for one in again} <= {"", *map(str, Reason)}
 
 
-@pytest.mark.parametrize("name", ["recording.mcap", "recording.rrd"])
-@pytest.mark.parametrize("stage", ["localize", "smooth"])
+@pytest.mark.parametrize(
+    ("stage", "name"),
+    [
+        ("localize", "recording.mcap"),
+        pytest.param("localize", "recording.rrd", marks=pytest.mark.slow),
+        pytest.param("smooth", "recording.mcap", marks=pytest.mark.slow),
+        pytest.param("smooth", "recording.rrd", marks=pytest.mark.slow),
+    ],
+)
 def test_a_replay_gives_the_same_lengths(scene, combined, stage, name, tmp_path):
     replayed = invoke(f"replay {scene / 'both' / name} --from {stage} --out {tmp_path}")
     assert replayed.code == 0, replayed.err

@@ -184,7 +184,9 @@ def test_a_mesh_of_the_user_stays_and_the_camera_measures_on(
     assert len(rows(tmp_path / "lengths.csv")) == 4
 
 
-@pytest.mark.parametrize(("half_breadth", "is_believed"), [(17, True), (11, False)])
+@pytest.mark.parametrize(
+    ("half_breadth", "is_believed"), [pytest.param(17, True, marks=pytest.mark.slow), (11, False)]
+)
 def test_a_given_mesh_is_compared_with_the_first_fish(
     runs: list[Path],
     tmp_path: Path,

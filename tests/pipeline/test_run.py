@@ -124,7 +124,15 @@ def test_a_clip_without_fish_gives_empty_tables(tmp_path: Path):
     assert rows(Path(options["--out"]) / "lengths.csv") == []
 
 
-@pytest.mark.parametrize("left_out", [[], ["mcap"], ["rrd"], ["mcap", "rrd"]])
+@pytest.mark.parametrize(
+    "left_out",
+    [
+        pytest.param([], marks=pytest.mark.slow),
+        ["mcap"],
+        ["rrd"],
+        pytest.param(["mcap", "rrd"], marks=pytest.mark.slow),
+    ],
+)
 def test_the_last_line_names_what_was_written(tmp_path: Path, left_out: list[str]):
     options = write_clip(tmp_path / "clip", fish=[[], []])
     config = Path(options["--config"])
@@ -286,6 +294,7 @@ class AddsClip(RunObserver):
             self.stop.set()
 
 
+@pytest.mark.slow
 def test_fish_in_view_at_the_end_of_a_clip_are_final_if_no_further_clip_comes(tmp_path: Path):
     clip = tmp_path / "clip"
     write_clip(clip, fish=[[1]] * 6)
@@ -356,7 +365,7 @@ class StopAt(RunObserver):
             self.stop.set()
 
 
-@pytest.mark.parametrize("num_frames", [0, 1, 4])
+@pytest.mark.parametrize("num_frames", [0, pytest.param(1, marks=pytest.mark.slow), 4])
 def test_a_run_stopped_at_any_frame_leaves_valid_results(tmp_path: Path, num_frames: int):
     clip = tmp_path / "clip"
     write_clip(clip, fish=[[1, 2]] * 12)
@@ -376,9 +385,9 @@ def test_a_run_stopped_at_any_frame_leaves_valid_results(tmp_path: Path, num_fra
 @pytest.mark.parametrize(
     ("share", "pose", "is_warned"),
     [
-        (1.0, "hanging", False),
+        pytest.param(1.0, "hanging", False, marks=pytest.mark.slow),
         (0.1, "hanging", True),
-        (11.0, "hanging", True),
+        pytest.param(11.0, "hanging", True, marks=pytest.mark.slow),
         (0.1, "lying", False),
     ],
 )

@@ -174,7 +174,9 @@ def test_a_mesh_of_the_user_is_not_written_over(clip: Path, tmp_path: Path, name
     assert name.startswith("template.") or (out / name).read_text() == "mine"
 
 
-@pytest.mark.parametrize("is_sealed", [True, False])  # not: the earlier run was killed
+@pytest.mark.parametrize(
+    "is_sealed", [pytest.param(True, marks=pytest.mark.slow), False]
+)  # not: the earlier run was killed
 def test_overwrite_removes_what_an_earlier_run_learnt(
     clip: Path, learnt: tuple[Path, Listener], tmp_path: Path, is_sealed: bool
 ):
@@ -202,6 +204,7 @@ def test_it_replays_to_the_last_bit(learnt: tuple[Path, Listener]):
     assert not replay(asked, stop=threading.Event()).mismatches
 
 
+@pytest.mark.slow
 def test_a_live_run_s_recording_learns_its_shapes_ashore(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -254,6 +257,7 @@ def test_a_source_without_an_end_is_not_looked_at_first(
     assert same is inputs
 
 
+@pytest.mark.slow
 def test_a_named_form_is_a_hint_and_its_stock_is_learnt(clip: Path, tmp_path: Path):
     named = measured(clip, tmp_path / "named", Listener(), template="cod").out
     header = read_header(named / "recording.mcap")
@@ -288,6 +292,7 @@ def test_a_mesh_of_other_fish_is_not_believed(
     assert set(known_files(out)) == set(known_files(learnt[0]))
 
 
+@pytest.mark.slow
 def test_a_mesh_that_fits_no_mask_is_not_believed(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -300,6 +305,7 @@ def test_a_mesh_that_fits_no_mask_is_not_believed(
     assert len(candidates) > 1
 
 
+@pytest.mark.slow
 def test_a_replay_does_not_believe_it_either(learnt: tuple[Path, Listener], tmp_path: Path):
     slim = str(learnt[0].parent / "clip" / "slim.ply")
     asked = ReplayOptions(

@@ -487,6 +487,7 @@ def localized(path: Path) -> list[LocalizedFish]:
     return [m for m in read_messages(path, [LocalizedFish]) if isinstance(m, LocalizedFish)]
 
 
+@pytest.mark.slow
 def test_the_fish_of_a_folder_that_grew_are_found_again(tmp_path: Path):
     """Each run begins with nothing seen; also where a replay has made one recording of both."""
     options = write_clips(tmp_path, num_frames=10)
@@ -502,14 +503,20 @@ def test_the_fish_of_a_folder_that_grew_are_found_again(tmp_path: Path):
     assert outcome.code == 0, outcome.out + outcome.err
 
 
-@pytest.mark.parametrize("first", ["crop", "fit", "localize", "smooth"])
+# A single segment, below, is replayed from the others.
+@pytest.mark.parametrize(
+    "first",
+    ["crop", *(pytest.param(one, marks=pytest.mark.slow) for one in ("fit", "localize", "smooth"))],
+)
 def test_consecutive_segments_are_what_was_recorded_over_a_crash(interrupted: Path, first: str):
     outcome = invoke(f"replay {interrupted}", {"--from": first, "--check": None})
     assert outcome.code == 0, outcome.out + outcome.err
     assert "recovered after a crash" in outcome.err
 
 
-@pytest.mark.parametrize("first", ["fit", "localize", "smooth"])
+@pytest.mark.parametrize(
+    "first", ["fit", pytest.param("localize", marks=pytest.mark.slow), "smooth"]
+)
 def test_every_segment_alone_is_what_was_recorded(interrupted: Path, first: str):
     paths = sorted(interrupted.glob("*.mcap"))
     assert len(paths) > 3

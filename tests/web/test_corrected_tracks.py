@@ -140,9 +140,10 @@ def glove(rows: Rows) -> Rows:
     ("change", "said"),
     [
         (lambda rows: numbered(rows, lambda track, _: track + 70), []),
-        (
+        pytest.param(
             lambda rows: numbered(rows, lambda t, frame: 9 if (t, frame > 4) == (2, True) else t),
             [SPLIT],
+            marks=pytest.mark.slow,
         ),
         (
             lambda rows: numbered(
