@@ -109,7 +109,8 @@ class TokenServer(ThreadingHTTPServer):
         if ip_address(host).is_unspecified:  # it listens on all; nobody can open that
             host = socket.gethostname()
         self.address = f"http://{host}:{self.server_port}/"
-        self._thread = threading.Thread(target=self.serve_forever, daemon=True)
+        # Looks every 0.1 s whether it shall end.
+        self._thread = threading.Thread(target=self.serve_forever, args=(0.1,), daemon=True)
         self._thread.start()
 
     def close(self) -> None:

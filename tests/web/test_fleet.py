@@ -116,7 +116,7 @@ def test_another_server_is_said_to_be_one(answer: bytes):
             pass
 
     with HTTPServer(("127.0.0.1", 0), Other) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
+        Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         (state,) = ask(Box(name="one", address=f"http://127.0.0.1:{server.server_port}/"))
         server.shutdown()
     assert "no stream-dmr run" in state.error

@@ -149,7 +149,7 @@ class Quiet(SimpleHTTPRequestHandler):
 
 def test_the_page_of_another_server_is_not_printed():
     with ThreadingHTTPServer(("127.0.0.1", 0), Quiet) as other:
-        threading.Thread(target=other.serve_forever, daemon=True).start()
+        threading.Thread(target=other.serve_forever, args=(0.01,), daemon=True).start()
         told = invoke("haul", {"start": None, f"http://127.0.0.1:{other.server_port}/": None})
         other.shutdown()
     assert told.code == 2
