@@ -32,7 +32,7 @@ class BoardView:
 class BoardRenderer:
     """Renders one board through one camera; the camera's rays are computed once."""
 
-    def __init__(self, camera: Camera, *, board=(9, 6), square_mm=25.0, samples=3):
+    def __init__(self, camera: Camera, *, board=(9, 6), square_mm=25.0, samples=2):
         self.camera, self.board, self.square_mm = camera, board, square_mm
         offsets = (np.arange(samples) + 0.5) / samples - 0.5
         x = np.arange(camera.width)[:, None] + offsets
