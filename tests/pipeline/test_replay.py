@@ -53,7 +53,10 @@ def contents(path: Path) -> list[tuple[type, bytes]]:
 @pytest.mark.parametrize(
     ("first", "name"),
     # An .rrd, read by a process of its own, holds the same, see below: one stage tells.
-    [*((first, "recording.mcap") for first in STAGES), ("crop", "recording.rrd")],
+    [
+        *((first, "recording.mcap") for first in STAGES),
+        pytest.param("crop", "recording.rrd", marks=pytest.mark.slow),
+    ],
 )
 def test_recomputed_is_what_was_recorded(run, first, name):
     folder, options = run
@@ -245,17 +248,9 @@ class TestDamage:
                 open_recordings([run[0]]).payloads(TOPICS, selection)
             )
 
-    def test_a_flipped_byte_of_an_rrd_changes_no_message(self, run, tmp_path):
-        # A process each; more in the slow test.
-        _check_flip(run[0] / "recording.rrd", tmp_path, seed=1)
-
     @given(share=st.floats(0.0, 0.999))
     def test_what_is_whole_of_a_torn_file_is_used(self, run, tmp_path_factory, share):
         _check_truncation(run[0] / "recording.mcap", tmp_path_factory.mktemp("torn"), share)
-
-    def test_what_is_whole_of_a_torn_rrd_is_used(self, run, tmp_path):
-        # A process each; more in the slow test.
-        _check_truncation(run[0] / "recording.rrd", tmp_path, share=0.6)
 
     @pytest.mark.slow
     def test_a_thousand_flips_and_two_hundred_truncations(self, run, tmp_path):
@@ -269,6 +264,7 @@ class TestDamage:
         for share in rng.random(50):
             _check_truncation(run[0] / "recording.rrd", tmp_path, float(share))
 
+    @pytest.mark.slow
     def test_a_folder_with_an_rrd_alone_is_read_beside_the_run_that_writes_it(self, run, tmp_path):
         original = (run[0] / "recording.rrd").read_bytes()
         (tmp_path / "recording.rrd").write_bytes(original[: len(original) // 2])
