@@ -95,6 +95,7 @@ def times_of(setup, pair):
     return list(time_to_iou.SolverComparison(setup.template).run(pair, size=48, index=0))
 
 
+@pytest.mark.slow
 def test_backlog_has_as_many_frames_raw_as_with_masks(tmp_path):
     with_masks, whole = batch_speed.backlogs(tmp_path, videos=2)
     assert [job.options.trip for job in with_masks.jobs] == ["0", "1"]

@@ -38,6 +38,7 @@ def test_examples_are_numbered_and_short():
     assert all(len(path.read_text().splitlines()) <= 40 for path in EXAMPLES)
 
 
+@pytest.mark.slow
 def test_measure_a_video_holds_the_true_lengths(measured: Path):
     for fish, true_mm in zip(sd.Run(measured).fish, true_lengths(), strict=True):
         assert fish.ci95_low_mm is not None
@@ -45,6 +46,7 @@ def test_measure_a_video_holds_the_true_lengths(measured: Path):
         assert fish.ci95_low_mm < true_mm < fish.ci95_high_mm
 
 
+@pytest.mark.slow
 def test_lengths_with_pandas_counts_every_fish(
     measured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -54,6 +56,7 @@ def test_lengths_with_pandas_counts_every_fish(
     assert sum(int(number) for number in re.findall(r",(\d+)$", table, re.MULTILINE)) == 4
 
 
+@pytest.mark.slow
 def test_replay_with_a_stricter_setting_uses_fewer_frames(
     measured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -49,15 +49,12 @@ def test_every_name_is_there_and_no_other():
         sd.weigh  # noqa: B018
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("call", "said"),
     [
         ("replay('x', out='o', first='foo')", "first: expected one of crop, fit, localize, smooth"),
-        pytest.param(
-            "measure('x', out='o', pose='standing')",
-            "pose: expected one of hanging, lying",
-            marks=pytest.mark.slow,
-        ),
+        ("measure('x', out='o', pose='standing')", "pose: expected one of hanging, lying"),
     ],
 )
 def test_an_unknown_choice_is_a_user_error(call: str, said: str):

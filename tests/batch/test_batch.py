@@ -101,6 +101,7 @@ def test_a_batch_measures_a_video_as_run_does(season: Path, tmp_path: Path):
     assert read_outcome(job, tmp_path) == outcome
 
 
+@pytest.mark.slow
 def test_a_worker_s_video_has_positions_and_its_fish_have_fates(season: Path, tmp_path: Path):
     """The other video is not there, which the command's exit code says."""
     (season / "way.nmea").write_text(straight_way(10), newline="")

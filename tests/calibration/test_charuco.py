@@ -39,8 +39,8 @@ def rendered() -> CharucoRenderer:
     ("dictionary", "is_legacy"),
     [
         (cv2.aruco.DICT_4X4_50, False),
-        (cv2.aruco.DICT_6X6_250, True),
-        (cv2.aruco.DICT_APRILTAG_36h11, False),
+        pytest.param(cv2.aruco.DICT_6X6_250, True, marks=pytest.mark.slow),
+        pytest.param(cv2.aruco.DICT_APRILTAG_36h11, False, marks=pytest.mark.slow),
     ],
 )
 def test_all_corners_are_found_whatever_the_markers(dictionary, is_legacy):

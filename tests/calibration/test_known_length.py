@@ -39,7 +39,10 @@ def farther(share: float) -> Calibration:
     return replace(TRUE, plane=plane)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.05, -0.02])
+@pytest.mark.parametrize(
+    "share",
+    [pytest.param(0.0, marks=pytest.mark.slow), 0.05, pytest.param(-0.02, marks=pytest.mark.slow)],
+)
 def test_the_error_is_that_of_the_scale(picture: np.ndarray, share: float):
     found = scale_of_board([picture], farther(share), PrintedBoard())
     assert found.error_percent == pytest.approx(100 * share, abs=0.1)

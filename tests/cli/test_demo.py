@@ -37,7 +37,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize("options", [{}, {"--out": "mine"}])
+@pytest.mark.parametrize("options", [{}, pytest.param({"--out": "mine"}, marks=pytest.mark.slow)])
 def test_the_results_of_an_earlier_demo_are_replaced(
     scene: dict[str, str], options: dict[str, str]
 ):

@@ -237,7 +237,13 @@ def test_no_message_has_the_number_of_an_error(command: str, options: dict[str, 
 
 
 @pytest.mark.parametrize(
-    "again", ["clip/../out", "link", "out/recording.mcap", "out/recording.rrd"]
+    "again",
+    [
+        "clip/../out",
+        "link",
+        "out/recording.mcap",
+        pytest.param("out/recording.rrd", marks=pytest.mark.slow),
+    ],
 )
 def test_fish_of_a_recording_that_is_given_twice_are_not_counted_twice(
     out: Path, tmp_path: Path, again: str

@@ -85,7 +85,7 @@ def test_a_box_found_in_a_small_picture_is_where_the_fish_is_in_the_frame():
     assert (candidate.foreground & seen).sum() / (candidate.foreground | seen).sum() > 0.8
 
 
-@pytest.mark.parametrize("preset", ["realistic", "severe"])
+@pytest.mark.parametrize("preset", [pytest.param("realistic", marks=pytest.mark.slow), "severe"])
 def test_the_fish_of_a_simulated_scene_are_found(preset: str):
     scene = make_scene(num_fish=2, num_frames=30, preset=preset, seed=3)
     detector = MotionDetector(MotionSettings())

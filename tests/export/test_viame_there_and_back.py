@@ -37,7 +37,7 @@ def exported(run: Path, into: Path) -> Path:
     return into / "tracks.viame.csv"
 
 
-@pytest.fixture(scope="module", params=["given", "cut out"])
+@pytest.fixture(scope="module", params=[pytest.param("given", marks=pytest.mark.slow), "cut out"])
 def runs(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """A run whose masks are given or cut out, one by its VIAME CSV, one by the CSV of that.
 

@@ -170,6 +170,7 @@ class Warned(RunObserver):
         self.lines.append(line)
 
 
+@pytest.mark.slow
 def test_a_mesh_of_the_user_stays_and_the_camera_measures_on(
     runs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -390,6 +390,7 @@ def test_the_documented_topics_are_the_real_ones():
     assert topics_table() in text
 
 
+@pytest.mark.slow
 def test_rerun_and_its_global_stream_stay_untouched_by_a_reader():
     code = "import sys, stream_dmr.recording.reading; sys.exit('rerun' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

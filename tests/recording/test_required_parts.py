@@ -73,7 +73,7 @@ def test_a_frame_that_is_not_in_it_is_refused(folder: Path, tmp_path: Path):
         require_frame(open_recordings([folder]), 6, Selection.from_seconds((0.0, 0.15)))
 
 
-@pytest.mark.parametrize("suffix", [".mcap", ".rrd"])
+@pytest.mark.parametrize("suffix", [".mcap", pytest.param(".rrd", marks=pytest.mark.slow)])
 def test_a_recording_without_a_whole_message_is_refused(tmp_path: Path, suffix: str):
     """Such as is left of a crash, or of a copy that was not finished: a header and no more."""
     torn, path = tmp_path / f"torn{suffix}", tmp_path / f"begun{suffix}"

@@ -77,6 +77,7 @@ def test_a_file_without_its_footer_is_torn_and_its_chunks_can_be_copied(rrd: Pat
     assert copy.stat().st_size > rrd.stat().st_size / 2
 
 
+@pytest.mark.slow
 def test_a_view_without_messages_is_refused_as_a_recording(tmp_path: Path):
     settings = SETTINGS.model_copy(update={"rrd_messages": False})
     sink = RrdSink(tmp_path / "view.rrd", header(), settings)

@@ -364,7 +364,7 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A measurement of clips, killed in the middle of a fish and started again."""
     folder = tmp_path_factory.mktemp("interrupted")
     make_key(folder / "key")
-    options = write_clips(folder, num_frames=80) | {"--key": str(folder / "key")}
+    options = write_clips(folder, num_frames=60) | {"--key": str(folder / "key")}
     out = Path(options["--out"])
     arguments = [part for item in options.items() for part in item]
     killed = subprocess.run(

@@ -125,6 +125,7 @@ def test_a_clip_is_read_when_it_has_come_and_not_before(tmp_path: Path):
     assert folder.warnings == []
 
 
+@pytest.mark.slow  # waits for seconds
 def test_a_pause_is_announced_once_if_no_clip_comes(tmp_path: Path):
     clip(tmp_path / "1.avi", first=1)
     folder, announced = ClipFolder(tmp_path, ReadFramesSettings(clips_wait_s=7.0)), list[int]()

@@ -29,7 +29,14 @@ def write_views(folder: Path, name: str, *, turn_top: bool = False) -> tuple[Pat
     return paths[0], paths[1]
 
 
-@pytest.mark.parametrize("name", bundled_names())
+# A flat, a long and a usual body in every run.
+FORMS = [
+    name if name in ("cod", "eel", "halibut") else pytest.param(name, marks=pytest.mark.slow)
+    for name in bundled_names()
+]
+
+
+@pytest.mark.parametrize("name", FORMS)
 @pytest.mark.parametrize("turn_top", [False, True])
 def test_two_views_of_a_fish_give_its_body_back(tmp_path: Path, name: str, turn_top: bool):
     side, top = write_views(tmp_path, name, turn_top=turn_top)
@@ -43,7 +50,7 @@ def test_two_views_of_a_fish_give_its_body_back(tmp_path: Path, name: str, turn_
     assert template.total_per_fork == pytest.approx(expected.total_per_fork, abs=0.007)
 
 
-@pytest.mark.parametrize("name", bundled_names())
+@pytest.mark.parametrize("name", FORMS)
 def test_the_silhouette_keeps_the_fork_of_the_tail(tmp_path: Path, name: str):
     side, top = write_views(tmp_path, name)
     template = template_from_masks(side, top=top, name=name).template
@@ -56,7 +63,7 @@ def test_the_silhouette_keeps_the_fork_of_the_tail(tmp_path: Path, name: str):
     assert overlap > 0.96
 
 
-@pytest.mark.parametrize("name", bundled_names())
+@pytest.mark.parametrize("name", FORMS)
 def test_without_a_view_from_above_the_nearest_form_gives_the_thickness(tmp_path: Path, name: str):
     side, _ = write_views(tmp_path, name)
     made = template_from_masks(side, name=name)
