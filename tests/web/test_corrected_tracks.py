@@ -162,7 +162,7 @@ def glove(rows: Rows) -> Rows:
                 {"kind": "merge", "track_id": 4, "other_fish": 1},
             ],
         ),
-        (
+        pytest.param(
             glove,
             [
                 {"kind": "reject", "track_id": 1, "reason": "not in corrected.viame.csv"},
@@ -173,6 +173,7 @@ def glove(rows: Rows) -> Rows:
                 {"kind": "reject", "track_id": 5, "reason": "not in corrected.viame.csv"},
                 {"kind": "merge", "track_id": 4, "other_fish": 2},
             ],
+            marks=pytest.mark.slow,
         ),
         (
             lambda rows: [
