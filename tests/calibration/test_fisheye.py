@@ -212,6 +212,7 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_rendered_boards_give_the_dome_and_true_lengths(folder, tmp_path):
     """All by the command: the lens is recognised, written, read, and measures."""
     out = tmp_path / "dome.yaml"
@@ -230,6 +231,7 @@ def test_rendered_boards_give_the_dome_and_true_lengths(folder, tmp_path):
     assert scale.worst_percent < 1.0
 
 
+@pytest.mark.slow
 def test_a_pinhole_that_is_asked_for_says_what_else_to_try(folder):
     pictures = sorted(folder.glob("[0-9]*.png"))
     result = calibrate(pictures, plane_image=folder / "plane.png", model="pinhole")

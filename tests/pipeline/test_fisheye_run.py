@@ -61,12 +61,14 @@ def measured(tmp_path_factory) -> dict[str, dict[str, float]]:
     }
 
 
+@pytest.mark.slow
 def test_lengths_through_a_dome_are_those_through_a_pinhole(measured):
     assert len(measured["pinhole"]) == 2
     for track, length_mm in measured["pinhole"].items():
         assert measured["fisheye"][track] == pytest.approx(length_mm, rel=0.005)
 
 
+@pytest.mark.slow
 def test_lengths_through_a_dome_are_true(measured):
     truth = {
         str(v.fish.track_id): v.fish.length_mm for v in scene_through(LENSES["pinhole"]).visits

@@ -66,8 +66,8 @@ class Immediate:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """A run over a clip, one that goes on there with a second clip, and one over both at once."""
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four fish, with masks for a second clip of the same."""
     folder = tmp_path_factory.mktemp("live")
     write_clip(folder / "clip", fish=SEEN)
     masks = folder / "clip" / "masks"
@@ -81,18 +81,25 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     quick = config.read_text().replace("learn_shapes = false", "max_faces = 600")
     waits = "[smooth_length]\ntrack_timeout_s = 0.15\n[read_frames]\nclips_wait_s = 0.1\n"
     config.write_text(f"{quick}\n{waits}")
+    return folder / "clip"
+
+
+@pytest.fixture(scope="module")
+def runs(clip: Path) -> list[Path]:
+    """A run over a clip, one that goes on there with a second clip, and one over both at once."""
+    folder = clip.parent
     (clips := folder / "clips").mkdir()
     source: dict[str, str] = {"source": str(clips), "template": "auto"}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("stream_dmr.pipeline.learn_shapes.ThreadPoolExecutor", Immediate)
         for number, out in enumerate(("out-0", "out-1")):
-            shutil.copy(folder / "clip" / "video.mp4", clip := clips / f"{number}.mp4")
-            os.utime(clip, (1_000_000_000 + number, 1_000_000_000 + number))  # it is complete
+            shutil.copy(clip / "video.mp4", copy := clips / f"{number}.mp4")
+            os.utime(copy, (1_000_000_000 + number, 1_000_000_000 + number))  # it is complete
             if number:
                 shutil.copytree(folder / "out-0", folder / out)
-            asked = request(folder / "clip", folder / out, **source)
+            asked = request(clip, folder / out, **source)
             measure_source(asked, stop=threading.Event())
-        asked = request(folder / "clip", folder / "whole", **source)
+        asked = request(clip, folder / "whole", **source)
         measure_source(asked, stop=threading.Event())
     return [folder / "out-0", folder / "out-1", folder / "whole"]
 
@@ -107,6 +114,7 @@ def candidates_of(folder: Path) -> dict[int, int | None]:
     }
 
 
+@pytest.mark.slow
 def test_fish_after_the_first_ones_may_have_the_shape_of_those(runs: list[Path]):
     assert FORMS is not None
     [learnt] = learnt_shapes(open_recordings([runs[0]]))
@@ -118,6 +126,7 @@ def test_fish_after_the_first_ones_may_have_the_shape_of_those(runs: list[Path])
     assert (runs[0] / LEARNT).exists()
 
 
+@pytest.mark.slow
 def test_a_restart_knows_what_was_learnt_and_learns_on_from_the_fish_of_both_runs(
     runs: list[Path],
 ):
@@ -129,6 +138,7 @@ def test_a_restart_knows_what_was_learnt_and_learns_on_from_the_fish_of_both_run
     assert [one.shares.sum() for one in (known, learnt)] == pytest.approx([3 / 4, 6 / 7])
 
 
+@pytest.mark.slow
 def test_the_fish_of_earlier_runs_are_seen_as_those_runs_saw_them(runs: list[Path]):
     seen = SeenFish()
     for kind in (FishCrop, LengthEstimate):
@@ -140,6 +150,7 @@ def test_the_fish_of_earlier_runs_are_seen_as_those_runs_saw_them(runs: list[Pat
         assert encode(one) == encode(other)
 
 
+@pytest.mark.slow
 def test_what_was_learnt_survives_a_crash_at_the_start_of_a_segment(
     runs: list[Path], tmp_path: Path
 ):
@@ -151,6 +162,7 @@ def test_what_was_learnt_survives_a_crash_at_the_start_of_a_segment(
     np.testing.assert_array_equal(earlier.coefficients, found.coefficients)
 
 
+@pytest.mark.slow
 def test_a_restart_changes_no_length_of_fish_before_and_after_it(runs: list[Path]):
     lengths = [[row["length_mm"] for row in rows(out / "lengths.csv")] for out in runs]
     assert lengths[1] == lengths[2]
@@ -172,13 +184,13 @@ class Warned(RunObserver):
 
 @pytest.mark.slow
 def test_a_mesh_of_the_user_stays_and_the_camera_measures_on(
-    runs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     (tmp_path / LEARNT).write_text("mine")
     monkeypatch.setattr(Inputs, "is_endless", property(lambda inputs: True))
     monkeypatch.setattr("stream_dmr.pipeline.learn_shapes.ThreadPoolExecutor", Immediate)
     observer = Warned()
-    asked = request(runs[0].parent / "clip", tmp_path, template="auto")
+    asked = request(clip, tmp_path, template="auto")
     measure_source(asked, stop=threading.Event(), observer=observer)
     assert (tmp_path / LEARNT).read_text() == "mine"
     assert [line for line in observer.lines if f"{LEARNT}: expected a name that is free" in line]
@@ -189,7 +201,7 @@ def test_a_mesh_of_the_user_stays_and_the_camera_measures_on(
     ("half_breadth", "is_believed"), [pytest.param(17, True, marks=pytest.mark.slow), (11, False)]
 )
 def test_a_given_mesh_is_compared_with_the_first_fish(
-    runs: list[Path],
+    clip: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     half_breadth: float,
@@ -199,7 +211,7 @@ def test_a_given_mesh_is_compared_with_the_first_fish(
     monkeypatch.setattr(Inputs, "is_endless", property(lambda inputs: True))
     monkeypatch.setattr("stream_dmr.pipeline.learn_shapes.ThreadPoolExecutor", Immediate)
     observer, mesh, out = Warned(), str(tmp_path / "mine.ply"), tmp_path / "out"
-    asked = request(runs[0].parent / "clip", out, template=mesh)
+    asked = request(clip, out, template=mesh)
     measure_source(asked, stop=threading.Event(), observer=observer)
     lines = [line for line in observer.lines if "the fish are not like mine: " in line]
     assert len(lines) == (0 if is_believed else 1)
@@ -213,6 +225,7 @@ def test_a_given_mesh_is_compared_with_the_first_fish(
     assert again.mismatches == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mcap", pytest.param("rrd", marks=pytest.mark.slow)])
 def test_a_replay_gives_the_same_bits(runs: list[Path], kind: str):
     for recording in sorted(runs[1].glob(f"recording-*.{kind}")):
@@ -289,8 +302,8 @@ class Learner(ShapeLearner):
 
 
 @pytest.fixture
-def inputs(runs: list[Path], tmp_path: Path) -> Iterator[Inputs]:
-    found = checked_inputs(request(runs[0].parent / "clip", tmp_path, template="auto"))
+def inputs(clip: Path, tmp_path: Path) -> Iterator[Inputs]:
+    found = checked_inputs(request(clip, tmp_path, template="auto"))
     yield found
     found.reader.close()
 

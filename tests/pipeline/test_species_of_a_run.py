@@ -55,6 +55,7 @@ def out(scene: Path, model: Path) -> Path:
     return scene / "out"
 
 
+@pytest.mark.slow
 def test_every_fish_has_its_species(out: Path, scene: Path):
     fish = read_stored_fish(out / "lengths.db")
     assert {one.estimate.track_id: one.estimate.species_code for one in fish} == species_of(scene)
@@ -62,6 +63,7 @@ def test_every_fish_has_its_species(out: Path, scene: Path):
     assert "species: 2 HAP, 2 COE" in (scene / "printed.txt").read_text()
 
 
+@pytest.mark.slow
 def test_the_recording_has_what_the_classifier_said_of_each_frame(out: Path):
     recording = open_recordings([out / "recording.mcap"])
     fits = [message for message, _ in decoded_messages(recording, [FittedMesh])]
@@ -72,6 +74,7 @@ def test_the_recording_has_what_the_classifier_said_of_each_frame(out: Path):
         assert sum(fit.species.values()) == pytest.approx(1)
 
 
+@pytest.mark.slow
 def test_each_fish_has_the_body_form_of_its_species(out: Path, scene: Path):
     recording = open_recordings([out / "recording.mcap"])
     shapes = recording.header.candidates
@@ -86,6 +89,7 @@ def test_each_fish_has_the_body_form_of_its_species(out: Path, scene: Path):
             assert form == {"HAP": "halibut", "COE": "eel"}[codes[message.track_id]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", ["smooth", "fit"])
 def test_it_replays_to_the_last_bit_without_the_model(
     out: Path, model: Path, tmp_path: Path, first: str
@@ -99,6 +103,7 @@ def test_it_replays_to_the_last_bit_without_the_model(
     assert "to the last bit" in outcome.out
 
 
+@pytest.mark.slow
 def test_a_higher_threshold_makes_fish_unsure(out: Path, tmp_path: Path):
     config = tmp_path / "config.toml"
     config.write_text("[species]\nmin_share = 1.0\n")
