@@ -20,6 +20,7 @@ from stream_dmr.tracking.tracker import TrackNumbering
 class CropFish:
     """Frame -> FishCrop, one per fish, then TrackEnded of each that no later frame will show.
 
+    Where it becomes clear that something is a fish, its crops of earlier frames come before.
     Without a calibrated camera a nominal one is assumed.
     """
 
@@ -75,13 +76,12 @@ class CropFish:
         crops = {
             one.source_id: crop for one, crop in zip(found, self._map(cut, found), strict=True)
         }
-        fish = {
-            self._numbering.track_id(source_id): source_id
-            for source_id in self._finder.confirm(crops)
-        }
+        confirmed = self._finder.confirm(crops)
+        fish = {self._numbering.track_id(source_id): source_id for source_id in confirmed}
         self._open |= fish
         self._last = frame
-        return [*self._crops(fish, crops), *self._ends(frame, fish)]
+        shown = {track_id: confirmed[source_id] for track_id, source_id in fish.items()}
+        return [*self._crops(shown), *self._ends(frame, fish)]
 
     def pause(self) -> list[FishCrop | TrackEnded]:
         """All open tracks end, unless their ids are given; the next frame shows other fish."""
@@ -99,11 +99,11 @@ class CropFish:
         self._open.clear()
         return [] if last is None else [TrackEnded.after(last, one, cause) for one in ended]
 
-    def _crops(self, fish: Mapping[int, int], crops: Mapping[int, FishCrop]) -> Iterator[FishCrop]:
-        for track_id, source_id in sorted(fish.items()):
-            crop = crops[source_id]
-            species = self._classifier.classify(crop) if self._classifier else {}
-            yield replace(crop, track_id=track_id, species=species)
+    def _crops(self, fish: Mapping[int, list[FishCrop]]) -> Iterator[FishCrop]:
+        for track_id, crops in sorted(fish.items()):
+            for crop in crops:
+                species = self._classifier.classify(crop) if self._classifier else {}
+                yield replace(crop, track_id=track_id, species=species)
 
     def _ends(self, frame: Frame, fish: Collection[int]) -> Iterator[TrackEnded]:
         while self._interrupted:

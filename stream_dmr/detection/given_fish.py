@@ -126,9 +126,9 @@ class AnnotatedFish:
         """None: a given id may come again at any time."""
         return None
 
-    def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:
-        """All ids: every annotated object is a fish."""
-        return list(crops)
+    def confirm(self, crops: Mapping[int, FishCrop]) -> dict[int, list[FishCrop]]:
+        """All: every annotated object is a fish."""
+        return {one: [crop] for one, crop in crops.items()}
 
     @property
     def warnings(self) -> list[str]:
@@ -297,9 +297,9 @@ class NamedPictures:
         areas = [np.prod(box[2:] - box[:2]) for box in boxes]
         return boxes[int(np.argmax(areas))] if boxes else np.array([0.0, 0.0, width, height])
 
-    def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:
-        """All ids: every picture that is named shows a fish."""
-        return list(crops)
+    def confirm(self, crops: Mapping[int, FishCrop]) -> dict[int, list[FishCrop]]:
+        """All: every picture that is named shows a fish."""
+        return {one: [crop] for one, crop in crops.items()}
 
 
 _MAX_BYTES = 100_000_000  # a million pictures; chosen

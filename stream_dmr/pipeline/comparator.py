@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stream_dmr.messages import LengthEstimate, Message
-from stream_dmr.pipeline.session import RecordedMessages
+from stream_dmr.pipeline.session import RecordedMessages, SoughtMessages
 
 UNREPEATABLE = {"elapsed_ns"}  # wall clock: the one field that no replay can repeat
 _MAX_SHOWN = 60  # characters of a value, so that both fit in a line
@@ -74,7 +74,7 @@ class Mismatch(NamedTuple):
 
 
 class MessageComparator:
-    """Compares recomputed messages with recorded ones, type by type in the order of their frames.
+    """Compares recomputed messages with recorded ones, type by type, frame by frame.
 
     The final length of a fish is compared with the recorded one wherever that stands: where a
     recording was cut off, or goes on in another file, a track may end at another moment.
@@ -91,7 +91,7 @@ class MessageComparator:
         self._leave_out = leave_out
         self._recorded_final: dict[int, LengthEstimate] = {}  # by track, not computed yet
         self._computed_final: dict[int, LengthEstimate] = {}
-        self._expected = {kind: _Lookahead(self._running(recorded, kind)) for kind in kinds}
+        self._expected = {kind: SoughtMessages(self._running(recorded, kind)) for kind in kinds}
         self._ends_early = recorded.ends_early
         self._tracks_beyond: set[int] = set()
         self.num_compared = 0
@@ -111,21 +111,17 @@ class MessageComparator:
             self._computed_final[computed.track_id] = computed
             return
         expected = self._expected[type(computed)]
-        while (recorded := expected.value) is not None and _comes_before(recorded, computed):
-            self._add_missing(recorded)
-            expected.step()
-        if recorded is None or not _is_of_same(recorded, computed):
+        recorded = expected.take(computed.frame_index, _track_of(computed))
+        if recorded is None:
             self._add_surplus(computed)
-            return
-        expected.step()
-        self._compare(recorded, computed)
+        else:
+            self._compare(recorded, computed)
 
     def finish(self) -> None:
         """Compare the final lengths, and add what was recorded and not computed."""
-        for rest in self._expected.values():
-            while rest.value is not None:
-                self._add_missing(rest.value)
-                rest.step()
+        for expected in self._expected.values():
+            for recorded in expected.rest():
+                self._add_missing(recorded)
         for track_id, computed in self._computed_final.items():
             recorded = self._recorded_final.pop(track_id, None)
             if recorded is None or track_id in self._tracks_beyond:
@@ -136,6 +132,7 @@ class MessageComparator:
                 self.length_change = max(self.length_change, change)
         for recorded in self._recorded_final.values():
             self._add_missing(recorded)
+        self.mismatches.sort(key=lambda one: one.frame_index)
 
     def _running(self, recorded: RecordedMessages, kind: type[Message]) -> Iterator[Message]:
         """The recorded messages of a type; final lengths are kept apart."""
@@ -168,32 +165,8 @@ class MessageComparator:
         self.mismatches.append(Mismatch(message.frame_index, _track_of(message), kind, difference))
 
 
-class _Lookahead:
-    """An iterator whose next value can be looked at."""
-
-    def __init__(self, values: Iterator[Message]) -> None:
-        self._values = values
-        self.value: Message | None = None
-        self.step()
-
-    def step(self) -> None:
-        self.value = next(self._values, None)
-
-
 def _track_of(message: Message) -> int:
     return getattr(message, "track_id", 0)
-
-
-def _comes_before(recorded: Message, computed: Message) -> bool:
-    """True where the computed message is of a later frame, or of another fish in the same one."""
-    if recorded.frame_index != computed.frame_index:
-        return recorded.frame_index < computed.frame_index
-    return not _is_of_same(recorded, computed)
-
-
-def _is_of_same(recorded: Message, computed: Message) -> bool:
-    is_same_frame = recorded.frame_index == computed.frame_index
-    return is_same_frame and _track_of(recorded) == _track_of(computed)
 
 
 def _length_change(recorded: LengthEstimate, computed: LengthEstimate) -> float:

@@ -417,6 +417,49 @@ class RecordedMessages:
         return self._payloads.pop(id(message))
 
 
+# How much further a message of a fish may stand than what it is sought for. Chosen.
+_AHEAD_FRAMES = 300
+
+
+class SoughtMessages:
+    """Messages of one type, sought by frame and fish in nearly the order in which they stand.
+
+    A fish comes with crops of earlier frames when it is known as one, maybe in a later segment.
+    """
+
+    def __init__(self, messages: Iterator[Message]) -> None:
+        self._messages = messages
+        self._next = next(messages, None)
+        self._passed: dict[tuple[int, int], Message] = {}  # and not taken yet
+
+    def until(self, frame_index: int) -> list[Message]:
+        """The next ones up to a frame, in their order."""
+        found: list[Message] = []
+        while (message := self._next) is not None and message.frame_index <= frame_index:
+            found.append(message)
+            self._next = next(self._messages, None)
+        return found
+
+    def take(self, frame_index: int, track_id: int) -> Message | None:
+        """The one of this frame and fish, if there is one."""
+        key = frame_index, track_id
+        while (
+            key not in self._passed
+            and (message := self._next) is not None
+            and message.frame_index <= frame_index + _AHEAD_FRAMES
+        ):
+            self._passed[message.frame_index, getattr(message, "track_id", 0)] = message
+            self._next = next(self._messages, None)
+        return self._passed.pop(key, None)
+
+    def rest(self) -> Iterator[Message]:
+        """Those that were not taken."""
+        yield from self._passed.values()
+        if self._next is not None:
+            yield self._next
+        yield from self._messages
+
+
 class PlaybackNode:
     """Takes the place of a node and returns the messages that the node returned in the run.
 
@@ -427,8 +470,7 @@ class PlaybackNode:
     def __init__(
         self, recorded: RecordedMessages, kind: type[Message], *, track_timeout_s: float
     ) -> None:
-        self._messages = recorded.of_type(kind)
-        self._next = next(self._messages, None)
+        self._messages = SoughtMessages(recorded.of_type(kind))
         self._ends = deque(recorded.of_type(TrackEnded, keep_payloads=False))
         self._timeout = None if self._ends else TrackTimeout(track_timeout_s)
         self._last: Frame | None = None
@@ -450,17 +492,10 @@ class PlaybackNode:
             yield self._ends.popleft()
 
     def _recorded(self, message: Frame | FishCrop | FittedMesh) -> list[Message]:
-        recorded: list[Message] = []
-        while self._next is not None and self._next.frame_index <= message.frame_index:
-            if self._next.frame_index == message.frame_index:
-                if not isinstance(message, Frame) and self._track_id() != message.track_id:
-                    break
-                recorded.append(self._next)
-            self._next = next(self._messages, None)
-        return recorded
-
-    def _track_id(self) -> int:
-        return getattr(self._next, "track_id", 0)
+        if isinstance(message, Frame):
+            return self._messages.until(message.frame_index)
+        found = self._messages.take(message.frame_index, message.track_id)
+        return [] if found is None else [found]
 
     def close(self) -> Sequence[Message]:
         """The ends of the tracks that are left, if none was recorded."""

@@ -12,7 +12,15 @@ from threading import Thread
 
 from stream_dmr.errors import OutputError
 from stream_dmr.files import free_bytes, writing_to
-from stream_dmr.messages import Frame, LearntShapes, LengthEstimate, LocalizedFish
+from stream_dmr.messages import (
+    FishCrop,
+    Frame,
+    LearntShapes,
+    LengthEstimate,
+    LocalizedFish,
+    Message,
+    TrackEnded,
+)
 from stream_dmr.reasons import Reason
 from stream_dmr.recording.codec import decode, encode
 from stream_dmr.recording.header import RunHeader
@@ -247,8 +255,9 @@ class RotatingSink:
     """Writes recording-000001.mcap and .rrd, recording-000002.mcap and .rrd, ...
 
     A cut lies between two frames. The stages are some frames apart, so two segments are open for a
-    moment: messages of frames after the cut go to the new one. A segment is complete when the last
-    stage has reached the cut; the frames of open tracks are then carried over to the next one.
+    moment: messages of frames after the cut go to the new one, and all of a fish that is first
+    heard of in that moment, since it comes with crops of earlier frames. A segment is complete when
+    the last stage has reached the cut; the frames of open tracks are then carried over to the next.
     Where the disk refuses a write, `on_notice` gets a line and a new segment is tried; `close` says
     how many frames are in none.
     """
@@ -271,6 +280,7 @@ class RotatingSink:
         self._cut_ns: int | None = None  # of the first frame of `_next`
         self._frames_since_cut = self._frames_lost = 0
         self._open_tracks, self._ahead = OpenTracks(), list[Record]()
+        self._cropped, self._new = set[int](), set[int]()  # tracks; first cropped since the cut
         for fish in interrupted:
             self._open_tracks.add_earlier(fish)
         self._learnt = [make_record(one, self._settings) for one in learnt]
@@ -288,6 +298,7 @@ class RotatingSink:
             if is_after and not message.is_final:
                 self._complete()
             is_after = False  # a final one belongs to the segment in which its track ended
+        is_after |= self._is_of_new_track(message)
         if is_after:
             self._ahead.append(record)
         else:
@@ -298,6 +309,18 @@ class RotatingSink:
         self._files.each(sinks, lambda sink: sink.write(record))
         if isinstance(message, Frame) and not sinks:
             self._frames_lost += 1
+
+    def _is_of_new_track(self, message: Message) -> bool:
+        match message:
+            case FishCrop(track_id=track_id) if track_id not in self._cropped:
+                self._cropped.add(track_id)
+                if self._cut_ns is not None:
+                    self._new.add(track_id)
+            case TrackEnded(track_id=track_id):
+                self._cropped.discard(track_id)
+            case _:
+                pass
+        return self._cut_ns is not None and getattr(message, "track_id", None) in self._new
 
     def flush_due(self) -> None:
         """Write what was kept long enough. Never raises OutputError."""
@@ -357,6 +380,7 @@ class RotatingSink:
         self._files.close(self._open)
         self._open, self._next = self._next, []
         self._began_ns, self._cut_ns = self._cut_ns, None
+        self._new.clear()
         for record in self._ahead:
             self._open_tracks.add(record)
         self._ahead.clear()

@@ -7,7 +7,8 @@ Plants sway and marks glitter in their places, rock passes by before a camera th
 them looks like a fish. Letters and stones may, but stay where they are.
 """
 
-from collections import Counter
+from collections import Counter, deque
+from collections.abc import Collection
 from typing import Annotated
 
 import numpy as np
@@ -18,8 +19,7 @@ from stream_dmr.detection.detector import FISH_LIKE, Candidate
 from stream_dmr.messages import FishCrop
 from stream_dmr.settings import Settings
 
-# Bounds the memory of a run of weeks; tracks live for seconds, so older ones have ended long ago.
-_MAX_UNCONFIRMED_TRACKS = 1000
+_MAX_KEPT_CROPS = 10  # of a track that is not confirmed; chosen
 # After so many frames in a row whose masks show as good as nothing, a track is at another thing:
 # the place where its fish was. Of simulated fish at most three frames in a row are unclear.
 _MAX_EMPTY_FRAMES, _NOTHING = 5, 0.2
@@ -65,32 +65,42 @@ class FishConfirmation:
         self._settings = settings
         self._confirmed: set[int] = set()  # track numbers
         self._num_clear_frames: Counter[int] = Counter()  # of unconfirmed tracks
+        self._clear_crops: dict[int, deque[FishCrop]] = {}  # likewise, the latest
         self._num_empty_frames: Counter[int] = Counter()  # of confirmed ones, in a row
 
     def is_confirmed(self, number: int) -> bool:
         return number in self._confirmed
 
-    def update(self, number: int, crop: FishCrop, *, may_count: bool = True) -> bool:
-        """Take a track's crop of one frame into account; True for a confirmed fish that it shows.
+    def update(self, number: int, crop: FishCrop, *, may_count: bool = True) -> list[FishCrop]:
+        """Take a track's crop of one frame into account; itself if it shows a confirmed fish.
 
+        In the frame that confirms it, the earlier ones that showed it clearly come before it.
         `may_count`: False while the other evidence doubts it. A confirmed fish remains one
         outside the zone. A crop without `mask_confidence` (a given mask) counts as clearly seen.
         """
         confidence = crop.quality.mask_confidence
+        earlier: list[FishCrop] = []
         if number not in self._confirmed:
             if confidence is None or confidence >= self._settings.min_mask_confidence:
                 self._num_clear_frames[number] += 1
-                if len(self._num_clear_frames) > _MAX_UNCONFIRMED_TRACKS:
-                    del self._num_clear_frames[min(self._num_clear_frames)]
+                kept = self._clear_crops.setdefault(number, deque(maxlen=_MAX_KEPT_CROPS))
+                kept.append(crop)
             if not (may_count and self._is_confirmed_by(number, crop)):
-                return False
+                return []
             self._confirmed.add(number)
             del self._num_clear_frames[number]
+            earlier = [one for one in self._clear_crops.pop(number, ()) if one is not crop]
         if confidence is None or confidence >= _NOTHING:
             self._num_empty_frames.pop(number, None)
         else:
             self._num_empty_frames[number] += 1
-        return self._num_empty_frames[number] <= _MAX_EMPTY_FRAMES
+        return [*earlier, crop] if self._num_empty_frames[number] <= _MAX_EMPTY_FRAMES else []
+
+    def forget_all_but(self, numbers: Collection[int]) -> None:
+        """Forget what was seen of other tracks that are not confirmed."""
+        for number in [one for one in self._num_clear_frames if one not in numbers]:
+            del self._num_clear_frames[number]
+            self._clear_crops.pop(number, None)
 
     def _is_confirmed_by(self, number: int, crop: FishCrop) -> bool:
         width, height = crop.frame_camera.width, crop.frame_camera.height

@@ -202,16 +202,18 @@ class TrackedFish:
         """Later frames show none of the fish of those before."""
         self._tracker.forget_tracks()
 
-    def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:
-        """The track numbers of confirmed fish; `crops` are those of all detections of the frame."""
+    def confirm(self, crops: Mapping[int, FishCrop]) -> dict[int, list[FishCrop]]:
+        """Confirmed fish by track number; `crops` are those of all detections of the frame."""
         self._corrector.update(crops)
-        fish = [
-            track
+        self._confirmation.forget_all_but(self._tracker.open_numbers)
+        fish = {
+            track: shown
             for track, crop in crops.items()
-            if self._confirmation.update(track, crop, may_count=self._may_count(track))
-        ]
+            if (shown := self._confirmation.update(track, crop, may_count=self._may_count(track)))
+        }
         if self._are_stills:
-            fish = without_repeats({track: crops[track] for track in fish}, self._scores)
+            single = without_repeats({track: crops[track] for track in fish}, self._scores)
+            fish = {track: fish[track] for track in single}
         self._found_any |= bool(fish)
         self._seen.tracks = max([self._seen.tracks, *crops])
         confidences = [crop.quality.mask_confidence or 0.0 for crop in crops.values()]
@@ -273,8 +275,11 @@ class FishFinder(Protocol):
         """The ids that later frames may show; None if ids are given, so that nobody knows."""
         ...
 
-    def confirm(self, crops: Mapping[int, FishCrop]) -> list[int]:
-        """Those of the frame's detections that are fish; `crops` and results by `source_id`."""
+    def confirm(self, crops: Mapping[int, FishCrop]) -> dict[int, list[FishCrop]]:
+        """Those of the frame's detections that are fish; `crops` and results by `source_id`.
+
+        A fish that is known as one only now comes with its crops of earlier frames.
+        """
         ...
 
 

@@ -26,7 +26,7 @@ def crop_at(x: int, y: int, *, confidence: float | None = 1.0) -> FishCrop:
 def confirmed(crops: Sequence[FishCrop], **settings: object) -> list[bool]:
     """Frame by frame, whether one track is a fish."""
     confirmation = FishConfirmation(ConfirmationSettings.model_validate(settings))
-    return [confirmation.update(1, crop) for crop in crops]
+    return [bool(confirmation.update(1, crop)) for crop in crops]
 
 
 def test_a_track_is_confirmed_after_enough_clear_frames():
@@ -54,12 +54,39 @@ def test_a_fish_counts_while_it_is_seen():
 def test_tracks_are_counted_apart():
     confirmation = FishConfirmation(ConfirmationSettings(min_track_frames=2))
     crop = crop_at(50, 50)
-    assert [confirmation.update(number, crop) for number in (1, 2, 2, 1)] == [
+    assert [bool(confirmation.update(number, crop)) for number in (1, 2, 2, 1)] == [
         False,
         False,
         True,
         True,
     ]
+
+
+def test_a_fish_comes_with_its_clear_crops_of_before():
+    confirmation = FishConfirmation(ConfirmationSettings(min_track_frames=3))
+    crops = [crop_at(50, y, confidence=c) for y, c in ((50, 1.0), (51, 0.3), (52, 0.9), (53, 0.8))]
+    assert [confirmation.update(1, crop) for crop in crops[:3]] == [[], [], []]
+    assert confirmation.update(1, crops[3]) == [crops[0], crops[2], crops[3]]
+    assert confirmation.update(1, crops[1]) == [crops[1]]
+
+
+def test_what_is_long_no_fish_keeps_few_crops():
+    confirmation = FishConfirmation(ConfirmationSettings(min_track_frames=3))
+    crops = [crop_at(50, 50) for _ in range(100)]
+    for crop in crops:
+        assert confirmation.update(1, crop, may_count=False) == []
+    shown = confirmation.update(1, crops[0], may_count=True)
+    assert len(shown) < 20
+    assert shown == [*crops[101 - len(shown) :], crops[0]]
+
+
+def test_tracks_that_have_ended_are_forgotten():
+    confirmation = FishConfirmation(ConfirmationSettings(min_track_frames=2))
+    confirmation.update(1, crop_at(50, 50))
+    confirmation.update(2, crop_at(50, 50))
+    confirmation.forget_all_but({2})
+    assert not confirmation.update(1, crop_at(50, 50))
+    assert confirmation.update(2, crop_at(50, 50))
 
 
 @pytest.mark.parametrize("zone", [[0.5, 0.0, 0.5, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 1.1]])
