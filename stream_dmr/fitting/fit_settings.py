@@ -38,7 +38,7 @@ class FitMeshSettings(Settings):
         "held as they hang",
     )
     tilt_std_rad: float = Field(
-        default=0.25,
+        default=0.3,
         gt=0,
         description="std of a tilt out of the way in which fish hang, rad",
     )

@@ -208,7 +208,7 @@ def _carry(
                     out[c, i, k] += scale * carried * directions[n, m, k]
 
 
-# Fish of a stock hang nearer to the plane on average than any one of them.
+# Fish of a stock hang that way more nearly on average than any one of them does.
 _TILT_STD_RAD = 0.15
 # Of the joints' log scales in a square fit: while the outline is learnt, and while the breadth is
 # read off. Chosen.
