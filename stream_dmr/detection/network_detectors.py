@@ -9,6 +9,13 @@ yolo-nms: (1, N, 6), left, top, right, bottom, score, class, input pixels (expor
 detr: boxes (1, N, 4) as x, y, w, h, fractions of the input, and logits (1, N, C + 1), the last of
 them "nothing" (DETR). rt-detr: the same with C independent logits (RT-DETR, RF-DETR, DINO).
 
+Three kinds find each fish's mask as well, which no segmenter then looks for:
+
+yolo-seg: yolo's rows with M more of weights, and M pictures (1, M, h, w) of which they make the
+logits of a mask (YOLOv8-seg and later). rf-detr-seg: rt-detr's boxes and logits, and the logits of
+masks (1, N, h, w) (RF-DETR Seg). mask-rcnn: boxes (N, 4) in input pixels, classes (N), scores (N)
+and probabilities (N, 1, height, width) (Mask R-CNN of torchvision). A mask spans the whole input.
+
 The U-Net, which also finds masks, finds fish in the whole frame at low resolution, for cameras and
 seas that move so much that no fish stands out by its motion.
 """
@@ -25,15 +32,26 @@ from pydantic import Field
 
 from stream_dmr.detection.detector import Candidate
 from stream_dmr.errors import ModelError
-from stream_dmr.geometry import components
+from stream_dmr.geometry import components, whole_pixels
 from stream_dmr.messages import Frame
 from stream_dmr.networks.onnx_session import open_session
 from stream_dmr.networks.unet_interface import SIZE_MULTIPLE_PX
 from stream_dmr.segmentation.unet_segmenter import UNetSegmenter
 from stream_dmr.settings import Settings
 
-Layout = Literal["yolo", "yolov5", "yolo-nms", "detr", "rt-detr"]
-NUM_OUTPUTS = {"yolo": 1, "yolov5": 1, "yolo-nms": 1, "detr": 2, "rt-detr": 2}
+Layout = Literal[
+    "yolo", "yolov5", "yolo-nms", "detr", "rt-detr", "yolo-seg", "rf-detr-seg", "mask-rcnn"
+]
+NUM_OUTPUTS: dict[str, int] = {
+    "yolo": 1,
+    "yolov5": 1,
+    "yolo-nms": 1,
+    "detr": 2,
+    "rt-detr": 2,
+    "yolo-seg": 2,
+    "rf-detr-seg": 3,
+    "mask-rcnn": 4,
+}
 
 # x0, y0, x1, y1 in input pixels; scores by class
 BoxesAndScores = tuple[Float[np.ndarray, "N 4"], Float[np.ndarray, "N C"]]
@@ -91,6 +109,48 @@ def _rt_detr(outputs: list[np.ndarray], input_size: tuple[int, int]) -> BoxesAnd
     return boxes * np.tile(input_size, 2), 1 / (1 + np.exp(-logits.clip(-60, 60)))
 
 
+def _yolo_seg(outputs: list[np.ndarray], size: tuple[int, int]) -> BoxesAndScores:
+    rows, pictures = outputs
+    if rows.ndim != 3 or pictures.ndim != 4 or rows.shape[1] < 5 + pictures.shape[1]:
+        raise OutputShapeError("(1, 4 + classes + M, boxes) and (1, M, height, width)")
+    return _yolo([rows[:, : -pictures.shape[1]]], size)
+
+
+def _rf_detr_seg(outputs: list[np.ndarray], size: tuple[int, int]) -> BoxesAndScores:
+    *rest, masks = outputs
+    if masks.ndim != 4 or masks.shape[:2] != rest[0].shape[:2]:
+        raise OutputShapeError("(1, boxes, 4), (1, boxes, classes), (1, boxes, height, width)")
+    return _rt_detr(rest, size)
+
+
+def _mask_rcnn(outputs: list[np.ndarray], _: tuple[int, int]) -> BoxesAndScores:
+    boxes, labels, scores, masks = outputs
+    if boxes.ndim != 2 or boxes.shape[1] != 4 or masks.ndim != 4 or masks.shape[1] != 1:
+        raise OutputShapeError("(boxes, 4), (boxes), (boxes), (boxes, 1, height, width)")
+    return _yolo_nms([np.column_stack([boxes, scores, labels])[None]], (0, 0))
+
+
+def mask_in_input(
+    outputs: Sequence[np.ndarray], layout: str, index: int
+) -> Float32[np.ndarray, "h w"] | None:
+    """Fish probability of one box over the whole input; None from a layout without masks."""
+    match layout:
+        case "yolo-seg":
+            rows, pictures = outputs
+            weights = rows[0, -pictures.shape[1] :, index]
+            return _sigmoid(np.tensordot(weights, pictures[0], axes=1))
+        case "rf-detr-seg":
+            return _sigmoid(outputs[2][0, index])
+        case "mask-rcnn":
+            return outputs[3][index, 0].astype(np.float32)
+        case _:
+            return None
+
+
+def _sigmoid(logits: Float[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    return (1 / (1 + np.exp(-logits.clip(-60, 60)))).astype(np.float32)
+
+
 def _boxes_and_logits(outputs: list[np.ndarray]) -> BoxesAndScores:
     """The two outputs, in either order; boxes still as fractions of the input."""
     shapes = [output.shape for output in outputs]
@@ -116,6 +176,9 @@ _DECODERS: dict[str, Callable[[list[np.ndarray], tuple[int, int]], BoxesAndScore
     "yolo-nms": _yolo_nms,
     "detr": _detr,
     "rt-detr": _rt_detr,
+    "yolo-seg": _yolo_seg,
+    "rf-detr-seg": _rf_detr_seg,
+    "mask-rcnn": _mask_rcnn,
 }
 
 
@@ -160,6 +223,21 @@ class Letterbox:
         """Boxes of the input as boxes of the frame, half-open, px."""
         return (boxes_xyxy_px - np.tile(self.offset, 2)) / np.tile(self.scale, 2)
 
+    def mask_to_frame(
+        self, probability: Float32[np.ndarray, "h w"], bbox_xyxy_px: Float[np.ndarray, "4"]
+    ) -> Bool[np.ndarray, "H W"]:
+        """The part of a mask of the whole input that lies in a box of the frame, in its pixels."""
+        x0, y0, x1, y1 = whole_pixels(bbox_xyxy_px)
+        per_input = np.array(probability.shape[::-1]) / self.input_size
+        scale = self.scale * per_input
+        # From the middle of a frame pixel of the box to that of a mask pixel.
+        shift = scale * (np.array([x0, y0]) + 0.5) + self.offset * per_input - 0.5
+        affine = np.column_stack([np.diag(scale), shift])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        border = cv2.BORDER_REPLICATE
+        size = (x1 - x0, y1 - y0)
+        return cv2.warpAffine(probability, affine, size, flags=flags, borderMode=border) > 0.5
+
 
 _MIN_INPUT_PX = 32  # the stride of the usual detectors
 _SCORE_TOLERANCE = 1e-3  # rounding may put a score of 1 above 1
@@ -188,7 +266,7 @@ class OnnxSettings(Settings):
 
 
 class OnnxDetector:
-    """A `Detector` of boxes and scores, without silhouettes."""
+    """A `Detector` of boxes and scores, and of masks where its layout has them."""
 
     def __init__(
         self,
@@ -218,26 +296,34 @@ class OnnxDetector:
         """Empty: what was not found is not known."""
         return {}
 
+    @property
+    def gives_masks(self) -> bool:
+        return self._settings.onnx_layout in ("yolo-seg", "rf-detr-seg", "mask-rcnn")
+
     def find(self, frame: Frame) -> list[Candidate]:
-        """The boxes of a frame after non-maximum suppression."""
+        """The boxes of a frame after non-maximum suppression; none whose mask is empty."""
         height, width = frame.image.shape[:2]
         letterbox = Letterbox.from_sizes(frame_size=(width, height), input_size=self._input_size)
-        boxes, scores = self._run(letterbox.apply(frame.image))
+        boxes, scores, outputs = self._run(letterbox.apply(frame.image))
         boxes = letterbox.to_frame(boxes).clip(0, [width, height, width, height])
         sides = boxes[:, 2:] - boxes[:, :2]
         usable = np.isfinite(boxes).all(axis=1) & (sides >= 1).all(axis=1)
         usable &= scores >= self._min_score  # not NaN
-        boxes, scores = boxes[usable], scores[usable]
+        indices, boxes, scores = np.flatnonzero(usable), boxes[usable], scores[usable]
         kept = cv2.dnn.NMSBoxes(
             np.column_stack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]]).tolist(),
             scores.tolist(),
             self._min_score,
             self._settings.onnx_overlap,
         )
-        return [
-            Candidate(bbox_xyxy_px=boxes[i], score=float(min(scores[i], 1.0)))
-            for i in np.array(kept, int).ravel()
-        ]
+        found: list[Candidate] = []
+        for i in np.array(kept, int).ravel():
+            mask = mask_in_input(outputs, self._settings.onnx_layout, int(indices[i]))
+            inside = None if mask is None else letterbox.mask_to_frame(mask, boxes[i])
+            if inside is None or inside.any():
+                score = float(min(scores[i], 1.0))
+                found.append(Candidate(bbox_xyxy_px=boxes[i], score=score, foreground=inside))
+        return found
 
     def _read_input(self) -> tuple[str, tuple[int, int]]:
         """Name, and width and height, of the model's image input."""
@@ -259,22 +345,25 @@ class OnnxDetector:
 
     def _run(
         self, picture: UInt8[np.ndarray, "h w 3"]
-    ) -> tuple[Float[np.ndarray, "N 4"], Float[np.ndarray, "N"]]:
-        """Boxes x0, y0, x1, y1 in input pixels, and the best score of any fish class."""
+    ) -> tuple[Float[np.ndarray, "N 4"], Float[np.ndarray, "N"], list[np.ndarray]]:
+        """Boxes x0, y0, x1, y1 in input pixels, the best score of any fish class, all outputs."""
         values = picture[..., ::-1].astype(np.float32) / 255
         if self._settings.onnx_imagenet:
             values = (values - _IMAGENET_MEAN) / _IMAGENET_STD
         blob = np.ascontiguousarray(values.transpose(2, 0, 1)[None])
         outputs = self._session.run(None, {self._input_name: blob})
         boxes, scores = decode(outputs, self._settings.onnx_layout, input_size=self._input_size)
-        return boxes, self._fish_scores(scores).max(axis=1, initial=0.0)
+        return boxes, self._fish_scores(scores).max(axis=1, initial=0.0), outputs
 
     def _fish_scores(self, scores: Float[np.ndarray, "N C"]) -> Float[np.ndarray, "N F"]:
         """The scores of the classes that `onnx_classes` names."""
         classes = self._settings.onnx_classes
         if not classes:
             return scores
-        if self._settings.onnx_layout == "yolo-nms":  # has as many columns as classes were found
+        if self._settings.onnx_layout in (
+            "yolo-nms",
+            "mask-rcnn",
+        ):  # have as many columns as classes were found
             classes = [c for c in classes if c < scores.shape[1]]
         elif max(classes) >= scores.shape[1]:
             raise OutputShapeError(f"with class {max(classes)}, which onnx_classes names")
@@ -284,7 +373,7 @@ class OnnxDetector:
         """Raise ModelError where the model fails on a picture or gives impossible outputs."""
         layout = self._settings.onnx_layout
         try:
-            boxes, scores = self._run(picture)
+            boxes, scores, _ = self._run(picture)
         except OutputShapeError as error:
             shapes = ", ".join(str(tuple(o.shape)) for o in self._session.get_outputs())
             raise self._refusal(

@@ -25,8 +25,10 @@ from stream_dmr.detection.given_fish import (
     open_annotated_fish,
 )
 from stream_dmr.detection.mask_folder import MaskFolder
+from stream_dmr.detection.network_detectors import OnnxDetector
 from stream_dmr.detection.open_detector import DetectFishSettings, open_detector
 from stream_dmr.detection.picture_views import find_in_still
+from stream_dmr.geometry import whole_pixels
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.segmentation.crop import Detection
 from stream_dmr.tracking.box_correction import BoxCorrector
@@ -141,13 +143,15 @@ class TrackedFish:
 
     def detect(self, frame: Frame) -> list[Detection]:
         """All tracks seen in a frame, by track number. Frames must come in order."""
-        if self._are_stills:
+        if self._are_stills and not self.gives_masks:
             candidates = find_in_still(self._detector, frame)
         else:
             candidates = [] if self._passes_over(frame) else self._detector.find(frame)
         tracked = self._tracker.step(frame, candidates)
         self._seen.frames += 1
         self._seen.candidates += len(candidates)
+        if self.gives_masks:
+            tracked = [one for one in tracked if one.candidate.foreground is not None]
         boxes = {one.track_number: one.candidate.bbox_xyxy_px for one in tracked}
         visible = {one.track_number: one.visible_fraction for one in tracked}
         self._evidence = {one.track_number: one.evidence for one in tracked}
@@ -155,6 +159,17 @@ class TrackedFish:
         self._look_closer(frame, boxes)
         self._seen.any_moved |= any(one.has_moved for one in self._evidence.values())
         self._seen.any_fish_like |= any(map(self._may_count, self._evidence))
+        if self.gives_masks:
+            return [
+                Detection(
+                    source_id=one.track_number,
+                    bbox_xyxy_px=one.candidate.bbox_xyxy_px,
+                    mask=one.candidate.foreground,
+                    mask_corner=whole_pixels(one.candidate.bbox_xyxy_px)[:2],
+                    visible_fraction=one.visible_fraction,
+                )
+                for one in tracked
+            ]
         return [
             replace(one, may_be_no_fish=not self._is_surely_fish(one.source_id))
             for one in self._corrector.correct(boxes, visible, frame)
@@ -222,8 +237,8 @@ class TrackedFish:
 
     @property
     def gives_masks(self) -> bool:
-        """False: the segmenter finds the masks."""
-        return False
+        """True where the detector finds masks as well; else the segmenter does."""
+        return isinstance(self._detector, OnnxDetector) and self._detector.gives_masks
 
     @property
     def warnings(self) -> list[str]:

@@ -9,10 +9,14 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from stream_dmr.detection.network_detectors import Letterbox, OnnxDetector, OnnxSettings
+from stream_dmr.detection.network_detectors import Layout, Letterbox, OnnxDetector, OnnxSettings
 from stream_dmr.detection.open_detector import DetectFishSettings, open_detector
 from stream_dmr.errors import ModelError
-from stream_dmr.messages import Frame
+from stream_dmr.geometry import whole_pixels
+from stream_dmr.messages import FishCrop, Frame
+from stream_dmr.nodes.crop_fish import CropFish
+from stream_dmr.segmentation.crop import CropFishSettings
+from stream_dmr.tracking.finder import TrackedFish, TrackFishSettings
 
 INPUT = 320
 
@@ -212,3 +216,69 @@ def test_classes_that_the_model_does_not_have_are_refused(tmp_path):
     assert "with class 80, which onnx_classes names" in refusal(model, onnx_classes=[0, 80])
     with pytest.raises(ValueError, match="greater than or equal to 0"):
         OnnxSettings(onnx_classes=[-1])
+
+
+GRID = 80  # cells of a mask of the whole input
+
+
+def mask_outputs(layout: str, boxes: np.ndarray) -> list[np.ndarray]:
+    """Elliptic masks that fill the boxes (input px), as a model of that family puts them out."""
+    middle = (np.arange(GRID) + 0.5) * INPUT / GRID
+    center, half = (boxes[:, :2] + boxes[:, 2:]) / 2, (boxes[:, 2:] - boxes[:, :2]) / 2
+    x, y = ((middle - center[:, i : i + 1]) / half[:, i : i + 1] for i in (0, 1))
+    logits = (20 * (1 - np.hypot(x[:, None, :], y[:, :, None]))).clip(-50)
+    match layout:
+        case "yolo-seg":
+            (rows,) = outputs_of("yolo", boxes)
+            weights = np.eye(len(boxes))[None]  # each mask is a picture of its own
+            return [np.concatenate([rows, weights], axis=1), logits[None]]
+        case "rf-detr-seg":
+            return [*outputs_of("rt-detr", boxes), logits[None]]
+    probability = 1 / (1 + np.exp(-logits))
+    return [boxes, np.ones(len(boxes)), np.full(len(boxes), SCORE), probability[:, None]]
+
+
+@pytest.mark.parametrize("layout", ["yolo-seg", "rf-detr-seg", "mask-rcnn"])
+@pytest.mark.parametrize("size", [(640, 480), (300, 1000)])
+def test_every_family_of_masks_gives_the_silhouette_in_the_frame(
+    tmp_path: Path, layout: Layout, size: tuple[int, int]
+):
+    letterbox = Letterbox.from_sizes(frame_size=size, input_size=(INPUT, INPUT))
+    truth = np.array([[30.0, 50.0, 130.0, 210.0], [150.5, 220.25, 290.75, 300.5]])
+    filling = np.array([[0.0, 0.0, 0.5, 0.5]] * 40)
+    boxes = to_input(letterbox, np.concatenate([truth, filling]))
+    model = write_model(tmp_path / "model.onnx", mask_outputs(layout, boxes))
+    settings = DetectFishSettings(detector=str(model), onnx_layout=layout)
+    found = sorted(open_detector(settings).find(frame_of(*size)), key=lambda c: c.bbox_xyxy_px[0])
+    assert len(found) == 2
+    for candidate, (x0, y0, x1, y1) in zip(found, truth, strict=True):
+        left, top, right, bottom = whole_pixels(candidate.bbox_xyxy_px)
+        x, y = np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5
+        a, b = (x - (x0 + x1) / 2) / (x1 - x0) * 2, (y - (y0 + y1) / 2) / (y1 - y0) * 2
+        ellipse = np.hypot(a[None, :], b[:, None]) < 1
+        assert candidate.foreground is not None
+        both = np.count_nonzero(candidate.foreground & ellipse)
+        assert both / np.count_nonzero(candidate.foreground | ellipse) > 0.95
+
+
+def test_the_fish_of_a_model_with_masks_need_no_segmenter(tmp_path: Path):
+    box = np.array([[60.0, 100, 220, 160]])
+    filled = np.concatenate([box, np.tile([[0.0, 0.0, 0.1, 0.1]], (40, 1))])
+    model = write_model(tmp_path / "model.onnx", mask_outputs("yolo-seg", filled))
+    settings = DetectFishSettings(detector=str(model), onnx_layout="yolo-seg")
+    finder = TrackedFish(open_detector(settings), TrackFishSettings(min_track_frames=1))
+    assert finder.gives_masks
+    node = CropFish(CropFishSettings(), camera=None, finder=finder)
+    [crop] = [one for one in node.step(frame_of(INPUT, INPUT)) if isinstance(one, FishCrop)]
+    assert crop.quality.mask_confidence is None
+    assert crop.quality.mask_area_px == pytest.approx(np.pi * 80 * 30, rel=0.05)
+
+
+def test_other_outputs_than_of_masks_are_refused(tmp_path: Path):
+    model = yolo_model(tmp_path / "model.onnx", np.array([[16.0, 16, 80, 48]]))
+    with pytest.raises(ModelError, match="2 outputs"):
+        OnnxDetector(model, OnnxSettings(onnx_layout="yolo-seg"))
+    rows = outputs_of("yolo", np.zeros((40, 4)))
+    model = write_model(tmp_path / "flat.onnx", [*rows, np.zeros((1, 8, 8))])
+    with pytest.raises(ModelError, match="M, height, width"):
+        OnnxDetector(model, OnnxSettings(onnx_layout="yolo-seg"))
