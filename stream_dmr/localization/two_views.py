@@ -3,6 +3,9 @@
 Each camera's fit knows where the midline is in its picture: well across the body, less well which
 point of it a pixel shows. A curve in space is fitted to both pictures with these two weights, so
 neither the plane nor a fit's slant matters. Its ends are the triangulated head and tail.
+
+A fit that fails ends short: of a fish seen on edge it leaves out the tail. So the ends of a fit of
+low IoU weigh less, and where the two pictures contradict each other, those that are short do.
 """
 
 from collections.abc import Callable
@@ -19,10 +22,18 @@ _DEGREE = 4  # of the curve: a C, an S and a little more
 _STATIONS = 17
 # Std of a midline in a picture, over its length there: across the body; along it at the ends, whose
 # place is seen, and between them, where a turned body is foreshortened unevenly.
-_ACROSS, _ALONG_ENDS, _ALONG = 0.003, 0.007, 0.1
+_ACROSS, _ALONG_ENDS, _ALONG = 0.003, 0.005, 0.1
+# Of the ends at an IoU of 0.9, in any direction; it falls with the cube of what is missing.
+_MISFIT_STD = 0.03
+_SHORT = 0.7  # stds by which a picture may be short at both ends before they weigh less
+_DOUBT = 0.8  # misfit that adds as much to the length's std as the two pictures' errors
 _RIDGE_STD = 1.0  # of the curve's coefficients, over the length, but for place and direction
-_ROUNDS = 6
+_ROUNDS = 10
 _STEP, _SETTLED = 1e-4, 1e-5  # of a numerical slope, of the last round; over the length
+
+
+# Points of a midline in the picture, and what their residuals are multiplied by.
+_Target = tuple[Float[np.ndarray, "S 2"], Float[np.ndarray, "S 2 2"]]
 
 
 class View(NamedTuple):
@@ -30,6 +41,7 @@ class View(NamedTuple):
 
     midline_px: Float[np.ndarray, "M 2"]  # from head to tail, frame pixels
     calibration: Calibration
+    iou: float = 1.0  # of the fit, with its mask
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -38,8 +50,8 @@ class Placed:
 
     midline_mm: Float[np.ndarray, "S 3"]
     length_mm: float
-    length_std_mm: float  # by the two pictures' errors
-    misfit: float  # root mean square of the residuals, in their stds: 1 is expected
+    length_std_mm: float  # by the two pictures' errors, and by how they contradict each other
+    misfit: float  # root mean square of the residuals, in the stds of good fits: 1 is expected
 
 
 def second_from_first(
@@ -70,15 +82,20 @@ def place_between(views: tuple[View, View], start_mm: Float[np.ndarray, "M 3"]) 
     coefficients = np.linalg.lstsq(basis, start, rcond=None)[0].ravel()
     frames = (np.eye(3), np.zeros(3)), second_from_first(*(view.calibration for view in views))
     targets = [_weights(view) for view in views]
+    good = [_weights(view._replace(iou=1.0)) for view in views]
     ridge = np.repeat((np.arange(_DEGREE + 1) > 1) / (_RIDGE_STD * scale), 3)
 
-    def residuals(x: Float[np.ndarray, "C"]) -> Float[np.ndarray, "R"]:
+    def misses(x: Float[np.ndarray, "C"], given: list[_Target]) -> Float[np.ndarray, "2 S 2"]:
         curve = basis @ x.reshape(-1, 3)
-        parts = [
-            np.einsum("sij,sj->si", weights, view.calibration.camera.project(curve @ R.T + t) - px)
-            for view, (R, t), (px, weights) in zip(views, frames, targets, strict=True)
-        ]
-        return np.concatenate([*(part.ravel() for part in parts), ridge * x])
+        return np.stack(
+            [
+                np.einsum("sij,sj->si", w, view.calibration.camera.project(curve @ R.T + t) - px)
+                for view, (R, t), (px, w) in zip(views, frames, given, strict=True)
+            ]
+        )
+
+    def residuals(x: Float[np.ndarray, "C"]) -> Float[np.ndarray, "R"]:
+        return np.concatenate([(trust * misses(x, targets)).ravel(), ridge * x])
 
     shifts = _STEP * scale * np.eye(coefficients.size)
 
@@ -87,11 +104,15 @@ def place_between(views: tuple[View, View], start_mm: Float[np.ndarray, "M 3"]) 
     ) -> Float[np.ndarray, "R C"]:
         return np.stack([(of(x + d) - of(x - d)) / (2 * _STEP * scale) for d in shifts], axis=-1)
 
-    J = slopes(residuals, coefficients)
+    trust = np.ones((2, _STATIONS, 1))
     for _ in range(_ROUNDS):
+        # How far the curve goes on beyond a picture's two ends, along the body. Of both together:
+        # a picture that is shifted along the body, as by a late clock, is not short.
+        beyond = misses(coefficients, targets)[:, [0, -1], 0] @ [-0.5, 0.5]
+        trust[:, [0, -1], 0] = 1 / np.hypot(1, np.maximum(beyond, 0) / _SHORT)[:, None]
+        J = slopes(residuals, coefficients)
         step = np.linalg.solve(J.T @ J, J.T @ residuals(coefficients))
         coefficients = coefficients - step
-        J = slopes(residuals, coefficients)
         if np.abs(step).max() < _SETTLED * scale:
             break
     dense = np.polynomial.legendre.legvander(np.linspace(-1, 1, len(start_mm)), _DEGREE)
@@ -100,12 +121,13 @@ def place_between(views: tuple[View, View], start_mm: Float[np.ndarray, "M 3"]) 
         return np.array([arc_length(dense @ x.reshape(-1, 3))])
 
     slope = slopes(length, coefficients)[0]
-    left = residuals(coefficients)[: -ridge.size]
+    misfit = float(np.sqrt(np.mean(misses(coefficients, good) ** 2)))
+    std_mm = float(np.sqrt(slope @ np.linalg.solve(J.T @ J, slope)))
     return Placed(
         midline_mm=dense @ coefficients.reshape(-1, 3),
         length_mm=float(length(coefficients)[0]),
-        length_std_mm=float(np.sqrt(slope @ np.linalg.solve(J.T @ J, slope))),
-        misfit=float(np.sqrt(np.mean(left**2))),
+        length_std_mm=std_mm * float(np.hypot(1, misfit / _DOUBT)),
+        misfit=misfit,
     )
 
 
@@ -116,14 +138,13 @@ def _at(line: Float[np.ndarray, "M D"], num: int) -> Float[np.ndarray, "S D"]:
     return np.column_stack([np.interp(places, arc, axis) for axis in line.T])
 
 
-def _weights(view: View) -> tuple[Float[np.ndarray, "S 2"], Float[np.ndarray, "S 2 2"]]:
-    """Points of a midline in the picture, and what their residuals are multiplied by."""
+def _weights(view: View) -> _Target:
     line = _at(view.midline_px, _STATIONS)
     length_px = arc_length(view.midline_px)
     along = np.gradient(line, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    along_std = np.full(_STATIONS, _ALONG)
-    along_std[[0, -1]] = _ALONG_ENDS
-    weights = np.stack([along / along_std[:, None], across / _ACROSS], axis=1) / length_px
-    return line, weights
+    stds = np.full((_STATIONS, 2, 1), [[_ALONG], [_ACROSS]])
+    misfit_std = _MISFIT_STD * ((1 - view.iou) / 0.1) ** 3
+    stds[[0, -1]] = np.hypot([[_ALONG_ENDS], [_ACROSS]], misfit_std)
+    return line, np.stack([along, across], axis=1) / stds / length_px

@@ -37,7 +37,6 @@ _MOST_MISFIT = 4.0
 _LEAST_APART_DEG = 3  # between the cameras, seen from the fish: less tells little of depth
 # Of the rays' distance over the length: what is usual on simulated pairs, and what is worth a word.
 _RAYS_USUAL, _RAYS_WARN = 0.01, 0.03
-_SHARED_STD = 0.004  # of the log length, of errors that all frames share: both masks' ends
 
 
 class FishSightings(NamedTuple):
@@ -45,34 +44,42 @@ class FishSightings(NamedTuple):
 
     times_ns: Int[np.ndarray, "T"]
     midlines_px: Float[np.ndarray, "T M 2"]
+    ious: Float[np.ndarray, "T"]  # of the fits
     length_mm: float
 
-    def at(self, time_ns: int) -> Float[np.ndarray, "M 2"] | None:
-        """The midline at a time, between the frames around it; None too far from them."""
+    def at(self, time_ns: int) -> tuple[Float[np.ndarray, "M 2"], float] | None:
+        """The midline at a time, between the frames around it, and the poorer one's IoU.
+
+        None too far from them.
+        """
         before = max(int(np.searchsorted(self.times_ns, time_ns, side="right")) - 1, 0)
         after = min(int(np.searchsorted(self.times_ns, time_ns)), len(self.times_ns) - 1)
         t0, t1 = self.times_ns[before], self.times_ns[after]
         if max(t1 - t0, t0 - time_ns, time_ns - t1) > _MOST_APART_S * 1e9:
             return None
         share = 0.0 if t1 == t0 else (time_ns - t0) / (t1 - t0)
-        return (1 - share) * self.midlines_px[before] + share * self.midlines_px[after]
+        midline_px = (1 - share) * self.midlines_px[before] + share * self.midlines_px[after]
+        return midline_px, float(min(self.ious[before], self.ious[after]))
 
 
 def tracks_of(fish: Iterable[LocalizedFish], calibration: Calibration) -> dict[int, FishSightings]:
     """The tracks of a run by their ids, of the frames that count."""
     times: dict[int, list[int]] = {}
     midlines: dict[int, list[Float[np.ndarray, "M 2"]]] = {}
+    ious: dict[int, list[float]] = {}
     lengths: dict[int, list[float]] = {}
     for one in fish:
         if one.accepted and one.midline_mm is not None and one.length_mm is not None:
             midline_px = calibration.camera.project(one.midline_mm)
             times.setdefault(one.track_id, []).append(one.timestamp_ns)
             midlines.setdefault(one.track_id, []).append(midline_px)
+            ious.setdefault(one.track_id, []).append(one.iou or 0.0)
             lengths.setdefault(one.track_id, []).append(one.length_mm)
     return {
         track_id: FishSightings(
             times_ns=np.array(times[track_id]),
             midlines_px=np.stack(midlines[track_id]),
+            ious=np.array(ious[track_id]),
             length_mm=float(np.median(lengths[track_id])),
         )
         for track_id in times
@@ -108,7 +115,7 @@ def pair_up(
 
     steps = np.arange(-_MOST_OFFSET_S, _MOST_OFFSET_S + 1e-9, frame_s / 2)
     best = min(sorted(steps.tolist(), key=abs), key=cost)  # of equals: the clocks agree
-    for step in (frame_s / 4, frame_s / 10):
+    for step in (frame_s / 4, frame_s / 10, frame_s / 40):
         finer = [best + step * n for n in sorted(range(-4, 5), key=abs)]
         best = min(finer, key=cost)
     apart = _apart(first, second, calibrations, best)
@@ -145,7 +152,7 @@ def _apart(
         rays = calibrations[0].camera.back_project(ends_px).reshape(-1, 2, 3)
         for column in np.flatnonzero((begins <= times[-1]) & (ends >= times[0])).tolist():
             seen = {n: others[column].at(time_ns) for n, time_ns in enumerate(times.tolist())}
-            both = {n: midline[[0, -1]] for n, midline in seen.items() if midline is not None}
+            both = {n: found[0][[0, -1]] for n, found in seen.items() if found is not None}
             if len(both) < _FEWEST:
                 continue
             other_rays = calibrations[1].camera.back_project(np.concatenate([*both.values()])) @ R
@@ -234,12 +241,17 @@ class LocalizeByTwo:
         is_refused = alone.reason not in _BY_ONE_CAMERA
         if track is None or is_refused or alone.midline_mm is None or alone.keypoints_mm is None:
             return [alone]
-        seen_px = track.at(mesh.timestamp_ns + round(self.pairing.offset_s * 1e9))
-        if seen_px is None:
+        seen = track.at(mesh.timestamp_ns + round(self.pairing.offset_s * 1e9))
+        if seen is None:
             return [replace(alone, accepted=False, reason=Reason.SEEN_BY_ONE)]
         px = self._calibration.camera.project(alone.midline_mm)
-        views = View(px, self._calibration), View(seen_px, self._second_calibration)
-        placed = place_between(views, alone.midline_mm)
+        first = View(px, self._calibration, alone.iou or 0.0)
+        second = View(seen[0], self._second_calibration, seen[1])
+        placed = place_between((first, second), alone.midline_mm)
+        if placed.misfit > _MOST_MISFIT:  # one of the cameras may take the head for the tail
+            turned = second._replace(midline_px=second.midline_px[::-1])
+            other = place_between((first, turned), alone.midline_mm)
+            placed = min(placed, other, key=lambda one: one.misfit)
         line = placed.midline_mm
         part = np.linalg.norm(alone.midline_mm - alone.keypoints_mm[1], axis=1).argmin()
         chord_mm = float(np.linalg.norm(line[0] - line[-1]))
@@ -252,7 +264,7 @@ class LocalizeByTwo:
                 bending_ratio=placed.length_mm / chord_mm,
                 length_mm=placed.length_mm,
                 length_std_mm=placed.length_std_mm,
-                shared_std_ratio=float(np.hypot(_SHARED_STD, mask_std_ratio(mesh.quality))),
+                shared_std_ratio=mask_std_ratio(mesh.quality),
                 accepted=not disagree,
                 reason=Reason.CAMERAS_DISAGREE if disagree else "",
             )

@@ -83,6 +83,39 @@ def test_the_std_is_that_of_errors_along_and_across():
     assert 0.6 < np.std(lengths) / np.mean(stds) < 1.4
 
 
+@pytest.mark.parametrize("short", [0, 1])
+@pytest.mark.parametrize("degrees", [35.0, 60.0, 90.0])
+def test_a_tail_that_one_camera_leaves_out_is_taken_from_the_other(degrees, short):
+    """Seen on edge, a fit leaves out the tail, and covers less of its mask."""
+    line = bent_fish(0.5, np.array([0.1, 0.1, 0.1]))
+    views = [*seen(line, degrees)]
+    good = place_between((views[0], views[1]), line)
+    px = views[short].midline_px
+    views[short] = View(px[: round(0.85 * len(px))], views[short].calibration, iou=0.88)
+    placed = place_between((views[0], views[1]), line)
+    assert placed.length_mm == pytest.approx(700, rel=0.02)
+    assert placed.length_std_mm > 2 * good.length_std_mm
+    assert placed.misfit > 1
+
+
+@pytest.mark.parametrize("share", [-0.02, 0.02])
+def test_a_picture_that_is_shifted_along_the_body_makes_no_fish_longer(share):
+    """As by cameras that are not quite in step."""
+    line = bent_fish(0.5, np.array([0.1, 0.1, 0.1]))
+    first, second = seen(line, 35.0)
+    shift = share * (second.midline_px[-1] - second.midline_px[0])
+    placed = place_between((first, second._replace(midline_px=second.midline_px + shift)), line)
+    assert placed.length_mm == pytest.approx(700, rel=3e-3)
+
+
+def test_what_both_pictures_leave_out_is_short_and_no_contradiction():
+    line = bent_fish(0.5, np.array([0.1, 0.1, 0.1]))
+    views = seen(line[:-6], 35.0)
+    placed = place_between(views, line)
+    assert placed.length_mm == pytest.approx(arc_length(line[:-6]), rel=5e-3)
+    assert placed.misfit < 0.3
+
+
 @given(st.tuples(*[st.floats(-400, 400)] * 3), st.floats(10, 90), st.floats(5, 100))
 def test_rays_to_a_point_meet_and_others_pass(place, degrees, aside_mm):
     second = second_camera(FIRST, degrees=degrees)

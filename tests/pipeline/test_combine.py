@@ -9,9 +9,10 @@ from rerun.chunk import RrdReader
 import stream_dmr as sd
 from stream_dmr.errors import UserError
 from stream_dmr.geometry import box_iou
+from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.localization.two_views import second_from_first
 from stream_dmr.messages import FishCrop, FittedMesh, LocalizedFish
-from stream_dmr.pipeline.combine import FishSightings, pair_up
+from stream_dmr.pipeline.combine import FishSightings, LocalizeByTwo, pair_up, tracks_of
 from stream_dmr.pipeline.replay_recording import replay
 from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.reasons import Reason
@@ -60,11 +61,11 @@ def errors(scene, run):
 
 
 def test_fish_that_both_see_are_within_two_percent(scene, combined):
-    """The third fish has too few frames that are good for both: it is measured by the first."""
-    assert "2 of 3 fish were seen by both cameras" in combined.err
+    """Clocks that are in step to a few milliseconds leave the third fish its few frames."""
+    assert "3 of 3 fish were seen by both cameras" in combined.err
     single, both = errors(scene, "run"), errors(scene, "both")
     changed = [new for old, new in zip(single, both, strict=True) if old != new]
-    assert len(changed) == 2
+    assert len(changed) == 3
     assert np.abs(changed).max() < 0.02
 
 
@@ -160,6 +161,32 @@ def test_the_common_mesh_is_where_the_second_camera_sees_the_fish(scene, combine
     assert np.median(overlaps) > 0.8
 
 
+def test_a_head_that_one_camera_takes_for_the_tail_changes_no_length(scene, combined):
+    first, second = (open_recordings([scene / one / "run"]) for one in ("", SECOND))
+    first_calibration, other = first.header.calibration, second.header.calibration
+    tracks, others = (
+        tracks_of(messages_of(one, LocalizedFish), one.header.calibration)
+        for one in (first, second)
+    )
+    pairing = pair_up(tracks, others, (first_calibration, other), frame_s=FRAME_S)
+    turned = {
+        track_id: one._replace(midlines_px=one.midlines_px[:, ::-1])
+        for track_id, one in others.items()
+    }
+    nodes = [
+        LocalizeByTwo(LocalizeSettings(), first_calibration, sightings, other, pairing)
+        for sightings in (others, turned)
+    ]
+    num_accepted = 0
+    for mesh in messages_of(first, FittedMesh):
+        (straight,), (swapped,) = (node.step(mesh) for node in nodes)
+        if straight.accepted:
+            num_accepted += 1
+            assert swapped.accepted
+            assert swapped.length_mm == pytest.approx(straight.length_mm, rel=1e-3)
+    assert num_accepted > 20
+
+
 def test_runs_that_share_no_fish_or_no_calibration_are_refused(scene, tmp_path):
     result = invoke(f"combine {scene / 'run'} {scene / 'run'} --out {tmp_path / 'same'}")
     assert "two cameras at least 3 degrees apart" in result.error
@@ -199,6 +226,7 @@ def tracks(rng, degrees, offset_s):
             found[fish if found is first_tracks else fish + 10] = FishSightings(
                 times_ns=np.round(clock_s * 1e9).astype(np.int64),
                 midlines_px=np.stack([camera.camera.project(line) for line in lines]),
+                ious=np.full(len(lines), 0.95),
                 length_mm=700.0,
             )
     return first_tracks, second_tracks, (FIRST, second)
