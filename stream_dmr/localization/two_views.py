@@ -121,6 +121,7 @@ def place_between(views: tuple[View, View], start_mm: Float[np.ndarray, "M 3"]) 
         return np.array([arc_length(dense @ x.reshape(-1, 3))])
 
     slope = slopes(length, coefficients)[0]
+    J = slopes(residuals, coefficients)
     misfit = float(np.sqrt(np.mean(misses(coefficients, good) ** 2)))
     std_mm = float(np.sqrt(slope @ np.linalg.solve(J.T @ J, slope)))
     return Placed(
