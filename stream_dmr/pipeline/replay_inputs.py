@@ -11,6 +11,7 @@ from stream_dmr.fitting.shape.candidates import load_shapes
 from stream_dmr.messages import FishCrop, Frame
 from stream_dmr.pipeline.config import (
     Config,
+    by_two_cameras,
     load_config,
     lying,
     parse_config,
@@ -198,6 +199,8 @@ def read_inputs(
     config = replay_config(
         request.config, header.config_toml, first=request.first, on_notice=observer.warn
     )
+    if request.second is not None:
+        config = by_two_cameras(config)
     calibration = header.calibration
     if request.calibration is not None:
         calibration = load_calibration(request.calibration)
