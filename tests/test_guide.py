@@ -45,6 +45,7 @@ NOT_RUN = {
     "sqlite3 ": "a program of Debian, not of this project",
     "rtsp://": "a camera; tests/sources/test_live.py has one",
     "http://": "a running box; tests/web/test_haul_button.py has one",
+    "verify digest-": "a day of a box; tests/web/test_day_digest.py has some",
     "fleet boxes.txt": "running boxes, and no end; tests/web/test_fleet.py has some",
     "agreement ": "verdicts of two people; tests/web/test_agreement.py has them",
     "review ": "serves until it is stopped; tests/web/test_review.py",

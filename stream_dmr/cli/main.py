@@ -24,7 +24,7 @@ from stream_dmr.cli.shared_options import exit_on_signals, printable, typer_comm
 from stream_dmr.cli.templates import learn_template, make_template
 from stream_dmr.cli.train import evaluate, train
 from stream_dmr.cli.verify import keygen, report, verify
-from stream_dmr.cli.vessel import fleet, haul
+from stream_dmr.cli.vessel import digest, fleet, haul
 from stream_dmr.cli.view import convert, view
 from stream_dmr.errors import OutputError, UserError
 from stream_dmr.version import __version__
@@ -55,6 +55,7 @@ _GROUPS: dict[str, dict[Callable[..., None], str]] = {
         haul: "Begin or end a haul.",
         recover: "Repair recordings after a crash or a power cut.",
         keygen: "Make a device key, which signs results.",
+        digest: "Write a day into one small file, to be sent ashore.",
         fleet: "Write one page about all boxes of a fleet.",
     },
     "Set up": {

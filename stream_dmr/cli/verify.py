@@ -17,9 +17,13 @@ _Config = Annotated[Path | None, "A config.toml; its [fisheries] replaces the ru
 
 
 def verify(
-    folder: Annotated[Path, typer.Argument(help="The --out of runs or of exports.", metavar="DIR")],
+    folder: Annotated[
+        Path,
+        typer.Argument(help="The --out of runs or of exports, or a digest.", metavar="DIR|FILE"),
+    ],
     key: Annotated[
-        Path | None, "The device's FILE.pub: all that it signed is checked by it as well."
+        Path | None,
+        "The device's FILE.pub: all that it signed is checked by it as well. A digest needs it.",
     ] = None,
 ) -> None:
     """Check that results are still what their run measured, and say what was changed.
@@ -27,6 +31,8 @@ def verify(
     Exit code 1: something was changed. 3: nothing but what an interrupted run leaves, or one that
     goes on.
     """
+    from stream_dmr.errors import UserError
+    from stream_dmr.evidence.digest_file import read_digest
     from stream_dmr.evidence.verify_batch import verify_all
     from stream_dmr.evidence.verify_folder import Change, summary
     from stream_dmr.evidence.verify_signatures import check_signatures
@@ -35,6 +41,14 @@ def verify(
     from stream_dmr.store.schema import NAME
 
     signed_by = None if key is None else load_public_key(key)
+    if folder.is_file():
+        if signed_by is None:
+            raise UserError(f"{folder}: expected --key FILE.pub with a digest, got none; add it")
+        if (digest := read_digest(folder, signed_by)) is None:
+            print(f"{folder}: is not as it was signed, or not signed by this key")
+            raise typer.Exit(1)
+        print(f"{folder}: nothing was changed; {digest['day']}, {len(digest['fish']) - 1} fish")
+        return
     changes, num_files = verify_all(folder)
     databases, notes = sorted(folder.rglob(NAME)), list[str]()
     if signed_by is not None:

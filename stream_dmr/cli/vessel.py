@@ -1,9 +1,10 @@
-"""The commands `haul` and `fleet`."""
+"""The commands `haul`, `digest` and `fleet`."""
 
 import json
 import time
 import urllib.error
 import urllib.request
+from datetime import date
 from getpass import getuser
 from http import HTTPStatus
 from http.client import HTTPException
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from stream_dmr.cli.shared_options import OverwriteOption, stop_on_signals
+from stream_dmr.cli.shared_options import OverwriteOption, stop_on_signals, warn
 
 _TIMEOUT_S = 10.0
 
@@ -86,6 +87,35 @@ def _write(folder: Path, what: str, name: str, at: str | None) -> str:
     return f"haul {written}: {what}"
 
 
+def digest(
+    folder: Annotated[Path, typer.Argument(help="The --out of a run.", metavar="DIR")],
+    day: Annotated[str, "The UTC day, such as 2026-11-25."],
+    out: Annotated[Path | None, "The file to write.", "digest-DAY.zip in the folder"] = None,
+    key: Annotated[Path | None, "The device's private key, which signs it; see keygen."] = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Write what a day of a run was into one file of at most 50 kB, to be sent ashore.
+
+    It has the fish, hauls, positions, hours watched, alarms, hashes of the recordings, and small
+    pictures of as many fish as there is room for. `fleet` shows it, `verify --key` checks it.
+    """
+    from stream_dmr.errors import UserError
+    from stream_dmr.evidence.own_files import is_made_by, require_writable
+    from stream_dmr.store.ledger import Signer
+    from stream_dmr.web.day_digest import MAX_BYTES, digest_name, write_digest
+
+    try:
+        asked = date.fromisoformat(day)
+    except ValueError as error:
+        raise UserError(f"--day: expected a day such as 2026-11-25, got {day}") from error
+    path = out or folder / digest_name(asked)
+    require_writable(path, overwrite=overwrite, is_own=is_made_by("digest"))
+    size = write_digest(folder, asked, path, Signer(key))
+    print(f"{path}: {size / 1000:.1f} kB")
+    if size > MAX_BYTES:
+        warn([f"{path}: more than {MAX_BYTES // 1000} kB, since no fish is left out"])
+
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
@@ -96,9 +126,9 @@ def fleet(
     boxes: Annotated[
         list[str],
         typer.Argument(
-            help="Addresses of status pages, such as http://10.0.0.7:8480/, or files with one "
-            "NAME ADDRESS a line.",
-            metavar="URL|FILE...",
+            help="Addresses of status pages, such as http://10.0.0.7:8480/, digests or folders of "
+            "a box's digests, or files with one NAME ADDRESS a line.",
+            metavar="URL|FILE|DIR...",
         ),
     ],
     out: Annotated[Path, "The page to write."] = Path("fleet.html"),

@@ -123,6 +123,16 @@ class AlertSettings(Settings):
         return {key: value for key, value in values.items() if key not in _MAIL_KEYS}
 
 
+class DigestSettings(Settings):
+    """`[digest]`: what goes ashore of each day of an endless run."""
+
+    folder: str = Field(
+        default="",
+        description="folder that gets a small file for each UTC day, as `stream-dmr digest` writes "
+        'it; of a camera or growing folder alone; "": none',
+    )
+
+
 _HEADER = """\
 # Every setting of stream-dmr with its default. Lines that you don't change may be left out;
 # unknown keys and wrong values are refused.
@@ -192,6 +202,9 @@ class Config(Settings):
     )
     alerts: AlertSettings = Field(
         default_factory=AlertSettings, description="who is told of a run that is not well"
+    )
+    digest: DigestSettings = Field(
+        default_factory=DigestSettings, description="what goes ashore of each day of a camera"
     )
     fisheries: FisheriesSettings = Field(
         default_factory=FisheriesSettings,

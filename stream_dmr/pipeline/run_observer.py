@@ -26,6 +26,7 @@ class OpenRun:
     hauls: HaulLog
     out: Path
     sinks: SinkStates
+    key: Path | None = None  # of the device, which signs what it writes
 
 
 class RunObserver:

@@ -377,6 +377,7 @@ def _open_run(inputs: Inputs, store: LengthStore, hauls: HaulLog, states: SinkSt
         hauls=hauls,
         out=inputs.request.out,
         sinks=states,
+        key=inputs.request.key,
     )
 
 

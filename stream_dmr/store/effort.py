@@ -27,10 +27,16 @@ class HaulEffort:
     fates: Mapping[str, int] | None = None  # number of fish; None: nobody looked for any's fate
 
 
-def read_effort(database: Path, fish: Sequence[Fish]) -> list[HaulEffort]:
-    """The effort of each haul of a folder, and of what is outside of them. Raises OutputError."""
+def read_effort(
+    database: Path, fish: Sequence[Fish], *, span: Haul | None = None
+) -> list[HaulEffort]:
+    """The effort of each haul of a folder, and of what is outside of them. Raises OutputError.
+
+    `span`: only what was watched in this time, to the five minutes of a row.
+    """
     hauls = hauls_of(read_rows(database, HAULS))
     watched = read_rows(database, WATCHED)
+    watched = [row for row in watched if span is None or span.includes(row["last_ns"])]
     if hauls:
         efforts = list[HaulEffort]()
         for name in dict.fromkeys(haul.name for haul in hauls):

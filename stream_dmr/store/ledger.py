@@ -28,6 +28,7 @@ from stream_dmr.store.schema import CHECKS, LEDGER, Statement, insertion, record
 # file that was FOUND lay there when a run started, after a crash or renamed.
 END, STATE, FILE, FOUND, REMOVED = "end", "state", "file", "found", "removed"
 FILE_KINDS = (FILE, FOUND, REMOVED)
+SIGNATURE_BYTES = 64  # of Ed25519
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,10 +56,9 @@ class ChainEntry:
     def is_signed_by(self, key: Ed25519PublicKey) -> bool:
         """True where the signature is this key's, and of this entry."""
         try:
-            key.verify(b64decode(self.signature), self.signed_bytes)
-        except (InvalidSignature, ValueError):
+            return is_signature(key, b64decode(self.signature), self.signed_bytes)
+        except ValueError:
             return False
-        return True
 
 
 class Signer:
@@ -103,6 +103,19 @@ class Signer:
         signature = b64encode(self._key.sign(unsigned.signed_bytes)).decode()
         self._last = replace(unsigned, signature=signature)
         return self._last
+
+    def sign_bytes(self, data: bytes) -> bytes:
+        """A signature of something that is in no chain; b"" without a key."""
+        return b"" if self._key is None else self._key.sign(data)
+
+
+def is_signature(key: Ed25519PublicKey, signature: bytes, data: bytes) -> bool:
+    """True for this key's signature of exactly these bytes."""
+    try:
+        key.verify(signature, data)
+    except InvalidSignature:
+        return False
+    return True
 
 
 def lines_sha256(lines: Iterable[str]) -> str:

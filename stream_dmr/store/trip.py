@@ -3,7 +3,7 @@
 import sqlite3
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +132,14 @@ def positions_of(database: sqlite3.Connection) -> list[KeptPosition]:
         KeptPosition(**{n: row[n] for n in _NAMES} | {"is_joined": bool(row["is_joined"])})
         for row in rows(database, POSITIONS)
     ]
+
+
+def thinned(positions: Sequence[KeptPosition], *, most: int) -> list[KeptPosition]:
+    """Every n-th position, so that at most so many are left; between two of them gaps stay gaps."""
+    step = max(1, -(-len(positions) // most))
+    starts = range(0, len(positions), step)
+    passed = (positions[max(0, i - step + 1) : i + 1] for i in starts)
+    return [replace(them[-1], is_joined=all(one.is_joined for one in them)) for them in passed]
 
 
 def kept_of(

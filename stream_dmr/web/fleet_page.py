@@ -1,4 +1,4 @@
-"""One page about all boxes of a fleet, asked one by one."""
+"""One page about all boxes of a fleet, asked one by one, or told by their digests."""
 
 import json
 import time
@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from dataclasses import dataclass, field, replace
+from datetime import UTC, date, datetime, timedelta
 from functools import partial
 from http import HTTPStatus
 from http.client import HTTPConnection, HTTPException, HTTPSConnection
@@ -17,11 +17,14 @@ from threading import Timer
 from typing import Annotated, Any
 from urllib.error import HTTPError
 from urllib.parse import parse_qs, urlsplit
+from urllib.request import url2pathname
 
 from prometheus_client.parser import text_string_to_metric_families
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from stream_dmr.errors import ConfigError, OutputError, reason_of
+from stream_dmr.errors import ConfigError, OutputError, UserError, reason_of
+from stream_dmr.evidence.digest_file import read_digest
+from stream_dmr.evidence.own_files import is_made_by
 from stream_dmr.files import read_text, replacing
 from stream_dmr.web.pages import render
 
@@ -31,6 +34,7 @@ _MAX_AT_ONCE = 16
 _MAX_ALARM_CHARACTERS = 300
 _MAX_WARNINGS = 5  # shown of each box, the latest
 _WARNING_AGE_S = 86_400.0  # older ones are history
+_MAX_DIGEST_AGE = timedelta(days=2)  # that of yesterday comes today
 
 
 _WORDS = {"healthy": "measures", "unhealthy": "has a problem", "silent": "does not answer"}
@@ -40,7 +44,10 @@ _ORDER = tuple(reversed(_WORDS))  # what needs a look comes first
 
 @dataclass(frozen=True, kw_only=True)
 class Box:
-    """A box: its status page's address, which ends in "/", and the token that it asks for."""
+    """A box: its status page's address, which ends in "/", and the token that it asks for.
+
+    Or the address of a digest, or of the folder that gets its digests, with file://.
+    """
 
     name: str
     address: str
@@ -57,7 +64,7 @@ class BoxReading(BaseModel):
     warnings: Annotated[tuple[str, ...], Field(strict=False)]
     num_fish: int = Field(ge=0)
     fish_per_hour: float = Field(ge=0)
-    frames_per_s: float = Field(ge=0)
+    frames_per_s: float | None = Field(default=None, ge=0)  # None: of a digest
     disk_free_bytes: int = Field(ge=0)
     last_frame_age_s: float | None = None  # None: its source is no camera
 
@@ -100,12 +107,14 @@ class BoxState:
 def load_boxes(given: Sequence[str]) -> list[Box]:
     """The boxes of addresses, and of files with one `NAME ADDRESS` or `ADDRESS` a line.
 
-    An address is that of a status page, with `?token=...` where it asks for one; # begins a
-    comment. Raises ConfigError for files and addresses that can't be used, and doubled ones.
+    An address is that of a status page, with `?token=...` where it asks for one, a digest or a
+    folder of digests; # begins a comment. Raises ConfigError for files and addresses that can't be
+    used, and doubled ones.
     """
     boxes = list[Box]()
     for one in given:
-        boxes += [_box(one, where=one)] if "://" in one else _read_file(Path(one))
+        is_address = "://" in one or _has_digests(one)
+        boxes += [_box(one, where=one)] if is_address else _read_file(Path(one))
     for number, box in enumerate(boxes):
         if any(box.address == other.address for other in boxes[:number]):
             raise ConfigError(f"{box.address}: expected each box once, got it twice; remove one")
@@ -119,7 +128,8 @@ def _read_file(path: Path) -> list[Box]:
         lines = read_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(
-            f"{path}: expected http://HOST:PORT/ or a file with such lines, got: {reason_of(error)}"
+            f"{path}: expected http://HOST:PORT/, a digest or a file with such lines, got: "
+            f"{reason_of(error)}"
         ) from error
     boxes = list[Box]()
     for number, line in enumerate(lines, start=1):
@@ -129,7 +139,14 @@ def _read_file(path: Path) -> list[Box]:
     return boxes
 
 
+def _has_digests(text: str) -> bool:
+    return "://" not in text and (Path(text).is_dir() or is_made_by("digest")(Path(text)))
+
+
 def _box(text: str, *, where: str, name: str = "") -> Box:
+    if _has_digests(text):
+        path = Path(text).resolve()
+        return Box(name=name or path.name, address=path.as_uri())
     expected = f"{where}: expected the address of a status page, such as http://10.0.0.7:8480/"
     try:
         parts = urlsplit(text)
@@ -155,15 +172,34 @@ def ask_all(states: Iterable[BoxState], *, timeout_s: float = _TIMEOUT_S) -> lis
 def _ask(before: BoxState, *, timeout_s: float) -> BoxState:
     box, until_s = before.box, time.monotonic() + timeout_s
     try:
+        if box.address.startswith("file:"):
+            return _told_by_digest(before)
         health = json.loads(_get(box, "health", until_s))
         reading = _reading(health, _values(_get(box, "metrics", until_s).decode()))
-    except (KeyError, TypeError, ValueError, ValidationError, RecursionError):
+    except (KeyError, TypeError, ValueError, OverflowError, ValidationError, RecursionError):
         error = "something answers there that is no stream-dmr run, or one of another version"
+    except UserError as failure:
+        error = str(failure)
     except (OSError, HTTPException) as failure:
         error = _failure(failure)
     else:
         return BoxState(box=box, contact_ns=time.time_ns(), reading=reading)
     return BoxState(box=box, contact_ns=before.contact_ns, reading=before.reading, error=error)
+
+
+def _told_by_digest(before: BoxState) -> BoxState:
+    """The state by the last digest; a box whose last one is old is silent."""
+    path = Path(url2pathname(urlsplit(before.box.address).path))
+    last = max(path.glob("digest-*.zip"), default=None) if path.is_dir() else path
+    if last is None or (digest := read_digest(last)) is None:
+        return replace(before, error="no digest has come")
+    age = datetime.now(UTC).date() - date.fromisoformat(digest["day"])
+    return BoxState(
+        box=before.box,
+        contact_ns=max(0, min(int(digest["made_ns"]), time.time_ns())),
+        reading=BoxReading.model_validate(digest["box"]),
+        error=f"its last digest is of {digest['day']}" if age > _MAX_DIGEST_AGE else "",
+    )
 
 
 def _failure(failure: Exception) -> str:

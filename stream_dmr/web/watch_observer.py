@@ -13,11 +13,13 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
+from pathlib import Path
 from typing import Any
 
 from stream_dmr.messages import LengthEstimate, Message
 from stream_dmr.pipeline.chain import Chain
 from stream_dmr.pipeline.run_observer import OpenRun, RunObserver
+from stream_dmr.store.ledger import Signer
 from stream_dmr.store.scale_checks import ScaleAlarm
 from stream_dmr.web.alerts import AlertSender
 from stream_dmr.web.run_state import RunState
@@ -189,6 +191,20 @@ class WatchObserver(RunObserver):
                 alerts, run=run.out.resolve().name, problems=state.problems, on_notice=self.warn
             )
             self._opened.enter_context(closing(sender))
+        if run.config.digest.folder and run.source.is_endless:
+            from stream_dmr.web.day_digest import DailyDigests  # with the views of a report
+
+            # Clips may be measured long after they were filmed.
+            now_ns = time.time_ns if run.source.is_live else lambda: run.store.last_ns
+            folder, signer, problems = (
+                Path(run.config.digest.folder),
+                Signer(run.key),
+                state.problems,
+            )
+            digests = DailyDigests(
+                folder, run.store, signer, now_ns, problems=problems, on_notice=self.warn
+            )
+            self._opened.enter_context(closing(digests))
         self._opened.enter_context(closing(SystemdWatchdog(lambda: not state.is_stuck())))
         self._state = state
 

@@ -1,0 +1,261 @@
+"""Digests: one small signed file for each day of a run, which goes ashore over a thin link."""
+
+import shutil
+import threading
+import time
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from datetime import date, timedelta
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from stream_dmr.errors import OutputError, RecordingError, UserError
+from stream_dmr.evidence.digest_file import ENTRY_BYTES, pack
+from stream_dmr.evidence.own_files import is_made_by, require_writable
+from stream_dmr.export.agency_tables import haul_row
+from stream_dmr.files import make_folder, replacing, sha256_of, sha256_of_files
+from stream_dmr.messages import Frame
+from stream_dmr.recording.reading import files_of, messages_of, open_recordings
+from stream_dmr.recording.selection import Selection
+from stream_dmr.store.effort import read_effort
+from stream_dmr.store.fish import Fish, read_measured_fish, read_runs
+from stream_dmr.store.ledger import Signer, read_chain
+from stream_dmr.store.length_store import LengthStore
+from stream_dmr.store.scale_checks import last_checks
+from stream_dmr.store.schema import EVENTS, FISH, WATCHED, flags_in_status, read_rows, reading
+from stream_dmr.store.schema import NAME as DATABASE
+from stream_dmr.store.trip import Haul, VesselTrack, read_positions, thinned
+from stream_dmr.tables import utc_text
+from stream_dmr.version import __version__
+from stream_dmr.web.views import draw_views, read_tracks
+
+MAX_BYTES = 50_000
+# Chosen, so that 500 fish leave room for pictures.
+_MAX_POSITIONS, _MAX_EVENTS, _MAX_RECORDINGS, _MAX_WARNINGS, _MAX_TEXT = 288, 48, 96, 5, 200
+_PICTURE_PX, _WEBP_QUALITY = 64, 50
+FISH_COLUMNS = ("id", "utc", "length_mm", "low_mm", "high_mm", "species", "status", "haul", "fate")
+_WRITTEN = "digest"  # the kind of event by which a run notes that it wrote one
+_DAY_NS, _EPOCH = 86_400_000_000_000, date(1970, 1, 1)
+_SETTLE_NS = 600_000_000_000  # after a day's end: a row of `watched` takes five minutes
+_LOOK_S, _NEVER = 300.0, threading.Event()
+
+
+def digest_name(day: date) -> str:
+    return f"digest-{day}.zip"
+
+
+def write_digest(
+    folder: Path,
+    day: date,
+    out: Path,
+    signer: Signer,
+    *,
+    problems: Sequence[str] = (),
+    stop: threading.Event = _NEVER,
+) -> int:
+    """Write the digest of a UTC day: of the fish whose tracks ended on it, as they were measured.
+
+    `problems`: of the run, now. `stop`: leaves out the pictures that are not made yet. Returns its
+    bytes, more than MAX_BYTES only for rows of fish. OutputError where nothing is known of the day.
+    """
+    days, zero_ns = _days(folder / DATABASE)
+    if day not in days:
+        known = f"{min(days)} to {max(days)}" if days else "none so far"
+        raise OutputError(f"{folder}: expected a day (UTC) of its runs, {known}, got {day}")
+    began_ns = (day - _EPOCH).days * _DAY_NS - zero_ns
+    span = Haul(name="", began_ns=began_ns, ended_ns=began_ns + _DAY_NS)
+    fish = read_measured_fish(folder / DATABASE)
+    fish = [one for one in fish if span.includes(one.estimate.last_timestamp_ns)]
+    content = _content(folder / DATABASE, span, fish, zero_ns, problems)
+    content["box"]["num_fish"] = days.total()
+    recordings = _recordings(folder, span)
+    content["recordings"] = grouped_sums([path for _, path in recordings])
+    pictures, room = dict[str, bytes](), MAX_BYTES - len(pack(content, {}, signer))
+    for name, picture in _pictures(fish, recordings, stop) if room > 0 else ():
+        room -= len(picture) + ENTRY_BYTES + 2 * len(name)
+        if room < 0:
+            break
+        pictures[name] = picture
+    with replacing(out) as draft:
+        return draft.write_bytes(pack(content, pictures, signer))
+
+
+def _days(database: Path) -> tuple[Counter[date], int]:
+    """The number of fish of each UTC day that was watched; what gives UTC of capture times, ns."""
+    zeros, found = [one.utc_zero_ns for one in read_runs(database).values()], Counter[date]()
+    if not zeros or (zero_ns := zeros[-1]) is None:
+        raise OutputError(
+            f"{database.parent}: expected a run that knows the time of day, got one that does not; "
+            "measure with --start-utc"
+        )
+    for table, column, count in ((WATCHED, "last_ns", 0), (FISH, "last_timestamp_ns", 1)):
+        for row in read_rows(database, table):
+            found[_day_of(row[column] + zero_ns)] += count
+    return found, zero_ns
+
+
+def _day_of(utc_ns: int) -> date:
+    return _EPOCH + timedelta(days=utc_ns // _DAY_NS)
+
+
+def _content(
+    database: Path, span: Haul, fish: Sequence[Fish], zero_ns: int, problems: Sequence[str]
+) -> dict[str, Any]:
+    """What lengths.db has of a day."""
+    facts, efforts = [*read_runs(database).values()][-1], read_effort(database, fish, span=span)
+    hours = sum(one.hours_watched for one in efforts)
+    if (scale := last_checks(database).get(facts.calibration_sha256)) and scale.alarm:
+        problems = list(dict.fromkeys([*problems, scale.alarm]))
+    track = VesselTrack(p for p in read_positions(database) if span.includes(p.timestamp_ns))
+    events = [
+        [utc_text(row["timestamp_ns"] + zero_ns), row["kind"], row["text"][:_MAX_TEXT]]
+        for row in read_rows(database, EVENTS)
+        if span.includes(row["timestamp_ns"]) and row["kind"] != _WRITTEN
+    ]
+    flags = Counter(flag[:_MAX_TEXT] for one in fish for flag in one.flags)
+    warnings = [f"{count} fish: {flag}" for flag, count in flags.most_common(_MAX_WARNINGS)]
+    with reading(database) as connection:
+        chain = [[last.number, last.sha256] for last in read_chain(connection)[-1:]]
+    return {
+        **{"day": str(_day_of(span.began_ns + zero_ns)), "made_ns": time.time_ns()},
+        **{"vessel": facts.vessel, "trip": facts.trip, "software_version": __version__},
+        "box": {  # as a `BoxReading`
+            "is_healthy": not problems,
+            "problems": problems,
+            "warnings": [*warnings, *(text for *_, text in events[-_MAX_WARNINGS:])],
+            "fish_per_hour": len(fish) / hours if hours else 0.0,
+            "disk_free_bytes": shutil.disk_usage(database.parent).free,
+        },
+        "chain": chain,  # number and SHA-256 of its last entry
+        "hours_watched": round(hours, 4),
+        "hauls": [
+            haul_row(e, utc_zero_ns=zero_ns) for e in efforts if e.hours_watched or e.num_fish
+        ],
+        "events": events[-_MAX_EVENTS:],
+        "positions": [
+            [
+                utc_text(p.timestamp_ns + zero_ns),
+                f"{p.latitude:.5f}",
+                f"{p.longitude:.5f}",
+                p.is_joined,
+            ]
+            for p in thinned(track.positions, most=_MAX_POSITIONS)
+        ],
+        "fish": [FISH_COLUMNS, *map(_fish_row, fish)],
+    }
+
+
+def _fish_row(fish: Fish) -> list[object]:
+    estimate, interval = fish.estimate, fish.estimate.ci95_mm
+    lengths = [estimate.length_mm, *((None, None) if interval is None else interval.tolist())]
+    return [
+        *(estimate.track_id, utc_text(fish.utc_ns)),
+        *(None if length is None else round(length, 1) for length in lengths),
+        *(fish.species_code, estimate.status + flags_in_status(fish.flags), fish.haul, fish.fate),
+    ]
+
+
+def _recordings(folder: Path, span: Haul) -> list[tuple[int, Path]]:
+    """The closed recordings that began in a time, each after the time of its first frame."""
+    files, found = list[Path](), list[tuple[int, Path]]()
+    with suppress(RecordingError):
+        files = [path for path in files_of(folder) if path.suffix in (".mcap", ".rrd")]
+    for path in reversed(files):
+        with suppress(RecordingError):
+            first = next(messages_of(open_recordings([path]), Frame), None)
+            if first is not None and span.includes(first.timestamp_ns):
+                found.append((first.timestamp_ns, path))
+            elif first is not None and first.timestamp_ns < span.began_ns:
+                break  # months of segments lie before it
+    return found[::-1]
+
+
+def grouped_sums(paths: Sequence[Path], *, most: int = _MAX_RECORDINGS) -> list[list[str]]:
+    """Name and SHA-256 of each file; of more than `most` first name, last name and one of a group.
+
+    That of a group is of what `sha256sum` prints of its files.
+    """
+    size = max(1, -(-len(paths) // most))
+    if size == 1:
+        return [[path.name, sha256_of(path)] for path in paths]
+    groups = (paths[first : first + size] for first in range(0, len(paths), size))
+    return [[group[0].name, group[-1].name, sha256_of_files(group)] for group in groups]
+
+
+def _pictures(
+    fish: Sequence[Fish], recordings: Sequence[tuple[int, Path]], stop: threading.Event
+) -> Iterator[tuple[str, bytes]]:
+    """Name and WebP of each fish that a recording shows, by its best frame; the best fits first."""
+    for one in sorted(fish, key=lambda one: -(one.iou or 0.0)):
+        track_id = one.estimate.track_id
+        index = bisect_right(recordings, one.middle_ns, key=lambda recording: recording[0])
+        with suppress(UserError):  # a damaged recording
+            if stop.is_set() or not index:
+                continue  # index 0: in a recording that began the day before
+            recording = open_recordings([recordings[index - 1][1]])
+            selection = Selection(tracks=frozenset([track_id]))
+            tracks = read_tracks(recording, selection=selection, max_views=1)
+            for view in draw_views(tracks, recording).get(track_id, []):
+                large = cv2.imdecode(np.frombuffer(view.picture, np.uint8), cv2.IMREAD_COLOR)
+                assert large is not None  # it was just encoded
+                small = cv2.resize(large, (_PICTURE_PX,) * 2, interpolation=cv2.INTER_AREA)
+                webp = cv2.imencode(".webp", small, [cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY])[1]
+                yield f"pictures/{track_id}.webp", webp.tobytes()
+
+
+class DailyDigests:
+    """Writes the digest of each day of a run when it is over, in a thread of its own.
+
+    What was written is an event in lengths.db, so that neither an emptied folder nor a restart nor
+    days without power lose a day or repeat one. A day is written again, by the same name, only if
+    a fish of it came later, such as one that a crash interrupted.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        store: LengthStore,
+        signer: Signer,
+        now_ns: Callable[[], int],
+        *,
+        problems: Callable[[], Sequence[str]],
+        on_notice: Callable[[str], None],
+    ) -> None:
+        """`now_ns`: up to which time, since 1970, all is measured. `problems`: of the run."""
+        self._folder, self._store, self._signer = folder, store, signer
+        self._now_ns, self._problems, self._on_notice = now_ns, problems, on_notice
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="digests", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop, once what is being written is noted. Idempotent."""
+        self._ended.set()
+        self._thread.join()
+
+    def write_due(self) -> None:
+        """Write what is missing of the days that are over. Raises OutputError."""
+        out, today = self._store.path.parent, _day_of(self._now_ns() - _SETTLE_NS)
+        events = read_rows(self._store.path, EVENTS)
+        told = {row["text"] for row in events if row["kind"] == _WRITTEN}
+        for day, count in sorted(_days(self._store.path)[0].items()):
+            path, text = self._folder / digest_name(day), f"digest of {day}: {count} fish"
+            if day >= today or text in told or self._ended.is_set():
+                continue
+            make_folder(self._folder)
+            require_writable(path, is_own=is_made_by("digest"))
+            problems = self._problems() if day == today - timedelta(days=1) else ()
+            write_digest(out, day, path, self._signer, problems=problems, stop=self._ended)
+            self._store.note(_WRITTEN, text, timestamp_ns=self._store.last_ns)
+
+    def _watch(self) -> None:
+        while not self._ended.wait(_LOOK_S):
+            try:
+                self.write_due()
+            except Exception as error:  # measuring goes on
+                self._on_notice(f"[digest] could not be written, tried again later: {error}")
