@@ -1,4 +1,4 @@
-"""DMR: ours, through the nodes of the chain; and ours as the paper wrote it."""
+"""DMR: ours, through the nodes of the chain, by one camera and two; and as the paper wrote it."""
 
 from collections.abc import Iterable, Sequence
 
@@ -9,11 +9,13 @@ from stream_dmr.evaluation.length_tables import LengthRow
 from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish, Message
 from stream_dmr.pipeline.chain import Node
-from stream_dmr.pipeline.config import Config
+from stream_dmr.pipeline.combine import LocalizeByTwo, Pairing, tracks_of
+from stream_dmr.pipeline.config import Config, by_two_cameras
 from stream_dmr.pipeline.session import Session, Setup
 from stream_dmr.template.template import Template
 
 ROWS = ("dmr", "dmr-flat")
+TWO_ROWS = ("dmr-two",)
 PAPER_ROWS = ("paper", "paper-flat")
 PAPER_FRAMES = 2  # of each fish: Adam takes a hundred times as long as ours
 _PAPER = {"fit_mesh": {"deformation": "linear-blend", "solver": "adam"}}
@@ -33,6 +35,30 @@ class Dmr:
             estimates = [m for m in nodes if isinstance(m, LengthEstimate) and m.is_final]
             measured[row] = {estimate.track_id: _row(estimate) for estimate in estimates}
         return measured
+
+
+class ByTwo:
+    """The default settings by the two cameras that stereo has, as `stream-dmr combine` does it."""
+
+    def __init__(self, template: Template) -> None:
+        self._template = template
+
+    def measure(self, filmed: FilmedScene) -> dict[str, dict[int, LengthRow]]:
+        """Lengths by row and track id; a fish that one camera saw is measured by that one."""
+        assert filmed.second is not None, "film it by both cameras"
+        sightings = [sighting for frame in filmed.frames for sighting in frame]
+        config = by_two_cameras(Config())
+        ours, theirs = (
+            Session(Setup(config=config, template=self._template, calibration=calibration)).nodes
+            for calibration in (filmed.calibration, filmed.second)
+        )
+        located = through_all([one.other for one in sightings if one.other], theirs[:2])
+        seen = tracks_of((m for m in located if isinstance(m, LocalizedFish)), filmed.second)
+        pairing = Pairing(ids={track_id: track_id for track_id in seen}, offset_s=0.0, apart=0.0)
+        by_two = LocalizeByTwo(config.localize, filmed.calibration, seen, filmed.second, pairing)
+        said = through_all([one.crop for one in sightings], [ours[0], by_two, ours[2]])
+        final = [m for m in said if isinstance(m, LengthEstimate) and m.is_final]
+        return {TWO_ROWS[0]: {estimate.track_id: _row(estimate) for estimate in final}}
 
 
 class Paper:

@@ -36,6 +36,7 @@ class Sighting(NamedTuple):
 
     crop: FishCrop  # by the first camera, as the chain crops it
     pair: tuple[FishCrop, FishCrop] | None  # by both, larger; None where the second saw nothing
+    other: FishCrop | None = None  # by the second camera, as the chain crops it
 
 
 class FilmedScene(NamedTuple):
@@ -44,6 +45,7 @@ class FilmedScene(NamedTuple):
     calibration: Calibration  # of the first camera
     truth_mm: dict[int, float]  # by track id
     frames: list[list[Sighting]]
+    second: Calibration | None = None
 
 
 def table_scene(index: int) -> RailScene:
@@ -66,6 +68,7 @@ def film_passages(scene: RailScene, *, with_second: bool) -> FilmedScene:
         shots = ((shot, None) for shot in film(scene))
     return FilmedScene(
         calibration=first,
+        second=second.calibration,
         truth_mm={visit.fish.track_id: visit.fish.length_mm for visit in scene.visits},
         frames=[list(_sightings(*pair, first, second.calibration)) for pair in shots],
     )
@@ -89,11 +92,12 @@ def _sightings(
         yield from (Sighting(_seen(crop), None) for crop in ours.values())
         return
     lefts, rights = dict(_crops(left, first, _STEREO)), dict(_crops(right, second, _STEREO))
+    theirs = dict(chain_crops(right, second))
     for track_id, crop in ours.items():
-        both = None
+        both, other = None, None
         if track_id in rights:
-            both = _seen(lefts[track_id]), _seen(rights[track_id])
-        yield Sighting(_seen(crop), both)
+            both, other = (_seen(lefts[track_id]), _seen(rights[track_id])), theirs[track_id]
+        yield Sighting(_seen(crop), both, None if other is None else _seen(other))
 
 
 def _seen(crop: FishCrop) -> FishCrop:

@@ -7,14 +7,14 @@ from pathlib import Path
 from benchmarks.fit_speed.targets import species_template
 from benchmarks.table1 import cached_results, stereo
 from benchmarks.table1.bfs import BruteForce
-from benchmarks.table1.dmr import Dmr, Paper
+from benchmarks.table1.dmr import ByTwo, Dmr, Paper
 from benchmarks.table1.filmed_scene import FilmedScene, film_passages, table_scene
 from benchmarks.table1.monopose import MonoPose
 from benchmarks.table1.plate import Plate
 from benchmarks.table1.silhouettes import open_database
 from stream_dmr.evaluation.length_tables import LengthRow
 
-METHODS = ("stereo", "monopose", "bfs", "dmr", "paper")
+METHODS = ("stereo", "monopose", "bfs", "dmr", "two", "paper")
 LOG2_DATABASE = 20  # a million entries
 
 Measure = Callable[[FilmedScene], dict[str, dict[int, LengthRow]]]
@@ -23,7 +23,7 @@ Measure = Callable[[FilmedScene], dict[str, dict[int, LengthRow]]]
 def measure_scene(task: tuple[int, list[str], Path]) -> int:
     """Film one scene, measure it by these methods, keep what they say; the scene's number."""
     scene, methods, cache = task
-    filmed = film_passages(table_scene(scene), with_second="stereo" in methods)
+    filmed = film_passages(table_scene(scene), with_second=bool({"stereo", "two"} & {*methods}))
     for method in methods:
         measured = make_method(method, cache)(filmed)
         cached_results.save(method, scene, filmed.truth_mm, measured, cache=cache)
@@ -44,6 +44,8 @@ def make_method(method: str, cache: Path, log2_database: int = LOG2_DATABASE) ->
             return BruteForce(template, database).measure
         case "dmr":
             return Dmr(template).measure
+        case "two":
+            return ByTwo(template).measure
         case "paper":
             return Paper(template).measure
     raise ValueError(f"expected one of {', '.join(METHODS)}, got {method}")

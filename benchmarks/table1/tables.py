@@ -22,6 +22,7 @@ TITLES = {
     "paper-flat": "DMR as the paper wrote it, without bending",
     "paper": "DMR as the paper wrote it",
     "dmr": "**DMR (ours)**",
+    "dmr-two": "**DMR by the two cameras of stereo (ours)**",
 }
 _PLOTTED = ("stereo", "monopose", "bfs", "dmr")
 _HEADER = """\

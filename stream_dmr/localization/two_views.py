@@ -23,11 +23,15 @@ _STATIONS = 17
 # Std of a midline in a picture, over its length there: across the body; along it at the ends, whose
 # place is seen, and between them, where a turned body is foreshortened unevenly.
 _ACROSS, _ALONG_ENDS, _ALONG = 0.003, 0.005, 0.1
-# Of the ends at an IoU of 0.9, in any direction; it falls with the cube of what is missing.
-_MISFIT_STD = 0.03
+# Of the ends at an IoU of 0.9, in any direction; it falls with the cube of what is missing. And
+# the share of it that the midline between the ends is off, across the body.
+_MISFIT_STD, _ACROSS_SHARE = 0.03, 0.2
 _SHORT = 0.7  # stds by which a picture may be short at both ends before they weigh less
 _DOUBT = 0.8  # misfit that adds as much to the length's std as the two pictures' errors
 _RIDGE_STD = 1.0  # of the curve's coefficients, over the length, but for place and direction
+# The same along the first camera's line of sight, which cameras that stand close together hardly
+# see: fish slant by some 17 degrees, and bend in depth as they do across it. Chosen.
+_DEPTH_STDS = (0.15, 0.1, 0.05, 0.03)
 _ROUNDS = 10
 _STEP, _SETTLED = 1e-4, 1e-5  # of a numerical slope, of the last round; over the length
 
@@ -84,6 +88,8 @@ def place_between(views: tuple[View, View], start_mm: Float[np.ndarray, "M 3"]) 
     targets = [_weights(view) for view in views]
     good = [_weights(view._replace(iou=1.0)) for view in views]
     ridge = np.repeat((np.arange(_DEGREE + 1) > 1) / (_RIDGE_STD * scale), 3)
+    sight = start.mean(axis=0) / np.linalg.norm(start.mean(axis=0))
+    depths = np.kron(np.diag(1 / (np.array([np.inf, *_DEPTH_STDS]) * scale)), sight)
 
     def misses(x: Float[np.ndarray, "C"], given: list[_Target]) -> Float[np.ndarray, "2 S 2"]:
         curve = basis @ x.reshape(-1, 3)
@@ -95,7 +101,7 @@ def place_between(views: tuple[View, View], start_mm: Float[np.ndarray, "M 3"]) 
         )
 
     def residuals(x: Float[np.ndarray, "C"]) -> Float[np.ndarray, "R"]:
-        return np.concatenate([(trust * misses(x, targets)).ravel(), ridge * x])
+        return np.concatenate([(trust * misses(x, targets)).ravel(), ridge * x, depths @ x])
 
     shifts = _STEP * scale * np.eye(coefficients.size)
 
@@ -147,5 +153,6 @@ def _weights(view: View) -> _Target:
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)
     stds = np.full((_STATIONS, 2, 1), [[_ALONG], [_ACROSS]])
     misfit_std = _MISFIT_STD * ((1 - view.iou) / 0.1) ** 3
+    stds[:, 1] = np.hypot(_ACROSS, _ACROSS_SHARE * misfit_std)
     stds[[0, -1]] = np.hypot([[_ALONG_ENDS], [_ACROSS]], misfit_std)
     return line, np.stack([along, across], axis=1) / stds / length_px
