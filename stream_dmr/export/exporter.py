@@ -30,7 +30,6 @@ from stream_dmr.messages import FishCrop, FittedMesh, Frame, LengthEstimate, Loc
 from stream_dmr.recording.codec import stored_picture
 from stream_dmr.recording.reading import (
     decoded_messages,
-    known_shapes,
     messages_of,
     require_messages,
     require_time,
@@ -105,13 +104,13 @@ class Export:
         long.
         """
         self._require_writable(needed_for="--meshes")
-        template, count = self.header.template, 0
-        restored = MeshRebuilder(template, known_shapes(self.recording))
+        faces, count = self.header.template.faces, 0
+        restored = MeshRebuilder.of(self.recording)
         for fit, fish in self._localized(FittedMesh):
             shape = restored.with_vertices(fit).shape
             vertices = None if shape is None else place_fit(shape, fish)[0]
             if vertices is not None:
-                mesh = trimesh.Trimesh(vertices, template.faces, process=False)
+                mesh = trimesh.Trimesh(vertices, faces, process=False)
                 target = out / f"fish-{fit.track_id}" / f"{fit.frame_index:06d}.{format}"
                 self._require_writable(target)
                 with self._writing(target):

@@ -43,7 +43,6 @@ from stream_dmr.recording.header import REPRODUCIBLE_BY, RunHeader, SecondCamera
 from stream_dmr.recording.reading import (
     Recording,
     decoded_messages,
-    known_shapes,
     open_recordings,
     require_messages,
     require_selected,
@@ -384,7 +383,7 @@ def _open_whole(
     recording: Recording, inputs: ReplayInputs, second: _SecondRun | None, stack: ExitStack
 ) -> WholeRecords:
     """Pictures are those of the sources of two cameras, since their view is made here first."""
-    meshes = MeshRebuilder(recording.header.template, known_shapes(recording))
+    meshes = MeshRebuilder.of(recording)
     if second is None:
         return WholeRecords(meshes)
     pictures, others = None, None

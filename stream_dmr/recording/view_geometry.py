@@ -17,6 +17,7 @@ from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.fitting.solver.spine import KINDS, deform
 from stream_dmr.geometry import arc_length, arc_lengths
 from stream_dmr.messages import FishCrop, FittedMesh, FittedShape, Frame, LocalizedFish
+from stream_dmr.recording.reading import Recording, known_shapes
 from stream_dmr.template.template import Template
 
 T = TypeVar("T")
@@ -65,6 +66,10 @@ class PendingItems(Generic[T]):
 
 class MeshRebuilder:
     """Deforms the template of a recording, or its candidate shapes, by recorded parameters."""
+
+    @classmethod
+    def of(cls, recording: Recording) -> "MeshRebuilder":
+        return cls(recording.header.template, known_shapes(recording))
 
     def __init__(self, template: Template, candidates: CandidateShapes | None) -> None:
         shapes = [reshaped(template, c.coefficients) for c in candidates or ()]

@@ -27,7 +27,6 @@ from stream_dmr.recording.frame_images import FrameLookup, RecordedPictures, ope
 from stream_dmr.recording.reading import (
     Recording,
     decoded_messages,
-    known_shapes,
     recorded_settings,
 )
 from stream_dmr.recording.selection import EVERYTHING, Selection
@@ -313,7 +312,7 @@ def draw_views(
     if path is not None and Path(path).is_file():
         with closing(FrameLookup(recording, path)) as found:
             return draw_views(tracks, recording, pictures=found)
-    meshes = MeshRebuilder(recording.header.template, known_shapes(recording))
+    meshes = MeshRebuilder.of(recording)
     waiting: defaultdict[int, list[tuple[int, RecordedView]]] = defaultdict(list)
     for track_id, track in tracks.items():
         for view in track.views:

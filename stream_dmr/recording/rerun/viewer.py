@@ -20,7 +20,6 @@ from stream_dmr.files import make_folder, replacing, writing_to
 from stream_dmr.recording.frame_images import FrameRestorer, RecordedPictures
 from stream_dmr.recording.reading import (
     decoded_messages,
-    known_shapes,
     open_recordings,
     require_messages,
     require_selected,
@@ -154,13 +153,11 @@ def convert(
     opened = open_recordings([recording])
     require_messages(opened)
     require_selected(opened, selection)
-    meshes = MeshRebuilder(opened.header.template, known_shapes(opened))
-    pictures = source or RecordedPictures(opened, selection)
     second = opened.header.second
     later = selection.shifted(0 if second is None else second.offset_ns)
     records = WholeRecords(
-        meshes,
-        pictures,
+        MeshRebuilder.of(opened),
+        source or RecordedPictures(opened, selection),
         second=second,
         of_second=decoded_messages(opened, [*SECOND_TOPICS], later, of=SECOND_TOPICS),
         second_pictures=second_source,
