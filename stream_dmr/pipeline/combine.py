@@ -6,6 +6,7 @@ same moment is placed by both, and the rest as one camera places it.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,14 @@ from stream_dmr.messages import FittedMesh, LocalizedFish
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.pipeline.session import Setup
 from stream_dmr.reasons import Reason
-from stream_dmr.recording.reading import Recording, messages_of
+from stream_dmr.recording.header import SecondCamera
+from stream_dmr.recording.reading import (
+    Recording,
+    decoded_messages,
+    messages_of,
+    open_recordings,
+)
+from stream_dmr.recording.topics import SECOND_TOPICS, TOPICS, Topics
 
 _MOST_APART_S = 0.25  # between two pictures of a fish, for what it is between them to be known
 _MOST_OFFSET_S = 10.0  # of the two cameras' clocks, if nothing says better
@@ -162,7 +170,41 @@ def _apart(
     return apart
 
 
+@dataclass(frozen=True, kw_only=True)
+class SecondRun:
+    """The run of the other camera of two."""
+
+    camera: SecondCamera
+    recording: Recording  # that has its messages
+    topics: Topics  # that they have there
+    node: "LocalizeByTwo | None"  # None if fish are not placed again
+
+
 def open_second(
+    first: Recording, second: Path | None, setup: Setup, observer: RunObserver, *, places_fish: bool
+) -> SecondRun | None:
+    """The run that is combined with the first, or that was; None for a single camera."""
+    camera = first.header.second
+    if second is not None:
+        recording, topics = open_recordings([second]), TOPICS
+        header = recording.header
+    elif camera is not None:
+        recording, topics, header = first, SECOND_TOPICS, camera.header
+    else:
+        return None
+    node = None
+    if places_fish:
+        messages = decoded_messages(recording, [LocalizedFish], of=topics)
+        fish = (message for message, _ in messages if isinstance(message, LocalizedFish))
+        node = _localize_by_two(first, fish, header.calibration, setup, observer)
+        offset_ns = round(node.pairing.offset_s * 1e9)
+        ids = {other: first for first, other in node.pairing.ids.items()}
+        camera = SecondCamera(header=header, offset_ns=offset_ns, ids=ids)
+    assert camera is not None
+    return SecondRun(camera=camera, recording=recording, topics=topics, node=node)
+
+
+def _localize_by_two(
     first: Recording,
     second: Iterable[LocalizedFish],
     other: Calibration | None,

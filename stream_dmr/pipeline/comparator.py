@@ -102,7 +102,10 @@ class MessageComparator:
         self.length_change = 0.0
 
     def compare(self, computed: Message) -> None:
-        """Compare with the recorded message of the same type, frame and fish."""
+        """Compare with the recorded message of the same frame and fish, if its type is compared."""
+        expected = self._expected.get(type(computed))
+        if expected is None:
+            return
         if _track_of(computed) in self._leave_out:
             self.num_left_out += 1
             return
@@ -110,7 +113,6 @@ class MessageComparator:
         if isinstance(computed, LengthEstimate) and computed.is_final:
             self._computed_final[computed.track_id] = computed
             return
-        expected = self._expected[type(computed)]
         recorded = expected.take(computed.frame_index, _track_of(computed))
         if recorded is None:
             self._add_surplus(computed)

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -21,7 +21,7 @@ from stream_dmr.messages import (
 )
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.pipeline.chain import Node, StageCounters, run_chain
-from stream_dmr.pipeline.combine import LocalizeByTwo, open_second
+from stream_dmr.pipeline.combine import LocalizeByTwo, SecondRun, open_second
 from stream_dmr.pipeline.comparator import MessageComparator, Mismatch
 from stream_dmr.pipeline.learn_shapes import save_stocks
 from stream_dmr.pipeline.replay_inputs import ReplayInputs, new_header, read_inputs
@@ -88,32 +88,27 @@ def _is_same(run: RunFacts, expected: RunFacts) -> bool:
     return all(getattr(run, name) == getattr(expected, name) for name in names)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReplayOutputs:
-    """What a replay with --out writes to."""
-
-    recorder: Recorder
-    results: ResultWriter
-    whole: WholeRecords
-
-
 @contextmanager
 def open_replay_outputs(
     request: ReplayOptions,
     out: Path,
-    header: RunHeader,
+    recording: Recording,
     inputs: ReplayInputs,
-    recorded: OriginalRun,
-    whole: WholeRecords,
+    second: SecondCamera | None,
     *,
     stop: threading.Event,
     observer: RunObserver,
-    in_one_thread: bool,
-) -> Generator[ReplayOutputs]:
+) -> Generator[ResultWriter]:
     """Open everything that a replay writes to; it is closed in the reverse order.
 
     Raises OutputError where the folder can't be written to, or holds an earlier run's results.
     """
+    header = new_header(request, recording.header, inputs, second)
+    try:
+        recorded = read_recorded_run(request.recordings, recording.header)
+    except OutputError as error:
+        observer.warn(f"{error}; vessel, trip, haul and flags are not taken over from it")
+        recorded = OriginalRun()
     signer = None if request.key is None else Signer(request.key)
     stocks = None if inputs.candidates is None else inputs.candidates.stocks()
     if stocks is not None:
@@ -139,7 +134,7 @@ def open_replay_outputs(
             header,
             inputs.config.recording,
             sinks=[FramesTable(out)],
-            in_one_thread=in_one_thread,
+            in_one_thread=_is_light(request),
         )
         stack.enter_context(recorder)
         results = ResultWriter(
@@ -152,7 +147,7 @@ def open_replay_outputs(
             on_notice=observer.warn,
         )
         try:
-            yield ReplayOutputs(recorder=recorder, results=results, whole=whole)
+            yield results
         except BaseException as error:
             store.end(f"an error: {error}")
             raise
@@ -179,61 +174,56 @@ class ReplayWriter:
         *,
         recomputed: Sequence[type[Message]],
         settings: RecordingSettings,
-        outputs: ReplayOutputs | None,
-        comparator: MessageComparator | None,
+        results: ResultWriter | None,
+        whole: WholeRecords,
+        comparator: MessageComparator,
     ) -> None:
+        """`results`, None without --out, gets `whole` records of what is not recomputed."""
         self._recorded, self._recomputed, self._settings = recorded, recomputed, settings
-        self._outputs, self._comparator = outputs, comparator
+        self._results, self._whole, self._comparator = results, whole, comparator
         self._positions = recorded.of_type(Position, keep_payloads=False)
-        self._next_position = None if outputs is None else next(self._positions, None)
+        self._next_position = None if results is None else next(self._positions, None)
         self.totals = RunTotals(max_fish=None)
         self.num_frames = 0
 
     def write(self, message: Message) -> Message:
         """Record, compare and count a message; returns it as the next node is to get it."""
         if type(message) in self._recomputed or isinstance(message, TrackEnded):
-            return self._write_recomputed(message)
+            if self._results is not None:
+                message = self._results.write(message)
+            else:
+                message = as_recorded(message, self._settings)
+            self._comparator.compare(message)
+            self.totals.take(message)
+            return message
         payload = self._recorded.payload(message)
         if isinstance(message, Frame):
             self.num_frames += 1
             self.totals.take(message)
-        if self._outputs is not None:
-            self._outputs.results.store(message)
-            for record in self._outputs.whole.of(message, payload):
-                self._outputs.recorder.put(record)
+        if self._results is not None:
+            self._results.store(message)
+            self._results.put(self._whole.of(message, payload))
             if isinstance(message, Frame):
-                self._put_positions(self._outputs, message.frame_index)
+                self._write_positions(self._results, message.frame_index)
         return message
 
     def finish(self) -> None:
         """Record what comes after the last frame: positions, and what a second camera saw."""
-        if self._outputs is not None:
-            for record in self._outputs.whole.rest():
-                self._outputs.recorder.put(record)
-            self._put_positions(self._outputs, None)
+        if self._results is not None:
+            self._results.put(self._whole.rest())
+            self._write_positions(self._results, None)
 
-    def _put_positions(self, outputs: ReplayOutputs, until_frame: int | None) -> None:
+    def _write_positions(self, results: ResultWriter, until_frame: int | None) -> None:
         """Record the positions up to a frame, as they were recorded; None: all that are left."""
         while (position := self._next_position) is not None:
             if until_frame is not None and position.frame_index > until_frame:
                 return
-            outputs.results.write(position)
+            results.write(position)
             self._next_position = next(self._positions, None)
 
     def frame_done(self) -> None:
-        """Take note that a frame has left the last stage."""
-        if self._outputs is not None:
-            self._outputs.results.frame_done()
-
-    def _write_recomputed(self, message: Message) -> Message:
-        if self._outputs is not None:
-            message = self._outputs.results.write(message)
-        else:
-            message = as_recorded(message, self._settings)
-        if self._comparator is not None and not isinstance(message, TrackEnded):
-            self._comparator.compare(message)
-        self.totals.take(message)
-        return message
+        if self._results is not None:
+            self._results.frame_done()
 
 
 # Relative, of lengths, where the last bits are rounded differently: a fit stops at a tolerance of
@@ -280,31 +270,31 @@ def replay(
     recorded = RecordedMessages(recording, request.selection)
     carried_over = _carried_over(request, recorded)
     with ExitStack() as stack:
-        second = _open_second(request, recording, inputs, observer)
+        places_fish = request.first == "localize"
+        second = open_second(recording, request.second, inputs, observer, places_fish=places_fish)
         node = None if second is None else second.node
         frames, session = _open_chain(request, recorded, inputs, recording, node, stack)
         session.continue_tracks(carried_over)
-        outputs = None
+        results, whole = None, WholeRecords(None)
         if request.out is not None:
-            header = new_header(request, recording.header, inputs, second and second.camera)
+            whole = _open_whole(recording, inputs.config.recording, second, stack)
             opening = open_replay_outputs(
                 request,
                 request.out,
-                header,
+                recording,
                 inputs,
-                _recorded_run(request, recording, observer),
-                _open_whole(recording, inputs, second, stack),
+                second and second.camera,
                 stop=stop,
                 observer=observer,
-                in_one_thread=_is_light(request),
             )
-            outputs = stack.enter_context(opening)
+            results = stack.enter_context(opening)
         comparator = _open_comparator(request, recorded, {fish.track_id for fish in carried_over})
         writer = ReplayWriter(
             recorded,
             recomputed=messages_from(request.first),
             settings=inputs.config.recording,
-            outputs=outputs,
+            results=results,
+            whole=whole,
             comparator=comparator,
         )
 
@@ -323,8 +313,7 @@ def replay(
             in_one_thread=_is_light(request),
         )
         writer.finish()
-    if comparator is not None:
-        comparator.finish()
+    comparator.finish()
     for line in (*recording.warnings, *recorded.notes):
         observer.warn(line)
     return ReplaySummary(
@@ -333,12 +322,12 @@ def replay(
         elapsed_s=time.perf_counter() - began,
         recorded_s=writer.totals.recorded_s,
         counters=counters,
-        num_compared=comparator.num_compared if comparator else 0,
-        num_left_out=comparator.num_left_out if comparator else 0,
-        num_beyond=comparator.num_beyond if comparator else 0,
-        mismatches=comparator.mismatches if comparator else [],
+        num_compared=comparator.num_compared,
+        num_left_out=comparator.num_left_out,
+        num_beyond=comparator.num_beyond,
+        mismatches=comparator.mismatches,
         other_versions=_other_versions(recording),
-        length_change=comparator.length_change if comparator else 0.0,
+        length_change=comparator.length_change,
     )
 
 
@@ -347,50 +336,18 @@ def _is_light(request: ReplayOptions) -> bool:
     return FittedMesh not in messages_from(request.first)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _SecondRun:
-    """What the other camera of two recorded."""
-
-    camera: SecondCamera
-    messages: Callable[..., Iterator[tuple[Message, bytes]]]  # of kinds
-    node: LocalizeByTwo | None  # None where fish are not placed again
-
-
-def _open_second(
-    request: ReplayOptions, recording: Recording, inputs: ReplayInputs, observer: RunObserver
-) -> _SecondRun | None:
-    """Another run that is combined with this one, or that was; None for a single camera."""
-    camera = recording.header.second
-    if request.second is not None:
-        other = open_recordings([request.second])
-        header, messages = other.header, partial(decoded_messages, other)
-    elif camera is not None:
-        header, messages = camera.header, partial(decoded_messages, recording, of=SECOND_TOPICS)
-    else:
-        return None
-    node = None
-    if request.first == "localize":
-        fish = (one for one, _ in messages([LocalizedFish]) if isinstance(one, LocalizedFish))
-        node = open_second(recording, fish, header.calibration, inputs, observer)
-        offset_ns = round(node.pairing.offset_s * 1e9)
-        ids = {other: first for first, other in node.pairing.ids.items()}
-        camera = SecondCamera(header=header, offset_ns=offset_ns, ids=ids)
-    assert camera is not None
-    return _SecondRun(camera=camera, messages=messages, node=node)
-
-
 def _open_whole(
-    recording: Recording, inputs: ReplayInputs, second: _SecondRun | None, stack: ExitStack
+    recording: Recording, settings: RecordingSettings, second: SecondRun | None, stack: ExitStack
 ) -> WholeRecords:
     """Pictures are those of the sources of two cameras, since their view is made here first."""
-    meshes = MeshRebuilder.of(recording)
+    meshes = MeshRebuilder.of(recording) if settings.rrd or settings.foxglove else None
     if second is None:
         return WholeRecords(meshes)
     pictures, others = None, None
-    if inputs.config.recording.rrd:
+    if settings.rrd:
         pictures = stack.enter_context(open_recorded_source(recording.header))
         others = stack.enter_context(open_recorded_source(second.camera.header))
-    of_second = second.messages([*SECOND_TOPICS])
+    of_second = decoded_messages(second.recording, [*SECOND_TOPICS], of=second.topics)
     return WholeRecords(
         meshes, pictures, second=second.camera, of_second=of_second, second_pictures=others
     )
@@ -399,16 +356,6 @@ def _open_whole(
 def _other_versions(recording: Recording) -> list[str]:
     here = recording.header.metadata()
     return [name for name in REPRODUCIBLE_BY if recording.metadata.get(name) != here[name]]
-
-
-def _recorded_run(
-    request: ReplayOptions, recording: Recording, observer: RunObserver
-) -> OriginalRun:
-    try:
-        return read_recorded_run(request.recordings, recording.header)
-    except OutputError as error:
-        observer.warn(f"{error}; vessel, trip, haul and flags are not taken over from it")
-        return OriginalRun()
 
 
 def _refuse_impossible(request: ReplayOptions, recording: Recording) -> None:
@@ -476,12 +423,10 @@ def _carried_over(request: ReplayOptions, recorded: RecordedMessages) -> list[Lo
 
 def _open_comparator(
     request: ReplayOptions, recorded: RecordedMessages, carried_over: Collection[int]
-) -> MessageComparator | None:
-    if not request.check:
-        return None
-    # The first fit of a track that was carried over starts from another one than in the run.
-    leave_out = carried_over if FittedMesh in messages_from(request.first) else ()
-    return MessageComparator(recorded, messages_from(request.first), leave_out=leave_out)
+) -> MessageComparator:
+    kinds = messages_from(request.first) if request.check else ()
+    # The first fit of a track that was carried over starts from another fit than in the run.
+    return MessageComparator(recorded, kinds, leave_out=carried_over if FittedMesh in kinds else ())
 
 
 def _open_chain(
@@ -500,10 +445,11 @@ def _open_chain(
         playback: list[Node] = [
             PlaybackNode(recorded, kind, track_timeout_s=timeout_s) for kind in played
         ]
+        first = request.first
         if by_two is not None:
             playback.append(by_two)
-            return recorded.of_type(Frame), Session(inputs, given=playback, first="smooth")
-        return recorded.of_type(Frame), Session(inputs, given=playback, first=request.first)
+            first = "smooth"
+        return recorded.of_type(Frame), Session(inputs, given=playback, first=first)
     restorer = None
     if files.source is not None:
         restorer = stack.enter_context(open_pictures(files.source, config.read_frames))

@@ -1,7 +1,7 @@
 """Write all outputs of a run: recording, database, tables, events."""
 
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -100,9 +100,16 @@ class ResultWriter:
         if payload is None:
             message = self._recorder.write(message)
         else:
-            self._recorder.put(Record.of_payload(message, payload))
-        self.tabulate(message)
+            self.put([Record(message=message, whole=message, encoding=partial(bytes, payload))])
+        if isinstance(message, LengthEstimate) and message.is_final:
+            self._lengths.add(message)
+            self._recorder.states.report("lengths.csv", self._lengths.trouble)
         return message
+
+    def put(self, records: Iterable[Record]) -> None:
+        """Record messages that are encoded already."""
+        for record in records:
+            self._recorder.put(record)
 
     def store(self, message: Message) -> None:
         """Keep what lengths.db holds of a message, before anything else is done with it."""
@@ -130,12 +137,6 @@ class ResultWriter:
             self._on_notice(f"{self._store.path}: {lost}")
         if self._store.trouble:
             self._on_notice(f"{self._store.path}: {self._store.trouble}; lengths wait in memory")
-
-    def tabulate(self, message: Message) -> None:
-        """Append a finished fish to lengths.csv."""
-        if isinstance(message, LengthEstimate) and message.is_final:
-            self._lengths.add(message)
-            self._recorder.states.report("lengths.csv", self._lengths.trouble)
 
     def frame_done(self) -> None:
         """Take note that a frame has left the last stage: its clip is measured so far."""

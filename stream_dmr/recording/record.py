@@ -23,19 +23,6 @@ class Record:
     encoding: Callable[[], bytes]
     is_second: bool = False  # of the second camera of two
 
-    @classmethod
-    def of_payload(
-        cls,
-        message: Message,
-        payload: bytes,
-        *,
-        whole: Message | None = None,
-        is_second: bool = False,
-    ) -> "Record":
-        """A message that was recorded before, with the encoding that it had."""
-        encoding = partial(bytes, payload)
-        return cls(message=message, whole=whole or message, encoding=encoding, is_second=is_second)
-
     @cached_property
     def payload(self) -> bytes:
         """The bytes that `codec.encode` gives."""

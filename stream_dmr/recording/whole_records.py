@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 
 from stream_dmr.messages import FishMessage, FittedMesh, Frame, Message
 from stream_dmr.recording.frame_images import FrameRestorer
@@ -19,14 +20,14 @@ class WholeRecords:
 
     def __init__(
         self,
-        meshes: MeshRebuilder,
+        meshes: MeshRebuilder | None,
         pictures: FrameRestorer | None = None,
         *,
         second: SecondCamera | None = None,
         of_second: Iterable[tuple[Message, bytes]] = (),
         second_pictures: FrameRestorer | None = None,
     ) -> None:
-        """`of_second`: the second camera's messages in their order."""
+        """`meshes`: None if nothing is drawn. `of_second`: the second camera's messages."""
         self._meshes, self._pictures = meshes, pictures
         self._offset_ns = 0 if second is None else second.offset_ns
         self._ids = {} if second is None else second.ids
@@ -46,9 +47,9 @@ class WholeRecords:
             self._last = message
             if self._pictures is not None:
                 whole = self._pictures.restore(message, payload)
-        elif isinstance(message, FittedMesh):
+        elif isinstance(message, FittedMesh) and self._meshes is not None:
             whole = self._meshes.with_vertices(message)
-        yield Record.of_payload(message, payload, whole=whole)
+        yield Record(message=message, whole=whole, encoding=partial(bytes, payload))
 
     def rest(self) -> Iterator[Record]:
         """What is left of the second camera."""
@@ -59,8 +60,12 @@ class WholeRecords:
             message, payload = self._next
             if until_ns is not None and message.timestamp_ns >= until_ns:
                 return
-            whole = self._drawn(message, payload)
-            yield Record.of_payload(message, payload, whole=whole, is_second=True)
+            yield Record(
+                message=message,
+                whole=self._drawn(message, payload),
+                encoding=partial(bytes, payload),
+                is_second=True,
+            )
             self._next = next(self._of_second, None)
 
     def _drawn(self, message: Message, payload: bytes) -> Message:

@@ -20,6 +20,7 @@ from stream_dmr.recording.mcap.mcap_sink import McapSink
 from stream_dmr.recording.reading import Recording, open_recordings
 from stream_dmr.recording.record import make_record
 from stream_dmr.recording.topics import RecordingSettings
+from stream_dmr.recording.whole_records import WholeRecords
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.run_facts import run_facts
 from tests.support.final_estimates import fish
@@ -88,7 +89,12 @@ def test_no_shapes_are_learnt_where_the_settings_have_none(
 def test_recorded_messages_pass_as_they_are_and_are_counted(recording: Recording):
     recorded = RecordedMessages(recording)
     writer = ReplayWriter(
-        recorded, recomputed=[LengthEstimate], settings=SETTINGS, outputs=None, comparator=None
+        recorded,
+        recomputed=[LengthEstimate],
+        settings=SETTINGS,
+        results=None,
+        whole=WholeRecords(None),
+        comparator=MessageComparator(recorded, []),
     )
     for message in of_kinds(recorded, [Frame, LocalizedFish]):
         assert writer.write(message) is message
@@ -103,7 +109,8 @@ def test_recomputed_messages_are_compared_and_final_lengths_kept(recording: Reco
         recorded,
         recomputed=[LengthEstimate],
         settings=SETTINGS,
-        outputs=None,
+        results=None,
+        whole=WholeRecords(None),
         comparator=comparator,
     )
     for message in RecordedMessages(recording).of_type(LengthEstimate):

@@ -30,7 +30,7 @@ def test_the_second_camera_s_frames_go_to_the_nearest_of_the_first():
 
 
 def test_without_a_second_camera_each_message_is_one_record():
-    records = WholeRecords(MeshRebuilder(header().template, None))
+    records = WholeRecords(None)
     made = [[*records.of(message, b"")] for message in run(3)]
     assert all(len(one) == 1 for one in made)
     assert [*records.rest()] == []
