@@ -217,10 +217,6 @@ class ClipFolder(Source):
     def has_clips(self) -> bool:
         return True
 
-    def listen(self, on_notice: Callable[[str], None]) -> None:
-        """Say at once what is wrong with a clip, in the thread that reads, not in `warnings`."""
-        self._on_notice = on_notice
-
     def announce_pauses(self, on_pause: Callable[[], None]) -> None:
         self._on_pause = on_pause
 

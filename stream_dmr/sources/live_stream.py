@@ -132,10 +132,6 @@ class LiveStream(Source):
     def counts(self) -> CameraCounts:
         return self._counts
 
-    def listen(self, on_notice: Callable[[str], None]) -> None:
-        """Call `on_notice` in the receiving thread for losses and returns; few different lines."""
-        self._on_notice = on_notice
-
     def resume(self, point: ResumePoint) -> None:
         """Make all capture times later than those of earlier runs."""
         self._after_ns = point.after_ns

@@ -75,11 +75,12 @@ class Source(ABC):
         """Frames received, passed on and lost so far; None unless the source `is_live`."""
         return None
 
-    def listen(self, on_notice: Callable[[str], None]) -> None:  # noqa: B027, optional
+    def listen(self, on_notice: Callable[[str], None]) -> None:
         """Call `on_notice`, in any thread, with a line for each loss and return of a camera.
 
-        A folder of clips says what is wrong with one.
+        A folder of clips reports what is wrong with a clip, at once and not in `warnings`.
         """
+        self._on_notice = on_notice
 
     def announce_pauses(self, on_pause: Callable[[], None]) -> None:  # noqa: B027, optional
         """Call `on_pause`, in the iterating thread, if clips stay away for longer than usual."""
