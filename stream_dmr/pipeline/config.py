@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
@@ -98,9 +98,6 @@ class WatchSettings(Settings):
     )
 
 
-_MAIL_KEYS = ("mail_to", "mail_from", "mail_server", "mail_password_file")
-
-
 class AlertSettings(Settings):
     """`[alerts]`: who is told when a run becomes unhealthy, and when it is healthy again."""
 
@@ -113,14 +110,6 @@ class AlertSettings(Settings):
         description="file with an address of apprise a line, for mail and some hundred services; "
         '"": none',
     )
-
-    @model_validator(mode="before")
-    @classmethod
-    def leave_out_mail(cls, values: object) -> object:
-        """Recordings of older versions hold keys of mails, which `load_config` refuses if set."""
-        if not isinstance(values, dict):
-            return values
-        return {key: value for key, value in values.items() if key not in _MAIL_KEYS}
 
 
 class DigestSettings(Settings):
@@ -146,72 +135,51 @@ _TYPES: dict[object, str] = {
 _BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 
 
+def _table(kind: type[Settings], description: str) -> Any:  # as pydantic's Field
+    return Field(default_factory=kind, description=description)
+
+
 class Config(Settings):
     """All settings; each table belongs to the node or room of its name."""
 
-    read_frames: ReadFramesSettings = Field(
-        default_factory=ReadFramesSettings, description="from a video, folder or camera to frames"
+    read_frames: ReadFramesSettings = _table(
+        ReadFramesSettings, "from a video, folder or camera to frames"
     )
-    detect_fish: DetectFishSettings = Field(
-        default_factory=DetectFishSettings,
-        description="where fish are in a video that comes without boxes and masks",
+    detect_fish: DetectFishSettings = _table(
+        DetectFishSettings, "where fish are in a video that comes without boxes and masks"
     )
-    track_fish: TrackFishSettings = Field(
-        default_factory=TrackFishSettings,
-        description="from detections to fish with ids, each counted once",
+    track_fish: TrackFishSettings = _table(
+        TrackFishSettings, "from detections to fish with ids, each counted once"
     )
-    crop_fish: CropFishSettings = Field(
-        default_factory=CropFishSettings, description="from frames to one crop and mask per fish"
+    crop_fish: CropFishSettings = _table(
+        CropFishSettings, "from frames to one crop and mask per fish"
     )
-    fit_mesh: FitMeshSettings = Field(
-        default_factory=FitMeshSettings,
-        description="from a crop to the deformed mesh that fills it",
+    fit_mesh: FitMeshSettings = _table(
+        FitMeshSettings, "from a crop to the deformed mesh that fills it"
     )
-    localize: LocalizeSettings = Field(
-        default_factory=LocalizeSettings,
-        description="from the mesh to millimetres, and what counts",
+    localize: LocalizeSettings = _table(
+        LocalizeSettings, "from the mesh to millimetres, and what counts"
     )
-    smooth_length: SmoothLengthSettings = Field(
-        default_factory=SmoothLengthSettings, description="from many frames to one length per fish"
+    smooth_length: SmoothLengthSettings = _table(
+        SmoothLengthSettings, "from many frames to one length per fish"
     )
-    species: SpeciesSettings = Field(
-        default_factory=SpeciesSettings, description="which species a fish is of"
+    species: SpeciesSettings = _table(SpeciesSettings, "which species a fish is of")
+    zones: ZonesSettings = _table(ZonesSettings, "what became of a fish, by where its track ends")
+    sensors: SensorsSettings = _table(SensorsSettings, "positions of `run --nmea`, and their time")
+    hauls: HaulsSettings = _table(HaulsSettings, "when a run begins and ends hauls by itself")
+    train: TrainSettings = _table(TrainSettings, "how `stream-dmr train` trains the U-Net")
+    recording: RecordingSettings = _table(RecordingSettings, "what is recorded, and how exactly")
+    drift: DriftSettings = _table(
+        DriftSettings, "when a live camera raises an alarm: moved, blurred, or fitted worse"
     )
-    zones: ZonesSettings = Field(
-        default_factory=ZonesSettings, description="what became of a fish, by where its track ends"
+    watch: WatchSettings = _table(WatchSettings, "the status page of a run")
+    alerts: AlertSettings = _table(AlertSettings, "who is told of a run that is not well")
+    digest: DigestSettings = _table(DigestSettings, "what goes ashore of each day of a camera")
+    fisheries: FisheriesSettings = _table(
+        FisheriesSettings, "columns of the exports that follow from a length"
     )
-    sensors: SensorsSettings = Field(
-        default_factory=SensorsSettings,
-        description="positions of `run --nmea`, and their time",
-    )
-    hauls: HaulsSettings = Field(
-        default_factory=HaulsSettings, description="when a run begins and ends hauls by itself"
-    )
-    train: TrainSettings = Field(
-        default_factory=TrainSettings, description="how `stream-dmr train` trains the U-Net"
-    )
-    recording: RecordingSettings = Field(
-        default_factory=RecordingSettings, description="what is recorded, and how exactly"
-    )
-    drift: DriftSettings = Field(
-        default_factory=DriftSettings,
-        description="when a live camera raises an alarm: moved, blurred, or fitted worse",
-    )
-    watch: WatchSettings = Field(
-        default_factory=WatchSettings, description="the status page of a run"
-    )
-    alerts: AlertSettings = Field(
-        default_factory=AlertSettings, description="who is told of a run that is not well"
-    )
-    digest: DigestSettings = Field(
-        default_factory=DigestSettings, description="what goes ashore of each day of a camera"
-    )
-    fisheries: FisheriesSettings = Field(
-        default_factory=FisheriesSettings,
-        description="columns of the exports that follow from a length",
-    )
-    evaluate: EvaluateSettings = Field(
-        default_factory=EvaluateSettings, description="how `stream-dmr evaluate` compares lengths"
+    evaluate: EvaluateSettings = _table(
+        EvaluateSettings, "how `stream-dmr evaluate` compares lengths"
     )
 
 
@@ -229,23 +197,34 @@ def load_config(path: Path | str | None) -> Config:
         raise ConfigError(f"{path}: expected a config.toml, got: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: expected TOML in UTF-8, got other bytes") from error
-    config = parse_config(text, where=str(path))
-    if tomllib.loads(text).get("alerts", {}).get("mail_to"):
-        raise ConfigError(
-            f"{path} [alerts]: mail_to is no key any more; expected apprise_file, a file with the "
-            "line mailtos://SERVER:587?user=LOGIN&pass=PASSWORD&from=ADDRESS&to=ADDRESS"
-        )
-    return config
+    return parse_config(text, where=str(path), is_recorded=False)
 
 
-def parse_config(text: str, *, where: str) -> Config:
-    """The settings in the text of a config.toml; raises ConfigErrors that begin with `where`."""
+_MAIL_KEYS = ("mail_to", "mail_from", "mail_server", "mail_password_file")  # of older versions
+
+
+def parse_config(text: str, *, where: str, is_recorded: bool = True) -> Config:
+    """The settings in the text of a config.toml; raises ConfigErrors that begin with `where`.
+
+    An older recording may have an address for mails, which a new run must not silently ignore.
+    """
     try:
-        return Config.model_validate(tomllib.loads(text))
+        tables = tomllib.loads(text)
+        alerts = tables.get("alerts")
+        mail = (
+            {key: alerts.pop(key, None) for key in _MAIL_KEYS} if isinstance(alerts, dict) else {}
+        )
+        config = Config.model_validate(tables)
     except ValidationError as error:
         raise ConfigError(f"{where}{_explain(error.errors()[0])}") from error
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{where}: expected TOML, got a mistake in it: {error}") from error
+    if mail.get("mail_to") and not is_recorded:
+        raise ConfigError(
+            f"{where} [alerts]: mail_to is no key any more; expected apprise_file, a file with the "
+            "line mailtos://SERVER:587?user=LOGIN&pass=PASSWORD&from=ADDRESS&to=ADDRESS"
+        )
+    return config
 
 
 def to_toml(config: Config) -> str:
