@@ -261,6 +261,14 @@ def _believed(
     return believed.shapes
 
 
+def save_learnt(setup: Setup, out: Path, *, source: str) -> list[Path]:
+    """Write the meshes of learnt stocks, if there are any, into a run's folder. OutputError."""
+    stocks = None if setup.candidates is None else setup.candidates.stocks()
+    if stocks is None:
+        return []
+    return save_stocks(setup.template, stocks, out / LEARNT, made_by=MADE_BY_RUN, source=source)
+
+
 def save_stocks(
     template: Template, stocks: CandidateShapes, path: Path, *, made_by: str, source: str
 ) -> list[Path]:
@@ -422,19 +430,13 @@ class ShapeLearner:
             for line in describe(self._given, stocks):
                 self._observer.notice(f"learnt from the fish so far: {line}")
         try:
-            _save_meshes(self._inputs, stocks)
+            out = self._inputs.request.out
+            require_free_names(out, overwrite=self._inputs.request.overwrite)
+            setup = replace(self._inputs, candidates=more)
+            meshes = save_learnt(setup, out, source=self._inputs.source.name)
+            add_files(out, [*meshes, *(mesh.with_suffix(".toml") for mesh in meshes)])
         except OutputError as error:
             self._observer.warn(str(error))
-
-
-def _save_meshes(inputs: Inputs, stocks: CandidateShapes) -> None:
-    """Write the mesh of each stock into the run's folder. Raises OutputError."""
-    path = inputs.request.out / LEARNT
-    require_free_names(path.parent, overwrite=inputs.request.overwrite)
-    meshes = save_stocks(
-        inputs.template, stocks, path, made_by=MADE_BY_RUN, source=inputs.source.name
-    )
-    add_files(path.parent, [*meshes, *(mesh.with_suffix(".toml") for mesh in meshes)])
 
 
 def _message(stocks: CandidateShapes, num_fish: int, frame: Frame) -> LearntShapes:

@@ -20,7 +20,7 @@ from stream_dmr.pipeline.drift import DriftAlarms
 from stream_dmr.pipeline.learn_shapes import (
     ShapeLearner,
     mesh_fits_fish,
-    save_stocks,
+    save_learnt,
     with_learnt_shapes,
 )
 from stream_dmr.pipeline.prepare_kernels import compile_kernels, prepare_kernels
@@ -32,7 +32,7 @@ from stream_dmr.pipeline.run_outputs import Outputs, ResultWriter, open_outputs,
 from stream_dmr.pipeline.session import Session
 from stream_dmr.sources.positions import PositionSource
 from stream_dmr.store.length_store import LengthStore
-from stream_dmr.store.open_results import LEARNT, MADE_BY_RUN, learnt_files
+from stream_dmr.store.open_results import learnt_files
 from stream_dmr.store.run_facts import ENDLESS_STOPPED, SOURCE_CUT_OFF, SOURCE_ENDED, STOPPED
 from stream_dmr.store.schema import CUT_OFF_BY_SOURCE, CUT_OFF_BY_STOP
 
@@ -250,7 +250,7 @@ def _measure(
                 interrupted={fish.track_id for fish in outputs.interrupted},
             )
             session.continue_tracks(outputs.interrupted)
-            _save_learnt_meshes(inputs)
+            save_learnt(inputs, request.out, source=inputs.source.name)
             _report_start(inputs, outputs, observer)
             observer.begin(inputs.source.num_frames)
             clock.begin("measuring")
@@ -268,19 +268,6 @@ def _measure(
             inputs.positions.close()
         for line in (*inputs.source.warnings, *inputs.finder.warnings, *unused):
             observer.warn(line)
-
-
-def _save_learnt_meshes(inputs: Inputs) -> None:
-    """Write the meshes of what the first pass learnt, if anything, into the run's folder."""
-    stocks = None if inputs.candidates is None else inputs.candidates.stocks()
-    if stocks is not None:
-        save_stocks(
-            inputs.template,
-            stocks,
-            inputs.request.out / LEARNT,
-            made_by=MADE_BY_RUN,
-            source=inputs.source.name,
-        )
 
 
 def _report_start(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> None:

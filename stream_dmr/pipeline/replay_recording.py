@@ -23,7 +23,7 @@ from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.pipeline.chain import Node, StageCounters, run_chain
 from stream_dmr.pipeline.combine import LocalizeByTwo, SecondRun, open_second
 from stream_dmr.pipeline.comparator import MessageComparator, Mismatch
-from stream_dmr.pipeline.learn_shapes import save_stocks
+from stream_dmr.pipeline.learn_shapes import save_learnt
 from stream_dmr.pipeline.replay_inputs import ReplayInputs, new_header, read_inputs
 from stream_dmr.pipeline.run_folder import prepare_folder
 from stream_dmr.pipeline.run_observer import RunObserver, RunTotals
@@ -55,7 +55,7 @@ from stream_dmr.recording.whole_records import WholeRecords
 from stream_dmr.store.fish import database_of, read_measured_fish, read_runs
 from stream_dmr.store.ledger import Signer
 from stream_dmr.store.length_store import LengthStore
-from stream_dmr.store.open_results import LEARNT, MADE_BY_RUN, require_free_names
+from stream_dmr.store.open_results import require_free_names
 from stream_dmr.store.run_facts import SOURCE_ENDED, STOPPED, RunFacts, cut_short, run_facts
 from stream_dmr.store.run_tables import FramesTable, LengthsTable
 from stream_dmr.store.schema import CUT_OFF_BY_STOP
@@ -110,8 +110,7 @@ def open_replay_outputs(
         observer.warn(f"{error}; vessel, trip, haul and flags are not taken over from it")
         recorded = OriginalRun()
     signer = None if request.key is None else Signer(request.key)
-    stocks = None if inputs.candidates is None else inputs.candidates.stocks()
-    if stocks is not None:
+    if inputs.candidates is not None and inputs.candidates.stocks() is not None:
         require_free_names(out, overwrite=request.overwrite)
     prepare_folder(out, overwrite=request.overwrite)
     facts, known = run_facts(header), recorded.facts
@@ -126,9 +125,7 @@ def open_replay_outputs(
         stack.callback(partial(files.finish, with_recordings=True))
         store.count_frames(None if known is None else known.frames_promised)
         lengths = stack.enter_context(closing(LengthsTable(out, store)))
-        if stocks is not None:
-            place, source = out / LEARNT, header.source
-            save_stocks(inputs.template, stocks, place, made_by=MADE_BY_RUN, source=source)
+        save_learnt(inputs, out, source=header.source)
         recorder = Recorder(
             out,
             header,

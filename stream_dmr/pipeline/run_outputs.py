@@ -32,7 +32,7 @@ from stream_dmr.pipeline.run_inputs import Inputs
 from stream_dmr.pipeline.run_observer import OpenRun, RunObserver
 from stream_dmr.recording.header import RunHeader, RunStart
 from stream_dmr.recording.reading import Recording, learnt_shapes, messages_of, open_recordings
-from stream_dmr.recording.record import Record, SinkFactory, SinkStates
+from stream_dmr.recording.record import Record, SinkStates
 from stream_dmr.recording.recorder import STEM, Recorder, open_recording_files
 from stream_dmr.recording.repair import Repair
 from stream_dmr.recording.retention import Retention
@@ -308,18 +308,29 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
     Raises OutputError where the folder can't be written to, or holds an earlier run's results. An
     endless run warns of what the disk refuses, and tries again.
     """
-    out, is_endless = inputs.request.out, inputs.is_endless
+    request, settings = inputs.request, inputs.config.recording
+    out, is_endless = request.out, inputs.is_endless
     on_refusal = observer.warn if is_endless else None
     files, states = SignedFiles(out), SinkStates()
     retention = _free_space(inputs, files, observer)
-    overwrite, resume = inputs.request.overwrite, inputs.resumes
-    repairs = prepare_folder(out, overwrite=overwrite, resume=resume, waits_for_room=is_endless)
+    resume = inputs.resumes
+    repairs = prepare_folder(
+        out, overwrite=request.overwrite, resume=resume, waits_for_room=is_endless
+    )
     header = inputs.header()
+    facts = replace(
+        run_facts(header),
+        vessel=request.vessel,
+        trip=request.trip,
+        haul=request.haul,
+        utc_zero_ns=inputs.utc_zero_ns,
+    )
     with ExitStack() as stack:
         # At the end lengths.csv is complete before it is signed, it is signed while the store is
         # open, and the provenance is made of all that there is then.
         stack.enter_context(sealed(out, with_recordings=not is_endless, on_notice=observer.warn))
-        store = stack.enter_context(closing(_open_store(inputs, header)))
+        store = LengthStore(out, facts, waits_for_disk=is_endless, signer=Signer(request.key))
+        stack.enter_context(closing(store))
         files.attach(store, repaired=[repair.path for repair in repairs])
         stack.callback(partial(files.finish, with_recordings=not is_endless))
         lengths = LengthsTable(out, store, resume=resume, on_refusal=on_refusal)
@@ -328,7 +339,17 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
         # the recording's end.
         stack.enter_context(closing(observer))
         hauls = HaulLog(store, inputs.config.hauls, frames_lost=partial(_frames_lost, inputs))
-        observer.open(_open_run(inputs, store, hauls, states))
+        observer.open(
+            OpenRun(
+                config=inputs.config,
+                source=inputs.source,
+                positions=inputs.positions,
+                store=store,
+                hauls=hauls,
+                out=out,
+                sinks=states,
+            )
+        )
         # What earlier runs recorded is read before a new segment stands beside it.
         interrupted = interrupted_tracks(
             repairs if is_endless else [], store, on_notice=observer.warn
@@ -345,14 +366,22 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
                 on_closed=files.changed,
                 states=states,
             )
-        header = replace(header, runs=(_start_of(inputs, store),))
-        recorder = _open_recorder(
-            inputs,
-            header,
-            recording,
+        # For a replay, which finds the fish again.
+        begin = RunStart(
+            frames_before=store.before.frame_index if inputs.numbers_frames_on else 0,
+            tracks_before=store.before.track_id,
+        )
+        frames = FramesTable(out, resume=resume, is_endless=is_endless, on_closed=files.changed)
+        recorder = Recorder(
+            out,
+            replace(header, runs=(begin,)),
+            settings,
+            live=request.live,
+            sinks=[frames],
+            files=recording,
             on_refusal=on_refusal,
-            on_closed=files.changed,
             states=states,
+            photographs=settings.keeps_photographs(is_live=inputs.source.is_live),
         )
         stack.enter_context(recorder)
         stack.enter_context(closing(retention))
@@ -369,19 +398,6 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
         )
 
 
-def _open_run(inputs: Inputs, store: LengthStore, hauls: HaulLog, states: SinkStates) -> OpenRun:
-    return OpenRun(
-        config=inputs.config,
-        source=inputs.source,
-        positions=inputs.positions,
-        store=store,
-        hauls=hauls,
-        out=inputs.request.out,
-        sinks=states,
-        key=inputs.request.key,
-    )
-
-
 def _free_space(inputs: Inputs, files: SignedFiles, observer: RunObserver) -> Retention:
     """Make room for the run, before anything of it is written; what keeps it free, not started."""
     out, keep_free_gb = inputs.request.out, inputs.config.recording.keep_free_gb
@@ -395,53 +411,6 @@ def _free_space(inputs: Inputs, files: SignedFiles, observer: RunObserver) -> Re
     with suppress(OSError, OutputError):  # it tries again while the run goes on
         retention.free_space()
     return retention
-
-
-def _open_store(inputs: Inputs, header: RunHeader) -> LengthStore:
-    request = inputs.request
-    facts = replace(
-        run_facts(header),
-        vessel=request.vessel,
-        trip=request.trip,
-        haul=request.haul,
-        utc_zero_ns=inputs.utc_zero_ns,
-    )
-    signer = Signer(request.key)
-    return LengthStore(request.out, facts, waits_for_disk=inputs.is_endless, signer=signer)
-
-
-def _open_recorder(
-    inputs: Inputs,
-    header: RunHeader,
-    files: SinkFactory,
-    *,
-    on_refusal: Callable[[str], None] | None,
-    on_closed: Callable[[Path], None],
-    states: SinkStates,
-) -> Recorder:
-    request, settings = inputs.request, inputs.config.recording
-    frames = FramesTable(
-        request.out, resume=inputs.resumes, is_endless=inputs.is_endless, on_closed=on_closed
-    )
-    return Recorder(
-        request.out,
-        header,
-        settings,
-        live=request.live,
-        sinks=[frames],
-        files=files,
-        on_refusal=on_refusal,
-        states=states,
-        photographs=settings.keeps_photographs(is_live=inputs.source.is_live),
-    )
-
-
-def _start_of(inputs: Inputs, store: LengthStore) -> RunStart:
-    """Where this run begins in its folder, for a replay that finds the fish again."""
-    return RunStart(
-        frames_before=store.before.frame_index if inputs.numbers_frames_on else 0,
-        tracks_before=store.before.track_id,
-    )
 
 
 def _frames_lost(inputs: Inputs) -> int:
