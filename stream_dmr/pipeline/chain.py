@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -114,27 +114,22 @@ def run_chain(
     return chain.run_in_line() if in_one_thread else chain.run()
 
 
+@dataclass(eq=False)
 class Chain:
     """One run: stage 0 is the source, stage k the k-th node. Counters may be read at any time."""
 
-    def __init__(
-        self,
-        source: Iterable[Frame],
-        nodes: Sequence[Node],
-        *,
-        on_message: Callable[[Message], Message],
-        on_frame: Callable[[], None],
-        on_failure: Callable[[str, Exception], bool],
-        stop: threading.Event,
-    ) -> None:
-        self._source = source
-        self._nodes = nodes
-        self._on_message = on_message
-        self._on_frame = on_frame
-        self._on_failure = on_failure
-        self._stop = stop
-        self._inboxes = [_Inbox(_QUEUE_FRAMES) for _ in nodes]  # of stages 1, 2, ...
-        self.counters = [StageCounters(stage=type(stage).__name__) for stage in (source, *nodes)]
+    source: Iterable[Frame]
+    nodes: Sequence[Node]
+    _: KW_ONLY
+    on_message: Callable[[Message], Message]
+    on_frame: Callable[[], None]
+    on_failure: Callable[[str, Exception], bool]
+    stop: threading.Event
+
+    def __post_init__(self) -> None:
+        self._inboxes = [_Inbox(_QUEUE_FRAMES) for _ in self.nodes]  # of stages 1, 2, ...
+        stages = (self.source, *self.nodes)
+        self.counters = [StageCounters(stage=type(stage).__name__) for stage in stages]
         self._busy_since: list[float | None] = [None] * len(self.counters)
         self._is_stopped = False  # has `stop` been seen?
         self._cut = -1  # the last stage that drops what it has not begun
@@ -159,7 +154,7 @@ class Chain:
         threads = [threading.Thread(target=self._run_source, name="source", daemon=True)]
         threads += [
             threading.Thread(target=self._run_node, args=(stage,), name=f"stage-{stage}")
-            for stage in range(1, len(self._nodes) + 1)
+            for stage in range(1, len(self.nodes) + 1)
         ]
         for thread in threads:
             thread.start()
@@ -167,12 +162,12 @@ class Chain:
             for thread in threads[1:]:
                 thread.join()
         except BaseException:
-            self._stop.set()
+            self.stop.set()
             for thread in threads[1:]:
                 thread.join()
             raise
         finally:
-            self._cut = len(self._nodes)
+            self._cut = len(self.nodes)
             threads[0].join(_SOURCE_GRACE_S)
             self._count_leftovers()
         if self._failure is not None:
@@ -182,7 +177,7 @@ class Chain:
     def run_in_line(self) -> list[StageCounters]:
         """Run to the end in this thread alone; see `run_chain`."""
         try:
-            frames = iter(self._source)
+            frames = iter(self.source)
             while self._failure is None and (batch := self._read(frames)) is not None:
                 self._pass_through(batch)
         except BaseException as error:
@@ -193,12 +188,12 @@ class Chain:
         return self.counters
 
     def _pass_through(self, batch: _Batch, *, close: bool = False) -> None:
-        for stage, node in enumerate(self._nodes, start=1):
+        for stage, node in enumerate(self.nodes, start=1):
             batch = self._process(stage, node, batch, close=close)
 
     def _run_source(self) -> None:
         try:
-            frames = iter(self._source)
+            frames = iter(self.source)
             while (batch := self._read(frames)) is not None:
                 self._pass_on(0, batch)
         except BaseException as error:
@@ -220,7 +215,7 @@ class Chain:
             return batch
 
     def _run_node(self, stage: int) -> None:
-        node = self._nodes[stage - 1]
+        node = self.nodes[stage - 1]
         while (batch := self._take(stage)) is not None and batch.kind != "end":
             self._pass_on(stage, self._process(stage, node, batch))
         # The last messages of the stage before, then our own end.
@@ -244,23 +239,25 @@ class Chain:
                 is_whole = not self._is_cut(stage)
                 outcome = "processed" if is_whole else "dropped"
                 self._count(stage, outcome if is_done else "failed")
-                if is_whole and stage == len(self._nodes):
+                if is_whole and stage == len(self.nodes):
                     self._attempt(stage, self._frame_done, made)
             if close:
                 self._attempt(stage, node.close, made)
         return made
 
     def _frame_done(self) -> Sequence[Message]:
-        self._on_frame()
+        self.on_frame()
         return ()
 
     def _attempt(self, stage: int, work: Callable[[], Sequence[Message]], made: _Batch) -> bool:
         """Do a part of a frame's work; False where it failed, which may end the chain."""
         try:
-            self._emit(stage, work(), made)
+            for message in work():
+                made.messages.append(self.on_message(message))
+                self.counters[stage].messages_out += not isinstance(message, TrackEnded)
         except BaseException as error:
             name = self.counters[stage].stage
-            if not isinstance(error, Exception) or not self._on_failure(name, error):
+            if not isinstance(error, Exception) or not self.on_failure(name, error):
                 self._fail(stage, error)
             return False
         return True
@@ -279,11 +276,6 @@ class Chain:
                 left = sum(batch.kind == "frame" for batch in inbox.queue)
             self._count(stage, "dropped", left)
 
-    def _emit(self, stage: int, messages: Sequence[Message], made: _Batch) -> None:
-        for message in messages:
-            made.messages.append(self._on_message(message))
-            self.counters[stage].messages_out += not isinstance(message, TrackEnded)
-
     def _take(self, stage: int) -> _Batch | None:
         """Wait for the next batch of a stage; None once the stage drops what waits."""
         while not self._is_cut(stage):
@@ -295,12 +287,12 @@ class Chain:
 
     def _pass_on(self, stage: int, batch: _Batch) -> None:
         """Hand a batch to the next stage, or count it as dropped where that takes no more."""
-        while stage < len(self._nodes) and not self._is_cut(stage + 1):
+        while stage < len(self.nodes) and not self._is_cut(stage + 1):
             try:
                 return self._inboxes[stage].put(batch, timeout=_POLL_S)
             except queue.Full:
                 continue
-        if stage < len(self._nodes) and batch.kind == "frame":
+        if stage < len(self.nodes) and batch.kind == "frame":
             self._count(stage + 1, "dropped")
         return None
 
@@ -312,7 +304,7 @@ class Chain:
 
     def _is_cut(self, stage: int) -> bool:
         """True where the chain is ending and this stage drops what it has not begun."""
-        if self._stop.is_set() and not self._is_stopped:
+        if self.stop.is_set() and not self._is_stopped:
             with self._lock:
                 self._is_stopped = True
                 # The first node always: a source that hangs would never send it its end.
@@ -367,7 +359,6 @@ class ErrorPolicy:
         self._num_consecutive = 0
 
     def continues_after(self, stage: str, error: Exception) -> bool:
-        """True where the chain goes on after this exception in this stage."""
         if not self._is_endless or self._num_consecutive >= _MAX_CONSECUTIVE:
             return False
         if isinstance(error, UserError) and not isinstance(error, OutputError):

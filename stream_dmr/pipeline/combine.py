@@ -277,7 +277,6 @@ class LocalizeByTwo:
         self._second, self.pairing = second, pairing
 
     def step(self, mesh: FittedMesh, /) -> Sequence[LocalizedFish]:
-        """Return the fish of a fit."""
         alone = localize(mesh, settings=self._settings, calibration=self._calibration)
         track = self._second.get(self.pairing.ids.get(mesh.track_id, -1))
         is_refused = alone.reason not in _BY_ONE_CAMERA
@@ -313,5 +312,4 @@ class LocalizeByTwo:
         ]
 
     def close(self) -> Sequence[LocalizedFish]:
-        """Nothing is left."""
         return []

@@ -44,16 +44,13 @@ class FitMonitor:
         lower = float(np.median(self._reference) - np.median(self._recent))
         is_worse = (
             lower > self._settings.worse_iou
-            and _p_value(self._recent, self._reference) < _MAX_P_VALUE
+            # Mann and Whitney, 1947: the p-value that the recent fish do not fit worse.
+            and mannwhitneyu(self._recent, self._reference, alternative="less").pvalue
+            < _MAX_P_VALUE
         )
         self.alarm = (
             f"meshes fit worse than at first (IoU lower by {lower:.3f})" if is_worse else ""
         )
-
-
-def _p_value(recent: Sequence[float], reference: Sequence[float]) -> float:
-    """One-sided p-value that `recent` is not lower than `reference` (Mann and Whitney, 1947)."""
-    return float(mannwhitneyu(recent, reference, alternative="less").pvalue)
 
 
 # Chosen on simulated decks with waves, fish, noise and dusk: tests/pipeline/test_scene_drift.py.

@@ -46,7 +46,6 @@ class PositionFeed:
         self._num_written = 0
 
     def take(self, frame: Frame) -> None:
-        """Write the positions up to a frame."""
         for position in () if self._source is None else self._source.take(frame):
             self._num_written += 1
             self._write(position)
@@ -118,7 +117,6 @@ class MessageFlow:
         return message
 
     def frame_done(self) -> None:
-        """A frame has left the last stage."""
         for receiver in (self.policy, self._writer, self.totals, self._observer):
             receiver.frame_done()
 
@@ -191,13 +189,11 @@ class _Clock:
         self._parts_s: dict[str, float] = {}
 
     def begin(self, name: str) -> None:
-        """Another part begins."""
         now = time.perf_counter()
         self._parts_s[self._name] = self._parts_s.get(self._name, 0.0) + now - self._began
         self._began, self._name = now, name
 
     def parts_s(self) -> Mapping[str, float]:
-        """The parts so far, in their order."""
         self.begin(self._name)
         return self._parts_s
 

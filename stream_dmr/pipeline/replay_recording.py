@@ -27,16 +27,16 @@ from stream_dmr.pipeline.learn_shapes import save_learnt
 from stream_dmr.pipeline.replay_inputs import ReplayInputs, new_header, read_inputs
 from stream_dmr.pipeline.run_folder import prepare_folder
 from stream_dmr.pipeline.run_observer import RunObserver, RunTotals
-from stream_dmr.pipeline.run_options import ReplayOptions
+from stream_dmr.pipeline.run_options import ReplayOptions, Stage
 from stream_dmr.pipeline.run_outputs import ResultWriter
 from stream_dmr.pipeline.session import (
-    STAGES,
     CropFishOfRuns,
     PlaybackNode,
     RecordedMessages,
     Session,
     messages_before,
     messages_from,
+    stage_number,
 )
 from stream_dmr.recording.frame_images import open_pictures, open_recorded_source
 from stream_dmr.recording.header import REPRODUCIBLE_BY, RunHeader, SecondCamera
@@ -313,6 +313,7 @@ def replay(
     comparator.finish()
     for line in (*recording.warnings, *recorded.notes):
         observer.warn(line)
+    versions = recording.header.metadata()
     return ReplaySummary(
         fish=writer.totals.fish(),
         num_frames=writer.num_frames,
@@ -323,7 +324,9 @@ def replay(
         num_left_out=comparator.num_left_out,
         num_beyond=comparator.num_beyond,
         mismatches=comparator.mismatches,
-        other_versions=_other_versions(recording),
+        other_versions=[
+            name for name in REPRODUCIBLE_BY if recording.metadata.get(name) != versions[name]
+        ],
         length_change=comparator.length_change,
     )
 
@@ -348,11 +351,6 @@ def _open_whole(
     return WholeRecords(
         meshes, pictures, second=second.camera, of_second=of_second, second_pictures=others
     )
-
-
-def _other_versions(recording: Recording) -> list[str]:
-    here = recording.header.metadata()
-    return [name for name in REPRODUCIBLE_BY if recording.metadata.get(name) != here[name]]
 
 
 def _refuse_impossible(request: ReplayOptions, recording: Recording) -> None:
@@ -386,7 +384,7 @@ def _refuse_impossible(request: ReplayOptions, recording: Recording) -> None:
 
 def _refuse_unused(request: ReplayOptions) -> None:
     """Raise UserError for an input of a stage that is not recomputed."""
-    given = (
+    given: Sequence[tuple[str, str, object, Stage]] = (
         ("--template", "a template matters to the fit", request.template, "fit"),
         ("--calibration", "a calibration matters to millimetres", request.calibration, "localize"),
         ("--source", "pictures matter to crops", request.source, "crop"),
@@ -394,7 +392,7 @@ def _refuse_unused(request: ReplayOptions) -> None:
         ("--masks", "masks matter to crops", request.masks, "crop"),
     )
     for option, meaning, value, last in given:
-        if value is not None and [*STAGES].index(request.first) > [*STAGES].index(last):
+        if value is not None and stage_number(request.first) > stage_number(last):
             raise UserError(
                 f"{option} with --from {request.first}: {meaning}; use --from {last}, or leave it "
                 "out"

@@ -128,16 +128,19 @@ class Inputs(Setup):
             source = InputFile(path=str(Path(request.source).absolute()))
         else:
             source = InputFile.read(request.source)
-        return RunInputs(
-            source=source,
-            boxes=None if request.boxes is None else InputFile.read(request.boxes),
-            masks=None if request.masks is None else InputFile.read(request.masks),
-            calibration=None
-            if request.calibration is None
-            else InputFile.read(request.calibration),
-            nmea=None if request.nmea is None else _nmea_input(request.nmea),
-            species_model=InputFile.read(model) if (model := self.config.species.model) else None,
-        )
+        nmea = None
+        if request.nmea is not None:
+            is_file = Path(request.nmea).is_file()
+            address = InputFile(path=without_password(request.nmea))
+            nmea = InputFile.read(request.nmea) if is_file else address
+        others = {
+            "boxes": request.boxes,
+            "masks": request.masks,
+            "calibration": request.calibration,
+            "species_model": self.config.species.model,
+        }
+        files = {name: InputFile.read(path) for name, path in others.items() if path}
+        return RunInputs(source=source, nmea=nmea, **files)
 
 
 def checked_inputs(request: RunOptions) -> Inputs:
@@ -216,11 +219,6 @@ def _keep_template(request: RunOptions) -> None:
 def _is_since_1970(source: Source) -> bool:
     """True where capture times are times of day, not from the start of a video."""
     return source.is_live or source.is_endless
-
-
-def _nmea_input(address: str) -> InputFile:
-    is_file = Path(address).is_file()
-    return InputFile.read(address) if is_file else InputFile(path=without_password(address))
 
 
 _USUAL_M = (0.5, 20.0)  # chosen: from cameras to the plane of hanging fish

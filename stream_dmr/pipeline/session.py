@@ -56,7 +56,6 @@ class Setup:
 
     @property
     def camera(self) -> Camera | None:
-        """The calibrated camera."""
         return None if self.calibration is None else self.calibration.camera
 
     @property
@@ -133,16 +132,14 @@ STAGES: Mapping[Stage, StageNode] = {
 
 
 def messages_before(stage: Stage) -> list[type[Message]]:
-    """The messages of the stages before this one."""
-    return [one.message for one in STAGES.values()][: _number(stage)]
+    return [node.message for node in STAGES.values()][: stage_number(stage)]
 
 
 def messages_from(stage: Stage) -> list[type[Message]]:
-    """The messages of this stage and of those after it."""
-    return [one.message for one in STAGES.values()][_number(stage) :]
+    return [node.message for node in STAGES.values()][stage_number(stage) :]
 
 
-def _number(stage: Stage) -> int:
+def stage_number(stage: Stage) -> int:
     return [*STAGES].index(stage)
 
 
@@ -158,8 +155,8 @@ class Session:
         last: Stage = "smooth",
     ) -> None:
         """`given`: a CropFish, the crops of a first pass, or the playback of a recording."""
-        stages = [*STAGES.values()][_number(first) : _number(last) + 1]
-        self.nodes = [*given, *(one.make(setup) for one in stages if one.make is not None)]
+        stages = [*STAGES.values()][stage_number(first) : stage_number(last) + 1]
+        self.nodes = [*given, *(stage.make(setup) for stage in stages if stage.make is not None)]
 
     def continue_tracks(self, interrupted: Iterable[LocalizedFish]) -> None:
         """Give the last node the frames of fish that an earlier recording has."""
@@ -204,7 +201,6 @@ class KeptCrops:
         self._ended: dict[int, list[TrackEnded]] = {}
 
     def keep(self, message: FishCrop | TrackEnded) -> None:
-        """Take one more message of CropFish."""
         if isinstance(message, TrackEnded):
             self._ended.setdefault(message.frame_index, []).append(message)
             return
@@ -213,7 +209,6 @@ class KeptCrops:
         self._file.write(data)
 
     def __iter__(self) -> Iterator[FishCrop]:
-        """All crops, in the order in which they came."""
         return (crop for frame_index in self._places for crop in self._of(frame_index))
 
     def step(self, frame: Frame, /) -> Sequence[FishCrop | TrackEnded]:
@@ -221,7 +216,6 @@ class KeptCrops:
         return [*self._of(frame.frame_index), *self._ended.get(frame.frame_index, [])]
 
     def close(self) -> Sequence[FishCrop]:
-        """Close the file; no output at the end."""
         self._file.close()
         return ()
 
@@ -327,19 +321,15 @@ class CropFishOfRuns:
             run = self._runs.popleft()
             if run.frames_before > self._frames_before:
                 ended += self._crop_fish.close()
-                self._begin(run)
+                if not self._is_new:
+                    self._crop_fish, self._is_new = self._open(), True
+                self._crop_fish.number_after(run.tracks_before)
+                self._frames_before = run.frames_before
         self._is_new = False
         ended += self._crop_fish.step(frame)
         return [*ended, *self._crop_fish.pause()] if frame.frame_index in self._pauses else ended
 
-    def _begin(self, run: RunStart) -> None:
-        if not self._is_new:
-            self._crop_fish, self._is_new = self._open(), True
-        self._crop_fish.number_after(run.tracks_before)
-        self._frames_before = run.frames_before
-
     def close(self) -> Sequence[FishCrop | TrackEnded]:
-        """The tracks of the last run end."""
         return self._crop_fish.close()
 
 
@@ -357,7 +347,6 @@ class RecordedMessages:
 
     @property
     def ends_early(self) -> bool:
-        """True where the run went on after the end of the recording."""
         return self._recording.ends_early
 
     def carried_over(self) -> list[LocalizedFish]:
@@ -453,7 +442,7 @@ class SoughtMessages:
         return self._passed.pop(key, None)
 
     def rest(self) -> Iterator[Message]:
-        """Those that were not taken."""
+        """The messages that were not taken."""
         yield from self._passed.values()
         if self._next is not None:
             yield self._next

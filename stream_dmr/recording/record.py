@@ -25,7 +25,6 @@ class Record:
 
     @cached_property
     def payload(self) -> bytes:
-        """The bytes that `codec.encode` gives."""
         return self.encoding()
 
     @property

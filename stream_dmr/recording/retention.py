@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from threading import Event, Thread
 
@@ -51,7 +52,6 @@ class Retention:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop the thread. Idempotent."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
@@ -118,7 +118,7 @@ class Retention:
         if is_thinned:
             return
         with suppress(OSError, RecordingError):
-            copy, _ = rewrite(path, note=THINNED, edit=_Thinning().edit)
+            copy, _ = rewrite(path, note=THINNED, edit=partial(_thinned, PhotographChooser()))
             rename_durably(copy, path)
             self._on_changed(path)
             self._known[path.stem] = tracks, True
@@ -131,17 +131,11 @@ def _is_open(stem: Path) -> bool:
     return has_part or (rrd.exists() and not is_closed(rrd))
 
 
-class _Thinning:
-    """Takes pictures and masks out of one segment, but for a few photographs of each fish."""
-
-    def __init__(self) -> None:
-        self._chooser = PhotographChooser()
-
-    def edit(self, topic: str, data: bytes) -> bytes | None:
-        """What a message becomes; None: it goes."""
-        if topic == TOPICS[FishCrop].topic:
-            crop = decode(FishCrop, data)
-            return data if crop.image is not None and self._chooser.takes(crop) else None
-        if topic in _THINNED_TOPICS:
-            return None
-        return without_picture(data) if topic == TOPICS[Frame].topic else data
+def _thinned(chooser: PhotographChooser, topic: str, data: bytes) -> bytes | None:
+    """A message without pictures and masks, but for some photographs; None if it is dropped."""
+    if topic == TOPICS[FishCrop].topic:
+        crop = decode(FishCrop, data)
+        return data if crop.image is not None and chooser.takes(crop) else None
+    if topic in _THINNED_TOPICS:
+        return None
+    return without_picture(data) if topic == TOPICS[Frame].topic else data

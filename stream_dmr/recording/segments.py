@@ -63,7 +63,6 @@ class OpenTracks:
         self.add(Record(message=fish, whole=fish, encoding=partial(encode, fish)))
 
     def records(self) -> Iterator[Record]:
-        """The records of all open tracks, track by track."""
         for records in self._tracks.values():
             yield from records
 
@@ -103,7 +102,6 @@ class UnfinishedFiles:
         self._paths += [one for one in left if os.path.exists(one)]  # False where the disk fails
 
     def repair_soon(self) -> None:
-        """Begin to repair them; this may take a while."""
         if self._paths and not self._thread.is_alive():
             self._thread = Thread(target=self._repair, name="repairs")
             self._thread.start()
@@ -151,13 +149,8 @@ class SegmentFiles:
         self._out_dir, self._header, self.settings = out_dir, header, settings
         self.on_notice, self._on_closed, self._states = on_notice, on_closed, states
         self._number = 0
-        self._retry_ns = self._refused_ns = 0  # capture times: of the next try, the last refusal
+        self.retry_ns = self._refused_ns = 0  # capture times: of the next try, the last refusal
         self._unfinished = UnfinishedFiles(on_notice=on_notice, on_closed=on_closed)
-
-    @property
-    def may_try(self) -> bool:
-        """False for some seconds after the disk refused a segment."""
-        return self.now_ns >= self._retry_ns
 
     @property
     def is_disk_full(self) -> bool:
@@ -201,7 +194,7 @@ class SegmentFiles:
             except OutputError as error:
                 sinks.remove(sink)
                 is_again = self.now_ns - self._refused_ns < _RETRY_NS
-                self._retry_ns = self.now_ns + _RETRY_NS * is_again
+                self.retry_ns = self.now_ns + _RETRY_NS * is_again
                 self._refused_ns = self.now_ns
                 with suppress(OutputError):
                     sink.close()
@@ -218,15 +211,13 @@ class SegmentFiles:
         sinks.clear()
 
     def finish(self) -> None:
-        """Repair what is left unfinished, and wait for it."""
         self._unfinished.finish()
 
     def refuse_for_room(self) -> None:
-        """Say that no segment is begun for want of room."""
         self._refuse(f"{self._out_dir}: {_NO_ROOM}")
 
     def _refuse(self, reason: str) -> None:
-        self._retry_ns = self.now_ns + _RETRY_NS
+        self.retry_ns = self.now_ns + _RETRY_NS
         self._report(reason)
         self.on_notice(reason)
 
@@ -236,7 +227,6 @@ class SegmentFiles:
         self._unfinished.add(sink.path)
 
     def _report(self, error: str = "") -> None:
-        """Say how the files of all kinds are."""
         for suffix, is_wanted in ((".mcap", self.settings.mcap), (".rrd", self.settings.rrd)):
             if is_wanted:
                 self._states.report(f"{STEM}-*{suffix}", error)
@@ -354,7 +344,7 @@ class RotatingSink:
                 self._complete()
         elif self._began_ns is None:
             self._began_ns = now_ns
-        elif self._files.may_try:
+        elif now_ns >= self._files.retry_ns:
             size = sum(sink.size for sink in self._open if isinstance(sink, McapSink))
             is_long = now_ns - self._began_ns >= self._settings.segment_s * 1e9
             lacks_file = len(self._open) < self._settings.mcap + self._settings.rrd  # refused

@@ -52,7 +52,6 @@ class LiveView:
             self.num_dropped += 1
 
     def close(self) -> None:
-        """Stop serving. Idempotent."""
         self._stop.set()
         self._thread.join(_CLOSE_TIMEOUT_S)
 
