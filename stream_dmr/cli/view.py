@@ -128,7 +128,7 @@ def _convert(
         pictures = of_second = None
         if source is not None:
             opened = open_recordings([recording])
-            of_run = recorded_settings(opened, "read_frames", ReadFramesSettings)
+            of_run = recorded_settings(opened.header, "read_frames", ReadFramesSettings)
             pictures = stack.enter_context(open_pictures(source, of_run))
             if (camera := opened.header.second) is not None:
                 of_second = stack.enter_context(open_recorded_source(camera.header))

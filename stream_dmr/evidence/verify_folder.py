@@ -130,7 +130,7 @@ def _corrections(
         for fit in ReviewedMessages(recording, database, fish).of([FittedMesh])
         if isinstance(fit, FittedMesh) and (fit.track_id, fit.frame_index) in wanted
     }
-    localizing = recorded_settings(recording, "localize", LocalizeSettings)
+    localizing = recorded_settings(recording.header, "localize", LocalizeSettings)
     for number, verdict in corrections:
         said, name = verdicts[:number], f"verdict {number}: fish {verdict.track_id}"
         of_reader = blind_readings(said).get(verdict.reviewer, [])

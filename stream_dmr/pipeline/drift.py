@@ -1,9 +1,7 @@
-"""Alarms for a camera that moved and for fits that become worse.
+"""Alarms for a moved camera, a fouled lens, and fits that become worse.
 
-Detects a moved camera and a fouled lens: compares the static scene with an earlier one.
-
-The static scene is what doesn't move before the camera (rail, hull), as edges; the earlier one is
-from when the calibration was first used in the output folder.
+The static scene is what doesn't move before the camera (rail, hull), as edges. It is compared with
+the scene of when the calibration was first used in the output folder.
 """
 
 from collections import deque

@@ -71,7 +71,7 @@ Lengths = dict[int, tuple[float, float]]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeshComparison:
-    """What fish say of the mesh that was given for them."""
+    """How fish compare with the mesh that was given for them."""
 
     mesh: CandidateShapes
     stocks: CandidateShapes | None  # learnt beginning at the mesh; None: it fits none of the masks
@@ -138,7 +138,7 @@ def _lengths(
 
 
 def _shift(by_mesh: Lengths, by_stocks: Lengths) -> LengthShift:
-    """None at all where no fish has both lengths."""
+    """The mean shift of lengths; no shift if no fish has both lengths."""
     both = [track_id for track_id in by_mesh if track_id in by_stocks]
     if not both:
         return LengthShift()
@@ -254,7 +254,7 @@ def _learn_and_report(
 def _believed(
     forms: CandidateShapes, stocks: CandidateShapes, observer: RunObserver
 ) -> CandidateShapes:
-    """What can be believed of learnt stocks; the observer is warned of the rest."""
+    """The believable part of learnt stocks; warns of the rest."""
     believed = believable(forms, stocks)
     for doubt in believed.doubts:
         observer.warn(doubt)
@@ -357,7 +357,7 @@ class ShapeLearner:
         write: Callable[[LearntShapes], object],
         observer: RunObserver,
     ) -> None:
-        """`learnt` by earlier runs: FitMesh knows it at once. `write` records what this one learns.
+        """`learnt` by earlier runs: FitMesh knows it at once. `write` records what this run learns.
 
         `seen` has what is left of the fish of those runs, so that it is learnt on as if they were
         one. `inputs` have candidates.
@@ -369,7 +369,7 @@ class ShapeLearner:
         for one in learnt:
             self._known = self._known.extended(one)
         self._fit_mesh.learn(self._known)
-        self._compared: MeshComparison | None = None  # the last one with a given mesh
+        self._compared: MeshComparison | None = None  # the last comparison with a given mesh
         self._stop = threading.Event()
         self._next_at = 2 * _num_fish(learnt[-1]) if learnt else _FIRST
         self._worker = ThreadPoolExecutor(1, "shapes", initializer=_be_nice)
@@ -414,7 +414,7 @@ class ShapeLearner:
             raise InterruptedError("the run has ended")
 
     def pass_on(self, learnt: LearntShapes) -> None:
-        """Let the fish of this frame and of later ones have what was learnt."""
+        """Measure the fish of this frame and of later frames by what was learnt."""
         more = self._known.extended(learnt)
         stocks = more.stocks()
         assert stocks is not None
@@ -458,6 +458,6 @@ def _num_fish(learnt: LearntShapes) -> int:
 
 
 def _be_nice() -> None:
-    """Lower the priority of this thread, where the system lets one do that."""
+    """Lower the priority of this thread, if the system allows it."""
     with suppress(AttributeError, OSError):
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)

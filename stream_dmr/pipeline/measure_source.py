@@ -40,20 +40,17 @@ from stream_dmr.store.schema import CUT_OFF_BY_SOURCE, CUT_OFF_BY_STOP
 class PositionFeed:
     """Called in the thread of the source, and at the end of the run."""
 
-    def __init__(self, source: PositionSource | None, write: Callable[[Position], object]) -> None:
-        """`source` None: there are no positions."""
+    def __init__(self, source: PositionSource, write: Callable[[Position], object]) -> None:
         self._source, self._write = source, write
         self._num_written = 0
 
     def take(self, frame: Frame) -> None:
-        for position in () if self._source is None else self._source.take(frame):
+        for position in self._source.take(frame):
             self._num_written += 1
             self._write(position)
 
     def finish(self) -> str:
         """Write those after the last frame; returns what a user must know of them all, or ""."""
-        if self._source is None:
-            return ""
         for position in self._source.finish():
             self._write(position)
         lines = [self._source.counts.left_out()]
@@ -87,8 +84,12 @@ class MessageFlow:
         self._seen, self._observer = outputs.seen, observer
         self._kept_frames = inputs.kept_frames
         self._writer = _result_writer(inputs, outputs, stop, on_notice=observer.warn)
-        _begin_positions(inputs, outputs, observer)
-        self._positions = PositionFeed(inputs.positions, self._take_position)
+        self._positions = None
+        if inputs.positions is not None:
+            inputs.positions.listen(observer.warn)
+            is_live = inputs.source.is_live
+            inputs.positions.begin(after_ns=outputs.store.resume_after_ns() if is_live else 0)
+            self._positions = PositionFeed(inputs.positions, self._take_position)
         self._shapes = None
         are_learnt = inputs.is_endless and inputs.config.fit_mesh.are_shapes_learnt
         if are_learnt and inputs.candidates is not None:
@@ -111,7 +112,8 @@ class MessageFlow:
         self._observer.take(message)
         self._seen.take(message)
         if isinstance(message, Frame):
-            self._positions.take(message)
+            if self._positions is not None:
+                self._positions.take(message)
             if self._shapes is not None:
                 self._shapes.take(message)
         return message
@@ -124,20 +126,12 @@ class MessageFlow:
         """Write what is left, after the last frame or an error."""
         if self._shapes is not None:
             self._shapes.close()
-        if line := self._positions.finish():
+        if self._positions is not None and (line := self._positions.finish()):
             self._observer.warn(line)
         self._writer.finish()
 
     def _take_position(self, position: Position) -> None:
         self._observer.take(self._writer.write(position))
-
-
-def _begin_positions(inputs: Inputs, outputs: Outputs, observer: RunObserver) -> None:
-    if inputs.positions is not None:
-        inputs.positions.listen(observer.warn)
-        is_live = inputs.source.is_live
-        after_ns = outputs.store.resume_after_ns() if is_live else 0
-        inputs.positions.begin(after_ns=after_ns)
 
 
 def _result_writer(
@@ -323,7 +317,7 @@ def _run_chain(
 
 @contextmanager
 def _noting_the_end(inputs: Inputs, store: LengthStore, stop: threading.Event) -> Generator[None]:
-    """Let lengths.db say what ended the block."""
+    """Note in lengths.db what ended the block."""
     try:
         yield
     except UserError as error:
@@ -338,7 +332,7 @@ def _noting_the_end(inputs: Inputs, store: LengthStore, stop: threading.Event) -
 
 
 def _end_of(inputs: Inputs, stop: threading.Event) -> str:
-    """What ended a run that no error ended."""
+    """Describe the end of a run without an error."""
     if not stop.is_set():
         return SOURCE_CUT_OFF if inputs.source.is_cut_off else SOURCE_ENDED
     return ENDLESS_STOPPED if inputs.is_endless else STOPPED

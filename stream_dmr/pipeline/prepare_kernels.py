@@ -1,9 +1,7 @@
-"""Compile the kernels before the first frame, by two fits of a drawn fish.
+"""Compile all kernels of a run, once on a machine, before its first frame.
 
 Numba compiles a kernel when it is first called. All of them take a minute on a new installation, in
 which a camera's frames would be lost.
-
-Compiles all kernels of a run, once on a machine, before its first frame waits for one of them.
 
 Two processes share the work. Each takes from the cache what the other has put there: this one
 compiles the largest kernel of a descent first, the other what comes before and after it.
@@ -124,7 +122,7 @@ def _is_complete(folder: Path) -> bool:
 
 
 def kernels_of_machine() -> str:
-    """What compiled functions depend on beside their sources."""
+    """Name what compiled functions depend on beside their sources."""
     return f"numba {numba.__version__}, {llvmlite.binding.get_host_cpu_name()}"
 
 
@@ -146,7 +144,7 @@ def _progress(folder: Path, began: float) -> str:
 
 
 def _compile_largest() -> None:
-    """The normal equations: by the types of what they take, since none of it is at hand yet."""
+    """Compile the normal equations by the types of their arguments, which do not exist yet."""
     template, settings = load_template(_TEMPLATE), FitMeshSettings()
     body = MeshLevels.from_template(template, max_faces=settings.max_faces).fine
     points, flat, lengths = np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0)
@@ -172,7 +170,7 @@ def _compile_largest() -> None:
 
 
 def _compile_rest() -> None:
-    """All others; last those that need the largest, which is done by then."""
+    """Compile all others; last those that need the largest, which is done by then."""
     template, settings = load_template(_TEMPLATE), FitMeshSettings()
     levels = MeshLevels.from_template(template, max_faces=settings.max_faces)
     fitter = Fitter(template, settings)

@@ -107,7 +107,7 @@ def _stages_before(first: str, config: Config) -> Mapping[str, Mapping[str, str]
 
 @dataclass(frozen=True, kw_only=True)
 class CropFiles:
-    """What a replay cuts crops out of."""
+    """The files that a replay cuts crops out of."""
 
     source: str | None  # None: not found, for the reason in `missing_source`
     boxes: Path | None
@@ -140,7 +140,7 @@ def inputs_with(
     masks: Path | None,
     calibration: Path | None,
 ) -> RunInputs | None:
-    """The recorded inputs, those that are given in the place of the recorded ones."""
+    """The recorded inputs, replaced by the given ones."""
     if recorded is None:
         return None
     given = {"source": source, "boxes": boxes, "masks": masks, "calibration": calibration}
@@ -182,7 +182,7 @@ def _complaint(file: InputFile, option: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayInputs(Setup):
-    """What the nodes of a replay are made of."""
+    """The setup of a replay, and the files of its crops."""
 
     files: CropFiles | None  # None where no crop is cut again
 

@@ -64,7 +64,7 @@ from stream_dmr.tracking.finder import open_finder
 
 @dataclass(frozen=True, kw_only=True)
 class OriginalRun:
-    """What the lengths.db beside a recording knows and the recording doesn't."""
+    """Facts that the lengths.db beside a recording has and the recording doesn't."""
 
     facts: RunFacts | None = None  # None: there is no such run in it, or no lengths.db
     flags: Mapping[int, Sequence[str]] = field(default_factory=dict[int, Sequence[str]])
@@ -154,7 +154,7 @@ def open_replay_outputs(
 
 
 def _end_of(request: ReplayOptions, recorded: RunFacts | None) -> str:
-    """What ended a replay that nobody stopped."""
+    """Describe the end of a replay that nobody stopped."""
     if not request.selection.is_everything:
         return "the end of the selected part of a recording"
     if recorded is not None and cut_short(recorded):
@@ -232,7 +232,7 @@ LENGTH_TOLERANCE = 5e-3
 class ReplaySummary:
     """How a replay went."""
 
-    fish: Sequence[LengthEstimate]  # the final ones, by track id
+    fish: Sequence[LengthEstimate]  # final, by track id
     num_frames: int
     elapsed_s: float
     recorded_s: float  # capture time from the first frame to the last
@@ -432,7 +432,7 @@ def _open_chain(
     by_two: LocalizeByTwo | None,
     stack: ExitStack,
 ) -> tuple[Iterable[Frame], Session]:
-    """The frames and the nodes; playback nodes that only a new recording needs only with `out`."""
+    """The frames and the nodes; with `out` also playback nodes that only a recording needs."""
     files, config = inputs.files, inputs.config
     if files is None:
         played = messages_before(request.first)[0 if request.out is not None else -1 :]

@@ -17,7 +17,7 @@ from stream_dmr.store.length_store import LengthStore
 
 @dataclass(frozen=True, kw_only=True)
 class OpenRun:
-    """What can be observed of a run beside its messages."""
+    """The parts of a run that can be observed beside its messages."""
 
     config: Config
     source: Source
@@ -41,7 +41,7 @@ class RunObserver:
         """The user should know this; the same line may come again."""
 
     def stage(self, line: str) -> None:
-        """What is being done before the first frame is measured, and how far it is."""
+        """Report the work before the first frame is measured, and its progress."""
 
     def notice(self, line: str) -> None:
         """Something worth knowing that is no reason to worry."""

@@ -227,10 +227,10 @@ def resume_source(
 
 
 def learnt_before(out: Path, header: RunHeader) -> list[LearntShapes]:
-    """What earlier runs in a folder learnt of their fish.
+    """Shapes that earlier runs in a folder learnt.
 
-    Each segment begins with all of it, but a crash may have left of the last ones nothing or their
-    header alone. Nothing where the fish had other candidate shapes then.
+    Each segment begins with all of them, but after a crash the last segments may be empty or have
+    their header alone. Empty if the fish had other candidate shapes then.
     """
     for segment in _segments(out, "mcap") or _segments(out, "rrd"):
         with suppress(RecordingError):
@@ -268,7 +268,7 @@ def seen_before(out: Path) -> SeenFish:
 
 
 def _segments(out: Path, suffix: str) -> list[Path]:
-    """The last one first."""
+    """The segments of a folder, the last segment first."""
     return sorted(out.glob(f"{STEM}-*.{suffix}"), key=natural_order, reverse=True)
 
 
@@ -289,7 +289,7 @@ def interrupted_tracks(
 
 @dataclass(frozen=True, kw_only=True)
 class Outputs:
-    """What a run writes to, and what it found in the folder."""
+    """The open outputs of a run, and what it found in the folder."""
 
     store: LengthStore
     hauls: HaulLog

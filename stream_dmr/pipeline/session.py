@@ -164,7 +164,7 @@ class Session:
             self.nodes[-1].step(fish)
 
     def messages(self, inputs: Iterable[Message], settings: RecordingSettings) -> Iterator[Message]:
-        """What all nodes return, each as a recording with these settings gives it to the next.
+        """Messages of all nodes, each as a recording with these settings gives it to the next node.
 
         Computed in this thread; tracks end with `inputs` alone.
         """
@@ -422,7 +422,7 @@ class SoughtMessages:
         self._passed: dict[tuple[int, int], Message] = {}  # and not taken yet
 
     def until(self, frame_index: int) -> list[Message]:
-        """The next ones up to a frame, in their order."""
+        """The next messages up to a frame, in their order."""
         found: list[Message] = []
         while (message := self._next) is not None and message.frame_index <= frame_index:
             found.append(message)
@@ -430,7 +430,7 @@ class SoughtMessages:
         return found
 
     def take(self, frame_index: int, track_id: int) -> Message | None:
-        """The one of this frame and fish, if there is one."""
+        """The message of this frame and fish, if there is one."""
         key = frame_index, track_id
         while (
             key not in self._passed

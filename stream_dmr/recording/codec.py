@@ -352,7 +352,7 @@ def _build(kind: type[T], proto: Proto) -> T:
 
 @cache
 def _fields(kind: type) -> list[Any]:
-    """Those of its protobuf message, which has a field for each of the dataclass."""
+    """The protobuf fields of a dataclass, in the order of its own fields."""
     by_name = proto_class(kind.__name__).DESCRIPTOR.fields_by_name
     return [by_name[field.name] for field in fields(kind)]
 

@@ -1,6 +1,5 @@
 """Restore the images of recorded frames."""
 
-import tomllib
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
@@ -125,8 +124,8 @@ def open_recorded_source(header: RunHeader) -> Generator[FrameRestorer | None]:
     if source is None or not source.is_unchanged():
         yield None
         return
-    recorded = tomllib.loads(header.config_toml).get("read_frames", {})
-    with open_pictures(source.path, ReadFramesSettings.model_validate(recorded)) as pictures:
+    settings = recorded_settings(header, "read_frames", ReadFramesSettings)
+    with open_pictures(source.path, settings) as pictures:
         yield pictures
 
 
@@ -215,7 +214,7 @@ class FrameLookup:
         """Frames that no search finds: the source is read up to them."""
         if not missing or self._source is None:
             return
-        settings = recorded_settings(self._recording, "read_frames", ReadFramesSettings)
+        settings = recorded_settings(self._recording.header, "read_frames", ReadFramesSettings)
         with open_pictures(self._source, settings) as pictures:
             for frame, payload in missing:
                 try:

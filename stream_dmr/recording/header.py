@@ -48,7 +48,7 @@ class InputFile:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RunInputs:
-    """What a run was given; None where it was given no such file."""
+    """Files that a run was given; None for a file that it was not given."""
 
     source: InputFile
     boxes: InputFile | None = None
@@ -58,7 +58,7 @@ class RunInputs:
     species_model: InputFile | None = None  # the classifier of `[species] model`
 
     def metadata(self) -> dict[str, str]:
-        """As the recording's metadata have it: `source_path`, `source_sha256`, `boxes_path`, ..."""
+        """The recording's metadata: `source_path`, `source_sha256`, `boxes_path`, ..."""
         metadata = dict[str, str]()
         for field in fields(self):
             file: InputFile | None = getattr(self, field.name)
@@ -80,12 +80,12 @@ class RunInputs:
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, str]) -> "RunInputs | None":
-        """What metadata or `RunFacts` of any age say, of old ones by `from_command`."""
+        """Inputs by metadata or `RunFacts` of any age; of old recordings by `from_command`."""
         return cls.from_metadata(facts) or cls.from_command(facts["command"])
 
     @classmethod
     def from_command(cls, command: str) -> "RunInputs | None":
-        """What the command of an old recording says: paths as typed, and no hashes.
+        """Inputs by the command of an old recording: paths as typed, and no hashes.
 
         None where it is no `stream-dmr run` or names no source.
         """
@@ -168,7 +168,7 @@ class SecondCamera:
     ids: Mapping[int, int]  # the first camera's fish, by those of the second
 
     def attachments(self) -> dict[str, bytes]:
-        """Those of its run by other names, and what is known of both."""
+        """The attachments of its run by other names, and what is known of both runs."""
         metadata = self.header.metadata()
         known = {"offset_ns": self.offset_ns, "ids": [*self.ids.items()], "run": metadata}
         parts = {"json": json.dumps(known).encode(), **self.header.attachments()}

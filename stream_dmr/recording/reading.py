@@ -132,7 +132,7 @@ class _Segments:
         return chain.from_iterable(one.payloads(kinds, selection, of=of) for one in self._segments)
 
     def carried_over(self) -> Iterator[bytes]:
-        """What the first segment took over: the others continue it."""
+        """The frames that the first segment took over: the others continue it."""
         return self._segments[0].carried_over()
 
     def video(self, selection: Selection = EVERYTHING) -> Iterator[bytes]:
@@ -188,7 +188,7 @@ def require_frame(recording: Recording, frame_index: int, selection: Selection) 
 
 
 def learnt_shapes(recording: Recording) -> list[LearntShapes]:
-    """What the camera of a recording learnt, in its order; each segment holds all before it."""
+    """Shapes that the camera of a recording learnt, in order; each segment holds all before it."""
     found = {learnt.timestamp_ns: learnt for learnt in messages_of(recording, LearntShapes)}
     return [found[timestamp_ns] for timestamp_ns in sorted(found)]
 
@@ -208,7 +208,7 @@ def known_shapes(recording: Recording) -> CandidateShapes | None:
 Table = TypeVar("Table", bound=Settings)
 
 
-def recorded_settings(recording: Recording, table: str, kind: type[Table]) -> Table:
+def recorded_settings(header: RunHeader, table: str, kind: type[Table]) -> Table:
     """The table `[table]` of the run's config.toml; defaults where an older run had none."""
-    config = tomllib.loads(recording.header.config_toml)
+    config = tomllib.loads(header.config_toml)
     return kind.model_validate(config.get(table, {}))

@@ -83,7 +83,7 @@ class Sink(Protocol):
 
     @property
     def name(self) -> str:
-        """What people know it by: the name of its file."""
+        """The name of its file, for people."""
         ...
 
     def write(self, record: Record, /) -> None:
@@ -163,7 +163,7 @@ class PhotographChooser:
     """Chooses the 1st, 2nd, 4th, 8th, ... crop in which a fish does not touch the border.
 
     So a fish has a few photographs from all of the time that it is in view: 1 + log2(n) of n crops.
-    Of one that always touches the border, the first is chosen.
+    Of a fish that always touches the border, the first crop is chosen.
     """
 
     def __init__(self) -> None:

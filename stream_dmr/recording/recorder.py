@@ -199,7 +199,7 @@ class Recorder:
             self._try(sink, partial(sink.write, record))
 
     def _try(self, sink: Sink, write: Callable[[], None]) -> None:
-        """Let one sink write; without `on_refusal`, one that failed is not tried again.
+        """Let a sink write; without `on_refusal`, a sink that failed is not tried again.
 
         The others go on: where there is no room for pictures, there may still be for lengths.
         """

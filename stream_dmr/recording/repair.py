@@ -74,9 +74,9 @@ _DAMAGED = ".damaged"  # suffix of a file in which nothing is intact
 
 
 class Repair(NamedTuple):
-    """What was done about an unfinished file of a recording."""
+    """The repair of an unfinished file of a recording."""
 
-    path: Path  # of the repaired file, or of the one that was set aside
+    path: Path  # of the repaired file, or of a damaged file that was set aside
     line: str  # for the user
 
 

@@ -5,7 +5,6 @@ import re
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
-from functools import partial
 from itertools import chain
 from pathlib import Path
 from threading import Thread
@@ -22,7 +21,7 @@ from stream_dmr.messages import (
     TrackEnded,
 )
 from stream_dmr.reasons import Reason
-from stream_dmr.recording.codec import decode, encode
+from stream_dmr.recording.codec import decode
 from stream_dmr.recording.header import RunHeader
 from stream_dmr.recording.mcap.mcap_sink import PART, McapSink
 from stream_dmr.recording.reading import Recording
@@ -57,10 +56,6 @@ class OpenTracks:
                     self._tracks.pop(estimate.track_id, None)
             case _:
                 pass
-
-    def add_earlier(self, fish: LocalizedFish) -> None:
-        """Take a frame that an earlier recording has."""
-        self.add(Record(message=fish, whole=fish, encoding=partial(encode, fish)))
 
     def records(self) -> Iterator[Record]:
         for records in self._tracks.values():
@@ -99,7 +94,7 @@ class UnfinishedFiles:
         is written.
         """
         left = (path, path.with_name(path.name + PART))
-        self._paths += [one for one in left if os.path.exists(one)]  # False where the disk fails
+        self._paths += [file for file in left if os.path.exists(file)]  # False if the disk fails
 
     def repair_soon(self) -> None:
         if self._paths and not self._thread.is_alive():
@@ -170,7 +165,7 @@ class SegmentFiles:
         try:
             with writing_to(self._out_dir):
                 last = last_segment_number(self._out_dir)
-            number = 1 + max(self._number, last)  # a torn one keeps its own
+            number = 1 + max(self._number, last)  # a torn file keeps its own
             stem = f"{STEM}-{number:06d}"
             names = [self._out_dir / f"{stem}{suffix}" for suffix in (".mcap", ".rrd")]
             sinks = open_recording_files(
@@ -187,7 +182,7 @@ class SegmentFiles:
         return sinks
 
     def each(self, sinks: list[FileSink], write: Callable[[FileSink], None]) -> None:
-        """Write to each; one that the disk refuses is closed and leaves the list."""
+        """Write to each; a sink that the disk refuses is closed and leaves the list."""
         for sink in [*sinks]:
             try:
                 write(sink)
@@ -272,7 +267,7 @@ class RotatingSink:
         self._open_tracks, self._ahead = OpenTracks(), list[Record]()
         self._cropped, self._new = set[int](), set[int]()  # tracks; first cropped since the cut
         for fish in interrupted:
-            self._open_tracks.add_earlier(fish)
+            self._open_tracks.add(make_record(fish, self._settings))
         self._learnt = [make_record(one, self._settings) for one in learnt]
         self._next: list[FileSink] = []
         self._open = self._open_next()
@@ -287,7 +282,7 @@ class RotatingSink:
         if isinstance(message, LengthEstimate):
             if is_after and not message.is_final:
                 self._complete()
-            is_after = False  # a final one belongs to the segment in which its track ended
+            is_after = False  # a final length belongs to the segment in which its track ended
         is_after |= self._is_of_new_track(message)
         if is_after:
             self._ahead.append(record)

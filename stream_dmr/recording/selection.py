@@ -1,4 +1,4 @@
-"""What is read of a recording: some time, some tracks, or all of it."""
+"""The part of a recording that is read: some time, some tracks, or all of it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -15,7 +15,7 @@ class WholeRecords:
     """Makes records of messages that were recorded before, with pictures and vertices.
 
     What a second camera recorded comes in between, drawn with the first camera's frame that is the
-    nearest in time. From before the first one it has frame 0, which is not drawn.
+    nearest in time. Messages from before the first frame have frame 0, which is not drawn.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class WholeRecords:
         yield Record(message=message, whole=whole, encoding=partial(bytes, payload))
 
     def rest(self) -> Iterator[Record]:
-        """What is left of the second camera."""
+        """The messages that are left of the second camera."""
         return self._seconds(None)
 
     def _seconds(self, until_ns: int | None) -> Iterator[Record]:

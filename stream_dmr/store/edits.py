@@ -154,7 +154,7 @@ Frames = Mapping[int, Sequence[LocalizedFish]]  # by recorded or added track, in
 
 
 def settings_of(recording: Recording) -> SmoothLengthSettings:
-    return recorded_settings(recording, "smooth_length", SmoothLengthSettings)
+    return recorded_settings(recording.header, "smooth_length", SmoothLengthSettings)
 
 
 def frames_of_tracks(

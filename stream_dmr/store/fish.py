@@ -157,7 +157,7 @@ def read_fish(path: Path, recording: Recording, selection: Selection = EVERYTHIN
 
 def recorded_track(recording: Recording) -> VesselTrack:
     """The vessel's track of a recording, as its run's settings cut it at gaps."""
-    settings = recorded_settings(recording, "sensors", SensorsSettings)
+    settings = recorded_settings(recording.header, "sensors", SensorsSettings)
     positions = messages_of(recording, Position)
     return VesselTrack(kept_of(positions, keep_s=settings.keep_s, max_gap_s=settings.max_gap_s))
 

@@ -118,7 +118,7 @@ def frame_images(
     if source is None:
         opened = nullcontext(RecordedPictures(recording, EVERYTHING))
     else:
-        settings = recorded_settings(recording, "read_frames", ReadFramesSettings)
+        settings = recorded_settings(recording.header, "read_frames", ReadFramesSettings)
         opened = open_pictures(source, settings)
     with checked, opened as pictures:
         for message, payload in decoded_messages(recording, [Frame], EVERYTHING):

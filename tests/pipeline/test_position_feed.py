@@ -37,9 +37,3 @@ def test_positions_of_another_day_are_said(tmp_path: Path):
 def test_what_was_left_out_is_said(tmp_path: Path):
     text = "$GPRMC,1\n" + straight_way(9)
     assert "1 unreadable" in fed(tmp_path / "way.nmea", "2026-11-22T06:00:00Z", text)[1]
-
-
-def test_without_positions_nothing_is_written(tmp_path: Path):
-    feed = PositionFeed(None, lambda position: None)
-    feed.take(frame(1, 0))
-    assert feed.finish() == ""

@@ -12,6 +12,6 @@ GOLDEN = Path(__file__).parents[2] / "recordings" / "golden"
 def test_a_table_is_the_run_s_and_a_newer_one_has_its_defaults():
     recording = open_recordings([GOLDEN])
     of_run = parse_config(recording.header.config_toml, where="golden").smooth_length
-    assert recorded_settings(recording, "smooth_length", SmoothLengthSettings) == of_run
-    newer = recorded_settings(recording, "not_yet_there", SmoothLengthSettings)
+    assert recorded_settings(recording.header, "smooth_length", SmoothLengthSettings) == of_run
+    newer = recorded_settings(recording.header, "not_yet_there", SmoothLengthSettings)
     assert newer == SmoothLengthSettings()

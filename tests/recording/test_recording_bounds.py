@@ -85,16 +85,9 @@ def test_a_final_length_ends_its_track_and_no_other():
 @pytest.mark.parametrize("reason", ["track has ended", "outlier"])
 def test_a_frame_after_the_end_leaves_no_track_open(reason: str):
     tracks = OpenTracks()
-    tracks.add_earlier(localized(1, 1))
+    tracks.add(record(localized(1, 1)))
     tracks.add(record(replace(final_estimate(1), is_final=False, frame_reason=reason)))
     assert bool(list(tracks.records())) == (reason != "track has ended")
-
-
-def test_earlier_frames_are_encoded_as_they_were():
-    tracks = OpenTracks()
-    tracks.add_earlier(LOCALIZED)
-    (only,) = tracks.records()
-    assert only.payload == encode(LOCALIZED)
 
 
 def test_neighbouring_tracks_have_different_colours():

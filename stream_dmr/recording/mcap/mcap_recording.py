@@ -61,12 +61,12 @@ class McapRecording:
         Of a file that a run is writing, and may rename, this is what it holds now.
         """
         self.path = path
-        self._snapshot = _snapshot(path) if path.suffix == PART else None
-        self.is_being_written = self._snapshot is not None and is_locked(path.parent)
+        self._snapshot: Snapshot | None = None
         self.warnings: list[str] = []
         self.metadata: dict[str, str] = {}
         self.is_segment = self.is_thinned = self.ends_early = False
         self.header = self._read_header()
+        self.is_being_written = path.suffix == PART and is_locked(path.parent)
 
     def tracks(self) -> Collection[int]:
         """The track ids in it, read from the index where it has one."""
@@ -173,6 +173,8 @@ class McapRecording:
     @contextmanager
     def _open(self) -> Generator[IO[bytes]]:
         try:
+            if self._snapshot is None and self.path.suffix == PART:
+                self._snapshot = _snapshot(self.path)
             with self._snapshot.open() if self._snapshot else self.path.open("rb") as stream:
                 yield stream
         except OSError as error:
@@ -190,20 +192,14 @@ class McapRecording:
 
 
 def _snapshot(path: Path) -> Snapshot:
-    """Of a file that may just be getting its final name."""
+    """A snapshot of a file that may just be getting its final name."""
     try:
-        try:
-            return Snapshot(path)
-        except FileNotFoundError:
-            return Snapshot(path.with_suffix(""))
-    except OSError as error:
-        raise RecordingError(
-            f"{path}: expected a recording (.mcap or .rrd), got: {error.strerror}; check the path"
-        ) from error
+        return Snapshot(path)
+    except FileNotFoundError:
+        return Snapshot(path.with_suffix(""))
 
 
 def is_torn(path: Path) -> bool:
-    """True where a file lacks its end."""
     with path.open("rb") as stream:
         return _is_torn(stream)
 
