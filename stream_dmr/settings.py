@@ -7,7 +7,7 @@ class Settings(BaseModel):
     """Base class of one table of `config.toml`, defined beside the algorithm that uses it.
 
     Unknown keys, wrong types and values out of range raise pydantic's ValidationError, which
-    `running.config` turns into a ConfigError of one line.
+    `pipeline.config` turns into a ConfigError of one line.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)

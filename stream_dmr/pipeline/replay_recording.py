@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -265,7 +265,7 @@ def replay(
     _refuse_impossible(request, recording)
     inputs = read_inputs(request, recording, observer)
     recorded = RecordedMessages(recording, request.selection)
-    carried_over = _carried_over(request, recorded)
+    recomputed, carried_over = messages_from(request.first), _carried_over(request, recorded)
     with ExitStack() as stack:
         places_fish = request.first == "localize"
         second = open_second(recording, request.second, inputs, observer, places_fish=places_fish)
@@ -285,10 +285,13 @@ def replay(
                 observer=observer,
             )
             results = stack.enter_context(opening)
-        comparator = _open_comparator(request, recorded, {fish.track_id for fish in carried_over})
+        kinds = recomputed if request.check else ()
+        # The first fit of a track that was carried over starts from another fit than in the run.
+        unlike = {fish.track_id for fish in carried_over} if FittedMesh in kinds else ()
+        comparator = MessageComparator(recorded, kinds, leave_out=unlike)
         writer = ReplayWriter(
             recorded,
-            recomputed=messages_from(request.first),
+            recomputed=recomputed,
             settings=inputs.config.recording,
             results=results,
             whole=whole,
@@ -414,14 +417,6 @@ def _carried_over(request: ReplayOptions, recorded: RecordedMessages) -> list[Lo
             f"{in_view}: their fits start from others, and --check leaves them out"
         )
     return carried_over
-
-
-def _open_comparator(
-    request: ReplayOptions, recorded: RecordedMessages, carried_over: Collection[int]
-) -> MessageComparator:
-    kinds = messages_from(request.first) if request.check else ()
-    # The first fit of a track that was carried over starts from another fit than in the run.
-    return MessageComparator(recorded, kinds, leave_out=carried_over if FittedMesh in kinds else ())
 
 
 def _open_chain(

@@ -2,31 +2,13 @@
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
 from stream_dmr.messages import Frame, LengthEstimate, Message
 from stream_dmr.pipeline.chain import Chain
-from stream_dmr.pipeline.config import Config
 from stream_dmr.pipeline.haul_log import HaulLog
+from stream_dmr.pipeline.run_inputs import Inputs
 from stream_dmr.recording.record import SinkStates
-from stream_dmr.sources.positions import PositionSource
-from stream_dmr.sources.source import Source
 from stream_dmr.store.length_store import LengthStore
-
-
-@dataclass(frozen=True, kw_only=True)
-class OpenRun:
-    """The parts of a run that can be observed beside its messages."""
-
-    config: Config
-    source: Source
-    positions: PositionSource | None = None
-    store: LengthStore
-    hauls: HaulLog
-    out: Path
-    sinks: SinkStates
-    key: Path | None = None  # of the device, which signs what it writes
 
 
 class RunObserver:
@@ -49,7 +31,7 @@ class RunObserver:
     def serving(self, address: str) -> None:
         """The view can be watched at `address` from now on."""
 
-    def open(self, run: OpenRun) -> None:
+    def open(self, inputs: Inputs, store: LengthStore, hauls: HaulLog, sinks: SinkStates) -> None:
         """Inputs and outputs are open; raise a UserError to refuse the run."""
 
     def attach(self, chain: Chain) -> None:

@@ -29,7 +29,7 @@ from stream_dmr.pipeline.haul_log import HaulLog
 from stream_dmr.pipeline.learn_shapes import SeenFish
 from stream_dmr.pipeline.run_folder import prepare_folder
 from stream_dmr.pipeline.run_inputs import Inputs
-from stream_dmr.pipeline.run_observer import OpenRun, RunObserver
+from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.recording.header import RunHeader, RunStart
 from stream_dmr.recording.reading import Recording, learnt_shapes, messages_of, open_recordings
 from stream_dmr.recording.record import Record, SinkStates
@@ -339,17 +339,7 @@ def open_outputs(inputs: Inputs, observer: RunObserver) -> Generator[Outputs]:
         # the recording's end.
         stack.enter_context(closing(observer))
         hauls = HaulLog(store, inputs.config.hauls, frames_lost=partial(_frames_lost, inputs))
-        observer.open(
-            OpenRun(
-                config=inputs.config,
-                source=inputs.source,
-                positions=inputs.positions,
-                store=store,
-                hauls=hauls,
-                out=out,
-                sinks=states,
-            )
-        )
+        observer.open(inputs, store, hauls, states)
         # What earlier runs recorded is read before a new segment stands beside it.
         interrupted = interrupted_tracks(
             repairs if is_endless else [], store, on_notice=observer.warn

@@ -18,8 +18,12 @@ from typing import Any
 
 from stream_dmr.messages import LengthEstimate, Message
 from stream_dmr.pipeline.chain import Chain
-from stream_dmr.pipeline.run_observer import OpenRun, RunObserver
+from stream_dmr.pipeline.haul_log import HaulLog
+from stream_dmr.pipeline.run_inputs import Inputs
+from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.recording.record import SinkStates
 from stream_dmr.store.ledger import Signer
+from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.scale_checks import ScaleAlarm
 from stream_dmr.web.alerts import AlertSender
 from stream_dmr.web.run_state import RunState
@@ -160,23 +164,24 @@ class WatchObserver(RunObserver):
         self._state: RunState | None = None  # from `open` on
         self._opened = ExitStack()
 
-    def open(self, run: OpenRun) -> None:
+    def open(self, inputs: Inputs, store: LengthStore, hauls: HaulLog, sinks: SinkStates) -> None:
         """Serve as `[watch]` says; ConfigError or OutputError where it can't listen as asked."""
-        self._observer.open(run)
-        settings, silence_s = run.config.watch, run.config.read_frames.silence_s
+        self._observer.open(inputs, store, hauls, sinks)
+        config, out = inputs.config, inputs.request.out
+        settings = config.watch
         state = RunState(
-            run.source,
-            run.out,
-            silence_s=silence_s,
+            inputs.source,
+            out,
+            silence_s=config.read_frames.silence_s,
             stuck_s=settings.stuck_s,
-            sinks=run.sinks,
-            zones=run.config.zones,
-            positions=run.positions,
-            hauls=run.hauls,
-            scale_alarm=ScaleAlarm(run.store.path, run.store.calibration_sha256).line,
-            store=run.store,
+            sinks=sinks,
+            zones=config.zones,
+            positions=inputs.positions,
+            hauls=hauls,
+            scale_alarm=ScaleAlarm(store.path, store.calibration_sha256).line,
+            store=store,
         )
-        state.continue_after(run.store)
+        state.continue_after(store)
         if settings.port:
             server = self._opened.enter_context(closing(WatchServer(state, settings)))
             self.address = server.address
@@ -185,24 +190,23 @@ class WatchObserver(RunObserver):
                     f"{server.address}metrics: for Prometheus, with the token of "
                     f"{settings.token_file} in the header Authorization: Bearer TOKEN"
                 )
-        alerts = run.config.alerts
+        alerts = config.alerts
         if alerts.webhook or alerts.apprise_file:
             sender = AlertSender(
-                alerts, run=run.out.resolve().name, problems=state.problems, on_notice=self.warn
+                alerts, run=out.resolve().name, problems=state.problems, on_notice=self.warn
             )
             self._opened.enter_context(closing(sender))
-        if run.config.digest.folder and run.source.is_endless:
+        if config.digest.folder and inputs.source.is_endless:
             from stream_dmr.web.day_digest import DailyDigests  # with the views of a report
 
-            # Clips may be measured long after they were filmed.
-            now_ns = time.time_ns if run.source.is_live else lambda: run.store.last_ns
-            folder, signer, problems = (
-                Path(run.config.digest.folder),
-                Signer(run.key),
-                state.problems,
-            )
             digests = DailyDigests(
-                folder, run.store, signer, now_ns, problems=problems, on_notice=self.warn
+                Path(config.digest.folder),
+                store,
+                Signer(inputs.request.key),
+                # Clips may be measured long after they were filmed.
+                time.time_ns if inputs.source.is_live else lambda: store.last_ns,
+                problems=state.problems,
+                on_notice=self.warn,
             )
             self._opened.enter_context(closing(digests))
         self._opened.enter_context(closing(SystemdWatchdog(lambda: not state.is_stuck())))
