@@ -42,14 +42,23 @@ from stream_dmr.fitting.shape.candidates import (
 )
 from stream_dmr.fitting.shape.space import reshaped
 from stream_dmr.fitting.shape.stocks import FRAMES_PER_FISH, MAX_FISH, GoodCrops, evenly, good_crops
-from stream_dmr.messages import FishCrop, Frame, LearntShapes, LengthEstimate, Message
+from stream_dmr.messages import (
+    FishCrop,
+    Frame,
+    LearntShapes,
+    LengthEstimate,
+    Message,
+    TrackEnded,
+)
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.nodes.read_frames import ReadFrames
+from stream_dmr.pipeline.chain import run_chain
 from stream_dmr.pipeline.run_folder import require_folder
 from stream_dmr.pipeline.run_inputs import Inputs
 from stream_dmr.pipeline.run_observer import RunObserver
-from stream_dmr.pipeline.session import KeptFrames, Session, Setup, keep_crops
+from stream_dmr.pipeline.session import KeptCrops, KeptFrames, Session, Setup
+from stream_dmr.recording.record import as_recorded
 from stream_dmr.store.open_results import (
     LEARNT,
     MADE_BY_RUN,
@@ -172,27 +181,37 @@ def with_learnt_shapes(
     require_free_names(request.out, overwrite=request.overwrite)
     on_part("finding the fish")
     observer.stage("finding the fish, for their shapes")
-    frames = None
-    if not (config.recording.keeps_pictures or config.watch.port or observer.needs_pictures):
-        frames = KeptFrames(config.recording, request.out)
-    crops = keep_crops(
-        inputs.reader,
-        crop_fish,
-        config.recording,
-        kept_frames=frames,
-        stop=stop,
-        on_frame=observer.frame_done,
-    )
-    inputs.reader.close()
-    if frames is None:
-        inputs = replace(inputs, reader=ReadFrames(request.source, config.read_frames))
-    else:
-        inputs.reader.give_again(frames)
-    inputs = replace(inputs, crops=crops, kept_frames=frames)
+    inputs, crops = _first_pass(inputs, crop_fish, stop=stop, observer=observer)
     if stop.is_set():
         return inputs
     on_part("learning their shapes")
     return replace(inputs, candidates=_learn_and_report(crops, inputs, forms, observer))
+
+
+def _first_pass(
+    inputs: Inputs, crop_fish: CropFish, *, stop: Event, observer: RunObserver
+) -> tuple[Inputs, KeptCrops]:
+    """Keep the crops of the source, and its frames unless their pictures are needed again."""
+    config, reader = inputs.config, inputs.reader
+    crops, frames = KeptCrops(), None
+    if not (config.recording.keeps_pictures or config.watch.port or observer.needs_pictures):
+        frames = KeptFrames(config.recording, inputs.request.out)
+
+    def take(message: Message) -> Message:
+        message = as_recorded(message, config.recording)  # from decoded pixels, as in the run
+        if isinstance(message, FishCrop | TrackEnded):
+            crops.keep(message)
+        elif isinstance(message, Frame) and frames is not None:
+            frames.keep(message)
+        return message
+
+    run_chain(reader, [crop_fish], on_message=take, on_frame=observer.frame_done, stop=stop)
+    reader.close()
+    if frames is None:
+        reader = ReadFrames(inputs.request.source, config.read_frames)
+    else:
+        reader.give_again(frames)
+    return replace(inputs, reader=reader, crops=crops, kept_frames=frames), crops
 
 
 def learnt_from(crops: Iterable[FishCrop], setup: S, observer: RunObserver) -> S:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from tempfile import SpooledTemporaryFile, TemporaryFile
-from threading import Event
 from typing import IO, TypeVar
 
 from stream_dmr.camera import Calibration, Camera
@@ -27,9 +26,8 @@ from stream_dmr.messages import (
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
 from stream_dmr.nodes.localize import Localize
-from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.nodes.smooth_length import SmoothLength
-from stream_dmr.pipeline.chain import Node, run_chain
+from stream_dmr.pipeline.chain import Node
 from stream_dmr.pipeline.config import Config
 from stream_dmr.pipeline.run_options import Stage
 from stream_dmr.recording.codec import compress, decode, encode
@@ -263,33 +261,6 @@ class KeptFrames:
 
     def _next(self) -> bytes:
         return self._file.read(int.from_bytes(self._file.read(_LENGTH_BYTES)))
-
-
-def keep_crops(
-    frames: ReadFrames,
-    crop_fish: CropFish,
-    settings: RecordingSettings,
-    *,
-    kept_frames: KeptFrames | None,
-    stop: Event,
-    on_frame: Callable[[], None],
-) -> KeptCrops:
-    """The crops of a source, as a recording with these settings would hold them.
-
-    `kept_frames` gets the frames, if it is given.
-    """
-    kept = KeptCrops()
-
-    def take(message: Message) -> Message:
-        message = as_recorded(message, settings)  # from decoded pixels, as in the run
-        if isinstance(message, FishCrop | TrackEnded):
-            kept.keep(message)
-        elif isinstance(message, Frame) and kept_frames is not None:
-            kept_frames.keep(message)
-        return message
-
-    run_chain(frames, [crop_fish], on_message=take, on_frame=on_frame, stop=stop)
-    return kept
 
 
 class CropFishOfRuns:

@@ -104,7 +104,7 @@ FOXGLOVE_TOPICS = {
 
 
 def topics_table() -> str:
-    """The Markdown tables of topics in `docs/files.md`; `python -m` this module prints them."""
+    """The Markdown tables of topics in `docs/files.md`."""
     lines = ["| message | topic (.mcap) | schema | entities (.rrd) |", "|---|---|---|---|"]
     for row in TOPICS.values():
         entities = ", ".join(f"`{path}`" for path in row.entities)
@@ -191,7 +191,3 @@ class RecordingSettings(Settings):
     def keeps_photographs(self, *, is_live: bool) -> bool:
         """True where some crops of each fish are all that will be left to see of it."""
         return is_live and self.crops == "few" and self.frames == "reference"
-
-
-if __name__ == "__main__":
-    print(topics_table())
