@@ -127,8 +127,7 @@ class HaulLog:
     def finish(self) -> None:
         with self._lock:
             self._write_watched()
-            if self._ruled is not None:
-                self._end_ruled(self._last_fish_ns)
+            self._end_ruled(self._last_fish_ns)
 
     def _end_ruled(self, timestamp_ns: int) -> None:
         if self._ruled is not None:

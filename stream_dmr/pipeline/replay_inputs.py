@@ -132,21 +132,13 @@ def find_crop_files(
     return CropFiles(source=source, boxes=boxes, masks=masks, missing_source=missing_source)
 
 
-def inputs_with(
-    recorded: RunInputs | None,
-    *,
-    source: str | None,
-    boxes: Path | None,
-    masks: Path | None,
-    calibration: Path | None,
-) -> RunInputs | None:
+def inputs_with(recorded: RunInputs | None, **given: str | Path | None) -> RunInputs | None:
     """The recorded inputs, replaced by the given ones."""
     if recorded is None:
         return None
-    given = {"source": source, "boxes": boxes, "masks": masks, "calibration": calibration}
-    if boxes is not None or masks is not None:
-        recorded = replace(recorded, boxes=None, masks=None)
     files = {name: InputFile.read(path) for name, path in given.items() if path is not None}
+    if files.keys() & {"boxes", "masks"}:
+        recorded = replace(recorded, boxes=None, masks=None)
     return replace(recorded, **files)
 
 
@@ -238,10 +230,12 @@ def new_header(
     inputs: ReplayInputs,
     second: SecondCamera | None,
 ) -> RunHeader:
-    calibration, is_cut_anew = request.calibration, inputs.files is not None
+    given: dict[str, str | Path | None] = {"calibration": request.calibration}
+    if inputs.files is not None:  # crops are cut again
+        given |= {"source": request.source, "boxes": request.boxes, "masks": request.masks}
     calibration_file = recorded.calibration_file
-    if calibration is not None:
-        calibration_file = calibration.read_bytes()
+    if request.calibration is not None:
+        calibration_file = request.calibration.read_bytes()
     return RunHeader(
         source=recorded.source,
         command=request.command,
@@ -250,13 +244,7 @@ def new_header(
         candidates=inputs.candidates,
         calibration=inputs.calibration,
         calibration_file=calibration_file,
-        inputs=inputs_with(
-            recorded.inputs,
-            source=request.source if is_cut_anew else None,
-            boxes=request.boxes if is_cut_anew else None,
-            masks=request.masks if is_cut_anew else None,
-            calibration=calibration,
-        ),
+        inputs=inputs_with(recorded.inputs, **given),
         runs=recorded.runs,
         second=second,
     )

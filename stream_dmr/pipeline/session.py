@@ -437,9 +437,10 @@ class PlaybackNode:
 
     def step(self, message: Frame | FishCrop | FittedMesh, /) -> Sequence[Message]:
         """The recorded messages of a frame and its ends, or that of one fish in a frame."""
-        recorded = self._recorded(message)
         if not isinstance(message, Frame):
-            return recorded
+            found = self._messages.take(message.frame_index, message.track_id)
+            return [] if found is None else [found]
+        recorded = self._messages.until(message.frame_index)
         self._last = message
         return [*recorded, *self._ends_after(message, recorded)]
 
@@ -450,12 +451,6 @@ class PlaybackNode:
                 yield TrackEnded.after(frame, track_id, "timeout")
         while self._ends and self._ends[0].frame_index <= frame.frame_index:
             yield self._ends.popleft()
-
-    def _recorded(self, message: Frame | FishCrop | FittedMesh) -> list[Message]:
-        if isinstance(message, Frame):
-            return self._messages.until(message.frame_index)
-        found = self._messages.take(message.frame_index, message.track_id)
-        return [] if found is None else [found]
 
     def close(self) -> Sequence[Message]:
         """The ends of the tracks that are left, if none was recorded."""

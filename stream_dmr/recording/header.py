@@ -151,7 +151,7 @@ _LIBRARIES = ("numpy", "opencv-python-headless", "torch", "scipy", "numba", "mca
 REPRODUCIBLE_BY = ("stream_dmr", "arithmetic", *_LIBRARIES)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True, slots=True, order=True)
 class RunStart:
     """Where a run in a folder began: with nothing seen, after the numbers of earlier runs there."""
 
@@ -275,8 +275,7 @@ class RunHeader:
 
 def joined_runs(headers: Iterable[RunHeader]) -> tuple[RunStart, ...]:
     """The runs of several segments, each once, by their frames."""
-    runs = {run for header in headers for run in header.runs}
-    return tuple(sorted(runs, key=lambda run: (run.frames_before, run.tracks_before)))
+    return tuple(sorted({run for header in headers for run in header.runs}))
 
 
 def _checksum(attachments: Mapping[str, bytes]) -> int:
