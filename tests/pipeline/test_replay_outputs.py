@@ -8,6 +8,8 @@ import pytest
 
 from stream_dmr.calibration.calibration_file import load_calibration, save_calibration
 from stream_dmr.evidence.verify_folder import verify
+from stream_dmr.messages import FittedMesh
+from stream_dmr.recording.view_geometry import MeshRebuilder
 from stream_dmr.store.fish import read_runs, read_stored_fish, run_notes
 from stream_dmr.store.run_facts import SOURCE_ENDED
 from stream_dmr.web.open_reports import open_report
@@ -60,6 +62,25 @@ def test_a_part_says_that_it_is_one(run: Path, tmp_path: Path):
     out = tmp_path / "out"
     assert invoke(f"replay {run}", {"--track": "1", "--out": str(out)}).code == 0
     assert "the selected part of a recording" in run_notes(out)[0]
+
+
+@pytest.mark.parametrize(("rrd", "are_computed"), [("true", True), ("false", False)])
+def test_vertices_are_computed_only_to_be_drawn(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rrd: str, are_computed: bool
+):
+    computed: list[FittedMesh] = []
+    with_vertices = MeshRebuilder.with_vertices
+
+    def counted(meshes: MeshRebuilder, fit: FittedMesh) -> FittedMesh:
+        computed.append(fit)
+        return with_vertices(meshes, fit)
+
+    monkeypatch.setattr(MeshRebuilder, "with_vertices", counted)
+    config = tmp_path / "config.toml"
+    config.write_text(f"[recording]\nrrd = {rrd}\n")
+    options = {"--from": "localize", "--config": str(config), "--out": str(tmp_path / "out")}
+    assert invoke(f"replay {run}", options).code == 0
+    assert bool(computed) == are_computed
 
 
 def test_the_recording_alone_is_replayed_without_them(run: Path, tmp_path: Path):
