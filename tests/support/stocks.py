@@ -1,5 +1,7 @@
 """Two stocks of one small mesh, slim and broad, and crops of their fish in known poses."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from stream_dmr.fitting.paper.torch_body import Rig
@@ -12,9 +14,10 @@ from stream_dmr.fitting.shape.space import (
     reshaped,
 )
 from stream_dmr.fitting.shape.stocks import FishSamples, Sample
+from stream_dmr.messages import FishEnds
 from stream_dmr.template.template import simplified
 from stream_dmr.template.template_file import load_template
-from tests.support.shapes import crop_of, pose
+from tests.support.shapes import anchor, crop_of, picture, pose
 
 TEMPLATE = simplified(load_template("salmon"), max_faces=600)
 TOWARD_CAMERA = np.array([0.0, 0.0, 1.0])
@@ -58,5 +61,9 @@ def fish_of(shape, *, track_id, candidate=SLIM, num_frames=2, against=(0.0, 0.0)
     for frame_index in range(1, num_frames + 1):
         flat = pose(rng, in_plane_rad=rng.uniform(-np.pi, np.pi))
         crop = crop_of(flat, rig, frame_index=frame_index, track_id=track_id)
+        _, deformed = picture(flat, rig, crop.crop_camera)
+        points = (deformed.keypoints[0] + anchor(crop.crop_camera)).numpy()
+        head_px, _, tail_px = crop.crop_camera.project(points)
+        crop = replace(crop, ends=FishEnds(head_px=head_px, tail_px=tail_px, confidence=0.99))
         samples.append(Sample(crop, flat[0].numpy()))
     return FishSamples(track_id, candidate, samples, np.array(against))
