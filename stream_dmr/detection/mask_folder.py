@@ -18,8 +18,11 @@ from stream_dmr.files import open_file
 from stream_dmr.pictures import PICTURE_SUFFIXES
 
 _FILE_NAME = re.compile(r"\d{6,}\.png")
-# What Pillow raises for a PNG that it cannot decode.
-_DECODING_ERRORS = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
+# What Pillow raises for a PNG that it cannot decode; IndexError for one without pixels.
+_DECODING_ERRORS = (
+    *(OSError, SyntaxError, ValueError, EOFError, IndexError),
+    Image.DecompressionBombError,
+)
 _MAX_LOOKED_AT = 20  # pictures, for ids where the first one has none
 _MIN_GREY_LEVELS = 8  # ids of a picture, from which on they are looked at; chosen
 # Commands that make ids of white on black, in place: 1, and 1, 2, 3 ... picture by picture.

@@ -208,3 +208,13 @@ def test_a_mask_with_a_wrong_checksum_is_refused(tmp_path):
     path.write_bytes(content)
     with pytest.raises(AnnotationError, match="can't be decoded"):
         MaskFolder(tmp_path).labels(1, **LABELS_SIZE)
+
+
+def test_a_mask_without_pixels_is_refused(tmp_path):
+    path = tmp_path / "000001.png"
+    cv2.imwrite(str(path), labels_of(id1=(0, 0, 2, 2)))
+    content = path.read_bytes()
+    begin = content.index(b"IDAT") - 4
+    path.write_bytes(content[:begin] + content[content.index(b"IEND") - 4 :])
+    with pytest.raises(AnnotationError, match="can't be decoded"):
+        MaskFolder(tmp_path).labels(1, **LABELS_SIZE)
