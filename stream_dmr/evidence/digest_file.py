@@ -41,9 +41,18 @@ def read_digest(path: Path, key: Ed25519PublicKey | None = None) -> dict[str, An
         if key and not is_signature(key, data[-SIGNATURE_BYTES:], data[:-SIGNATURE_BYTES]):
             return None
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if archive.getinfo(CONTENT).file_size > _MAX_CONTENT_BYTES:
+            said = archive.getinfo(CONTENT)
+            # `archive.read` unpacks all there is, whatever size is said, and so do other methods.
+            if said.compress_type not in (zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED):
+                raise ValueError("another way of packing")
+            with archive.open(said) as file:
+                text = file.read(_MAX_CONTENT_BYTES + 1)
+            if len(text) > _MAX_CONTENT_BYTES:
                 raise ValueError("too much")
-            return json.loads(archive.read(CONTENT))
+            content = json.loads(text)
+            if not isinstance(content["day"], str) or not isinstance(content["fish"], list):
+                raise ValueError("no day of fish")
+            return content
     except Exception as error:  # of zipfile, zlib and JSON: damage has many
         raise OutputError(
             f"{path}: expected a digest, got: {reason_of(error)}; check the path, or make it again"

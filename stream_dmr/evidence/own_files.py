@@ -6,6 +6,7 @@ from pathlib import Path
 
 from stream_dmr.errors import OutputError
 from stream_dmr.evidence.seal import known_files, read_origin
+from stream_dmr.files import open_file
 from stream_dmr.store.schema import NAME as DATABASE
 
 _OF_RUN = re.compile(
@@ -59,7 +60,7 @@ def is_made_by(command: str) -> Callable[[Path], bool]:
 
     def is_made(path: Path) -> bool:
         try:
-            with path.open("rb") as file:
+            with open_file(path) as file:
                 return f"stream-dmr {command}".encode() in file.read(_HEAD_BYTES)
         except OSError:
             return False

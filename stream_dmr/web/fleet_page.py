@@ -20,7 +20,7 @@ from urllib.parse import parse_qs, urlsplit
 from urllib.request import url2pathname
 
 from prometheus_client.parser import text_string_to_metric_families
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from stream_dmr.errors import ConfigError, OutputError, UserError, reason_of
 from stream_dmr.evidence.digest_file import read_digest
@@ -54,14 +54,22 @@ class Box:
     token: str = field(default="", repr=False)
 
 
+def _shown(text: str) -> str:
+    """The beginning of what a box says, as text that any file takes: JSON may hold half letters."""
+    return text[:_MAX_ALARM_CHARACTERS].encode(errors="backslashreplace").decode()
+
+
+_Lines = Annotated[tuple[Annotated[str, AfterValidator(_shown)], ...], Field(strict=False)]
+
+
 class BoxReading(BaseModel):
     """What a box said of itself."""
 
     model_config = ConfigDict(frozen=True, strict=True, allow_inf_nan=False)
 
     is_healthy: bool
-    problems: Annotated[tuple[str, ...], Field(strict=False)]
-    warnings: Annotated[tuple[str, ...], Field(strict=False)]
+    problems: _Lines
+    warnings: _Lines
     num_fish: int = Field(ge=0)
     fish_per_hour: float = Field(ge=0)
     frames_per_s: float | None = Field(default=None, ge=0)  # None: of a digest
@@ -194,11 +202,12 @@ def _told_by_digest(before: BoxState) -> BoxState:
     if last is None or (digest := read_digest(last)) is None:
         return replace(before, error="no digest has come")
     age = datetime.now(UTC).date() - date.fromisoformat(digest["day"])
+    is_old = not timedelta(0) <= age <= _MAX_DIGEST_AGE  # of a day to come: its clock is wrong
     return BoxState(
         box=before.box,
         contact_ns=max(0, min(int(digest["made_ns"]), time.time_ns())),
         reading=BoxReading.model_validate(digest["box"]),
-        error=f"its last digest is of {digest['day']}" if age > _MAX_DIGEST_AGE else "",
+        error=f"its last digest is of {digest['day']}" if is_old else "",
     )
 
 
@@ -250,8 +259,8 @@ def _reading(health: Any, values: dict[str, float]) -> BoxReading:
     recent = [one for one in health["warnings"] if one["age_s"] <= _WARNING_AGE_S]
     return BoxReading(
         is_healthy=health["healthy"],
-        problems=tuple(str(one)[:_MAX_ALARM_CHARACTERS] for one in health["problems"]),
-        warnings=tuple(str(one["line"])[:_MAX_ALARM_CHARACTERS] for one in recent[:_MAX_WARNINGS]),
+        problems=tuple(str(one) for one in health["problems"]),
+        warnings=tuple(str(one["line"]) for one in recent[:_MAX_WARNINGS]),
         num_fish=int(values.get("stream_dmr_fish_total", 0)),
         fish_per_hour=values["stream_dmr_fish_per_hour"],
         frames_per_s=values["stream_dmr_frames_per_second"],
@@ -310,7 +319,7 @@ def write_memory(path: Path, states: Iterable[BoxState]) -> None:
 def replace_text(path: Path, text: str) -> None:
     """Write a text in one step: who reads meanwhile gets the old or the new. Raises OutputError."""
     with replacing(path) as draft:
-        draft.write_text(text, encoding="utf-8")
+        draft.write_text(text, encoding="utf-8", errors="backslashreplace")  # names of files
 
 
 def fleet_page(states: Sequence[BoxState], *, title: str, every_s: float, now_ns: int) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import trimesh
 
+from stream_dmr.errors import OutputError
 from stream_dmr.evidence.own_files import is_made_by, is_of_run, require_writable
 from stream_dmr.evidence.seal import seal_files
 from stream_dmr.simulation import scene_files
@@ -178,3 +179,10 @@ def test_a_run_writes_nothing_into_a_batch_or_exports(
     assert outcome.code == 2
     assert f"of {'exports' if kind == 'exports' else 'a batch'}, which" in outcome.error
     assert contents(target) == before
+
+
+def test_a_pipe_is_no_file_of_ours_and_nobody_waits_for_it(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipe")
+    assert not is_made_by("report")(tmp_path / "pipe")
+    with pytest.raises(OutputError, match="a name that is free"):
+        require_writable(tmp_path / "pipe", is_own=is_made_by("report"))

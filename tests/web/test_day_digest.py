@@ -1,9 +1,12 @@
 """Digests of days: their size, what they say and sign, and that a run writes each day once."""
 
+import io
+import json
 import os
 import shutil
 import threading
 import time
+import tracemalloc
 import zipfile
 from collections.abc import Iterator
 from contextlib import closing
@@ -225,6 +228,42 @@ def test_what_is_no_digest_is_refused(damage: bytes | None, tmp_path: Path):
         path.write_bytes(damage)
     with pytest.raises(OutputError, match="expected a digest"):
         read_digest(path)
+
+
+def zipped(text: str, kind: int, says_bytes: int | None = None) -> bytes:
+    """A digest with this content, whose zip says another size of it."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr(zipfile.ZipInfo(CONTENT), text, kind)
+    data = bytearray(packed.getvalue())
+    if says_bytes is not None:
+        for start in (22, data.rfind(b"PK\1\2") + 24):
+            data[start : start + 4] = says_bytes.to_bytes(4, "little")
+    return bytes(data)
+
+
+@pytest.mark.parametrize("kind", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_bomb_is_not_unpacked(kind: int, tmp_path: Path):
+    path, size = tmp_path / "d.zip", 100_000_000
+    path.write_bytes(zipped("0" * size, kind, says_bytes=100))
+    tracemalloc.start()
+    with pytest.raises(OutputError, match="expected a digest"):
+        read_digest(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < size / 10
+
+
+@pytest.mark.parametrize(
+    "text", ["[]", "null", '{"day": 5, "fish": []}', '{"day": "x", "fish": 1}']
+)
+def test_a_signed_digest_of_other_content_is_refused(text: str, key: Path, tmp_path: Path):
+    path = tmp_path / "d.zip"
+    data = zipped(text, zipfile.ZIP_STORED)
+    signed = data[:-2] + (64).to_bytes(2, "little")  # the length of the comment
+    path.write_bytes(signed + Signer(key).sign_bytes(signed))
+    said = invoke(f"verify {path} --key {key.with_name('device.pub')}")
+    assert (said.code, "expected a digest" in said.error) == (2, True)
 
 
 def test_pictures_are_small_and_of_the_fish(tmp_path: Path):
@@ -468,3 +507,21 @@ def test_the_fleet_shows_digests(busy: Path, tmp_path: Path):
     (state,) = ask_all(states[:1])
     assert (state.kind, state.reading) == ("silent", states[0].reading)  # as it said last
     assert "not a zip file" in state.error
+
+
+def test_the_fleet_bounds_what_digests_say(busy: Path, tmp_path: Path):
+    path, today = tmp_path / "digest-1.zip", datetime.now(UTC).date()
+    write_digest(busy, DAY, path, Signer(None))
+    content = content_of(path)
+    content["box"] |= {"is_healthy": False, "problems": ["\ud800" + "x" * 9000]}
+    (tmp_path / os.fsdecode(b"digest-\xff.zip")).write_bytes(b"none")
+    out, states = tmp_path / "fleet.html", list[BoxState]()
+    for day in (today, date(2999, 1, 1)):
+        text = json.dumps(content | {"day": str(day)})
+        path.write_bytes(zipped(text, zipfile.ZIP_DEFLATED))
+        states += ask_all([BoxState(box=box) for box in load_boxes([str(path)])])
+    assert len(states[0].alarms[0]) < 400
+    assert states[1].error == "its last digest is of 2999-01-01"  # and is not healthy for ever
+    for box in (path, tmp_path):
+        assert invoke(f"fleet {box} --out {out}").code == 0
+    assert "expected a digest" in out.read_text()
