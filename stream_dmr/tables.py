@@ -48,13 +48,17 @@ class CsvFile:
         """Append a row. Raises OutputError where the disk refuses it; nothing of it stays then."""
         try:
             file = self._file or self._open(resume=True)
-            if not file.is_at(self._path):
-                raise OSError(errno.ESTALE, "another file or none has its name now")
+            self.require_name()
             if self._max_bytes is not None and file.tell() >= self._max_bytes:
                 file = self._rotate()
             file.write(_line(row))
         except OSError as error:
             raise self._refusal(error) from error
+
+    def require_name(self) -> None:
+        """Raise OutputError where the file that is open was renamed, deleted or replaced."""
+        if self._file is not None and not self._file.is_at(self._path):
+            raise self._refusal(OSError(errno.ESTALE, "another file or none has its name now"))
 
     def sync(self) -> None:
         """Wait until the rows are on the disk."""

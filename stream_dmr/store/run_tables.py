@@ -207,7 +207,8 @@ class FramesTable:
         self._waiting: dict[tuple[int, int], LocalizedFish] = {}  # by track and frame
 
     def write(self, record: Record) -> None:
-        """Take any record; raises OutputError where the disk refuses a row."""
+        """Take any record; raises OutputError where the disk refuses a row, or the file is lost."""
+        self._table.require_name()  # also with what is no row, which would pass for one written
         message = record.message
         if isinstance(message, LocalizedFish) and not record.is_second:
             self._waiting[message.track_id, message.frame_index] = message

@@ -114,3 +114,15 @@ def test_a_full_disk_is_refused_in_one_line_and_leaves_whole_rows(
         table.close()
     assert (tmp_path / "frames.csv").read_text().endswith("\n")
     assert 0 < len(read(tmp_path / "frames.csv")) < len(fish)
+
+
+def test_a_table_that_was_deleted_is_refused_whatever_comes(
+    tmp_path: Path, messages: list[Message]
+):
+    """Else the next record that is no row would pass for one that was written."""
+    table = FramesTable(tmp_path, is_endless=True)
+    (tmp_path / "frames.csv").unlink()
+    for message in messages:
+        with pytest.raises(OutputError, match="another file or none has its name now"):
+            write_all(table, [message])
+    table.close()

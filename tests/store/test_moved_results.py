@@ -4,13 +4,14 @@ import shutil
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from stream_dmr.errors import OutputError
-from stream_dmr.pipeline.measure_source import measure_source
+from stream_dmr.pipeline.measure_source import RunSummary, measure_source
 from stream_dmr.pipeline.run_observer import RunObserver
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.source import ReadFramesSettings
@@ -18,6 +19,7 @@ from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.run_tables import LengthsTable
 from stream_dmr.web.run_state import RunState
 from stream_dmr.web.watch_page import health_json
+from tests.support.command import invoke
 from tests.support.final_estimates import FACTS, fish
 from tests.support.fish_run import request
 from tests.support.tiny_clip import write_clip
@@ -80,3 +82,22 @@ def test_a_run_whose_folder_was_replaced_does_not_end_well(tmp_path: Path):
     given = request(tmp_path / "clip", out)
     with pytest.raises(OutputError, match=r"lengths\.db|frames\.csv|recording"):
         measure_source(given, stop=threading.Event(), observer=Replacing(out))
+
+
+def test_the_end_promises_no_file_that_is_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def losing(*args: Any, **options: Any) -> RunSummary:
+        summary = measure_source(*args, **options)
+        (tmp_path / "out" / "frames.csv").unlink()
+        return summary
+
+    monkeypatch.setattr("stream_dmr.pipeline.measure_source.measure_source", losing)
+    write_clip(tmp_path / "clip", fish=[[1]] * 4)
+    clip = tmp_path / "clip"
+    given = (
+        f"--masks {clip / 'masks'} --template {clip / 'tiny.ply'} --config {clip / 'quick.toml'}"
+    )
+    said = invoke(f"run --source {clip / 'video.mp4'} {given} --out {tmp_path / 'out'}")
+    assert "frames.csv" not in said.out
+    assert "lengths.db, lengths.csv, recording.mcap, recording.rrd, provenance.json" in said.out
