@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from datetime import UTC, datetime
+from itertools import takewhile
 from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
@@ -35,6 +36,7 @@ from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.messages import FittedMesh, LengthEstimate, LocalizedFish
 from stream_dmr.recording.mcap.mcap_recording import is_torn
 from stream_dmr.recording.reading import decoded_messages, open_recordings, recorded_settings
+from stream_dmr.recording.repair import DAMAGED
 from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.store.edits import (
     ReviewedMessages,
@@ -243,21 +245,35 @@ def _changes(folder: Path, others: Checks) -> Iterator[Change]:
     is_cut = bool(_unfinished_run(runs))
     if runs:
         table = folder / "lengths.csv"
-        yield from _csv(table, LENGTHS_COLUMNS, lengths, witness=DATABASE, is_cut=is_cut)
+        cuts = [len(lengths)] if is_cut else []
+        yield from _csv(table, LENGTHS_COLUMNS, lengths, witness=DATABASE, cuts=cuts)
     frames: dict[str, list[str]] = {}
+    cuts = list[int]()
     # Every .mcap, and an .rrd, which is slow to read, where nothing knows it.
     known = known_files(folder)
-    found = [*folder.glob("*.mcap"), *folder.glob("*.mcap.part")]
+    ends = ("", ".part", f".part{DAMAGED}")
+    found = [path for end in ends for path in folder.glob(f"*.mcap{end}")]
     found += [path for path in folder.glob("*.rrd") if path.name not in known]
     for recording in sorted(path for path in found if path.is_file()):
-        yield from _broken(recording, _recording(recording, runs, fish, frames))
+        if recording.suffix == DAMAGED:  # nothing in it was whole when a crash was repaired
+            cuts += [len(frames)] if _has_crashed(runs) else []
+            continue
+        check, is_left = _recording(recording, runs, fish, frames), recording.suffix == ".part"
+        findings = list(_broken(recording, check, is_by_crash=is_cut and is_left))
+        yield from findings
+        if any(one.path == recording and one.is_by_crash for one in findings):
+            cuts.append(len(frames))
     if frames:
         table, witness = folder / "frames.csv", "the recording"
-        yield from _csv(table, FRAMES_COLUMNS, frames, witness=witness, is_cut=is_cut)
+        cuts += [len(frames)] if is_cut else []
+        yield from _csv(table, FRAMES_COLUMNS, frames, witness=witness, cuts=cuts)
 
 
-def _broken(path: Path, check: Iterable[Change]) -> Iterator[Change]:
-    return guarded(check, lambda why: Change(path, f"damaged: {why.removeprefix(f'{path}: ')}"))
+def _broken(path: Path, check: Iterable[Change], *, is_by_crash: bool = False) -> Iterator[Change]:
+    def finding(why: str) -> Change:
+        return Change(path, f"damaged: {why.removeprefix(f'{path}: ')}", is_by_crash)
+
+    return guarded(check, finding)
 
 
 def _stored(
@@ -278,6 +294,10 @@ def _stored(
             lengths[str(track_id)] = lengths_row(estimate_of(row), flags)
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             yield Change(database, f"fish {track_id}: its row is damaged: {error!r}")
+
+
+def _has_crashed(runs: Mapping[str, RunFacts]) -> bool:
+    return any(one.ended_by == NOT_ENDED for one in runs.values())
 
 
 def _unfinished_run(runs: Mapping[str, RunFacts]) -> str:
@@ -439,12 +459,11 @@ def _recording(
                 now, was = stored.get(column), getattr(message, column)
                 if now != was:
                     yield Change(database, f"{name}: {column} is {now}, {path.name} says {was}")
-    has_crashed = any(one.ended_by == NOT_ENDED for one in runs.values())
     # A crash leaves a torn .mcap.part, which is repaired; .mcap is the name of a whole one.
     is_cut_off = path.suffix == ".mcap" and is_torn(path)
     for line in recording.warnings:
         what = line.removeprefix(f"{path}: ")
-        yield Change(path, what, is_by_crash=has_crashed and not is_cut_off)
+        yield Change(path, what, is_by_crash=_has_crashed(runs) and not is_cut_off)
 
 
 def _csv(
@@ -453,11 +472,12 @@ def _csv(
     expected: dict[str, list[str]],
     *,
     witness: str,
-    is_cut: bool,
+    cuts: Iterable[int],
 ) -> Iterator[Change]:
     """Compare a table with rows of a witness; only frames.csv may have more rows.
 
-    `is_cut`: a crash may have kept the last rows from it.
+    `cuts`: numbers of rows of the witness after which a crash came; it may have kept from the table
+    what stands right before.
     """
     if not path.is_file():
         yield Change(path, "is missing")
@@ -472,14 +492,19 @@ def _csv(
         found |= found_rows
     # Where room was short the oldest tables went, maybe with some rows of the first frame left.
     first = min((int(row[0]) for row in found.values()), default=0) if older else 0
-    last = max((number for number, name in enumerate(expected) if name in found), default=-1)
-    for number, (name, row) in enumerate(expected.items()):
+    names = [*expected]
+    kept_by_crash = {
+        name
+        for cut in cuts
+        for name in takewhile(lambda name: name not in found, names[:cut][::-1])
+    }
+    for name, row in expected.items():
         if older and int(row[0]) <= first:
             continue
         label = "frame {}, fish {}".format(*name.split(",")) if "," in name else f"fish {name}"
         if name not in found:
-            is_at_end, what = number > last, f"{label} is missing; {witness} has it"
-            yield Change(path, what, is_by_crash=is_cut and is_at_end)
+            what = f"{label} is missing; {witness} has it"
+            yield Change(path, what, is_by_crash=name in kept_by_crash)
             continue
         for column, now, was in zip(columns, found[name], row, strict=True):
             if now != was:

@@ -70,7 +70,7 @@ def _copy(records: Iterable[object], file: TransactionalFile, note: str, edit: E
     return num_messages
 
 
-_DAMAGED = ".damaged"  # suffix of a file in which nothing is intact
+DAMAGED = ".damaged"  # suffix of a file in which nothing is intact
 
 
 class Repair(NamedTuple):
@@ -113,7 +113,7 @@ def repair_file(path: Path, *, left_by: str = "a crash") -> Repair:
 
 
 def _set_aside_damaged(path: Path) -> tuple[Path, str]:
-    aside = path.with_name(path.name + _DAMAGED)
+    aside = path.with_name(path.name + DAMAGED)
     try:
         path.replace(aside)
     except OSError as error:

@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from stream_dmr.errors import UserError
-from stream_dmr.evidence.seal import NAME, seal_verdicts
+from stream_dmr.evidence.seal import NAME, seal_run, seal_verdicts
 from stream_dmr.evidence.verify_folder import verify
+from stream_dmr.recording.repair import repair_recordings
 from stream_dmr.store.fish import read_runs
 from stream_dmr.store.length_store import LengthStore
 from stream_dmr.store.run_facts import NOT_ENDED
@@ -253,6 +254,37 @@ def test_a_run_that_crashed_over_earlier_results_explains_its_tables_alone(out: 
     assert invoke(f"verify {out}").code == 3
     (out / "recording.mcap").write_bytes(b"")
     assert invoke(f"verify {out}").code == 1
+
+
+def test_rows_that_a_crash_kept_from_a_table_are_explained_after_a_restart_as_well(out: Path):
+    with closing(sqlite3.connect(out / "lengths.db")) as database:
+        database.executescript(
+            f"""CREATE TEMP TABLE later AS SELECT * FROM runs;
+            UPDATE later SET run_id = 'later', started_ns = started_ns + 1;
+            UPDATE runs SET ended_by = '{NOT_ENDED}', ended_ns = NULL;
+            INSERT INTO runs SELECT * FROM later;"""
+        )
+    recording, table = out / "recording.mcap", out / "frames.csv"
+    recording.rename(recording.with_suffix(".mcap.part"))
+    with recording.with_suffix(".mcap.part").open("r+b") as file:
+        file.truncate(recording.with_suffix(".mcap.part").stat().st_size - 40)
+    assert [*repair_recordings(out)]
+    columns, *rows = table.read_text().splitlines(keepends=True)
+    for lost, code in ((rows[-3:], 3), (rows[-4:-1], 1)):  # a crash keeps what follows from it, too
+        table.write_text("".join([columns, *(row for row in rows if row not in lost)]))
+        seal_run(out, with_recordings=True)
+        outcome = invoke(f"verify {out}")
+        assert outcome.out.count("is missing; the recording has it") == 3
+        assert outcome.code == code
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"rubbish"])
+def test_what_a_crash_only_began_to_record_is_explained(out: Path, content: bytes):
+    (out / "recording-000002.mcap.part").write_bytes(content)
+    assert invoke(f"verify {out}").code == 1
+    sql(out, f"UPDATE runs SET ended_by = '{NOT_ENDED}', ended_ns = NULL")
+    unlink_provenance(out)
+    assert invoke(f"verify {out}").code == 3
 
 
 def test_nothing_to_check_is_refused(tmp_path: Path):
