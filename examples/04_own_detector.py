@@ -27,7 +27,7 @@ with boxes.open("w", encoding="utf-8") as file:
         number += 1
         blue, _, red = cv2.split(read[1][RAIL_PX:].astype(np.int16))
         found = (red - blue > -20).astype(np.uint8)
-        found = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((11, 11)))  # removes the lines
+        found = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((25, 25)))  # removes lines and gaff
         for x, y, width, height, area in cv2.connectedComponentsWithStats(found)[2][1:]:
             if area > 1500:
                 file.write(f"{number},-1,{x},{y + RAIL_PX},{width},{height},1,1,1\n")

@@ -28,7 +28,7 @@ LENSES = {
 
 def scene_through(camera: Camera) -> RailScene:
     """Two fish, as near as the wide lens must be for them to be as large as usual."""
-    scene = make_scene(num_fish=2, num_frames=16, preset="clean", seed=4)
+    scene = make_scene(num_fish=2, num_frames=24, preset="clean", seed=4)
     near = ReferencePlane(
         rotation=scene.calibration.plane.rotation,
         translation_mm=scene.calibration.plane.translation_mm * [1, 1, 0.4],
