@@ -1,7 +1,7 @@
 """CropFish: every fish of a frame, cut out through an ideal camera of its own; then who is gone."""
 
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -80,8 +80,7 @@ class CropFish:
         fish = {self._numbering.track_id(source_id): source_id for source_id in confirmed}
         self._open |= fish
         self._last = frame
-        shown = {track_id: confirmed[source_id] for track_id, source_id in fish.items()}
-        return [*self._crops(shown), *self._ends(frame, fish)]
+        return [*self._crops(fish, confirmed), *self._ends(frame, fish)]
 
     def pause(self) -> list[FishCrop | TrackEnded]:
         """All open tracks end, unless their ids are given; the next frame shows other fish."""
@@ -99,9 +98,11 @@ class CropFish:
         self._open.clear()
         return [] if last is None else [TrackEnded.after(last, one, cause) for one in ended]
 
-    def _crops(self, fish: Mapping[int, list[FishCrop]]) -> Iterator[FishCrop]:
-        for track_id, crops in sorted(fish.items()):
-            for crop in crops:
+    def _crops(
+        self, fish: Mapping[int, int], shown: Mapping[int, Sequence[FishCrop]]
+    ) -> Iterator[FishCrop]:
+        for track_id, source_id in sorted(fish.items()):
+            for crop in shown[source_id]:
                 species = self._classifier.classify(crop) if self._classifier else {}
                 yield replace(crop, track_id=track_id, species=species)
 

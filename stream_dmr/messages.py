@@ -274,3 +274,8 @@ Message = (
     | Position
     | LearntShapes
 )
+
+
+def track_of(message: Message) -> int:
+    """The id of the fish that a message is of; 0: of none."""
+    return getattr(message, "track_id", 0)

@@ -7,15 +7,13 @@ hour. Runs that are in the folder already are not repeated.
 """
 
 import argparse
-import csv
 import threading
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-import numpy as np
-from jaxtyping import Float
 
 import stream_dmr as sd
+from stream_dmr.evaluation.compare import evaluate
 from stream_dmr.pipeline.replay_recording import replay
 from stream_dmr.pipeline.run_options import ReplayOptions
 from stream_dmr.simulation import SECOND, simulate
@@ -67,23 +65,6 @@ def runs_of(preset: str, folder: Path) -> dict[int, Path]:
     return dict(sorted(runs.items()))
 
 
-def errors_of(run: Path, truth: Path) -> Float[np.ndarray, "F 2"]:
-    """Relative errors of a run's fish, and the widths of their intervals."""
-    with truth.open() as table:
-        true_mm = {row["track_id"]: float(row["length_mm"]) for row in csv.DictReader(table)}
-    with (run / "lengths.csv").open() as table:
-        fish = [row for row in csv.DictReader(table) if row["length_mm"]]
-    return np.array(
-        [
-            (
-                float(row["length_mm"]) / true_mm[row["track_id"]] - 1,
-                (float(row["ci95_high_mm"]) - float(row["ci95_low_mm"])) / float(row["length_mm"]),
-            )
-            for row in fish
-        ]
-    )
-
-
 def main() -> None:
     """Print the table, and draw the plot."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -95,14 +76,18 @@ def main() -> None:
     _, axes = plt.subplots(figsize=(6.6, 3.1))
     for preset, marker in zip(SEEDS, "os", strict=True):
         truth = args.folder / preset / str(DEGREES[0]) / "truth.csv"
-        found = {n: errors_of(run, truth) for n, run in runs_of(preset, args.folder).items()}
-        means = {degrees: 100 * abs(fish[:, 0]).mean() for degrees, fish in found.items()}
-        for degrees, fish in found.items():
-            error, width = fish.T
-            held = np.mean(2 * abs(error) <= width)
+        means: dict[int, float] = {}
+        for degrees, run in runs_of(preset, args.folder).items():
+            found = evaluate(run / "lengths.csv", truth)
+            errors, intervals = found.errors, found.intervals
+            assert errors is not None, run
+            assert intervals is not None, run
+            means[degrees] = errors.mean_absolute_percent
+            num_measured = round(found.fraction_measured * len(found.fish))
             print(
-                f"| {preset} | {degrees or 'one camera'} | {len(fish)} | {means[degrees]:.1f} % | "
-                f"{error.mean():+.1%} | {held:.0%} | {width.mean():.1%} |"
+                f"| {preset} | {degrees or 'one camera'} | {num_measured} | "
+                f"{means[degrees]:.1f} % | {errors.bias_percent:+.1f} % | "
+                f"{intervals.coverage:.0%} | {intervals.mean_width:.1%} |"
             )
         axes.plot([*means], [*means.values()], marker=marker, label=_NAMES[preset])
     ticks = sorted([0, *DEGREES])

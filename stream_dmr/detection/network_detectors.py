@@ -106,7 +106,7 @@ def _detr(outputs: list[np.ndarray], input_size: tuple[int, int]) -> BoxesAndSco
 
 def _rt_detr(outputs: list[np.ndarray], input_size: tuple[int, int]) -> BoxesAndScores:
     boxes, logits = _boxes_and_logits(outputs)
-    return boxes * np.tile(input_size, 2), 1 / (1 + np.exp(-logits.clip(-60, 60)))
+    return boxes * np.tile(input_size, 2), _sigmoid(logits)
 
 
 def _yolo_seg(outputs: list[np.ndarray], size: tuple[int, int]) -> BoxesAndScores:
@@ -130,25 +130,18 @@ def _mask_rcnn(outputs: list[np.ndarray], _: tuple[int, int]) -> BoxesAndScores:
     return _yolo_nms([np.column_stack([boxes, scores, labels])[None]], (0, 0))
 
 
-def mask_in_input(
-    outputs: Sequence[np.ndarray], layout: str, index: int
-) -> Float32[np.ndarray, "h w"] | None:
-    """Fish probability of one box over the whole input; None from a layout without masks."""
-    match layout:
-        case "yolo-seg":
-            rows, pictures = outputs
-            weights = rows[0, -pictures.shape[1] :, index]
-            return _sigmoid(np.tensordot(weights, pictures[0], axes=1))
-        case "rf-detr-seg":
-            return _sigmoid(outputs[2][0, index])
-        case "mask-rcnn":
-            return outputs[3][index, 0].astype(np.float32)
-        case _:
-            return None
+# Fish probability of the box of an index over the whole input, by the layouts that have masks.
+_MASKS: dict[str, Callable[[Sequence[np.ndarray], int], Float[np.ndarray, "h w"]]] = {
+    "yolo-seg": lambda outputs, index: _sigmoid(
+        np.tensordot(outputs[0][0, -outputs[1].shape[1] :, index], outputs[1][0], axes=1)
+    ),
+    "rf-detr-seg": lambda outputs, index: _sigmoid(outputs[2][0, index]),
+    "mask-rcnn": lambda outputs, index: outputs[3][index, 0],
+}
 
 
-def _sigmoid(logits: Float[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    return (1 / (1 + np.exp(-logits.clip(-60, 60)))).astype(np.float32)
+def _sigmoid(logits: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    return 1 / (1 + np.exp(-logits.clip(-60, 60)))
 
 
 def _boxes_and_logits(outputs: list[np.ndarray]) -> BoxesAndScores:
@@ -298,7 +291,7 @@ class OnnxDetector:
 
     @property
     def gives_masks(self) -> bool:
-        return self._settings.onnx_layout in ("yolo-seg", "rf-detr-seg", "mask-rcnn")
+        return self._settings.onnx_layout in _MASKS
 
     def find(self, frame: Frame) -> list[Candidate]:
         """The boxes of a frame after non-maximum suppression; none whose mask is empty."""
@@ -316,10 +309,12 @@ class OnnxDetector:
             self._min_score,
             self._settings.onnx_overlap,
         )
-        found: list[Candidate] = []
+        mask_of, found = _MASKS.get(self._settings.onnx_layout), list[Candidate]()
         for i in np.array(kept, int).ravel():
-            mask = mask_in_input(outputs, self._settings.onnx_layout, int(indices[i]))
-            inside = None if mask is None else letterbox.mask_to_frame(mask, boxes[i])
+            inside = None
+            if mask_of is not None:
+                probability = mask_of(outputs, int(indices[i])).astype(np.float32)
+                inside = letterbox.mask_to_frame(probability, boxes[i])
             if inside is None or inside.any():
                 score = float(min(scores[i], 1.0))
                 found.append(Candidate(bbox_xyxy_px=boxes[i], score=score, foreground=inside))

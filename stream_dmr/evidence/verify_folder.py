@@ -33,7 +33,7 @@ from stream_dmr.evidence.seal import (
 from stream_dmr.evidence.seal import NAME as PROVENANCE
 from stream_dmr.files import is_locked, sha256_of
 from stream_dmr.localization.localize_fish import LocalizeSettings
-from stream_dmr.messages import FittedMesh, LengthEstimate, LocalizedFish
+from stream_dmr.messages import FittedMesh, LengthEstimate, LocalizedFish, track_of
 from stream_dmr.recording.mcap.mcap_recording import is_torn
 from stream_dmr.recording.reading import decoded_messages, open_recordings, recorded_settings
 from stream_dmr.recording.repair import DAMAGED
@@ -442,7 +442,7 @@ def _recording(
                 yield Change(path, f"{name} is {now}, no run in {DATABASE} has")
     waiting: dict[tuple[int, int], LocalizedFish] = {}
     for message, _ in decoded_messages(recording, [LocalizedFish, LengthEstimate], EVERYTHING):
-        key = message.frame_index, getattr(message, "track_id", 0)
+        key = message.frame_index, track_of(message)
         if isinstance(message, LocalizedFish):
             waiting[key] = message
         elif isinstance(message, LengthEstimate):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stream_dmr.messages import LengthEstimate, Message
+from stream_dmr.messages import LengthEstimate, Message, track_of
 from stream_dmr.pipeline.session import RecordedMessages, SoughtMessages
 
 UNREPEATABLE = {"elapsed_ns"}  # wall clock: the one field that no replay can repeat
@@ -106,14 +106,14 @@ class MessageComparator:
         expected = self._expected.get(type(computed))
         if expected is None:
             return
-        if _track_of(computed) in self._leave_out:
+        if track_of(computed) in self._leave_out:
             self.num_left_out += 1
             return
         self.num_compared += 1
         if isinstance(computed, LengthEstimate) and computed.is_final:
             self._computed_final[computed.track_id] = computed
             return
-        recorded = expected.take(computed.frame_index, _track_of(computed))
+        recorded = expected.take(computed.frame_index, track_of(computed))
         if recorded is None:
             self._add_surplus(computed)
         else:
@@ -139,7 +139,7 @@ class MessageComparator:
     def _running(self, recorded: RecordedMessages, kind: type[Message]) -> Iterator[Message]:
         """The recorded messages of a type; final lengths are kept apart."""
         for message in recorded.of_type(kind, keep_payloads=False):
-            if _track_of(message) in self._leave_out:
+            if track_of(message) in self._leave_out:
                 continue
             if isinstance(message, LengthEstimate) and message.is_final:
                 self._recorded_final[message.track_id] = message
@@ -157,18 +157,14 @@ class MessageComparator:
     def _add_surplus(self, computed: Message) -> None:
         if self._ends_early:
             self.num_beyond += 1
-            self._tracks_beyond.add(_track_of(computed))
+            self._tracks_beyond.add(track_of(computed))
         else:
             self._add(computed, Difference("message", "none", "one more"))
             self.length_change = inf
 
     def _add(self, message: Message, difference: Difference) -> None:
         kind = type(message).__name__
-        self.mismatches.append(Mismatch(message.frame_index, _track_of(message), kind, difference))
-
-
-def _track_of(message: Message) -> int:
-    return getattr(message, "track_id", 0)
+        self.mismatches.append(Mismatch(message.frame_index, track_of(message), kind, difference))
 
 
 def _length_change(recorded: LengthEstimate, computed: LengthEstimate) -> float:

@@ -22,6 +22,7 @@ from stream_dmr.messages import (
     LocalizedFish,
     Message,
     TrackEnded,
+    track_of,
 )
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.nodes.fit_mesh import FitMesh
@@ -408,7 +409,7 @@ class SoughtMessages:
             and (message := self._next) is not None
             and message.frame_index <= frame_index + _AHEAD_FRAMES
         ):
-            self._passed[message.frame_index, getattr(message, "track_id", 0)] = message
+            self._passed[message.frame_index, track_of(message)] = message
             self._next = next(self._messages, None)
         return self._passed.pop(key, None)
 

@@ -159,19 +159,15 @@ class TrackedFish:
         self._look_closer(frame, boxes)
         self._seen.any_moved |= any(one.has_moved for one in self._evidence.values())
         self._seen.any_fish_like |= any(map(self._may_count, self._evidence))
-        if self.gives_masks:
-            return [
-                Detection(
-                    source_id=one.track_number,
-                    bbox_xyxy_px=one.candidate.bbox_xyxy_px,
-                    mask=one.candidate.foreground,
-                    mask_corner=whole_pixels(one.candidate.bbox_xyxy_px)[:2],
-                    visible_fraction=one.visible_fraction,
-                )
-                for one in tracked
-            ]
+        # Boxes of given masks are not corrected, since these have no confidence.
+        masks = {one.track_number: one.candidate.foreground for one in tracked}
         return [
-            replace(one, may_be_no_fish=not self._is_surely_fish(one.source_id))
+            replace(
+                one,
+                mask=masks[one.source_id] if self.gives_masks else None,
+                mask_corner=whole_pixels(boxes[one.source_id])[:2],
+                may_be_no_fish=not self._is_surely_fish(one.source_id),
+            )
             for one in self._corrector.correct(boxes, visible, frame)
         ]
 

@@ -21,6 +21,7 @@ from stream_dmr.messages import (
     Frame,
     LengthEstimate,
     LocalizedFish,
+    track_of,
 )
 from stream_dmr.recording.codec import decode
 from stream_dmr.recording.frame_images import FrameLookup, RecordedPictures, open_pictures
@@ -254,7 +255,7 @@ def _read_rows(recording: Recording, selection: Selection) -> Iterator[_Row]:
     located = dict[_Key, LocalizedFish]()
     kinds = (FishCrop, FittedMesh, LocalizedFish, LengthEstimate)
     for message, payload in decoded_messages(recording, kinds, selection):
-        key = message.frame_index, getattr(message, "track_id", 0)
+        key = message.frame_index, track_of(message)
         match message:
             case FishCrop():
                 crops[key] = payload, message.image is not None
