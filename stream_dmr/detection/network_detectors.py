@@ -234,8 +234,8 @@ class Letterbox:
 
 _MIN_INPUT_PX = 32  # the stride of the usual detectors
 _SCORE_TOLERANCE = 1e-3  # rounding may put a score of 1 above 1
-_IMAGENET_MEAN = np.array([0.485, 0.456, 0.406], np.float32)  # RGB
-_IMAGENET_STD = np.array([0.229, 0.224, 0.225], np.float32)
+_IMAGENET_MEAN = np.array([0.485, 0.456, 0.406], np.float32)[:, None, None]  # RGB
+_IMAGENET_STD = np.array([0.229, 0.224, 0.225], np.float32)[:, None, None]
 
 
 class OnnxSettings(Settings):
@@ -342,10 +342,11 @@ class OnnxDetector:
         self, picture: UInt8[np.ndarray, "h w 3"]
     ) -> tuple[Float[np.ndarray, "N 4"], Float[np.ndarray, "N"], list[np.ndarray]]:
         """Boxes x0, y0, x1, y1 in input pixels, the best score of any fish class, all outputs."""
-        values = picture[..., ::-1].astype(np.float32) / 255
+        blob = cv2.dnn.blobFromImage(picture, swapRB=True)
+        blob /= 255
         if self._settings.onnx_imagenet:
-            values = (values - _IMAGENET_MEAN) / _IMAGENET_STD
-        blob = np.ascontiguousarray(values.transpose(2, 0, 1)[None])
+            blob -= _IMAGENET_MEAN
+            blob /= _IMAGENET_STD
         outputs = self._session.run(None, {self._input_name: blob})
         boxes, scores = decode(outputs, self._settings.onnx_layout, input_size=self._input_size)
         return boxes, self._fish_scores(scores).max(axis=1, initial=0.0), outputs

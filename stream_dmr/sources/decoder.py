@@ -7,6 +7,7 @@ import select
 import subprocess
 import sys
 import time
+import weakref
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from jaxtyping import UInt8
 
 from stream_dmr.sources.decoder_process import NUM_SLOTS
 
+_LENT_SLOTS = NUM_SLOTS - 3  # to pictures in use: one slot is written, one waits, one is read
 _PROGRAM = Path(__file__).with_name("decoder_process.py")
 
 
@@ -55,7 +57,8 @@ class Decoder:
         self.fps = 0.0  # as the container says; 0, NaN or impossible where it doesn't
         self.promised = 0.0  # number of frames, likewise
         self._reading = Lock()
-        self._slots: np.ndarray | None = None
+        self._shared: memoryview | None = None  # all slots
+        self._lent = set[int]()  # slots that pictures in use lie in
         self._received = b""  # of the pipe, not yet a whole line
         self._memory = os.memfd_create("pictures")  # nameless: nothing is left after a crash
         self._process = subprocess.Popen(
@@ -88,7 +91,7 @@ class Decoder:
             if self._memory >= 0:
                 os.close(self._memory)
                 self._memory = -1
-            self._received, self._slots = b"", None
+            self._received, self._shared = b"", None
 
     def _read(self, timeout_s: float) -> DecodedPicture | None:
         deadline_s = time.monotonic() + timeout_s
@@ -96,25 +99,43 @@ class Decoder:
             if "shape" in message:
                 self.height, self.width = message["shape"][:2]
                 self.fps, self.promised = message["fps"], message["promised"]
-                shared = mmap.mmap(self._memory, NUM_SLOTS * self.height * self.width * 3)
-                slots = np.frombuffer(shared, np.uint8)
-                self._slots = slots.reshape(-1, self.height, self.width, 3)
+                size = NUM_SLOTS * self.height * self.width * 3
+                self._shared = memoryview(mmap.mmap(self._memory, size))
             elif "resized" in message:
                 height, width = message["resized"][:2]
                 raise ResizedError(width=width, height=height)
             elif "slot" in message:
-                assert self._slots is not None
-                assert self._process.stdin is not None
-                image = self._slots[message["slot"]].copy()
-                with suppress(BrokenPipeError):  # the child has died; the next read raises
-                    self._process.stdin.write(bytes([message["slot"]]))
+                image = self._picture(message["slot"])
                 return DecodedPicture(milliseconds=message["milliseconds"], image=image)
             else:
                 return None
-        if self._slots is None:
+        if self._shared is None:
             return None  # it could not be opened, holds no picture, or was closed
         status = self._process.wait()
         raise DecodingError(f"the decoder crashed (status {status})")
+
+    def _picture(self, slot: int) -> UInt8[np.ndarray, "H W 3"]:
+        """The picture of a slot, which is free again when nothing refers to it, or to its parts.
+
+        Where many pictures are in use, it is a copy, since the child must not wait for them.
+        """
+        assert self._shared is not None
+        size = self.height * self.width * 3
+        pixels = np.frombuffer(self._shared[slot * size : (slot + 1) * size], np.uint8)
+        if len(self._lent) < _LENT_SLOTS:
+            self._lent.add(slot)
+            # Views of views have this array as their base, so it lives as long as any of them.
+            weakref.finalize(pixels, self._release, slot).atexit = False
+        else:
+            pixels = pixels.copy()
+            self._release(slot)
+        return pixels.reshape(self.height, self.width, 3)
+
+    def _release(self, slot: int) -> None:
+        assert self._process.stdin is not None
+        self._lent.discard(slot)
+        with suppress(BrokenPipeError, ValueError):  # the child has died, or this was closed
+            self._process.stdin.write(bytes([slot]))
 
     def _receive(self, deadline_s: float) -> dict[str, Any] | None:
         """The child's next message; None where it has ended. Raises DecodingError if too late."""

@@ -3,8 +3,8 @@
     python -P decoder_process.py ADDRESS MEMORY_FD
 
 Each picture goes into a slot of the shared memory, and a line of JSON about it to stdout; the
-slot's number comes back as one byte on stdin when the picture was copied. The process ends with
-stdin. Nothing of stream_dmr is imported here, so that it starts quickly.
+slot's number comes back as one byte on stdin when the picture is no longer used. The process ends
+with stdin. Nothing of stream_dmr is imported here, so that it starts quickly.
 """
 
 import json
@@ -21,7 +21,7 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
 import cv2
 import numpy as np
 
-NUM_SLOTS = 3  # one is written, one waits, one is copied
+NUM_SLOTS = 8  # most of them hold pictures in use
 
 
 def main(address: str, memory: int) -> None:

@@ -1,5 +1,6 @@
 import itertools
 import wave
+from collections import deque
 from fractions import Fraction
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.source import nominal_ns
-from stream_dmr.sources.video_file import container_ns
+from stream_dmr.sources.video_file import VideoFile, container_ns
 from tests.support.sources import SETTINGS, noise, read, refusal
 
 SECOND_NS = 10**9
@@ -53,6 +54,17 @@ def test_timestamps_of_a_constant_rate_are_exact(tmp_path, name, codec, fps):
     assert (opened.num_frames, opened.width, opened.height) == (12, 64, 48)
     assert opened.fps == pytest.approx(float(fps), rel=1e-4)
     assert opened.warnings == []
+
+
+@pytest.mark.parametrize("num_kept", [1, 3, 40])
+def test_a_part_of_a_picture_stays_as_it_is_while_others_are_decoded(tmp_path, num_kept):
+    kept, seen = deque(maxlen=num_kept), []
+    for frame in VideoFile(write_video(tmp_path / "a.avi", num_frames=40), SETTINGS):
+        kept.append(frame.image[8:40:2].T)
+        seen.append(kept[-1].copy())
+        del frame
+        np.testing.assert_array_equal(np.array(kept), np.array(seen[-num_kept:]))
+    assert len(np.unique(np.array(seen), axis=0)) == 40
 
 
 def test_matroska_keeps_its_whole_milliseconds(tmp_path):
