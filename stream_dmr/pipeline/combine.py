@@ -55,6 +55,11 @@ class FishSightings(NamedTuple):
     ious: Float[np.ndarray, "T"]  # of the fits
     length_mm: float
 
+    def is_beside(self, others: Iterable["FishSightings"]) -> bool:
+        """True if it was seen before or after each of these: it may be a part of their track."""
+        begin, end = self.times_ns[0], self.times_ns[-1]
+        return all(end < one.times_ns[0] or one.times_ns[-1] < begin for one in others)
+
     def at(self, time_ns: int) -> tuple[Float[np.ndarray, "M 2"], float] | None:
         """The midline at a time, between the frames around it, and the poorer one's IoU.
 
@@ -99,7 +104,7 @@ class Pairing:
     """Which fish of two runs are the same."""
 
     offset_s: float  # the second camera's clock minus the first's
-    ids: Mapping[int, int]  # of the second run, by those of the first
+    ids: Mapping[int, Sequence[int]]  # of the second run, by those of the first
     apart: float  # of the rays to a fish's ends, over its length: median of all pairs
 
 
@@ -112,7 +117,8 @@ def pair_up(
 ) -> Pairing:
     """Pair the fish, at the offset of the clocks at which most rays meet.
 
-    Every offset up to 10 s is tried in steps of half a frame, then finer around the best.
+    Every offset up to 10 s is tried in steps of half a frame, then finer around the best. Where one
+    camera's track broke off and went on as another, both are the other camera's fish.
     """
     chosen = np.unique(np.linspace(0, len(first) - 1, _COMPARED).round().astype(int))
     some = {fish: first[fish] for fish in np.array([*first])[chosen].tolist()}
@@ -127,15 +133,21 @@ def pair_up(
         finer = [best + step * n for n in sorted(range(-4, 5), key=abs)]
         best = min(finer, key=cost)
     apart = _apart(first, second, calibrations, best)
-    rows, columns = linear_sum_assignment(apart)
     ids, other_ids = [*first], [*second]
-    pairs = {
-        ids[r]: other_ids[c]
-        for r, c in zip(rows.tolist(), columns.tolist(), strict=True)
-        if apart[r, c] < _MOST_RAYS_APART
-    }
-    found = [apart[ids.index(a), other_ids.index(b)] for a, b in pairs.items()]
-    return Pairing(offset_s=best, ids=pairs, apart=float(np.median(found)) if found else np.nan)
+    best_pairs = [*zip(*(axis.tolist() for axis in linear_sum_assignment(apart)), strict=True)]
+    meeting = np.argwhere(apart < _MOST_RAYS_APART).tolist()
+    found = list[tuple[int, int]]()
+    for r, c in [*best_pairs, *sorted(meeting, key=lambda pair: apart[*pair])]:
+        parts = [first[ids[row]] for row, column in found if column == c]
+        others = [second[other_ids[column]] for row, column in found if row == r]
+        are_free = first[ids[r]].is_beside(parts) and second[other_ids[c]].is_beside(others)
+        if apart[r, c] < _MOST_RAYS_APART and are_free:
+            found.append((r, c))
+    return Pairing(
+        offset_s=best,
+        ids={ids[r]: [other_ids[c] for row, c in found if row == r] for r, _ in found},
+        apart=float(np.median([apart[r, c] for r, c in found])) if found else np.nan,
+    )
 
 
 def _apart(
@@ -198,7 +210,7 @@ def open_second(
         fish = (message for message, _ in messages if isinstance(message, LocalizedFish))
         node = _localize_by_two(first, fish, header.calibration, setup, observer)
         offset_ns = round(node.pairing.offset_s * 1e9)
-        ids = {other: first for first, other in node.pairing.ids.items()}
+        ids = {other: first for first, others in node.pairing.ids.items() for other in others}
         camera = SecondCamera(header=header, offset_ns=offset_ns, ids=ids)
     assert camera is not None
     return SecondRun(camera=camera, recording=recording, topics=topics, node=node)
@@ -278,11 +290,12 @@ class LocalizeByTwo:
 
     def step(self, mesh: FittedMesh, /) -> Sequence[LocalizedFish]:
         alone = localize(mesh, settings=self._settings, calibration=self._calibration)
-        track = self._second.get(self.pairing.ids.get(mesh.track_id, -1))
+        others = self.pairing.ids.get(mesh.track_id, ())
         is_refused = alone.reason not in _BY_ONE_CAMERA
-        if track is None or is_refused or alone.midline_mm is None or alone.keypoints_mm is None:
+        if not others or is_refused or alone.midline_mm is None or alone.keypoints_mm is None:
             return [alone]
-        seen = track.at(mesh.timestamp_ns + round(self.pairing.offset_s * 1e9))
+        time_ns = mesh.timestamp_ns + round(self.pairing.offset_s * 1e9)
+        seen = next(filter(None, (self._second[other].at(time_ns) for other in others)), None)
         if seen is None:
             return [replace(alone, accepted=False, reason=Reason.SEEN_BY_ONE)]
         px = self._calibration.camera.project(alone.midline_mm)

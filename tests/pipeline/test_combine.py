@@ -236,6 +236,17 @@ def tracks(rng, degrees, offset_s):
 def test_fish_are_paired_and_the_clocks_difference_is_found(offset_s):
     first, second, calibrations = tracks(np.random.default_rng(4), 35.0, offset_s)
     pairing = pair_up(first, second, calibrations, frame_s=FRAME_S)
-    assert pairing.ids == {fish: fish + 10 for fish in (1, 2, 3, 4)}
+    assert pairing.ids == {fish: [fish + 10] for fish in (1, 2, 3, 4)}
     assert pairing.offset_s == pytest.approx(offset_s, abs=0.02)
     assert pairing.apart < 0.005
+
+
+def test_tracks_that_broke_off_are_parts_of_the_other_cameras_fish():
+    first, second, calibrations = tracks(np.random.default_rng(4), 35.0, 0.0)
+    for found, whole, rest in ((first, 1, 7), (second, 12, 17)):
+        one = found[whole]
+        parts = [FishSightings(*(x[s] for x in one[:3]), 700.0) for s in np.s_[:7, 7:]]
+        found[whole], found[rest] = parts
+    pairing = pair_up(first, second, calibrations, frame_s=FRAME_S)
+    ids = {fish: sorted(others) for fish, others in pairing.ids.items()}
+    assert ids == {1: [11], 7: [11], 2: [12, 17], 3: [13], 4: [14]}
