@@ -12,6 +12,7 @@ from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from queue import SimpleQueue
 from threading import Lock
 from typing import Any
 
@@ -58,7 +59,8 @@ class Decoder:
         self.promised = 0.0  # number of frames, likewise
         self._reading = Lock()
         self._shared: memoryview | None = None  # all slots
-        self._lent = set[int]()  # slots that pictures in use lie in
+        self._num_lent = 0  # slots that pictures in use lie in
+        self._unused = SimpleQueue[int]()  # slots whose picture is no longer used, not yet told
         self._received = b""  # of the pipe, not yet a whole line
         self._memory = os.memfd_create("pictures")  # nameless: nothing is left after a crash
         self._process = subprocess.Popen(
@@ -95,6 +97,7 @@ class Decoder:
 
     def _read(self, timeout_s: float) -> DecodedPicture | None:
         deadline_s = time.monotonic() + timeout_s
+        self._return_unused()
         while (message := self._receive(deadline_s)) is not None:
             if "shape" in message:
                 self.height, self.width = message["shape"][:2]
@@ -115,27 +118,29 @@ class Decoder:
         raise DecodingError(f"the decoder crashed (status {status})")
 
     def _picture(self, slot: int) -> UInt8[np.ndarray, "H W 3"]:
-        """The picture of a slot, which is free again when nothing refers to it, or to its parts.
+        """The picture of a slot, which is unused when nothing refers to it, or to its parts.
 
         Where many pictures are in use, it is a copy, since the child must not wait for them.
         """
         assert self._shared is not None
         size = self.height * self.width * 3
         pixels = np.frombuffer(self._shared[slot * size : (slot + 1) * size], np.uint8)
-        if len(self._lent) < _LENT_SLOTS:
-            self._lent.add(slot)
+        if self._num_lent < _LENT_SLOTS:
             # Views of views have this array as their base, so it lives as long as any of them.
-            weakref.finalize(pixels, self._release, slot).atexit = False
+            weakref.finalize(pixels, self._unused.put, slot).atexit = False
         else:
             pixels = pixels.copy()
-            self._release(slot)
+            self._unused.put(slot)
+        self._num_lent += 1
         return pixels.reshape(self.height, self.width, 3)
 
-    def _release(self, slot: int) -> None:
+    def _return_unused(self) -> None:
+        """Tell the child which slots are free: here, since a picture may go in any thread."""
         assert self._process.stdin is not None
-        self._lent.discard(slot)
-        with suppress(BrokenPipeError, ValueError):  # the child has died, or this was closed
-            self._process.stdin.write(bytes([slot]))
+        while not self._unused.empty():
+            self._num_lent -= 1
+            with suppress(BrokenPipeError, ValueError):  # the child has died, or this was closed
+                self._process.stdin.write(bytes([self._unused.get()]))
 
     def _receive(self, deadline_s: float) -> dict[str, Any] | None:
         """The child's next message; None where it has ended. Raises DecodingError if too late."""
