@@ -219,7 +219,7 @@ def resume_source(
         store.note("clips", line, timestamp_ns=store.last_ns)
         on_notice(line)
 
-    source.listen(on_notice_of_clip if source.has_clips else on_notice)
+    source.listen(on_notice if source.is_live else on_notice_of_clip)
     source.resume(
         ResumePoint(after_ns=after_ns, clips_done=frozenset(done), frames_done=frames_done)
     )

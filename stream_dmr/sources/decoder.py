@@ -57,6 +57,7 @@ class Decoder:
         self.width = self.height = 0  # px, known after the first picture, as are these:
         self.fps = 0.0  # as the container says; 0, NaN or impossible where it doesn't
         self.promised = 0.0  # number of frames, likewise
+        self.num_errors = 0  # pictures, and the end, before which FFmpeg reported errors
         self._reading = Lock()
         self._shared: memoryview | None = None  # all slots
         self._num_lent = 0  # slots that pictures in use lie in
@@ -99,6 +100,7 @@ class Decoder:
         deadline_s = time.monotonic() + timeout_s
         self._return_unused()
         while (message := self._receive(deadline_s)) is not None:
+            self.num_errors += message.get("has_errors", False)
             if "shape" in message:
                 self.height, self.width = message["shape"][:2]
                 self.fps, self.promised = message["fps"], message["promised"]

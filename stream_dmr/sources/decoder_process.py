@@ -5,8 +5,12 @@
 Each picture goes into a slot of the shared memory, and a line of JSON about it to stdout; the
 slot's number comes back as one byte on stdin when the picture is no longer used. The process ends
 with stdin. Nothing of stream_dmr is imported here, so that it starts quickly.
+
+FFmpeg makes up what is damaged, and OpenCV has no sign of it; but FFmpeg prints an error. So it
+prints into a file in memory here, and a line of JSON says whether that got longer.
 """
 
+import ctypes
 import json
 import mmap
 import os
@@ -16,7 +20,7 @@ import threading
 from queue import SimpleQueue
 
 # FFmpeg reads its level once, at its first use in the process.
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
+os.environ["OPENCV_FFMPEG_LOGLEVEL"] = "16"  # AV_LOG_ERROR
 
 import cv2
 import numpy as np
@@ -35,7 +39,9 @@ def main(address: str, memory: int) -> None:
         free.put(slot)
     threading.Thread(target=_collect_free_slots, args=(free,), daemon=True).start()
     place = (int(address),) if address.isdecimal() else (address, cv2.CAP_FFMPEG)
+    lines, printed = os.dup(1), _Printed()
     capture = cv2.VideoCapture(*place)
+    printed.is_new()  # it looks at some pictures here, and at the same ones again
     is_read, image = capture.read()
     if not is_read or image.ndim != 3 or image.dtype != np.uint8:
         return
@@ -43,24 +49,48 @@ def main(address: str, memory: int) -> None:
     shared = mmap.mmap(memory, NUM_SLOTS * image.size)
     slots = np.frombuffer(shared, np.uint8).reshape(NUM_SLOTS, *image.shape)
     _send(
+        lines,
         shape=image.shape,
         fps=capture.get(cv2.CAP_PROP_FPS),
         promised=capture.get(cv2.CAP_PROP_FRAME_COUNT),
     )
     slot = free.get()
     np.copyto(slots[slot], image)
-    _send(slot=slot, milliseconds=capture.get(cv2.CAP_PROP_POS_MSEC))
+    _send(lines, slot=slot, **_facts(capture, printed))
     while capture.grab():
         slot = free.get()  # while a slot is waited for, the next picture is decoded already
         is_read, image = capture.retrieve(slots[slot])
         if not is_read:
             break
         if image.shape != slots[0].shape:
-            return _send(resized=image.shape)
+            return _send(lines, resized=image.shape)
         if not np.shares_memory(image, slots[slot]):
             np.copyto(slots[slot], image)
-        _send(slot=slot, milliseconds=capture.get(cv2.CAP_PROP_POS_MSEC))
-    return _send(end=True)
+        _send(lines, slot=slot, **_facts(capture, printed))
+    return _send(lines, end=True, has_errors=printed.is_new())
+
+
+class _Printed:
+    """What C code prints, kept from stdout."""
+
+    def __init__(self) -> None:
+        self._file = os.memfd_create("printed")
+        os.dup2(self._file, 1)
+        self._flush = ctypes.CDLL(None).fflush
+
+    def is_new(self) -> bool:
+        """Whether something was printed since the last call, which is dropped."""
+        self._flush(None)
+        if not os.fstat(self._file).st_size:
+            return False
+        os.lseek(self._file, 0, os.SEEK_SET)
+        os.ftruncate(self._file, 0)
+        return True
+
+
+def _facts(capture: cv2.VideoCapture, printed: _Printed) -> dict[str, object]:
+    milliseconds = capture.get(cv2.CAP_PROP_POS_MSEC)
+    return {"milliseconds": milliseconds, "has_errors": printed.is_new()}
 
 
 def _collect_free_slots(free: "SimpleQueue[int]") -> None:
@@ -69,8 +99,8 @@ def _collect_free_slots(free: "SimpleQueue[int]") -> None:
     os._exit(0)
 
 
-def _send(**facts: object) -> None:
-    os.write(1, json.dumps(facts).encode() + b"\n")
+def _send(lines: int, **facts: object) -> None:
+    os.write(lines, json.dumps(facts).encode() + b"\n")
 
 
 if __name__ == "__main__":

@@ -78,7 +78,7 @@ class Source(ABC):
     def listen(self, on_notice: Callable[[str], None]) -> None:
         """Call `on_notice`, in any thread, with a line for each loss and return of a camera.
 
-        A folder of clips reports what is wrong with a clip, at once and not in `warnings`.
+        What is wrong with a clip comes here at once, and is not in `warnings`.
         """
         self._on_notice = on_notice
 

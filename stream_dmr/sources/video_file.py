@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Lock
 
@@ -26,14 +26,16 @@ _TEXT_BYTES = bytes(range(32, 127)) + b"\t\r\n"
 
 
 class VideoFile(Source):
-    """A video file; a damaged one gives the frames that still decode, and a warning."""
+    """A video file; a damaged one gives what FFmpeg makes of it, and a warning."""
 
     def __init__(self, path: Path, settings: ReadFramesSettings) -> None:
         """Raises SourceError where not even a first frame can be read."""
         self.name = path.name
         self.warnings: list[str] = []
+        self._on_notice: Callable[[str], None] = self.warnings.append
         self._timeout_s = settings.silence_s
         self._is_closed = False
+        self._first_error, self._is_noted = 0, False  # about the frame of it; 0: none
         start = _first_bytes(path)
         self._is_matroska = start.startswith(_MATROSKA)
         self._decoder = open_decoder(path)
@@ -53,7 +55,10 @@ class VideoFile(Source):
         frame_index, timestamp_ns = 0, -1
         pending, self._first = self._first, None
         while pending is not None:
+            self._note_errors()  # of the frame before: at the last one of a cut file it is the cut
             frame_index += 1
+            if self._decoder.num_errors and not self._first_error:
+                self._first_error = frame_index
             timestamp_ns = container_ns(
                 pending.milliseconds,
                 frame_index=frame_index,
@@ -68,12 +73,24 @@ class VideoFile(Source):
             )
             pending = self._read(after=frame_index)
         self._warn_if_cut_off(frame_index, last_ns=timestamp_ns)
+        if not self.is_cut_off and self._decoder.num_errors:
+            self._first_error = self._first_error or frame_index
+            self._note_errors()
         self.close()
 
     def close(self) -> None:
         self._is_closed = True
         self._first = None
         self._decoder.close()
+
+    def _note_errors(self) -> None:
+        """Say once that FFmpeg makes up what it could not decode."""
+        if self._first_error and not self._is_noted:
+            self._is_noted = True
+            self._on_notice(
+                f"{self.name}: FFmpeg reports errors from about frame {self._first_error} on; the "
+                "file seems damaged, and pictures there are made up in part"
+            )
 
     def _read(self, *, after: int) -> DecodedPicture | None:
         """The next picture; None at the end, and with a warning where the decoder fails."""

@@ -106,6 +106,21 @@ def test_what_decodes_of_a_cut_video_is_read_and_the_rest_reported(tmp_path, nam
         np.testing.assert_array_equal(frame.image, original.image)
 
 
+@pytest.mark.parametrize(("name", "codec"), [("a.mp4", "mp4v"), ("a.avi", "MJPG")])
+@pytest.mark.parametrize("filling", [bytes(60), noise(1).tobytes()[:60]])
+def test_what_ffmpeg_makes_up_is_said(tmp_path, name, codec, filling):
+    """All frames come, so that neither their number nor OpenCV shows it."""
+    _, whole = read(write_video(tmp_path / name, codec=codec, num_frames=40))
+    data = bytearray((tmp_path / name).read_bytes())
+    data[len(data) // 2 : len(data) // 2 + len(filling)] = filling
+    (tmp_path / name).write_bytes(data)
+    opened, frames = read(tmp_path / name)
+    assert (len(frames), opened.is_cut_off) == (40, False)
+    differ = [a for a, b in zip(frames, whole, strict=True) if not np.array_equal(a.image, b.image)]
+    (line,) = opened.warnings
+    assert abs(int(line.partition("about frame ")[2].split()[0]) - differ[0].frame_index) <= 2
+
+
 def test_a_matroska_of_variable_rate_is_whole_where_its_time_is(tmp_path):
     """OpenCV promises duration x mean rate: here 0.48 s x 31 frames/s."""
     write_video(tmp_path / "a.mkv")
