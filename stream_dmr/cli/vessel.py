@@ -127,7 +127,8 @@ def fleet(
         list[str],
         typer.Argument(
             help="Addresses of status pages, such as http://10.0.0.7:8480/, digests or folders of "
-            "a box's digests, or files with one NAME ADDRESS a line.",
+            "a box's digests, or files with one NAME ADDRESS a line; FILE.pub after digests checks "
+            "their signature.",
             metavar="URL|FILE|DIR...",
         ),
     ],
@@ -186,6 +187,7 @@ def _print_changes(states: "Iterable[BoxState]", told: dict[str, str]) -> None:
 def _figures(state: "BoxState") -> str:
     if state.contact_ns is None or state.reading is None:
         return ""
+    figures = f"{state.reading.fish_per_hour:.0f} fish per hour, {state.reading.disk_text} free"
     if state.error:
-        return f"last contact {state.contact_text}"
-    return f"{state.reading.fish_per_hour:.0f} fish per hour, {state.reading.disk_text} free"
+        figures = f"last contact {state.contact_text}"
+    return ", ".join(filter(None, (figures, state.signature_text)))

@@ -19,6 +19,7 @@ from urllib.error import HTTPError
 from urllib.parse import parse_qs, urlsplit
 from urllib.request import url2pathname
 
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from prometheus_client.parser import text_string_to_metric_families
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
@@ -26,6 +27,7 @@ from stream_dmr.errors import ConfigError, OutputError, UserError, reason_of
 from stream_dmr.evidence.digest_file import read_digest
 from stream_dmr.evidence.own_files import is_made_by
 from stream_dmr.files import read_text, replacing
+from stream_dmr.store.ledger import load_public_key
 from stream_dmr.web.pages import render
 
 _TIMEOUT_S = 10.0  # chosen: a link by satellite takes a second or two
@@ -52,6 +54,7 @@ class Box:
     name: str
     address: str
     token: str = field(default="", repr=False)
+    key: Ed25519PublicKey | None = field(default=None, repr=False)  # that must have signed digests
 
 
 def _shown(text: str) -> str:
@@ -108,6 +111,15 @@ class BoxState:
         return [self.error] if self.error or self.reading is None else self.reading.problems
 
     @property
+    def signature_text(self) -> str:
+        """Whether what the last digest says is known to be the device's; "" without a digest."""
+        if not self.box.address.startswith("file:") or self.reading is None:
+            return ""
+        if self.box.key is None:
+            return "signature not checked"
+        return "" if self.error else "signature checked"
+
+    @property
     def contact_text(self) -> str:
         return "never" if self.contact_ns is None else minute_text(self.contact_ns)
 
@@ -116,8 +128,8 @@ def load_boxes(given: Sequence[str]) -> list[Box]:
     """The boxes of addresses, and of files with one `NAME ADDRESS` or `ADDRESS` a line.
 
     An address is that of a status page, with `?token=...` where it asks for one, a digest or a
-    folder of digests; # begins a comment. Raises ConfigError for files and addresses that can't be
-    used, and doubled ones.
+    folder of digests, which the device's FILE.pub may follow; # begins a comment. Raises
+    ConfigError for files and addresses that can't be used, and doubled ones; UserError for keys.
     """
     boxes = list[Box]()
     for one in given:
@@ -142,8 +154,10 @@ def _read_file(path: Path) -> list[Box]:
     boxes = list[Box]()
     for number, line in enumerate(lines, start=1):
         if words := line.split("#")[0].split():
+            key = words.pop() if words[-1].endswith(".pub") and len(words) > 1 else ""
             *name, address = words
-            boxes.append(_box(address, where=f"{path}, line {number}", name=" ".join(name)))
+            where = f"{path}, line {number}"
+            boxes.append(_box(address, where=where, name=" ".join(name), key=key))
     return boxes
 
 
@@ -151,10 +165,15 @@ def _has_digests(text: str) -> bool:
     return "://" not in text and (Path(text).is_dir() or is_made_by("digest")(Path(text)))
 
 
-def _box(text: str, *, where: str, name: str = "") -> Box:
+def _box(text: str, *, where: str, name: str = "", key: str = "") -> Box:
     if _has_digests(text):
-        path = Path(text).resolve()
-        return Box(name=name or path.name, address=path.as_uri())
+        path, signer = Path(text).resolve(), load_public_key(Path(key)) if key else None
+        return Box(name=name or path.name, address=path.as_uri(), key=signer)
+    if key:
+        raise ConfigError(
+            f"{where}: expected a key after a digest or a folder of digests alone, got one after "
+            f"{text.partition('?')[0]}; leave it out"
+        )
     expected = f"{where}: expected the address of a status page, such as http://10.0.0.7:8480/"
     try:
         parts = urlsplit(text)
@@ -199,8 +218,10 @@ def _told_by_digest(before: BoxState) -> BoxState:
     """The state by the last digest; a box whose last one is old is silent."""
     path = Path(url2pathname(urlsplit(before.box.address).path))
     last = max(path.glob("digest-*.zip"), default=None) if path.is_dir() else path
-    if last is None or (digest := read_digest(last)) is None:
+    if last is None:
         return replace(before, error="no digest has come")
+    if (digest := read_digest(last, before.box.key)) is None:
+        return replace(before, error=f"{last.name} is not as it was signed, or not by its key")
     age = datetime.now(UTC).date() - date.fromisoformat(digest["day"])
     is_old = not timedelta(0) <= age <= _MAX_DIGEST_AGE  # of a day to come: its clock is wrong
     return BoxState(

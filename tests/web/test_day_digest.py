@@ -23,7 +23,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stream_dmr.errors import OutputError
+from stream_dmr.errors import ConfigError, OutputError, UserError
 from stream_dmr.evidence.digest_file import CONTENT, pack, read_digest
 from stream_dmr.evidence.own_files import is_made_by
 from stream_dmr.evidence.verify_signatures import check_signatures
@@ -507,6 +507,38 @@ def test_the_fleet_shows_digests(busy: Path, tmp_path: Path):
     (state,) = ask_all(states[:1])
     assert (state.kind, state.reading) == ("silent", states[0].reading)  # as it said last
     assert "not a zip file" in state.error
+
+
+def test_the_fleet_checks_signatures_where_it_has_a_key(busy: Path, key: Path, tmp_path: Path):
+    path, boxes, out = tmp_path / "digest-1.zip", tmp_path / "boxes", tmp_path / "fleet.html"
+    write_digest(busy, DAY, path, Signer(key))
+    today = content_of(path) | {"day": str(datetime.now(UTC).date())}
+    path.write_bytes(pack(today, {}, Signer(key)))
+    boxes.write_text(f"Bird {path} {key}.pub\n")
+    other = make_key(tmp_path / "other")
+    for signer, line in ((Signer(key), "signature checked"), (Signer(None), "not by its key")):
+        path.write_bytes(pack(today, {}, signer))
+        assert line in invoke(f"fleet {boxes} --out {out}").out
+        assert line in out.read_text()
+    assert "signature checked" not in out.read_text()
+    path.write_bytes(pack(today, {}, Signer(key)))
+    boxes.write_text(f"Bird {path} {other}\n")
+    assert "not by its key" in invoke(f"fleet {boxes} --out {out}").out
+    boxes.write_text(f"Bird {path}\n")
+    assert invoke(f"fleet {boxes} --out {out}").out.count("signature not checked") == 1
+    assert out.read_text().count("signature not checked") == 1
+
+
+def test_a_key_behind_a_status_page_or_that_is_none_is_refused(tmp_path: Path):
+    boxes, digests = tmp_path / "boxes", tmp_path / "digests"
+    digests.mkdir()
+    boxes.write_text("Bird http://10.0.0.7:8480/?token=secret device.pub\n")
+    with pytest.raises(ConfigError, match="line 1: expected a key after a digest") as caught:
+        load_boxes([str(boxes)])
+    assert "secret" not in str(caught.value)
+    boxes.write_text(f"Bird {digests} {tmp_path / 'none.pub'}\n")
+    with pytest.raises(UserError, match=r"none\.pub"):
+        load_boxes([str(boxes)])
 
 
 def test_the_fleet_bounds_what_digests_say(busy: Path, tmp_path: Path):
