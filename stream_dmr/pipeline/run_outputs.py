@@ -212,6 +212,13 @@ def resume_source(
     Returns the frames done of each unfinished clip, None where the source has no clips. What is
     wrong with a clip is an event of the run as well.
     """
+    if (behind_s := store.clock_behind_s()) >= 1:
+        line = (
+            f"by this machine's clock the run begins {behind_s:.0f} s before an earlier one of its "
+            "folder ended; it was set back meanwhile, or is wrong"
+        )
+        store.note("clock", line, timestamp_ns=store.last_ns)
+        on_notice(line)
     done, frames_done = store.clips_before()
     after_ns = store.resume_after_ns() if source.is_live else store.before.timestamp_ns
 

@@ -289,6 +289,13 @@ class LengthStore:
         done = {clip["name"] for clip in clips if clip["is_done"]}
         return done, {c["name"]: c["frames_done"] for c in clips if not c["is_done"]}
 
+    def clock_behind_s(self) -> float:
+        """By how much this run's start lies before one or the end of an earlier run; else 0."""
+        runs = list(rows(self._rows.database, RUNS))
+        times = [one[name] or 0 for one in runs for name in ("started_ns", "ended_ns")]
+        began = [one["started_ns"] for one in runs if one["run_id"] == self.run_id]
+        return (max(times) - began[0]) / 1e9 if began else 0.0
+
     def resume_after_ns(self) -> int:
         """The capture time after which a live source goes on, whatever the clock was set to."""
         mark_ns = self.before.timestamp_ns

@@ -12,6 +12,8 @@ import pytest
 from stream_dmr.errors import SourceError
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.pipeline.run_observer import RunObserver
+from stream_dmr.pipeline.run_outputs import resume_source
+from stream_dmr.sources.open_source import open_source
 from stream_dmr.sources.source import Source
 from stream_dmr.store.fish import read_runs, read_stored_fish, run_notes
 from stream_dmr.store.length_store import LengthStore
@@ -24,12 +26,13 @@ from stream_dmr.store.run_facts import (
     RunFacts,
     cut_short,
 )
-from stream_dmr.store.schema import CUT_OFF_BY_SOURCE, CUT_OFF_BY_STOP, NAME
+from stream_dmr.store.schema import CUT_OFF_BY_SOURCE, CUT_OFF_BY_STOP, EVENTS, NAME, read_rows
 from stream_dmr.web.open_reports import open_report
 from stream_dmr.web.report_page import render_page
 from tests.support.command import invoke, rows
 from tests.support.final_estimates import FACTS, fish
 from tests.support.fish_run import measure, request
+from tests.support.sources import SETTINGS
 from tests.support.tiny_clip import write_clip
 
 NUM_FRAMES = 40  # more than the queues of the chain hold
@@ -117,6 +120,24 @@ def test_an_end_before_the_start_is_noted(tmp_path: Path):
         database.execute("UPDATE runs SET ended_ns = started_ns - 3600000000000")
     (line,) = run_notes(out)
     assert "ended 3600 s before it began" in line
+
+
+@pytest.mark.parametrize("early_s", [-60, 3600])
+def test_a_start_before_the_end_of_an_earlier_run_is_said(tmp_path: Path, early_s: int):
+    write_clip(tmp_path / "clip", fish=[[1]])
+    source, said = open_source(str(tmp_path / "clip" / "video.mp4"), SETTINGS), list[str]()
+    with closing(LengthStore(tmp_path, FACTS)) as store:
+        resume_source(source, store, on_notice=said.append)
+    assert said == []
+    with closing(sqlite3.connect(tmp_path / NAME)) as database, database:
+        database.execute("UPDATE runs SET ended_ns = ended_ns + ?", [early_s * 10**9])
+    with closing(LengthStore(tmp_path, FACTS)) as store:
+        resume_source(source, store, on_notice=said.append)
+    source.close()
+    assert [row["text"] for row in read_rows(tmp_path / NAME, EVENTS)] == said
+    assert [line.partition(" the run begins ")[2].split()[0] for line in said] == (
+        ["3600"] if early_s > 0 else []
+    )
 
 
 def test_an_error_is_what_ended_the_run(tmp_path: Path):
