@@ -6,24 +6,28 @@ Each picture goes into a slot of the shared memory, and a line of JSON about it 
 slot's number comes back as one byte on stdin when the picture is no longer used. The process ends
 with stdin. Nothing of stream_dmr is imported here, so that it starts quickly.
 
-FFmpeg makes up what is damaged, and OpenCV has no sign of it; but FFmpeg prints an error. So it
-prints into a file in memory here, and a line of JSON says whether that got longer.
+FFmpeg makes up what is damaged, and OpenCV has no sign of it; but FFmpeg prints that. So it prints
+into a file in memory here, and a line of JSON says whether errors came.
 """
 
 import ctypes
 import json
 import mmap
 import os
+import re
 import signal
 import sys
 import threading
 from queue import SimpleQueue
 
 # FFmpeg reads its level once, at its first use in the process.
-os.environ["OPENCV_FFMPEG_LOGLEVEL"] = "16"  # AV_LOG_ERROR
+os.environ["OPENCV_FFMPEG_LOGLEVEL"] = "32"  # AV_LOG_INFO
 
 import cv2
 import numpy as np
+
+# A line of the levels "panic", "fatal" or "error"; and what H.264 says as information only.
+_ERRORS = re.compile(rb"FFMPEG:(00|08|16)\]|\bconcealing\b")
 
 NUM_SLOTS = 8  # most of them hold pictures in use
 
@@ -41,7 +45,7 @@ def main(address: str, memory: int) -> None:
     place = (int(address),) if address.isdecimal() else (address, cv2.CAP_FFMPEG)
     lines, printed = os.dup(1), _Printed()
     capture = cv2.VideoCapture(*place)
-    printed.is_new()  # it looks at some pictures here, and at the same ones again
+    printed.has_errors()  # it looks at some pictures here, and at the same ones again
     is_read, image = capture.read()
     if not is_read or image.ndim != 3 or image.dtype != np.uint8:
         return
@@ -67,7 +71,7 @@ def main(address: str, memory: int) -> None:
         if not np.shares_memory(image, slots[slot]):
             np.copyto(slots[slot], image)
         _send(lines, slot=slot, **_facts(capture, printed))
-    return _send(lines, end=True, has_errors=printed.is_new())
+    return _send(lines, end=True, has_errors=printed.has_errors())
 
 
 class _Printed:
@@ -78,19 +82,21 @@ class _Printed:
         os.dup2(self._file, 1)
         self._flush = ctypes.CDLL(None).fflush
 
-    def is_new(self) -> bool:
-        """Whether something was printed since the last call, which is dropped."""
+    def has_errors(self) -> bool:
+        """Whether errors were printed since the last call."""
         self._flush(None)
-        if not os.fstat(self._file).st_size:
+        num_bytes = os.fstat(self._file).st_size
+        if not num_bytes:
             return False
+        text = os.pread(self._file, num_bytes, 0)
         os.lseek(self._file, 0, os.SEEK_SET)
         os.ftruncate(self._file, 0)
-        return True
+        return _ERRORS.search(text) is not None
 
 
 def _facts(capture: cv2.VideoCapture, printed: _Printed) -> dict[str, object]:
     milliseconds = capture.get(cv2.CAP_PROP_POS_MSEC)
-    return {"milliseconds": milliseconds, "has_errors": printed.is_new()}
+    return {"milliseconds": milliseconds, "has_errors": printed.has_errors()}
 
 
 def _collect_free_slots(free: "SimpleQueue[int]") -> None:
