@@ -241,11 +241,14 @@ class ClipFolder(Source):
             state, duration_s = _state_of(path), (self._video.num_frames or 0) / self._video.fps
             self._clip_s = duration_s
             start_ns = 0 if state is None else state.modified_ns - round(duration_s * 1e9)
-            start_ns = max(start_ns, last_ns + round(1e9 / self._video.fps))
+            next_ns = last_ns + round(1e9 / self._video.fps)
+            done = self._frames_done.get(path.name, 0)
             for frame in self._video:
                 frame_index += 1
-                last_ns = start_ns + frame.timestamp_ns
-                if frame.frame_index > self._frames_done.get(path.name, 0):
+                if frame.frame_index == done + 1:  # what was read before may lie before the last
+                    start_ns = max(start_ns, next_ns - frame.timestamp_ns)
+                if frame.frame_index > done:
+                    last_ns = start_ns + frame.timestamp_ns
                     self._frames_done[path.name] = frame.frame_index
                     yield replace(frame, frame_index=frame_index, timestamp_ns=last_ns)
             for line in self._video.warnings:
