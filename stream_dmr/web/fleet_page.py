@@ -19,7 +19,6 @@ from urllib.error import HTTPError
 from urllib.parse import parse_qs, urlsplit
 from urllib.request import url2pathname
 
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from prometheus_client.parser import text_string_to_metric_families
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
@@ -54,7 +53,7 @@ class Box:
     name: str
     address: str
     token: str = field(default="", repr=False)
-    key: Ed25519PublicKey | None = field(default=None, repr=False)  # that must have signed digests
+    key: Path | None = None  # the FILE.pub of whoever must have signed its digests
 
 
 def _shown(text: str) -> str:
@@ -167,7 +166,9 @@ def _has_digests(text: str) -> bool:
 
 def _box(text: str, *, where: str, name: str = "", key: str = "") -> Box:
     if _has_digests(text):
-        path, signer = Path(text).resolve(), load_public_key(Path(key)) if key else None
+        path, signer = Path(text).resolve(), Path(key) if key else None
+        if signer is not None:
+            load_public_key(signer)  # refused now, not when the first digest comes
         return Box(name=name or path.name, address=path.as_uri(), key=signer)
     if key:
         raise ConfigError(
@@ -220,7 +221,8 @@ def _told_by_digest(before: BoxState) -> BoxState:
     last = max(path.glob("digest-*.zip"), default=None) if path.is_dir() else path
     if last is None:
         return replace(before, error="no digest has come")
-    if (digest := read_digest(last, before.box.key)) is None:
+    key = None if before.box.key is None else load_public_key(before.box.key)
+    if (digest := read_digest(last, key)) is None:
         return replace(before, error=f"{last.name} is not as it was signed, or not by its key")
     age = datetime.now(UTC).date() - date.fromisoformat(digest["day"])
     is_old = not timedelta(0) <= age <= _MAX_DIGEST_AGE  # of a day to come: its clock is wrong
