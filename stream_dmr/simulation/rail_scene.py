@@ -5,6 +5,7 @@ Amplitudes and rates were chosen by eye.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -45,49 +46,23 @@ class Preset:
     noise_levels: float  # sensor noise, grey levels
 
 
+_AMPLITUDES: dict[str, tuple[Any, Any, Any]] = {  # of clean, realistic and severe scenes
+    "max_bend_deg": (30.0, 60.0, 120.0),
+    "max_twist_deg": (8.0, 20.0, 30.0),
+    "yaw_deg": (15.0, 28.0, 40.0),
+    "sway_deg": (6.0, 10.0, 16.0),
+    "tilt_deg": (5.0, 9.0, 14.0),
+    "blind_side_share": (0.3, 0.4, 0.5),
+    "lane_mm": (1100.0, 900.0, 700.0),
+    "gaff_every": (0, 3, 2),
+    "ragged_px": (0.0, 0.9, 1.5),
+    "defocus_px": (0.5, 0.8, 1.2),
+    "exposure_frames": (0.02, 0.08, 0.15),
+    "noise_levels": (1.5, 4.0, 7.0),
+}
 PRESETS = {
-    "clean": Preset(
-        max_bend_deg=30.0,
-        max_twist_deg=8.0,
-        yaw_deg=15.0,
-        sway_deg=6.0,
-        tilt_deg=5.0,
-        blind_side_share=0.3,
-        lane_mm=1100.0,
-        gaff_every=0,
-        ragged_px=0.0,
-        defocus_px=0.5,
-        exposure_frames=0.02,
-        noise_levels=1.5,
-    ),
-    "realistic": Preset(
-        max_bend_deg=60.0,
-        max_twist_deg=20.0,
-        yaw_deg=28.0,
-        sway_deg=10.0,
-        tilt_deg=9.0,
-        blind_side_share=0.4,
-        lane_mm=900.0,
-        gaff_every=3,
-        ragged_px=0.9,
-        defocus_px=0.8,
-        exposure_frames=0.08,
-        noise_levels=4.0,
-    ),
-    "severe": Preset(
-        max_bend_deg=120.0,
-        max_twist_deg=30.0,
-        yaw_deg=40.0,
-        sway_deg=16.0,
-        tilt_deg=14.0,
-        blind_side_share=0.5,
-        lane_mm=700.0,
-        gaff_every=2,
-        ragged_px=1.5,
-        defocus_px=1.2,
-        exposure_frames=0.15,
-        noise_levels=7.0,
-    ),
+    name: Preset(**{field: values[k] for field, values in _AMPLITUDES.items()})
+    for k, name in enumerate(("clean", "realistic", "severe"))
 }
 
 
