@@ -33,8 +33,8 @@ def verify(
     """
     from stream_dmr.errors import UserError
     from stream_dmr.evidence.digest_file import read_digest
-    from stream_dmr.evidence.verify_batch import verify_all
     from stream_dmr.evidence.verify_folder import Change, summary
+    from stream_dmr.evidence.verify_folder import verify as verify_folder
     from stream_dmr.evidence.verify_signatures import check_signatures
     from stream_dmr.store.fish import run_notes
     from stream_dmr.store.ledger import load_public_key
@@ -49,7 +49,7 @@ def verify(
             raise typer.Exit(1)
         print(f"{folder}: nothing was changed; {digest['day']}, {len(digest['fish']) - 1} fish")
         return
-    changes, num_files = verify_all(folder)
+    changes, num_files = verify_folder(folder)
     databases, notes = sorted(folder.rglob(NAME)), list[str]()
     if signed_by is not None:
         if not databases:

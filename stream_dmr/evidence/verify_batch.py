@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from stream_dmr.errors import OutputError
-from stream_dmr.evidence.verify_folder import Change, verify
 from stream_dmr.files import sha256_of
 from stream_dmr.store.batch_folder import (
     DONE,
@@ -22,11 +21,6 @@ from stream_dmr.store.batch_folder import (
 )
 
 Finding = tuple[Path, str]  # a file, and what is wrong with it
-
-
-def verify_all(folder: Path) -> tuple[list[Change], int]:
-    """`verify` that knows the folders of batches as well: the changes, and the files checked."""
-    return verify(folder, {VIDEOS: check_batch})
 
 
 def check_batch(out: Path) -> Iterator[Finding]:

@@ -15,7 +15,6 @@ from datetime import UTC, datetime
 from itertools import takewhile
 from operator import attrgetter
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -31,6 +30,7 @@ from stream_dmr.evidence.seal import (
     verdict_lines,
 )
 from stream_dmr.evidence.seal import NAME as PROVENANCE
+from stream_dmr.evidence.verify_batch import check_batch
 from stream_dmr.files import is_locked, sha256_of
 from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.messages import FittedMesh, LengthEstimate, LocalizedFish, track_of
@@ -38,6 +38,7 @@ from stream_dmr.recording.mcap.mcap_recording import is_torn
 from stream_dmr.recording.reading import decoded_messages, open_recordings, recorded_settings
 from stream_dmr.recording.repair import DAMAGED
 from stream_dmr.recording.selection import EVERYTHING, Selection
+from stream_dmr.store.batch_folder import VIDEOS
 from stream_dmr.store.edits import (
     ReviewedMessages,
     TrackEdits,
@@ -188,9 +189,6 @@ def _lengths(database: Path, edits: TrackEdits, last_frames: Mapping[int, int]) 
 
 _MADE_BY = ("config_sha256", "calibration_sha256", "template_sha256")
 
-Checks = Mapping[str, Callable[[Path], Iterable[tuple[Path, str]]]]
-"""By the file that a folder has: what is found there, each with the file that it concerns."""
-
 
 class Change(NamedTuple):
     """One file, run or fish that is not as its run wrote it, or that its run never finished."""
@@ -200,13 +198,13 @@ class Change(NamedTuple):
     is_by_crash: bool = False  # a crash explains it; nobody need have changed anything
 
 
-def verify(folder: Path, others: Checks = MappingProxyType({})) -> tuple[list[Change], int]:
-    """Check a folder of results or exports and those in it; what was changed, and files checked.
+def verify(folder: Path) -> tuple[list[Change], int]:
+    """Check a folder of results, exports or a batch and those in it.
 
-    `others` are checks of folders that hold a file of that name. Raises UserError where there is
+    Returns what was changed, and the number of files checked. Raises UserError where there is
     nothing to check.
     """
-    marks = (DATABASE, PROVENANCE, *others)
+    marks = (DATABASE, PROVENANCE, VIDEOS)
     places = {path.parent for name in marks for path in folder.rglob(name)}
     if not places:
         raise UserError(
@@ -215,13 +213,13 @@ def verify(folder: Path, others: Checks = MappingProxyType({})) -> tuple[list[Ch
         )
     changes, num_files = list[Change](), 0
     for place in sorted(places):
-        changes += dict.fromkeys(_changes(place, others))
+        changes += dict.fromkeys(_changes(place))
         num_files += sum(1 for path in place.iterdir() if path.is_file())
         num_files += sum(1 for _ in place.glob("dataset/*/*/*/*.parquet"))
     return changes, num_files
 
 
-def _changes(folder: Path, others: Checks) -> Iterator[Change]:
+def _changes(folder: Path) -> Iterator[Change]:
     """The walk over one folder: each check is of its own, and none stops the next."""
     for path in sorted(folder.iterdir()):
         if not path.is_file() and not path.is_dir():
@@ -232,10 +230,9 @@ def _changes(folder: Path, others: Checks) -> Iterator[Change]:
     lengths: dict[str, list[str]] = {}
     of_rows = [*_broken(database, _stored(database, runs, fish, lengths))] if database else []
     yield from _broken(folder / PROVENANCE, _against_provenance(folder, runs))
-    for name, check in others.items():
-        if (folder / name).is_file():
-            findings = (Change(*finding) for finding in check(folder))
-            yield from _broken(folder / name, findings)
+    if (folder / VIDEOS).is_file():
+        findings = (Change(*finding) for finding in check_batch(folder))
+        yield from _broken(folder / VIDEOS, findings)
     if database is None:
         return
     yield from of_rows

@@ -24,7 +24,7 @@ from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
 from stream_dmr.batch.measure_video import BatchProgress, measure_video, read_outcome
 from stream_dmr.errors import OutputError
 from stream_dmr.evidence.seal import seal_verdicts
-from stream_dmr.evidence.verify_batch import verify_all
+from stream_dmr.evidence.verify_folder import verify
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.store.batch_folder import results_folder
 from stream_dmr.store.fish import read_stored_fish
@@ -97,7 +97,7 @@ def test_a_batch_measures_a_video_as_run_does(season: Path, tmp_path: Path):
     assert (outcome.num_frames, outcome.num_fish) == (len(FISH), 2)
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
-    assert verify_all(folder)[0] == []
+    assert verify(folder)[0] == []
     assert read_outcome(job, tmp_path) == outcome
 
 
@@ -132,7 +132,7 @@ def test_a_worker_s_video_has_positions_and_its_fish_have_fates(season: Path, tm
     said = ", ".join(f"{count} {name}" for name, count in counted.most_common())
     assert f"fate: {said}" in outcome.out
     assert json.loads((folder / "outcome.json").read_text())["fates"] == counted
-    assert verify_all(folder)[0] == []
+    assert verify(folder)[0] == []
 
 
 def test_a_bad_video_fails_alone(season: Path, tmp_path: Path):
@@ -213,17 +213,17 @@ def test_pandas_opens_the_data_set(finished: Path):
 def test_verify_finds_a_changed_data_set(season: Path, tmp_path: Path):
     (job,) = jobs_of(season, tmp_path, row())
     measure([job], tmp_path)
-    assert verify_all(tmp_path)[0] == []
+    assert verify(tmp_path)[0] == []
     (copy,) = (tmp_path / "dataset" / "fish").rglob("*.parquet")
     copy.write_bytes(copy.read_bytes() + b"x")
-    (change,) = verify_all(tmp_path)[0]
+    (change,) = verify(tmp_path)[0]
     assert change.path == copy
     assert "differs from videos/video/fish.parquet" in change.what
     shutil.copy(tmp_path / "videos" / "video" / "fish.parquet", copy)
     elsewhere = copy.parents[1] / "trip=9" / copy.name
     elsewhere.parent.mkdir()
     copy.rename(elsewhere)  # which makes it another trip's
-    assert [(change.path, change.what) for change in verify_all(tmp_path)[0]] == [
+    assert [(change.path, change.what) for change in verify(tmp_path)[0]] == [
         (copy, "is missing"),
         (elsewhere, "belongs to no finished video of videos.csv"),
     ]
@@ -242,16 +242,16 @@ def test_verify_finds_a_changed_table_of_videos(
 ):
     jobs = jobs_of(season, tmp_path, row(vessel="Sea Bird"), row(video="no/broken.mp4"))
     measure(jobs, tmp_path)
-    assert verify_all(tmp_path)[0] == []
+    assert verify(tmp_path)[0] == []
     table = tmp_path / "videos.csv"
     text = table.read_text()
     assert before in text
     table.write_text(text.replace(before, after, 1))
-    found = [change.what for change in verify_all(tmp_path)[0]]
+    found = [change.what for change in verify(tmp_path)[0]]
     assert "was changed: its SHA-256 is not that in provenance.json" in found
     assert any(what.startswith(expected) for what in found), found
     measure(jobs, tmp_path)
-    assert verify_all(tmp_path)[0] == []
+    assert verify(tmp_path)[0] == []
 
 
 def test_a_report_shows_all_videos(season: Path, tmp_path: Path):
@@ -272,10 +272,10 @@ def test_a_report_shows_all_videos(season: Path, tmp_path: Path):
     assert all(f'id="fish-{one["id"]}"' in text for one in fish)
     assert fish[1]["time_s"] < fish[2]["time_s"]  # the second clip's clock begins anew
     assert [line.split(":")[0] for line in shown["notes"]] == ["broken"]
-    assert verify_all(tmp_path)[0] == []  # the report is known there
+    assert verify(tmp_path)[0] == []  # the report is known there
     measure(jobs, tmp_path)
     target.write_text(text + " ")
-    assert [change.path for change in verify_all(tmp_path)[0]] == [target]
+    assert [change.path for change in verify(tmp_path)[0]] == [target]
 
 
 def test_the_next_call_takes_verdicts_into_the_data_set(season: Path, tmp_path: Path):
@@ -287,7 +287,7 @@ def test_the_next_call_takes_verdicts_into_the_data_set(season: Path, tmp_path: 
     measure([job], tmp_path)
     fish = dataset.dataset(tmp_path / "dataset" / "fish").to_table().to_pylist()
     assert [one["verdict"] for one in fish] == [None, "reject"]
-    assert verify_all(tmp_path)[0] == []
+    assert verify(tmp_path)[0] == []
 
 
 def test_a_video_whose_tables_can_not_be_written_again_is_named(season: Path, tmp_path: Path):
@@ -318,7 +318,7 @@ def test_the_next_call_takes_checks_of_the_scale_into_the_data_set(season: Path,
     measure([job], tmp_path)
     fish = dataset.dataset(tmp_path / "dataset" / "fish").to_table().to_pylist()
     assert [one["scale_error_percent"] for one in fish] == [4.0, 4.0]
-    assert verify_all(tmp_path)[0] == []
+    assert verify(tmp_path)[0] == []
 
 
 def test_finished_videos_are_skipped(season: Path, tmp_path: Path):
@@ -349,10 +349,10 @@ def test_a_failure_keeps_the_results_of_an_earlier_call(season: Path, tmp_path: 
     assert measure(jobs, tmp_path) == {"video": "failed"}
     assert (tmp_path / "videos" / "video" / "lengths.csv").read_bytes() == before
     assert list(tmp_path.glob("dataset/**/*.parquet")) == []  # which has finished videos alone
-    assert verify_all(tmp_path)[0] == []
+    assert verify(tmp_path)[0] == []
     (season / "not-mounted").rename(season / "disk")
     assert run_batch(jobs, tmp_path, ThisProcess(), stop=threading.Event()).num_before == 1
-    assert verify_all(tmp_path)[0] == []
+    assert verify(tmp_path)[0] == []
 
 
 @pytest.mark.parametrize("name", ["video", "video.part"])
@@ -492,7 +492,7 @@ def test_a_batch_killed_at_random_moments_finishes_in_the_end(tmp_path: Path, se
     assert ended.returncode == 0, ended.stderr
     assert int(ended.stdout.split()[0]) > 2
     assert_same_tables(tmp_path / "out" / "videos" / "video", tmp_path / "alone")
-    assert verify_all(tmp_path / "out")[0] == []
+    assert verify(tmp_path / "out")[0] == []
     assert [line["status"] for line in rows(tmp_path / "out" / "videos.csv")] == ["done"] * 2
 
 
