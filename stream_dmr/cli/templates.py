@@ -123,7 +123,6 @@ def crops_of(paths: "list[Path]", recordings: "list[Recording]") -> "Iterator[Fi
     """
     from stream_dmr.errors import UserError
     from stream_dmr.messages import FishCrop
-    from stream_dmr.recording.selection import EVERYTHING
     from stream_dmr.store.edits import ReviewedMessages
     from stream_dmr.store.fish import database_of, read_stored_fish
 
@@ -132,14 +131,14 @@ def crops_of(paths: "list[Path]", recordings: "list[Recording]") -> "Iterator[Fi
         source, database = _identity(recording), database_of(path)
         fish = () if database is None else read_stored_fish(database)
         left_out = {one.estimate.track_id for one in fish if not one.counts}
-        for crop in ReviewedMessages(recording, database, EVERYTHING).of([FishCrop]):
+        for crop in ReviewedMessages(recording, database).of(FishCrop):
             first = first_with.setdefault((source, crop.timestamp_ns), number)
             if first != number:
                 raise UserError(
                     f"{path}: expected recordings of different frames, got some of the same source "
                     f"and time as in {paths[first]}; leave one out, else their fish count twice"
                 )
-            if isinstance(crop, FishCrop) and crop.track_id not in left_out:
+            if crop.track_id not in left_out:
                 yield replace(crop, track_id=crop.track_id + number * _IDS)
 
 

@@ -130,8 +130,8 @@ def _corrections(
     wanted = {(verdict.track_id, verdict.frame_index) for _, verdict in corrections}
     fits = {
         (fit.track_id, fit.frame_index): fit
-        for fit in ReviewedMessages(recording, database, fish).of([FittedMesh])
-        if isinstance(fit, FittedMesh) and (fit.track_id, fit.frame_index) in wanted
+        for fit in ReviewedMessages(recording, database, fish).of(FittedMesh)
+        if (fit.track_id, fit.frame_index) in wanted
     }
     localizing = recorded_settings(recording.header, "localize", LocalizeSettings)
     for number, verdict in corrections:

@@ -126,22 +126,17 @@ class Export:
         Rejected fish and doubles are left out: `train` would learn from them.
         """
         self._require_writable(path, needed_for="--masks")
-        frames = decoded_messages(self.recording, [Frame], self._selection)
-        placed = {
-            (one.track_id, one.frame_index): one
-            for one in self._reviewed.of([LocalizedFish])
-            if isinstance(one, LocalizedFish)
-        }
+        placed = {(one.track_id, one.frame_index): one for one in self._reviewed.of(LocalizedFish)}
         coco = coco_masks(
             (
                 (frame.frame_index, frame.source, stored_picture(payload))
-                for frame, payload in frames
+                for frame, payload in decoded_messages(self.recording, [Frame], self._selection)
                 if isinstance(frame, Frame)
             ),
             (
                 (crop, placed.get((crop.track_id, crop.frame_index)))
-                for crop in self._reviewed.of([FishCrop])
-                if isinstance(crop, FishCrop) and crop.track_id not in self._left_out
+                for crop in self._reviewed.of(FishCrop)
+                if crop.track_id not in self._left_out
             ),
             {one.estimate.track_id: one for one in self._fish},
             video=self.header.source,
@@ -160,7 +155,7 @@ class Export:
         self._require_writable(*paths, *(path.with_suffix(".parquet") for path in paths))
         frames, edits = FramesTable(make_folder(out)), self._reviewed.edits
         edited, finished = self._reviewed.estimates(), list[LengthEstimate]()
-        for message in self._reviewed.of([LocalizedFish, LengthEstimate]):
+        for message, _ in self._reviewed.decoded([LocalizedFish, LengthEstimate]):
             if isinstance(message, LengthEstimate):
                 if message.track_id in edited or message.track_id in edits.merged:
                     continue
@@ -291,7 +286,7 @@ class Export:
         if not fish:
             require_time(self.recording, self._selection)
         if self._selection.tracks is not None:
-            fish |= {getattr(one, "track_id", 0) for one in self._reviewed.of([LocalizedFish])}
+            fish |= {one.track_id for one in self._reviewed.of(LocalizedFish)}
             require_tracks(self._selection, fish)
 
     def _require_writable(self, *paths: Path, needed_for: str = "") -> None:
@@ -317,7 +312,7 @@ class Export:
     def _localized(self, kind: type[Stage]) -> Iterator[tuple[Stage, LocalizedFish]]:
         """Each crop or fit with the place of its fish."""
         waiting: dict[tuple[int, int], Stage] = {}
-        for message in self._reviewed.of([kind, LocalizedFish]):
+        for message, _ in self._reviewed.decoded([kind, LocalizedFish]):
             if isinstance(message, kind):
                 waiting[message.track_id, message.frame_index] = message
             elif isinstance(message, LocalizedFish):

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from heapq import merge
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -32,7 +32,7 @@ from stream_dmr.messages import (
 )
 from stream_dmr.recording.codec import decode
 from stream_dmr.recording.reading import Recording, decoded_messages, messages_of, recorded_settings
-from stream_dmr.recording.selection import Selection
+from stream_dmr.recording.selection import EVERYTHING, Selection
 from stream_dmr.store.schema import fish_row
 from stream_dmr.store.verdicts import (
     EDITS,
@@ -44,6 +44,7 @@ from stream_dmr.store.verdicts import (
 )
 
 _LAST = 2**62  # a frame number that no recording reaches
+M = TypeVar("M", bound=Message)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -262,7 +263,12 @@ class ReviewedMessages:
     Without a database, or where reviewers changed no track, they are those of the recording.
     """
 
-    def __init__(self, recording: Recording, database: Path | None, selection: Selection) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        database: Path | None = None,
+        selection: Selection = EVERYTHING,
+    ) -> None:
         """`selection` by the numbers that fish have after the review."""
         self._recording, self._selection = recording, selection
         verdicts = [] if database is None else read_verdicts(database)
@@ -271,30 +277,29 @@ class ReviewedMessages:
         if database is not None and self.edits.fish:
             self._added = read_added_frames(database)
 
-    def of(self, kinds: Collection[type[Message]]) -> Iterator[Message]:
-        """In the order of their time."""
+    def of(self, kind: type[M]) -> Iterator[M]:
+        """The messages of one kind, in the order of their time."""
+        return (message for message, _ in self.decoded([kind]) if isinstance(message, kind))
+
+    def decoded(self, kinds: Collection[type[Message]]) -> Iterator[tuple[Message, bytes]]:
+        """The messages in the order of their time, each with its encoding, as it was recorded."""
         if not self.edits.fish:
-            found = decoded_messages(self._recording, kinds, self._selection)
-            yield from (message for message, _ in found)
+            yield from decoded_messages(self._recording, kinds, self._selection)
             return
         recorded = decoded_messages(self._recording, kinds, self._by_track())
-        messages = merge(
-            (message for message, _ in recorded),
-            self._of_added(kinds),
-            key=lambda message: message.timestamp_ns,
-        )
-        for message in messages:
+        found = merge(recorded, self._of_added(kinds), key=lambda one: one[0].timestamp_ns)
+        for message, payload in found:
             if isinstance(message, FishMessage) and not isinstance(message, LengthEstimate):
                 fish = self.edits.fish_of(message.track_id, message.frame_index)
                 message = replace(message, track_id=fish)
             if self._selection.includes(message):
-                yield message
+                yield message, payload
 
     def estimates(self) -> dict[int, dict[int, LengthEstimate]]:
         """Of each fish that reviewers made, by frame: the running estimate after it."""
         frames = defaultdict[int, list[LocalizedFish]](list)
-        for message in self.of([LocalizedFish]) if self.edits.fish else ():
-            if isinstance(message, LocalizedFish) and message.track_id in self.edits.fish:
+        for message in self.of(LocalizedFish) if self.edits.fish else ():
+            if message.track_id in self.edits.fish:
                 frames[message.track_id].append(message)
         settings = settings_of(self._recording)
         return {
@@ -310,12 +315,13 @@ class ReviewedMessages:
         parts = (part.track_id for one in fish for part in self.edits.parts_of(one))
         return replace(self._selection, tracks=frozenset(parts))
 
-    def _of_added(self, kinds: Collection[type[Message]]) -> Iterator[Message]:
+    def _of_added(self, kinds: Collection[type[Message]]) -> Iterator[tuple[Message, bytes]]:
         wanted = [(kind, name) for kind, name in _STAGES.items() if kind in kinds]
         standing = {part.track_id for fish in self.edits.fish.values() for part in fish.parts}
         frames = [one for track, of in self._added.items() if track in standing for one in of]
         for frame in sorted(frames, key=lambda one: one.frame_index):
             for kind, name in wanted:
-                message = decode(kind, getattr(frame, name))
+                payload = getattr(frame, name)
+                message = decode(kind, payload)
                 if self._selection.includes_time(message.timestamp_ns):
-                    yield message
+                    yield message, payload

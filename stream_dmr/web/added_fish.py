@@ -187,8 +187,7 @@ class TrackEditor:
     ) -> None:
         """DoubtError if the boxes lie over one of the `measured` fish."""
         selection = Selection(time_ns=(time_ns[0], time_ns[1] + 1))
-        for crop in ReviewedMessages(report.recording, self._database, selection).of([FishCrop]):
-            assert isinstance(crop, FishCrop)
+        for crop in ReviewedMessages(report.recording, self._database, selection).of(FishCrop):
             box = boxes_between(drawn, [crop.frame_index]).get(crop.frame_index)
             if box is None or crop.track_id not in measured:
                 continue

@@ -70,7 +70,7 @@ def _outlines(report: RunReport, span_ns: tuple[int, int]) -> dict[int, list[dic
     database = database_of(report.path) if report.edits.fish else None
     messages = ReviewedMessages(report.recording, database, Selection(time_ns=span_ns))
     frames = defaultdict[int, dict[int, dict[str, Any]]](dict)
-    for message in messages.of([FishCrop, LocalizedFish]):
+    for message, _ in messages.decoded([FishCrop, LocalizedFish]):
         if not isinstance(message, FishCrop | LocalizedFish):
             continue
         fish = message.track_id

@@ -25,7 +25,6 @@ from stream_dmr.export.coco_masks import mask_in_frame
 from stream_dmr.export.viame_csv import NO_SPECIES, PART, species_name
 from stream_dmr.messages import FishCrop, Frame, LocalizedFish
 from stream_dmr.recording.reading import messages_of
-from stream_dmr.recording.selection import EVERYTHING
 from stream_dmr.store.edits import ReviewedMessages
 from stream_dmr.store.open_results import require_recording
 from stream_dmr.store.schema import copy_database
@@ -102,13 +101,13 @@ class _Comparison:
             for track_id, frames in read_added_frames(database).items()
             for one in frames
         }
-        reviewed = ReviewedMessages(report.recording, database, EVERYTHING)
+        reviewed = ReviewedMessages(report.recording, database)
         self._ends_px = {
             (one.track_id, one.frame_index): one.keypoints_px[[0, 2]]
-            for one in reviewed.of([LocalizedFish])
-            if isinstance(one, LocalizedFish) and one.keypoints_px is not None
+            for one in reviewed.of(LocalizedFish)
+            if one.keypoints_px is not None
         }
-        crops = (one for one in reviewed.of([FishCrop]) if isinstance(one, FishCrop))
+        crops = reviewed.of(FishCrop)
         for frame_index, of_frame in groupby(crops, key=lambda crop: crop.frame_index):
             self._compare(frame_index, list(of_frame), rows.pop(frame_index, []))
         for frame_index, boxes in rows.items():

@@ -22,6 +22,7 @@ from stream_dmr.files import make_folder, replacing, sha256_of, sha256_of_files
 from stream_dmr.messages import Frame
 from stream_dmr.recording.reading import files_of, messages_of, open_recordings
 from stream_dmr.recording.selection import Selection
+from stream_dmr.store.edits import ReviewedMessages
 from stream_dmr.store.effort import read_effort
 from stream_dmr.store.fish import Fish, read_measured_fish, read_runs
 from stream_dmr.store.ledger import Signer, read_chain
@@ -199,7 +200,7 @@ def _pictures(
                 continue  # index 0: in a recording that began the day before
             recording = open_recordings([recordings[index - 1][1]])
             selection = Selection(tracks=frozenset([track_id]))
-            tracks = read_tracks(recording, selection=selection, max_views=1)
+            tracks = read_tracks(ReviewedMessages(recording, None, selection), max_views=1)
             for view in draw_views(tracks, recording).get(track_id, []):
                 large = cv2.imdecode(np.frombuffer(view.picture, np.uint8), cv2.IMREAD_COLOR)
                 assert large is not None  # it was just encoded

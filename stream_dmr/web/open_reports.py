@@ -7,12 +7,12 @@ from pathlib import Path
 from stream_dmr.errors import UserError
 from stream_dmr.evidence.seal import add_files
 from stream_dmr.files import make_folder, writing_to
-from stream_dmr.pipeline.config import Config, load_config, parse_config
+from stream_dmr.pipeline.config import load_config, parse_config
 from stream_dmr.recording.frame_images import FrameLookup
 from stream_dmr.recording.reading import require_messages
 from stream_dmr.recording.selection import Selection
 from stream_dmr.store.batch_folder import DONE, FAILED, VIDEO_FOLDERS, VIDEOS, read_videos
-from stream_dmr.store.edits import NO_EDITS, edits_of
+from stream_dmr.store.edits import ReviewedMessages
 from stream_dmr.store.effort import read_effort, watched_times
 from stream_dmr.store.fish import (
     database_of,
@@ -23,10 +23,9 @@ from stream_dmr.store.fish import (
 )
 from stream_dmr.store.open_results import LostRecording, open_results
 from stream_dmr.store.trip import VesselTrack, read_positions
-from stream_dmr.store.verdicts import read_added_frames, read_verdicts
 from stream_dmr.web.report_page import RunReport, render_page
 from stream_dmr.web.trip_map import Line
-from stream_dmr.web.views import ReviewedTracks, draw_views, read_tracks
+from stream_dmr.web.views import draw_views, read_tracks
 
 
 def open_report(
@@ -43,8 +42,8 @@ def open_report(
     recording = open_results(path)
     header = recording.header
     of_run = parse_config(header.config_toml, where=f"{path}: its config.toml")
-    reviewed = None if as_measured else reviewed_tracks(path, of_run)
     database = database_of(path)
+    reviewed = ReviewedMessages(recording, None if as_measured else database)
     if database is None:
         require_messages(recording)
     if as_measured and database is not None:
@@ -52,7 +51,7 @@ def open_report(
     else:
         fish = read_fish(path, recording)
     is_lost = isinstance(recording, LostRecording)
-    tracks = {} if is_lost else read_tracks(recording, reviewed=reviewed)
+    tracks = {} if is_lost else read_tracks(reviewed)
     return RunReport(
         path=path,
         recording=recording,
@@ -61,7 +60,7 @@ def open_report(
         views={} if is_lost else draw_views(tracks, recording, source),
         config=of_run,
         settings=(of_run if config is None else load_config(config)).fisheries,
-        edits=NO_EDITS if reviewed is None else reviewed.edits,
+        edits=reviewed.edits,
         source=source,
         efforts=[]
         if database is None
@@ -74,27 +73,11 @@ def open_report(
     )
 
 
-def reviewed_tracks(path: Path, config: Config) -> ReviewedTracks | None:
-    """What reviewers changed of a run's tracks; None of a recording without its database."""
-    database = database_of(path)
-    if database is None:
-        return None
-    return ReviewedTracks(
-        edits=edits_of(read_verdicts(database)),
-        added=read_added_frames(database),
-        settings=config.smooth_length,
-    )
-
-
 def reread_fish(report: RunReport, changed: frozenset[int], pictures: FrameLookup) -> RunReport:
     """The report after more edits of reviewers, with the frames and views of the `changed` fish."""
-    reviewed = reviewed_tracks(report.path, report.config)
-    if reviewed is None:
-        return report
-    parts = (part for fish in changed for part in reviewed.edits.parts_of(fish))
-    selection = Selection(tracks=frozenset(part.track_id for part in parts))
-    read = read_tracks(report.recording, selection=selection, reviewed=reviewed)
-    tracks = {fish: track for fish, track in read.items() if fish in changed}
+    selection = Selection(tracks=changed)
+    reviewed = ReviewedMessages(report.recording, database_of(report.path), selection)
+    tracks = read_tracks(reviewed)
     views = draw_views(tracks, report.recording, pictures=pictures)
     gone = changed - tracks.keys()
     return replace(

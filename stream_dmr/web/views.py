@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from stream_dmr.camera import Camera, crop_from_frame
 from stream_dmr.errors import SourceError
-from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.messages import (
     FishCrop,
     FittedMesh,
@@ -30,12 +29,11 @@ from stream_dmr.recording.reading import (
     decoded_messages,
     recorded_settings,
 )
-from stream_dmr.recording.selection import EVERYTHING, Selection
+from stream_dmr.recording.selection import EVERYTHING
 from stream_dmr.recording.view_geometry import MeshRebuilder, place_fit
 from stream_dmr.segmentation.crop_geometry import frame_from_crop_map
 from stream_dmr.sources.source import ReadFramesSettings
-from stream_dmr.store.edits import TrackEdits, length_of_frames
-from stream_dmr.store.verdicts import AddedFrame
+from stream_dmr.store.edits import ReviewedMessages
 
 _MASK_BGR, _MESH_BGR = (80, 220, 255), (90, 230, 90)
 _KEYPOINTS_BGR = (60, 60, 255), (255, 255, 255), (255, 160, 60)  # head, center, tail
@@ -148,15 +146,6 @@ _Key = tuple[int, int]  # frame index, track id
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReviewedTracks:
-    """What reviewers changed of the tracks."""
-
-    edits: TrackEdits
-    added: Mapping[int, Sequence[AddedFrame]]  # by track id
-    settings: SmoothLengthSettings  # of the run
-
-
-@dataclass(frozen=True, kw_only=True)
 class FishFrame:
     """One fish in one frame: its own length, and the running estimate after it."""
 
@@ -201,61 +190,18 @@ class RecordedTrack:
             self.views.sort(key=lambda view: view.rank, reverse=True)
             del self.views[max_views:]
 
-    def filter_again(self, settings: SmoothLengthSettings) -> None:
-        """Compute the running estimates from the frames in their order."""
-        fish = sorted((row.fish for row in self.rows), key=lambda one: one.frame_index)
-        running = length_of_frames(fish, settings)[:-1]
-        self.rows = [FishFrame(fish=f, estimate=e) for f, e in zip(fish, running, strict=True)]
 
+def read_tracks(reviewed: ReviewedMessages, *, max_views: int = 3) -> dict[int, RecordedTrack]:
+    """Every fish with its `max_views` best views. Raises RecordingError.
 
-def read_tracks(
-    recording: Recording,
-    *,
-    selection: Selection = EVERYTHING,
-    max_views: int = 3,
-    reviewed: ReviewedTracks | None = None,
-) -> dict[int, RecordedTrack]:
-    """Every fish of a recording with its `max_views` best views. Raises RecordingError.
-
-    Without `reviewed` fish are the recorded tracks.
+    Fish that reviewers made have the running estimates of their frames.
     """
-    tracks: dict[int, RecordedTrack] = {}
-    added = () if reviewed is None else _added_rows(reviewed, selection)
-    for row, view in chain(_read_rows(recording, selection), added):
-        if reviewed is not None:
-            fish_id = reviewed.edits.fish_of(row.fish.track_id, row.fish.frame_index)
-            row = replace(row, fish=replace(row.fish, track_id=fish_id))
-            view = None if view is None else replace(view, row=row)
-        track = tracks.setdefault(row.fish.track_id, RecordedTrack())
-        track.add(row, view, max_views=max_views)
-    if reviewed is not None:
-        for fish_id in tracks.keys() & reviewed.edits.fish.keys():
-            tracks[fish_id].filter_again(reviewed.settings)
-    return tracks
-
-
-_Row = tuple[FishFrame, RecordedView | None]  # None: the recording lacks the crop or the fit
-
-
-def _added_rows(reviewed: ReviewedTracks, selection: Selection) -> Iterator[_Row]:
-    """The frames of added fish, each with the running estimate of its fish."""
-    for track_id, frames in reviewed.added.items():
-        if selection.tracks is not None and track_id not in selection.tracks:
-            continue
-        fish = [decode(LocalizedFish, frame.fish) for frame in frames]
-        running = length_of_frames(fish, reviewed.settings)[:-1]
-        for frame, one, estimate in zip(frames, fish, running, strict=True):
-            row = FishFrame(fish=one, estimate=estimate)
-            yield row, RecordedView(crop=frame.crop, fit=frame.fit, row=row, has_picture=False)
-
-
-def _read_rows(recording: Recording, selection: Selection) -> Iterator[_Row]:
-    """Each fish in each frame."""
+    tracks, edited = dict[int, RecordedTrack](), reviewed.estimates()
     crops, fits = dict[_Key, tuple[bytes, bool]](), dict[_Key, bytes]()
     located = dict[_Key, LocalizedFish]()
     kinds = (FishCrop, FittedMesh, LocalizedFish, LengthEstimate)
-    for message, payload in decoded_messages(recording, kinds, selection):
-        key = message.frame_index, track_of(message)
+    for message, payload in reviewed.decoded(kinds):
+        key, estimate = (message.frame_index, track_of(message)), None
         match message:
             case FishCrop():
                 crops[key] = payload, message.image is not None
@@ -263,15 +209,20 @@ def _read_rows(recording: Recording, selection: Selection) -> Iterator[_Row]:
                 fits[key] = payload
             case LocalizedFish():
                 located[key] = message
-            case LengthEstimate() if (fish := located.pop(key, None)) is not None:
-                row = FishFrame(fish=fish, estimate=message)
-                (crop, has_picture), fit = crops.pop(key, (None, False)), fits.pop(key, None)
-                if crop is None or fit is None:
-                    yield row, None
-                else:
-                    yield row, RecordedView(crop=crop, fit=fit, row=row, has_picture=has_picture)
+                estimate = edited.get(message.track_id, {}).get(message.frame_index)
+            case LengthEstimate() if message.track_id not in edited:
+                estimate = message
             case _:
                 pass
+        if estimate is None or (fish := located.pop(key, None)) is None:
+            continue
+        row, view = FishFrame(fish=fish, estimate=estimate), None
+        (crop, has_picture), fit = crops.pop(key, (None, False)), fits.pop(key, None)
+        if crop is not None and fit is not None:
+            view = RecordedView(crop=crop, fit=fit, row=row, has_picture=has_picture)
+        track = tracks.setdefault(fish.track_id, RecordedTrack())
+        track.add(row, view, max_views=max_views)
+    return tracks
 
 
 _PICTURE_PX, _THUMBNAIL_PX = 240, 72

@@ -15,6 +15,7 @@ from stream_dmr.recording.reading import open_recordings
 from stream_dmr.recording.record import PhotographChooser
 from stream_dmr.recording.recorder import Recorder
 from stream_dmr.recording.topics import RecordingSettings
+from stream_dmr.store.edits import ReviewedMessages
 from stream_dmr.web.views import draw_views, read_tracks
 from tests.support.reading import read_messages
 from tests.support.recorded_run import assert_same, header, run
@@ -69,6 +70,6 @@ def test_a_report_of_a_camera_shows_the_photographs(tmp_path: Path):
     of_first = [one.image is not None for one in crops if one.track_id == crops[0].track_id]
     assert 0 < sum(of_first) < len(of_first)
     recording = open_recordings([tmp_path])
-    for views in draw_views(read_tracks(recording), recording).values():
+    for views in draw_views(read_tracks(ReviewedMessages(recording)), recording).values():
         photograph = cv2.imdecode(np.frombuffer(views[0].picture, np.uint8), cv2.IMREAD_COLOR)
         assert len(np.unique(photograph)) > 20  # a mask alone has two greys

@@ -13,6 +13,7 @@ from stream_dmr.errors import SourceError
 from stream_dmr.messages import FittedMesh, LocalizedFish
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.recording.reading import decoded_messages, open_recordings
+from stream_dmr.store.edits import ReviewedMessages
 from stream_dmr.store.verdicts import Verdict, add_verdict
 from stream_dmr.web.open_reports import open_report, write_report
 from stream_dmr.web.views import draw_views, read_tracks
@@ -37,7 +38,7 @@ def page(out: Path) -> Path:
 
 def test_the_best_views_are_the_best_of_all(out: Path):
     recording = open_recordings([out])
-    tracks = read_tracks(recording, max_views=2)
+    tracks = read_tracks(ReviewedMessages(recording), max_views=2)
     ious: dict[int, list[float]] = {}
     for fish, _ in decoded_messages(recording, [LocalizedFish]):
         assert isinstance(fish, LocalizedFish)
@@ -53,7 +54,7 @@ def test_the_best_views_are_the_best_of_all(out: Path):
 
 def test_outlines_lie_on_the_mask_and_on_the_mesh(out: Path):
     recording = open_recordings([out])
-    tracks = read_tracks(recording)
+    tracks = read_tracks(ReviewedMessages(recording))
     album = draw_views(tracks, recording)
     fits = {
         (fit.track_id, fit.frame_index): fit
@@ -76,7 +77,7 @@ def test_outlines_lie_on_the_mask_and_on_the_mesh(out: Path):
 
 def test_pictures_come_from_the_clip_and_without_it_from_the_mask(out: Path, tmp_path: Path):
     recording = open_recordings([out])
-    tracks = read_tracks(recording)
+    tracks = read_tracks(ReviewedMessages(recording))
     seen = draw_views(tracks, recording)[1][0].picture
     clip = out.parent / "clip" / "video.mp4"
     assert draw_views(tracks, recording, str(clip))[1][0].picture == seen
