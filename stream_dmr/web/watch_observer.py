@@ -5,7 +5,6 @@ datagram socket that NOTIFY_SOCKET names.
 """
 
 import json
-import logging
 import os
 import socket
 import sys
@@ -14,7 +13,6 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
-from typing import Any
 
 from stream_dmr.messages import LengthEstimate, Message
 from stream_dmr.pipeline.chain import Chain
@@ -32,83 +30,62 @@ from stream_dmr.web.watch_page import WatchServer
 _REPEAT_INTERVAL_S = 60.0
 _MAX_KINDS = 200  # of lines that are remembered; beyond it, the one that was silent longest goes
 _PROGRESS_INTERVAL_S = 60.0
+_Kind = tuple[object, ...]  # what makes lines equal: event, text and fish
 _FISH_FACTS = ("track_id", "length_mm", "length_std_mm", "frames_used", "frames_seen", "status")
 
 
-class JsonFormatter(logging.Formatter):
-    """Formats a record as JSON: time, level, event, and its facts."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        facts: dict[str, Any] = getattr(record, "facts", {})
-        line = {"time": record.created, "level": record.levelname.lower(), "event": record.msg}
-        return json.dumps(line | facts, ensure_ascii=False)
-
-
-class RepeatFilter(logging.Filter):
-    """Passes equal lines once a minute; the next that passes counts those held back."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._passed_s: dict[tuple[object, ...], float] = {}  # the longest silent first
-        self._held_back: dict[tuple[object, ...], int] = {}
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        facts: dict[str, Any] = getattr(record, "facts", {})
-        kind = (record.msg, facts.get("text"), facts.get("track_id"))
-        now_s = time.monotonic()
-        if now_s - self._passed_s.get(kind, -_REPEAT_INTERVAL_S) < _REPEAT_INTERVAL_S:
-            self._held_back[kind] = self._held_back.get(kind, 0) + 1
-            return False
-        self._passed_s.pop(kind, None)
-        self._passed_s[kind] = now_s
-        if held_back := self._held_back.pop(kind, 0):
-            record.facts = facts | {"held_back": held_back}
-        if len(self._passed_s) > _MAX_KINDS:
-            oldest = next(iter(self._passed_s))
-            del self._passed_s[oldest]
-            self._held_back.pop(oldest, None)
-        return True
-
-
 class JsonLog(RunObserver):
-    """Logs the events of a run, for a service's log."""
+    """Logs the events of a run as JSON on stderr, for a service's log; equal ones once a minute.
+
+    The next that is logged counts those held back.
+    """
 
     needs_pictures = False
 
     def __init__(self) -> None:
-        self._log = logging.getLogger("stream_dmr.run")
-        self._log.setLevel(logging.INFO)
-        self._log.propagate = False
-        handler = logging.StreamHandler(sys.stderr)
-        handler.setFormatter(JsonFormatter())
-        handler.addFilter(RepeatFilter())
-        self._log.handlers = [handler]
         self._num_frames = 0
         self._progress_s = time.monotonic()
+        self._lock = threading.Lock()
+        self._passed_s: dict[_Kind, float] = {}  # the longest silent first
+        self._held_back: dict[_Kind, int] = {}
 
     def warn(self, line: str) -> None:
-        self._log_event(logging.WARNING, "warning", text=line)
+        self._log_event("warning", "warning", text=line)
 
     def serving(self, address: str) -> None:
-        self._log_event(logging.INFO, "serving", text=address)
+        self._log_event("info", "serving", text=address)
 
     def begin(self, num_frames: int | None) -> None:
-        self._log_event(logging.INFO, "begin", frames_promised=num_frames)
+        self._log_event("info", "begin", frames_promised=num_frames)
 
     def frame_done(self) -> None:
         self._num_frames += 1
         now_s = time.monotonic()
         if now_s - self._progress_s >= _PROGRESS_INTERVAL_S:
             self._progress_s = now_s
-            self._log_event(logging.INFO, "progress", frames=self._num_frames)
+            self._log_event("info", "progress", frames=self._num_frames)
 
     def take(self, message: Message) -> None:
         if isinstance(message, LengthEstimate) and message.is_final:
             facts = {name: getattr(message, name) for name in _FISH_FACTS}
-            self._log_event(logging.INFO, "fish", **facts)
+            self._log_event("info", "fish", **facts)
 
-    def _log_event(self, level: int, event: str, **facts: object) -> None:
-        self._log.log(level, event, extra={"facts": facts})
+    def _log_event(self, level: str, event: str, **facts: object) -> None:
+        kind, now_s = (event, facts.get("text"), facts.get("track_id")), time.monotonic()
+        with self._lock, suppress(OSError):  # nobody reads the log: the run goes on
+            if now_s - self._passed_s.get(kind, -_REPEAT_INTERVAL_S) < _REPEAT_INTERVAL_S:
+                self._held_back[kind] = self._held_back.get(kind, 0) + 1
+                return
+            self._passed_s.pop(kind, None)
+            self._passed_s[kind] = now_s
+            if held_back := self._held_back.pop(kind, 0):
+                facts["held_back"] = held_back
+            if len(self._passed_s) > _MAX_KINDS:
+                oldest = next(iter(self._passed_s))
+                del self._passed_s[oldest]
+                self._held_back.pop(oldest, None)
+            line = {"time": time.time(), "level": level, "event": event} | facts
+            print(json.dumps(line, ensure_ascii=False), file=sys.stderr, flush=True)
 
 
 class SystemdWatchdog:
