@@ -238,11 +238,7 @@ def corrected_length(
 ) -> LengthEstimate:
     """The length from the corrected frames alone, filtered as in a run."""
     of_points = settings.model_copy(update={"min_frames": 1, "max_std_ratio": math.inf})
-    ordered = [frames[index] for index in sorted(frames)]
-    track = TrackLength(ordered[0], of_points)
-    for fish in ordered:
-        track.add(fish)
-    return track.finish()
+    return length_of_frames([frames[index] for index in sorted(frames)], of_points)[-1]
 
 
 def edited_row(

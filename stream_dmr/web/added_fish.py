@@ -13,6 +13,7 @@ from stream_dmr.detection.box_files import AnnotatedBox
 from stream_dmr.detection.given_fish import AnnotatedFish
 from stream_dmr.errors import UserError
 from stream_dmr.files import is_locked
+from stream_dmr.geometry import box_iou
 from stream_dmr.messages import FishCrop, LengthEstimate, LocalizedFish
 from stream_dmr.nodes.crop_fish import CropFish
 from stream_dmr.pipeline.config import Config
@@ -122,13 +123,6 @@ def _length_text(fish: LengthEstimate) -> str:
     return f"Fish {fish.track_id} is {(fish.length_mm or 0) / 10:.1f} cm"
 
 
-def _overlap(box: Float[np.ndarray, "4"], other: Float[np.ndarray, "4"]) -> float:
-    """Intersection over union."""
-    sides = np.minimum(box[2:], other[2:]) - np.maximum(box[:2], other[:2])
-    common = float(np.prod(np.maximum(sides, 0)))
-    return common / float(np.prod(box[2:] - box[:2]) + np.prod(other[2:] - other[:2]) - common)
-
-
 _SAME_FISH = 0.5  # chosen: of two fish side by side, boxes share less than half of what they cover
 
 ADDED = "added by a reviewer"
@@ -191,7 +185,7 @@ class TrackEditor:
             box = boxes_between(drawn, [crop.frame_index]).get(crop.frame_index)
             if box is None or crop.track_id not in measured:
                 continue
-            if (overlap := _overlap(box, crop.bbox_xyxy_px)) > _SAME_FISH:
+            if (overlap := box_iou(box, crop.bbox_xyxy_px)) > _SAME_FISH:
                 raise DoubtError(
                     f"{_length_text(measured[crop.track_id])}, and in frame {crop.frame_index} "
                     f"the new box and its box share {100 * overlap:.0f} % of their area. Is it "

@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 
@@ -80,7 +80,7 @@ def crop_picture(
 ) -> UInt8[np.ndarray, "N N 3"]:
     """A crop of `size` by `size` px: from `frame`, else as recorded, else its mask in grey."""
     if frame is not None:
-        x, y = frame_from_crop_map(_resized(crop.crop_camera, size), frame_camera=crop.frame_camera)
+        x, y = frame_from_crop_map(crop.crop_camera.resized(size), frame_camera=crop.frame_camera)
         return cv2.remap(frame, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     image = crop.image
     if image is None:
@@ -132,14 +132,6 @@ def recorded_source(recording: Recording) -> str | None:
     """Path of the recorded source, where there is still a file or folder."""
     inputs = recording.header.known_inputs
     return inputs.source.path if inputs is not None and inputs.source.exists() else None
-
-
-def _resized(camera: Camera, size: int) -> Camera:
-    scale = size / camera.width
-    K = camera.K.copy()
-    K[:2] *= scale
-    K[:2, 2] += 0.5 * scale - 0.5  # pixel centres are integers
-    return replace(camera, K=K, width=size, height=size)
 
 
 _Key = tuple[int, int]  # frame index, track id
