@@ -21,7 +21,8 @@ from stream_dmr.calibration.lens import (
 )
 from stream_dmr.calibration.lens_file import LensFile
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
-from stream_dmr.errors import CalibrationError, OutputError
+from stream_dmr.errors import CalibrationError
+from stream_dmr.files import make_folder, writing_to
 
 _SAME_VIEW = 0.01  # of the picture's diagonal, chosen: closer boards add no information
 # Of the picture's longer side; chosen: a lens that is another's is worse.
@@ -105,15 +106,10 @@ def draw_views(result: BoardResult, folder: Path) -> None:
 
     Raises OutputError where the folder can't be written to.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    with writing_to(make_folder(folder)):
         for number, view in enumerate(result.fit.views, start=1):
             out = folder / f"{number:02d}_{view.path.stem}.png"  # two folders may share a name
             draw_corners(view.path, view.corners.pixels, result.board.inner, out)
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: expected a folder to draw the corners into, got: {error.strerror}"
-        ) from error
 
 
 def _find_boards(

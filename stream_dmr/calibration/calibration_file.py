@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from stream_dmr.calibration.calibration_values import CALIBRATE, read_values, require_lens
 from stream_dmr.calibration.lens_file import lens_of, load_lens, read_array, with_common_names
 from stream_dmr.camera import Calibration, Camera, ReferencePlane
-from stream_dmr.errors import CalibrationError, OutputError
+from stream_dmr.errors import CalibrationError
+from stream_dmr.files import writing_to
 
 _PLANE_KEYS = ("rvec", "tvec")
 _LENS_KEYS = ("image_width", "image_height", "camera_matrix", "distortion_coefficients")
@@ -80,12 +81,8 @@ def save_calibration(path: Path | str, calibration: Calibration) -> None:
         storage.write("distortion_model", "fisheye")
     storage.write("rvec", rvec.reshape(3, 1))
     storage.write("tvec", plane.translation_mm.reshape(3, 1))
-    try:
+    with writing_to(path):
         path.write_text(storage.releaseAndGetString(), encoding="utf-8")
-    except OSError as error:
-        raise OutputError(
-            f"{path}: expected a place to write the calibration to, got: {error.strerror}"
-        ) from error
 
 
 def require_size(calibration: Calibration, *, width: int, height: int) -> None:

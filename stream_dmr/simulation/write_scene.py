@@ -11,7 +11,8 @@ import trimesh
 from jaxtyping import UInt16
 
 from stream_dmr.calibration.calibration_file import save_calibration
-from stream_dmr.errors import OutputError, UserError, reason_of
+from stream_dmr.errors import OutputError, UserError
+from stream_dmr.files import writing_to
 from stream_dmr.simulation.film import VisibleBox, film
 from stream_dmr.simulation.rail_scene import FPS, RailScene, make_scene, second_camera
 from stream_dmr.simulation.simulated_fish import (
@@ -101,7 +102,7 @@ def simulate(
 
 def write_scene(out: Path, scene: RailScene, *, species: str = "halibut") -> None:
     """Write a clip of this scene, as `simulate` does. Raises OutputError."""
-    try:
+    with writing_to(out):
         (out / "masks").mkdir(parents=True, exist_ok=True)
         for path in (out / "masks").iterdir():  # of an earlier clip, which may have been longer
             if re.fullmatch(r"\d{6}\.png", path.name):
@@ -113,11 +114,6 @@ def write_scene(out: Path, scene: RailScene, *, species: str = "halibut") -> Non
         write_table(out / "truth_frames.csv", TRUTH_FRAMES_COLUMNS, _truth_rows(scene))
         save_calibration(out / "calibration.yaml", scene.calibration)
         _write_film(out, scene)
-    except OSError as error:
-        raise OutputError(
-            f"{out}: expected a folder for the simulated scene, got: {reason_of(error)}; "
-            "choose another --out or free some space"
-        ) from error
 
 
 def write_species(path: Path, name: str = "halibut") -> None:

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, UInt8
 
 from stream_dmr.errors import ModelError, OutputError
+from stream_dmr.files import make_folder
 from stream_dmr.networks.unet import SHIPPED, load_weights
 from stream_dmr.segmentation.segmenter import resize
 from stream_dmr.training.annotated_images import (
@@ -182,17 +183,10 @@ def _prepare(request: TrainRequest) -> UNetTrainer:
         )
     init = request.init or (SHIPPED if request.images is not None else None)
     network = None if init is None else load_weights(init)
-    try:
-        request.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"{request.out}: expected a folder to write to, got: {error.strerror}; "
-            "choose another --out"
-        ) from error
     training = UNetTrainer(
         settings=request.settings,
         device=torch.device(request.device),
-        out=request.out,
+        out=make_folder(request.out),
         is_fine_tuning=init is not None,
     )
     if request.resume:

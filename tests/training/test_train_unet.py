@@ -99,7 +99,7 @@ def test_impossible_requests_are_refused_before_training(trained, tmp_path):
     with pytest.raises(ModelError, match="of the same settings"):
         train_unet(request(out, settings=other, resume=True), stop=never())
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(OutputError, match="expected a folder"):
+    with pytest.raises(OutputError, match="expected a place to write to"):
         train_unet(request(tmp_path / "file"), stop=never())
 
 
