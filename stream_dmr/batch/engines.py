@@ -17,6 +17,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict
+from functools import partial
 from importlib import import_module  # Ray is an extra: type checks pass without it
 from pathlib import Path
 from typing import IO, Any
@@ -39,21 +40,8 @@ def main() -> None:
     threading.Thread(target=_read_stdin, args=(jobs,), daemon=True).start()
     while True:
         job, out = Job(**json.loads(jobs.get())), Path(sys.argv[1])
-        measure_video(job, out, on_progress=PercentPrinter().update)
+        measure_video(job, out, on_progress=partial(print, flush=True))
         print(FINISHED, flush=True)
-
-
-class PercentPrinter:
-    """Prints a share at each whole percent."""
-
-    def __init__(self) -> None:
-        self._printed = 0
-
-    def update(self, share: float) -> None:
-        """Print `share` where it has grown by a hundredth since the last print."""
-        if int(100 * share) > self._printed:
-            self._printed = int(100 * share)
-            print(share, flush=True)
 
 
 def _read_stdin(jobs: queue.Queue[str]) -> None:

@@ -179,19 +179,21 @@ def request_of(job: Job, out: Path) -> RunOptions:
 
 
 class _ProgressObserver(RunObserver):
-    """Reports the share of a video's frames that is done."""
+    """Reports the share of a video's frames that is done, whenever that grew by a hundredth."""
 
     needs_pictures = False
 
     def __init__(self, on_progress: OnProgress) -> None:
         self._on_progress = on_progress
         self._num_frames: int | None = None
-        self._done = 0
+        self._done = self._percent = 0
 
     def begin(self, num_frames: int | None) -> None:
         self._num_frames = num_frames
 
     def frame_done(self) -> None:
         self._done += 1
-        if self._num_frames:
-            self._on_progress(min(1.0, self._done / self._num_frames))
+        share = min(1.0, self._done / self._num_frames) if self._num_frames else 0.0
+        if int(100 * share) > self._percent:
+            self._percent = int(100 * share)
+            self._on_progress(share)
