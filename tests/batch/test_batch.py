@@ -24,6 +24,7 @@ from stream_dmr.batch.manifest import COLUMNS, Job, read_manifest
 from stream_dmr.batch.measure_video import BatchProgress, measure_video, read_outcome
 from stream_dmr.errors import OutputError
 from stream_dmr.evidence.seal import seal_verdicts
+from stream_dmr.evidence.verify_batch import check_batch
 from stream_dmr.evidence.verify_folder import verify
 from stream_dmr.pipeline.measure_source import measure_source
 from stream_dmr.store.batch_folder import results_folder
@@ -217,6 +218,7 @@ def test_verify_finds_a_changed_data_set(season: Path, tmp_path: Path):
     (copy,) = (tmp_path / "dataset" / "fish").rglob("*.parquet")
     copy.write_bytes(copy.read_bytes() + b"x")
     (change,) = verify(tmp_path)[0]
+    assert [*check_batch(tmp_path)] == [change[:2]]
     assert change.path == copy
     assert "differs from videos/video/fish.parquet" in change.what
     shutil.copy(tmp_path / "videos" / "video" / "fish.parquet", copy)
