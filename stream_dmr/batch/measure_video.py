@@ -125,7 +125,7 @@ def measure_video(job: Job, out: Path, *, on_progress: OnProgress = lambda share
     folder.parent.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(folder, ignore_errors=True)
     try:
-        observer = WatchObserver(_ProgressObserver(on_progress))
+        observer = WatchObserver(ProgressObserver(on_progress))
         summary = measure_source(request_of(job, out), stop=threading.Event(), observer=observer)
         write_tables(folder, job)
         outcome = Outcome(
@@ -178,7 +178,7 @@ def request_of(job: Job, out: Path) -> RunOptions:
     return replace(request, out=unfinished_folder(job.name, out))
 
 
-class _ProgressObserver(RunObserver):
+class ProgressObserver(RunObserver):
     """Reports the share of a video's frames that is done, whenever that grew by a hundredth."""
 
     needs_pictures = False

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from stream_dmr.batch.engines import PercentPrinter
 from stream_dmr.batch.manifest import Job
-from stream_dmr.batch.measure_video import BatchProgress, duration
+from stream_dmr.batch.measure_video import BatchProgress, ProgressObserver, duration
 
 
 @pytest.fixture
@@ -44,8 +43,10 @@ def test_durations_have_one_unit(seconds: float, text: str):
     assert duration(seconds) == text
 
 
-def test_a_worker_prints_each_percent_once(capsys: pytest.CaptureFixture[str]):
-    printer = PercentPrinter()
-    for share in (0.001, 0.012, 0.013, 0.5, 0.5, 1.0):
-        printer.update(share)
-    assert capsys.readouterr().out.split() == ["0.012", "0.5", "1.0"]
+def test_a_video_reports_each_percent_once():
+    shares = list[float]()
+    observer = ProgressObserver(shares.append)
+    observer.begin(250)
+    for _ in range(250):
+        observer.frame_done()
+    assert [int(100 * share) for share in shares] == [*range(1, 101)]
