@@ -58,6 +58,13 @@ class SmoothLengthSettings(Settings):
         ge=0,
         description="error that all frames of a fish share beside shape and plane, std over length",
     )
+    upward_share: float = Field(
+        default=0.65,
+        gt=0,
+        lt=1,
+        description="share of a 95 % interval above its length: a slant that nobody sees makes a "
+        "fish longer than it looks, never shorter",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

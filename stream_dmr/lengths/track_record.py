@@ -20,7 +20,7 @@ from stream_dmr.lengths.kalman import (
 from stream_dmr.messages import LengthEstimate, LocalizedFish
 from stream_dmr.reasons import MEASURED, MEASURING, Reason, with_counts
 
-_STD_PER_CI95 = NormalDist().inv_cdf(0.975)  # 1.96
+_CI95_STDS = 2 * NormalDist().inv_cdf(0.975)  # its width: 3.92
 
 
 def measurement_of(fish: LocalizedFish, settings: SmoothLengthSettings) -> Measurement:
@@ -131,7 +131,9 @@ class TrackLength:
         std_mm = float(self._std_mm(np.array([length_mm]), np.array([self._filter.variance]))[0])
         if std_mm > self._settings.max_std_ratio * length_mm:
             return None, None, None
-        return length_mm, std_mm, length_mm + _STD_PER_CI95 * std_mm * np.array([-1.0, 1.0])
+        share = self._settings.upward_share
+        ends_mm = length_mm + _CI95_STDS * std_mm * np.array([share - 1.0, share])
+        return length_mm, std_mm, ends_mm
 
     def _smoothed(self) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
         """Length and std in mm at each used frame, given all of them."""

@@ -352,6 +352,7 @@ _LYING: dict[str, dict[str, Any]] = {
         "misfit_std": 0.03,
         "max_bow_ratio": 0.1,
     },
+    "smooth_length": {"upward_share": 0.5},
 }
 # Independent pictures: none follows another, and one good one gives a length. Ten
 # seconds between them are more than anything in `[smooth_length]` remembers, but for the track.
@@ -367,7 +368,11 @@ _STILLS: dict[str, dict[str, Any]] = {
 # Of fish placed by two cameras no slant is left, by which all frames err alike. Chosen on simulated
 # pairs (docs/two-cameras.md), where intervals are still too wide rather than too narrow.
 _BY_TWO: dict[str, dict[str, Any]] = {
-    "smooth_length": {"frame_correlation": 0.15, "common_std_ratio": 0.005},
+    "smooth_length": {
+        "frame_correlation": 0.15,
+        "common_std_ratio": 0.005,
+        "upward_share": 0.5,
+    },
 }
 
 

@@ -37,6 +37,8 @@ _TABLES = {
     "fit_mesh": "fit",
     "localize": "localize",
 }
+# Of recordings older than a setting, what runs did then.
+_BEFORE = (("fit_mesh", "hang", "plane"), ("smooth_length", "upward_share", 0.5))
 _KEYS = {"species": {"model": "crop", "forms": "fit"}}  # of tables that several stages use
 
 
@@ -54,9 +56,11 @@ def replay_config(
     can't be read.
     """
     recorded = parse_config(recorded_toml, where="the recording's config.toml")
-    if "hang" not in recorded.fit_mesh.model_fields_set:  # a recording older than the setting
-        in_plane = recorded.fit_mesh.model_copy(update={"hang": "plane"})
-        recorded = recorded.model_copy(update={"fit_mesh": in_plane})
+    for table, key, before in _BEFORE:
+        settings = getattr(recorded, table)
+        if key not in settings.model_fields_set:
+            as_then = {table: settings.model_copy(update={key: before})}
+            recorded = recorded.model_copy(update=as_then)
     if given is None:
         return recorded
     mine = load_config(given)

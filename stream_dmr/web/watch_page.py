@@ -213,8 +213,8 @@ def status_json(state: RunState) -> dict[str, Any]:
                 "track_id": fish.track_id,
                 "length": "-" if fish.length_mm is None else f"{fish.length_mm / 10:.1f} cm",
                 "note": fish.status
-                if fish.length_std_mm is None
-                else f"± {1.96 * fish.length_std_mm / 10:.1f} cm",
+                if fish.ci95_mm is None
+                else "{:.1f} to {:.1f} cm".format(*fish.ci95_mm / 10),
                 "kind": ", ".join(text for text in (fish.species_code, fish.fate) if text),
             }
             for fish in reversed(list(state.finished))

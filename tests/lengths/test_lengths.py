@@ -174,7 +174,7 @@ def test_interval_covers_the_truth_as_often_as_it_says(common, lasting, tau_s):
     rng = np.random.default_rng(1)
     apart_s = np.abs(np.subtract.outer(np.arange(15), np.arange(15))) * FRAME_NS / 1e9
     alike = np.linalg.cholesky(lasting + (1 - lasting) * np.exp(-apart_s / tau_s))
-    changes = {"frame_correlation": lasting, "correlation_time_s": tau_s}
+    changes = {"frame_correlation": lasting, "correlation_time_s": tau_s, "upward_share": 0.5}
     hits, nees = [], []
     for truth in rng.uniform(400, 1200, 300):
         std = truth * rng.uniform(0.02, 0.06, 15)
@@ -232,9 +232,11 @@ def test_overconfident_fits_are_widened_by_their_own_scatter():
 
 def test_common_error_does_not_average_out():
     frames = [frame(i, 700.0) for i in range(1, 400)]
-    final = run(frames, common_std_ratio=0.02, **ALL_NEW)[-1]
+    final = run(frames, common_std_ratio=0.02, upward_share=0.5, **ALL_NEW)[-1]
     assert final.length_std_mm == pytest.approx(14.0, rel=0.01)
     np.testing.assert_allclose(final.ci95_mm, [700 - 27.5, 700 + 27.5], atol=0.3)
+    final = run(frames, common_std_ratio=0.02, upward_share=0.6, **ALL_NEW)[-1]
+    np.testing.assert_allclose(final.ci95_mm, [700 - 22.0, 700 + 33.0], atol=0.3)
 
 
 def test_no_frame_has_a_smaller_std_than_the_floor():
