@@ -20,6 +20,9 @@ _TILE_SHARE = 0.625  # of the picture's sides: two by two overlap by a quarter o
 _EDGE_PX = 3  # from a tile's edge: what a box there may lack
 _SURE_NEAR = 0.5  # least score in a tile, where parts of other things look like fish
 _SAME_FISH, _INSIDE = 0.45, 0.9  # IoU of two boxes of a fish; share of a part in the fish's box
+# Of the longest fish of the picture: what is shorter is dirt, a scale or a leaf beside it, of which
+# nothing but its size says so. See docs/research/real-lengths.md.
+_SHORTEST = 0.1
 
 
 def find_in_view(
@@ -39,7 +42,7 @@ def find_in_still(detector: Detector, frame: Frame) -> list[Candidate]:
     large = [
         one
         for one in find_in_view(detector, frame, afar, (-rim_px, -rim_px))
-        if (one.bbox_xyxy_px[2:] - one.bbox_xyxy_px[:2]).max() > _LARGE * max(height, width)
+        if _side_px(one) > _LARGE * max(height, width)
     ]
     whole, others = [*detector.find(frame)], list[Candidate]()
     rows, columns = round(_TILE_SHARE * height), round(_TILE_SHARE * width)
@@ -56,7 +59,13 @@ def find_in_still(detector: Detector, frame: Frame) -> list[Candidate]:
     for one in sorted([*whole, *others], key=lambda one: -one.score):
         if not any(_are_same(one, fish) for fish in kept):
             kept.append(one)
-    return kept
+    longest_px = max((_side_px(one) for one in kept if one.score >= _SURE_NEAR), default=0.0)
+    return [one for one in kept if _side_px(one) >= _SHORTEST * longest_px]
+
+
+def _side_px(one: Candidate) -> float:
+    """The longer side of its box."""
+    return float((one.bbox_xyxy_px[2:] - one.bbox_xyxy_px[:2]).max())
 
 
 def _is_part(one: Candidate, fish: Candidate) -> bool:

@@ -1,5 +1,6 @@
 """A fish that was found twice in one picture counts once; neighbours that touch count both."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import cv2
@@ -92,3 +93,29 @@ def test_large_and_small_fish_of_a_still_are_found_whole_and_once(left, length, 
     boxes = sorted(one.bbox_xyxy_px.tolist() for one in found)
     expected = [[left, 80, right, 120]] + [[10, 150, 10 + neighbour, 160]] * (neighbour > 0)
     np.testing.assert_allclose(boxes, sorted(expected))
+
+
+class _Boxes:
+    """The boxes of all white rectangles, with one score."""
+
+    refused: Mapping[str, int] = {}
+
+    def __init__(self, score: float) -> None:
+        self._score = score
+
+    def find(self, frame):
+        white = (frame.image[..., 0] > 200).astype(np.uint8)
+        _, _, stats, _ = cv2.connectedComponentsWithStats(white)
+        boxes = [np.array([x, y, x + w, y + h], np.float64) for x, y, w, h, _ in stats[1:]]
+        return [Candidate(bbox_xyxy_px=box, score=self._score) for box in boxes]
+
+
+@given(st.sampled_from([0, 400]), st.integers(20, 60), st.sampled_from([0.4, 0.8]))
+def test_dirt_beside_a_fish_of_ten_times_its_length_is_none(fish, dirt, score):
+    picture = np.zeros((300, 500, 3), np.uint8)
+    picture[50:150, 20 : 20 + fish] = 255
+    picture[200:215, 100 : 100 + dirt] = 255
+    found = find_in_still(_Boxes(score), frame_of(picture))
+    lengths = sorted(float(one.bbox_xyxy_px[2] - one.bbox_xyxy_px[0]) for one in found)
+    is_dirt = fish > 0 and score >= 0.5 and dirt < 0.1 * fish
+    assert lengths == [dirt] * (not is_dirt) + [fish] * (fish > 0)
