@@ -11,7 +11,8 @@ from stream_dmr.lengths.fate import FateTracker, ZonesSettings
 from stream_dmr.lengths.kalman import SmoothLengthSettings
 from stream_dmr.lengths.track_record import TrackLength, late_estimate
 from stream_dmr.messages import LengthEstimate, LocalizedFish, TrackEnded
-from stream_dmr.species import UNSURE, SpeciesEvidence, SpeciesSettings
+from stream_dmr.reasons import Reason
+from stream_dmr.species import UNSURE, SpeciesEvidence, SpeciesSettings, is_longer_than_known
 
 
 @dataclass(frozen=True)
@@ -35,14 +36,15 @@ class SmoothLength:
         zones: ZonesSettings | None = None,
         species: SpeciesSettings | None = None,
         frame_size: tuple[int, int] | None = None,
+        tail_gives: str | None = None,
     ) -> None:
         """With `zones` a final estimate has a fate; `frame_size`: width and height, px.
 
-        It has a species where a classifier has looked at the fish.
+        It has a species where a classifier has looked at the fish; `tail_gives`: see Template.
         """
         self._settings = settings
         self._zones, self._frame_size = zones or ZonesSettings(), frame_size
-        self._species = species or SpeciesSettings()
+        self._species, self._tail_gives = species or SpeciesSettings(), tail_gives
         self._open: dict[int, _Track] = {}
         self._ended: set[int] = set()
         self._last: LocalizedFish | None = None
@@ -92,4 +94,9 @@ class SmoothLength:
         if found is None:
             return estimate
         code = found.code if found.share >= self._species.min_share else UNSURE
-        return replace(estimate, species_code=code, species_share=found.share)
+        estimate = replace(estimate, species_code=code, species_share=found.share)
+        low_mm = None if estimate.ci95_mm is None else float(estimate.ci95_mm[0])
+        if low_mm is None or not is_longer_than_known(code, low_mm, given=self._tail_gives):
+            return estimate
+        status = Reason.LONGER_THAN_SPECIES
+        return replace(estimate, length_mm=None, length_std_mm=None, ci95_mm=None, status=status)

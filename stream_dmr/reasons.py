@@ -169,6 +169,13 @@ class Reason(StrEnum):
         "`[smooth_length] max_std_ratio`",
         "look at its frames",
     )
+    LONGER_THAN_SPECIES = (
+        "longer than the species grows",
+        _FISH,
+        "the classifier is sure of the species, and the whole 95 % interval is above its largest "
+        "known length, see [Species](species.md#the-list)",
+        "look at the species, the scale and the masks",
+    )
 
 
 def with_counts(reason: Reason, count: int, expected: int) -> str:

@@ -4,7 +4,8 @@ The species that reviewers choose from, and that codes stand for.
 
 `species.csv` has 101 species that fisheries with hooks land, with codes and names from the ASFIS
 List of Species for Fishery Statistics Purposes (FAO, 2022), and the bundled body form that each is
-near to. A user's own file adds others, or replaces them.
+near to; where a source could be read, also AphiaID (ICES' code lists), equations between lengths,
+and the largest known one. A user's own file adds others, or replaces them.
 """
 
 import csv
@@ -25,6 +26,10 @@ from stream_dmr.settings import Settings
 
 CODE = re.compile(r"[A-Z0-9]{3}")  # FAO 3-alpha
 _EXPECTED = "code,scientific_name,english_name,form"
+LENGTHS = ("total", "fork", "standard", "precaudal", "disc width")
+_LENGTH, _NUMBER = f"({'|'.join(LENGTHS)})", r"(\d+(?:\.\d+)?)"
+_EQUATION = re.compile(rf"{_LENGTH} = {_NUMBER} {_LENGTH} ([+-]) {_NUMBER} cm \(([^)]+)\)")
+_LARGEST = re.compile(rf"{_NUMBER} cm {_LENGTH} \((.+)\)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +40,9 @@ class Species:
     scientific_name: str
     english_name: str
     form: str = ""  # bundled body form that it is near to; "": none
+    aphia_id: str = ""  # of the World Register of Marine Species; "": not known
+    lengths: str = ""  # such as "fork = 0.83 total + 1.4 cm (SOURCE); ..."
+    largest: str = ""  # the largest known length, such as "250 cm total (SOURCE)"
 
 
 _COLUMNS = [field.name for field in fields(Species)]
@@ -90,6 +98,37 @@ def _parse(text: str, *, where: str) -> list[Species]:
             )
         found.append(Species(**values))
     return found
+
+
+def converted_length(
+    species: Species, length_mm: float, *, given: str, wanted: str
+) -> tuple[float, str] | None:
+    """Another of the species' lengths by its own equation, or by that solved for it; its source.
+
+    None where there is no equation of these two: two in sequence would add their errors.
+    """
+    for length, factor, other, sign, offset_cm, source in _EQUATION.findall(species.lengths):
+        offset_mm = 10 * float(sign + offset_cm)
+        if (length, other) == (wanted, given):
+            found_mm = float(factor) * length_mm + offset_mm
+        elif (length, other) == (given, wanted):
+            found_mm = (length_mm - offset_mm) / float(factor)
+        else:
+            continue
+        return (found_mm, source) if found_mm > 0 else None
+    return None
+
+
+def is_longer_than_known(code: str, low_mm: float, *, given: str | None) -> bool:
+    """True where even `low_mm` is above the largest known length of a species of the bundled list.
+
+    No length from the snout is above the total one; others are compared with their own kind only.
+    """
+    species = find_species(code, _bundled())
+    match = _LARGEST.fullmatch(species.largest) if species else None
+    if match is None or match[2] not in ("total", given) or given == "disc width":
+        return False
+    return low_mm > 10 * float(match[1])
 
 
 class SpeciesSettings(Settings):

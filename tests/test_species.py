@@ -1,5 +1,6 @@
 """Lists of species, the combination of frames, and what a classifier's file must be."""
 
+import re
 from pathlib import Path
 
 import cv2
@@ -17,10 +18,13 @@ from stream_dmr.pipeline.config import parse_config
 from stream_dmr.segmentation.species_classifier import SpeciesClassifier
 from stream_dmr.species import (
     CODE,
+    LENGTHS,
     SpeciesEvidence,
     SpeciesSettings,
+    converted_length,
     find_species,
     forms_of_species,
+    is_longer_than_known,
     load_species,
 )
 from stream_dmr.template.template_file import bundled_names
@@ -34,6 +38,55 @@ def test_the_bundled_list_has_codes_names_and_bundled_forms():
     by_code = {one.code: one for one in species}
     assert by_code["YFT"].scientific_name == "Thunnus albacares"
     assert by_code["HAP"].form == "halibut"
+
+
+def test_the_lengths_of_the_bundled_list_have_their_order_and_their_way_back():
+    listed = [one for one in load_species() if one.lengths]
+    assert {"BSH", "SMA", "HER"} <= {one.code for one in listed}
+    for one in listed:
+        for length_mm in (1500.0, 2500.0):
+            total = converted_length(one, length_mm, given="fork", wanted="total")
+            assert total is not None
+            assert 1.02 * length_mm < total[0] < 1.9 * length_mm, one.code  # threshers: long tails
+            assert re.search(r"\w{4}", total[1])
+            back = converted_length(one, total[0], given="total", wanted="fork")
+            assert back is not None
+            assert back[0] == pytest.approx(length_mm)
+            shorter = converted_length(one, length_mm, given="fork", wanted="precaudal")
+            assert shorter is None or 0.85 * length_mm < shorter[0] < length_mm, one.code
+    for one in load_species():
+        assert not one.largest or is_longer_than_known(one.code, 5000.0, given="fork"), one.code
+        assert not is_longer_than_known(one.code, 900.0, given="fork"), one.code
+        assert one.aphia_id.isdecimal() or not one.aphia_id
+
+
+def test_a_length_is_converted_as_published_or_not_at_all():
+    by_code = {one.code: one for one in load_species()}
+    blue = by_code["BSH"]  # FL = 0.8313 TL + 1.39 cm, PCL = 0.92 FL - 0.22 cm
+    fork = converted_length(blue, 2000.0, given="total", wanted="fork")
+    assert fork is not None
+    assert fork[0] == pytest.approx(10 * (0.8313 * 200 + 1.39))
+    assert "Skomal" in fork[1]
+    precaudal = converted_length(blue, 2000.0, given="fork", wanted="precaudal")
+    assert precaudal is not None
+    assert precaudal[0] == pytest.approx(10 * (0.92 * 200 - 0.22))
+    assert converted_length(blue, 2000.0, given="total", wanted="precaudal") is None
+    thresher = by_code["ALV"]
+    assert converted_length(thresher, 50.0, given="fork", wanted="total") is None  # below 0
+    for kind in LENGTHS:
+        assert converted_length(by_code["COD"], 500.0, given=kind, wanted="total") is None
+
+
+def test_only_a_length_that_can_be_compared_is_longer_than_known():
+    cod, skipjack = "COD", "SKJ"  # 200 cm total, 110 cm fork
+    for kind in ("fork", "total", None):  # none is above the total length
+        assert is_longer_than_known(cod, 2000.1, given=kind)
+        assert not is_longer_than_known(cod, 2000.0, given=kind)
+    assert not is_longer_than_known(cod, 2500.0, given="disc width")
+    assert is_longer_than_known(skipjack, 1100.1, given="fork")
+    assert not is_longer_than_known(skipjack, 1150.0, given="total")
+    assert not is_longer_than_known(skipjack, 1150.0, given=None)
+    assert not is_longer_than_known("COE", 1e5, given="total")  # no source could be read
 
 
 @pytest.mark.parametrize("text", ["swo", " Swordfish ", "xiphias gladius"])

@@ -110,6 +110,8 @@ _COLUMNS: dict[str, _Column] = {
     "scale_checked_ns": (int, lambda row: row.check and row.check.time_ns),  # since 1970
     # Which length `length_mm` is, by the ICES vocabulary.
     "length_type": (str, lambda row: ICES_LENGTHS.get(row.template.tail_gives or "")),
+    **_same(float, "derived", "standard_length_mm", "precaudal_length_mm", "disc_width_mm"),
+    **_same(str, "derived", "conversion_source"),
 }
 FISH_TABLE: dict[str, type] = {name: kind for name, (kind, _) in _COLUMNS.items()}
 
@@ -128,7 +130,7 @@ def fish_record(
     found = fish.species
     named = "" if CODE.fullmatch(fish.review.species) else fish.review.species
     species = named or (found.english_name if found else "") or fish.review.species
-    derived = derive(fish.length_mm, template, settings, species=species)
+    derived = derive(fish.length_mm, template, settings, species=species, listed=found)
     check = (checks or {}).get(fish.facts.calibration_sha256)
     row = _Row(fish, template, settings, species, derived, check)
     return {name: value(row) for name, (_, value) in _COLUMNS.items()}

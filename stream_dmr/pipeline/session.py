@@ -125,6 +125,7 @@ STAGES: Mapping[Stage, StageNode] = {
             zones=setup.config.zones,
             species=setup.config.species,
             frame_size=setup.camera and (setup.camera.width, setup.camera.height),
+            tail_gives=setup.template.tail_gives,
         ),
     ),
 }

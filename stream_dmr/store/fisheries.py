@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from stream_dmr.settings import Settings
+from stream_dmr.species import LENGTHS, Species, converted_length
 from stream_dmr.store.fish import is_same_species
 from stream_dmr.template.template import Template
 
@@ -55,6 +56,10 @@ class Derived:
 
     fork_length_mm: float | None = None
     total_length_mm: float | None = None
+    standard_length_mm: float | None = None
+    precaudal_length_mm: float | None = None
+    disc_width_mm: float | None = None
+    conversion_source: str | None = None  # of those that follow from the species' own equations
     length_cm: int | None = None  # of the length by which the species is measured, see `derive`
     weight_kg: float | None = None
     is_legal_size: bool | None = None
@@ -66,17 +71,20 @@ def derive(
     settings: FisheriesSettings,
     *,
     species: str | None = None,
+    listed: Species | None = None,
 ) -> Derived:
     """All that follows from the length from snout to tail keypoint, in mm.
 
-    The template says which length its tail keypoint ends, and total over fork length; without the
-    one neither is known, without the other only the first. Whole centimetres are those of the
-    length as it is measured. Weight and legal size are for the settings' species alone; `species`:
-    the fish's, where it is not the template's.
+    The template says which length its tail keypoint ends, without which none is known; the others
+    see `all_lengths`. Whole centimetres are those of the length as it is measured. Weight and legal
+    size are for the settings' species alone; `species`: the fish's, where it is not the template's;
+    `listed`: the same, where the bundled list has it.
     """
     if length_mm is None:
         return Derived()
-    lengths = _both_lengths(length_mm, template)
+    found = all_lengths(length_mm, template, listed)
+    lengths = {kind: found[kind][0] if kind in found else None for kind in LENGTHS}
+    sources = dict.fromkeys(source for _, source in found.values() if source)
     is_species = is_same_species(species or template.name, settings.species)
     weighed, legal = lengths[settings.weight_length], lengths[settings.legal_length]
     has_weight = is_species and settings.weight_a > 0 and weighed is not None
@@ -84,6 +92,10 @@ def derive(
     return Derived(
         fork_length_mm=lengths["fork"],
         total_length_mm=lengths["total"],
+        standard_length_mm=lengths["standard"],
+        precaudal_length_mm=lengths["precaudal"],
+        disc_width_mm=lengths["disc width"],
+        conversion_source="; ".join(sources) or None,
         length_cm=whole_cm(length_mm, settings.rounding),
         weight_kg=weight_kg(weighed, settings) if has_weight and weighed is not None else None,
         is_legal_size=legal / 10 >= settings.legal_cm if has_legal and legal is not None else None,
@@ -100,12 +112,23 @@ def whole_cm(length_mm: float, rounding: str) -> int:
     return math.floor(length_mm / 10 + (0.5 if rounding == "nearest" else 0.0))
 
 
-def _both_lengths(length_mm: float, template: Template) -> dict[str, float | None]:
-    factor = template.total_per_fork
-    match template.tail_gives:
-        case "fork":
-            return {"fork": length_mm, "total": None if factor is None else length_mm * factor}
-        case "total":
-            return {"fork": None if factor is None else length_mm / factor, "total": length_mm}
-        case _:
-            return {"fork": None, "total": None}
+def all_lengths(
+    length_mm: float, template: Template, species: Species | None
+) -> dict[str, tuple[float, str]]:
+    """Each of LENGTHS that is known, and the source of the species' equation it follows from.
+
+    The source is "" for the length that was measured, and for the fork or total length by the
+    template's ratio, which counts where the species has no equation of its own.
+    """
+    given, factor = template.tail_gives, template.total_per_fork
+    if given is None:
+        return {}
+    found = {given: (length_mm, "")}
+    if factor is not None:
+        both = {"fork": ("total", length_mm * factor), "total": ("fork", length_mm / factor)}
+        kind, other_mm = both[given]
+        found[kind] = (other_mm, "")
+    for wanted in LENGTHS if species else ():
+        converted = species and converted_length(species, length_mm, given=given, wanted=wanted)
+        found |= {wanted: converted} if converted else {}
+    return found

@@ -1,5 +1,7 @@
 """The last two nodes together, and the ends of tracks."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from stream_dmr.localization.localize_fish import LocalizeSettings
 from stream_dmr.messages import TrackEnded
 from stream_dmr.nodes.localize import Localize
 from stream_dmr.nodes.smooth_length import SmoothLength
+from stream_dmr.species import SpeciesSettings
 from tests.lengths.test_lengths import frame
 from tests.localization.test_localization import make_calibration, make_mesh, straight_fish
 
@@ -80,3 +83,32 @@ def test_the_same_frames_give_the_same_bits():
         finals += node.close()
     assert finals[0].length_mm == finals[1].length_mm
     np.testing.assert_array_equal(finals[0].smoothed_mm, finals[1].smoothed_mm)
+
+
+@pytest.mark.parametrize(
+    ("length_mm", "shares", "tail", "expected"),
+    [
+        (2300.0, {"COD": 0.99, "HAP": 0.01}, "fork", None),
+        (2300.0, {"COD": 0.6, "HAP": 0.4}, "fork", 2300.0),  # unsure
+        (2300.0, {"COD": 0.01, "HAP": 0.99}, "fork", 2300.0),
+        (2300.0, {}, "fork", 2300.0),  # nobody said the species
+        (2030.0, {"COD": 0.99, "HAP": 0.01}, "fork", 2030.0),  # the interval reaches below 2 m
+        (1300.0, {"SKJ": 0.99, "ALB": 0.01}, "fork", None),
+        (1300.0, {"SKJ": 0.99, "ALB": 0.01}, "total", 1300.0),  # known is the fork length
+    ],
+)
+def test_a_fish_that_is_longer_than_its_species_grows_has_no_length(
+    length_mm: float, shares: dict[str, float], tail: str, expected: float | None
+):
+    settings = SpeciesSettings(model="any.onnx", min_share=0.9)
+    node = SmoothLength(SmoothLengthSettings(), species=settings, tail_gives=tail)
+    for i in range(1, 9):
+        node.step(replace(frame(i, length_mm), species=shares))
+    (final,) = node.close()
+    if expected is not None:
+        assert final.length_mm == pytest.approx(expected)
+        assert final.status == "measured"
+    else:
+        assert (final.length_mm, final.length_std_mm, final.ci95_mm) == (None, None, None)
+        assert final.status == "longer than the species grows"
+        assert final.frames_used == 8

@@ -19,6 +19,7 @@ from stream_dmr.export.exporter import Export
 from stream_dmr.export.fish_table import FISH_TABLE
 from stream_dmr.fitting.shape.candidates import AUTO, load_shapes
 from stream_dmr.pipeline.config import parse_config
+from stream_dmr.species import find_species, load_species
 from stream_dmr.store.fish import Fish
 from stream_dmr.store.fisheries import Derived, FisheriesSettings, derive, whole_cm
 from stream_dmr.store.run_tables import LENGTHS_COLUMNS
@@ -44,6 +45,21 @@ def test_the_tail_keypoint_says_which_length_is_which(length_mm: float):
     assert (unsaid.fork_length_mm, unsaid.total_length_mm, unsaid.weight_kg) == (None,) * 3
     without = derive(length_mm, replace(HALIBUT, total_per_fork=None), SETTINGS)
     assert (without.fork_length_mm, without.total_length_mm) == (length_mm, None)
+
+
+def test_other_lengths_follow_from_the_species_own_equations_or_stay_empty():
+    blue, cod = (find_species(code, load_species()) for code in ("BSH", "COD"))
+    shark = derive(2000.0, HALIBUT, SETTINGS, listed=blue)
+    assert shark.fork_length_mm == 2000.0
+    assert shark.total_length_mm == pytest.approx(10 * (200 - 1.39) / 0.8313)
+    assert shark.precaudal_length_mm == pytest.approx(1837.8)
+    assert (shark.standard_length_mm, shark.disc_width_mm) == (None, None)
+    assert (shark.conversion_source or "").count(";") == 1
+    by_template = derive(2000.0, HALIBUT, SETTINGS, listed=cod)
+    assert by_template == derive(2000.0, HALIBUT, SETTINGS)
+    assert by_template.conversion_source is None
+    unsaid = derive(2000.0, replace(HALIBUT, tail_gives=None), SETTINGS, listed=blue)
+    assert (unsaid.total_length_mm, unsaid.precaudal_length_mm) == (None, None)
 
 
 @given(length_mm=lengths)
