@@ -98,7 +98,7 @@ def test_the_table_of_fish_has_the_truth(measured: Measured):
     assert len(table) == len(measured.trip.fish)
     for row, true in zip(table, measured.trip.fish, strict=True):
         assert row["track_id"] == str(true.track_id)
-        assert row["length_type"] == "LengthFork"
+        assert row["length_type"] == "ForkLength"
         found = (row["haul"], row["species_code"], row["fate"], row["vessel"], row["trip"])
         assert found == (true.haul, true.species_code, true.fate, "Sea Bird", "26-11")
         assert int(row["time_utc_ns"]) == pytest.approx(true.utc_ns, abs=1)

@@ -41,9 +41,9 @@ def export(
     agency: Annotated[
         list[Agency] | None,
         typer.Option(
-            help="Table in the manner of WCPFC's longline monitoring or ICES' RDBES; may be "
-            "repeated.",
-            metavar="<wcpfc|rdbes>",
+            help="Tables in the manner of WCPFC's longline monitoring or ICES' RDBES, Darwin Core "
+            "for OBIS, observations of Camtrap DP; may be repeated.",
+            metavar="<wcpfc|rdbes|obis|camtrap-dp>",
         ),
     ] = None,
     hauls: Annotated[bool, "hauls.csv: hours watched and fish of each haul."] = False,
@@ -69,7 +69,6 @@ def export(
     from stream_dmr.store.fish import run_notes
 
     exported = Export(recording, parse_selection(time, track), overwrite=overwrite)
-    notes: list[str] = []
     with exported.into(out):
         if meshes:
             print(f"{out / 'meshes'}: {exported.meshes(out / 'meshes', format=meshes)} meshes")
@@ -80,8 +79,9 @@ def export(
                 print(path)
         if fish:
             settings = settings_of(config, exported.header.config_toml, recording)
-            notes = species_notes(settings, exported.header.template)
             path = exported.fish(out, settings.fisheries, format=fish, all_columns=all_columns)
+            notes = species_notes(settings, exported.header.template)
+            exported.notes = notes or exported.notes
             print(path)
         if viame:
             path = out / "tracks.viame.csv"
@@ -90,8 +90,8 @@ def export(
             path = out / "tracks.mot.txt"
             print(f"{path}: {exported.mot(path)} boxes")
         for one in dict.fromkeys(agency or ()):
-            print(exported.agency(out, one))
+            print(*exported.agency(out, one), sep="\n")
         if hauls:
             print(exported.hauls(out))
     print(out / PROVENANCE)
-    warn([*run_notes(recording), *exported.recording.warnings, *(notes or exported.notes)])
+    warn([*run_notes(recording), *exported.recording.warnings, *exported.notes])

@@ -1,12 +1,14 @@
 """Tables in the manner of WCPFC's longline monitoring and of ICES' RDBES; docs/trip.md maps them.
 
 What a camera can't know stays empty: nothing is guessed. Sources: draft longline EM fields
-(WCPFC-SC16-2020/ST-IP-07) and the SPC/FFA longline observer form; the RDBES data model and the ICES
-vocabularies TypeMeasured and ValueUnitOrScale.
+(WCPFC-SC16-2020/ST-IP-07) and the SPC/FFA longline observer form; the types and code lists of RDBES
+(BaseTypes.xsd of February 2025, Enumerators.zip).
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 
+from stream_dmr.export.darwin_core import CAMTRAP_TABLES, OBIS_TABLES, FishTable, fish_id
 from stream_dmr.export.export_choices import Agency
 from stream_dmr.fitting.shape.candidates import AUTO
 from stream_dmr.lengths.fate import FATE_OF_ZONE
@@ -24,10 +26,11 @@ WCPFC_COLUMNS = [
     "comments",
 ]
 RDBES_COLUMNS = [
-    *("FOstationNumber", "FOlatitude", "FOlongitude", "SAspeciesCodeFAO", "SAcatchCategory"),
-    *("BVrecordType", "BVnationalUniqueFishId", "BVstateOfProcessing", "BVpresentation"),
-    *("BVspecimensState", "BVtypeMeasured", "BVtypeAssessment", "BVvalueMeasured"),
-    *("BVvalueUnitOrScale", "BVmethod", "BVmeasurementEquipment", "BVaccuracy", "BVsampler"),
+    *("FOstationNumber", "FOlatitude", "FOlongitude", "SAspeciesCode", "SAspeciesCodeFAO"),
+    *("SAcatchCategory", "BVrecordType", "BVnationalUniqueFishId", "BVstateOfProcessing"),
+    *("BVpresentation", "BVspecimensState", "BVtypeMeasured", "BVtypeAssessment"),
+    *("BVvalueMeasured", "BVvalueUnitOrScale", "BVspecimenType", "BVanalysisType", "BVaccuracy"),
+    "BVsampler",
 ]
 _FATE_COLUMNS = {f"num_{zone}": fate for zone, fate in FATE_OF_ZONE.items()}
 HAUL_COLUMNS = [
@@ -35,7 +38,7 @@ HAUL_COLUMNS = [
     *("num_measured", *_FATE_COLUMNS),
 ]
 _WCPFC_LENGTHS = {"fork": "UF", "total": "TL"}  # upper jaw to fork; tip of snout to end of tail
-ICES_LENGTHS = {"fork": "LengthFork", "total": "LengthTotal"}
+ICES_LENGTHS = {"fork": "ForkLength", "total": "LengthTotal"}
 
 
 def template_of(fish: Fish, template: Template) -> Template:
@@ -63,30 +66,29 @@ def wcpfc_row(fish: Fish, template: Template) -> Row:
         "length_cm": "" if length_mm is None else str(int(length_mm // 10)),
         "length_code": ""
         if length_mm is None
-        else _WCPFC_LENGTHS.get(template_of(fish, template).tail_gives or "", ""),
+        else _WCPFC_LENGTHS.get(template.tail_gives or "", ""),
         "comments": "; ".join(note for note in notes if note),
     }
 
 
 def rdbes_row(fish: Fish, template: Template) -> Row:
     """One measured length, as a biological variable with the sample's and the haul's keys."""
-    kind, length_mm = (
-        ICES_LENGTHS.get(template_of(fish, template).tail_gives or "", ""),
-        fish.length_mm,
-    )
+    kind, length_mm = ICES_LENGTHS.get(template.tail_gives or "", ""), fish.length_mm
     is_measured = length_mm is not None
     place = fish.where.latitude, fish.where.longitude
     return {
         "FOstationNumber": fish.haul,
         "FOlatitude": "" if place[0] is None else f"{place[0]:.5f}",
         "FOlongitude": "" if place[1] is None else f"{place[1]:.5f}",
+        "SAspeciesCode": fish.species.aphia_id if fish.species else "",
         "SAspeciesCodeFAO": fish.sure_code,
         "BVrecordType": "BV",
-        "BVnationalUniqueFishId": f"{fish.run_id[:8]}-{fish.estimate.track_id}",
+        "BVnationalUniqueFishId": fish_id(fish),
         "BVtypeMeasured": kind if is_measured else "",
         "BVtypeAssessment": kind if is_measured else "",
         "BVvalueMeasured": f"{length_mm:.0f}" if length_mm is not None else "",
         "BVvalueUnitOrScale": "Lengthmm" if is_measured else "",
+        "BVaccuracy": "mm" if is_measured else "",  # the unit that the value is rounded to
     }
 
 
@@ -122,4 +124,9 @@ def _degrees(value: float | None, letters: str, *, digits: int) -> str:
     return f"{whole:0{digits}d}{minutes / 1000:06.3f}{letters[value < 0]}"
 
 
-AGENCIES = {Agency.WCPFC: (WCPFC_COLUMNS, wcpfc_row), Agency.RDBES: (RDBES_COLUMNS, rdbes_row)}
+AGENCIES: Mapping[Agency, Mapping[str, FishTable]] = {
+    Agency.WCPFC: {"wcpfc.csv": (WCPFC_COLUMNS, lambda fish, mesh: [wcpfc_row(fish, mesh)])},
+    Agency.RDBES: {"rdbes.csv": (RDBES_COLUMNS, lambda fish, mesh: [rdbes_row(fish, mesh)])},
+    Agency.OBIS: {f"obis/{name}": table for name, table in OBIS_TABLES.items()},
+    Agency.CAMTRAP_DP: {f"camtrap-dp/{name}": table for name, table in CAMTRAP_TABLES.items()},
+}

@@ -8,7 +8,9 @@ TableFormat = Literal["csv", "parquet"]
 
 
 class Agency(StrEnum):
-    """An agency's table, by its name; an enumeration, since the option may be repeated."""
+    """Tables for an agency or a data portal; an enumeration, since the option may be repeated."""
 
     WCPFC = "wcpfc"
     RDBES = "rdbes"
+    OBIS = "obis"
+    CAMTRAP_DP = "camtrap-dp"

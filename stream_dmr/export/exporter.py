@@ -13,8 +13,9 @@ import trimesh
 from stream_dmr.errors import OutputError
 from stream_dmr.evidence.own_files import require_writable
 from stream_dmr.evidence.seal import known_files, read_origin, seal_files
-from stream_dmr.export.agency_tables import AGENCIES, HAUL_COLUMNS, haul_row
+from stream_dmr.export.agency_tables import AGENCIES, HAUL_COLUMNS, haul_row, template_of
 from stream_dmr.export.coco_masks import coco_masks, is_picture
+from stream_dmr.export.darwin_core import archive_description
 from stream_dmr.export.export_choices import Agency, MeshFormat, TableFormat
 from stream_dmr.export.fish_table import (
     FISH_TABLE,
@@ -243,14 +244,26 @@ class Export:
                 file.write(f"{frame_index},{track_id},{x0},{y0},{x1 - x0},{y1 - y0},1,-1,-1,-1\n")
         return len(boxes)
 
-    def agency(self, out: Path, agency: Agency) -> Path:
-        """Write the fish as wcpfc.csv or rdbes.csv; rejected ones and doubles are left out."""
-        path, (columns, row) = out / f"{agency}.csv", AGENCIES[agency]
-        self._require_writable(path)
-        rows = [row(one, self.header.template) for one in self._fish if one.counts]
-        with self._writing(path):
-            write_csv(path, columns, rows)
-        return path
+    def agency(self, out: Path, agency: Agency) -> list[Path]:
+        """Write the tables of AGENCIES; rejected fish and doubles are left out."""
+        fish = [(one, template_of(one, self.header.template)) for one in self._fish if one.counts]
+        tables = {
+            out / name: (columns, [row for one in fish for row in rows_of(*one)])
+            for name, (columns, rows_of) in AGENCIES[agency].items()
+        }
+        meta = [out / "obis" / "meta.xml"] if agency is Agency.OBIS else []
+        self._require_writable(*tables, *meta)
+        for path, (columns, rows) in tables.items():
+            with self._writing(path):
+                write_csv(path, columns, rows)
+        for path in meta:
+            with self._writing(path):
+                path.write_text(archive_description(), encoding="utf-8")
+        first, (_, rows) = next(iter(tables.items()))
+        if lacking := len(fish) - len(rows):
+            why = "have no time in UTC, or no species where it needs one, and are left out"
+            self.notes.append(f"{first.name}: {lacking} of {len(fish)} fish {why}")
+        return [*tables, *meta]
 
     def hauls(self, out: Path) -> Path:
         """Write hauls.csv: each haul with its effort. Raises OutputError without a lengths.db."""

@@ -58,6 +58,9 @@ def test_a_line_of_each_table():
     assert wcpfc["length_code"] == {"fork": "UF", "total": "TL"}[TEMPLATE.tail_gives or ""]
     assert "fate_code" not in wcpfc
     assert (rdbes["BVvalueMeasured"], rdbes["BVvalueUnitOrScale"]) == ("1234", "Lengthmm")
+    # The codes of RDBES' Enumerators.zip: BiologicalMeasurementType, AccuracyCode, SpecWoRMS.
+    assert (rdbes["BVtypeMeasured"], rdbes["BVaccuracy"]) == ("ForkLength", "mm")
+    assert rdbes["SAspeciesCode"] == "127138"
 
 
 def test_what_is_not_known_stays_empty():

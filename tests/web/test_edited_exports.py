@@ -125,4 +125,4 @@ def test_tables_are_of_the_reviewed_fish(out: Path, exported: Path):
 def test_a_fish_that_was_added_has_the_species_and_the_fate_that_a_reviewer_says(exported: Path):
     row = next(one for one in rows(exported / "fish.csv") if one["track_id"] == "4")
     assert (row["species_code"], row["fate"], row["condition"]) == ("COD", "dropped", "A1")
-    assert (row["origin"], row["length_type"]) == ("add", "LengthFork")
+    assert (row["origin"], row["length_type"]) == ("add", "ForkLength")
