@@ -21,6 +21,7 @@ from stream_dmr.segmentation.crop_geometry import (
     clean_mask,
     frame_from_crop_map,
     glare,
+    is_rectangle,
     mask_bbox,
     resample,
     sharpness,
@@ -111,6 +112,10 @@ class MaskedCrop:
     unknown: Bool[np.ndarray, "S S"] | None = None  # hidden by something in front, or no fish
     pixel_px: float = 1.0  # frame pixels along a pixel of the mask that `extent` is of
     length_doubt: float | None = None  # see `CropQuality`
+
+    def touches_border(self, view: FrameView) -> bool:
+        """True where the fish may go on beyond the crop or the frame."""
+        return self.is_cut or touches_border(self.extent, shape=view.shape, pixel_px=self.pixel_px)
 
 
 def crop_given_mask(
@@ -373,8 +378,7 @@ def crop_fish(
         crop_camera=crop.crop_camera,
         frame_camera=frame_camera,
         quality=CropQuality(
-            touches_border=crop.is_cut
-            or touches_border(crop.extent, shape=view.shape, pixel_px=crop.pixel_px),
+            touches_border=crop.touches_border(view),
             visible_fraction=detection.visible_fraction,
             sharpness=sharpness(crop.image, crop.mask),
             mask_area_px=crop.area_px,
@@ -390,10 +394,14 @@ def _doubted(view: FrameView, crop: MaskedCrop, segmenter: Segmenter) -> MaskedC
     """A crop of what may be no fish: of little confidence where a wider view shows another mask.
 
     An eye, a fin, a leaf or a letter looks like a fish while its surroundings are cut off. Seen
-    with them it is nothing, or a part of something larger.
+    with them it is nothing, or a part of something larger. A label looks like one in both views,
+    but no fish fills a rectangle.
     """
     if (crop.confidence or 0.0) < _MIN_AGREEMENT:
         return crop  # doubted already, and the wider view costs as much as a crop
+    # Of a fish that the picture cuts off, the trunk alone may fill one.
+    if is_rectangle(crop.mask) and not crop.touches_border(view):
+        return replace(crop, confidence=0.0)
     wider = crop_wider(view, crop, segmenter)
     agreed = agreement(crop, wider)
     if agreed < _MIN_AGREEMENT:

@@ -2,6 +2,7 @@
 
 from dataclasses import asdict
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -173,7 +174,7 @@ def test_a_mask_found_beyond_the_frame_does_not_count():
     assert crop.quality.touches_border
 
 
-@given(st.integers(200, 400), st.integers(150, 300), st.integers(30, 90), st.integers(30, 90))
+@given(st.integers(200, 400), st.integers(150, 300), st.integers(50, 90), st.integers(50, 90))
 @settings(max_examples=10, deadline=None)
 def test_what_looks_alike_in_a_wider_view_keeps_its_confidence(x, y, w, h):
     camera = Camera.nominal(width=640, height=480)
@@ -235,11 +236,11 @@ class Obedient(Painter):
 def test_a_second_look_finds_the_tail_that_a_box_lacks(second_look):
     camera = Camera.nominal(width=640, height=480)
     picture = np.zeros((480, 640), np.uint8)
-    picture[200:300, 200:470] = 255
+    picture[180:330, 200:470] = 255
     frame = frame_of(np.repeat(picture[..., None], 3, axis=2))
     detection = Detection(
         source_id=1,
-        bbox_xyxy_px=np.array([200.0, 200.0, 430.0, 300.0]),
+        bbox_xyxy_px=np.array([200.0, 180.0, 430.0, 330.0]),
         mask=None,
         visible_fraction=1.0,
         may_be_no_fish=True,
@@ -247,7 +248,7 @@ def test_a_second_look_finds_the_tail_that_a_box_lacks(second_look):
     knobs = CropFishSettings(second_look=second_look)
     crop = crop_fish(frame, detection, frame_camera=camera, settings=knobs, segmenter=Obedient())
     length_px = 270 if second_look else 230
-    assert crop.quality.mask_area_px == pytest.approx(length_px * 100, rel=0.05)
+    assert crop.quality.mask_area_px == pytest.approx(length_px * 150, rel=0.05)
     # Whether it is a fish says the first look.
     assert crop.quality.mask_confidence == pytest.approx(0.9**2.85, abs=0.02)
     assert (crop.quality.length_doubt is None) == (not second_look)
@@ -270,9 +271,7 @@ def test_an_end_that_only_a_longer_box_shows_is_taken_and_doubted(lost_px):
     picture = np.zeros((480, 640), np.uint8)
     picture[200:320, 200:500] = 255
     box = np.array([200.0, 200.0, 500.0 - lost_px, 320.0])
-    detection = Detection(
-        source_id=1, bbox_xyxy_px=box, mask=None, visible_fraction=1.0, may_be_no_fish=True
-    )
+    detection = Detection(source_id=1, bbox_xyxy_px=box, mask=None, visible_fraction=1.0)
     frame = frame_of(np.repeat(picture[..., None], 3, axis=2))
     knobs = CropFishSettings(second_look=True)
     crop = crop_fish(frame, detection, frame_camera=camera, settings=knobs, segmenter=Believer())
@@ -312,8 +311,40 @@ def test_a_fish_that_a_longer_box_does_not_show_keeps_its_mask_and_is_doubted():
 def test_a_part_of_something_larger_is_doubted():
     camera = Camera.nominal(width=640, height=480)
     picture = np.zeros((480, 640), np.uint8)
-    picture[200:300, 200:500] = 255
-    whole, _ = segmented(picture, [200, 200, 500, 300], camera, may_be_no_fish=True)
+    picture[180:340, 200:500] = 255
+    whole, _ = segmented(picture, [200, 180, 500, 340], camera, may_be_no_fish=True)
     part, _ = segmented(picture, [300, 220, 340, 250], camera, may_be_no_fish=True)
     assert whole.quality.mask_confidence > 0.9
     assert part.quality.mask_confidence < 0.4
+
+
+def strip(*, tapers: bool) -> np.ndarray:
+    """A slanted strip on black, or an ellipse as long and as broad."""
+    picture = np.zeros((480, 640), np.uint8)
+    if tapers:
+        cv2.ellipse(picture, (320, 240), (120, 20), 30, 0, 360, 255, cv2.FILLED)
+    else:
+        corners = cv2.boxPoints(((320.0, 240.0), (240.0, 40.0), 30.0))
+        cv2.fillConvexPoly(picture, np.round(corners).astype(np.int32), 255)
+    return picture
+
+
+@pytest.mark.parametrize(
+    ("tapers", "may_be_no_fish", "is_sure"),
+    [(False, True, False), (True, True, True), (False, False, True)],
+)
+def test_an_oblong_rectangle_is_a_label_unless_it_is_known_as_a_fish(
+    tapers, may_be_no_fish, is_sure
+):
+    camera = Camera.nominal(width=640, height=480)
+    box = [205, 160, 435, 320]
+    crop, _ = segmented(strip(tapers=tapers), box, camera, may_be_no_fish=may_be_no_fish)
+    assert (crop.quality.mask_confidence > 0.9) == is_sure
+
+
+def test_the_trunk_of_a_fish_that_the_picture_cuts_off_may_be_a_rectangle():
+    picture = np.zeros((480, 640), np.uint8)
+    picture[220:260, :200] = 255
+    camera = Camera.nominal(width=640, height=480)
+    crop, _ = segmented(picture, [0, 220, 200, 260], camera, may_be_no_fish=True)
+    assert crop.quality.mask_confidence > 0.9
