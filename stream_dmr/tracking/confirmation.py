@@ -23,6 +23,9 @@ _MAX_KEPT_CROPS = 10  # of a track that is not confirmed; chosen
 # After so many frames in a row whose masks show as good as nothing, a track is at another thing:
 # the place where its fish was. Of simulated fish at most three frames in a row are unclear.
 _MAX_EMPTY_FRAMES, _NOTHING = 5, 0.2
+# Of a track's frames: a lamp or a leaf that is seen for hours is clear in four of them. Real fish
+# were clear in a fifth and more when they were confirmed; see docs/research/tracking.md.
+_MIN_CLEAR_SHARE = 0.1
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
@@ -64,7 +67,8 @@ class FishConfirmation:
     def __init__(self, settings: ConfirmationSettings) -> None:
         self._settings = settings
         self._confirmed: set[int] = set()  # track numbers
-        self._num_clear_frames: Counter[int] = Counter()  # of unconfirmed tracks
+        self._num_frames: Counter[int] = Counter()  # of unconfirmed tracks
+        self._num_clear_frames: Counter[int] = Counter()  # likewise
         self._clear_crops: dict[int, deque[FishCrop]] = {}  # likewise, the latest
         self._num_empty_frames: Counter[int] = Counter()  # of confirmed ones, in a row
 
@@ -81,6 +85,7 @@ class FishConfirmation:
         confidence = crop.quality.mask_confidence
         earlier: list[FishCrop] = []
         if number not in self._confirmed:
+            self._num_frames[number] += 1
             if confidence is None or confidence >= self._settings.min_mask_confidence:
                 self._num_clear_frames[number] += 1
                 kept = self._clear_crops.setdefault(number, deque(maxlen=_MAX_KEPT_CROPS))
@@ -88,7 +93,7 @@ class FishConfirmation:
             if not (may_count and self._is_confirmed_by(number, crop)):
                 return []
             self._confirmed.add(number)
-            del self._num_clear_frames[number]
+            del self._num_frames[number], self._num_clear_frames[number]
             earlier = [one for one in self._clear_crops.pop(number, ()) if one is not crop]
         if confidence is None or confidence >= _NOTHING:
             self._num_empty_frames.pop(number, None)
@@ -98,8 +103,8 @@ class FishConfirmation:
 
     def forget_all_but(self, numbers: Collection[int]) -> None:
         """Forget what was seen of other tracks that are not confirmed."""
-        for number in [one for one in self._num_clear_frames if one not in numbers]:
-            del self._num_clear_frames[number]
+        for number in [one for one in self._num_frames if one not in numbers]:
+            del self._num_frames[number], self._num_clear_frames[number]
             self._clear_crops.pop(number, None)
 
     def _is_confirmed_by(self, number: int, crop: FishCrop) -> bool:
@@ -110,7 +115,9 @@ class FishConfirmation:
             left * width <= (x0 + x1) / 2 <= right * width
             and top * height <= (y0 + y1) / 2 <= bottom * height
         )
-        return is_in_zone and self._num_clear_frames[number] >= self._settings.min_track_frames
+        share = _MIN_CLEAR_SHARE * self._num_frames[number]
+        needed = max(self._settings.min_track_frames, share)
+        return is_in_zone and self._num_clear_frames[number] >= needed
 
 
 _SURE = 0.6  # of how much it looks like a fish: in so many frames it need not move

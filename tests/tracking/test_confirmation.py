@@ -80,6 +80,14 @@ def test_what_is_long_no_fish_keeps_few_crops():
     assert shown == [*crops[101 - len(shown) :], crops[0]]
 
 
+def test_what_is_hardly_ever_clear_is_no_fish():
+    unclear, clear = crop_at(50, 50, confidence=0.3), crop_at(50, 50)
+    rarely = [*[unclear] * 15, clear] * 30
+    assert not any(confirmed(rarely, min_track_frames=4))
+    often = [*[unclear] * 5, clear] * 4
+    assert confirmed(often, min_track_frames=4) == [False] * 23 + [True]
+
+
 def test_tracks_that_have_ended_are_forgotten():
     confirmation = FishConfirmation(ConfirmationSettings(min_track_frames=2))
     confirmation.update(1, crop_at(50, 50))
