@@ -182,8 +182,8 @@ def with_learnt_shapes(
     on_part("finding the fish")
     observer.stage("finding the fish, for their shapes")
     inputs, crops = _first_pass(inputs, crop_fish, stop=stop, observer=observer)
-    if stop.is_set():
-        return inputs
+    if stop.is_set() or next(iter(crops), None) is None:
+        return inputs  # without fish the end says why
     on_part("learning their shapes")
     return replace(inputs, candidates=_learn_and_report(crops, inputs, forms, observer))
 

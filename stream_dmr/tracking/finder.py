@@ -57,14 +57,16 @@ def explain_no_fish(
     `min_confidence` are `[track_fish] min_track_frames` and `min_mask_confidence`.
     """
     begin = f"no fish in {seen.frames} frames: "
+    commonest = sorted(refused.items(), key=lambda item: -item[1])
+    shapes = ", ".join(f"{count} {reason}" for reason, count in commonest)
+    if 0 < seen.candidates < sum(refused.values()):  # what most often moved may be the fish
+        begin += f"most of what moved was refused ({shapes}), change that where it was fish; else "
     if seen.candidates == 0 and not refused:
         return begin + (
             "nothing moved or looked like a fish; fish that hardly move and look unlike others "
             "need a detector of your own (.onnx), or --boxes"
         )
     if seen.candidates == 0:
-        commonest = sorted(refused.items(), key=lambda item: -item[1])
-        shapes = ", ".join(f"{count} {reason}" for reason, count in commonest)
         return begin + (
             f"all {sum(refused.values())} moving shapes were refused ({shapes}); change that "
             "setting where these were fish"
@@ -87,8 +89,9 @@ def explain_no_fish(
             "lower it, or train the network on these pictures"
         )
     return begin + (
-        f"{seen.tracks} shapes were followed, none with a sure mask in {min_frames} frames within "
-        "the zone; lower [track_fish] min_track_frames, or widen zone; --stills for single pictures"
+        f"{seen.tracks} shapes were followed, none with a sure mask in {min_frames} frames and a "
+        "tenth of all within the zone; lower [track_fish] min_track_frames, or widen zone; "
+        "--stills for single pictures"
     )
 
 

@@ -326,6 +326,18 @@ def test_a_stop_while_fish_are_looked_for_leaves_an_empty_valid_result(clip: Pat
     assert not (out / LEARNT).exists()
 
 
+def test_a_clip_without_fish_is_not_said_to_be_measured(tmp_path: Path):
+    write_clip(tmp_path / "clip", fish=[[], [], []])
+    observer = Listener()
+    config = tmp_path / "clip" / "quick.toml"
+    config.write_text(config.read_text().replace("learn_shapes = false", "learn_shapes = true"))
+    out = measured(tmp_path / "clip", tmp_path / "out", observer).out
+    assert not [line for line in observer.warnings if "measured" in line or "seen whole" in line]
+    candidates = read_header(out / "recording.mcap").candidates
+    assert candidates is not None
+    assert not candidates.are_learnt
+
+
 def test_a_shape_that_no_fish_has_is_not_believed(monkeypatch: pytest.MonkeyPatch):
     template, forms = load_shapes(AUTO)
     assert forms is not None

@@ -47,6 +47,17 @@ def test_the_line_names_what_was_seen_and_the_setting(seen, refused, words):
     assert "\n" not in line
 
 
+SHORT = "shorter than [detect_fish] motion_min_length"
+
+
+@pytest.mark.parametrize(("count", "is_said"), [(500, True), (5, False)])
+def test_small_shapes_are_named_where_most_of_what_moved_was_small(count, is_said):
+    seen = Sightings(frames=90, candidates=20, tracks=2, best_confidence=0.9)
+    line = explain_no_fish(seen, {SHORT: count}, **LIMITS)
+    assert (f"{count} {SHORT}" in line) is is_said
+    assert "none left its place" in line
+
+
 def frame(index: int, *, spot_x: int | None) -> Frame:
     image = np.full((240, 320, 3), 60, np.uint8)
     if spot_x is not None:
