@@ -24,7 +24,7 @@ _MAX_KEPT_CROPS = 10  # of a track that is not confirmed; chosen
 # the place where its fish was. Of simulated fish at most three frames in a row are unclear.
 _MAX_EMPTY_FRAMES, _NOTHING = 5, 0.2
 # Of a track's frames: a lamp or a leaf that is seen for hours is clear in four of them. Real fish
-# were clear in a fifth and more when they were confirmed; see docs/research/tracking.md.
+# were clear in a seventh and more when they were confirmed, but one; docs/research/tracking.md.
 _MIN_CLEAR_SHARE = 0.1
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
