@@ -317,6 +317,10 @@ def replay(
     for line in (*recording.warnings, *recorded.notes):
         observer.warn(line)
     versions = recording.header.metadata()
+    others = [name for name in REPRODUCIBLE_BY if recording.metadata.get(name) != versions[name]]
+    ran_by = [facts.get("onnx_providers", "") for facts in (recording.metadata, versions)]
+    if all(ran_by) and ran_by[0] != ran_by[1]:
+        others.append("onnx_providers")
     return ReplaySummary(
         fish=writer.totals.fish(),
         num_frames=writer.num_frames,
@@ -327,9 +331,7 @@ def replay(
         num_left_out=comparator.num_left_out,
         num_beyond=comparator.num_beyond,
         mismatches=comparator.mismatches,
-        other_versions=[
-            name for name in REPRODUCIBLE_BY if recording.metadata.get(name) != versions[name]
-        ],
+        other_versions=others,
         length_change=comparator.length_change,
     )
 

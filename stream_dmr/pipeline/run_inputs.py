@@ -10,6 +10,7 @@ import numpy as np
 from stream_dmr.calibration.calibration_file import load_calibration, require_size
 from stream_dmr.errors import ConfigError, UserError
 from stream_dmr.fitting.shape.candidates import given_mesh, load_shapes
+from stream_dmr.networks.onnx_session import provider_notice
 from stream_dmr.nodes.read_frames import ReadFrames
 from stream_dmr.pipeline.config import (
     Config,
@@ -23,6 +24,7 @@ from stream_dmr.pipeline.config import (
 from stream_dmr.pipeline.run_options import RunOptions, without_password
 from stream_dmr.pipeline.session import KeptCrops, KeptFrames, Setup
 from stream_dmr.recording.header import InputFile, RunHeader, RunInputs
+from stream_dmr.segmentation.unet_segmenter import SHIPPED
 from stream_dmr.sources.open_source import open_positions
 from stream_dmr.sources.positions import PositionSource
 from stream_dmr.sources.source import Source
@@ -229,6 +231,8 @@ def start_notices(inputs: Inputs) -> Iterator[str]:
     """A line each: of the template, the species, the calibration, and what is not recorded."""
     yield from inputs.notices
     yield from species_notes(inputs.config, inputs.template)
+    if line := provider_notice(SHIPPED):
+        yield line
     if inputs.calibration is None:
         yield "without --calibration there are relative shapes, no millimetres"
     elif inputs.request.pose == "hanging":

@@ -18,6 +18,7 @@ from stream_dmr.camera import Calibration
 from stream_dmr.errors import RecordingError, SourceError
 from stream_dmr.files import sha256_of, sha256_of_files
 from stream_dmr.fitting.shape.candidates import CandidateShapes
+from stream_dmr.networks.onnx_session import providers_in_use
 from stream_dmr.pictures import PICTURE_SUFFIXES
 from stream_dmr.recording.codec import CODEC_VERSION, decode, encode
 from stream_dmr.template.template import Template
@@ -235,6 +236,7 @@ class RunHeader:
             "cpu": _cpu(),
             "arithmetic": arithmetic_checksum(),
             **{name: _version(name) for name in _LIBRARIES},
+            "onnx_providers": providers_in_use(),
         }
 
     def attachments(self) -> dict[str, bytes]:
